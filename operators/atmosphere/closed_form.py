@@ -10,7 +10,8 @@ and behind an aperture with a rim, of transform B (`turbulence.beams`), with the
     S(f) = (2 / V) (1 / pi) int_0^inf P(k) B(k)^2 dq,      k^2 = (2 pi f / V)^2 + q^2.                                   (2)
 
 The relative fluctuation of the PWV has p^2 sum_l a_l^2 <S_l>, the mean over the speeds of the scan: this holds above the
-frequencies of the scan itself. The emission on the calibrated sky has that times (epsilon dT / dy / (zeta e^-tau))^2, y small.
+frequencies of the scan itself. The emission on the calibrated sky has p^2 sum_l kappa_l^2 a_l^2 <S_l> (`layer_terms`) times
+(epsilon dT / dy / (zeta e^-tau))^2, y small.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def closed_form(model: AtmosphereModel, observation: Observation) -> Callable[[F
 
     def spectrum(frequency: Floats) -> Floats:
         speeds = layer_speeds(observation, model.plane, model.layers)
-        parts = (model.layers[k].amplitude ** 2 * layer_spectrum(model.layers[k], frequency, speeds[k]) for k in simulated)
+        parts = (model.emitting[k].amplitude ** 2 * layer_spectrum(model.layers[k], frequency, speeds[k]) for k in simulated)
         return np.asarray(_emission_per_fluctuation(model, observation) ** 2 * model.fluctuation.scale**2 * sum(parts))
 
     return lambda frequency: between_knots(spectrum, frequency)

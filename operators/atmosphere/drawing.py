@@ -11,6 +11,7 @@ from zonda.core.instrument import SPEED_OF_LIGHT
 from zonda.core.types import Floats
 
 from .fluctuations import BYTES_KEPT, AtNodes, OfDetectors, keeps_all, times, units_bytes
+from .layer_terms import NAMES
 from .model import AtmosphereModel, ExpectedLoad
 from .response import Response, delay_per_vapour
 from .turbulence.beams import rayleigh_distance, widened
@@ -31,21 +32,25 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     turbulence = _layers_of(model, label)
     path = turbulence.paths[chosen.step]
     shares = np.array([layer.amplitude for layer in model.layers])
-    heights = np.array([layer.height for layer in model.layers])
     vapour_height = height_of_vapour(model)
-    per_vapour = delay_per_vapour(np.asarray(model.profile.at(heights).temperature), shares)
+    per_vapour = delay_per_vapour(np.asarray(model.profile.at(model.heights).temperature), shares)
     top = model.band.pwv_max / model.pwv - 1
-    response = Response(
-        model.band, model.pwv, law.limits(top), (path.low, path.high), vapour_height, per_vapour, streams(parameters.outputs)
-    )
+    sines, terms = (path.low, path.high), model.terms((path.low, path.high))
+    names = streams(parameters.outputs)
+    response = Response(model.band, model.pwv, law.limits(top), sines, vapour_height, per_vapour, names, terms)
+    if terms is not None:
+        turbulence.weights = terms.weights
 
-    def pwv(g: Floats, own: slice) -> Floats:
+    def pwv(g: Floats, weighted: Floats, sine: Floats, own: slice) -> tuple[Floats, Floats]:
+        strength = model.strength(sine)
+        if strength is not None:
+            g, weighted = g * strength, weighted * strength
         y, count = law(g), 0
         if y.min() < -1 or y.max() > top:
             clipped = np.clip(y, -1.0, top)
             count, y = int((clipped != y)[:, own].sum()), clipped
         observation.tally.count(label, "values of the PWV clipped to the table", count)
-        return y
+        return y, weighted
 
     for what, text in _statements(model, path):
         observation.tally.state(label, what, text)
@@ -158,6 +163,18 @@ def _of_the_pwv(model: AtmosphereModel) -> Iterator[tuple[str, str]]:
         for layer, field in zip(model.layers, model.turbulence, strict=True)
     )
     yield "PWV rms after the beam, per layer", ", ".join(each)
+    if model.parameters.pwv_rms_at == "zenith":
+        text = f"{law.rms / model.parameters.pwv_rms:.3f} of that at the zenith, at {math.degrees(model.elevation):.1f} deg"
+        yield (
+            "PWV rms by elevation",
+            text + (", one value for the scan" if model.strength(np.ones(1)) is None else ", and by sample"),
+        )
+    if model.parameters.layer_response == "layer":
+        for name in NAMES:
+            each = (f"{h:.0f} m: {k:.3f}" for h, k in zip(model.heights, model.kappa[name], strict=True))
+            yield f"{name} of a layer's water, over the column's", ", ".join(each)
+    else:
+        yield "emission and opacity of a layer's water", "as of the column, whatever its height"
 
 
 def _of_the_beam(model: AtmosphereModel, path: LinesOfSight) -> Iterator[tuple[str, str]]:

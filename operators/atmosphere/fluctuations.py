@@ -20,14 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, SmoothField, spline_coefficients
-from zonda.core.types import AnyFloats
+from zonda.core.types import AnyFloats, Floats
 
 from .response import Response
 from .turbulence.nodes import Nodes
 from .turbulence.sampling import TIMES_AT_ONCE, DriftingLayers
 
-ToPwv = Callable[[NDArray[np.float64], slice], NDArray[np.float64]]
-"""(sum of the layers, columns that belong to the scan) -> y; it counts there what it clips."""
+ToPwv = Callable[[Floats, Floats, Floats, slice], tuple[Floats, Floats]]
+"""(sum of the layers, their weighted sums, sine of the elevation, columns that belong to the scan) -> y, and the weighted sums as
+strong as y is there; it counts what it clips."""
 
 UNIT_DETECTORS, UNIT_SAMPLES = 128, 16384
 """Size of a unit."""
@@ -68,13 +69,14 @@ class AtNodes:
         sums = []
         part = step * max(TIMES_AT_ONCE, POINTS_AT_ONCE // n_node)
         for start in range(0, n_samples, part):
-            g, sine = layers(nodes.xi, nodes.eta, *times(slice(start, min(start + part, n_samples)), step))
+            at = times(slice(start, min(start + part, n_samples)), step)
+            (g,), (weighted,), sine = layers.sums([], nodes.xi, nodes.eta, *at)
             own = _own(g.shape[1])
-            y = to_pwv(g, own)
+            y, weighted = to_pwv(g, weighted, sine, own)
             sums.append(_sums(y[:, own]))
             first = start // step
             for name, whole in coefficients.items():
-                made = spline_coefficients(response(name, y, sine))
+                made = spline_coefficients(response(name, y, sine, weighted))
                 whole[:, first : first + made.shape[1]] = made
         fields = {name: SmoothField(weights, c, step, n_samples) for name, c in coefficients.items()}
         return cls(fields, (sum(n for n, _, _ in sums), math.fsum(t for _, t, _ in sums), math.fsum(q for _, _, q in sums)))
@@ -191,9 +193,9 @@ class OfDetectors:
         try:
             for alike in sorted({band._alike for band, _ in todo}):
                 these = [one for one in todo if one[0]._alike == alike]
-                drawn, sine = these[0][0]._draw([band._layers for band, _ in these[1:]], *key)
-                for (band, future), g in zip(these, drawn, strict=True):
-                    future.set_result(band._make(key, g, sine))
+                drawn, weighted, sine = these[0][0]._draw([band._layers for band, _ in these[1:]], *key)
+                for (band, future), g, own in zip(these, drawn, weighted, strict=True):
+                    future.set_result(band._make(key, g, own, sine))
         except BaseException as error:
             for band, future in todo:
                 if not future.done():
@@ -215,20 +217,21 @@ class OfDetectors:
         for k in range(unit + 1, min(unit + reach, self._groups)):
             yield k, number
 
-    def _draw(self, others: Sequence[DriftingLayers], unit: int, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """`DriftingLayers.with_others` for the detectors and times of a unit."""
+    def _draw(self, others: Sequence[DriftingLayers], unit: int, number: int) -> tuple[Floats, list[Floats], Floats]:
+        """`DriftingLayers.sums` for the detectors and times of a unit."""
         rows = slice(unit * UNIT_DETECTORS, (unit + 1) * UNIT_DETECTORS)
         samples = slice(number * UNIT_SAMPLES, min((number + 1) * UNIT_SAMPLES, self._n_samples))
-        return self._layers.with_others(others, self._xi[rows], self._eta[rows], *times(samples, self.step))
+        return self._layers.sums(others, self._xi[rows], self._eta[rows], *times(samples, self.step))
 
-    def _make(self, key: tuple[int, int], g: NDArray[np.float64], sine: NDArray[np.float64]) -> dict[str, AnyFloats]:
+    def _make(self, key: tuple[int, int], g: Floats, weighted: Floats, sine: Floats) -> dict[str, AnyFloats]:
         own = _own(g.shape[1])
         with self._lock:  # what is made again is not counted again
             counted = own if key not in self._sums else slice(0, 0)
             self._sums.setdefault(key, (0, 0.0, 0.0))
-        y = self._to_pwv(g, counted)
+        y, weighted = self._to_pwv(g, weighted, sine, counted)
         self._sums[key] = _sums(y[:, own])
-        return {name: spline_coefficients(self._response(name, y, sine), np.float32) for name in self._response.names}
+        made = ((name, self._response(name, y, sine, weighted)) for name in self._response.names)
+        return {name: spline_coefficients(values, np.float32) for name, values in made}
 
 
 def units_fit(n_detectors: int, n_samples: int, step: int, streams: int) -> bool:

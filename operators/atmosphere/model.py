@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,9 +22,12 @@ from zonda.core.types import Floats
 from zonda.core.weather import GroundWeather, WeatherSource
 
 from .distribution import Fluctuation, largest_pwv
+from .layer_terms import NAMES, LayerTerms, kappa
 from .parameters import LayerParameters, Wind
 from .resolution import Resolution, choose_resolution
+from .slab import Slab
 from .turbulence.beams import Aperture, widened
+from .turbulence.covariance import beam_correlation
 from .turbulence.geometry import ScanPlane, axes_at, rays, scan_planes
 from .turbulence.lattice import Turbulence
 from .turbulence.nodes import Layer, times_with_margin
@@ -39,6 +42,9 @@ if TYPE_CHECKING:
 
 EDGE_TAPER = 10.0
 """dB: power at the rim of a tapered aperture below that at its centre, where none is given."""
+
+ONE_VALUE = 0.01
+"""Relative change of the fluctuation's rms with elevation within a scan up to which one value serves the whole scan."""
 
 AIRMASS_STEP = 0.05
 """Of ln(airmass), between which the load's integrals over the passband are interpolated."""
@@ -114,17 +120,102 @@ class AtmosphereModel:
 
     @cached_property
     def fluctuation(self) -> Fluctuation:
-        """The distribution of the PWV about its mean."""
-        variance = sum(m.amplitude**2 * b.variance for m, b in zip(self.layers, self.turbulence, strict=True))
-        return Fluctuation(self.parameters.pwv_rms, self.parameters.pwv_rms_after_beam, variance)
+        """The distribution of the PWV about its mean, at the scan's mean elevation."""
+        p, variance = self.parameters, self._variance(self.layers)
+        if p.pwv_rms_at == "scan":
+            return Fluctuation(p.pwv_rms, p.pwv_rms_after_beam, variance)
+        before = p.pwv_rms
+        if p.pwv_rms_after_beam:
+            before, _ = Fluctuation(p.pwv_rms, True, self._variance_at_zenith).before_and_after()
+        return Fluctuation(before * float(self.slab.share(math.sin(self.elevation))), False, variance)
+
+    def strength(self, sine: Floats) -> Floats | None:
+        """By which the fluctuation at sines of the elevation exceeds that at the mean elevation; None: nowhere.
+
+        Where `pwv_rms` holds at the zenith, in scans whose elevation changes by so much that it varies by `ONE_VALUE`.
+        """
+        if self._strength is None:
+            return None
+        sines, factors = self._strength
+        return np.interp(sine, sines, factors)
+
+    @cached_property
+    def _strength(self) -> tuple[Floats, Floats] | None:
+        if self.parameters.pwv_rms_at == "scan":
+            return None
+        elevation, reach = self.observation.elevation, math.atan(self.observation.focalplane.radius)
+        ends = np.clip([float(elevation.min()), float(elevation.max())], ELEVATION_MIN, ELEVATION_MAX)
+        mean = float(self.slab.share(math.sin(self.elevation)))
+        if np.abs(self.slab.share(np.sin(ends)) / mean - 1).max() <= ONE_VALUE:
+            return None
+        low, high = np.sin(np.clip(ends + np.array([-reach, reach]), ELEVATION_MIN, ELEVATION_MAX))
+        sines = np.linspace(low, high, 64)
+        return sines, self.slab.share(sines) / mean
+
+    @cached_property
+    def slab(self) -> Slab:
+        """The water between the lowest and the highest layer."""
+        p = self.parameters
+        return Slab(self.profile if p.weights == "vapour" else None, p.lowest, p.highest, p.outer_scale)
+
+    @property
+    def elevation(self) -> float:
+        """Mean elevation of the scan, rad, within the limits of the radiative transfer."""
+        return min(max(float(np.mean(self.observation.elevation)), ELEVATION_MIN), ELEVATION_MAX)
+
+    def _variance(self, layers: Sequence[Layer]) -> float:
+        return sum(m.amplitude**2 * b.variance for m, b in zip(layers, self.turbulence, strict=True))
+
+    @cached_property
+    def _variance_at_zenith(self) -> float:
+        """Of the sum of the layers behind the beam, for a telescope that looks up."""
+        telescope, band, total = self.observation.instrument.telescope, self.observation.instrument.band, 0.0
+        for layer in self.layers:
+            if layer.aperture is None:
+                one = float(beam_correlation(0.0, layer.outer_scale, beam_sigma(telescope, band, layer.height))[0])
+            else:
+                width = widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, layer.height)
+                one = Aperture(width, layer.aperture.taper).variance(layer.outer_scale)
+            total += layer.amplitude**2 * one
+        return total
+
+    @cached_property
+    def kappa(self) -> dict[str, Floats]:
+        """``emission`` and ``opacity`` (n_layer,) of water at each layer's height over the column's, at the mean elevation.
+
+        1 where layers respond as the column does."""
+        if self.parameters.layer_response == "column":
+            return {name: np.ones(len(self.layers)) for name in NAMES}
+        return kappa(self.band, self.pwv, self.elevation, self.heights)
+
+    @property
+    def heights(self) -> Floats:
+        """(n_layer,) m above the site."""
+        return np.array([layer.height for layer in self.layers])
+
+    @cached_property
+    def emitting(self) -> list[Layer]:
+        """The layers, with their shares of the emission's fluctuation in place of those of the water's: kappa_l a_l."""
+        if self.parameters.layer_response == "column":
+            return self.layers
+        shares = np.abs(self.kappa["emission"])
+        return [replace(m, amplitude=m.amplitude * k) for m, k in zip(self.layers, shares.tolist(), strict=True)]
+
+    def terms(self, sines: tuple[float, float]) -> LayerTerms | None:
+        """What the layers that are simulated add to the column's response between two sines of the elevation."""
+        if self.parameters.layer_response == "column":
+            return None
+        simulated = [k for k in range(len(self.layers)) if k not in self.parameters.omit]
+        return LayerTerms.of(self.band, self.pwv, self.heights[simulated], self.fluctuation.scale, sines)
 
     def resolution(self, tolerance: float | None = None) -> Resolution:
         """Nodes and steps in time, for the parameters' tolerance or another."""
         tolerance = tolerance or self.parameters.tolerance
         if tolerance not in self._resolutions:
             emission = partial(self.band.emission, self.pwv)
-            variance, rms = self.fluctuation.variance, self.parameters.pwv_rms
-            found = choose_resolution(self.observation, self.plane, self.layers, variance, tolerance, emission, rms)
+            layers, rms = self.emitting, self.fluctuation.rms
+            variance = self._variance(layers)
+            found = choose_resolution(self.observation, self.plane, layers, variance, tolerance, emission, rms)
             self._resolutions[tolerance] = found
         return self._resolutions[tolerance]
 

@@ -39,6 +39,9 @@ class LayerParameters(Operator):
     for the date and hour). A scene whose weather gives another PWV is refused: it would be given twice."""
     pwv_rms: Fraction = quantity("0.5 %", ge=0, le=1)
     """Ensemble rms of the line-of-sight water vapour, as a fraction of its mean (at one point of the sky, over all weather)."""
+    pwv_rms_at: Literal["scan", "zenith"] = "scan"
+    """Where `pwv_rms` holds: at the scan's own elevation, or at the zenith. From there the turbulent slab between `lowest` and
+    `highest` says what it is along the line of sight (docs/atmosphere.md): in metres of water, about airmass^(1/2) as much."""
     pwv_rms_after_beam: bool = False
     """Whether `pwv_rms` is what the telescope sees, or what a pencil beam would see (the beam smooths a part away)."""
     layers: int = Field(10, ge=1, le=200)
@@ -49,6 +52,8 @@ class LayerParameters(Operator):
     """Height of the highest layer above the site."""
     weights: Literal["vapour", "equal"] = "vapour"
     """How the fluctuation is shared among the layers: by vapour density times thickness, or equally."""
+    layer_response: Literal["layer", "column"] = "layer"
+    """How a layer's water emits and absorbs: as at its height, or as the column does on average (van Marrewijk et al. 2024)."""
     outer_scale: Metres = quantity("500 m", gt=0)
     """Outer scale r0 of the turbulence (van Marrewijk et al. 2024), a length in the von Karman covariance."""
     wind: Literal["profile"] | Wind | list[Wind] = "profile"
@@ -90,6 +95,8 @@ class LayerParameters(Operator):
         of_many = {"highest", "weights"} & self.model_fields_set
         if self.layers == 1 and of_many:
             raise ValueError(f"{sorted(of_many)[0]} needs several layers; a single one lies at lowest")
+        if self.layers == 1 and self.pwv_rms_at == "zenith":
+            raise ValueError("pwv_rms_at: zenith needs several layers: lowest to highest is the depth of the turbulence")
         if any(not 0 <= k < self.layers for k in self.omit):
             raise ValueError(f"omit names layers 0 to {self.layers - 1}, the lowest first")
         if isinstance(self.wind, list) and len(self.wind) != self.layers:

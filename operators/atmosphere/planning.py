@@ -1,8 +1,9 @@
 """Bounds and costs of the atmosphere's effects, see `core.plan`.
 
-Of a layer l with share a_l, variance s_l^2 behind the beam, and the band's emission T(PWV), one calibrated sample has the rms
+Of a layer l with share a_l, variance s_l^2 behind the beam, the band's emission T(PWV), and its kappa_l for water at that height
+(`layer_terms`; 1 where layers respond as the column does), one calibrated sample has the rms
 
-    K a_l s_l,    K = p PWV dT/dPWV epsilon / (zeta <e^-tau>)                                                     (1)
+    K kappa_l a_l s_l,    K = p PWV dT/dPWV epsilon / (zeta <e^-tau>)                                             (1)
 
 and, where what all detectors have in common is removed, at most K times what their differences from the mean leave of it
 (`nodes.differential_rms`).
@@ -167,11 +168,12 @@ def calibrated(model: AtmosphereModel) -> Calibrated:
     elevation = model.observation.elevation
     low, high = float(elevation.min()), float(elevation.max())
     gains = _gains(model.observation, model.band, model.pwv, low)
-    largest = float(gains.max())
+    largest, factors = float(gains.max()), model.strength(np.sin([low, high]))
+    strongest = 1.0 if factors is None else max(1.0, float(factors.max()))
     return Calibrated(
-        layers=model.layers,
+        layers=model.emitting,
         variances=[field.variance for field in model.turbulence],
-        kelvin=model.fluctuation.scale * largest,
+        kelvin=model.fluctuation.scale * strongest * largest,
         uneven=float(gains.std()) / max(largest, 1e-30),
         velocities=_velocities(model.observation, model.plane, model.layers),
         model=model,
@@ -235,7 +237,7 @@ def _correlated(context: Context, layer: Layer) -> float:
 
 
 def _layer_effects(context: Context, a: Calibrated, left: Sequence[float], points: float) -> list[Effect]:
-    text = "1.25 p PWV dT/dPWV epsilon / (zeta e^-tau) a_l x " + (
+    text = "1.25 p PWV dT/dPWV epsilon / (zeta e^-tau) kappa_l a_l x " + (
         "rms left of the layer after subtraction of the detectors' mean" if context.removes_common else "rms behind the beam"
     )
     bounds, p = _layer_bounds(context, a, left), a.model.parameters
@@ -254,7 +256,7 @@ def _layer_effects(context: Context, a: Calibrated, left: Sequence[float], point
 
 def _layer_bounds(context: Context, a: Calibrated, left: Sequence[float]) -> list[dict[str, float]]:
     """Bound on what each layer adds to the products."""
-    averages, spectra, p = a.averages[str(context.coverage)], _spectral_shares(context, a), a.model.parameters
+    averages, spectra = a.averages[str(context.coverage)], _spectral_shares(context, a)
     bounds = []
     for k, layer in enumerate(a.layers):
         rms = SAFETY * left[k]
@@ -262,7 +264,8 @@ def _layer_bounds(context: Context, a: Calibrated, left: Sequence[float]) -> lis
         bound["map_rms"] = min(bound["map_rms"], averages[k] * rms)
         if context.before_filters:
             bound["tod"] = SAFETY * a.of_layer(k)
-        opacity = _opacity_share(a) * p.pwv_rms * layer.amplitude * math.sqrt(a.variances[k])
+        share = abs(a.model.layers[k].amplitude * float(a.model.kappa["opacity"][k]))
+        opacity = _opacity_share(a) * a.model.fluctuation.scale * share * math.sqrt(a.variances[k])
         bound |= context.sky_error(PASSAGES * opacity)
         bound["psd"] = min(SAFETY**2 * spectra[k], 1.0)
         bounds.append(bound)

@@ -6,8 +6,8 @@ With y the relative fluctuation of the PWV and s the sine of the elevation,
 
 stands for the difference of the emission [K_RJ] and of the opacity from those at y = 0, fitted to `BandAtmosphere` at Chebyshev
 points; the relative transmission, which spans decades in opaque bands, is expm1 of minus the latter. The factor y makes it
-exact where nothing fluctuates. Ranges too wide for polynomials of `_DEGREES` (strong log-normal fluctuations) are left to
-`BandAtmosphere` itself.
+exact where nothing fluctuates. Where layers have a response of their own (`layer_terms`), its first order is added. Ranges too
+wide for polynomials of `_DEGREES` (strong log-normal fluctuations) are left to `BandAtmosphere` itself.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from zonda.core.compilation.jit import nb
 from zonda.core.types import Floats
 
+from .layer_terms import LayerTerms
 from .weather.bands import BandAtmosphere
 from .weather.radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
 
@@ -64,6 +65,8 @@ class Response:
         Path delay per line-of-sight PWV.
     names
         The responses wanted, of ``emission, transmission, opacity, pwv, path_delay``.
+    terms
+        What layers add to the column's response; None: nothing.
 
     Raises
     ------
@@ -80,8 +83,10 @@ class Response:
         vapour_height: float,
         delay_per_vapour: float,
         names: tuple[str, ...],
+        terms: LayerTerms | None = None,
     ) -> None:
         self.names = names
+        self._terms = terms
         self._range = y_low, y_high = y_range
         bottom, top = np.sin(ELEVATION_MIN) * (1 + 1e-12), np.sin(ELEVATION_MAX)
         self._y = ((y_low + y_high) / 2, 2 / max(y_high - y_low, 1e-9))
@@ -107,10 +112,19 @@ class Response:
         self._direct = {name: every[name] for name in needed}
         self._coefficients = {name: self._fit(self._direct[name]) for name in needed}
 
-    def __call__(self, name: str, y: Floats, s: Floats) -> Floats:
-        """The difference called ``name`` at fluctuations ``y`` and sines of the elevation ``s``, both (n, m)."""
+    def __call__(self, name: str, y: Floats, s: Floats, weighted: Floats | None = None) -> Floats:
+        """The difference called ``name`` at fluctuations ``y`` and sines of the elevation ``s``, both (n, m).
+
+        ``weighted``: (k, n, m) sums over the layers, with the weights of `LayerTerms`.
+        """
         if name == "transmission":
-            return np.asarray(np.expm1(-self("opacity", y, s)), np.float64)
+            return np.asarray(np.expm1(-self("opacity", y, s, weighted)), np.float64)
+        found = self._of_column(name, y, s)
+        if self._terms is not None and weighted is not None:
+            self._terms.add(name, weighted, s, found)
+        return found
+
+    def _of_column(self, name: str, y: Floats, s: Floats) -> Floats:
         coefficients = self._coefficients[name]
         if coefficients is None:
             return self._direct[name](y, s)

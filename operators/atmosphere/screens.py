@@ -119,7 +119,8 @@ def pwv_at(model: AtmosphereModel, xi: Floats, eta: Floats, samples: NDArray[np.
     found = []
     for sample in samples:
         g, sine = layers(xi, eta, int(sample) // step, 1)
-        y = np.clip(law(g), -1.0, model.band.pwv_max / model.pwv - 1)
+        strength = model.strength(sine)
+        y = np.clip(law(g if strength is None else g * strength), -1.0, model.band.pwv_max / model.pwv - 1)
         found.append((model.pwv * y * airmass(np.arcsin(sine), height))[:, 0])
     return np.stack(found, axis=1)
 

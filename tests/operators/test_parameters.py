@@ -332,11 +332,13 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
     "AtmosphereLayers": {
         "pwv": ({}, {"pwv": "5 mm"}),
         "pwv_rms": ({}, {"pwv_rms": "1 %"}),
+        "pwv_rms_at": ({}, {"pwv_rms_at": "zenith"}),
         "pwv_rms_after_beam": ({}, {"pwv_rms_after_beam": True}),
         "layers": ({}, {"layers": 5}),
         "lowest": ({}, {"lowest": "600 m"}),
         "highest": ({}, {"highest": "4000 m"}),
         "weights": ({}, {"weights": "equal"}),
+        "layer_response": ({}, {"layer_response": "column"}),
         "outer_scale": ({}, {"outer_scale": "400 m"}),
         "wind": ({}, {"wind": {"speed": "3 m/s", "direction": "10 deg"}}),
         "fidelity": ({}, {"fidelity": "fine"}),

@@ -83,6 +83,8 @@ class DriftingLayers:
     ) -> None:
         first, stop = span
         self._drifting, self._step, self._band = list(drifting), step, 0
+        self.weights = np.zeros((0, len(self._drifting)))
+        """(k, n_layer) weights of further sums over the layers, which `sums` makes beside the plain one."""
         self.paths: dict[int, LinesOfSight] = {}
         for own in sorted({step, *(layer.step for layer in drifting)}):
             low, high = (first, stop) if own == step else _coarse(first, stop, own // step)
@@ -119,33 +121,54 @@ class DriftingLayers:
 
         The sum of the layers is (1 + len(others), len(xi), count).
         """
+        total, _, sine = self.sums(others, xi, eta, first, count)
+        return total, sine
+
+    def sums(
+        self, others: Sequence[DriftingLayers], xi: Floats, eta: Floats, first: int, count: int
+    ) -> tuple[Floats, list[Floats], Floats]:
+        """As `with_others`, and for each band its weighted sums, (k, len(xi), count) in the order of its ``weights``.
+
+        The plain sums have the same bits with such weights and without.
+        """
         bands, stop, n_xi = [self, *others], first + count, len(xi)
         total, sine = np.zeros((len(bands), n_xi, count)), np.empty((n_xi, count))
+        weighted = [np.zeros((len(band.weights), n_xi, count)) for band in bands]
         for own in sorted(set().union(*(band.paths for band in bands))):
             path = next(band.paths[own] for band in bands if own in band.paths)
             ratio, groups = own // self._step, _groups(bands, own)
             low, high = (first, stop) if ratio == 1 else _coarse(first, stop, ratio)
             values = total if ratio == 1 else np.empty((len(bands), n_xi, high - low))
+            others_of = weighted if ratio == 1 else [np.empty((len(band.weights), n_xi, high - low)) for band in bands]
             for start in range(low, high, TIMES_AT_ONCE):
                 end = min(start + TIMES_AT_ONCE, high)
                 x, y, up = path(xi, eta, start, end - start)
                 part, boxes = np.zeros((len(bands), *x.shape)), boxes_of(x, y)
+                parts = [np.zeros((len(band.weights), *x.shape)) for band in bands]
                 for n, which in groups:
                     one = bands[which[0]]
                     matrix, i, j = one._places[n]
                     i, j = i[start - path.first : end - path.first], j[start - path.first : end - path.first]
                     cover = one._tilings[n].cover(tuple(bands[k]._band for k in which), matrix, boxes, i, j)
                     where = *cover.sides, *cover.origin, cover.width, cover.addresses
-                    interpolate(matrix, x, y, i, j, *where, one._constants[n], which, part)
+                    alone = np.zeros_like(part) if any(len(parts[k]) for k in which) else part
+                    interpolate(matrix, x, y, i, j, *where, one._constants[n], which, alone)
+                    for k in which if alone is not part else ():
+                        part[k] += alone[k]
+                        for row, weight in zip(parts[k], bands[k].weights[:, n].tolist(), strict=True):
+                            row += weight * alone[k]
                 values[:, :, start - low : end - low] = part
+                for whole, piece in zip(others_of, parts, strict=True):
+                    whole[:, :, start - low : end - low] = piece
                 if ratio == 1:
                     sine[:, start - low : end - low] = up
             for k in sorted({k for _, which in groups for k in which}) if ratio > 1 else ():
-                fine = DetectorField(spline_coefficients(values[k]), ratio, (high - low) * ratio)
                 # Coefficient 0 stands at coarse time low + SPLINE_MARGIN, where DetectorField has its time -PAD.
                 offset = first - (low + SPLINE_MARGIN + PAD) * ratio
-                total[k] += fine.evaluate(slice(0, n_xi), slice(offset, offset + count))
-        return total, sine
+                for coarse, into in ((values[k], total[k]), *zip(others_of[k], weighted[k], strict=True)):
+                    fine = DetectorField(spline_coefficients(coarse), ratio, (high - low) * ratio)
+                    into += fine.evaluate(slice(0, n_xi), slice(offset, offset + count))
+        return total, weighted, sine
 
     def looks_as(self, other: DriftingLayers) -> bool:
         """Whether another band looks along the same lines at the same times, and at layers that drift alike."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,7 +27,7 @@ from zonda.core.types import Floats
 
 from .absorption import AbsorptionTable, CrossSections
 from .profiles import PWV_MAX, check_pwv
-from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN, Layers, emission
+from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN, Layers, emission, emission_slopes
 
 if TYPE_CHECKING:
     from zonda.core.instrument import Band
@@ -98,6 +98,10 @@ class BandAtmosphere:
     def spectra(self, pwv: float, elevations: Sequence[float]) -> LoadSpectra:
         """Brightness and transmission over the passband by radiative transfer. PWV in m, elevations in rad."""
         return self._transfer.spectra(pwv, elevations)
+
+    def of_water(self, pwv: float, elevations: Sequence[float]) -> WaterResponse:
+        """What water at each height changes, by radiative transfer. PWV in m, elevations in rad."""
+        return self._transfer.of_water(pwv, elevations)
 
     def emission(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """Equation (1): the atmosphere alone, background 0 K. PWV in m, elevation in rad -> K_RJ."""
@@ -197,6 +201,34 @@ class BandAtmosphere:
         return found.reshape(elevation.shape)
 
 
+@dataclass(frozen=True)
+class WaterResponse:
+    """What water that is added at a height changes, per metre of PWV, along lines of sight at k elevations.
+
+    Attributes
+    ----------
+    height
+        (n,) m above the site of the layers' middles.
+    water
+        (n,) m of PWV that each holds.
+    emission, opacity
+        (k, n) dT/dw [K_RJ / m] and d(-ln <e^-tau>)/dw [neper / m] of the band.
+    """
+
+    height: Floats
+    water: Floats
+    emission: Floats
+    opacity: Floats
+
+    def of_column(self, name: str) -> Floats:
+        """(k,) the same of water that is added everywhere in proportion to what is there."""
+        return np.asarray(getattr(self, name) @ self.water / self.water.sum())
+
+    def at(self, name: str, height: Floats) -> Floats:
+        """(k, m) ``emission`` or ``opacity`` at heights (m,) above the site [m]; below the lowest middle as there."""
+        return np.array([np.interp(height, self.height, row) for row in getattr(self, name)])
+
+
 class BandTransfer:
     """Radiative transfer averaged over a band: pwv [m], elevations [rad] -> (emission, ln transmission, ln background) each."""
 
@@ -227,6 +259,21 @@ class BandTransfer:
         brightness = np.array([emission(one, self._source) for one in slant])
         transmission = np.exp(-np.array([one.sum(axis=0) for one in slant]))
         return LoadSpectra(self._frequency, self._width, self._square, brightness, transmission)
+
+    def of_water(self, pwv: float, elevations: Sequence[float]) -> WaterResponse:
+        """What water at each height changes, where the column holds ``pwv`` [m]."""
+        layers = self._layers.scaled(pwv)
+        vertical, per_water = layers.opacity(self._cross_sections), layers.opacity_of_water(self._cross_sections)
+        emitted, absorbed = [], []
+        for elevation in elevations:
+            airmass = layers.airmass(elevation)[:, None]
+            slant = vertical * airmass
+            gained = per_water * airmass
+            emitted.append(np.einsum("lf,lf,f->l", emission_slopes(slant, self._source), gained, self._weight))
+            opacity = slant.sum(axis=0)
+            passed = self._weight * np.exp(opacity.min() - opacity)
+            absorbed.append(gained @ (passed / passed.sum()))
+        return WaterResponse(layers.middle, layers.water, np.array(emitted), np.array(absorbed))
 
     def _at(self, slant: Floats) -> tuple[float, float, float]:
         emitted = float(np.sum(self._weight * emission(slant, self._source)))

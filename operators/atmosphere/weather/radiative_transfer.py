@@ -104,6 +104,28 @@ class Layers:
         water_section = np.maximum(k.water + water * k.water_self, 0.0)
         return self.molecules[:, None] * ((1 - water) * k.dry_air + water * water_section + ozone * k.ozone)
 
+    def opacity_of_water(self, cross_sections: CrossSections) -> Floats:
+        """(n, n_frequency) vertical opacity that each layer gains per metre of water [neper / m of PWV] that is added to it.
+
+        The pressure stays: vapour takes the place of dry air, which is lighter by its mass.
+        """
+        k, water, ozone = cross_sections, self.h2o[:, None], self.o3[:, None]
+        heavier = (MOLAR_MASS_WATER - MOLAR_MASS_DRY_AIR) / (MOLAR_MASS_DRY_AIR * (1 - self.h2o) + MOLAR_MASS_WATER * self.h2o)
+        each = (1 - water) * k.dry_air + water * np.maximum(k.water + water * k.water_self, 0.0) + ozone * k.ozone
+        of_mixing = k.water + 2 * water * k.water_self - k.dry_air - heavier[:, None] * each  # per molecule of air
+        columns = (1 - self.h2o * heavier) * (MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY)  # d PWV / d mixing ratio, likewise
+        return np.asarray(of_mixing / columns[:, None], np.float64)
+
+    @property
+    def water(self) -> Floats:
+        """(n,) PWV that each layer holds, m."""
+        return np.asarray(self.molecules * self.h2o * (MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY))
+
+    @property
+    def middle(self) -> Floats:
+        """(n,) m above the site of the middles of the layers."""
+        return np.asarray((self.height[1:] + self.height[:-1]) / 2 - self.height[0])
+
     def in_parts(self, sections: CrossSections) -> tuple[CrossSections, NDArray[np.intp], Floats]:
         """Cross-sections with each cell that has narrow ozone lines in parts, (n, n_part); the cell of each part; its share."""
         column = (self.molecules * self.o3)[:, None] * sections.ozone
@@ -136,8 +158,7 @@ class Layers:
                 "4.5 to 90 deg",
                 cure="choose a target or a time with a higher elevation",
             )
-        above_site = (self.height[1:] + self.height[:-1]) / 2 - self.height[0]
-        ratio = math.cos(elevation) * (EARTH_RADIUS + self.height[0]) / (EARTH_RADIUS + self.height[0] + above_site)
+        ratio = math.cos(elevation) * (EARTH_RADIUS + self.height[0]) / (EARTH_RADIUS + self.height[0] + self.middle)
         return np.asarray(1 / np.sqrt(1 - ratio**2))
 
 
@@ -193,6 +214,26 @@ def emission(slant_opacity: Floats, source: Floats) -> Floats:
     absorbed *= source[:-1]
     mean += absorbed
     return np.asarray(np.einsum("i...,i...->...", below, mean))
+
+
+def emission_slopes(slant_opacity: Floats, source: Floats) -> Floats:
+    """(n, ...) derivatives of `emission` with respect to the opacity t_i of each layer, K: what the layer itself emits more, less
+    what it takes from those above it,
+
+        dT/dt_i = e^-tau_below,i [J_i e^-t + (J_i+1 - J_i) (e^-t / t - (1 - e^-t) / t^2 + e^-t)] - sum_k>i T_k           (3)
+    """
+    t = np.maximum(slant_opacity, 0.0)
+    passed, absorbed = np.exp(-t), -np.expm1(-t)
+    thin = t < 1e-3  # there 1 / t^2 loses digits
+    safe = np.where(thin, 1.0, t)
+    mean = np.where(thin, 1 - t / 2, absorbed / safe)
+    rise = np.where(thin, -0.5 + t / 3 - t**2 / 8, (passed - absorbed / safe) / safe)
+    below = np.ones_like(passed)
+    np.cumprod(passed[:-1], axis=0, out=below[1:])
+    step = source[1:] - source[:-1]
+    seen = below * (source[:-1] * absorbed + step * (mean - passed))
+    above = np.cumsum(seen[::-1], axis=0)[::-1] - seen
+    return np.asarray(below * (source[:-1] * passed + step * (rise + passed)) - above, np.float64)
 
 
 def spectrum(layers: Layers, elevation: float, *, low: float | None = None, high: float | None = None) -> Spectrum:

@@ -15,7 +15,7 @@ def runner(rms, pwv="7.7 mm", **filter_options):
     scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target=north)
     camera = scene.instrument.model_copy(update={"detectors": 37, "field_of_view": np.radians(0.5), "sample_rate": 2.0})
     wind = {"speed": "30 m/s", "direction": "270 deg"}
-    air = zonda.AtmosphereLayers(pwv=pwv, pwv_rms=rms, layers=1, lowest=f"{HEIGHT} m", wind=wind)
+    air = zonda.AtmosphereLayers(pwv=pwv, pwv_rms=rms, layers=1, lowest=f"{HEIGHT} m", wind=wind, layer_response="column")
     steps = [zonda.PointingStare(scan_duration="120 s"), air, zonda.Efficiency()]
     if filter_options:
         steps.append(zonda.CommonModeFilter(**filter_options))

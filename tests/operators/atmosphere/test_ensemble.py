@@ -19,7 +19,7 @@ def scans_of(seeds, seconds):
     scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target=up)
     camera = scene.instrument.model_copy(update={"detectors": 1, "sample_rate": 30 / seconds if seconds > 30 else 2.0})
     wind = {"speed": f"{SPEED} m/s", "direction": "270 deg"}
-    air = zonda.AtmosphereLayers(pwv="7.7 mm", pwv_rms=P, layers=1, lowest=f"{HEIGHT} m", wind=wind)
+    air = zonda.AtmosphereLayers(pwv="7.7 mm", pwv_rms=P, layers=1, lowest=f"{HEIGHT} m", wind=wind, layer_response="column")
     pipeline = zonda.Pipeline([zonda.PointingStare(scan_duration=f"{seconds} s"), air], precision="float64")
     scenes = (scene.model_copy(update={"instrument": camera, "seed": seed}) for seed in range(seeds))
     return [pipeline.run(s, keep=["atmosphere"], threads=1).observations[0] for s in scenes]

@@ -194,7 +194,7 @@ def test_streams_are_the_radiative_transfer_at_the_water_they_state(
     # give the emission, transmission and opacity of the other streams. Table: 1e-5 of the mean (docs/physics.md).
     camera = instrument(diameter="50 m").model_copy(update={"band": Band(name="b", low=low, high=high)})
     o = observe(200.0, 1.0, elevation, camera=camera, offsets=([0.0, 1e-3], [0.0, 2e-3]), seed=4)
-    parameters = {"pwv": f"{pwv} mm", "pwv_rms": rms, "layers": 3, "wind": {"speed": "15 m/s"}}
+    parameters = {"pwv": f"{pwv} mm", "pwv_rms": rms, "layers": 3, "wind": {"speed": "15 m/s"}, "layer_response": "column"}
     model = zonda.AtmosphereLayers(**parameters).model(o)
     profile, band = model.profile, model.band
     (o,) = streams([o], bench, **parameters)

@@ -94,7 +94,7 @@ def observe(
 
 
 def operator(**parameters: Any) -> AtmosphereLayers:
-    return AtmosphereLayers(**{"pwv": "7.7 mm", **parameters})
+    return AtmosphereLayers(**{"pwv": "7.7 mm", "layer_response": "column", **parameters})  # equation (1), of the water
 
 
 def whole(observation: Observation, state: AtNodes | OfDetectors, name: str = "emission", dtype: type = np.float64) -> Floats:

@@ -24,7 +24,7 @@ class Response:
 
     names = ("emission",)
 
-    def __call__(self, name: str, y: Floats, sine: Floats) -> Floats:
+    def __call__(self, name: str, y: Floats, sine: Floats, weighted: Floats) -> Floats:
         return y
 
 
@@ -38,13 +38,14 @@ class Layers:
     def looks_as(self, other: Layers) -> bool:
         return self.looks == other.looks
 
-    def with_others(self, others: list[Layers], xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats]:
+    def sums(self, others: list[Layers], xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, list[Floats], Floats]:
         number = round(first * STEP / UNIT_SAMPLES)
         self.made += [(one.name, int(xi[0]) // UNIT_DETECTORS, number) for one in (self, *others)]
         self.together.append(1 + len(others))
         times = np.arange(first, first + count)
         sums = np.sin(0.1 * times + xi[:, None])
-        return np.stack([sums] * (1 + len(others))), np.ones(sums.shape)
+        bands = 1 + len(others)
+        return np.stack([sums] * bands), [np.zeros((0, *sums.shape))] * bands, np.ones(sums.shape)
 
 
 def series(made: list[tuple[str, int, int]], name: str = "", looks: str = "", shift: float = 0.0) -> OfDetectors:
@@ -53,7 +54,7 @@ def series(made: list[tuple[str, int, int]], name: str = "", looks: str = "", sh
     nodes: Any = Nodes.__new__(Nodes)
     object.__setattr__(nodes, "xi", rows)
     object.__setattr__(nodes, "eta", rows + shift)
-    law: Any = lambda g, own: g  # noqa: E731
+    law: Any = lambda g, weighted, sine, own: (g, weighted)  # noqa: E731
     return OfDetectors(nodes, Layers(made, name, looks), law, Response(), STEP, SAMPLES)  # type: ignore[arg-type]
 
 
@@ -147,7 +148,7 @@ def test_a_band_that_is_gone_makes_nothing() -> None:
 def test_a_unit_that_fails_is_made_again() -> None:
     made: list[tuple[str, int, int]] = []
     state = series(made)
-    real, state._to_pwv = state._to_pwv, lambda g, own: 1 / 0  # type: ignore[assignment, return-value]
+    real, state._to_pwv = state._to_pwv, lambda g, weighted, sine, own: 1 / 0  # type: ignore[assignment, return-value]
     with pytest.raises(ZeroDivisionError):
         block(state, slice(0, 16), slice(0, 100))
     state._to_pwv = real
