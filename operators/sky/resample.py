@@ -165,7 +165,7 @@ class ImageOnSky:
 
     def is_own(self, x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether pixels are those that hold their centres: of several that stand for the same sky, one."""
-        if self._period or self.grid.kind in ZENITHAL:
+        if self._period or self.grid.kind in ZENITHAL or self.grid.wcs.has_distortion:
             return np.ones(x.shape, bool)
         u, v = self.grid.coordinates(self.grid.at(x, y))
         with np.errstate(invalid="ignore"):

@@ -220,15 +220,34 @@ def test_columns_that_stand_for_the_same_sky_count_once(made, save, columns):
         np.testing.assert_allclose(seen(made, SkyMap(file=path), d, np.radians(1.2)), 2.0, rtol=3e-4)
 
 
-def test_without_a_beam_no_pixel_is_skipped(made, save):
-    """At dec 60 a pixel of CAR is half as wide as it is high: at the centres of pixels the stream is what they hold."""
-    header = header_of(made, "CAR", 60.0, unit="K_RJ", shape=(40, 40))
+@pytest.mark.parametrize("dec", [60.0, 82.0])
+def test_without_a_beam_no_pixel_is_skipped(made, save, dec):
+    """A pixel of CAR is cos(dec) as wide as it is high: at the centres of pixels the stream is what they hold."""
+    header = header_of(made, "CAR", dec, unit="K_RJ", shape=(40, 40))
     values = np.random.default_rng(5).standard_normal((40, 40))
     y, x = (k.ravel() for k in np.mgrid[15:25, 15:25])
     d = directions(WCS(header), x, y)
     got = seen(made, SkyMap(file=save(values, header), beam="none"), d, ARCMIN)
     # splines through white noise on a grid of steps of a quarter of the narrowest pixel
     np.testing.assert_allclose(got, values[15:25, 15:25].ravel(), atol=0.02)
+
+
+@pytest.mark.parametrize("frame", ["RA", "GLON"])
+@pytest.mark.parametrize("kind", ["TAN", "CAR", "ZEA"])
+def test_a_moved_map_is_summed_where_it_is(made, save, kind, frame):
+    """Every pixel stands at its distance and its angle from ICRS north from the new centre as it did from the old one."""
+    header, fwhm = header_of(made, kind, 60.0, frame=frame, shape=(61, 121)), 2.4 * ARCMIN
+    values = np.zeros((61, 121))
+    values[40, 75] = 1.0
+    middle, pixel = (WCS(header).pixel_to_world(x, y).icrs for x, y in ((60, 30), (75, 40)))
+    target = SkyCoord(200.0, -10.0, unit="deg")
+    there = target.directional_offset_by(middle.position_angle(pixel), middle.separation(pixel))
+    source = np.asarray(there.cartesian.xyz.value)[None]
+    d = np.concatenate([source, around(source[0], 1.3 * fwhm)])
+    operator = SkyMap(file=save(values, header), centre="200 deg -10 deg")
+    got = seen(made, operator, d, fwhm, centre=np.asarray(target.cartesian.xyz.value))
+    expected = to_kelvin_rj("Jy/beam", made.BAND, None, 0.0, 1.0) * beam(d, source, fwhm)[:, 0]
+    np.testing.assert_allclose(got, expected, atol=(3e-3 if kind == "TAN" else 1e-3) * expected[0])
 
 
 @pytest.mark.parametrize("kind", ["CAR", "healpix"])
