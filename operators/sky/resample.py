@@ -168,8 +168,9 @@ class ImageOnSky:
         if self._period or self.grid.kind in ZENITHAL or self.grid.wcs.has_distortion:
             return np.ones(x.shape, bool)
         u, v = self.grid.coordinates(self.grid.at(x, y))
+        near = 0.5 if self.grid.kind != "CSC" else 5.0  # whose inverse is known to some 20 arcsec
         with np.errstate(invalid="ignore"):
-            return np.asarray((np.abs(u - x) < 0.5) & (np.abs(v - y) < 0.5))
+            return np.asarray((np.abs(u - x) < near) & (np.abs(v - y) < near))
 
     def planes(self, x: NDArray[np.int64], y: NDArray[np.int64], axis: Floats | None) -> Floats:
         """(k, ...) I of pixels, or I, Q and U from the meridians through the ICRS direction ``axis``."""
