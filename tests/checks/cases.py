@@ -66,9 +66,30 @@ MEAN = Case(
     "a step that multiplies a stream with tens of kelvin of mean",
     "the result is the same whether the mean stands beside the stream or in it",
 )
+SIZES = Case(
+    "pixels of another size than at the reference point (CAR, CEA, MER at high declination), oblong pixels, HEALPix near the"
+    " beam's size",
+    "a delta pixel keeps its flux within 0.5 % at any sub-pixel offset, declination and projection",
+)
+EDGES = Case(
+    "a band with steep edges or an oxygen line in it (66-118 GHz), one polarization",
+    "NET within 1 % of the integral over the band's own spectrum, edge cells included",
+)
+SLOW = Case(
+    "a detector slower than the sampling (one pole at 2 samples per FWHM)",
+    "within 0.5 % of the exact response; same bits for any block",
+)
+RED = Case(
+    "red noise steeper than 1/f below its lowest frequency",
+    "variance within 10 % of the stated law for slopes 1 to 3",
+)
+AT_ONCE = Case(
+    "several processes that compile or start at the same instant",
+    "four at once, different types: right values, then and in later runs",
+)
 
 MATRIX = (
     NEAR, FAR, OVERLAP, STRIP, WIND, DECADES, OPAQUE, BAND, WATER, PINK, TIME, SPHERE, DEAD, PIXELS, BLOCKS, TWICE, PARTIAL,
-    LEVEL, BANDS, MEAN, DISPATCH,
+    LEVEL, BANDS, MEAN, DISPATCH, SIZES, EDGES, SLOW, RED, AT_ONCE,
 )  # fmt: skip
 """Every row, in order."""

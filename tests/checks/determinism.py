@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -20,7 +23,7 @@ from zonda.operators.io.save_map import SaveMap
 from zonda.plugins.checks.determinism import steps
 from zonda.plugins.checks.scenes import camera, differing, scene
 
-from .cases import BLOCKS, TWICE
+from .cases import AT_ONCE, BLOCKS, TWICE
 
 checks = Family("determinism")
 
@@ -170,3 +173,44 @@ def resumed() -> Measured:
         products[0].write_bytes(products[0].read_bytes()[:1000])
         found = _campaign(out, SerialExecutor(), 1, again=True)
         return _bytes_that_differ(_campaign_once(), found), f"{len(products) - 1} tasks were kept"
+
+
+KERNEL = """
+import numba as nb
+
+@nb.njit(nogil=True, cache=True)
+def total(values):
+    found = values[0] * 0
+    for value in values:
+        found += value * value
+    return found
+"""
+COMPILING = """
+import importlib.util, sys
+import numpy as np
+import zonda.core.compilation.jit
+spec = importlib.util.spec_from_file_location("zonda.toy_at_once", sys.argv[1])
+module = sys.modules["zonda.toy_at_once"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+print(*(float(module.total(np.arange(10, dtype=kind))) for kind in sys.argv[2:]))
+"""
+
+
+@checks.add(AT_ONCE, reference="sum of the squares of 0 to 9", limit=0, unit="values")
+def compiled_at_once() -> Measured:
+    """wrong values of a kernel that four processes compile at once for four types, and of each type in four later processes"""
+    kinds = ("float64", "float32", "int64", "int32")
+    with TemporaryDirectory(prefix="zonda-check-") as folder:
+        path = Path(folder) / "toy_at_once.py"
+        path.write_text(KERNEL)
+        settings = {**os.environ, "ZONDA_CACHE_DIR": f"{folder}/cache", "PYTHONDONTWRITEBYTECODE": "1"}
+
+        def values(*types: Sequence[str]) -> list[float]:
+            command = [sys.executable, "-c", COMPILING, str(path)]
+            started = [subprocess.Popen([*command, *some], env=settings, stdout=subprocess.PIPE, text=True) for some in types]
+            return [float(value) for process in started for value in process.communicate()[0].split()]
+
+        first = values(*([kind] for kind in kinds))
+        later = values(*(kinds[k:] + kinds[:k] for k in range(len(kinds))))
+    wrong = sum(value != 285.0 for value in first + later) + abs(len(first) - 4) + abs(len(later) - 16)
+    return wrong, f"{len(first)} values at once, {len(later)} later"

@@ -11,19 +11,23 @@ import numpy as np
 
 from zonda.core.checks import Family, Measured
 from zonda.core.instrument import Band
+from zonda.core.numerics.radiation import BOLTZMANN, PLANCK
+from zonda.core.pipeline import Pipeline
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.weather.absorption import absorption_table
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere
 from zonda.operators.atmosphere.weather.climatology import profile
 from zonda.operators.atmosphere.weather.profiles import Profile
+from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
 from zonda.operators.atmosphere.weather.table import read_table
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.efficiency import Efficiency
-from zonda.plugins.checks.scenes import SITE, START, camera, largest, run, scan
+from zonda.operators.pointing.stare import PointingStare
+from zonda.plugins.checks.scenes import SITE, START, camera, largest, run, scan, scene
 
-from .cases import BAND, OPAQUE, WATER
+from .cases import BAND, EDGES, OPAQUE, WATER
 from .scenes import unrefused
 
 checks = Family("opacity")
@@ -168,3 +172,29 @@ def _read_humidity(percent: float) -> None:
         path = Path(folder) / "air.csv"
         path.write_text("height [m], pressure [hPa], temperature [K], relative humidity [%]\n" + "\n".join(rows) + "\n")
         read_table(path, SITE)
+
+
+@checks.add(EDGES, reference="NEP^2 summed over the cells of the spectrum", limit=0.01)
+def steep_band() -> Measured:
+    """relative error of a background-limited NET at 66 to 118 GHz, oxygen at both edges, one polarization, elevation 50 deg"""
+    low, high, efficiency = 66e9, 118e9, 0.3
+    pairs = camera(2, field="0 deg", low="66 GHz", high="118 GHz").model_copy(update={"polarization": "pairs"})
+    model = {"name": "background_limited", "telescope_temperature": "13 K", "optical_efficiency": efficiency}
+    steps = [
+        PointingStare(scan_duration="2 s"),
+        AtmosphereLayers(pwv="5 mm", pwv_rms="0 %"),
+        WhiteNoise(model=model),
+        Efficiency(),
+    ]
+    (o,) = Pipeline(steps).run(scene(pairs, target="az 150 deg el 50 deg"), threads=1).observations
+    seen = spectrum(_air(5e-3).layers, np.radians(50.0), low=low, high=high)
+    edges = np.clip(np.append(seen.frequency - 0.25e9, seen.frequency[-1] + 0.25e9), low, high)
+    width, nu = np.diff(edges), (edges[1:] + edges[:-1]) / 2
+    load = o.focalplane.illumination_efficiency[0] * (seen.brightness + seen.cmb) + 13.0
+    power = efficiency * BOLTZMANN * load
+    squared = 2 * (PLANCK * nu * power * width).sum() + 2 * (power**2 * width).sum()
+    expected = np.sqrt(squared / 2) / (efficiency * BOLTZMANN * width.sum())
+    flat = float(np.average(load, weights=width)) * efficiency * BOLTZMANN
+    mean = np.sqrt((2 * PLANCK * np.average(nu, weights=width) * flat + 2 * flat**2) / 2 / width.sum()) / (efficiency * BOLTZMANN)
+    on_sky = o.focalplane.main_beam_efficiency * float(_band(66, 118, 5e-3).transmission(5e-3, np.radians(50.0)))
+    return largest(*abs(o.focalplane.net * on_sky / expected - 1)), f"the mean load gives {mean / expected:.3f} of it"
