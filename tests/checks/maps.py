@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from zonda.core.checks import Family, Measured
 from zonda.core.data import Data
+from zonda.core.numerics.quaternions import from_angles
+from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.sky.skymap import SkyMap
-from zonda.plugins.checks.scenes import differing, largest, run, scan, sky_file
+from zonda.plugins.checks.scenes import TARGET, camera, differing, largest, run, scan, sky_file
 
-from .cases import DECADES, PIXELS
+from .cases import DECADES, PIXELS, SIZES
 from .scenes import unrefused
 
 checks = Family("maps")
@@ -129,3 +133,80 @@ def linearity() -> float:
     a, b, both = mapped(one), mapped(two), mapped(1.7 * one - 0.3 * two)
     hit = ~np.isnan(a)
     return float(abs(both - 1.7 * a + 0.3 * b)[hit].max() / both[hit].std())
+
+
+SIDE, BEAM = 200.0, 480.0
+"""Of the pixels and FWHM, arcsec: 2.4 pixels."""
+
+
+def _seen_of_one_pixel(path: Path, pixel: Floats, area: float, dec: float) -> float:
+    """Largest error of the stream of a map in which one pixel has 1 K, over its peak: every offset within 1.5 beams.
+
+    The beam is a Gaussian, so the stream is the pixel's solid angle times the Gaussian at its distance.
+    """
+    beam = camera(1, field="0 deg").model_copy(update={"fwhm": np.radians(BEAM / 3600)})
+    observation = scan(1, 2000, radius=0.0, instrument=beam)
+    step = np.linspace(0.0, 1.0, 2000)
+    reach = 1.5 * np.radians(BEAM / 3600) * np.sqrt(step)
+    x, y = reach * np.cos(80 * step), reach * np.sin(80 * step)
+    ra, lat = np.radians(TARGET[0]) + x / np.cos(np.radians(dec)), np.radians(dec) + y
+    observation.boresight_radec = from_angles(ra, lat)
+    observation.centre = (float(np.radians(TARGET[0])), float(np.radians(dec)))
+    found = run([SkyMap(file=path)], observation, keep=("sky",)).observations[0].detdata["sky"][0]
+    sigma = np.radians(BEAM / 3600) / np.sqrt(8 * np.log(2))
+    angle = 2 * np.arcsin(np.linalg.norm(unit_vectors(ra, lat) - pixel, axis=-1) / 2)
+    peak = area / (2 * np.pi * sigma**2)
+    return largest(*abs(np.asarray(found) / peak - np.exp(-(angle**2) / (2 * sigma**2))))
+
+
+@checks.add(SIZES, reference="solid angle x Gaussian at the pixel's centre", limit=5e-3)
+def one_bright_pixel() -> Measured:
+    """error of one pixel's stream over its peak: 2.4 pixels per FWHM and 0.4 as wide, six projections, Dec 0, 30, 60, 80"""
+    from astropy.io import fits
+    from astropy.wcs import WCS
+
+    worst = {}
+    for kind in ("TAN", "CAR", "SIN", "ZEA", "CEA", "MER"):
+        for dec in (0.0, 30.0, -60.0, 80.0):
+            for wide in (1.0, 0.4):
+                cylinder = kind in ("CAR", "CEA", "MER")
+                wcs = WCS(naxis=2)
+                wcs.wcs.ctype = [f"RA---{kind}", f"DEC--{kind}"]
+                wcs.wcs.cdelt = [-wide * SIDE / 3600, SIDE / 3600]
+                wcs.wcs.crval = [TARGET[0], 0.0 if cylinder else dec]
+                wcs.wcs.crpix = [101.0, 31.0]
+                if cylinder:
+                    wcs.wcs.crpix = [101.0, 31.0 - float(wcs.wcs_world2pix(TARGET[0], dec, 0)[1]) + 30.0]
+                values = np.zeros((61, 201))
+                values[30, 100] = 1.0
+                corners = np.radians(wcs.wcs_pix2world([100.25, 99.75, 100.0, 100.0, 100.0], [30.0, 30.0, 30.25, 29.75, 30.0], 0))
+                east, west, north, south, pixel = unit_vectors(*corners)
+                area = 4 * float(np.linalg.norm(np.cross(east - west, north - south)))
+                with TemporaryDirectory(prefix="zonda-check-") as folder:
+                    path = Path(folder) / "one.fits"
+                    header = wcs.to_header()
+                    header["BUNIT"], header["TEMPSCAL"], header["RADESYS"] = "K", "K_RJ", "ICRS"
+                    fits.PrimaryHDU(values, header).writeto(path)
+                    worst[f"{kind} at {dec:g} deg"] = _seen_of_one_pixel(path, pixel, area, dec)
+    where = max(worst, key=lambda name: worst[name])
+    return largest(*worst.values()), f"largest: {where}"
+
+
+@checks.add(SIZES, reference="solid angle x Gaussian at the pixel's centre", limit=5e-3)
+def one_bright_healpix_pixel() -> float:
+    """error of one HEALPix pixel's stream over its peak, nside 1024 at 2.3 pixels per FWHM, Dec 0, 41.8, -60, 80"""
+    import healpy
+
+    nside, found = 1024, []
+    for dec in (0.3, 41.8, -60.0, 80.0):
+        number = healpy.ang2pix(nside, TARGET[0], dec, lonlat=True)
+        lon, lat = healpy.pix2ang(nside, number, lonlat=True)
+        values = np.full(12 * nside**2, healpy.UNSEEN, np.float32)
+        values[healpy.query_disc(nside, healpy.pix2vec(nside, number), np.radians(1.0))] = 0.0
+        values[number] = 1.0
+        with TemporaryDirectory(prefix="zonda-check-") as folder:
+            path = Path(folder) / "one.fits"
+            healpy.write_map(path, values, coord="C", column_units="K_RJ", partial=True)
+            pixel = unit_vectors(*np.radians([lon, lat]))
+            found.append(_seen_of_one_pixel(path, pixel, healpy.nside2pixarea(nside), lat))
+    return largest(*found)
