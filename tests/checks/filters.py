@@ -8,6 +8,7 @@ from zonda.core.checks import Family, Measured
 from zonda.core.errors import PipelineError, ZondaError
 from zonda.core.types import Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
+from zonda.operators.detectors.time_constant import TimeConstant
 from zonda.operators.filters.common_mode import UNDETERMINED, CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
@@ -15,9 +16,9 @@ from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing.stare import PointingStare
 from zonda.operators.sky.skymap import SkyMap
 from zonda.plugins.checks.numerics import N_DET, WHITE, N, ten_million, without_modes
-from zonda.plugins.checks.scenes import differing, run, scan, sky_file
+from zonda.plugins.checks.scenes import differing, largest, run, scan, sky_file
 
-from .cases import DEAD, DECADES, PARTIAL, TIME
+from .cases import DEAD, DECADES, PARTIAL, SLOW, TIME
 
 checks = Family("filters")
 
@@ -151,3 +152,36 @@ def zero_length() -> int:
             continue
         wrong += 1
     return wrong
+
+
+def _sources(samples: int = 20_000) -> tuple[Floats, Floats]:
+    """A source of FWHM 2.1 samples, in each row a tenth of a sample later; frequencies per sample of its spectrum."""
+    t = np.arange(samples) - 8000.0 - np.arange(10)[:, None] / 10
+    return np.exp(-4 * np.log(2) * (t / 2.1) ** 2), np.fft.rfftfreq(samples)
+
+
+@checks.add(SLOW, reference="1 / (1 + 2 pi i f tau) on the whole spectrum", limit=5e-3)
+def one_pole() -> Measured:
+    """largest error over the input's peak behind tau of 0.05 to 100 samples: a source of FWHM 2.1 samples, at ten offsets"""
+    source, frequency = _sources()
+    errors = {}
+    for tau in (0.05, 0.3, 1.0, 3.0, 10.0, 100.0):
+        steps = [TimeConstant(tau=f"{10 * tau} ms")]
+        data = run(steps, scan(10, source.shape[1]), source, keep=("signal",))
+        exact = np.fft.irfft(np.fft.rfft(source) / (1 + 2j * np.pi * frequency * tau), source.shape[1])
+        errors[tau] = float(abs(data.observations[0].detdata["signal"] - exact).max())
+    worst = max(errors, key=lambda tau: errors[tau])
+    return largest(*errors.values()), f"largest: tau {worst:g} samples"
+
+
+@checks.add(SLOW, reference="one block", limit=0, unit="values")
+def one_pole_in_blocks() -> int:
+    """values that differ in their bits between one block and one thread, and small blocks and two threads"""
+    source, _ = _sources()
+    given = source + np.random.default_rng(3).standard_normal(source.shape)
+    found = []
+    for settings in ({"threads": 1}, {"threads": 3, "memory": 4_000_000}):
+        steps = [TimeConstant(tau="30 ms", scatter=0.2)]
+        data = run(steps, scan(10, source.shape[1]), given, keep=("signal",), **settings)
+        found.append(np.array(data.observations[0].detdata["signal"]))
+    return differing(*found)

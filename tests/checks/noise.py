@@ -21,7 +21,7 @@ from zonda.operators.noise.streams import Streams
 from zonda.operators.noise.white import WhiteNoise
 from zonda.plugins.checks.scenes import camera, largest
 
-from .cases import BANDS, LEVEL, PINK
+from .cases import BANDS, LEVEL, PINK, RED
 from .scenes import unrefused
 
 checks = Family("noise")
@@ -213,3 +213,19 @@ def planned() -> float:
         squares = [float(np.mean(o.focalplane.net**2)) * o.sample_rate for o in run.observations]
         worst = largest(worst, abs(made.noise[0] / math.sqrt(np.mean(squares)) - 1))
     return worst
+
+
+@checks.add(RED, reference="integral of a spectrum that is flat below f_min", limit=0.1)
+def variance_below_its_lowest_frequency() -> Measured:
+    """largest relative error of the variance, 8 poles, f_min 1e-5 to 1e-2 f_s, slopes 1 to 3: that stated, and of the response"""
+    errors = {}
+    for f_min in (1e-5, 1e-4, 1e-3, 1e-2):
+        for slope in (1.0, 1.5, 2.0, 2.5, 3.0):
+            law = power_law_filter(f_min, slope, 8)
+            above = math.log(0.5 / f_min) if slope == 1 else (1 - (0.5 / f_min) ** (1 - slope)) / (slope - 1)
+            expected = 2 * f_min * (1 + above)
+            f = np.r_[0.0, np.geomspace(1e-6 * f_min, 0.5, 400_000)]
+            measured = 2 * float(np.trapezoid(law.response(f), f))
+            errors[slope, f_min] = largest(abs(law.gain * law.variance / expected - 1), abs(measured / expected - 1))
+    slope, f_min = max(errors, key=lambda key: errors[key])
+    return largest(*errors.values()), f"largest: slope {slope:g}, f_min {f_min:g} f_s"
