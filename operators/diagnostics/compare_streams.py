@@ -40,10 +40,10 @@ class Pairs:
 class CompareStreams(Operator):
     """How a stream differs from another at this step: rms, correlation, gain, ratio of spectra and coherence.
 
-    Both are referred to the calibrated sky as in `PowerSpectrum`, their means included, and freed of a straight line in each
-    segment: what is slower than a segment is not compared. Makes the product ``stream_comparison`` (a `StreamComparison`), or
-    one under this step's own name where it has one; where there is an output folder, it is written there as tables (ECSV), by
-    frequency and by detector. `Plots` and `Report` show it.
+    Both are referred to the calibrated sky as in `PowerSpectrum`, and freed of a straight line in each segment: what is slower
+    than a segment is not compared. `signal` holds the mean emission of the atmosphere, `atmosphere` is the fluctuation about it.
+    Makes the product ``stream_comparison`` (a `StreamComparison`), or one under this step's own name where it has one; where
+    there is an output folder, it is written there as tables (ECSV), by frequency and by detector. `Plots` and `Report` show it.
 
     Raises `PipelineError` where a stream is absent at this step.
     """

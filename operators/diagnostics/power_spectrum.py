@@ -224,7 +224,7 @@ def calibration(block: Block, detector: int) -> Floats:
 
 
 def on_sky(block: Block, detector: int, name: str, gain: Floats) -> Floats:
-    """One detector's whole stream, mean included, as it enters the calibrated sum, float64 (n_samp,)."""
+    """One detector's stream as it enters the calibrated sum, float64 (n_samp,): `signal` with its mean, `atmosphere` without."""
     row = block.detdata[name][detector - block.detectors.start]
     enters = {str(c): c.enters for c in (*BUILT_IN, *block.observation.components) if isinstance(c, Component)}
     if name == "atmosphere":

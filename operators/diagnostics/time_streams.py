@@ -19,6 +19,7 @@ class TimeStreams(Operator):
     """Streams of a few detectors of one scan at this step, for a picture: product ``time_streams``.
 
     Components (`sky`, `white`, those of plugins ...) are at the detector, before the calibration; `signal` is the calibrated sum.
+    `signal` holds the mean emission of the atmosphere, `atmosphere` is the fluctuation about it.
     Further streams are those that a step above makes, e.g. `pwv`, `opacity` and `path_delay` (`AtmosphereLayers.outputs`).
     """
 

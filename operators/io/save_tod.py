@@ -91,7 +91,7 @@ class SaveTOD(StreamOutput):
     format: Literal["hdf5", "fits"] = "hdf5"
     """File format: hdf5 (TOAST's layout) or fits (binary tables)."""
     streams: list[StreamName] = Field(["signal"], min_length=1)
-    """Streams to write; components (sky, atmosphere ...) are as they entered the calibrated sum."""
+    """Streams to write; components (sky, atmosphere ...) are as they entered the calibrated sum, atmosphere without its mean."""
     dtype: Literal["float64", "float32"] = "float64"
     """Number type in the file. TOAST wants float64; float32 rounds a mean of 30 K to 2 uK."""
 

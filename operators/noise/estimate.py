@@ -8,13 +8,15 @@ It is estimated by Welch's method (1967, IEEE Trans. Audio Electroacoust. 15, 70
 removed from each; of the K segments without a flagged sample the *median* is taken, divided by the median of the mean of
 exponential deviates (Allen et al. 2012, Phys. Rev. D 85, 122006, appendix B). Segments with a glitch are left out: those
 whose power in the upper half of the band is more than `OUTLYING` robust standard deviations from their median.
-Frequencies are averaged in logarithmic bins of n each, and ln P is fitted by least squares with the standard deviation
+Frequencies are averaged in logarithmic bins, and ln P is fitted by least squares with the covariance of the bins. A frequency has
+the relative variance
 
-    sigma = sqrt(1.056 v / (K n')) ,   v = 1 / ln(2)^2                                                    (2)
+    sigma^2 = (1 + 2 c) v / K ,   v = 1 / ln(2)^2                                                         (2)
 
-v the variance of the median of K exponential deviates over that of a mean of K, in the limit of large K; 1.056 for what Hann
-windows that overlap by half have in common; n' = n / 1.944, for the powers of frequencies of a Hann window that are one or two
-apart are correlated by 4/9 and 1/36: 1 + 2 (4/9 + 1/36).
+v / K that of the median of K independent exponential deviates, in the limit of large K. The powers of Hann's windows that overlap
+by half are correlated by 1/36, those of frequencies of one window that are one or two apart by 4/9 and 1/36; medians of such
+powers are correlated less, by the probability q that both lie below their median: c = 4 q - 1, `MEDIANS`. What the window mixes
+into a frequency from others, a tenth of the power of the lowest for slope 1, is in the expectation that is fitted.
 """
 
 from __future__ import annotations
@@ -41,8 +43,12 @@ HIGHEST = 0.9
 """Of the Nyquist frequency: what lies above is not fitted (filters before the read-out)."""
 LEAST_SLOPE = 0.5
 """A flatter spectrum cannot be told from white noise."""
-OVERLAP, CORRELATED, MEDIAN = 1.056, 1 + 2 * (4 / 9 + 1 / 36), 1 / math.log(2) ** 2
-"""Factors of equation (2)."""
+MEDIANS = 0.2627, 0.0145
+"""c of equation (2) for powers that are correlated by 4/9 and 1/36 (of 4e6 pairs of complex normal deviates)."""
+VARIANCE = (1 + 2 * MEDIANS[1]) / math.log(2) ** 2
+"""Of equation (2), times the number of segments."""
+MIXED = 32
+"""Lowest frequencies whose expectation takes account of the window."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +76,15 @@ class Noise:
 
 
 def segment_length(n_samples: int, rate: float, seconds: float | None, place: str) -> int:
-    """Samples of a segment: those of ``seconds``, or a power of two such that there are `SEGMENTS`.
+    """Samples of a segment: those of ``seconds``, or the most of which there are `SEGMENTS`, but for a fast transform.
 
     Raises InputError for a scan that is too short.
     """
-    length = 2 ** int(math.log2(max(n_samples / SEGMENTS, 1))) if seconds is None else round(seconds * rate)
+    from scipy.fft import next_fast_len
+
+    length = round(seconds * rate) if seconds is not None else n_samples // SEGMENTS
+    if seconds is None and length >= 64:
+        length = next(n for n in range(length // 2 * 2, 0, -2) if next_fast_len(n, real=True) == n)
     if length < 64 or 2 * n_samples // max(length, 1) - 1 < FEWEST:
         text = f"{n_samples} samples make no {FEWEST} segments of at least 64"
         raise InputError(text, place=place, cure="give a longer scan, or a shorter --segment")
@@ -117,16 +127,22 @@ def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
     if not segments or not (power[use] > 0).all():
         return None
     every, bins = frequency[use], _Bins.of(frequency[use])
-    f, p, n = bins.mean(every), bins.mean(power[use]), bins.number
-    sigma = np.sqrt(OVERLAP * MEDIAN / (segments * np.maximum(n / CORRELATED, 1.0)))
-    log_p = np.log(p) + sigma**2 / 2  # the mean of a logarithm lies below the logarithm of the mean
+    f, p = bins.mean(every), bins.mean(power[use])
+    covariance = bins.covariance() * (VARIANCE / segments)
+    log_p = np.log(p) + np.diag(covariance) / 2  # the mean of a logarithm lies below the logarithm of the mean
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    alike = whiten.sum(axis=1)  # a level that all bins have in common
     start = math.log(float(np.median(p[f > f[-1] / 3])))
     middle = math.sqrt(f[0] * f[-1])
 
     log_f = np.log(every / middle)
+    near, share = _mixed(every[:MIXED], frequency[0])
+    log_near = np.log(near / middle)
 
     def residual(x: Any) -> Any:
-        return (np.log(bins.mean(np.exp(x[0]) + np.exp(x[1] - x[2] * log_f))) - log_p) / sigma
+        red = np.exp(x[1] - x[2] * log_f)
+        red[:MIXED] = np.exp(x[1] - x[2] * log_near) @ share
+        return whiten @ (np.log(bins.mean(np.exp(x[0]) + red)) - log_p)
 
     from scipy.optimize import least_squares
 
@@ -134,12 +150,12 @@ def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
     limits = [-np.inf, start - 40, LEAST_SLOPE], [np.inf, np.inf, 4.0]
     guesses = [[start, max(low, start - 2.0) - slope * math.log(middle / f[0]), slope] for slope in (1.0, 2.0)]
     found = min((least_squares(residual, guess, bounds=limits) for guess in guesses), key=lambda tried: float(tried.cost))
-    white_cost = 0.5 * float(np.sum(((np.average(log_p, weights=1 / sigma**2) - log_p) / sigma) ** 2))
+    level, variance = float(alike @ whiten @ log_p / (alike @ alike)), float(1 / (alike @ alike))
+    white_cost = 0.5 * float(np.sum((whiten @ (level - log_p)) ** 2))
     inside = float(found.x[1] - found.x[0]) < float(found.x[2]) * math.log(
         f[-1] / middle
     )  # the knee lies below the last frequency
     if white_cost - found.cost < 3.0 or not inside:  # two more parameters do as much by chance in one of twenty cases
-        level, variance = float(np.average(log_p, weights=1 / sigma**2)), float(1 / np.sum(1 / sigma**2))
         net = math.sqrt(math.exp(level) / 2)
         chi = 2 * white_cost / max(len(f) - 1, 1)
         return Noise(net, net * math.sqrt(variance) / 2, 0.0, float(f[0]), 1.0, 0.0, segments, chi)
@@ -159,6 +175,15 @@ def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
     )
 
 
+def _mixed(frequency: Floats, step: float) -> tuple[Floats, Floats]:
+    """Frequencies (n, m) that Hann's window mixes into each, which are ``step`` apart, and the share (m,) of each."""
+    x = np.linspace(-1.9, 1.9, 39)
+    window = np.sinc(x) / np.where(np.abs(np.abs(x) - 1) < 1e-9, np.inf, 1 - x**2)
+    window[np.abs(np.abs(x) - 1) < 1e-9] = 0.5
+    share = window**2 / np.sum(window**2)
+    return np.maximum(np.abs(frequency[:, None] + step * x), 0.5 * step), share
+
+
 @dataclass(frozen=True)
 class _Bins:
     """Logarithmic bins of frequencies: where each begins, and how many are in it."""
@@ -171,6 +196,15 @@ class _Bins:
         edge = np.floor(BINS * np.log10(f / f[0]) + 1e-9).astype(int)
         _, first, number = np.unique(edge, return_index=True, return_counts=True)
         return cls(first, number.astype(np.float64))
+
+    def covariance(self) -> Floats:
+        """Of the bins' means, where the values are of variance 1 and correlated by `MEDIANS` with those one and two on."""
+        which = np.repeat(np.arange(len(self.number)), self.number.astype(int))
+        found = np.diag(self.number)
+        for apart, common in enumerate(MEDIANS, 1):
+            np.add.at(found, (which[apart:], which[:-apart]), common)
+            np.add.at(found, (which[:-apart], which[apart:]), common)
+        return np.asarray(found / np.outer(self.number, self.number))
 
     def mean(self, values: Floats) -> Floats:
         """Mean in each bin."""

@@ -6,6 +6,7 @@ import pytest
 import zonda
 from zonda.core.errors import ZondaError
 from zonda.operators.diagnostics.plot_operators import Plots, pictures
+from zonda.operators.io.save_tod import load_tod
 from zonda.plugins.checks import scenes
 
 EVERY = ["pwv", "opacity", "path_delay"]
@@ -53,6 +54,31 @@ def test_streams_that_the_atmosphere_makes_on_request():
     before = ran(atmosphere(), zonda.Efficiency(), zonda.TimeStreams(streams=["atmosphere", "transmission"]))
     for name, values in before.products["time_streams"].streams.items():
         assert scenes.differing(values, streams[name]) == 0
+
+
+def test_the_mean_emission_is_in_the_signal_and_not_in_the_atmosphere(tmp_path):
+    """One rule for `TimeStreams`, spectra and files; `data.tod` adds it (docs/pipelines.md, The mean emission)."""
+    steps = [
+        zonda.PointingDaisy(radius="1 deg", speed="0.2 deg/s", scan_duration="20 s", check_limits="warn"),
+        atmosphere(layers=1), zonda.Efficiency(),
+        zonda.TimeStreams(streams=["signal", "atmosphere"], detectors=3), zonda.SaveTOD(streams=["signal", "atmosphere"]),
+        zonda.CompareStreams(stream="signal", reference="atmosphere", segment="5 s"),
+    ]  # fmt: skip
+    data = zonda.Pipeline(steps).run(scenes.scene(scenes.camera(3)), keep=["signal", "atmosphere"], output=tmp_path, threads=1)
+    shown, o = data["time_streams"].streams, data.observations[0]
+    saved = load_tod(next(tmp_path.glob("tod_*.h5"))).streams
+    mean = o.smooth["atmosphere"].evaluate(slice(0, 3), slice(0, o.n_samples))
+    assert mean.min() > 10
+    assert np.ptp(mean) > 0.1  # it changes with elevation
+    np.testing.assert_allclose(shown["atmosphere"], data.tod("atmosphere") - mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(saved["atmosphere"], shown["atmosphere"], rtol=0, atol=1e-9)
+    assert np.abs(shown["atmosphere"].mean()) < 5
+    for signal in (shown["signal"], saved["signal"]):
+        np.testing.assert_allclose(signal, data.tod("signal"), rtol=0, atol=1e-9)
+        assert signal.min() > 10
+    # the signal has what changes with elevation besides, which is correlated with nothing in the fluctuations
+    found = data["stream_comparison"]
+    assert found.power[0].sum() > found.power[1].sum()
 
 
 def test_spectra_keep_the_unit_of_the_stream():
