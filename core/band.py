@@ -91,8 +91,8 @@ class Band(Parameters):
         return float(np.trapezoid(self.transmission, self.frequency))
 
 
-GIGAHERTZ_MAX = 1e5
-"""Beyond, a column that was meant to be in GHz is in Hz."""
+GIGAHERTZ_MIN, GIGAHERTZ_MAX = 0.5, 1e5
+"""Beyond, a column that was meant to be in GHz is in THz, or in Hz."""
 
 
 def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -109,6 +109,8 @@ def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]
         raise InputError("contains NaN or infinity", place=place, cure=cure)
     if table[:, 0].max() > GIGAHERTZ_MAX:
         raise InputError(f"has a frequency above {GIGAHERTZ_MAX:g} GHz", place=place, cure=cure)
+    if table[:, 0].max() < GIGAHERTZ_MIN:
+        raise InputError(f"has no frequency above {GIGAHERTZ_MIN:g} GHz", place=place, cure=cure)
     nu, t = table[:, 0] * 1e9, table[:, 1]
     if (np.diff(nu) <= 0).any() or nu[0] <= 0:
         raise InputError("frequencies must be positive and increase", place=place, cure=cure)

@@ -12,6 +12,7 @@ from ..mapmaker import makes_products
 from ..operator import Operator
 from ..output import may_write
 from ..pipeline import Pipeline
+from ..plausible import doubts
 from ..signal import is_stream
 
 if TYPE_CHECKING:
@@ -49,6 +50,8 @@ def looks(
     """
     data, found = Data(scene=scene), list[list[str]]()
     refused: list[tuple[int, ZondaError]] = []
+    for text in doubts(scene.instrument):
+        warnings.warn(text, stacklevel=3)
     for number, operator in enumerate(operators):
         if operator is None:
             continue

@@ -12,6 +12,7 @@ elevation of the ray (`response`). All of it is smooth, so it is computed at nod
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,6 +23,7 @@ from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.observation import Observation
+from zonda.core.plausible import PWV, doubt
 
 from .closed_form import closed_form
 from .drawing import draw, state_drawn
@@ -68,6 +70,8 @@ class AtmosphereLayers(LayerParameters):
             every = np.concatenate([o.elevation[[o.elevation.argmin(), o.elevation.argmax()]] for o in data.observations])
             emission = np.asarray(model.band.emission(model.pwv, every))
             if not lines:
+                if text := doubt(f"{self.label}: PWV", model.pwv, PWV, "m"):
+                    warnings.warn(text, stacklevel=2)
                 lines.append(f"PWV {1e3 * model.pwv:.3g} mm at zenith")
             through = float(np.mean(model.band.transmission(model.pwv, every)))
             lines.append(f"{band}: emission {emission.min():.3g} to {emission.max():.3g} K_RJ, transmission {through:.3g}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
@@ -12,6 +13,7 @@ from pydantic import Field, model_validator
 from zonda.core.configuration.units import Fraction, Hertz, KelvinRootSecond
 from zonda.core.errors import InputError
 from zonda.core.operator import Operator
+from zonda.core.plausible import KNEE, doubt
 
 from .level import Amplitude, NoiseLevel, announced, resolve
 from .models import FixedNet
@@ -59,7 +61,14 @@ class PinkNoise(Operator):
         return self
 
     def check(self, data: Data) -> list[str]:
-        """Fit the filter, as `prepare` does: InputError where it cannot be."""
+        """Fit the filter, as `prepare` does: InputError where it cannot be. Warn of a knee that no noise has."""
+        for observation in data.observations[:1]:
+            spectrum, nyquist = PinkSpectrum.of(self, observation), observation.sampling[1] / 2
+            text = "" if spectrum is None else doubt(f"{self.label}: knee", spectrum.knee, KNEE, "Hz")
+            if spectrum is not None and spectrum.knee > nyquist:
+                text = f"{self.label}: the knee of {spectrum.knee:g} Hz is above the Nyquist frequency, {nyquist:g} Hz"
+            if text:
+                warnings.warn(text, stacklevel=2)
         for rate in {observation.sampling[1] for observation in data.observations}:
             for observation in data.observations[0].of_each_band():
                 if spectrum := PinkSpectrum.of(self, observation):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from zonda.core.errors import placed
 from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
 from zonda.core.numerics.smooth import series_into
 from zonda.core.operator import Operator
+from zonda.core.plausible import NET, doubt
 
 from .level import Amplitude, NoiseLevel, resolve
 from .models import FixedNet, NoiseModel, noise_model
@@ -68,7 +70,9 @@ class WhiteNoise(Operator):
             observation.noise_levels[self.label] = NoiseLevel(model, self.scatter, self.label)
 
     def check(self, data: Data) -> list[str]:
-        """Refuse a noise model that contradicts the detectors."""
+        """Refuse a noise model that contradicts the detectors; warn of a NET that none has."""
+        if self.net is not None and (text := doubt(f"{self.label}: net", self.net, NET, "K s(1/2)")):
+            warnings.warn(text, stacklevel=2)
         for observation in data.observations:
             self._check(observation.focalplane)
         return []

@@ -11,6 +11,7 @@ is the source's within the share of the beam beyond `REACH` standard deviations,
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -30,12 +31,16 @@ from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
+from zonda.core.plausible import FLUX, doubt
 from zonda.core.storage.ecsv import read_table
 from zonda.core.storage.table_mistakes import Mistakes
 from zonda.core.types import Floats
 
 REACH = 6.0
 """Standard deviations of the beam beyond which a source is not seen."""
+
+STEEPEST = 100.0
+"""Largest spectral index of a source."""
 
 PIECE = 256
 """Samples for which the sources in view are found together."""
@@ -59,8 +64,14 @@ class PointSources(Operator):
     """Factor on all fluxes."""
 
     def check(self, data: Data) -> list[str]:
-        """How many sources the catalogue has; raises InputError where it is wrong."""
-        return [f"{len(Catalogue.read(self).flux)} sources in {self.catalogue}"]
+        """How many sources the catalogue has, and the brightest; raises InputError where it is wrong."""
+        catalogue = Catalogue.read(self)
+        for camera in data.scene.instrument.cameras.values() if data is not None else ():
+            catalogue.brightness(camera.band, self.scale)
+        brightest = float(np.abs(catalogue.flux).max()) * abs(self.scale)
+        if text := doubt(f"{self.label}: the brightest source of {self.catalogue.name}", brightest, FLUX, "Jy"):
+            warnings.warn(text, stacklevel=2)
+        return [f"{len(catalogue.flux)} sources in {self.catalogue}, the brightest of {brightest:.4g} Jy"]
 
     def prepare(self, observation: Observation) -> Sources:
         """The sources with their brightness, and which of them are in view when."""
@@ -95,6 +106,13 @@ class Catalogue:
         for name in ["ra", "dec", "flux", *({"spectral_index", "frequency"} & table.columns.keys())]:
             with mistakes.noted():
                 found[name] = table.numbers(name, units[name])
+        for row in np.flatnonzero(np.abs(found.get("ra", np.zeros(0))) > 2 * np.pi + 1e-9).tolist():
+            mistakes.add(table.lines[row], f"ra is {np.degrees(found['ra'][row]):g} deg", "mend that row, or the unit of ra")
+        for row in np.flatnonzero(found.get("frequency", np.ones(0)) <= 0).tolist():
+            mistakes.add(table.lines[row], f"frequency is {found['frequency'][row]:g} Hz", "mend that row")
+        for row in np.flatnonzero(np.abs(found.get("spectral_index", np.zeros(0))) > STEEPEST).tolist():
+            text = f"spectral_index is {found['spectral_index'][row]:g}, beyond {STEEPEST:g}"
+            mistakes.add(table.lines[row], text, "mend that row")
         for row in np.flatnonzero(np.abs(found.get("dec", np.zeros(0))) > np.pi / 2 + 1e-12).tolist():
             mistakes.add(table.lines[row], f"dec is {np.degrees(found['dec'][row]):g} deg", "mend that row")
         mistakes.tell()
