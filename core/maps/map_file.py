@@ -17,7 +17,7 @@ from ..storage.files import atomic_path
 from ..storage.fits_image import BLOCK, Cards, image_pieces
 from ..types import AnyFloats
 from .map_arrays import MapArrays
-from .noise_figures import noise_stated
+from .measured_noise import stated
 from .stokes import CONVENTION, MEANINGS, file_planes, planes_of
 from .units import scale_of
 
@@ -243,8 +243,12 @@ def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
     path = Path(path).expanduser()
     if path.exists() and not overwrite:
         raise OutputError("exists already", place=str(path), cure="choose another name, or write overwrite=True")
-    whole: Any = product
-    return MapFile.of("map", product, noise_stated(planes_of(whole, "map"), "map")).write(path, Provenance.of_a_map(product))
+    noise = {}
+    for key, plane in zip("IQU", planes_of(product, "map").values(), strict=False):
+        half = plane.half_difference
+        if np.isfinite(plane.noise).any():
+            noise[key] = stated(plane.noise, None if half is None else (half, f"half the difference, {plane.difference}"))
+    return MapFile.of("map", product, noise).write(path, Provenance.of_a_map(product))
 
 
 def _type(name: str, plane: Any) -> np.dtype[Any]:

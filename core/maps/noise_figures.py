@@ -12,6 +12,7 @@ import numpy as np
 from ..types import Floats
 from .central import central_diameter
 from .map_product import MapProduct
+from .measured_noise import stated
 from .stokes import planes_of
 
 Noise = Literal["half_difference", "source_free"]
@@ -61,10 +62,6 @@ def noise_figures(maps: Mapping[str, MapProduct], given: float | None = None) ->
     return found
 
 
-LEAST = 0.1
-"""Share of the 99th percentile of the weight (1 / noise^2) that a pixel needs for its noise to be measured."""
-WHITE = "white noise only"
-"""Said of noise that is the standard error of independent pixels, where no map of the noise alone is known."""
 FREE = "the map of all but the sky"
 """How the source-free map is called."""
 
@@ -84,20 +81,6 @@ def noise_alone(
     return None
 
 
-def noise_factor(noise: Floats, alone: Floats) -> float | None:
-    """The rms of ``alone`` / ``noise`` over pixels with at least `LEAST` of the usual weight: what white
-    noise is to be multiplied by, so that noise that is correlated between pixels (1/f noise, the atmosphere)
-    counts in full. None where it cannot be measured."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        weight, ratio = noise**-2.0, alone / noise
-    known = np.isfinite(ratio) & np.isfinite(weight)
-    if not known.any():
-        return None
-    well = known & (weight >= LEAST * np.percentile(weight[known], 99))
-    factor = float(np.sqrt(np.mean(ratio[well] ** 2)))
-    return factor if factor > 0 else None
-
-
 def noise_stated(maps: Mapping[str, MapProduct], name: str) -> dict[str, tuple[float | None, str]]:
     """What is known of the noise of I, and of Q and U where they are there, of a map among ``maps`` (`maps_of`).
 
@@ -107,9 +90,7 @@ def noise_stated(maps: Mapping[str, MapProduct], name: str) -> dict[str, tuple[f
     found: dict[str, tuple[float | None, str]] = {}
     for key, own in (("I", name), ("Q", f"{name}_Q"), ("U", f"{name}_U")):
         if own in maps and np.isfinite(maps[own].noise).any():
-            alone = noise_alone(maps, own)
-            factor = None if alone is None else noise_factor(maps[own].noise, alone[0])
-            found[key] = (None, WHITE) if alone is None or factor is None else (factor, alone[1])
+            found[key] = stated(maps[own].noise, noise_alone(maps, own))
     return found
 
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.maps.grid import HealpixPixels, ImagePixels, MapGrid, image_grid
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.noise_figures import WHITE, noise_factor
+from zonda.core.maps.measured_noise import WHITE, noise_factor
 from zonda.core.maps.on_plane import on_plane
 from zonda.core.numerics import tangent
 from zonda.core.numerics.angles import FWHM_PER_SIGMA, angle_text
