@@ -15,6 +15,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
+from zonda.core.flags import has_a_signal
 from zonda.core.operator import Operator
 from zonda.core.signal import BUILT_IN, MAIN, TRANSMISSION, Component
 from zonda.core.stream_names import StreamName, StreamsAsked, StreamsNeeded
@@ -224,7 +225,20 @@ def calibration(block: Block, detector: int) -> Floats:
 
 
 def on_sky(block: Block, detector: int, name: str, gain: Floats) -> Floats:
-    """One detector's stream as it enters the calibrated sum, float64 (n_samp,): `signal` with its mean, `atmosphere` without."""
+    """One detector's stream as it enters the calibrated sum, float64 (n_samp,): `signal` with its mean, `atmosphere` without.
+
+    Where flags say that there is no signal it is a straight line, as filters see it.
+    """
+    values, there = _as_it_enters(block, detector, name, gain), has_a_signal(block.observation.flags[block.samples])
+    if there.all() or not there.any():
+        return values
+    known = np.flatnonzero(there)
+    values[~there] = np.interp(np.flatnonzero(~there), known, values[known])
+    return values
+
+
+def _as_it_enters(block: Block, detector: int, name: str, gain: Floats) -> Floats:
+    """See `on_sky`."""
     row = block.detdata[name][detector - block.detectors.start]
     enters = {str(c): c.enters for c in (*BUILT_IN, *block.observation.components) if isinstance(c, Component)}
     if name == "atmosphere":

@@ -93,6 +93,16 @@ def test_every_bit_of_the_mask(recorded: Path, bit: int, mask: int, format: str)
     np.testing.assert_allclose(other.signal, one.signal, rtol=0, atol=3e-7)
 
 
+def test_no_spectrum_holds_what_a_file_flags(recorded: Path) -> None:
+    """Power spectra and comparisons of streams see straight lines there, as filters do."""
+    steps = [zonda.PowerSpectrum(segment="8 s"), zonda.CompareStreams(stream="signal", reference="recorded", segment="8 s")]
+    found = [load(spoilt(recorded, PROCESSING, value, f"spectrum-{value}.h5"), steps) for value in (0.0, 1e6, np.nan)]
+    for other in found[1:]:
+        for name, psd in found[0]["spectrum"].psd.items():
+            np.testing.assert_allclose(other["spectrum"].psd[name], psd, rtol=1e-5, err_msg=name)
+        np.testing.assert_allclose(other["stream_comparison"].power, found[0]["stream_comparison"].power, rtol=1e-5)
+
+
 def test_turnarounds_are_used(recorded: Path) -> None:
     one, other = (
         load(spoilt(recorded, TURNAROUND, value, f"turn-{value}.h5"), [zonda.Detrend(), MAP])["map"] for value in (0.0, 1.0)
