@@ -9,6 +9,8 @@
 from __future__ import annotations
 
 import traceback
+import warnings
+import zlib
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, cast, overload
 
@@ -17,6 +19,7 @@ from pydantic import PrivateAttr
 
 from .block import Block
 from .changed import Changed, whole
+from .data import Data
 from .errors import PipelineError, ZondaError
 from .operator import Operator
 from .stream import Stream
@@ -33,6 +36,8 @@ class FunctionOperator(Operator):
     """File and line where it stands, for provenance."""
 
     _call: Any = PrivateAttr(None)
+    _idle: bool | None = PrivateAttr(None)
+    """Whether it left all that it provides as it was, in every call so far; None: it was not called."""
 
     def measure(self, stream: Stream, model: Any = None) -> Changed | None:
         """``couples = "all"``: call the function with a block that is the whole scan. Each signal is acted on by itself.
@@ -65,8 +70,16 @@ class FunctionOperator(Operator):
         elif state is not None:
             state.put(block, next(iter(self.provides)))
 
+    def finalize(self, data: Data) -> None:
+        """Warn where it did nothing."""
+        if self._idle and self.provides:
+            text = f"the function {self.function} left {' and '.join(sorted(self.provides))} as it was"
+            warnings.warn(f"{self.label}: {text}: does it lack a return?", stacklevel=2)
+        self._idle = None
+
     def _act(self, block: Block) -> None:
         """See `exec`."""
+        before = {name: _bits(block.detdata[name]) for name in self.provides & block.detdata.keys()}
         try:
             made = self._call(block)
         except (ZondaError, MemoryError):
@@ -76,7 +89,13 @@ class FunctionOperator(Operator):
             text = f"the function {self.function} raised {type(err).__name__}{': ' * bool(words)}{words}"
             raise PipelineError(text, place=self.label, cure=f"mend it: {_where(err) or self.source}") from err
         if made is None:
+            after = {name: _bits(block.detdata[name]) for name in self.provides & block.detdata.keys()}
+            if before != after:
+                self._idle = False
+            elif self._idle is None:
+                self._idle = True
             return
+        self._idle = False
         values = np.asarray(made)
         if len(self.provides) != 1 or values.dtype.kind not in "fiu" or values.shape != block.shape:
             what = f"an array of shape {values.shape}" if values.dtype.kind in "fiu" else f"{made!r:.40}"
@@ -170,6 +189,11 @@ def operator(
     step: FunctionOperator = made(name=label, function=_named(function, own), source=_place(function))
     step._call = function
     return step
+
+
+def _bits(values: Any) -> int:
+    """A check sum."""
+    return zlib.crc32(np.ascontiguousarray(values).view(np.uint8))
 
 
 def _where(err: Exception) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -144,6 +146,19 @@ def test_it_acts_on_each_signal_by_itself():
     assert [one >= {"white"} for one in seen] == [True, False]
     for name in ("signal", "signal/quiet"):
         assert abs(data.tod(name).mean()) < 30 * 2.0**-24
+
+
+@pytest.mark.parametrize("couples", ["sample", "time", "all"])
+def test_a_function_that_does_nothing_is_told(couples):
+    def forgets(block):
+        block.detdata["signal"] * 2
+
+    with pytest.warns(UserWarning, match=r"forgets left signal as it was: does it lack a return\?"):
+        signal(zonda.operator(forgets, couples=couples))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*left signal as it was")
+        for step in (zonda.operator(double, couples=couples), zonda.operator(forgets, provides=(), couples=couples)):
+            signal(step)
 
 
 def test_its_memory_is_planned_and_refused_beyond_the_ceiling():
