@@ -196,8 +196,8 @@ def tangent_grid(
     narrow, wide = widths
     spread = None
     if is_resolved(source, narrow):
-        spread = Spread.of(narrow, float(nominal_sides(source).max()))
         step = narrow / points / FINER
+        spread = Spread.of(narrow, float(nominal_sides(source).max()), step)
     else:
         side = shortest_side(source, observation)
         step = float(np.clip(narrow / points, side / 4, side if isinstance(source, WcsMap) else side / 1.5))

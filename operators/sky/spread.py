@@ -45,6 +45,8 @@ LEAST, MOST = 0.2, 0.5
 """Of f."""
 PIXELS = 0.65
 """Standard deviation of the narrower Gaussians, in pixels of the map, from which these do not show."""
+ALIAS = 9.0
+"""Exponent of what a grid may err by, where some share attains that: 1e-4 of a peak."""
 CUT = 5.0
 """Standard deviations at which the narrower Gaussians end."""
 STRAIGHT = 1e-5
@@ -69,10 +71,12 @@ class Spread:
     share: float
 
     @classmethod
-    def of(cls, fwhm: float, pixel: float) -> Spread:
-        """The least share that hides pixels of a side ``pixel`` [rad], in steps of 0.1."""
-        wanted = math.ceil(10 * (PIXELS * pixel / (SIGMA * fwhm)) ** 2) / 10
-        return cls(fwhm, min(max(wanted, LEAST), MOST))
+    def of(cls, fwhm: float, pixel: float, step: float) -> Spread:
+        """The least share, in steps of 0.1, that hides pixels of a side ``pixel`` and serves a grid of ``step`` [rad]."""
+        wanted = (PIXELS * pixel / (SIGMA * fwhm)) ** 2
+        needed = (ALIAS * (step / (SIGMA * fwhm)) ** 2) / (2 * math.pi**2)  # f (1 - f)
+        least = 0.5 - math.sqrt(max(0.25 - needed, 0.0))
+        return cls(fwhm, min(max(math.ceil(10 * max(wanted, least)) / 10, LEAST), MOST))
 
     @property
     def resolution(self) -> float:
