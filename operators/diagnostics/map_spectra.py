@@ -16,7 +16,6 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_sources
 from zonda.core.maps.stokes import IQU
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
-from zonda.core.numerics.transforms import gaussian_taps
 from zonda.core.output import Output
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import product_path
@@ -61,7 +60,10 @@ class MapSpectra:
             Column("scale", s.scale / ARCSEC, "arcsec", "1 / mean wavenumber of the ring"),
             Column("wavenumber", 1 / s.scale, "rad-1", "mean over the ring's modes"),
             *(Column(plain[n], p, "K2 sr", "power spectral density") for n, p in s.power.items()),
-            *(Column(f"{plain[n]}_white", p, "K2 sr", "of independent pixels with the map's noise") for n, p in s.white.items()),
+            *(
+                Column(f"{plain[n]}_white", p, "K2 sr", "of white noise with the map's standard errors")
+                for n, p in s.white.items()
+            ),
             *(Column(n.replace("/", "_"), p, "K2 sr", "cross power spectral density") for n, p in s.cross.items()),
             Column("modes", s.modes, "", "independent modes; relative standard error of the power: modes^-1/2"),
         ]
@@ -171,9 +173,7 @@ def _of_planes(flat: Mapping[str, MapProduct], names: list[str], wanted: Wanted,
     window = window_of(first, None, wanted.taper, wanted.least)
     known = {name: np.where(window > 0, values, np.nan) for name, values in noise.items()}
     sigma = first.smoothed_by / FWHM_PER_SIGMA
-    side = gaussian_taps(sigma / first.pixel)
-    left = 2 * float(side @ side) - side[0] ** 2  # what smoothing leaves of the noise of independent pixels: (sum K^2)^(1/2)
-    white = {name: np.nan_to_num(values) / left for name, values in known.items() if np.isfinite(values).any()}
+    white = {name: np.nan_to_num(values) for name, values in known.items() if np.isfinite(values).any()}
     edges = ring_edges(first.signal.shape, first.pixel, wanted.bins)
     spectra = radial_spectra(planes, window, first.pixel, edges, white, sigma, polarized)
     words = {f"half_difference{end}": f"half the difference{more}, {first.difference}" for end, more in HALVES.items()}

@@ -6,7 +6,9 @@ With a reference A, a map B and the threshold t of `CompareMaps`,
 
 With the power P_i of a map's rings i, their independent modes N_i, and the level W_i of white noise in independent pixels,
 
-    map_power   sum N_i P_i / sum N_i W_i,   smallest <= 1/k_i <= largest,     relative error (sum N_i)^-1/2  (2)
+    map_power   sum N_i P_i / sum N_i W_i,   smallest <= 1/k_i <= largest      (2)
+
+    relative error   (sum N_i W_i^2)^1/2 / sum N_i W_i,  of smoothed maps from draws of noise (radial)         (3)
 """
 
 from __future__ import annotations
@@ -101,7 +103,11 @@ class MapPower(FigureMetric):
             cure = "choose scales between two pixels and the map's size, or a wider range"
             raise InputError(f"no ring lies {self._range()}", place="map_power", cure=cure)
         value = float(number @ rings.power[self.of][used]) / float(number @ rings.white[self.of][used])
-        return value, value / math.sqrt(float(number.sum()))
+        level = rings.white[self.of][used]
+        if rings.draws is not None:
+            together = rings.draws[:, used] @ (number * level)
+            return value, value * float(together.std(ddof=1) / together.mean())
+        return value, value * math.sqrt(float(number @ level**2)) / float(number @ level)
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """What was measured."""

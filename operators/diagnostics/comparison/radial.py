@@ -8,9 +8,17 @@ the mean over the modes of ring i: the power spectral density, so that white noi
 P = n^2 A whatever the window. Its relative standard error is N_i^(-1/2), N_i = n_i / (2 c) independent modes as in
 `transfer_function`, equation (3). The coherence of two maps is Re sum a b* / (sum |a|^2 sum |b|^2)^(1/2).
 
+The noise of a map that was smoothed with a Gaussian of s is w n g, n its standard error and g of unit variance with
+the correlation rho(d) = exp(-d^2 / 4 s^2). With C(d) the autocorrelation of w n,
+
+    <|m_k|^2> = sum_d C(d) rho(d) exp(-i k d),                                                               (2)
+
+what the window spreads from large scales, where there is more, included; without smoothing rho is 1 at d = 0 alone. What is
+spread so is the same in many modes: rings are not independent, and their modes are counted from the scatter of draws of (2).
+
 Of Q and U on parallel axes, those of the plane, with phi the angle of k from south to east (COSMO; Seljak 1997, equation 17),
 
-    E_k = Q_k cos 2 phi + U_k sin 2 phi,    B_k = -Q_k sin 2 phi + U_k cos 2 phi;                            (2)
+    E_k = Q_k cos 2 phi + U_k sin 2 phi,    B_k = -Q_k sin 2 phi + U_k cos 2 phi;                            (3)
 
 cross spectra are A / sum w^2 mean_i Re a_k b_k*. The window mixes some of E into B on scales near its own.
 
@@ -23,13 +31,16 @@ the north.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.types import Floats
+
+DRAWS = 48
+"""Draws of noise by which modes of smoothed maps are counted: their number is right to 20 %."""
 
 
 def cell(steps: float | Floats) -> Floats:
@@ -86,6 +97,9 @@ class RadialSpectra:
         (n,) of maps whose noise is known: what independent pixels of that noise have, behind the smoothing; NaN without modes.
     coherence
         (n,) of the first two maps; NaN of one map alone.
+    draws
+        (n_draw, n) powers of drawn noise like that of ``white`` where the maps are smoothed, over its mean: how rings scatter
+        together.
     cross
         (n,) cross spectra by name (``map_TE``: of I and E), unit^2 sr; they have signs.
     """
@@ -97,6 +111,7 @@ class RadialSpectra:
     white: dict[str, Floats]
     coherence: Floats
     cross: dict[str, Floats] = field(default_factory=dict)
+    draws: Floats | None = None
 
     @property
     def scale(self) -> Floats:
@@ -140,11 +155,11 @@ def radial_spectra(
     edges
         Between the rings, rad^-1.
     noise
-        (ny, nx) standard errors of some of the maps, of independent pixels before the smoothing.
+        (ny, nx) standard errors of some of the maps.
     smoothing
-        Standard deviation of the Gaussian that they are smoothed with, rad.
+        Standard deviation of the Gaussian that the maps were smoothed with, rad; 0: their pixels are independent.
     polarized
-        Names of Q and U among the maps, by the name NAME of their I: in their place stand NAME_E and NAME_B, equation (2), whose
+        Names of Q and U among the maps, by the name NAME of their I: in their place stand NAME_E and NAME_B, equation (3), whose
         noise is the mean of both, and the cross spectra NAME_TE, NAME_TB and NAME_EB (T where there is an I).
     """
     known = np.logical_and.reduce([np.isfinite(values) for values in maps.values()])
@@ -173,21 +188,50 @@ def radial_spectra(
         return np.asarray(np.bincount(ring, values.ravel(), count + 1)[:count], np.float64)
 
     number = np.bincount(ring, minlength=count + 1)[:count]
-    correlated = window.size * float((window**4).sum()) / square**2 if square else math.inf
+    weighed = next((np.where(known, window * n, 0.0) for n in (noise or {}).values()), window)
+    total = float((weighed**2).sum())
+    correlated = window.size * float((weighed**4).sum()) / total**2 if total else math.inf
     with np.errstate(invalid="ignore", divide="ignore"):
         power = {name: area * summed(np.abs(values) ** 2) / number for name, values in transforms.items()}
         first, second = (list(transforms.values()) * 2)[:2]
         cross = summed((first * second.conj()).real) / np.sqrt(summed(np.abs(first) ** 2) * summed(np.abs(second) ** 2))
         crosses = {name: area * summed((transforms[a] * transforms[b].conj()).real) / number for name, (a, b) in pairs.items()}
         wavenumber = summed(k) / number
-        passed = summed(np.exp(-((2 * np.pi * k * smoothing) ** 2))) / number
-    white = {name: area * float((np.where(known, window * n, 0.0) ** 2).sum()) * passed for name, n in (noise or {}).items()}
+        expected = {name: _of_noise(np.where(known, window * n, 0.0), steps, smoothing) for name, n in (noise or {}).items()}
+        white = {name: area * summed(values) / number for name, values in expected.items()}
+        modes, draws = number / 2 / correlated, None
+        if smoothing and white:
+            passed = np.exp(-((2 * np.pi * k * smoothing) ** 2) / 2)
+            own = next(iter(white.values()))
+            draws = np.array([area * summed(found) / number / own for found in _drawn(weighed, passed)])
+            modes = np.where(number > 0, 1 / draws.var(axis=0, ddof=1), 0.0)
     for name, (q, u) in (polarized or {}).items():
         if q in white and u in white:
             white[f"{name}_E"] = white[f"{name}_B"] = (white.pop(q) + white.pop(u)) / 2
     if len(maps) < 2:
         cross = np.full(count, math.nan)
-    return RadialSpectra(edges, wavenumber, power, number / 2 / correlated, white, cross, crosses)
+    return RadialSpectra(edges, wavenumber, power, modes, white, cross, crosses, draws)
+
+
+def _drawn(error: Floats, passed: Floats) -> Iterator[Floats]:
+    """|m_k|^2 of `DRAWS` draws of noise like equation (2)'s; ``passed``: of the amplitude of each mode by the smoothing."""
+    rng = np.random.default_rng(1)
+    passed = passed / math.sqrt(float((passed**2).mean()))
+    for _ in range(DRAWS):
+        even = np.fft.ifft2(np.fft.fft2(rng.standard_normal(error.shape)) * passed).real
+        yield np.abs(np.fft.fft2(error * even)) ** 2
+
+
+def _of_noise(error: Floats, steps: float | Floats, smoothing: float) -> Floats:
+    """Equation (2) for each mode: w n is ``error`` (ny, nx)."""
+    if not smoothing:
+        return np.full(error.shape, float((error**2).sum()))
+    ny, nx = error.shape
+    lags = np.stack(np.meshgrid(np.fft.fftfreq(nx, 1 / nx), np.fft.fftfreq(ny, 1 / ny)))  # x and y, in pixels
+    east, north = np.tensordot(cell(steps), lags, 1)
+    correlation = np.fft.ifft2(np.abs(np.fft.fft2(error)) ** 2).real
+    found = np.fft.fft2(correlation * np.exp(-(east**2 + north**2) / (4 * smoothing**2))).real
+    return np.asarray(np.maximum(found, 0.0), np.float64)
 
 
 @dataclass(frozen=True)
