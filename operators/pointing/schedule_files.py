@@ -1,9 +1,10 @@
-"""Observing schedules of TOAST: version 5 (ECSV) and version 4 (text)."""
+"""Observing schedules of TOAST: version 5 (ECSV) and versions 4 to 1 (text)."""
 
 from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,11 @@ OVERLAP = 1.0
 """s: rows may overlap by as much, since schedules round their times to seconds."""
 WIDEST_WRAP = np.pi
 """rad: azmax below azmin is read as a sweep through north; a wider one is taken for exchanged limits."""
-CURE = f"give a schedule of TOAST, version 5 (ECSV with the columns {', '.join(COLUMNS)}) or version 4 (text)"
+CURE = f"give a schedule of TOAST, version 5 (ECSV with the columns {', '.join(COLUMNS)}) or version 4 to 1 (text)"
+TWO_WORDS = (11, 23, 24)
+"""Fields of a row whose dates and times are two words: versions 3 and 1."""
+CONCISE = {9: range(9), 21: (0, 1, 4, 5, 6, 7, 8, 19, 20), 22: (0, 1, 4, 5, 6, 7, 8, 19, 20)}
+"""Where `COLUMNS` stand in a row of so many fields: of versions 4 and 3; of 2 and 1, whose last may lack."""
 
 
 @dataclass(frozen=True)
@@ -129,23 +134,36 @@ def read_schedule(path: Path, nods: float = 0.0) -> list[Row]:
     place = str(path)
     with reading(place, "a schedule", CURE), path.open(encoding="utf-8") as file:
         first = file.readline()
-    return _rows(read_table(path) if first.startswith("# %ECSV") else _version_4(path, place), nods)
+    return _rows(read_table(path) if first.startswith("# %ECSV") else _of_text(path, place), nods)
 
 
-def _version_4(path: Path, place: str) -> Table:
-    """The table of a text schedule: a line about the site, then nine fields a line, between bars."""
+def _of_text(path: Path, place: str) -> Table:
+    """The table of a text schedule: a line about the site, then the fields of a row a line, between bars or blanks.
+
+    Rows that are SPECIAL (cooler cycles) are no scans; as in TOAST they are left out.
+    """
     with reading(place, "a schedule", CURE):
         text = path.read_text(encoding="utf-8").splitlines()
     written = [(number, line) for number, line in enumerate(text, 1) if line.strip() and not line.startswith("#")]
+    special = [number for number, line in written if re.match(r"\s*SPECIAL\b", line)]
+    written = [(number, line) for number, line in written if number not in special]
+    if special:
+        text_of = f"{len(special)} rows are SPECIAL, no scans (line {special[0]}{', ...' * (len(special) > 1)})"
+        warnings.warn(f"{place}: {text_of}: they are left out", stacklevel=2)
     rows = [[field.strip() for field in line.split("|")] if "|" in line else line.split() for _, line in written]
     if len(rows) < 2 or len(rows[0]) != 5:
         raise InputError("is no schedule: there is no line about the site, or none behind it", place=place, cure=CURE)
     mistakes, lines = Mistakes(place), [number for number, _ in written]
+    found = []
     for line, row in zip(lines[1:], rows[1:], strict=True):
-        if len(row) != len(COLUMNS):
+        if len(row) in TWO_WORDS:
+            row = [f"{row[0]} {row[1]}", f"{row[2]} {row[3]}", *row[4:]]
+        if len(row) not in CONCISE:
             mistakes.add(line, f"has {len(row)} fields, not {len(COLUMNS)}", CURE)
+            continue
+        found.append([row[k] for k in CONCISE[len(row)]])
     mistakes.tell()
-    columns = [list(column) for column in zip(*rows[1:], strict=True)]
+    columns = [list(column) for column in zip(*found, strict=True)]
     units = dict.fromkeys(("boresight_angle", "azmin", "azmax", "el"), "deg")
     named = {name: (column, units.get(name, "")) for name, column in zip(COLUMNS, columns, strict=True)}
     return Table(place, named, [*lines[1:], lines[0]])

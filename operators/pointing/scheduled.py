@@ -40,7 +40,7 @@ class ScheduleParameters(Operator):
     """What all scans of a schedule have in common."""
 
     schedule: InputPath
-    """Version 5 (ECSV) or version 4 (text) of TOAST's schedules."""
+    """Version 5 (ECSV) or versions 4 to 1 (text) of TOAST's schedules."""
     speed: AngularSpeed = quantity("1 deg/s", gt=0)
     """Constant speed on the sky between the limits."""
     acceleration: AngularAcceleration = quantity("1 deg/s2", gt=0)

@@ -474,3 +474,52 @@ def test_a_row_that_the_telescope_cannot_do_is_found_among_many(tmp_path):
         check(long_schedule(tmp_path / "low.ecsv", 2000, el=1.0))
     with pytest.raises(PointingError, match="patch-977-0"):
         check(long_schedule(tmp_path / "fast.ecsv", 2000, el=80.0), check_limits="error")
+
+
+HEAD_OF_TEXT = "#Site Telescope Latitude Longitude Elevation\nATACAMA SAT -22.958 -67.786 5200.0\n"
+SKY = "10.0 120.0 12.0 121.0 30.0 200.0 31.0 201.0 0.25"
+TEXTS = {
+    "version 4": "2027-06-23 08:01:00 | 2027-06-23 08:11:00 | 45.0 | field_a | 110.0 | 142.0 | 50.0 | 21 | 3",
+    "version 3": " 2027-06-23 08:01:00  2027-06-23 08:11:00 45.0 field_a 110.00 142.00 50.00 21 3",
+    "version 2": "|".join(
+        [
+            "2027-06-23 08:01:00",
+            "2027-06-23 08:11:00",
+            *["61579.3", "61579.4", "45", "field_a", "110", "142", "50", "R"],
+            *SKY.split(),
+            "21",
+            "3",
+            "0.5",
+        ]
+    ),
+    "version 1": f"2027-06-23 08:01:00 2027-06-23 08:11:00 61579.3 61579.4 45.0 field_a 110 142 50 R {SKY} 21 3 0.5",
+    "23 words": f"2027-06-23 08:01:00 2027-06-23 08:11:00 61579.3 61579.4 45.0 field_a 110 142 50 R {SKY} 21 3",
+}
+
+
+@pytest.mark.parametrize("version", TEXTS)
+def test_every_version_of_text(version, tmp_path):
+    """As TOAST reads them: dates and times are one field between bars, two words between blanks."""
+    path = tmp_path / "s.txt"
+    path.write_text(HEAD_OF_TEXT + TEXTS[version] + "\n")
+    (row,) = read_schedule(path)
+    assert (row.name, row.number) == ("field_a", ("21", "3"))
+    assert row.start.isoformat().startswith("2027-06-23T08:01:00")
+    assert row.duration == 600
+    assert np.degrees([*row.azimuth, row.elevation, row.rotation]) == pytest.approx([110, 142, 50, 45])
+
+
+def test_special_rows_are_left_out_and_told(tmp_path):
+    path = tmp_path / "s.txt"
+    path.write_text(
+        f"{HEAD_OF_TEXT}{TEXTS['version 4']}\nSPECIAL|2027-06-23 08:11:00|2027-06-23 09:00:00|0.0|cooler|100|125|48|0|0\n"
+    )
+    with pytest.warns(UserWarning, match=r"1 rows are SPECIAL, no scans \(line 4\)"):
+        assert len(read_schedule(path)) == 1
+
+
+def test_rows_of_no_version(tmp_path):
+    path = tmp_path / "s.txt"
+    path.write_text(HEAD_OF_TEXT + TEXTS["version 3"] + " 7\n")
+    with pytest.raises(InputError, match="has 12 fields, not 9"):
+        read_schedule(path)
