@@ -68,6 +68,8 @@ class ReadMap:
         What was chosen, and why Q and U that are in the file are not taken: ``what: text``.
     own
         Whether zonda wrote it.
+    measured_in
+        By plane, what its header says that its noise was measured in (NOISEOF).
     """
 
     planes: dict[str, Plane]
@@ -75,6 +77,7 @@ class ReadMap:
     band: str
     notes: list[str]
     own: bool = False
+    measured_in: dict[str, str] = field(default_factory=dict)
 
     def is_of_the_band_of(self, other: ReadMap) -> bool:
         """False where the frequencies that both state differ, or the names where one of them states no frequency."""
@@ -129,14 +132,14 @@ def read_planes(path: Path, name: str = "", wanted: Wanted | None = None) -> Rea
     """
     read = _read(path, name, wanted or Wanted())
     beside = path.with_name(f"source_free_{path.name}")
-    if not (read.own and any(plane.noise is not None for plane in read.planes.values()) and beside.is_file()):
+    if not (read.own and FREE in read.measured_in.values() and beside.is_file()):
         return read
     free = _read(beside, name, wanted or Wanted())
     made = {}
     for key, plane in read.planes.items():
         found = free.planes.get(key)
         alike = found is not None and free.own and found.unit == plane.unit and _on_one_grid(found, plane)
-        if alike and found is not None and plane.noise is not None:
+        if alike and found is not None and plane.noise is not None and read.measured_in.get(key) == FREE:
             white = plane.noise / (plane.factor or 1.0)
             plane = replace(plane, noise=white, alone=found.values, alone_of=FREE, factor=None)
         made[key] = plane
@@ -229,7 +232,14 @@ def _told(name: str, about: Any, image: bool, found: Found, place: str) -> ReadM
             )  # fmt: skip
             planes[key] = plane.scaled(factor, label)
     origin = text(about, "ORIGIN", place).lower() == "zonda"
-    return ReadMap(planes, hertz if hertz and hertz > 0 else None, text(about, "BAND", place), notes, origin)
+    return ReadMap(
+        planes,
+        hertz if hertz and hertz > 0 else None,
+        text(about, "BAND", place),
+        notes,
+        origin,
+        {key: words for key, (_, words) in found.stated.items()},
+    )
 
 
 def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:

@@ -130,6 +130,15 @@ def test_files_that_a_run_saved_are_compared_by_the_same_noise(tmp_path, capsys)
     assert f"x white noise, as in {FREE}" in capsys.readouterr().out
 
 
+def test_a_source_free_map_of_an_earlier_run_is_not_taken(tmp_path):
+    """The second run makes none, and leaves the first one's file where it is."""
+    run(tmp_path, zonda.SaveMap())
+    assert read_planes(tmp_path / "map.fits").planes["I"].alone is not None
+    run(tmp_path, zonda.SaveMap(), free=False)
+    assert (tmp_path / "source_free_map.fits").exists()
+    assert read_planes(tmp_path / "map.fits").planes["I"].noise_in_words == WHITE
+
+
 def test_healpix_files_state_their_noise(tmp_path):
     data = run(tmp_path, zonda.SaveMap(), nside=16384)
     header = fits.getheader(tmp_path / "map.fits", 1)
