@@ -205,7 +205,6 @@ def test_an_operator_that_changes_nothing_is_told():
 def test_where_no_detector_is_left_no_instant_is_flagged():
     class Dead(Operator):
         requires = frozenset({"signal"})
-        provides = frozenset({"signal"})
 
         def prepare(self, observation):
             observation.detector_flags |= 1

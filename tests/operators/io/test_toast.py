@@ -271,6 +271,51 @@ def test_zonda_looks_where_toast_looked(simulated):
         np.testing.assert_array_equal(samples_in(o.intervals[name], o.seconds), inside)
 
 
+@pytest.mark.parametrize("edge", [105.0, 104.5, 103.0])
+def test_ground_templates_of_processed_samples_are_toasts(edge, tmp_path):
+    """A throw that begins on the edge of a bin; 40 samples that TOAST flags as *processing*, 10 K higher or not: the streams of
+    TOAST's GroundFilter, with turnarounds in the fit as in ours, and one map for both."""
+    from datetime import datetime
+
+    import astropy.units as u
+    from astropy.table import QTable
+
+    site = toast.instrument.GroundSite("atacama", -22.958 * u.deg, -67.786 * u.deg, 5200 * u.m)
+    names = [f"d{k}" for k in range(3)]
+    table = QTable({"name": names, "quat": [[0.0, 0.0, 0.0, 1.0]] * 3, "psd_net": [1e-3] * 3 * u.K * u.s**0.5})
+    table["fwhm"], table["psd_fknee"], table["psd_fmin"] = [10] * 3 * u.arcmin, [1.0] * 3 * u.Hz, [1e-5] * 3 * u.Hz
+    table["psd_alpha"], table["bandcenter"], table["bandwidth"] = [1.0] * 3, [150] * 3 * u.GHz, [40] * 3 * u.GHz
+    plane = toast.instrument.Focalplane(detector_data=table, sample_rate=40 * u.Hz, field_of_view=1 * u.deg)
+    start, stop = (datetime(2024, 6, 25, 4, minute, tzinfo=UTC) for minute in (0, 3))
+    row = toast.schedule.GroundScan("patch", start, stop, az_min=edge * u.deg, az_max=(edge + 12) * u.deg, el=50 * u.deg)
+    schedule = toast.schedule.GroundSchedule([row], site.name, "dish", -22.958 * u.deg, -67.786 * u.deg, 5200 * u.m)
+    data = toast.Data(toast.Comm())
+    telescope = toast.instrument.Telescope("dish", focalplane=plane, site=site)
+    toast.ops.SimGround(telescope=telescope, schedule=schedule, weather="atacama", detset_key=None).apply(data)
+    toast.ops.DefaultNoiseModel().apply(data)
+    toast.ops.SimNoise(det_data="signal").apply(data)
+    (o,) = data.obs
+    at = np.r_[200:230, 900:910]
+    o.shared["flags"].set(np.asarray(o.shared["flags"].data) | np.isin(np.arange(o.n_local_samples), at).astype(np.uint8) * 2)
+    files = []
+    for value in (0.0, 10.0):
+        for name in names:
+            o.detdata["signal"][name][at] += value
+        (tmp_path / f"{value}").mkdir()
+        files.append(toast.io.save_hdf5(o, str(tmp_path / f"{value}"), detdata=["signal"]))
+    steps = [zonda.GroundFilter(bin="0.5 deg", trend=1), zonda.BinMap(pixel="20 arcmin")]
+    found = []
+    for path in files:
+        step = zonda.LoadTOD(file=path)
+        found.append(zonda.Pipeline([step, *steps], precision="float64").run(step.scene(seed=1), keep=["signal"], threads=1))
+    np.testing.assert_allclose(found[1]["map"].signal, found[0]["map"].signal, rtol=0, atol=1e-12)
+    traits = {"trend_order": 1, "filter_order": None, "bin_width": 0.5 * u.deg, "detrend": True, "shared_flag_mask": 11}
+    toast.ops.GroundFilter(**traits).apply(data)
+    good = found[1].observations[0].good_samples
+    theirs = np.array([o.detdata["signal"][name] for name in names])
+    np.testing.assert_allclose(found[1].tod("signal")[:, good], theirs[:, good], rtol=0, atol=1e-11)
+
+
 class Imperfect(Operator):
     """Detectors of polarization efficiencies of their own."""
 
