@@ -193,7 +193,7 @@ def operator(
 
 def _bits(values: Any) -> int:
     """A check sum."""
-    return zlib.crc32(np.ascontiguousarray(values).view(np.uint8))
+    return zlib.crc32(np.ascontiguousarray(values).view(np.uint8))  # type: ignore[arg-type]
 
 
 def _where(err: Exception) -> str:

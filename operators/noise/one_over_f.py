@@ -362,6 +362,6 @@ def _state_covariance(
     if more:  # of Re s = (s + s*) / 2 and Im s = (s - s*) / 2i
         real = np.eye(n, dtype=np.complex128)
         for k in range(n - more, n, 2):
-            real[k : k + 2, k : k + 2] = [[0.5, 0.5], [-0.5j, 0.5j]]
+            real[k : k + 2, k : k + 2] = np.array([[0.5, 0.5], [-0.5j, 0.5j]])
         covariance = (real @ covariance @ real.T).real
     return np.asarray((covariance + covariance.T) / 2)
