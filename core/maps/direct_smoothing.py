@@ -21,24 +21,25 @@ def table(power: float) -> Floats:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def smooth_directly(values, d, areas, reach, whole, sigma, power, gaussian):  # type: ignore[no-untyped-def]
-    """sum_q K_pq^power values_q (ny, nx).
+def smooth_directly(values, d, areas, reach, whole, sigma, power, gaussian, first, stop):  # type: ignore[no-untyped-def]
+    """sum_q K_pq^power values_q (ny, nx) for pixels from (row, column) ``first`` to before ``stop``; others are 0.
 
     ``d`` (ny, nx, 3) directions, NaN off the sky; ``areas`` (ny, nx) [sr]; ``reach`` (2, ny, nx) columns and rows to look at on
     either side; ``whole``: the last column is beside the first one.
     """
     ny, nx = values.shape
     out = np.zeros((ny, nx))
-    for y in range(ny):
-        for x in range(nx):
+    for y in range(first[0], stop[0]):
+        for x in range(first[1], stop[1]):
             scale = areas[y, x] / (2 * math.pi * sigma * sigma)
             if not scale > 0.0:
                 continue
             a, b, c = d[y, x, 0], d[y, x, 1], d[y, x, 2]
             wide, high, found = reach[0, y, x], reach[1, y, x], 0.0
-            left = x - wide
-            right = min(x + wide, left + nx - 1)
-            if not whole:
+            left, right = x - wide, x + wide
+            if whole:  # each column once
+                right = min(right, left + nx - 1)
+            else:
                 left, right = max(left, 0), min(right, nx - 1)
             for j in range(max(y - high, 0), min(y + high, ny - 1) + 1):
                 for k in range(left, right + 1):

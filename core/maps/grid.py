@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from ..numerics import tangent
-from ..numerics.angles import FWHM_PER_SIGMA
+from ..numerics.angles import FWHM_PER_SIGMA, angle_text
 from ..numerics.projection import central, frame_rotation, wcs_frame_rotation
 from ..numerics.sphere import angles, separation, unit_vectors
 from ..numerics.transforms import convolved, convolved_rows, gaussian_taps
@@ -36,10 +37,12 @@ Smoother = Callable[..., Floats]
 
 EVEN = 2e-3
 """Relative differences of steps across an image below which one kernel serves all pixels."""
-GENTLE = 1e-2
+GENTLE = 5e-3
 """sigma tan(latitude) of a CAR image up to which each row has its own kernel: the kernel's width varies by half of it within."""
 CUT = 5.0
 """Standard deviations at which kernels end."""
+STEEP = 0.15
+"""sigma tan(latitude) up to which the mean of two kernels for each row serves CAR images, to some 0.5 %."""
 SMALL = 1 << 20
 """Pixels of a grid whose solid angles and distances are kept."""
 MOST_PAIRS = 3e6
@@ -48,6 +51,8 @@ LARGEST_NSIDE = 2048
 """Of HEALPix maps that are smoothed by harmonics: beyond, a whole sphere takes gigabytes."""
 DIRECT = 1e9
 """Pairs of pixels under a kernel up to which each is looked at: some 3 s."""
+MOST_DIRECT = 3e11
+"""Pairs beyond which that is not done."""
 TILE = 64
 SKEW = 1e-2
 """Skewness of pixels below which the kernel is that of pixels at right angles: right to half of it, of the kernel's peak."""
@@ -345,8 +350,12 @@ class ImagePixels(MapGrid):
         steps = self._even()
         if steps is None:
             reach = self.reach(CUT * sigma)
-            few = 4.0 * math.prod(self.shape) * math.prod(reach) < DIRECT
-            return self._directly(sigma) if few or self.kind in CYLINDERS else self._by_tiles(sigma, reach)
+            by_latitudes = self.kind == "CAR" and self.cylinder  # right to 0.2 %, and much faster
+            if 4.0 * math.prod(self.shape) * math.prod(reach) < (DIRECT / 100 if by_latitudes else DIRECT):
+                return self._directly(sigma)
+            if by_latitudes:
+                return self._by_latitudes(sigma)
+            return self._directly(sigma) if 0 < self.around <= self.shape[1] else self._by_tiles(sigma, reach)
         along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
         return lambda values, power=1.0: np.asarray(convolved(values, along_y**power, along_x**power))
 
@@ -363,7 +372,8 @@ class ImagePixels(MapGrid):
                 around = slice(low[0], min(y.stop + more[0], ny)), slice(low[1], min(x.stop + more[1], nx))
                 steps, part = self.window(y, x)._even(), np.asarray(values[around], np.float64)
                 if steps is None:
-                    whole = self.window(*around)._directly(sigma)(part, power)
+                    own = [slice(s.start - n, s.stop - n) for s, n in zip((y, x), low, strict=True)]
+                    whole = self.window(*around)._directly(sigma, (own[0], own[1]))(part, power)
                 else:
                     along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
                     whole = np.asarray(convolved(part, along_y**power, along_x**power), np.float64)
@@ -383,19 +393,57 @@ class ImagePixels(MapGrid):
         middle = x.start + columns // 2
         return self._tiles(y, slice(x.start, middle)) + self._tiles(y, slice(middle, x.stop))
 
-    def _by_rows(self, sigma: float) -> Smoother:
-        """Of a CAR image: along each row with its own width, then along the columns; right to sigma tan(latitude) / 2."""
+    def _by_rows(self, sigma: float, both: bool = False) -> Smoother:
+        """Of a CAR image: along each row with its own width, then along the columns; right to sigma tan(latitude) / 2.
+
+        ``both``: the mean of that, of the height that equation (2) has, and of columns first, rows then. The widths go with
+        cos(latitude) of the pixel that is seen, and of the one that sees it; so has r^2 the mean of both: right to the square.
+        """
         side, taps = abs(float(self.matrix[0, 0])), gaussian_taps(sigma / abs(float(self.matrix[1, 1])))
-        rows = [gaussian_taps(sigma / side / cosine) for cosine in np.cos(self.latitudes)]
+        cosines = np.cos(self.latitudes)
+        if both:  # rows nearer to a pole are left to `_directly`
+            cosines = np.maximum(cosines, sigma / 2 / STEEP)
+        rows = [gaussian_taps(sigma / side / cosine) for cosine in cosines]
         around, nx = self.around, self.shape[1]
+
+        def convolve(values: Floats, power: float) -> Floats:
+            along, one = [row**power for row in rows], np.ones(1)
+            if not both:
+                return convolved_rows(values, taps**power, along)
+            height = cosines[:, None] ** power
+            seen = height * convolved_rows(values / height, taps**power, along)
+            return (seen + convolved_rows(convolved_rows(values, taps**power, [one] * len(rows)), one, along)) / 2
+
         if not 0 < around <= nx:
-            return lambda values, power=1.0: convolved_rows(values, taps**power, [row**power for row in rows])
+            return lambda values, power=1.0: convolve(np.asarray(values, np.float64), power)
         reach = min(max((len(row) for row in rows), default=0), (around - 1) // 2)
         columns = np.arange(-reach, around + reach) % around
 
         def found(values: AnyFloats, power: float = 1.0) -> Floats:
-            whole = convolved_rows(np.asarray(values, np.float64)[:, columns], taps**power, [row**power for row in rows])
-            return whole[:, reach + np.arange(nx) % around]
+            return convolve(np.asarray(values, np.float64)[:, columns], power)[:, reach + np.arange(nx) % around]
+
+        return found
+
+    def _by_latitudes(self, sigma: float) -> Smoother:
+        """Of a large CAR image: by rows, but near the poles pixel by pixel. InputError where that would take hours."""
+        ny, nx = self.shape
+        with np.errstate(divide="ignore", invalid="ignore"):
+            steep = ~(sigma * np.tan(abs(self.latitudes)) < STEEP)
+        rows, halo = self._by_rows(sigma, both=True), math.ceil(1.1 * CUT * sigma / abs(float(self.matrix[1, 1]))) + 2
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], steep.view(np.int8), [0]]))).reshape(-1, 2)
+        if (pairs := float(steep.sum()) * nx * nx * 2 * halo) > MOST_DIRECT:
+            text = f"a CAR map of {nx} x {ny} pixels that holds a pole, smoothed by {angle_text(sigma * FWHM_PER_SIGMA)}"
+            cure = "smooth it less, cut the pole off, or make a HEALPix map (nside)"
+            raise InputError(f"{text}, would take {pairs / 1e12:.2g} hours", place="smoothing", cure=cure)
+
+        def found(values: AnyFloats, power: float = 1.0) -> Floats:
+            out = rows(values, power)
+            for first, stop in edges:
+                low, high = max(int(first) - halo, 0), min(int(stop) + halo, ny)
+                own, whole = slice(int(first) - low, int(stop) - low), slice(0, nx)
+                part = self.window(slice(low, high), whole)._directly(sigma, (own, whole))
+                out[first:stop] = part(np.asarray(values)[low:high], power)[own]
+            return out
 
         return found
 
@@ -432,8 +480,8 @@ class ImagePixels(MapGrid):
                 return dy, dy if abs(dx / dy - 1) < 1e-9 else dx
         return None
 
-    def _directly(self, sigma: float) -> Smoother:
-        """Equation (2) as it stands: each pixel with its own kernel."""
+    def _directly(self, sigma: float, within: tuple[slice, slice] | None = None) -> Smoother:
+        """Equation (2) as it stands: each pixel with its own kernel. ``within``: only for these rows and columns."""
         from .direct_smoothing import smooth_directly, table
 
         ny, nx = self.shape
@@ -442,6 +490,8 @@ class ImagePixels(MapGrid):
         directions = np.ascontiguousarray(self.directions()[:, :columns])
         areas = np.ascontiguousarray(np.nan_to_num(np.broadcast_to(self.areas, self.shape)[:, :columns]))
         farthest = columns // 2 if whole else columns
+        down, across = within or (slice(0, ny), slice(0, columns))
+        begin, end = (down.start, across.start), (down.stop, min(across.stop, columns))
         reach = np.zeros((2, ny, columns), np.int32)
         for first in range(0, ny, ROWS):
             rows = np.arange(first, min(first + ROWS, ny), dtype=np.float64)
@@ -457,7 +507,7 @@ class ImagePixels(MapGrid):
 
         def found(values: AnyFloats, power: float = 1.0) -> Floats:
             own = np.ascontiguousarray(values[:, :columns], np.float64)
-            out = smooth_directly(own, directions, areas, reach, whole, sigma, power, table(power))
+            out = smooth_directly(own, directions, areas, reach, whole, sigma, power, table(power), begin, end)
             return np.asarray(out[:, np.arange(nx) % columns] if nx > columns else out, np.float64)
 
         return found

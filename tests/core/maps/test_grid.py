@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from zonda.core.errors import InputError
 from zonda.core.maps.grid import healpix_grid, image_grid, wcs_grid
 from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
 from zonda.core.numerics.sphere import separation, unit_vectors
@@ -109,6 +110,34 @@ def test_the_pole_of_a_whole_plate_carree_sky():
         weight = np.exp(-2 * np.arcsin(np.linalg.norm(directions - at, axis=-1) / 2) ** 2 / sigma**2) * grid.areas
         # cut at 5 sigma: what lies beyond is exp(-12.5)
         assert found[row, column] == pytest.approx(expected[row, column] / weight.sum(), abs=2e-5 * expected.max() / weight.sum())
+
+
+@pytest.mark.parametrize("width", [6.0, 18.0])
+def test_a_large_plate_carree_sky_is_smoothed_as_a_small_one(width, monkeypatch):
+    """By rows where these are nearly alike, pixel by pixel near the poles: as pixel by pixel everywhere, to 0.5 % of the peak."""
+    shape = (90, 180)
+    grid = image_grid(header("CAR", 0, shape, (-2.0, 2.0)), shape)
+    fwhm, rows = math.radians(width), (3, 15, 40, 60, 75, 85)
+    values = np.zeros(shape)
+    for row in rows:
+        values[row, (37 * row) % 180] = 1.0
+    monkeypatch.setattr("zonda.core.maps.grid.DIRECT", 1e99)
+    expected, noise = grid.smoothed(values, fwhm, noise=np.ones(shape))
+    monkeypatch.setattr("zonda.core.maps.grid.DIRECT", 0.0)
+    found, other = grid.smoothed(values, fwhm, noise=np.ones(shape))
+    for row in rows:
+        near = slice(max(row - 3, 0), row + 4)
+        assert abs(found - expected)[near].max() < 0.005 * expected[near].max()
+    np.testing.assert_allclose(other, noise, rtol=0.005)
+
+
+def test_a_pole_that_would_take_hours_is_refused(monkeypatch):
+    shape = (90, 180)
+    grid = image_grid(header("CAR", 0, shape, (-2.0, 2.0)), shape)
+    monkeypatch.setattr("zonda.core.maps.grid.DIRECT", 0.0)
+    monkeypatch.setattr("zonda.core.maps.grid.MOST_DIRECT", 1.0)
+    with pytest.raises(InputError, match="that holds a pole"):
+        grid.smoother(math.radians(6.0))
 
 
 def test_rows_that_go_round_the_sky_have_no_ends():

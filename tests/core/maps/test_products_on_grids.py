@@ -111,10 +111,10 @@ def test_a_wide_tangent_plane_is_smoothed_by_its_own_pixels():
 
 def test_large_images_are_smoothed_by_tiles(monkeypatch):
     """A single pixel 20 deg from the tangent point, as in small images, where each pixel has its own kernel."""
-    one = product("TAN", 0.0, side=45.0, pixel=6 * ARCMIN)
-    fwhm, sigma = 30 * ARCMIN, 30 * ARCMIN / FWHM_PER_SIGMA
+    one = product("TAN", 0.0, side=45.0, pixel=10 * ARCMIN)
+    fwhm, sigma = 50 * ARCMIN, 50 * ARCMIN / FWHM_PER_SIGMA
     values = np.zeros(one.signal.shape)
-    for at in ((225, 225 + 190), (225 + 130, 225 - 130), (64, 128)):
+    for at in ((135, 135 + 114), (135 + 78, 135 - 78), (64, 128)):
         values[at] = 1.0
     found, noise = one.grid.smoothed(values, fwhm, noise=np.ones(values.shape))
     monkeypatch.setattr("zonda.core.maps.grid.DIRECT", 0.0)
