@@ -44,7 +44,8 @@ def observation(c: dict) -> Observation:
 
 
 def run(c: dict) -> dict[str, float]:
-    o, operator = observation(c), AtmosphereLayers(pwv=f"{c['pwv']} m", pwv_rms=f"{100 * c['pwv_rms']} %")
+    rms = f"{100 * c['pwv_rms']} %"
+    o, operator = observation(c), AtmosphereLayers(pwv=f"{c['pwv']} m", pwv_rms=rms, layer_response="column")
     start = cpu()
     state = operator.prepare(o)
     setup = cpu() - start
