@@ -18,6 +18,7 @@ from zonda.core.flags import (
     SUN_UP,
     TURNAROUND,
 )
+from zonda.core.intervals import samples_in
 from zonda.core.numerics.earth_orientation import orientation
 from zonda.core.packages import needed
 from zonda.core.types import Floats
@@ -30,12 +31,13 @@ EXTRA = "sotodlib"
 FLAGS = {
     "invalid": INVALID,
     "processing": PROCESSING,
-    "turnarounds": TURNAROUND,
     "irregular": IRREGULAR,
     "sun_up": SUN_UP,
     "sun_close": SUN_CLOSE,
 }
-"""Flags of samples by their names in the AxisManager."""
+"""Flags of samples by their names in the AxisManager, of all detectors; the turnarounds are one for all (`_scans`)."""
+SCANS = {"left_scan": "rightleft", "right_scan": "leftright"}
+"""Names of sotodlib: to the left is towards smaller azimuth; ends of the intervals' names."""
 
 
 def to_axismanager(
@@ -50,8 +52,10 @@ def to_axismanager(
     boresight_equ.ra ...      ra, dec, psi (samps,) rad, ICRS: zonda's own pointing, which sotodlib's maps use where it is there
     focal_plane.xi ...        xi, eta (sines, not zonda's tangents) and gamma (dets,) rad
     flags                     FlagManager of RangesMatrix (dets, samps): those of `FLAGS`; ``detectors``, whole rows; ``samples``,
-                              single samples that are not finite or flagged in the file; ``excluded``, all that no map uses
-    det_info                  name, readout_id, det_id, band, wafer_slot, wafer.bandpass and wafer.array (dets,)
+                              single samples that are not finite or flagged in the file; ``excluded``, all that no map uses.
+                              ``turnarounds``, ``left_scan``, ``right_scan``: Ranges (samps,); the last two where there are throws
+    det_info                  name, readout_id, det_id, band, wafer_slot, wafer.bandpass, wafer.array and wafer.type (dets,)
+    iir_params                empty: no filter of the read-out is to be taken off
     obs_info                  obs_id, telescope, timestamp, start_time, stop_time, duration
     hwp_angle                 (samps,) rad, where there is a half-wave plate
     ========================  ==========================================================================================
@@ -91,6 +95,7 @@ def to_axismanager(
     aman.wrap("flags", _flags(core, aman, found))
     aman.wrap("det_info", _det_info(core, aman, tod))
     aman.wrap("obs_info", _obs_info(core, tod))
+    aman.wrap("iir_params", core.AxisManager())
     return aman
 
 
@@ -167,12 +172,22 @@ def _flags(core: Any, aman: Any, scan: Scan) -> Any:
 
     for name, bit in FLAGS.items():
         flags.wrap_dets_samps(name, of_samples((tod.flags & np.uint8(bit)) != 0))
+    for name, where in _scans(tod).items():
+        flags.wrap(name, so3g.Ranges.from_mask(where), [(0, "samps")])
     dead = (tod.detector_flags & np.uint8(DETECTOR_MASK)) != 0
     flags.wrap_dets("detectors", dead)
     flags.wrap_dets_samps("samples", so3g.RangesMatrix([so3g.Ranges.from_mask(row) for row in scan.spoilt]))
     excluded = of_samples((tod.flags & np.uint8(SAMPLE_MASK)) != 0) + flags.detectors + flags.samples
     flags.wrap_dets_samps("excluded", excluded)
     return flags
+
+
+def _scans(tod: TimeOrderedData) -> dict[str, NDArray[np.bool_]]:
+    """(n_samp,) turnarounds and, where the scan has throws, the direction of each sample: that of the throw it is in."""
+    found = {"turnarounds": np.asarray((tod.flags & np.uint8(TURNAROUND)) != 0, np.bool_)}
+    if any(tod.intervals.get(f"throw_{end}") for end in SCANS.values()):
+        found |= {name: samples_in(tod.intervals.get(f"throw_{end}", []), tod.seconds) for name, end in SCANS.items()}
+    return found
 
 
 def _det_info(core: Any, aman: Any, tod: TimeOrderedData) -> Any:
@@ -184,7 +199,7 @@ def _det_info(core: Any, aman: Any, tod: TimeOrderedData) -> Any:
     slots = np.array([f"ws{number}" for number in wafer])
     for name, values in {"name": names, "readout_id": names, "det_id": names, "band": band, "wafer_slot": slots}.items():
         info.wrap(name, values, [(0, "dets")])
-    _wrap(core, info, "wafer", "dets", {"bandpass": band, "array": slots})
+    _wrap(core, info, "wafer", "dets", {"bandpass": band, "array": slots, "type": np.full(n, "OPTC")})
     return info
 
 

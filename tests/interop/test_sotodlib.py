@@ -80,18 +80,37 @@ def test_names_and_values(aman, observation):
 
 def test_flags_are_ranges_matrices(aman, observation):
     o, flags = observation, aman.flags
-    for name in ("invalid", "processing", "turnarounds", "sun_up", "detectors", "samples", "excluded"):
+    for name in ("invalid", "processing", "irregular", "sun_up", "detectors", "samples", "excluded"):
         assert isinstance(flags[name], so3g.proj.RangesMatrix)
         assert flags[name].shape == (o.n_detectors, o.n_samples)
     np.testing.assert_array_equal(~flags.excluded.mask(), o.good_detectors[:, None] & o.good_samples)
-    np.testing.assert_array_equal(flags.turnarounds.mask()[0], (o.flags & 4) != 0)
+    np.testing.assert_array_equal(flags.turnarounds.mask(), (o.flags & 4) != 0)
     assert flags.sun_up.mask()[3, 420:600].all()
     assert flags.detectors.mask().all(axis=1).nonzero()[0].tolist() == [1, 5]
-    flags.turnarounds.buffer(1)  # in place: rows are independent, and no other flag changes
-    widened = flags.turnarounds.mask()[:, 1:-1].sum(axis=1)
-    flags.turnarounds.buffer(-1)
+    before = flags.excluded.mask()
+    flags.sun_up.buffer(1)  # in place: rows are independent, and no other flag changes
+    widened = flags.sun_up.mask().sum(axis=1)
     assert (widened == widened[0]).all()
-    assert (widened[0] - flags.turnarounds.mask()[0, 1:-1].sum()) % 2 == 0
+    np.testing.assert_array_equal(flags.excluded.mask(), before)
+
+
+def test_sotodlibs_own_steps_take_it(observation):
+    """Subscans by the directions of the throws, preprocessing, and the detectors that are not dark."""
+    from sotodlib.preprocess import Pipeline
+    from sotodlib.tod_ops import flags
+
+    aman = to_axismanager(observation)
+    found = flags.get_subscans(aman, merge=False)
+    inside = found.subscan_flags.mask()
+    good = (observation.flags & 4) == 0
+    np.testing.assert_array_equal(inside.any(axis=0), good)
+    rate = np.gradient(np.unwrap(observation.azimuth))
+    for direction, one in zip(found.direction, inside, strict=True):
+        assert (np.sign(np.median(rate[one])) > 0) == (direction == "right")
+    flags.get_turnaround_flags(to_axismanager(observation), merge=False)
+    assert not flags.get_dark_dets(aman, merge=False).mask().any()
+    steps = [{"name": "glitches", "glitch_name": "g", "calc": {"n_sig": 10}, "save": True}]
+    Pipeline(steps).run(to_axismanager(observation))
 
 
 def test_a_file_gives_what_the_run_gives(survey, aman):
