@@ -40,7 +40,13 @@ def expected_fwhm(fwhm: Floats, net: Floats) -> float:
     """Equation (1) [rad] of detectors (n_det,) that see the same of a map, with the weights of their ``net``; equal ones where
     one is 0."""
     weight = net**-2.0 if (net > 0).all() else np.ones(len(net))
-    return effective_fwhm({float(width): float(weight[fwhm == width].sum()) for width in np.unique(fwhm)})
+    return effective_fwhm(dict(_by_width(fwhm, weight)))
+
+
+def _by_width(fwhm: Floats, weight: Floats) -> list[tuple[float, float]]:
+    """Each width, and the sum of the weights of its detectors."""
+    widths, which = np.unique(fwhm, return_inverse=True)
+    return list(zip(widths.tolist(), np.bincount(which, weight, len(widths)).tolist(), strict=True))
 
 
 @dataclass
@@ -51,10 +57,10 @@ class Beams:
 
     def add(self, fwhm: Floats, weight: Floats, samples: int) -> None:
         """Detectors of ``fwhm`` (n_det,) whose samples weigh ``weight`` (n_det,), with about ``samples`` each."""
-        for width in np.unique(fwhm):
-            share = round(float(weight[fwhm == width].sum()) * UNIT) * samples
+        for width, total in _by_width(fwhm, weight):
+            share = round(total * UNIT) * samples
             if share > 0:
-                self.weights[float(width)] = self.weights.get(float(width), 0) + share
+                self.weights[width] = self.weights.get(width, 0) + share
 
     def __iadd__(self, other: Beams) -> Beams:
         for width, share in other.weights.items():
