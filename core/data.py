@@ -52,6 +52,8 @@ class Data:
     """By label: what all observations have in common (the grid of a map), as plain values and arrays; ``fixed: True`` says
     that further observations cannot change it. `Operator.observe` makes it, or extends what earlier parts of a campaign made.
     In `Operator.check` the ``kind`` of a map (its projection, HEALPix, or hits) and the ``product`` that it will be."""
+    made: frozenset[str] = frozenset()
+    """In `Operator.check` what the steps of the pipeline make: streams and products. Empty: not known."""
     laid_out: bool = False
     """The layouts are those of all parts of a campaign: `Operator.observe` takes them as they are."""
 

@@ -439,6 +439,12 @@ SIGNALS = "  - Efficiency\n"
         (SIGNALS, "AtmosphereLayers: {pwv: 200 mm}", "precipitable water vapour"),
         ("  - SaveMap\n", "CompareMaps: {file: nan.fits}", "no pixel has a value"),
         ("  - SaveMap\n", "CompareMaps: {file: my.yaml}", "my.yaml"),
+        ("  - SaveMap\n", "CompareMaps: {map: nope}", "there is no map 'nope'"),
+        ("  - SaveMap\n", "CompareMaps: {reference: noiseless/nope}", "there is no map 'noiseless/nope'"),
+        ("  - SaveMap\n", "MapSpectrum: {maps: [nope]}", "there is no map 'nope'"),
+        ("  - SaveMap\n", "TransferFunction: {map: nope}", "there is no map 'nope'"),
+        ("  - SaveMap\n", "AtmosphereScreens", "there is no atmosphere to show"),
+        (FILTERS, "CompareStreams: {reference: atmosphere}", "there is no stream 'atmosphere'"),
     ],
 )
 def test_what_a_scan_does_not_allow_is_refused_by_check_as_by_run(here, capsys, before, step, words):

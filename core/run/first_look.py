@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from ..data import Data
 from ..errors import ZondaError
-from ..mapmaker import makes_products
+from ..mapmaker import made_by, makes_products
 from ..operator import Operator
 from ..output import may_write
 from ..pipeline import Pipeline
@@ -48,7 +48,8 @@ def looks(
 
     None stands for a step that could not be made. ``say`` is told each step before it is looked at.
     """
-    data, found = Data(scene=scene), list[list[str]]()
+    made = frozenset().union(*(made_by(operator) for operator in operators if operator is not None))
+    data, found = Data(scene=scene, made=made), list[list[str]]()
     refused: list[tuple[int, ZondaError]] = []
     for text in doubts(scene.instrument):
         warnings.warn(text, stacklevel=3)

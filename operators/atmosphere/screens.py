@@ -38,6 +38,9 @@ LEAST_BEAMS = 4.0
 """Width of a layer's picture in beams, at least."""
 
 
+NOTHING = "there is no atmosphere to show"
+
+
 class AtmosphereScreens(Output):
     """Pictures and files of the simulated turbulence: each layer at a moment, and the PWV over the field as time goes on.
 
@@ -66,6 +69,8 @@ class AtmosphereScreens(Output):
         """Refuse a scan that is not there, once the telescope is pointed."""
         if data.observations:
             data.check_scan(self.observation, self.label)
+        if data.made and "atmosphere" not in data.made:
+            raise PipelineError(NOTHING, place=self.label, cure="add AtmosphereLayers")
         return []
 
     def watch(self, data: Data, done: Progress) -> None:
@@ -81,7 +86,7 @@ class AtmosphereScreens(Output):
         data.check_scan(self.observation, self.label)
         load = data.observations[self.observation].expected_load
         if not isinstance(load, ExpectedLoad):
-            raise PipelineError("there is no atmosphere to show", place=self.label, cure="add AtmosphereLayers")
+            raise PipelineError(NOTHING, place=self.label, cure="add AtmosphereLayers")
         found = screens(load.model(), self.moment, self.moments, self.pixels)
         key = self.name or "screens"
         data.products[key] = found

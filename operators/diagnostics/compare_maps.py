@@ -24,7 +24,7 @@ from .comparison.files import Wanted, plane_of, read_planes, write_comparison
 from .comparison.planes import Plane
 from .comparison.statistics import THRESHOLD, Comparison, Settings, compare
 from .comparison.stokes import on_meridians_of, planes_of, products_of
-from .series import about, key_of, plane_key
+from .series import about, check_map, key_of, plane_key
 from .transfer_function import window_of
 
 if TYPE_CHECKING:
@@ -77,6 +77,8 @@ class CompareMaps(Output):
 
     def check(self, data: Data) -> list[str]:
         """Read the `file`, and tell what it holds. Raises InputError where it cannot be read as a map."""
+        for name in (self.map, *([self.reference] if self.file is None else [])):
+            check_map(data, name, self.label)
         if self.file is None:
             return []
         read = _read(self)

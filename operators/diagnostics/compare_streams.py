@@ -20,7 +20,7 @@ from zonda.core.storage.files import product_path
 from zonda.core.stream_names import AnyStream, StreamsAsked, StreamsNeeded, check_signals
 
 from .power_spectrum import Welch, calibration, on_sky
-from .series import about, key_of
+from .series import about, check_streams, key_of
 from .stream_statistics import Pair, StreamComparison, pair
 
 LEAST_SEGMENTS = 8
@@ -69,6 +69,11 @@ class CompareStreams(Operator):
         if self.stream == self.reference:
             raise ValueError("stream and reference are the same")
         return self
+
+    def check(self, data: Data) -> list[str]:
+        """Refuse streams that no step makes."""
+        check_streams(data, self.streams, self.label)
+        return []
 
     @property
     def streams(self) -> tuple[str, str]:

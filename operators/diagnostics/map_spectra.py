@@ -22,7 +22,7 @@ from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
 
 from .comparison.radial import RadialSpectra, radial_spectra, ring_edges
-from .series import about, key_of, kinds_of_maps
+from .series import about, check_map, key_of, kinds_of_maps
 from .stokes_spectra import on_the_plane, sphere_spectra
 from .transfer_function import window_of
 
@@ -96,6 +96,8 @@ class MapSpectrum(Output):
 
     def check(self, data: Data) -> list[str]:
         """Raises PipelineError where the maps that will be made are none of which there is a spectrum."""
+        for name in self.maps:
+            check_map(data, name, self.label)
         made = kinds_of_maps(data)
         kinds = [made.get(name.rpartition("/")[2], "TAN") for name in self.maps]
         if len(kinds) > 1 and "HEALPix" in kinds:

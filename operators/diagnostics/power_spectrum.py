@@ -21,7 +21,7 @@ from zonda.core.signal import BUILT_IN, MAIN, TRANSMISSION, Component
 from zonda.core.stream_names import StreamName, StreamsAsked, StreamsNeeded
 from zonda.core.types import Floats
 
-from .series import Spectrum, key_of
+from .series import Spectrum, check_streams, key_of
 
 ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")
 """Of spectra in pictures."""
@@ -178,6 +178,11 @@ class PowerSpectrum(Operator):
     segment: Seconds = quantity("128 s", gt=0)
     """Length of Welch's segments (at most the scan): the inverse of the frequency resolution. Shortened to a number of samples
     that has no prime factor above 5."""
+
+    def check(self, data: Data) -> list[str]:
+        """Refuse streams that no step makes."""
+        check_streams(data, self.streams or (), self.label)
+        return []
 
     def prepare(self, observation: Observation) -> Periodograms:
         usable = np.flatnonzero(observation.good_detectors)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zonda.core.errors import PipelineError
 from zonda.core.notebook import html_table
 from zonda.core.product import Record
 from zonda.core.storage.ecsv import Column
@@ -160,6 +163,26 @@ def key_of(step: Operator, usual: str) -> str:
 def kinds_of_maps(data: Data) -> dict[str, str]:
     """In `Operator.check`: the kind of each map that will be made, by its product: its projection, HEALPix, or hits."""
     return {str(layout["product"]): str(layout["kind"]) for layout in data.layouts.values() if "kind" in layout}
+
+
+def check_map(data: Data, name: str, place: str) -> None:
+    """In `Operator.check`: PipelineError where no step makes the map of this name, of whatever signal and plane."""
+    base = name.rpartition("/")[2]
+    known = {*kinds_of_maps(data), *data.made, *({"input"} if "sky" in data.made else ())}
+    if data.made and base.partition(".")[0] not in known and re.sub(r"_([IQUPEB]|half_difference)$", "", base) not in known:
+        cure = f"name one of these: {', '.join(kinds_of_maps(data)) or 'none is made'}"
+        raise PipelineError(f"there is no map {name!r}", place=place, cure=cure)
+
+
+def check_streams(data: Data, names: Iterable[str], place: str) -> None:
+    """In `Operator.check`: PipelineError where no step makes a stream of this name."""
+    from zonda.core.signal import is_stream  # pictures are drawn without it
+
+    known = {*data.made, "signal"}
+    for name in names if data.made else ():
+        if name.partition("/")[0] not in known:
+            have = ", ".join(sorted(n for n in known if is_stream(n)))
+            raise PipelineError(f"there is no stream {name!r} at this step", place=place, cure=f"choose from: {have}")
 
 
 def plane_key(key: str, plane: str) -> str:

@@ -42,7 +42,7 @@ from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
 
 from .comparison.radial import tapered
-from .series import key_of, kinds_of_maps, plane_key
+from .series import check_map, key_of, kinds_of_maps, plane_key
 
 NOT_TAN, CURE = "a transfer function needs a TAN map of the signal", "leave nside, projection and contents of the map out"
 
@@ -94,6 +94,7 @@ class TransferFunction(Output):
 
     def check(self, data: Data) -> list[str]:
         """Raises PipelineError where the map that will be made cannot be compared."""
+        check_map(data, self.map, self.label)
         if kinds_of_maps(data).get(self.map, "TAN") != "TAN":
             raise PipelineError(NOT_TAN, place=self.label, cure=CURE)
         return []
