@@ -25,6 +25,10 @@ BEGINS = b"#time ra-"
 AZ_PRG, EL_PRG, AZ_REAL, EL_REAL, AZ_NO_COR, EL_NO_COR, COLUMNS = 2, 3, 4, 5, 13, 14, 17
 """Places of the columns behind the time; how many there are."""
 
+NAMES = {AZ_PRG: "az-prg", EL_PRG: "el-prg", AZ_REAL: "az-real", EL_REAL: "el-real", AZ_NO_COR: "az-prg(no-cor)",
+         EL_NO_COR: "el-prg(no-cor)"}  # fmt: skip
+"""What a log calls the columns that are read; it also writes `prog` for `prg`."""
+
 TYPES = {"SCAN": 0, "ON": 0, "ACC": flags.TURNAROUND, "TRAN": flags.TURNAROUND}
 """What the telescope did, and the flags of such a row; of others: `flags.IRREGULAR` (slews, off-source positions)."""
 
@@ -43,6 +47,8 @@ def read_log(path: Path, place: str) -> tuple[Instant, Floats, Floats, Floats, f
     with path.open(encoding="ascii", errors="replace") as file:
         for line, text in enumerate(file, 1):
             words = text.split()
+            if words[:1] == ["#time"]:
+                _check_names(words[1:], place)
             if not words or words[0].startswith("#") or words[-1] == END:
                 continue
             try:
@@ -64,6 +70,17 @@ def read_log(path: Path, place: str) -> tuple[Instant, Floats, Floats, Floats, f
     azimuth = table[:, AZ_NO_COR] + _difference(table[:, AZ_REAL], table[:, AZ_PRG])
     elevation = table[:, EL_NO_COR] + table[:, EL_REAL] - table[:, EL_PRG]
     return Instant(first * 1000), (np.array(moments) - first) * 1e-6, azimuth, elevation, np.array(bits, np.uint8)
+
+
+def _check_names(names: list[str], place: str) -> None:
+    for at, name in NAMES.items():
+        found = names[at].replace("prog", "prg") if at < len(names) else "nothing"
+        if found != name:
+            raise InputError(
+                f"column {at + 2} of the antenna log is {found}, where {name} is read",
+                place=place,
+                cure="give a log with the columns of ASTE, or a table of time, azimuth and elevation",
+            )
 
 
 def _difference(a: Floats, b: Floats) -> Floats:

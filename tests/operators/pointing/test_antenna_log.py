@@ -92,3 +92,14 @@ def test_bad_logs(tmp_path: Path, change: Any, message: str) -> None:
         observed(path)
     assert "bad.ant" in caught.value.place
     assert caught.value.cure
+
+
+def test_a_log_of_other_columns(tmp_path: Path) -> None:
+    """Its names are read, too: columns in another order would be other angles."""
+    lines, _, _ = rows()
+    path = tmp_path / "other.ant"
+    path.write_text(HEAD.replace("az-real el-real", "el-real az-real") + "\n" + "".join(lines) + END)
+    with pytest.raises(InputError, match="column 6 of the antenna log is el-real, where az-real is read"):
+        observed(path)
+    path.write_text(HEAD.replace("az-prg(no-cor)", "az-prog(no-cor)") + "\n" + "".join(lines) + END)
+    assert observed(path)
