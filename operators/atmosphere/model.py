@@ -215,6 +215,8 @@ class AtmosphereModel:
             emission = partial(self.band.emission, self.pwv)
             layers, rms = self.emitting, self.fluctuation.rms
             variance = self._variance(layers)
+            if not variance > 1e-12 * self.fluctuation.variance:  # of a saturated line only the air below is seen
+                layers, variance = self.layers, self.fluctuation.variance
             found = choose_resolution(self.observation, self.plane, layers, variance, tolerance, emission, rms)
             self._resolutions[tolerance] = found
         return self._resolutions[tolerance]
