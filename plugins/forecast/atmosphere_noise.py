@@ -24,7 +24,7 @@ from zonda.core.types import Floats
 from zonda.operators.atmosphere.planning import Calibrated, calibrated
 from zonda.operators.atmosphere.turbulence.geometry import ScanPlane, axes, crossing, rays, scan_planes
 
-from .survey import Survey, Track
+from .survey import Noise, Survey, Track
 
 WAVES = 320
 """Number of waves: with 96 the rms is wrong by half where the atmosphere is a small part of the noise (AtLAST); 1280 change it
@@ -45,12 +45,37 @@ NEGLIGIBLE = 1e-4
 
 
 @dataclass(frozen=True)
+class Mode:
+    """A singular mode of a scan that is found in the data, in place of the detectors' mean of equation (1).
+
+    Attributes
+    ----------
+    independent
+        Number of independent values of the common mode in a scan. Of few, the rest of the atmosphere varies with
+        it by chance, and goes with it: equation (1) is too high, by a half where there are nine.
+    turned
+        Variance [K^2] of the common mode that stays in a sample, in each detector by itself, because noise turns the mode.
+    """
+
+    independent: float
+    turned: float
+    noise: Noise
+    """It as noise of the detectors."""
+
+
+@dataclass(frozen=True)
 class Left:
     """Variance [K^2] after each scan, (n_scan,), and the relative standard error of its last value from the scatter of the
     waves."""
 
     variance: Floats
     error: float
+    mode: Mode | None = None
+
+
+def step_of_modes(survey: Survey) -> bool:
+    """Whether what detectors have in common is found in the data: equation (1), which takes their mean off, need not hold."""
+    return survey.common and survey.steps.common is not None and survey.steps.common.method == "svd"
 
 
 @dataclass(frozen=True)
@@ -75,22 +100,28 @@ def variance(survey: Survey, radius: float, waves: int = WAVES) -> Left:
     scans = _scans(survey, radius)
     shares = _expected(survey, found)
     total, spread = np.zeros(len(scans)), 0.0
+    some = _some(survey)
+    covariance, spectrum = np.zeros((len(some), len(some))), np.zeros(len(scans[0].track.index) // 2 + 1)
     share = np.array([s.sum() for s in shares]) * [k not in step.omit for k in range(len(shares))]
     rng = np.random.default_rng(3)
     for k in np.flatnonzero(share > NEGLIGIBLE * share.sum()).tolist():
         drawn, weights = _drawn(found, k, shares[k], max(8, round(waves * share[k] / share.sum())), rng)
-        each = _of_waves(survey, scans, found, k, drawn) * weights * (found.kelvin * found.layers[k].amplitude) ** 2
+        weights = weights * (found.kelvin * found.layers[k].amplitude) ** 2
+        each = _of_waves(survey, scans, found, k, drawn) * weights
+        if step_of_modes(survey):
+            part, power = _covariance(survey, scans[0], found, k, drawn, weights)
+            covariance, spectrum = covariance + part, spectrum + power
         total += each.sum(axis=1)
         spread += float(each[-1].size * each[-1].var())
     last = np.arange(len(scans), number)
     total = np.r_[total, total[-1] * survey.seconds[len(scans) - 1] / survey.seconds[last]]
-    return Left(total, math.sqrt(spread) / total[-1] if total[-1] > 0 else 0.0)
+    error = math.sqrt(spread) / total[-1] if total[-1] > 0 else 0.0
+    return Left(total, error, _mode(survey, covariance, spectrum) if total[-1] > 0 and step_of_modes(survey) else None)
 
 
 def _scans(survey: Survey, radius: float) -> list[_Scan]:
     """The first scans, at instants that resolve the beam's passages over the probes where there is time for that."""
-    needed = min(survey.rate, LARGEST)
-    rate = min(max(PER_CUT * survey.cut, needed, LEAST), survey.observations[0].sample_rate)
+    rate = _rate(survey)
     width = max(survey.sigma, 1.5 * survey.speed / rate / survey.fwhm * survey.sigma)
     density, reach, cell = _footprint(survey.offsets, width)
     angle = 2 * np.pi * (GOLDEN * np.arange(POINTS) % 1)
@@ -108,6 +139,11 @@ def _scans(survey: Survey, radius: float) -> list[_Scan]:
         jacobian = (corners[:, 1:] - corners[:, :1]) / little
         found.append(_Scan(track, plane, own, jacobian, seen * track.step, offsets, float(survey.weights[k])))
     return found
+
+
+def _rate(survey: Survey) -> float:
+    """Instants per second at which scans are followed, Hz."""
+    return min(max(PER_CUT * survey.cut, min(survey.rate, LARGEST), LEAST), survey.observations[0].sample_rate)
 
 
 def _footprint(offsets: Floats, sigma: float) -> tuple[Floats, float, float]:
@@ -170,7 +206,7 @@ def _of_waves(survey: Survey, scans: list[_Scan], found: Calibrated, layer: int,
     """(n_scan, n_wave) the square in equation (1) over (sum g)^2, after each scan, averaged over probes."""
     model = found.layers[layer]
     squares, amount = np.zeros((POINTS, len(waves))), np.zeros(POINTS)
-    some = survey.offsets[:: max(1, len(survey.offsets) // DETECTORS)]
+    some = _some(survey)
     rows = []
     for scan in scans:
         matrix, start, velocity = scan.plane.affine(model.height, model.wind)
@@ -192,3 +228,64 @@ def _of_waves(survey: Survey, scans: list[_Scan], found: Calibrated, layer: int,
         weighted = np.where(amount > 0, amount, np.inf)
         rows.append((squares / weighted[:, None]).sum(axis=0) / max(amount.sum(), 1e-300))
     return np.array(rows)
+
+
+def _some(survey: Survey) -> Floats:
+    """(n, 2) offsets of some detectors, which stand for all."""
+    return survey.offsets[:: max(1, len(survey.offsets) // DETECTORS)]
+
+
+def _covariance(
+    survey: Survey, scan: _Scan, found: Calibrated, layer: int, waves: Floats, weights: Floats
+) -> tuple[Floats, Floats]:
+    """(n, n) covariance [K^2] of a layer in the filtered samples of some detectors over a scan; spectrum of what they have in
+    common."""
+    model = found.layers[layer]
+    matrix, start, velocity = scan.plane.affine(model.height, model.wind)
+    path = matrix @ scan.crossings + start[:, None] + velocity[:, None] * scan.track.observation.seconds[scan.track.index]
+    phase = waves @ path
+    series = np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
+    survey.filter(scan.track, series)
+    energy = (np.abs(np.fft.rfft(series)) ** 2).reshape(2, len(waves), -1).sum(axis=0)
+    power = (series.astype(np.float64) ** 2).reshape(2, len(waves), -1).sum(axis=0).mean(axis=1)
+    seen = np.exp(1j * ((waves @ (matrix @ scan.jacobian)) @ _some(survey).T))
+    shared = weights * abs(seen.mean(axis=1)) ** 2
+    return np.asarray(((seen.conj().T * (power * weights)) @ seen).real), np.asarray(shared @ energy)
+
+
+def _mode(survey: Survey, covariance: Floats, spectrum: Floats) -> Mode:
+    """See `Mode`.
+
+    Noise of variance s^2, and of the spectrum R f_s / 2 at the frequencies of the common mode (on average over its power),
+    turns the mode of n detectors with the eigenvalue L in a scan of N samples by
+
+        <|du|^2> = (n - 1) R f_s / 2 (L + s^2) / L^2 / N                                                       (2)
+
+    (Anderson 1963 where it is white); that share of the common mode, which is L / n a sample, stays.
+    """
+    independent = 2 * float(spectrum.sum()) ** 2 / max(float((spectrum**2).sum()), 1e-300)
+    number, few, o = len(survey.offsets), len(covariance), survey.observations[0]
+    f = np.linspace(max(survey.cut, 1 / o.duration), o.sample_rate / 2, 4000)
+    own, shared = np.zeros_like(f), 0.0
+    for noise in survey.levels[0]:
+        each = noise.sample**2 / (o.sample_rate / 2) * (np.ones_like(f) if noise.spectrum is None else noise.spectrum(f))
+        own += (1 - noise.shared) * each
+        shared += noise.shared * float(np.trapezoid(each, f))
+    variance = float(np.trapezoid(own, f))
+    if not variance > 0:
+        return Mode(independent, 0.0, Noise(0.0))
+    values = 2 * o.duration * variance**2 / float(np.trapezoid(own**2, f))
+    eigenvalues, vectors = np.linalg.eigh(covariance + shared)
+    u, first = vectors[:, -1], max(float(eigenvalues[-1]), 1e-300) * number / few
+    step, second = survey.steps.common, variance * (1 + math.sqrt(number / values)) ** 2
+    if step is not None and step.on_undetermined == "mean" and second > first + variance:
+        return Mode(independent, 0.0, Noise(0.0))  # it is lost in the noise, far from determined: the detectors' mean is removed
+    track = survey.track(0, _rate(survey))
+    frequency = np.maximum(np.fft.rfftfreq(len(track.index), 1 / track.rate), f[0])
+    density = np.interp(frequency, f, own) * o.sample_rate / 2
+    along = float(spectrum @ density / spectrum.sum())
+    turned = (number - 1) * (first + variance) * along / first**2 / o.n_samples
+    stays = turned * float(u @ covariance @ u) / few
+    power = stays * spectrum / spectrum.sum() / (frequency[1] - np.fft.rfftfreq(len(track.index), 1 / track.rate)[0])
+    density = power * o.sample_rate / 2
+    return Mode(independent, stays, Noise(1.0, lambda at: np.interp(at, frequency, density, right=0.0)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +24,9 @@ PARTS = ("white", "1/f", "atmosphere")
 """What the noise is split into."""
 WITHIN = {"white": 0.05, "1/f": 0.05, "atmosphere": 0.25}
 """Relative error of each part's rms that audits found at most (docs/sensitivity.md); the atmosphere is indicative."""
+TURNED = 0.1
+"""Share of the atmosphere's variance from which what a turned mode leaves of it is not forecast: it is known to a
+factor of some in the rms only."""
 UNITS = ("K_RJ", "K_CMB", "Jy/beam", "MJy/sr", "Jy")
 """Units of a depth: ``Jy`` is the flux density of a point source, see `factors`."""
 PER_DECADE = (1.0, 2.0, 5.0)
@@ -59,6 +62,8 @@ class Depth:
     seconds: Floats
     variance: Mapping[str, Floats]
     error: Mapping[str, float]
+    reason: str = ""
+    """Why a part is not forecast."""
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -118,16 +123,28 @@ def depths_of(survey: Survey, radius: float) -> dict[str, Depth]:
         raise InputError(text, place="zonda sensitivity", cure=cure)
     left = atmosphere_noise.variance(survey, radius)
     # an error of a variance is half as large of its root
-    error = WITHIN | {"atmosphere": math.hypot(WITHIN["atmosphere"], left.error / 2)}
-    atmosphere = {"I": left.variance, "Q": np.zeros_like(left.variance), "U": np.zeros_like(left.variance)}
+    chance = left.mode.independent**-0.5 if left.mode else 0.0
+    error = WITHIN | {"atmosphere": math.hypot(WITHIN["atmosphere"], left.error / 2, chance)}
+    nothing, reason = np.zeros_like(left.variance), ""
+    atmosphere = {"I": left.variance, "Q": nothing, "U": nothing}
+    if left.mode and left.mode.turned and _stays(survey, left.mode, radius) > TURNED * left.variance[-1]:
+        atmosphere = dict.fromkeys(atmosphere, np.full_like(left.variance, np.nan))
+        reason = "noise turns the singular mode, which then leaves some of what all detectors see"
     if survey.polarized and left.variance.any() and not survey.cancels:
         atmosphere = dict.fromkeys(atmosphere, np.full_like(left.variance, np.nan))
+        reason = "the detectors at one place do not keep it out of Q and U"
     after = slice(int(known.argmax()), None)
     parts = {plane: each | {"atmosphere": atmosphere[plane]} for plane, each in variances.items()}
     return {
-        plane: Depth(survey.seconds[after], {part: values[after] for part, values in each.items()}, error)
+        plane: Depth(survey.seconds[after], {part: values[after] for part, values in each.items()}, error, reason)
         for plane, each in parts.items()
     }
+
+
+def _stays(survey: Survey, mode: atmosphere_noise.Mode, radius: float) -> float:
+    """Variance [K^2] in the map of what a turned mode leaves of the common mode: noise of each detector, of its spectrum."""
+    alone = replace(survey, levels=[(mode.noise,)] * len(survey.observations), steps=replace(survey.steps, common=None))
+    return float(detector_noise.variances(alone, radius)["1/f"][-1])
 
 
 def scatter(sigma: float, radius: float) -> float:

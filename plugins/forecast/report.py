@@ -87,8 +87,7 @@ def _errors(found: Forecast) -> list[str]:
     each = [f"{p} {100 * error[p]:.0f} %" for p in PARTS if found.depth.variance[p][-1] > 0]
     lines = [f"stated errors of the rms: {', '.join(each)}; together {100 * found.depth.total_error(found.seconds):.0f} %"]
     if found.depth.known != PARTS:
-        what = "the detectors at one place do not keep it out of Q and U"
-        lines.append(f"-: what is left of the atmosphere is not forecast, and comes on top: {what}")
+        lines.append(f"-: what is left of the atmosphere is not forecast, and comes on top: {found.depth.reason}")
     if found.depth.variance["atmosphere"][-1] > 0:
         lines.append("the atmosphere is indicative: one state of the weather, and pwv_rms is an assumption of the pipeline")
     lines.append(
