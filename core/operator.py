@@ -68,7 +68,8 @@ class Operator(Labelled):
     def check(self, data: Data) -> list[str]:
         """What `zonda check` finds out beyond the parameters, in well under a second: lines to print, or a `ZondaError`.
 
-        Pointing operators append (possibly coarser) observations to ``data``, on which later steps may look.
+        Pointing operators append observations to ``data``, on which later steps may look: of a long scan fewer instants, with
+        what the run will take in `Observation.seen_of` (`Observation.sampling`). ``data.made`` names what the steps make.
         """
         return []
 
