@@ -113,6 +113,13 @@ class Formed:
         return self.stream.partition("/")[2]
 
 
+def needed_name(signal: Signal) -> str:
+    """The name of a signal that an output asks for and no author has named, such as ``_sky_unfiltered``."""
+    parts = [*(signal.only or ["without", *(signal.without or ())])]
+    parts += ["unfiltered"] * (signal.filters == "none") + ["full"] * (signal.modes == "full")
+    return "_" + "_".join(parts)
+
+
 def can_be_named(name: str) -> bool:
     """Whether a pipeline's author may call a signal so; names that begin with an underscore are those of outputs."""
     return name.isidentifier() and not name.startswith("_")

@@ -12,7 +12,7 @@ from ..configuration.diagnostics import nearest
 from ..errors import PipelineError
 from ..operator import Operator
 from ..scene import Scene
-from ..signal import Signal
+from ..signal import Signal, needed_name
 from .contract import broken
 
 PRECISIONS = ("float32", "float64")
@@ -48,7 +48,7 @@ def runs(given: Any, name: str) -> dict[str, Signal]:
     for key, value in (given or {}).items():
         if not isinstance(value, Signal | Mapping):
             raise PipelineError(f"signal {key} is a dict, not {_what(value)}", place=name, cure=cure)
-        if isinstance(value, Signal) and str(key).startswith("_"):
+        if isinstance(value, Signal) and key == needed_name(value):
             continue  # of `Pipeline.runs`: its output asks for it again
         made[str(key)] = value if isinstance(value, Signal) else Signal(**value)
     return made

@@ -20,7 +20,7 @@ from ..mapmaker import MapMaker, acts, changes_components, filters, forms, with_
 from ..observation import Observation
 from ..operator import Operator
 from ..output import Output
-from ..signal import BUILT_IN, MAIN, TRANSMISSION, Component, Formed, Signal, can_be_named, is_signal, stream_of
+from ..signal import BUILT_IN, MAIN, TRANSMISSION, Component, Formed, Signal, can_be_named, is_signal, needed_name, stream_of
 
 MOST_PARTS = 4
 """Signals that may be taken from the complete one: each adds its rounding."""
@@ -166,9 +166,7 @@ class Signals:
                 elif same:
                     names.append(same[0])
                 else:
-                    parts = [*(wanted.only or ["without", *(wanted.without or ())])]
-                    parts += ["unfiltered"] * (wanted.filters == "none") + ["full"] * (wanted.modes == "full")
-                    names.append("_" + "_".join(parts))
+                    names.append(needed_name(wanted))
                     self.runs[names[-1]] = wanted
             operator._shown = tuple(names)
 

@@ -78,6 +78,9 @@ class ToyPointing(Operator):
     scans: int = Field(1, ge=1, le=64)
     """Number of scans."""
 
+    def observe(self, data: Any) -> None:
+        """Not looked at by tests of the configuration."""
+
 
 class ToySky(Operator):
     """A sky."""
@@ -86,6 +89,9 @@ class ToySky(Operator):
     provides = frozenset({"sky"})
     file: InputPath | None = None
     """Input map."""
+
+    def exec(self, block: Any, state: Any) -> None:
+        """See `ToyPointing.observe`."""
 
 
 class ToyNoise(Operator):
@@ -96,6 +102,9 @@ class ToyNoise(Operator):
     knee: Hertz = quantity("0.5 Hz", gt=0)
     """Knee."""
 
+    def exec(self, block: Any, state: Any) -> None:
+        """See `ToyPointing.observe`."""
+
 
 class ToySum(Operator):
     """Calibrated sum."""
@@ -103,6 +112,9 @@ class ToySum(Operator):
     requires = frozenset({"boresight"})
     optional = frozenset({"sky", "white"})
     provides = frozenset({"signal"})
+
+    def exec(self, block: Any, state: Any) -> None:
+        """See `ToyPointing.observe`."""
 
 
 class ToyMap(Operator):
@@ -112,6 +124,9 @@ class ToyMap(Operator):
     provides = frozenset({"map"})
     pixel: Angle = quantity("2 arcsec", gt=0)
     """Pixel size."""
+
+    def exec(self, block: Any, state: Any) -> None:
+        """See `ToyPointing.observe`."""
 
 
 def toy_camera() -> Instrument:

@@ -136,7 +136,8 @@ def test_sensitivity_of_each_band(path: Path, tmp_path: Path) -> None:
     for name in NAMES:
         alone = zonda.sensitivity(str(path), settings=[f"instrument.band={name}"])
         for part in ("white", "1/f", "atmosphere"):
-            assert found[name].rms(part=part) == alone.rms(part=part) > 0
+            assert found[name].rms(part=part) == pytest.approx(alone.rms(part=part), rel=0, abs=0, nan_ok=True)
+            assert part == "atmosphere" or found[name].rms(part=part) > 0  # behind a singular mode there is no forecast of it
         assert found[name].factors == alone.factors
         assert found[name].radius == alone.radius
     assert found.reach("1 mK") == max(found[name].reach("1 mK") for name in NAMES)
@@ -151,7 +152,11 @@ def test_sensitivity_of_each_band(path: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", ["separate"], indirect=True)
 def test_depths_of_arrays_side_by_side_are_as_simulated(path: Path) -> None:
-    """Within 4 standard errors; the array is 7.5 arcmin beside the boresight, which is where the circle is."""
+    """Within 4 standard errors; the array is 7.5 arcmin beside the boresight, which is where the circle is.
+
+    Behind the detectors' mean: noise would turn a singular mode, and of what that leaves there is no forecast.
+    """
+    path.write_text(path.read_text().replace("CommonModeFilter", "CommonModeFilter: {method: mean}"))
     found = zonda.sensitivity(str(path), radius="8 arcmin").audited(6, threads=1)
     for name in NAMES:
         rows = found[name].audit.rows

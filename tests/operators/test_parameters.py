@@ -18,6 +18,7 @@ import h5py
 import healpy
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
@@ -98,11 +99,23 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     header["BUNIT"] = "Jy/beam"
     fits.PrimaryHDU(values, header).writeto(folder / "beam.fits")
     healpy.write_map(folder / "sphere.fits", np.arange(12.0 * 64**2), coord="C", column_units="uK_CMB", dtype=np.float64)
+    middle = SkyCoord(75, 20, unit="deg")
+    near = [  # where the target is, if these are equatorial coordinates and if they are galactic ones
+        healpy.query_disc(8192, healpy.ang2vec(lon.deg, lat.deg, lonlat=True), np.radians(0.15))
+        for lon, lat in ((middle.ra, middle.dec), (middle.galactic.l, middle.galactic.b))
+    ]
+    columns = [fits.Column("PIXEL", "K", array=np.concatenate(near))]
+    for name, power in (("SIGNAL", 1), ("OTHER", 2)):
+        columns.append(fits.Column(name, "D", unit="K_RJ", array=np.linspace(0.1, 1, sum(map(len, near))) ** power))
+    fine = fits.BinTableHDU.from_columns(columns)
+    fine.header.update(PIXTYPE="HEALPIX", ORDERING="RING", NSIDE=8192, COORDSYS="C", INDXSCHM="EXPLICIT", OBJECT="PARTIAL")
+    fits.HDUList([fits.PrimaryHDU(), fine]).writeto(folder / "fine.fits")
     for name, minute in (("night", "00"), ("later", "05")):
         row = f"2024-11-25 07:{minute}:00 | 2024-11-25 07:{minute}:30 | 0 | patch | 120 | 124 | 50 | 0 | 0"
         (folder / f"{name}.txt").write_text(f"green_bank | dish | 38.4 | -79.8 | 818\n{row}\n")
     multipoles = np.arange(2, 1500)
     np.savetxt(folder / "theory.txt", np.stack([multipoles, 1e6 / multipoles], axis=1))
+    np.savetxt(folder / "two.txt", np.stack([multipoles, np.full(len(multipoles), 2e3), np.full(len(multipoles), 1e3)], axis=1))
     np.savetxt(folder / "flat.txt", np.stack([multipoles, np.full(len(multipoles), 1e3)], axis=1))
     for name, flux in (("sources", 1.0), ("others", 2.0)):
         (folder / f"{name}.csv").write_text(f"ra [deg],dec [deg],flux [Jy],spectral_index\n75,20,{flux},-0.7\n")
@@ -267,6 +280,9 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "spectrum": ({}, {"spectrum": "flat.txt"}),
         "nside": ({}, {"nside": 512}),
         "realization": ({}, {"realization": 1}),
+        "columns": ({"spectrum": "two.txt", "columns": "TT, EE"}, {"columns": "EE, TT"}),
+        "unit": ({"spectrum": "flat.txt", "unit": "uK^2"}, {"unit": "K^2"}),
+        "scaling": ({"unit": "uK^2"}, {"scaling": "none"}),
     },
     "PointSources": {
         "catalogue": ({}, {"catalogue": "others.csv"}),
@@ -320,6 +336,7 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "plane": ({"file": "cube.fits", "plane": 1}, {"plane": 2}),
         "polarization_convention": ({"file": "iqu.fits", "polarization_convention": "cosmo"}, {"polarization_convention": "iau"}),
         "hdu": ({"file": "two.fits"}, {"hdu": "second"}),
+        "column": ({"file": "fine.fits"}, {"column": "other"}),
         "beam": ({}, {"beam": "none"}),
         "fwhm": ({}, {"fwhm": "12 arcsec"}),
         "outside": ({"pixel_size": "1 arcsec"}, {"outside": "1 K"}),
@@ -497,6 +514,9 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "map": ({}, {"map": "chart"}),
         "reference": ({}, {"reference": "map"}),
         "file": ({}, {"file": "map.fits"}),
+        "plane": ({"file": "cube.fits", "plane": 1}, {"plane": 2}),
+        "hdu": ({"file": "two.fits"}, {"hdu": "second"}),
+        "coordsys": ({"file": "fine.fits"}, {"coordsys": "galactic"}),
         "beam": ({}, {"beam": "20 arcsec"}),
         "least_coverage": ({}, {"least_coverage": 0.6}),
         "threshold": ({}, {"threshold": 3.0}),
@@ -579,7 +599,7 @@ CHAINS = {
 DEFAULTS: dict[str, dict[str, Any]] = {
     "SkyMap": {"file": "map.fits"},
     "PointSources": {"catalogue": "sources.csv"},
-    "CMBSky": {"spectrum": "theory.txt", "nside": 256},
+    "CMBSky": {"spectrum": "theory.txt", "nside": 256, "scaling": "l(l+1)/2pi"},
     "AtmosphereLayers": {"pwv": "7.7 mm"},
     "WhiteNoise": {},
     "BinMap": {"pixel": "4 arcsec"},

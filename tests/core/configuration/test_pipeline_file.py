@@ -85,6 +85,9 @@ def test_resolved_yaml_leaves_out_defaults_that_do_not_apply(toys: Any) -> None:
                 raise ValueError("ordering belongs to nside")
             return self
 
+        def exec(self, block: Any, state: Any) -> None:
+            """Reads nothing."""
+
     text = toys.head + "operators: [ToyPointing: {duration: 1 s}, ToyGrid: , ToyGrid: {nside: 64}]\n"
     file = parse(text)
     resolved = file.resolved_yaml()

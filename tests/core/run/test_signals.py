@@ -106,6 +106,9 @@ class Unsaid(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
 
+    def exec(self, block: Any, state: Any) -> None:
+        """Leaves all as it is."""
+
 
 MAP = zonda.SkyMap(file=Path(zonda.__file__).parent / "pipelines" / "data" / "merging_cluster.fits")
 
@@ -771,6 +774,9 @@ def test_outputs_ask_for_signals():
 
         def signals(self) -> tuple[Signal, ...]:
             return Signal(only=["sky"], modes="full"), Signal(only=["sky"], filters="none")
+
+        def finalize(self, data: Any) -> None:
+            """Writes nothing."""
 
     sky = Sky()
     points, sky._values = scenes.Points(), streams()[0]

@@ -72,7 +72,7 @@ def test_a_table_of_a_billion_columns(tmp_path: Path) -> None:
 
 
 def test_texts_instead_of_numbers(tmp_path: Path) -> None:
-    refused(table(tmp_path / "map.fits", ["warm"] * 12, "4A"), "cannot be read as FITS: could not convert")
+    refused(table(tmp_path / "map.fits", ["warm"] * 12, "4A"), "column T holds no numbers")
 
 
 @pytest.mark.parametrize("unit", ["NaN", "1E400", "T", "''"])

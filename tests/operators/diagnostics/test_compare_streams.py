@@ -117,7 +117,7 @@ def test_a_mean_beside_the_stream_counts(make_observation, data):
 def test_a_run_and_its_files(tmp_path):
     """Spectra are those of `PowerSpectrum`; tables, pictures and the report; streams of other units have no difference."""
     steps = [
-        zonda.AtmosphereLayers(pwv="5 mm", outputs=["pwv"]),
+        zonda.AtmosphereLayers(pwv="5 mm", outputs=["pwv"], layer_response="column"),
         zonda.WhiteNoise(),
         zonda.Efficiency(),
         zonda.CompareStreams(segment="2 s"),
