@@ -57,6 +57,11 @@ FINER = 1.25
 """Points of a grid over which pixels are spread, in those that are asked for: 5 per FWHM err by 6e-4 of a peak, 4 by 2e-3."""
 NARROWEST = 8
 """Shortest side of pixels that are not skipped, as a part of their nominal one. (Near a pole those of CAR have none.)"""
+CLOSED = 1.3
+"""Pixels per FWHM, where they are looked at, from which a sum over them leaves no gaps: a uniform sky is so to
+2 exp(-2 pi^2 (sigma / pixel)^2) = 0.5 %."""
+ALIKE = 1.01
+"""Ratio of sides up to which these count as the nominal ones."""
 LOOKED_AT = 256, 37
 """Instants of a scan and detectors of which it is looked up where they are on a map, at most."""
 
@@ -195,11 +200,11 @@ def tangent_grid(
     """
     narrow, wide = widths
     spread = None
-    if is_resolved(source, narrow):
+    side, longest = sides_seen(source, observation)
+    if _resolves(min(longest, float(nominal_sides(source).max())), narrow) and narrow >= CLOSED * longest:
         step = narrow / points / FINER
-        spread = Spread.of(narrow, float(nominal_sides(source).max()), step)
+        spread = Spread.of(narrow, longest, step)
     else:
-        side = shortest_side(source, observation)
         step = float(np.clip(narrow / points, side / 4, side if isinstance(source, WcsMap) else side / 1.5))
     found = region(observation, step, REACH * SIGMA * wide, _disc(source), place)
     ra, dec = observation.centre
@@ -212,7 +217,11 @@ def tangent_grid(
 
 def is_resolved(source: WcsMap | HealpixMap, fwhm: float) -> bool:
     """Whether a beam of ``fwhm`` [rad] is at least 2 pixels of the map wide, by the header's scale."""
-    return bool(fwhm > 0 and fwhm >= SMOOTH_BELOW * nominal_sides(source).max())
+    return _resolves(float(nominal_sides(source).max()), fwhm)
+
+
+def _resolves(side: float, fwhm: float) -> bool:
+    return bool(fwhm > 0 and fwhm >= SMOOTH_BELOW * side)
 
 
 def nominal_sides(source: WcsMap | HealpixMap) -> Floats:
@@ -222,23 +231,30 @@ def nominal_sides(source: WcsMap | HealpixMap) -> Floats:
     return np.asarray(np.radians(np.linalg.norm(np.asarray(source.wcs.pixel_scale_matrix), axis=0)))
 
 
-def shortest_side(source: WcsMap | HealpixMap, observation: Observation) -> float:
-    """The shortest side of a pixel [rad] where an observation looks, rounded down in steps of 2^(1/2); `NARROWEST` at least."""
-    nominal = float(nominal_sides(source).min())
+def sides_seen(source: WcsMap | HealpixMap, observation: Observation) -> tuple[float, float]:
+    """The shortest width and the longest side of pixels [rad] where an observation looks; those of the header where it looks
+    beside the map.
+
+    The former is rounded down in steps of 2^(1/2) of the nominal one (`NARROWEST` at least), the latter up in steps of 2^(1/8),
+    `ALIKE` apart.
+    """
+    least, most = float(nominal_sides(source).min()), float(nominal_sides(source).max())
     if isinstance(source, HealpixMap):
-        return nominal
+        return least, most
     plane = observation.focalplane
-    at, of = (slice(None, None, -(-n // most)) for n, most in zip((observation.n_samples, len(plane)), LOOKED_AT, strict=True))
+    at, of = (slice(None, None, -(-n // limit)) for n, limit in zip((observation.n_samples, len(plane)), LOOKED_AT, strict=True))
     d = directions(observation.sky_boresight[at], plane.xi[of], plane.eta[of]).reshape(-1, 3)
     sky = ImageOnSky(source)
     x, y, inside = sky.at(d)
     if not inside.any():
-        return nominal
+        return least, most
     xx, xy, yy = sky.grid.metric(x[inside], y[inside])
     half, rest = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
-    found = np.sqrt(np.maximum(half - rest, 0.0))
-    ratio = float(np.nanmin(found, initial=nominal)) / nominal
-    return nominal * float(max(2.0 ** (math.floor(2 * math.log2(max(ratio, 1e-9)) + 1e-6) / 2), 1 / NARROWEST))
+    narrow = float(np.nanmin(np.sqrt(np.maximum(half - rest, 0.0)), initial=least)) / least
+    long = np.sqrt(np.maximum(xx, yy))
+    wide = float(np.max(long[np.isfinite(long)], initial=0.0)) / most or 1.0
+    steps = math.floor(2 * math.log2(max(narrow, 1e-9)) + 1e-6), math.ceil(8 * math.log2(wide / ALIKE))
+    return least * float(max(2.0 ** (steps[0] / 2), 1 / NARROWEST)), most * float(2.0 ** (steps[1] / 8))
 
 
 def _frame(source: WcsMap | HealpixMap, place: str) -> Floats:

@@ -195,6 +195,24 @@ def test_steep_passbands_weigh_the_noise_with_their_square(tmp_path):
     np.testing.assert_allclose(net, expected, rtol=1e-3)  # 0.13 % wide
 
 
+@pytest.mark.parametrize("rows", ["80 0\n90 1\n130 0\n", "80 1\n130 1\n", "80 1\n130 0.2\n"])
+@pytest.mark.parametrize("efficiency", [0.0, 0.9])
+def test_passbands_of_few_rows(tmp_path, rows, efficiency):
+    """The photons' energy changes along a straight line of the table: equations (1) to (3) on 40 001 points."""
+    path = tmp_path / "band.txt"
+    path.write_text(rows)
+    band, eta = Band(name="b", file=path), 0.05
+    nu = np.linspace(80e9, 130e9, 40_001)
+    t, load = np.interp(nu, band.frequency, band.transmission), 12 + 0.8 * rayleigh_jeans(nu, T_CMB)
+    n, bunching = (1, (1 + efficiency**2) / 2) if efficiency else (2, 1)
+    power = eta * n * t * BOLTZMANN * load
+    nep2 = 2 * np.trapezoid(PLANCK * nu * power, nu) + 2 * bunching / n * np.trapezoid(power**2, nu)
+    expected = np.sqrt(nep2 / 2) / (eta * n * BOLTZMANN * np.trapezoid(t, nu))
+    model = BackgroundLimited(optical_efficiency=eta)
+    net = model.net_of_load(band, np.array([12.0]), np.array([0.8]), np.array([efficiency]))
+    np.testing.assert_allclose(net, expected, rtol=5e-5)  # 1 / 12 n^2 of 40 / 110, n = 32, in the square
+
+
 def test_what_another_step_emits_is_taken_to_be_flat():
     band = Band(name="b", low="140 GHz", high="160 GHz")
     spectra = LoadSpectra(

@@ -67,6 +67,8 @@ def header_of(made, kind, dec, sides=(1.0, 1.0), rotation=0.0, shape=(90, 90), u
     header["PC1_1"], header["PC1_2"], header["PC2_1"], header["PC2_2"] = c, -s, s, c
     if kind in ("CAR", "CEA", "MOL", "AIT", "SFL", "MER", "CYP", "PAR"):  # whose own reference lies on the equator
         lat, header["CRVAL2"] = header["CRVAL2"], 0.0
+        if kind == "CEA":  # 1 / cos as high
+            header["CDELT2"] *= np.cos(np.radians(lat))
         if kind == "CYP":
             header["PV2_1"], header["PV2_2"] = 1.0, 0.8
         x, y = WCS(header).wcs_world2pix(header["CRVAL1"] + 5 / 60, lat, 1)  # a little beside the central meridian
@@ -96,6 +98,36 @@ def test_one_bright_pixel(made, save, kind, dec, sides, rotation):
         expected = factor * beam(d, pixel, fwhm)[:, 0]
         # 5 points of the grid per FWHM err by 6e-4; TAN images with 2.4 pixels, of which they are halves: 4.8
         np.testing.assert_allclose(got, expected, atol=(3e-3 if kind == "TAN" else 1e-3) * expected[0])
+
+
+@pytest.mark.parametrize("dec", [60.0, 80.0])
+@pytest.mark.parametrize("kind", ["MER", "CAR", "CEA"])
+def test_whether_pixels_are_resolved_is_asked_where_they_are(made, save, kind, dec):
+    """Pixels that are larger by the header than where they are looked at (MER, CAR of CDELT1 = 1 / cos) are summed up; those
+    that are larger there (CEA: 1 / cos as high) are smooth between their centres and leave no gaps."""
+    header = header_of(made, kind, dec, (1.0, 1.0))
+    if kind != "CEA":
+        factor = 1 / np.cos(np.radians(dec))
+        header["CDELT1"] *= factor
+        header["CDELT2"] *= factor if kind == "MER" else 1.0
+        x, y = WCS(header).wcs_world2pix(75.0, dec, 1)
+        header["CRPIX1"] += 45 - float(x)
+        header["CRPIX2"] += 45 - float(y)
+    else:
+        header["CDELT2"] = -header["CDELT1"]
+        header["CRPIX2"] += 45 - float(WCS(header).wcs_world2pix(75.0, dec, 1)[1])
+        header["BUNIT"] = "K_RJ"
+    wcs, fwhm = WCS(header), 2.4 * ARCMIN
+    values = np.ones((90, 90)) if kind == "CEA" else np.zeros((90, 90))
+    values[44, 47] = 1.0
+    pixel = directions(wcs, np.array([47]), np.array([44]))
+    d = np.concatenate([pixel, around(pixel[0], 1.3 * fwhm)])
+    got = seen(made, SkyMap(file=save(values, header)), d, fwhm)
+    if kind == "CEA":
+        np.testing.assert_allclose(got, 1.0, atol=1e-3)
+    else:
+        expected = to_kelvin_rj("Jy/beam", made.BAND, None, 0.0, 1.0) * beam(d, pixel, fwhm)[:, 0]
+        np.testing.assert_allclose(got, expected, atol=1e-3 * expected[0])
 
 
 @pytest.mark.parametrize("frame", ["RA", "GLON"])
