@@ -94,9 +94,15 @@ def float32_states() -> float:
         out = np.zeros((16, n), np.float32)
         Streams(law, stream_key(7, "a"), stream_key(7, "b")).add(0, 0, out)
         exact = normals(stream_key(7, "a"), 0, 16 * n).reshape(n, 16).T.astype(np.float64)
-        first = law.start @ normals(stream_key(7, "b"), 0, 8 * 16).reshape(8, 16)
-        for q, z, s in zip(law.poles, law.zeros, first, strict=True):
+        states = len(law.start)
+        first = law.start @ normals(stream_key(7, "b"), 0, states * 16).reshape(states, 16)
+        for q, z, s in zip(law.poles, law.zeros, first[: law.poles.size], strict=True):
             exact, _ = lfilter([1, z - 1], [1, q - 1], exact, axis=1, zi=((z - q) * s)[:, None])
+        pairs = zip(law.pairs, first[law.poles.size :].reshape(-1, 2, 16), strict=True)
+        for (real, imaginary, of_real, of_imaginary), (re, im) in pairs:  # equation (3) of `one_over_f`
+            q = complex(real, imaginary)
+            inside, _ = lfilter([0, 1], [1, q - 1], exact, axis=1, zi=(re + 1j * im)[:, None])
+            exact = exact + of_real * inside.real + of_imaginary * inside.imag
         worst = largest(worst, float((out - exact).std() / exact.std()))
     return worst
 
