@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..data import Data, Observation
-from ..mapmaker import filters, made_by
+from ..mapmaker import made_by
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
@@ -19,8 +19,7 @@ from ..scene import Scene
 from ..signal import is_stream
 from .context import Context, Depth
 from .coverage import cover
-from .estimate import Traits
-from .planning import Planning, planning_class, planning_of
+from .planning import planning_of
 from .structure import Structure, work
 
 LOOKED_AT = 4
@@ -59,21 +58,13 @@ def look(pipeline: Pipeline, scene: Scene, structure: Structure, band: str = "")
             operator.configure(observation)
     streams = frozenset().union(*((o.optional | o.requires) - {"signal"} for o in operators if o.label in readers))
     context = Context(data.scene, data.observations, operators, acting, readers=readers, kept_streams=streams, band=band)
-    context.traits = {o.label: _traits(o, context.lowest) for o in operators}
+    context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
     context.depth = _depth(operators, shown, context)
     pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]
     if pixels:
         context.coverage = cover(data.observations, min(pixels))
     context.metrics = _metrics(pipeline, structure, context)
     return context
-
-
-def _traits(operator: Operator, observation: Observation) -> Traits:
-    """Those that its planning states. A filter that has none may find what it removes in the data, or do anything with them."""
-    unknown = planning_class(type(operator)) is Planning and filters(operator)
-    if unknown and (operator.couples == "all" or not operator.linear):
-        return Traits(turns=True)
-    return planning_of(operator).traits(observation)
 
 
 def _some(observations: Sequence[Observation]) -> list[Observation]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 from ..knobs import Knob
+from ..mapmaker import filters
 from ..operator import Operator
 from ..registry import RegistryError, planning
 from .estimate import Cost, Estimate, Traits
@@ -51,9 +52,11 @@ class Planning(Generic[O]):
     def traits(self, observation: Observation) -> Traits:
         """What other operators' bounds need to know of this one (noise, pixels, filters).
 
-        Called after `Operator.configure`, before anything is prepared; ``observation`` has its pointing.
+        Called after `Operator.configure`, before anything is prepared; ``observation`` has its pointing. A filter of which
+        nothing is stated, and that couples all samples or is not linear, may find what it removes in the data.
         """
-        return Traits()
+        own = self.operator
+        return Traits(turns=filters(own) and (own.couples == "all" or not own.linear))
 
     def estimate(self, context: Context) -> Estimate:
         """Upper bounds on what its effects contribute, coarser forms of them, and what it costs."""
