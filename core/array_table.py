@@ -50,14 +50,17 @@ ALIASES = {
 """What sotodlib, so3g and TOAST call columns: their gamma runs from eta towards xi, as `Focalplane.polarization_angle` does."""
 LEAKAGE = "pol_leakage"
 """TOAST's cross-polar leakage e, in place of the efficiency (1 - e) / (1 + e)."""
-NOT_READ = {
-    "psd_net": "write net: on the sky, after calibration, in K_RJ s(1/2) (TOAST's is of the CMB's temperature)",
-    "psi": "write polarization_angle, from eta towards xi", "theta": "write xi and eta", "phi": "write xi and eta",
-    "quat": "write xi, eta and polarization_angle", "pol": "write polarization_angle, from eta towards xi",
-    "pol_x": "write polarization_angle, from eta towards xi", "pol_y": "write polarization_angle, from eta towards xi",
-    "x": "write xi", "y": "write eta", "nep": "write net", "tau": "remove it, and give the step of the time constant a value",
+ANGLE, PLACE = ("polarization_angle",), ("xi", "eta")
+NOT_READ: dict[str, tuple[tuple[str, ...], str]] = {
+    "psd_net": (("net",), "write net: on the sky, after calibration, in K_RJ s(1/2) (TOAST's is of the CMB's temperature)"),
+    **dict.fromkeys(("psi", "pol", "pol_x", "pol_y"), (ANGLE, "write polarization_angle, from eta towards xi")),
+    **dict.fromkeys(("theta", "phi"), (PLACE, "write xi and eta")),
+    "quat": (PLACE + ANGLE, "write xi, eta and polarization_angle"),
+    "x": (("xi",), "write xi"), "y": (("eta",), "write eta"), "nep": (("net",), "write net"),
+    "tau": ((), "remove it, and give the step of the time constant a value"),
 }  # fmt: skip
-"""Columns that say where detectors look, or how well, in ways that are not read, with the cure."""
+"""Columns that say where detectors look, or how well, in ways that are not read. Of each the columns of ours beside which it is
+not needed (none: it is always refused), and the cure."""
 OF_INSTRUMENT = ("fwhm", "main_beam_efficiency", "illumination_efficiency", "net", "knee", "slope", "pink_minimum_frequency")
 """Columns of what an instrument or a band states for all of its detectors."""
 
@@ -192,6 +195,7 @@ def _read(path: Path, changed: int, size: int) -> ArrayTable:
 def _by_known_names(table: Table, mistakes: Mistakes) -> tuple[Table, list[str]]:
     """The table with our names for columns that others call otherwise (`ALIASES`), and notes of them."""
     columns, notes = dict[str, tuple[list[str], str]](), list[str]()
+    there = {ALIASES.get(written.lower(), written) for written in table.columns}
     for written, column in table.columns.items():
         own = written if written in (*TEXTS, *QUANTITIES) else ALIASES.get(written.lower(), written)
         if own != written and (own in table.columns or own in columns):
@@ -202,8 +206,9 @@ def _by_known_names(table: Table, mistakes: Mistakes) -> tuple[Table, list[str]]
                 continue
         if own != written:
             notes.append(f"{written} is read as {own}")
-        if own.lower() in NOT_READ:
-            mistakes.add(table.lines[-1], f"has a column {written!r}, which is not read", NOT_READ[own.lower()])
+        instead, cure = NOT_READ.get(own.lower(), ((), ""))
+        if cure and not (instead and there.issuperset(instead)):
+            mistakes.add(table.lines[-1], f"has a column {written!r}, which is not read", cure)
         columns[own] = column
     return replace(table, columns=columns), notes
 
@@ -238,7 +243,9 @@ def _check_columns(table: Table, mistakes: Mistakes) -> None:
     """Those that a table must have are there, and none is misspelt."""
     known = (*TEXTS, *QUANTITIES, LEAKAGE)
     misspelt = {
-        c: hint for c in table.columns if c not in known and (hint := nearest(c, [k for k in known if k not in table.columns]))
+        c: hint
+        for c in table.columns
+        if c not in known and c.lower() not in NOT_READ and (hint := nearest(c, [k for k in known if k not in table.columns]))
     }
     for column, hint in misspelt.items():
         mistakes.add(table.lines[-1], f"has an unknown column {column!r}", hint)

@@ -189,7 +189,16 @@ def test_what_was_read_under_another_name_and_what_was_not_is_told(tmp_path: Pat
     assert ("camera", "focal plane", told) in list(mapped(CAMERA | {"focalplane": str(table)}).tally)
 
 
+def test_columns_that_say_again_what_ours_say_are_left_out(tmp_path: Path) -> None:
+    """Places in mm beside xi and eta, TOAST's NET beside net."""
+    table = written(tmp_path / "a.csv", f"{HEAD}, x [mm], y [mm], net [mK s(1/2)], psd_net", ["a, 0, 0, 1, 2, 3, 4"])
+    assert zonda.Instrument(**CAMERA, focalplane=str(table)).notes == {"focal plane": "not used: x, y, psd_net"}
+
+
 FAULTS = [
+    ("name, x [mm], y [mm]", ["a, 1, 2"], "has a column 'x', which is not read", "write xi"),
+    (f"{HEAD}, quat", ["a, 0, 0, 1"], "has a column 'quat', which is not read", "polarization_angle"),
+    (f"{HEAD}, tau [s]", ["a, 0, 0, 1"], "has a column 'tau', which is not read", "remove it"),
     (f"{HEAD}, gamma", ["a, 0, 0, 0"], "polarization_angle has no unit", "deg"),
     (f"{HEAD}, gamma [deg], polarization_angle [deg]", ["a, 0, 0, 0, 0"], "has 'gamma' beside", "remove one"),
     (f"{HEAD}, gamma [rad]", ["a, 0, 0, 0", "b, 0, 0, 90"], "goes to 90 rad", "unit of the angles"),
