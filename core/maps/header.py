@@ -22,6 +22,7 @@ _SAME = {
 """What CASA, AIPS and others write: RADESYS and equinox."""
 _NUMBERS = re.compile(r"(CRPIX|CRVAL|CDELT|CROTA)[12]|(CD|PC)[12]_[12]|LONPOLE|LATPOLE|PV[12]_\d+|EQUINOX|EPOCH")
 """Cards of world coordinates that are numbers: astropy takes a default for one that is none."""
+_IN_DEGREES = {"rad": math.degrees(1.0), "arcmin": 1 / 60, "arcsec": 1 / 3600, "mas": 1 / 3.6e6}
 _EQUATORIAL = ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH")
 
 
@@ -82,9 +83,11 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
             del made[key]
         elif key in ("CUNIT1", "CUNIT2"):
             text(made, key, place)
-    for key in ("CRVAL1", "CRVAL2"):
-        if abs(number(made, key, place) or 0.0) > 720.0:
-            raise InputError(f"{key} = {made[key]:g} is no longitude or latitude in degrees", place=place, cure=f"correct {key}")
+    for axis in "12":
+        key, unit = f"CRVAL{axis}", text(made, f"CUNIT{axis}", place) or "deg"
+        if abs(number(made, key, place) or 0.0) * _IN_DEGREES.get(unit.lower(), 1.0) > 720.0:
+            cure = f"correct {key}, or the unit CUNIT{axis}"
+            raise InputError(f"{key} = {made[key]:g} {unit} is no longitude or latitude", place=place, cure=cure)
     kinds = {str(header.get(f"CTYPE{axis}", "")).strip().upper()[:4] for axis in "12"}
     if kinds == {"GLON", "GLAT"}:
         for key in _EQUATORIAL:

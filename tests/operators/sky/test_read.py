@@ -125,6 +125,19 @@ def test_radians_and_degrees_agree(made, save, unit):
     np.testing.assert_allclose(pixel_matrix(radians.wcs), pixel_matrix(degrees.wcs), rtol=1e-11, atol=1e-8)
 
 
+@pytest.mark.parametrize(("unit", "size"), [("arcsec", 3600), ("arcmin", 60), ("mas", 3.6e6)])
+def test_coordinates_in_parts_of_a_degree_are_read(made, save, unit, size):
+    degrees = made.tan_header((20, 30), crpix=(7.0, 9.0))
+    header = degrees.copy()
+    for key in ("CRVAL1", "CRVAL2", "CDELT1", "CDELT2"):
+        header[key] *= size
+    header["CUNIT1"] = header["CUNIT2"] = unit
+    found, right = read_map(save(np.zeros((20, 30)), header, "p.fits")), read_map(save(np.zeros((20, 30)), degrees, "d.fits"))
+    np.testing.assert_allclose(pixel_matrix(found.wcs), pixel_matrix(right.wcs), rtol=1e-11, atol=1e-8)
+    header["CRVAL1"] = 721.0 * size
+    refused(save(np.zeros((20, 30)), header, "f.fits"), "CRVAL1 =", "no longitude or latitude", "CUNIT1")
+
+
 def test_cd_pc_and_cdelt_agree(made, save):
     plain = made.tan_header((20, 30), CROTA2=20.0)
     c, s = np.cos(np.radians(20)), np.sin(np.radians(20))
