@@ -51,7 +51,7 @@ def _methods(operator: Operator) -> tuple[str, str] | None:
         if not callable(method):
             return f"{stage} is a method, not {method!r:.60}", f"write {head}: ..."
         try:
-            inspect.signature(method).bind(operator, *arguments.split(", "))
+            inspect.signature(getattr(operator, stage)).bind(*arguments.split(", "))
         except TypeError:
             return f"{stage} does not take {arguments}", f"write {head}: ..."
         except ValueError:  # a method of compiled code

@@ -27,6 +27,15 @@ def method(*arguments: str) -> Any:
     return eval(f"lambda {', '.join(('self', *arguments))}: None")
 
 
+def test_a_method_that_takes_no_self_is_a_method() -> None:
+    def emptied(block: Any, state: Any) -> None:
+        block.detdata["signal"][...] = 0
+
+    data = zonda.Pipeline([*STEPS, made(exec=staticmethod(emptied))(), zonda.BinMap()]).run(scene(camera(4)))
+    signal = data["map"].signal
+    assert (signal[data["map"].hits > 0] == 0).all()
+
+
 @pytest.mark.parametrize(
     ("attributes", "said"),
     [
