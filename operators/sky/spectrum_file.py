@@ -34,7 +34,7 @@ PLAUSIBLE = 1.0, 3000.0
 """uK: limits of the rms of a CMB sky, which is 110 uK for all multipoles and 30 uK for the first few."""
 FALLS = 0.1
 """Of l (l + 1) C_l about l = 200 over that about l = 15: it is 5 in the CMB; below, the column is C_l itself, with 0.03."""
-CURE = "give columns of text: ell, TT or ell, TT, EE, BB, TE, as ell (ell + 1) C_l / (2 pi) in uK^2 (as CAMB writes them)"
+CURE = "give columns of text: l, TT or l, TT, EE, BB, TE, as l (l + 1) C_l / (2 pi) in uK^2 (as CAMB writes them)"
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,13 @@ def _read(place: str, changed: tuple[int, int], unit: Unit | None, scaling: Scal
                 line.strip("#! \n\t") for _, line in zip(range(100), file, strict=False) if line.lstrip().startswith(("#", "!"))
             ]
     ell = table[:, 0]
-    if (
-        table.shape[1] < 2
-        or not np.isfinite(table).all()
-        or (ell != np.round(ell)).any()
-        or (np.diff(ell) <= 0).any()
-        or ell[0] < 0
-        or ell[-1] > HIGHEST
-    ):
+    if not np.isfinite(table).all():
+        row, column = np.argwhere(~np.isfinite(table))[0]
+        text = f"row {row + 1} of the numbers has {table[row, column]} in column {column + 1}"
+        raise InputError(text, place=place, cure="mend that row")
+    if table.shape[1] < 2:
+        raise InputError("has one column", place=place, cure=CURE)
+    if (ell != np.round(ell)).any() or (np.diff(ell) <= 0).any() or ell[0] < 0 or ell[-1] > HIGHEST:
         raise InputError(f"the first column is no rising series of multipoles up to {HIGHEST}", place=place, cure=CURE)
     if (ell[-1] - max(ell[0], 2)) + 1 != np.count_nonzero(ell >= 2):
         raise InputError("multipoles are missing between the first and the last", place=place, cure="give every l")

@@ -151,6 +151,8 @@ def test_without_a_spectrum_it_is_refused():
         ("# L EE BB\n2 30 1\n3 30 1\n", "no heading names them"),
         ("2 1000\n4 1000\n", "multipoles are missing"),
         ("3 1000\n2 1000\n", "no rising series"),
+        ("2 1000\n3 nan\n4 1000\n", "row 2 of the numbers has nan in column 2"),
+        ("2\n3\n", "has one column"),
         ("2 -5\n3 1000\n", "no sky has this spectrum"),
         ("2 100 1 0 50\n3 100 1 0 5\n", "no sky has this spectrum"),
     ],
