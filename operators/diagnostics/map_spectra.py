@@ -162,14 +162,20 @@ def _of_planes(flat: Mapping[str, MapProduct], names: list[str], wanted: Wanted,
             q_and_u = np.stack([getattr(product.stokes(which), plane) for which in "QU"])
             planes.update(zip(polarized[name], on_the_plane(product, q_and_u), strict=True))
 
+    def add_noise(name: str, product: MapProduct) -> None:
+        own = [product] if name not in polarized else [product.stokes(which) for which in IQU]
+        noise.update(zip((name, *polarized.get(name, ())), (each.noise for each in own), strict=True))
+
     for name in names:
         add(name, flat[name])
         if not name.startswith("noiseless/"):
-            own = [flat[name]] if name not in polarized else [flat[name].stokes(which) for which in IQU]
-            noise |= dict(zip((name, *polarized.get(name, ())), (product.noise for product in own), strict=True))
+            add_noise(name, flat[name])
     if not wanted.maps:
         for of, (product, plane) in noise_sources(flat, names[0]).items():
-            add("half_difference" if of == "half_difference" else f"source_free/{names[0]}", product, plane)
+            name = "half_difference" if of == "half_difference" else f"source_free/{names[0]}"
+            add(name, product, plane)
+            if plane == "signal":
+                add_noise(name, product)
     if any(values.shape != first.signal.shape for values in planes.values()):
         raise PipelineError("the maps have different grids", place=place, cure="name maps of one step")
     window = window_of(first, None, wanted.taper, wanted.least)

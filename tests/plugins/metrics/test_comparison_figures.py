@@ -95,6 +95,25 @@ def test_a_map_of_white_noise_alone_has_its_level():
     assert found.error < 0.1
 
 
+def test_the_source_free_map_of_a_plain_map_spectrum_has_a_level():
+    """The figure's own default, beside a `MapSpectrum` without parameters: `zonda run` refused it at its end."""
+    with scenes.sky_file(np.full((64, 64), 1e-3), 8.0) as sky:
+        steps = [
+            zonda.PointingDaisy(radius="3 arcmin", speed="40 arcsec/s", scan_duration="60 s"),
+            zonda.SkyMap(file=sky),
+            zonda.WhiteNoise(),
+            zonda.Efficiency(),
+            zonda.BinMap(pixel="4 arcsec"),
+            zonda.MapSpectrum(),
+            zonda.MeasureFigures(metrics=["map_power(smallest=10 arcsec, largest=40 arcsec)"]),
+        ]
+        runs = {"source_free": zonda.Signal(without=["sky"], modes="full")}
+        data = zonda.Pipeline(steps, runs=runs).run(scenes.scene(scenes.camera(37)))
+    (found,) = data.products["figures"]
+    assert found.value == pytest.approx(1, abs=5 * found.error)
+    assert found.error < 0.1
+
+
 @pytest.mark.parametrize("taper", [None, "20 arcsec"])
 def test_a_smoothed_map_of_white_noise_alone_has_its_level_too(taper):
     """Also where the smoothing leaves less than the window spreads from larger scales (1.1 to 5.4 were found).
