@@ -338,7 +338,7 @@ def _noise(name: str, sources: dict[Noise, tuple[MapProduct, Any]], style: Style
 def _coverage(name: str, product: MapProduct) -> tuple[Any, ...]:
     hits, per_beam = product.hits, product.seconds_per_beam()
     flat = _flat(product, per_beam=per_beam)
-    return f"coverage{'' if name == 'map' else f'_{name}'}", flat, int(hits.sum()), int((hits > 0).sum())
+    return f"coverage{'' if name == 'map' else f'_{name}'}", flat, int(hits.sum()), int((hits > 0).sum()), product.sides
 
 
 def _crosslinking(file: str, product: MapProduct) -> tuple[Any, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from zonda.core.drawable import Drawable, Sketch
 from zonda.core.maps.central import central_diameter, in_beams
-from zonda.core.numerics.angles import angle_text
+from zonda.core.numerics.angles import angle_text, sides_text
 from zonda.core.types import AnyFloats
 
 from ..series import Modes, Spectrum, TimeStream, unit_of_stream
@@ -133,15 +133,15 @@ def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Ske
     if figures:
         wide = f"{np.degrees(diameter) * 60:.3g}′{in_beams(diameter, first.fwhm)}"
         text += f" Weighted rms within the dotted circle of {wide}: {', '.join(figures)}."
-    return [Sketch(file, "Noise", text, ax)]
+    return [Sketch(file, _named("Noise", file, "noise"), text, ax)]
 
 
-def draw_coverage(file: str, product: FlatMap, samples: int, pixels: int) -> list[Sketch]:
-    """Samples per pixel and seconds per beam; ``samples`` in ``pixels`` in all."""
+def draw_coverage(file: str, product: FlatMap, samples: int, pixels: int, sides: tuple[float, float]) -> list[Sketch]:
+    """Samples per pixel and seconds per beam; ``samples`` in ``pixels`` in all, of these `MapArrays.sides`."""
     product = product.cropped()
     what = "Samples per pixel" if product.per_beam is None else "Integration time per beam"
     ax = plot_coverage(product.hits, product.sky, per_beam=product.per_beam, title=_named(what, file, "coverage"))
-    text = f"{samples:,} samples in {pixels:,} pixels of {angle_text(product.pixel)}.".replace(",", "\u202f")
+    text = f"{samples:,} samples in {pixels:,} pixels of {sides_text(*sides)}.".replace(",", "\u202f")
     if product.per_beam is not None:
         beam = f"of {angle_text(product.fwhm)} FWHM (area π FWHM² / (4 ln 2))"
         text += f" Integration time: of all detectors together, in the area of the telescope's beam {beam}."

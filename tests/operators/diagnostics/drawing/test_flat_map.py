@@ -57,10 +57,12 @@ def test_titles_say_of_which_band_and_stokes_parameter_a_picture_is(product, key
     titles = [
         draw_map(key, "", key, flat, style)[0].ax.get_title(),
         draw_noise(f"noise_{key}", {"half_difference": half}, style)[0].ax.get_title(),
-        draw_coverage(f"coverage_{key}", flat, 1, 1)[0].ax.get_title(),
+        draw_coverage(f"coverage_{key}", flat, 1, 1, product.sides)[0].ax.get_title(),
     ]
     noise = f"Noise: {half.difference}{behind}, not smoothed"
     assert titles[:2] == [f"Map{behind}, not smoothed", noise]
+    assert draw_noise(f"noise_{key}", {"half_difference": half}, style)[0].title == f"Noise{behind}"
+    assert "in 1 pixels of 1″ x 2″." in draw_coverage(f"coverage_{key}", flat, 1, 1, (2 * ARCSEC, ARCSEC))[0].caption
     assert titles[2].endswith(f"per beam{behind}") or titles[2] == f"Samples per pixel{behind}"
 
 
@@ -69,7 +71,7 @@ def test_the_coverage_of_a_map_with_a_pole_in_it_is_drawn(product):
 
     header = tangent_wcs((1.3, np.pi / 2), 2 * ARCSEC, product.hits.shape).to_header()
     flat = _flat(replace(product, header=header, centre=(1.3, np.pi / 2)), "signal")
-    assert png_of(draw_coverage("coverage", flat, 1, 1)[0].ax).startswith(b"\x89PNG")
+    assert png_of(draw_coverage("coverage", flat, 1, 1, product.sides)[0].ax).startswith(b"\x89PNG")
 
 
 def test_an_input_with_a_pole_in_it_is_drawn():
