@@ -28,6 +28,7 @@ from zonda.core.configuration.units import Angle, Fraction
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.figures import FigureMetric
+from zonda.core.maps.central import central_diameter
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.measured_noise import WHITE
@@ -183,8 +184,9 @@ class PeakSnr(_OfSmoothMap):
     noise: Literal["source_free", "half_difference", "white"] = "source_free"
     """What scales the noise: the map of everything but the sky (with the modes of the complete data), half the difference of even
     and odd scans, or nothing: white noise by NET and samples."""
-    radius: Angle = quantity("1 arcmin", gt=0)
-    """Where the noise map is compared with the white noise."""
+    radius: Angle | None = Field(None, gt=0)
+    """Where the noise map is compared with the white noise: this near to the map's centre. Default: 1 arcmin, or 2.5 beams or
+    pixels where these are wider."""
     within: Angle | None = Field(None, gt=0)
     """Look for the peak only this near to the map's centre."""
 
@@ -196,11 +198,12 @@ class PeakSnr(_OfSmoothMap):
         """Equation (3); the noise itself scatters the ratio by 1."""
         product = self.smoothed(map_of(data, "peak_snr", "", self.map))
         factor, error = 1.0, 0.0
+        radius = max(ARCMIN, central_diameter(product.fwhm, product.pixel) / 2) if self.radius is None else self.radius
         if self.noise != "white":
             of: Any = "half_difference" if self.noise == "half_difference" else "signal"
             free = self.smoothed(map_of(data, "peak_snr", names[0], self.map)) if names else product
-            found, error = central_rms(free, self.radius, of)
-            near = (product.distance() <= self.radius) & np.isfinite(product.noise)
+            found, error = central_rms(free, radius, of)
+            near = (product.distance() <= radius) & np.isfinite(product.noise)
             if not near.any():
                 cure = "add a WhiteNoise and leave BinMap.noise at its default"
                 raise InputError("the white noise of the map is not known", place="peak_snr", cure=cure)

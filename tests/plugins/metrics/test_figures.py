@@ -238,6 +238,17 @@ def test_peak_snr():
         measure(data(map=replace(product(blob(12)), half_difference=np.zeros((SIDE, SIDE)))), "peak_snr", noise="half_difference")
 
 
+def test_the_noise_of_peak_snr_is_measured_in_five_beams():
+    """Beams of 4 arcmin: a circle of 1 arcmin about the centre holds one value, which may be near zero. White noise alone has the
+    ratio that NET and samples give, to the rms of some 11 values: (2 x 11)^-1/2 = 0.21."""
+    for seed in range(6):
+        noise = product(white(seed), noise=1.0, pixel=60.0, fwhm=240.0)
+        maps = data({"free": {"without": ["sky"], "modes": "full"}}, map=noise, free__map=noise)
+        alone = measure(maps, "peak_snr", noise="white").value
+        assert measure(maps, "peak_snr").value / alone == pytest.approx(1, abs=0.6)  # 3 sigma of 0.21
+        assert measure(maps, "peak_snr").value == measure(maps, "peak_snr", radius="10 arcmin").value
+
+
 # ---- coverage
 
 
