@@ -54,6 +54,10 @@ and no error is stated or found, as of closed forms.
 | needs data we do not have | nothing can be run without them |
 | differs | none of these. The exit status of `zonda validate` is then 1 |
 
+The pipelines of these rows, and the shipped ones, state `AtmosphereLayers: {layer_response: column}`: in the paper a layer's water emits as
+the column's does on average. With `layer`, the default elsewhere, the atmosphere fluctuates 10 % more at Green Bank and 6 % more at
+Chajnantor ([physics.md](physics.md#atmosphere)).
+
 Claims, pipelines and criteria stand in `pipelines/validation/claims.yaml`, whose head describes its keys. A file of one's own is
 given with `--claims FILE`. A counter-experiment that changes nothing but seeds is refused.
 

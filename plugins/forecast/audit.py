@@ -65,16 +65,16 @@ class Audited:
     rows: tuple[Row, ...]
 
     @property
-    def together(self) -> Row:
-        """All noise."""
-        return next(r for r in self.rows if r.part == TOGETHER)
+    def together(self) -> Row | None:
+        """All noise; None: a part of it is not forecast."""
+        return next((r for r in self.rows if r.part == TOGETHER), None)
 
     def as_dict(self) -> list[dict[str, Any]]:
         """The rows, for JSON."""
         return [{**asdict(r), "difference": r.difference, "z": r.z} for r in self.rows]
 
     def __str__(self) -> str:
-        factor, unit = prefixed(self.together.mean, "K_RJ")
+        factor, unit = prefixed(max(r.mean for r in self.rows), "K_RJ")
         table: list[tuple[str, ...]] = [("", f"forecast [{unit}]", "simulated", "standard error", "difference", "z")]
         for r in self.rows:
             figures = (f"{v * factor:.4g}" for v in (r.forecast, r.mean, r.error))

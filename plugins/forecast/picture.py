@@ -45,8 +45,7 @@ def figure(found: Forecast) -> Any:
         ax.plot(
             hours, depth.total(t) * factor, color="black", lw=1.2, ls="-." if plane == "Q" else ":", label=f"{plane}, together"
         )
-    if found.audit is not None:
-        row = found.audit.together
+    if found.audit is not None and (row := found.audit.together):
         ax.errorbar(end / 3600, row.mean * factor, row.error * factor, fmt="o", color="#D55E00", label=f"{row.seeds} simulations")
     ax.set_xscale("log")
     ax.set_yscale("log")

@@ -9,7 +9,8 @@ from zonda.core import cli
 from zonda.core.errors import InputError
 from zonda.plugins.forecast.lines import duration, in_unit, read_depth
 
-SHORT = "--set", "PointingDaisy.scans=1", "--set", "PointingDaisy.scan_duration=30 s"
+MEAN = "--set", "CommonModeFilter.method=mean"  # noise turns the singular mode of a short scan: no forecast of the atmosphere
+SHORT = "--set", "PointingDaisy.scans=1", "--set", "PointingDaisy.scan_duration=30 s", *MEAN
 M2 = "--instrument", "mustang2", "--site", "green_bank", "--month", "11"
 
 
@@ -45,6 +46,7 @@ def test_of_an_instrument_with_files(tmp_path, capsys):
             "1 min",
             "--set",
             "PointingDaisy.scan_duration=60 s",
+            *MEAN,
             "--set",
             "PinkNoise.shared=0.8",
             "--output",
@@ -108,6 +110,16 @@ def test_the_audit_in_words(tmp_path, capsys):
     assert "averaged over the band" in text
 
 
+def test_an_audit_beside_a_part_that_is_not_forecast(tmp_path, capsys):
+    """A scan of 30 s behind a singular mode: the atmosphere is left out, with the reason, and the rest is audited and drawn."""
+    singular = *FEW, "--set", "CommonModeFilter.method=svd"
+    assert sensitivity("mustang2_cluster", *singular, "--audit", "2", "--output", tmp_path / "depth") == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "is not forecast, and comes on top: noise turns the singular mode" in text
+    assert "audit: 2 simulations of the whole pipeline forecast [" in text
+    assert (tmp_path / "depth" / "sensitivity.png").exists()
+
+
 def test_a_folder_that_takes_no_files_is_told_before_anything_is_forecast(capsys):
     assert sensitivity("mustang2_cluster", "--audit", "200", "--output", "/proc/zonda") == 2
     assert "/proc/zonda: cannot be made: /proc takes no new folders" in capsys.readouterr().err
@@ -139,7 +151,7 @@ def test_in_python():
         ((*M2, "--quantile", "2"), "--quantile"),
         ((*M2, "--elevation", "20"), "20 has no unit; write an angle such as '60 deg'"),
         ((*M2, "--time", "2"), "2 has no unit; write a time such as '3 h'"),
-        (("mustang2_cluster", *SHORT, "--set", "CommonModeFilter.modes=3"), "the forecast does not cover modes: 3"),
+        (("mustang2_cluster", "--set", "CommonModeFilter.modes=3"), "the forecast does not cover modes: 3"),
         (("mustang2_cluster", *SHORT, "--reach", "10 apples"), "'apples' is no unit of a depth"),
         (("mustang2_cluster", *SHORT, "--reach", "100"), "100 has no unit"),
         (("mustang2_cluster", *SHORT, "--reach", "deep"), "cannot read 'deep' as a depth"),
