@@ -126,7 +126,8 @@ def pixel_matrix(wcs: Wcs) -> Floats:
     lng, lat = wcs.wcs.lng, wcs.wcs.lat
     kinds = [str(c) for c in wcs.wcs.ctype]
     if wcs.naxis != 2 or lng < 0 or lat < 0:
-        raise InputError(f"needs two celestial axes, has {kinds}", place="WCS", cure="pass wcs.celestial")
+        cure = "set CTYPE1 and CTYPE2, e.g. RA---TAN and DEC--TAN"
+        raise InputError(f"needs two celestial axes, has {kinds}", place="WCS", cure=cure)
     if not all(k.endswith("-TAN") for k in kinds) or wcs.has_distortion:
         raise InputError(f"projection {kinds} is not a plain TAN", place="WCS", cure="reproject to TAN without distortion")
     wcs.wcs.set()

@@ -73,7 +73,8 @@ class InsideImage:
 def read_mask(path: Path) -> MaskImage:
     """The first image of a FITS file.
 
-    Raises InputError for what is no image with a tangent-plane (TAN) WCS, and for NaN, which is neither masked nor not.
+    Raises InputError for what is no image with a tangent-plane (TAN) WCS, for NaN, which is neither masked nor not,
+    and for zeros alone.
     """
     return _read(path, path.stat().st_mtime_ns)
 
@@ -89,6 +90,10 @@ def _read(path: Path, changed: int) -> MaskImage:
         values, header = np.array(hdu.data), hdu.header.copy()
     if np.isnan(values).any():
         raise InputError("has pixels that are NaN", place=place, cure="write 1 where samples are masked and 0 elsewhere")
+    if not values.any():
+        raise InputError(
+            "all of its pixels are 0: it masks nothing", place=place, cure="write 1 where samples are masked, or leave it out"
+        )
     header, _ = with_known_frame(header, place)
     try:
         return MaskImage(values != 0, pixel_matrix(tangent.plain(header) or _astropy(header, place)))

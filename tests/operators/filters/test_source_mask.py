@@ -232,8 +232,9 @@ def test_files_that_are_no_masks(bench, tmp_path):
     for values, change, said in (
         (np.zeros((3, 4, 4)), {}, "has no two-dimensional image"),
         (np.full((4, 4), np.nan), {}, "has pixels that are NaN"),
-        (np.zeros((4, 4)), {"CTYPE1": "RA---SIN", "CTYPE2": "DEC--SIN"}, "is not a plain TAN"),
-        (np.zeros((4, 4)), {"CTYPE1": "", "CTYPE2": ""}, "needs two celestial axes"),
+        (np.zeros((4, 4)), {}, "all of its pixels are 0"),
+        (np.ones((4, 4)), {"CTYPE1": "RA---SIN", "CTYPE2": "DEC--SIN"}, "is not a plain TAN"),
+        (np.ones((4, 4)), {"CTYPE1": "", "CTYPE2": ""}, "needs two celestial axes"),
     ):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
