@@ -104,8 +104,7 @@ def looked_at(step: SkyParameters, data: Data) -> list[str]:
             grid = grid_of(step, observation)
             found = conversion(grid, observation.instrument.band, step.spectral_index)
             check_brightness(np.array([np.abs(source.values).max(initial=0.0)]) * found.typical * step.scale, step.place)
-    faintest = float(np.abs(source.values).max(initial=0.0)) * abs(step.scale)
-    if not faintest:
+    if not source.values.any() or not step.scale:
         warnings.warn(f"{step.label}: {step.source}: all of its pixels are 0", stacklevel=2)
     return [*lines, *([f"pixels taken as zero: {source.zeroed}"] if source.zeroed else [])]
 

@@ -64,14 +64,15 @@ class PointSources(Operator):
     """Factor on all fluxes."""
 
     def check(self, data: Data) -> list[str]:
-        """How many sources the catalogue has, and the brightest; raises InputError where it is wrong."""
+        """Number of sources, the brightest flux, columns that are not read. Raises InputError where the catalogue is wrong."""
         catalogue = Catalogue.read(self)
         for camera in data.scene.instrument.cameras.values() if data is not None else ():
             catalogue.brightness(camera.band, self.scale)
         brightest = float(np.abs(catalogue.flux).max()) * abs(self.scale)
         if text := doubt(f"{self.label}: the brightest source of {self.catalogue.name}", brightest, FLUX, "Jy"):
             warnings.warn(text, stacklevel=2)
-        return [f"{len(catalogue.flux)} sources in {self.catalogue}, the brightest of {brightest:.4g} Jy"]
+        unused = [f"not used: {', '.join(catalogue.unused)}"] if catalogue.unused else []
+        return [f"{len(catalogue.flux)} sources in {self.catalogue}, the brightest of {brightest:.4g} Jy", *unused]
 
     def prepare(self, observation: Observation) -> Sources:
         """The sources with their brightness, and which of them are in view when."""
@@ -90,12 +91,16 @@ class PointSources(Operator):
 
 @dataclass(frozen=True)
 class Catalogue:
-    """Sources: directions (n, 3), fluxes [Jy] at `frequency` [Hz] (NaN: the band's centre), spectral indices; each (n,)."""
+    """Sources: directions (n, 3), fluxes [Jy] at `frequency` [Hz] (NaN: the band's centre), spectral indices; each (n,).
+
+    ``unused``: columns of the table that are not read.
+    """
 
     directions: Floats
     flux: Floats
     index: Floats
     frequency: Floats
+    unused: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, step: PointSources) -> Catalogue:
@@ -126,7 +131,7 @@ class Catalogue:
             frequency = found["frequency"]
         else:
             frequency = np.full(len(flux), math.nan if step.frequency is None else step.frequency)
-        return cls(unit_vectors(ra, dec), flux, index, frequency)
+        return cls(unit_vectors(ra, dec), flux, index, frequency, tuple(name for name in table.columns if name not in units))
 
     def brightness(self, band: Band, scale: float) -> Floats:
         """(n,) S <...> of equation (1), K_RJ sr."""

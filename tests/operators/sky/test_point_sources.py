@@ -27,6 +27,11 @@ def test_it_keeps_the_contract(tmp_path):
     zonda.testing.check_operator(PointSources(catalogue=path))
 
 
+def test_columns_that_are_not_read_are_told(tmp_path):
+    path = catalogue(tmp_path / "c.csv", [(75.0, 20.0, 1.0, 0.1, "B1950")], "ra [deg],dec [deg],flux [Jy],q [Jy],epoch")
+    assert PointSources(catalogue=path).check(None)[1:] == ["not used: q, epoch"]
+
+
 @pytest.mark.parametrize("index", [0.0, -0.8])
 def test_the_flux_in_a_map(tmp_path, index):
     """Sum over a map, T dOmega, against S <c^2 (nu / nu_0)^alpha / 2 k nu^2>: to 1e-3.
