@@ -78,6 +78,11 @@ class Signal(Parameters):
             return bool(provides & set(self.only))
         return not provides & set(self.without or ())
 
+    @property
+    def is_quiet(self) -> bool:
+        """Whether no noise of detectors is in it, for sure."""
+        return self.only is not None and set(self.only) <= {"sky", "atmosphere", TRANSMISSION}
+
 
 @dataclass(frozen=True)
 class Formed:

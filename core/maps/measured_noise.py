@@ -8,6 +8,8 @@ from ..types import Floats
 
 LEAST = 0.1
 """Share of the 99th percentile of the weight (1 / noise^2) that a pixel needs for its noise to be measured."""
+ELSEWHERE = "that of the complete map, none in this one"
+"""Said of the noise of a signal without noise (`Signal.is_quiet`): it is that of the complete map."""
 WHITE = "white noise only"
 """Said of noise that is the standard error of independent pixels, where no map of the noise alone is known."""
 

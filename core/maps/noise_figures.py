@@ -9,10 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..signal import Signal
 from ..types import Floats
 from .central import central_diameter
 from .map_product import MapProduct
-from .measured_noise import stated
+from .measured_noise import ELSEWHERE, stated
 from .stokes import planes_of
 
 Noise = Literal["half_difference", "source_free"]
@@ -81,17 +82,26 @@ def noise_alone(
     return None
 
 
-def noise_stated(maps: Mapping[str, MapProduct], name: str) -> dict[str, tuple[float | None, str]]:
+def noise_stated(
+    maps: Mapping[str, MapProduct], name: str, runs: Mapping[str, Any] | None = None
+) -> dict[str, tuple[float | None, str]]:
     """What is known of the noise of I, and of Q and U where they are there, of a map among ``maps`` (`maps_of`).
 
     The factor on its white noise, and what it was measured in; None and `WHITE` where there is no map of the noise
-    alone. Nothing where no noise is known.
+    alone, and `ELSEWHERE` of a map without noise. Nothing where no noise is known. ``runs``: as of `is_quiet`.
     """
     found: dict[str, tuple[float | None, str]] = {}
     for key, own in (("I", name), ("Q", f"{name}_Q"), ("U", f"{name}_U")):
         if own in maps and np.isfinite(maps[own].noise).any():
-            found[key] = stated(maps[own].noise, noise_alone(maps, own))
+            quiet = is_quiet(runs or {}, name)
+            found[key] = (None, ELSEWHERE) if quiet else stated(maps[own].noise, noise_alone(maps, own))
     return found
+
+
+def is_quiet(runs: Mapping[str, Any], name: str) -> bool:
+    """Whether the map ``name`` is of a signal without noise. ``runs``: the signals of a run, as its provenance has them."""
+    signal, _, rest = name.partition("/")
+    return bool(rest) and signal in runs and Signal(**runs[signal]).is_quiet
 
 
 def noise_sources(

@@ -15,7 +15,7 @@ from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.noise_figures import maps_of, noise_alone
+from zonda.core.maps.noise_figures import is_quiet, maps_of, noise_alone
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.output import Output
 from zonda.core.storage.files import product_path
@@ -106,7 +106,11 @@ class CompareMaps(Output):
 def _compare(step: CompareMaps, data: Data, which: str, reference: Plane, product: tuple[str, Any]) -> None:
     """Compare one of I, Q and U with that of the reference. ``product``: the map's name, and the map."""
     name, found = product
+    runs = data.provenance.get("runs", {})
     plane = covered(_with_noise(step, data, which, plane_of(found, name)), found, step.least_coverage)
+    plane = replace(plane, quiet=is_quiet(runs, step.map))
+    if step.file is None:
+        reference = replace(reference, quiet=is_quiet(runs, step.reference))
     fwhm = step.beam or resolution(plane, reference, found)
     made = compare(reference, plane, Settings(fwhm or None, step.threshold, step.bins), step.label)
     of = "" if which == "I" else f"{which}: "

@@ -27,7 +27,8 @@ class SaveMap(Output):
     reads. Of polarized maps I, Q, U (POLCCONV = COSMO), HITS, WEIGHTS, the covariance COV_II ... COV_UU and CONDITION.
     CROSSLINKING and the table SCAN_HITS where `BinMap` kept them. NOISE is that of independent samples; where a map of the noise
     alone is there (source-free, half-difference), NOISEFAC in its header is what it is to be multiplied by for noise that is
-    correlated between pixels, and NOISEOF says what that was measured in, else "white noise only".
+    correlated between pixels, and NOISEOF says what that was measured in, else "white noise only"; of a signal without noise,
+    that NOISE is that of the complete map.
     ``noise_map.fits``: the half-difference of the scans and the source-free run's map, with the rms in the middle
     (`central_diameter`). Every file carries beam, seed, versions, the resolved YAML and the log of the run.
 
@@ -52,9 +53,9 @@ class SaveMap(Output):
         maps = maps_of(data.products, split=False)
         if not maps:
             raise PipelineError("there is no map to write", place=self.label, cure="add a step that makes one, e.g. BinMap")
-        planes = maps_of(data.products)
+        planes, runs = maps_of(data.products), data.provenance.get("runs")
         files = {
-            product_path(folder, name, ".fits"): MapFile.of(name, product, noise_stated(planes, name))
+            product_path(folder, name, ".fits"): MapFile.of(name, product, noise_stated(planes, name, runs))
             for name, product in maps.items()
         }
         figures = noise_figures(maps, self.central_diameter)

@@ -15,6 +15,7 @@ from zonda.core.maps.grid import healpix_grid
 from zonda.core.maps.header import marked_bad, number, text, with_known_frame
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.measured_noise import ELSEWHERE
 from zonda.core.maps.noise_figures import FREE
 from zonda.core.maps.stokes import IQU
 from zonda.core.maps.stokes_names import along_axis, columns_of_q_and_u, intensity_column, pixel_column
@@ -222,13 +223,16 @@ def _told(name: str, about: Any, image: bool, found: Found, place: str) -> ReadM
             sign = -1.0 if key == "U" and convention == "IAU" else 1.0
             noise, alone = values.get(f"noise {key}"), values.get(f"half {key}")
             own, words = found.stated.get(key, (None, ""))
+            quiet = words == ELSEWHERE
+            if quiet:
+                own, words = None, ""
             if alone is not None:
                 own, words = None, f"half the difference, {found.halves}"
             elif own is not None and noise is not None:
                 noise = noise * own
             plane = Plane(
                 name if key == "I" else f"{name} {key}", sign * values[key], found.where if image else None, "", fwhm, noise,
-                None if image else found.where, 0.0, alone, words, own,
+                None if image else found.where, 0.0, alone, words, own, quiet=quiet,
             )  # fmt: skip
             planes[key] = plane.scaled(factor, label)
     origin = text(about, "ORIGIN", place).lower() == "zonda"
@@ -316,6 +320,8 @@ def _root(variance: Floats) -> Floats:
 def _stated(header: Any, of: str, place: str) -> dict[str, tuple[float, str]]:
     """The factor on white noise that the header of a plane of noise states, and what it was measured in."""
     factor = number(header, "NOISEFAC", place) if of.startswith("noise") else None
+    if of.startswith("noise") and text(header, "NOISEOF", place) == ELSEWHERE:
+        return {of[-1]: (1.0, ELSEWHERE)}
     return {of[-1]: (factor, text(header, "NOISEOF", place) or "its file")} if factor and factor > 0 else {}
 
 

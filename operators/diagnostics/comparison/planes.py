@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.maps.grid import HealpixPixels, ImagePixels, MapGrid, image_grid
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.measured_noise import WHITE, noise_factor
+from zonda.core.maps.measured_noise import ELSEWHERE, WHITE, noise_factor
 from zonda.core.maps.on_plane import on_plane
 from zonda.core.numerics import tangent
 from zonda.core.numerics.angles import FWHM_PER_SIGMA, angle_text
@@ -75,6 +75,8 @@ class Plane:
         and what it is in words; None, empty: there is none.
     factor
         What `measured` has multiplied the noise by; None: it is white noise alone.
+    quiet
+        There is no noise in its values: ``noise`` is that of another map.
     """
 
     name: str
@@ -89,12 +91,15 @@ class Plane:
     alone_of: str = ""
     factor: float | None = None
     spread: float = 0.0
+    quiet: bool = False
 
     @property
     def noise_in_words(self) -> str:
         """What stands behind its noise; empty where none is known."""
         if self.noise is None:
             return ""
+        if self.quiet and self.factor is None:
+            return ELSEWHERE
         return WHITE if self.factor is None else f"{self.factor:.3g} x white noise, as in {self.alone_of}"
 
     @property

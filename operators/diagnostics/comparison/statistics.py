@@ -114,11 +114,11 @@ def compare(reference: Plane, other: Plane, settings: Settings | None = None, la
     maps = {name: planes[name] for name in ("reference", "map", "difference")}
     area = math.pi / math.log(16) * fwhm**2
     found = profiles(maps, grid.distance(centre), areas, max(pixel, fwhm / 2), area)
-    figures = figures_of(planes["reference"], planes["map"], (a.noise, b.noise), weights, _places(a, centre))
+    noisy = [plane for plane in (a, b) if plane.noise is not None and not plane.quiet]
+    figures = figures_of(planes["reference"], planes["map"], [plane.noise for plane in noisy], weights, _places(a, centre))
     figures["pixels"] = float(np.count_nonzero(both & (weights > 0)))
     figures["median fidelity where the reference is above 10 % of its peak"] = _median_fidelity(planes)
     if "chi2" in figures:
-        noisy = [plane for plane in (a, b) if plane.noise is not None]
         figures["chi2 values"] = min(figures["chi2 pixels"], *(plane.independent(both) for plane in noisy))
     noise = {name: plane for name, plane in (("snr", b), ("reference_snr", a)) if name in planes}
     for name, plane in noise.items():

@@ -19,8 +19,9 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCSEC
 from zonda.core.run.first_look import first_look
 from zonda.operators.diagnostics.compare_maps import CompareMaps
-from zonda.operators.diagnostics.comparison.files import plane_of
+from zonda.operators.diagnostics.comparison.files import plane_of, read_planes
 from zonda.operators.diagnostics.comparison.radial import radial_spectra
+from zonda.operators.diagnostics.comparison.statistics import compare
 from zonda.operators.diagnostics.drawing.comparison_plots import plot_radial_spectra
 from zonda.operators.diagnostics.map_spectra import MapSpectrum
 from zonda.operators.diagnostics.plot_operators import Plots
@@ -208,3 +209,27 @@ def test_maps_that_do_not_suit_are_refused_before_the_run(maps, step, message):
         return
     with pytest.raises(PipelineError, match=message):
         first_look(pipeline, scenes.scene(), saved=False)
+
+
+@pytest.mark.parametrize("binned", [{"pixel": "30 arcsec"}, {"projection": "CAR", "pixel": "30 arcsec"}, {"nside": 8192}])
+def test_chi2_against_a_map_without_noise_is_one(tmp_path, binned):
+    """A noiseless map's NOISE is that of the complete map: chi^2 counted it twice, 0.5 a pixel. In a run and of its files."""
+    camera = {"like": "mustang2", "detectors": 19, "fwhm": "60 arcsec", "sample_rate": "20 Hz"}
+    place = {"site": "green_bank", "time": "2024-11-25T07:00", "target": "05h +60d", "seed": 3}
+    y, x = np.indices((40, 40)) - 19.5
+    sky = zonda.SkyMap(map=1e-3 * np.exp(-(x**2 + y**2) / 30), pixel_size="20 arcsec", centre="target", unit="K_RJ")
+    steps = [
+        zonda.PointingDaisy(scan_duration="60 s", radius="4 arcmin", speed="1 arcmin/s"), sky,
+        zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(**binned),
+        zonda.CompareMaps(reference="noiseless/map", beam="60.01 arcsec"), zonda.SaveMap(),
+    ]  # fmt: skip
+    pipeline = zonda.Pipeline(steps, runs={"noiseless": {"only": ["sky"]}})
+    found = [pipeline.run(zonda.Scene(instrument=camera, **place), output=tmp_path)["comparison"]]
+    reference, noisy = (read_planes(tmp_path / name).planes["I"] for name in ("noiseless_map.fits", "map.fits"))
+    assert reference.quiet
+    assert not noisy.quiet
+    found.append(compare(reference, noisy))
+    for each in found:
+        error = np.sqrt(2 / each.figures["chi2 values"])
+        assert each.figures["chi2"] / each.figures["chi2 pixels"] == pytest.approx(1, abs=4 * error)
+        assert 4 * error < 0.4
