@@ -17,12 +17,30 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..errors import InputError
+from ..numerics.angles import ARCSEC
 from ..types import Floats
 
 UNIT = 1 << 10
 """Of weights, which are added up as whole numbers: their sums do not depend on the order."""
 SPREAD = 1.1
 """Widest over narrowest beam above which the shape of the map's beam is worth a warning."""
+
+
+WIDER = 3.0
+"""Widths of a map in which the beam that its header states cannot be."""
+
+
+def check_width(fwhm: float, across: float, place: str, cure: str) -> None:
+    """Raise InputError for a beam [rad] that is `WIDER` than the map, ``across`` [rad]: BMAJ in arcsec or radians."""
+    if fwhm > WIDER * across:
+        text = f"the beam of the map is {size_text(fwhm)} wide, and the whole map {size_text(across)}"
+        raise InputError(text, place=place, cure=cure)
+
+
+def size_text(angle: float) -> str:
+    """rad in the units of headers: ``20 deg``, ``18 arcsec``."""
+    return f"{math.degrees(angle):.4g} deg" if angle >= math.radians(0.1) else f"{angle / ARCSEC:.4g} arcsec"
 
 
 def effective_fwhm(weights: Mapping[float, float]) -> float:

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.maps.beams import check_width, size_text
 from zonda.core.maps.header import number, text
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
-from zonda.core.numerics.angles import ARCSEC
 from zonda.core.types import Floats
 
 from .limits import LARGEST, check_sides, check_values
 
-WIDER, MANY = 3.0, 60.0
-"""Widths of a map in which its beam cannot be; pixels per FWHM of its beam beyond which that is doubted."""
+MANY = 60.0
+"""Pixels per FWHM of a map's beam beyond which that is doubted."""
 DOUBT = "doubtful"
 """Key of the note about what is possible and not likely."""
 
@@ -87,24 +87,20 @@ def check_beam(
     Raises
     ------
     InputError
-        The header's beam is `WIDER` than the map, or narrower than a fifth of a pixel.
+        The header's beam is `beams.WIDER` than the map, or narrower than a fifth of a pixel.
     """
     if area is None:
         return
     fwhm, side = math.sqrt(area * 4 * math.log(2) / math.pi), math.sqrt(pixels[0] * pixels[1])
-    text = f"the beam of the map is {_angle(fwhm)} wide"
+    text = f"the beam of the map is {size_text(fwhm)} wide"
     cure = "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them, or set the operator's parameter input_beam: 18 arcsec"
     across = max(shape[0] * pixels[1], shape[1] * pixels[0]) if len(shape) == 2 else math.pi
-    if not given and fwhm > WIDER * across:
-        raise InputError(f"{text}, and the whole map {_angle(across)}", place=place, cure=cure)
+    if not given:
+        check_width(fwhm, across, place, cure)
     if not given and fwhm < side / 5:
-        raise InputError(f"{text}, and its pixels {_angle(side)}", place=place, cure=cure)
+        raise InputError(f"{text}, and its pixels {size_text(side)}", place=place, cure=cure)
     if not side / 2 <= fwhm <= min(across, MANY * side):
-        notes[DOUBT] = f"{text}, its pixels {_angle(side)} and all of it {_angle(across)}: is that right? {cure}"
-
-
-def _angle(value: float) -> str:
-    return f"{np.degrees(value):.4g} deg" if value >= np.radians(0.1) else f"{value / ARCSEC:.4g} arcsec"
+        notes[DOUBT] = f"{text}, its pixels {size_text(side)} and all of it {size_text(across)}: is that right? {cure}"
 
 
 def filled(place: str, values: Floats, missing: str, first: str) -> int:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.maps.beams import check_width
 from zonda.core.maps.grid import healpix_grid
 from zonda.core.maps.header import marked_bad, number, text, with_known_frame
 from zonda.core.maps.image import Image
@@ -129,7 +130,8 @@ def read_planes(path: Path, name: str = "", wanted: Wanted | None = None) -> Rea
     ------
     InputError
         Unreadable; no image of the sky in it; a cube of which no plane is wanted; an unknown unit or frame; a HEALPix table
-        without NSIDE, ORDERING or COORDSYS, or of which no column is I; cards that are no numbers.
+        without NSIDE, ORDERING or COORDSYS, or of which no column is I; cards that are no numbers; a beam far wider
+        than the image.
     """
     read = _read(path, name, wanted or Wanted())
     beside = path.with_name(f"source_free_{path.name}")
@@ -235,6 +237,10 @@ def _told(name: str, about: Any, image: bool, found: Found, place: str) -> ReadM
                 None if image else found.where, 0.0, alone, words, own, quiet=quiet,
             )  # fmt: skip
             planes[key] = plane.scaled(factor, label)
+    if fwhm and image and planes:
+        first = next(iter(planes.values()))
+        across = max(n * side for n, side in zip(first.values.shape, first.grid.sides, strict=True))
+        check_width(fwhm, across, place, "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them")
     origin = text(about, "ORIGIN", place).lower() == "zonda"
     return ReadMap(
         planes,

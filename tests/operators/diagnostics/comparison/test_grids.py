@@ -13,6 +13,7 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from zonda.core.errors import InputError
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.numerics.sphere import separation, unit_vectors
 from zonda.operators.diagnostics.comparison.files import in_unit, read_planes
@@ -227,3 +228,12 @@ def test_a_cell_holds_the_steps_on_the_sky(tmp_path):
         c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
         steps = np.array([[c, -s], [s, c]]) @ np.diag([-dx * (np.cos(np.radians(dec)) if kind == "CAR" else 1.0), dy])
         np.testing.assert_allclose(cell_of(plane.grid), steps * ARCSEC, atol=0.02 * ARCSEC)
+
+
+def test_a_beam_in_arcsec_is_refused(tmp_path):
+    """BMAJ = 24 deg in a map of arcminutes; `SkyMap` refuses it by the same rule."""
+    path = put(tmp_path / "a.fits", "TAN", {"I": gaussian("TAN", 24.0)}, beam=24.0)
+    fits.setval(path, "BMAJ", value=24.0)
+    fits.setval(path, "BMIN", value=24.0)
+    with pytest.raises(InputError, match="beam of the map is 24 deg wide, and the whole map"):
+        read_planes(path)
