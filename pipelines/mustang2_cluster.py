@@ -35,7 +35,7 @@ def pipeline() -> zonda.Pipeline:
                 offset_size="1 arcmin",
             ),
             zonda.SkyMap(file=Path(__file__).parent / "data" / "merging_cluster.fits"),
-            zonda.AtmosphereLayers(pwv="7.7 mm", pwv_rms="0.5 %"),
+            zonda.AtmosphereLayers(pwv="7.7 mm", pwv_rms="0.5 %", layer_response="column"),
             zonda.WhiteNoise(),
             zonda.PinkNoise(shared=0.8),
             zonda.Efficiency(),

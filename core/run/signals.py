@@ -154,7 +154,7 @@ class Signals:
             for name in {*operator.named_signals()} - {"", *given}:
                 cure = nearest(name, sorted(given)) or f"add it to runs, e.g. `runs: {{{name}: {{without: [sky]}}}}`"
                 raise PipelineError(
-                    f"{operator.label} reads the signal {name!r}, which runs does not have", place=self._place, cure=cure
+                    f"{operator.label} reads the signal {name!r}, which is not among runs", place=self._place, cure=cure
                 )
             names = []
             for wanted in operator.signals():

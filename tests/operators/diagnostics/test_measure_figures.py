@@ -89,7 +89,7 @@ def test_what_cannot_be_measured_is_said_before_the_run(tmp_path):
     with pytest.raises(ZondaError, match="listed twice"):
         loaded(tmp_path, "  - MeasureFigures: {metrics: [coverage, coverage]}\n")
     named = "  - MeasureFigures: {metrics: [{central_rms: {signal: fre}}]}\n"
-    with pytest.raises(ZondaError, match=r"(?s)MeasureFigures reads the signal 'fre', which runs does not have.*mean 'free'"):
+    with pytest.raises(ZondaError, match=r"(?s)MeasureFigures reads the signal 'fre', which is not among runs.*mean 'free'"):
         loaded(tmp_path, named, "runs: {free: {without: [sky]}}\n")
     with pytest.raises(ZondaError, match="add it to runs"):
         loaded(tmp_path, named)
