@@ -206,7 +206,7 @@ def one_bright_healpix_pixel() -> float:
         values[number] = 1.0
         with TemporaryDirectory(prefix="zonda-check-") as folder:
             path = Path(folder) / "one.fits"
-            healpy.write_map(path, values, coord="C", column_units="K_RJ", partial=True)
+            healpy.write_map(path, values, coord="C", column_units="K_RJ", partial=True, dtype=values.dtype)
             pixel = unit_vectors(*np.radians([lon, lat]))
             found.append(_seen_of_one_pixel(path, pixel, healpy.nside2pixarea(nside), lat))
     return largest(*found)
