@@ -193,13 +193,20 @@ class ImagePixels(MapGrid):
         rows = np.arange(self.shape[0]) + 1.0 - float(self.wcs.wcs.crpix[1])
         return np.asarray(np.radians(rows * float(self.wcs.pixel_scale_matrix[1][1])), np.float64)
 
+    @property
+    def _unbounded(self) -> Any:
+        """The WCS; that of a cylinder takes columns beyond a turn (astropy before 7 forgets that when parameters are read)."""
+        if str(self.wcs.wcs.ctype[0])[-3:] in CYLINDERS:
+            self.wcs.wcs.bounds_check(False, False)
+        return self.wcs
+
     def at(self, x: Any, y: Any) -> Floats:
         """(..., 3) unit vectors, in the grid's frame, of 0-based pixel coordinates; NaN where they are not on the sky."""
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
         if self.kind == "TAN":
             rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(central(self.wcs)).T
             return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True), np.float64)
-        lon, lat = self.wcs.all_pix2world(x, y, 0)
+        lon, lat = self._unbounded.all_pix2world(x, y, 0)
         if self.wcs.wcs.lng == 1:
             lon, lat = lat, lon
         known = np.isfinite(lon) & np.isfinite(lat)
@@ -313,9 +320,9 @@ class ImagePixels(MapGrid):
         known = np.isfinite(lon) & np.isfinite(lat)
         pair = [np.where(known, lon % 360.0, 0.0), np.where(known, lat, 0.0)][:: -1 if self.wcs.wcs.lng == 1 else 1]
         if self.wcs.has_distortion:
-            x, y = self.wcs.all_world2pix(*pair, 0, quiet=True)
+            x, y = self._unbounded.all_world2pix(*pair, 0, quiet=True)
         else:
-            x, y = self.wcs.wcs_world2pix(*pair, 0)
+            x, y = self._unbounded.wcs_world2pix(*pair, 0)
         x, y = np.where(known, x, np.nan), np.where(known, y, np.nan)
         if self.cylinder:
             turn = 2 * math.pi / abs(float(self.matrix[0, 0]))
@@ -618,8 +625,7 @@ def wcs_grid(wcs: Any, shape: tuple[int, int]) -> ImagePixels:
     if not isinstance(wcs, tangent.TangentWcs):
         wcs = wcs.celestial
         if str(wcs.wcs.ctype[0])[-3:] in CYLINDERS:
-            wcs = wcs.deepcopy()
-            wcs.wcs.bounds_check(False, False)
+            wcs = wcs.deepcopy()  # `_unbounded` changes it
     return ImagePixels(wcs, (int(shape[0]), int(shape[1])))
 
 
