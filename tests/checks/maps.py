@@ -172,7 +172,8 @@ def one_bright_pixel() -> Measured:
                 cylinder = kind in ("CAR", "CEA", "MER")
                 wcs = WCS(naxis=2)
                 wcs.wcs.ctype = [f"RA---{kind}", f"DEC--{kind}"]
-                wcs.wcs.cdelt = [-wide * SIDE / 3600, SIDE / 3600]
+                rows = np.cos(np.radians(dec)) if kind == "CEA" else 1.0  # whose rows are 1 / cos as high on the sky
+                wcs.wcs.cdelt = [-wide * SIDE / 3600, rows * SIDE / 3600]
                 wcs.wcs.crval = [TARGET[0], 0.0 if cylinder else dec]
                 wcs.wcs.crpix = [101.0, 31.0]
                 if cylinder:
