@@ -1,4 +1,4 @@
-"""What a step made of a whole stream at once."""
+"""Result of a step that changes a whole stream at once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Changed:
 
     @classmethod
     def of(cls, values: Floats, stream: Stream, fixed: SmoothField | None = None) -> Changed:
-        """Of the whole (n_det, n_samp), which is used up. The mean of ``stream`` stays beside it where it is nearer than zero;
+        """Take the whole (n_det, n_samp), which is used up. The mean of ``stream`` stays beside it where it is nearer than zero;
         ``fixed``: one that others have, and that stays."""
         mean, observation = stream.means.get(stream.name), stream.observation
         if mean is not None and not _is_left(values, mean, observation):
@@ -53,7 +53,7 @@ def whole(stream: Stream, fixed: SmoothField | None = None) -> Floats:
 
 
 def _is_left(values: AnyFloats, mean: SmoothField, observation: Observation) -> bool:
-    """Whether the mean is still in the signal: its samples are nearer to the mean than to zero."""
+    """True if the mean is still in the signal: its samples are nearer to the mean than to zero."""
     with_it, without, good = 0.0, 0.0, observation.good_samples
     for row in np.flatnonzero(observation.good_detectors):
         part = values[row, good]

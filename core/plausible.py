@@ -1,4 +1,4 @@
-"""Whether numbers of a scene are of the size that the field knows: a wrong unit is off by a factor of 60 or 1000.
+"""Warnings of numbers of a scene that are not of the size that the field knows: a wrong unit is off by a factor of 60 or 1000.
 
 What is beyond is possible, so that it is warned of and not refused; limits are wide. The checks of steps use `doubt`, too.
 """

@@ -87,7 +87,7 @@ class Beams:
 
     @property
     def fwhm(self) -> float:
-        """Of the map, equation (1)."""
+        """FWHM of the map, equation (1)."""
         return effective_fwhm(self.weights)
 
     @property

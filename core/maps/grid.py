@@ -62,7 +62,7 @@ ROWS = 256
 
 
 class MapGrid:
-    """Where the pixels of a map are on the sky: an image (`image_grid`) or a list of HEALPix pixels (`healpix_grid`).
+    """Positions and sizes of a map's pixels on the sky: an image (`image_grid`) or a list of HEALPix pixels (`healpix_grid`).
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class MapGrid:
         return separation(*angles(self.directions()), centre)
 
     def solid_angle(self, where: NDArray[np.bool_]) -> float:
-        """Of the pixels ``where`` [sr], each piece of the sky counted once."""
+        """Solid angle of the pixels ``where`` [sr], each piece of the sky counted once."""
         areas = np.where(self.once, self.areas, 0.0)
         return float(np.broadcast_to(areas, self.shape)[where].sum())
 
@@ -179,7 +179,7 @@ class ImagePixels(MapGrid):
 
     @cached_property
     def cylinder(self) -> bool:
-        """Whether rows are parallels of a cylindrical projection (of its own sphere, which may lie askew)."""
+        """True if rows are parallels of a cylindrical projection (of its own sphere, which may lie askew)."""
         return self.kind in CYLINDERS and self.wcs.wcs.lng == 0 and not self.matrix[0, 1] and not self.matrix[1, 0]
 
     @property
@@ -367,7 +367,7 @@ class ImagePixels(MapGrid):
         return lambda values, power=1.0: np.asarray(convolved(values, along_y**power, along_x**power))
 
     def _by_tiles(self, sigma: float, reach: tuple[int, int]) -> Smoother:
-        """Of a large image: tile by tile, each so small that one kernel serves it where that can be."""
+        """Smoother of a large image: tile by tile, each so small that one kernel serves it where that can be."""
         ny, nx = self.shape
         more = tuple(math.ceil(1.2 * n) + 2 for n in reach)
         tiles = self._tiles(slice(0, ny), slice(0, nx))
@@ -401,7 +401,7 @@ class ImagePixels(MapGrid):
         return self._tiles(y, slice(x.start, middle)) + self._tiles(y, slice(middle, x.stop))
 
     def _by_rows(self, sigma: float, both: bool = False) -> Smoother:
-        """Of a CAR image: along each row with its own width, then along the columns; right to sigma tan(latitude) / 2.
+        """Smoother of a CAR image: along each row with its own width, then along the columns; right to sigma tan(latitude) / 2.
 
         ``both``: the mean of that, of the height that equation (2) has, and of columns first, rows then. The widths go with
         cos(latitude) of the pixel that is seen, and of the one that sees it; so has r^2 the mean of both: right to the square.
@@ -432,7 +432,7 @@ class ImagePixels(MapGrid):
         return found
 
     def _by_latitudes(self, sigma: float) -> Smoother:
-        """Of a large CAR image: by rows, but near the poles pixel by pixel. InputError where that would take hours."""
+        """Smoother of a large CAR image: by rows, but near the poles pixel by pixel. InputError where that would take hours."""
         ny, nx = self.shape
         with np.errstate(divide="ignore", invalid="ignore"):
             steep = ~(sigma * np.tan(abs(self.latitudes)) < STEEP)
@@ -471,7 +471,7 @@ class ImagePixels(MapGrid):
 
     @property
     def even(self) -> bool:
-        """Whether all pixels have the same steps along its axes, to `EVEN`: one kernel serves all."""
+        """True if all pixels have the same steps along its axes, to `EVEN`: one kernel serves all."""
         return self._even() is not None
 
     def _even(self) -> tuple[float, float] | None:

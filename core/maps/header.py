@@ -51,7 +51,7 @@ UNSEEN = -1.6375e30
 
 
 def marked_bad(values: AnyFloats, header: Any, place: str) -> NDArray[np.bool_]:
-    """Which values a map's file marks as not observed: `UNSEEN`, and the value of the card BAD_DATA. NaN is not among them.
+    """True for values that a map's file marks as not observed: `UNSEEN`, and that of the card BAD_DATA. NaN is not among them.
 
     Raises InputError where BAD_DATA is no number.
     """
@@ -63,7 +63,7 @@ def marked_bad(values: AnyFloats, header: Any, place: str) -> NDArray[np.bool_]:
 
 
 def _is_blank(value: Any) -> bool:
-    """Whether a card is there without a value: astropy has an object of its own for it."""
+    """True if a card is there without a value: astropy has an object of its own for it."""
     return type(value).__name__ == "Undefined" or (isinstance(value, str) and not value.strip())
 
 

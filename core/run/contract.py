@@ -1,4 +1,4 @@
-"""Whether the class of a step keeps the contract of `Operator`.
+"""Check that the class of a step keeps the contract of `Operator`.
 
 What would otherwise be a step that does nothing, or a fault amid a run, is found before."""
 
@@ -22,7 +22,7 @@ COUPLES = ("sample", "detectors", "time", "all")
 
 
 def broken(operator: Operator) -> tuple[str, str] | None:
-    """What is wrong with the class of an operator, and the cure; None: nothing that can be seen before it runs."""
+    """Fault of the class of an operator, and the cure; None: nothing that can be seen before it runs."""
     return _fields(operator) or _methods(operator) or _acts(operator)
 
 

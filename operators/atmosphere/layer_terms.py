@@ -52,7 +52,7 @@ class LayerTerms:
 
     @classmethod
     def of(cls, band: BandAtmosphere, pwv: float, heights: Floats, scale: float, sines: tuple[float, float]) -> LayerTerms:
-        """Of layers at ``heights`` (n_layer,) above the site [m]; ``scale``: y / sum_l a_l g_l."""
+        """Compute the terms of layers at ``heights`` (n_layer,) above the site [m]; ``scale``: y / sum_l a_l g_l."""
         low, high = max(sines[0], math.sin(ELEVATION_MIN) * (1 + 1e-12)), min(sines[1], math.sin(ELEVATION_MAX))
         looked_at = np.cos(np.linspace(0, math.pi, LOOKED_AT))
         points = [np.cos(np.pi * (np.arange(n + 1) + 0.5) / (n + 1)) for n in DEGREES]

@@ -29,7 +29,7 @@ def made_with(header: Mapping[str, Any], given: float | None = None) -> tuple[fl
 
 
 def seen_twice(beam: tuple[float, float] | None, given: float | None, telescope: Floats) -> tuple[str, str]:
-    """What is stated of a map that was made with a ``beam`` (major, minor) [rad], and the warning; either may be empty.
+    """Statement about a map that was made with a ``beam`` (major, minor) [rad], and the warning; either may be empty.
 
     ``given``: `SkyMap.fwhm`; ``telescope`` (n,): the detectors' FWHM [rad]. There is no warning where peaks fall by less than
     `TOLD`, nor where ``given`` makes the resolution that of the telescope.

@@ -54,7 +54,7 @@ class Spectrum:
 
     @property
     def rms(self) -> float:
-        """Of the intensity, K."""
+        """Rms of the intensity, K."""
         ell = np.arange(self.values.shape[1])
         return float(np.sqrt(((2 * ell + 1) * self.values[0])[2:].sum() / (4 * np.pi)))
 
@@ -151,14 +151,14 @@ def _plain(name: str) -> str:
 
 
 def _unit_of(stated: str) -> Unit | None:
-    """What comments say of the unit."""
+    """Unit that comments state."""
     if re.search(r"(micro|mu|\bu|\N{MICRO SIGN}|\N{GREEK SMALL LETTER MU})\s*-?k", stated):
         return "uK^2"
     return "dimensionless" if "dimensionless" in stated else None
 
 
 def _scaling_of(stated: str) -> Scaling | None:
-    """What comments say of the factor."""
+    """Factor that comments state."""
     return "l(l+1)/2pi" if re.search(r"l\s*\*?\s*\(\s*l\s*\+\s*1\s*\)", stated) else None
 
 

@@ -84,7 +84,7 @@ class Spread:
         return math.sqrt(self.share) * self.fwhm
 
     def variance(self, fwhm: float) -> float:
-        """What is left to convolve with for a beam of ``fwhm`` [rad], rad^2."""
+        """Variance that is left to convolve with for a beam of ``fwhm`` [rad], rad^2."""
         return float(SIGMA**2 * (fwhm**2 - self.share * self.fwhm**2))
 
     def add(self, out: Floats, x: Floats, y: Floats, powers: Floats, origin: tuple[float, float], step: float) -> None:
@@ -130,7 +130,7 @@ def spread_map(
         left, low = int(block.x.min()) // BLOCK * BLOCK, int(block.y.min()) // BLOCK * BLOCK
 
         def nearest(d: Floats, left: int = left, low: int = low) -> NDArray[np.bool_]:
-            """Whether pixels are nearest to points of the block."""
+            """True if pixels are nearest to points of the block."""
             with np.errstate(invalid="ignore", divide="ignore"):
                 x, y = (np.rint(k) for k in _places(matrix, d))
                 inside = (x >= left) & (x < min(left + BLOCK, nx)) & (y >= low) & (y < min(low + BLOCK, ny)) & (d @ matrix[2] > 0)
@@ -154,7 +154,7 @@ def _places(matrix: Floats, d: Floats) -> tuple[Floats, Floats]:
 
 
 def _of_image(image: WcsMap, target: Any, axis: Floats | None) -> Under:
-    """What lies under blocks of ``target``: of an image."""
+    """Pixels of an image under blocks of ``target``."""
     sky, to_sky = ImageOnSky(image), np.linalg.inv(pixel_matrix(target)).T
 
     def parts(rows: NDArray[np.int64], columns: NDArray[np.int64], chosen: Chosen) -> Iterator[Part]:
@@ -182,7 +182,7 @@ def _of_image(image: WcsMap, target: Any, axis: Floats | None) -> Under:
 
 
 def _of_healpix(sky: HealpixMap, axis: Floats | None) -> Under:
-    """As `_of_image`, of a HEALPix map."""
+    """Pixels of a HEALPix map, as `_of_image`."""
     import healpy
 
     to_frame, area = frame_rotation(sky.frame), float(healpy.nside2pixarea(sky.nside))

@@ -47,7 +47,7 @@ PRESSURES = {
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a variable may be called, and its units; ``default`` is the unit of a variable that states none."""
+    """Names that a variable may have, and its units; ``default`` is the unit of a variable that states none."""
 
     what: str
     names: tuple[str, ...]
@@ -95,12 +95,12 @@ class Axis:
     values: Floats
 
     def at(self, number: int) -> dict[str, int]:
-        """Where its value ``number`` stands, by axis of the file."""
+        """Index of its value ``number``, by axis of the file."""
         return {dim: int(k) for dim, k in zip(self.dims, np.unravel_index(number, self.shape), strict=True)}
 
 
 class NetCdf:
-    """What NetCDF-3 and NetCDF-4 have in common.
+    """Base of the readers of NetCDF-3 and NetCDF-4.
 
     ``below_none``: how many values below 0 were raised to `DRIEST` before their logarithm was taken.
     ``remarks``: what was chosen.
@@ -141,7 +141,7 @@ class NetCdf:
         return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
 
     def units(self, name: str) -> str:
-        """As the file has them, in lower case, with one way to write a power; empty where there are none."""
+        """Units as the file has them, in lower case, with one way to write a power; empty where there are none."""
         text = str(self.attribute(name, "units", "") or "")
         return " ".join(text.replace("**", "").replace("^", "").replace("*", " ").lower().split())
 

@@ -125,7 +125,7 @@ def _ordinal(year: int, month: int, day: int, calendar: str) -> int:
 
 
 def _of_dates(raw: Any, units: str, name: str) -> Floats:
-    """Of numbers such as 20220801.25."""
+    """Read dates from numbers such as 20220801.25."""
     numbers = raw.astype(np.float64)
     if raw.dtype.kind == "f" and numbers.size and float(np.spacing(np.abs(raw).max())) * 86400 > RESOLVED:
         raise InputError(
