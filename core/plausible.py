@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from .band import SPEED_OF_LIGHT
+
 if TYPE_CHECKING:
     from .instrument import Instrument
 
@@ -43,7 +45,7 @@ def doubts(instrument: Instrument) -> list[str]:
     for name, camera in instrument.cameras.items():
         centre, who = camera.band.centre, f"{instrument.name}, {name}"
         found.append(doubt(f"{who}: the band's centre", centre / 1e9, (BAND[0] / 1e9, BAND[1] / 1e9), "GHz"))
-        limit = 1.22 * 299792458.0 / centre / instrument.telescope.diameter
+        limit = 1.22 * SPEED_OF_LIGHT / centre / instrument.telescope.diameter
         plane = camera.focalplane() if camera.focalplane_table is not None else None
         widths = [camera.beam_fwhm] if plane is None else [float(plane.fwhm.min()), float(plane.fwhm.max())]
         nets = [camera.net] if plane is None else [float(plane.net.min()), float(plane.net.max())]
