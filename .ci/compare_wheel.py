@@ -1,4 +1,6 @@
-"""Compare a wheel's content with the tree: every tracked source and data file is there, and nothing else."""
+"""Compare a wheel's content with the tree: every tracked source and data file is there, and nothing
+else.
+"""
 
 import subprocess
 import sys

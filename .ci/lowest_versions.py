@@ -1,4 +1,6 @@
-"""Constraints for pip: the lowest version of every dependency in pyproject.toml. python lowest_versions.py [EXTRA ...]"""
+"""Constraints for pip: the lowest version of every dependency in pyproject.toml. python
+lowest_versions.py [EXTRA ...]
+"""
 
 import re
 import sys

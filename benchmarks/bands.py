@@ -1,7 +1,9 @@
-"""CPU time of a camera with two bands and shared pixels beside each of its bands alone: `python benchmarks/bands.py [CASE ...]`.
+"""CPU time of a camera with two bands and shared pixels beside each of its bands alone: `python
+benchmarks/bands.py [CASE ...]`.
 
-The chain (pointing, atmosphere, white and pink noise, efficiencies, high-pass filter, common mode, map) on one thread, in one
-process, after a run that compiles; and the whole command, `zonda run` with maps, pictures and a report. By turns, medians.
+The chain (pointing, atmosphere, white and pink noise, efficiencies, high-pass filter, common mode,
+map) on one thread, in one process, after a run that compiles; and the whole command, `zonda run`
+with maps, pictures and a report. By turns, medians.
 """
 
 from __future__ import annotations
@@ -84,10 +86,14 @@ def command(file: Path, settings: list[str]) -> float:
     options = [part for setting in settings for part in ("--set", setting)]
     script = Path(sys.executable).with_name("zonda")
     subprocess.run(
-        [script, "run", file, "--threads", "1", "--output", file.parent / "out", *options], check=True, capture_output=True
+        [script, "run", file, "--threads", "1", "--output", file.parent / "out", *options],
+        check=True,
+        capture_output=True,
     )
     after = os.times()
-    return after.children_user + after.children_system - before.children_user - before.children_system
+    return (
+        after.children_user + after.children_system - before.children_user - before.children_system
+    )
 
 
 def main(names: list[str]) -> None:

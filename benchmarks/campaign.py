@@ -1,10 +1,12 @@
-"""What a campaign costs beside its observations: seconds per task, and memory against the number of tasks done.
+"""What a campaign costs beside its observations: seconds per task, and memory against the number of
+tasks done.
 
-    python benchmarks/campaign.py                       # 1000 tiny observations, two worker processes
-    python benchmarks/campaign.py --tasks 200 --engine serial --plot memory.png
+    python benchmarks/campaign.py                       # 1000 tiny observations, two worker
+    processes python benchmarks/campaign.py --tasks 200 --engine serial --plot memory.png
 
-The observations are 19 detectors x 100 samples, so that nearly all of the time is the campaign's own: sending tasks, the job log,
-partial products. Resident memory of the main process and of the largest worker is noted at every task.
+The observations are 19 detectors x 100 samples, so that nearly all of the time is the campaign's
+own: sending tasks, the job log, partial products. Resident memory of the main process and of the
+largest worker is noted at every task.
 """
 
 from __future__ import annotations
@@ -64,7 +66,17 @@ def main(arguments):
         path.write_text(YAML.format(tasks=given.tasks))
         options = ["--workers", str(given.workers)] if given.engine == "processes" else []
         begin, cpu = time.monotonic(), time.process_time()
-        status = zonda(["run", str(path), "--output", str(Path(folder) / "out"), "--engine", given.engine, *options])
+        status = zonda(
+            [
+                "run",
+                str(path),
+                "--output",
+                str(Path(folder) / "out"),
+                "--engine",
+                given.engine,
+                *options,
+            ]
+        )
         wall, cpu = time.monotonic() - begin, time.process_time() - cpu
     if status:
         return status
@@ -72,11 +84,18 @@ def main(arguments):
     span = rows[-1][0] - rows[skip][0]
     inside = sum(r[3] for r in rows[skip + 1 :])
     n = len(rows) - skip - 1
-    print(f"{len(rows)} tasks in {wall:.1f} s with planning and combining, {cpu:.1f} s of CPU time of the main process")
-    print(f"{1e3 * span / n:.1f} ms a task, of which {1e3 * inside / n:.1f} ms in the task itself on each worker")
+    print(
+        f"{len(rows)} tasks in {wall:.1f} s with planning and combining, {cpu:.1f} s of CPU time of"
+        " the main process"
+    )
+    print(
+        f"{1e3 * span / n:.1f} ms a task, of which {1e3 * inside / n:.1f} ms in the task itself on"
+        " each worker"
+    )
     for k in [*range(skip, len(rows), max(1, len(rows) // 10)), len(rows) - 1]:
         print(
-            f"{k + 1:>6} tasks  main {rows[k][1] / 1e6:6.1f} MB  worker at most {max(r[2] for r in rows[: k + 1]) / 1e6:6.1f} MB"
+            f"{k + 1:>6} tasks  main {rows[k][1] / 1e6:6.1f} MB  worker at most"
+            f" {max(r[2] for r in rows[: k + 1]) / 1e6:6.1f} MB"
         )
     if given.plot:
         plot(rows, given.plot)

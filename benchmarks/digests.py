@@ -1,6 +1,8 @@
-"""Digests of the shipped pipelines' main maps, to see whether a change moved a bit: `python benchmarks/digests.py [NAME ...]`.
+"""Digests of the shipped pipelines' main maps, to see whether a change moved a bit: `python
+benchmarks/digests.py [NAME ...]`.
 
-Bits belong to one machine's instruction set and one set of libraries: compare digests that the same machine has printed.
+Bits belong to one machine's instruction set and one set of libraries: compare digests that the same
+machine has printed.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ from zonda.core.pipeline import Pipeline
 PIPELINES = {
     "mustang2_cluster": (),
     "atlast_reduced": (),
-    "atlast_full": ("PointingDaisy.scan_duration=2 s",),  # 3.6e8 samples: all detectors, a short scan
+    "atlast_full": (
+        "PointingDaisy.scan_duration=2 s",
+    ),  # 3.6e8 samples: all detectors, a short scan
 }
 ARRAYS = ("signal", "hits", "weights", "noise", "half_difference")
 
@@ -34,10 +38,17 @@ def digest(array: np.ndarray) -> str:
 
 def main(names: list[str]) -> None:
     """One line a map: a digest of each of its arrays."""
-    print(f"numba {numba.__version__}, numpy {np.__version__}, CPU {llvmlite.binding.get_host_cpu_name()}")
+    print(
+        f"numba {numba.__version__}, numpy {np.__version__}, CPU"
+        f" {llvmlite.binding.get_host_cpu_name()}"
+    )
     for name in names or PIPELINES:
         file = load(name, PIPELINES[name])
-        steps = [o for o in file.operators if not isinstance(o, Output) and o.provides.isdisjoint({"spectrum", "time_streams"})]
+        steps = [
+            o
+            for o in file.operators
+            if not isinstance(o, Output) and o.provides.isdisjoint({"spectrum", "time_streams"})
+        ]
         with TemporaryDirectory() as folder:
             data = Pipeline(steps).run(file.scene(), output=Path(folder), memory=8 * 10**9)
         product = data.products["map"]

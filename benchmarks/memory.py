@@ -1,8 +1,10 @@
-"""Memory: what a run was predicted to hold and what it held, over scenes and budgets; and a long scan against time.
+"""Memory: what a run was predicted to hold and what it held, over scenes and budgets; and a long
+scan against time.
 
-    python benchmarks/memory.py                    # table: scenes x budgets, each in a process of its own
-    python benchmarks/memory.py --long 10          # one continuous scan of 10 hours; writes docs/memory.png
-    python benchmarks/memory.py --full 4 --memory 6  # 4 s of `atlast_full` in 6 GB: rate, and the total for 516 s
+    python benchmarks/memory.py                    # table: scenes x budgets, each in a process of
+    its own python benchmarks/memory.py --long 10          # one continuous scan of 10 hours; writes
+    docs/memory.png python benchmarks/memory.py --full 4 --memory 6  # 4 s of `atlast_full` in 6 GB:
+    rate, and the total for 516 s
 
 Resident memory is that of the whole process, libraries included, as the kernel counts it.
 """
@@ -23,10 +25,19 @@ from pathlib import Path
 SCENES = {
     "M2, 516 s": {"instrument": "mustang2", "scan_duration": "516 s"},
     "M2, 1 h": {"instrument": "mustang2", "scan_duration": "1 h"},
-    "M2, 2 h, svd": {"instrument": "mustang2", "scan_duration": "2 h", "method": "svd"},  # its stream must be whole: on disk
+    "M2, 2 h, svd": {
+        "instrument": "mustang2",
+        "scan_duration": "2 h",
+        "method": "svd",
+    },  # its stream must be whole: on disk
     "ACT-like, 60 s": {"instrument": "act", "scan_duration": "60 s"},
     # a tile of all detectors is larger than what is copied of it at a time
-    "SO LAT, 60 s, svd": {"instrument": "so_lat", "scan_duration": "60 s", "method": "svd", "pixel": "1 arcmin"},
+    "SO LAT, 60 s, svd": {
+        "instrument": "so_lat",
+        "scan_duration": "60 s",
+        "method": "svd",
+        "pixel": "1 arcmin",
+    },
 }
 BUDGETS = (0.6, 0.8, 1.2, 4.0)
 
@@ -61,10 +72,14 @@ def peak_memory():
 def chain(scan_duration, method="mean", pixel="2 arcsec"):
     import zonda
 
-    cluster = files("zonda.pipelines") / "data" / "merging_cluster.fits"  # in an installed package and in this tree
+    cluster = (
+        files("zonda.pipelines") / "data" / "merging_cluster.fits"
+    )  # in an installed package and in this tree
     return zonda.Pipeline(
         [
-            zonda.PointingDaisy(radius="4 arcmin", speed="50 arcsec/s", scan_duration=scan_duration),
+            zonda.PointingDaisy(
+                radius="4 arcmin", speed="50 arcsec/s", scan_duration=scan_duration
+            ),
             zonda.SkyMap(file=cluster, centre="target"),
             zonda.AtmosphereLayers(pwv_rms="0.5 %"),
             zonda.WhiteNoise(),
@@ -80,7 +95,9 @@ def chain(scan_duration, method="mean", pixel="2 arcsec"):
 def scene(instrument):
     import zonda
 
-    return zonda.Scene(site="green_bank", instrument=instrument, time="2024-11-25T01:00", target="05h +20d", seed=1)
+    return zonda.Scene(
+        site="green_bank", instrument=instrument, time="2024-11-25T01:00", target="05h +20d", seed=1
+    )
 
 
 def one(name, budget, threads):
@@ -116,7 +133,16 @@ def table(threads):
     print(f"{'scene':16s} {'budget':>8s} {'predicted':>10s} {'actual':>8s}  streams")
     for name in SCENES:
         for budget in BUDGETS:
-            command = [sys.executable, __file__, "--one", name, "--memory", str(budget), "--threads", str(threads)]
+            command = [
+                sys.executable,
+                __file__,
+                "--one",
+                name,
+                "--memory",
+                str(budget),
+                "--threads",
+                str(threads),
+            ]
             out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
             found = json.loads(out.splitlines()[-1])
             if "refused" in found:
@@ -124,8 +150,8 @@ def table(threads):
                 continue
             over = "  OVER THE BUDGET" if found["actual"] > budget else ""
             print(
-                f"{name:16s} {budget:5.1f} GB {found['predicted']:7.2f} GB {found['actual']:5.2f} GB  "
-                f"{found['elsewhere'] or 'kept'}{over}",
+                f"{name:16s} {budget:5.1f} GB {found['predicted']:7.2f} GB {found['actual']:5.2f}"
+                f" GB  {found['elsewhere'] or 'kept'}{over}",
                 flush=True,
             )
 
@@ -139,10 +165,14 @@ def report(data, rows, cpu, wall):
         if who == "Execution":
             print(f"  {what}: {text}")
     print(
-        f"  {n:.3e} samples, {cpu:.1f} s of CPU = {cpu / n * 1e9:.1f} ns/sample, {wall:.0f} s wall, peak {peak_memory():.2f} GB"
+        f"  {n:.3e} samples, {cpu:.1f} s of CPU = {cpu / n * 1e9:.1f} ns/sample, {wall:.0f} s wall,"
+        f" peak {peak_memory():.2f} GB"
     )
     third = rows[len(rows) // 3 :]
-    print(f"  resident over the last two thirds: {min(r for _, r in third):.2f} to {max(r for _, r in third):.2f} GB")
+    print(
+        f"  resident over the last two thirds: {min(r for _, r in third):.2f} to"
+        f" {max(r for _, r in third):.2f} GB"
+    )
 
 
 def run(pipeline, where, threads, memory):
@@ -156,7 +186,12 @@ def run(pipeline, where, threads, memory):
 def long(hours, threads, memory):
     print(f"MUSTANG-2, one scan of {hours:g} h at 100 Hz, budget {memory:g} GB, {threads} threads")
     data, rows = run(chain(f"{hours} h"), scene("mustang2"), threads, memory)
-    draw(rows, memory, f"MUSTANG-2, {hours:g} h in one scan: {data.observations[0].n_samples * 223 / 1e8:.1f}e8 samples")
+    draw(
+        rows,
+        memory,
+        f"MUSTANG-2, {hours:g} h in one scan: {data.observations[0].n_samples * 223 / 1e8:.1f}e8"
+        " samples",
+    )
 
 
 def draw(rows, memory, title):
@@ -169,7 +204,9 @@ def draw(rows, memory, title):
     axes.plot(*zip(*rows, strict=True), lw=1)
     axes.axhline(memory, color="0.5", ls="--", lw=0.8)
     axes.text(0, memory, " --memory", va="bottom", size=8, color="0.4")
-    axes.set(xlabel="wall time (s)", ylabel="resident memory (GB)", ylim=(0, 1.15 * memory), title=title)
+    axes.set(
+        xlabel="wall time (s)", ylabel="resident memory (GB)", ylim=(0, 1.15 * memory), title=title
+    )
     axes.title.set_size(9)
     path = Path(__file__).resolve().parents[1] / "docs" / "memory.png"
     figure.savefig(path, dpi=90)
@@ -187,14 +224,18 @@ def full(seconds, threads, memory):
 
     print(f"atlast_full, {seconds:g} s of 516 s, budget {memory:g} GB, {threads} threads")
     begin = time.process_time()
-    data, _ = run(zonda.Pipeline(steps, precision=file.header.precision), file.scene(), threads, memory)
+    data, _ = run(
+        zonda.Pipeline(steps, precision=file.header.precision), file.scene(), threads, memory
+    )
     n = sum(o.n_detectors * o.n_samples for o in data.observations)
     whole = (time.process_time() - begin) / n * 9.288e10
     print(f"  516 s would take {whole / 3600:.1f} h of CPU time")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--long", type=float, metavar="HOURS")
     parser.add_argument("--full", type=float, metavar="SECONDS")
     parser.add_argument("--memory", type=float, default=3.0, metavar="GB")

@@ -2,10 +2,12 @@
 
     python benchmarks/peers.py --toast /path/to/python --maria /path/to/python
     python benchmarks/peers.py --maria /path/to/python --what atmosphere --case M2 --repeat 1
-    python benchmarks/peers.py --maria /path/to/python --what statistics    # covariance and spectrum of realizations
+    python benchmarks/peers.py --maria /path/to/python --what statistics    # covariance and
+    spectrum of realizations
 
-Each code runs in an environment of its own, one process a run, one thread, in turns. CPU seconds are those of the process, all
-its threads and its children, without imports; memory is the process's peak. What each figure holds: docs/peers.md.
+Each code runs in an environment of its own, one process a run, one thread, in turns. CPU seconds
+are those of the process, all its threads and its children, without imports; memory is the process's
+peak. What each figure holds: docs/peers.md.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 
 @dataclass(frozen=True)
 class Case:
-    """A camera and a scan: dish [m], band centre [GHz], field [rad], scan size [rad] and speed [rad/s] on the sky."""
+    """A camera and a scan: dish [m], band centre [GHz], field [rad], scan size [rad] and speed
+    [rad/s] on the sky.
+    """
 
     about: str
     diameter: float
@@ -53,8 +57,30 @@ class Case:
 
 
 CASES = {
-    "M2": Case("100 m dish, daisy", 100, 93, 4.2 * ARCMIN, 223, 100, 516, "daisy", 4 * ARCMIN, 50 * ARCMIN / 60),
-    "SURVEY": Case("6 m dish, 7.8 deg, azimuth scan of 30 deg", 6, 150, 7.8 * DEG, 500, 100, 60, "azimuth", 30 * DEG, 1.5 * DEG),
+    "M2": Case(
+        "100 m dish, daisy",
+        100,
+        93,
+        4.2 * ARCMIN,
+        223,
+        100,
+        516,
+        "daisy",
+        4 * ARCMIN,
+        50 * ARCMIN / 60,
+    ),
+    "SURVEY": Case(
+        "6 m dish, 7.8 deg, azimuth scan of 30 deg",
+        6,
+        150,
+        7.8 * DEG,
+        500,
+        100,
+        60,
+        "azimuth",
+        30 * DEG,
+        1.5 * DEG,
+    ),
 }
 
 
@@ -71,10 +97,14 @@ def boresight(case: Case, t: Floats) -> tuple[Floats, Floats]:
     """Azimuth and elevation, rad."""
     if case.scan == "daisy":
         phase = t * case.speed / case.size
-        z = np.sin(phase) * np.exp(1j * phase * np.pi / 10) + 0.15 * np.cos(phase) * np.exp(1j * np.sqrt(2) * phase * np.pi / 10)
+        z = np.sin(phase) * np.exp(1j * phase * np.pi / 10) + 0.15 * np.cos(phase) * np.exp(
+            1j * np.sqrt(2) * phase * np.pi / 10
+        )
         return 150 * DEG + case.size * z.real / np.cos(ELEVATION), ELEVATION + case.size * z.imag
     reach = case.size / 2 / np.cos(ELEVATION)
-    return 150 * DEG + reach * np.sin(t * case.speed / np.cos(ELEVATION) / reach), np.full(len(t), ELEVATION)
+    return 150 * DEG + reach * np.sin(t * case.speed / np.cos(ELEVATION) / reach), np.full(
+        len(t), ELEVATION
+    )
 
 
 def write_case(case: Case, path: Path) -> int:
@@ -89,24 +119,52 @@ def write_case(case: Case, path: Path) -> int:
 
 
 def write_stare(case: Case, offset: float, path: Path) -> None:
-    """Five detectors that look at one place: the centre, and ``offset`` [rad] to each side of it."""
+    """Five detectors that look at one place: the centre, and ``offset`` [rad] to each side of
+    it.
+    """
     t = np.arange(round(STARE_SECONDS * STARE_RATE)) / STARE_RATE
     xi, eta = offset * np.array([[0, 1, -1, 0, 0], [0, 0, 0, 1, -1]])
-    _write(path, case, t, STARE_RATE, xi, eta, np.full(len(t), 150 * DEG), np.full(len(t), ELEVATION))
+    _write(
+        path, case, t, STARE_RATE, xi, eta, np.full(len(t), 150 * DEG), np.full(len(t), ELEVATION)
+    )
 
 
-def _write(path: Path, case: Case, t: Floats, rate: float, xi: Floats, eta: Floats, azimuth: Floats, elevation: Floats) -> None:
+def _write(
+    path: Path,
+    case: Case,
+    t: Floats,
+    rate: float,
+    xi: Floats,
+    eta: Floats,
+    azimuth: Floats,
+    elevation: Floats,
+) -> None:
     from zonda.core.configuration.time import Instant
 
     np.savez(
-        path, xi=xi, eta=eta, seconds=t, azimuth=azimuth, elevation=elevation, rate=float(rate), duration=len(t) / rate,
-        diameter=float(case.diameter), band_centre=case.band * 1e9, band_width=20e9, pwv=1e-3, pwv_rms=0.03, date=DATE,
-        start=Instant.parse(DATE).posix, **SITE,
-    )  # fmt: skip
+        path,
+        xi=xi,
+        eta=eta,
+        seconds=t,
+        azimuth=azimuth,
+        elevation=elevation,
+        rate=float(rate),
+        duration=len(t) / rate,
+        diameter=float(case.diameter),
+        band_centre=case.band * 1e9,
+        band_width=20e9,
+        pwv=1e-3,
+        pwv_rms=0.03,
+        date=DATE,
+        start=Instant.parse(DATE).posix,
+        **SITE,
+    )
 
 
 def tables(folder: Path) -> None:
-    """What maria reads, made from zonda's air, unless the user names a folder of her own (``MARIA_CACHE_DIR``)."""
+    """What maria reads, made from zonda's air, unless the user names a folder of her own
+    (``MARIA_CACHE_DIR``).
+    """
     sys.path.insert(0, str(HERE))
     from maria_tables import write_tables
     from zonda_atmosphere import chajnantor
@@ -127,19 +185,30 @@ def call(python: str, script: str, arguments: list[str], folder: Path, limit: fl
         environment["PYTHONPATH"] = os.pathsep.join(sys.path)
     try:
         done = subprocess.run(
-            [python, str(HERE / script), *arguments], env=environment, capture_output=True, text=True, timeout=limit, cwd=folder
+            [python, str(HERE / script), *arguments],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=limit,
+            cwd=folder,
         )
     except subprocess.TimeoutExpired:
         raise RuntimeError(f"not done after {limit:g} s") from None
     except OSError as error:
         raise RuntimeError(f"cannot be run: {error}") from None
     if done.returncode:
-        raise RuntimeError((done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1])
+        raise RuntimeError(
+            (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+        )
     return (done.stdout.strip().splitlines() or [""])[-1]
 
 
-def in_turns(runs: dict[str, tuple[str, str, list[str]]], options: argparse.Namespace, folder: Path) -> dict[str, list[Report]]:
-    """What every run reports, ``--repeat`` times, one after another so that all meet the same noise."""
+def in_turns(
+    runs: dict[str, tuple[str, str, list[str]]], options: argparse.Namespace, folder: Path
+) -> dict[str, list[Report]]:
+    """What every run reports, ``--repeat`` times, one after another so that all meet the same
+    noise.
+    """
     found: dict[str, list[Report]] = {name: [] for name in runs}
     failed: set[str] = set()
     for _ in range(options.repeat):
@@ -147,7 +216,9 @@ def in_turns(runs: dict[str, tuple[str, str, list[str]]], options: argparse.Name
             if name in failed:
                 continue
             try:
-                found[name].append(json.loads(call(python, script, arguments, folder, options.limit)))
+                found[name].append(
+                    json.loads(call(python, script, arguments, folder, options.limit))
+                )
             except RuntimeError as error:
                 print(f"  {name:8s} {error}")
                 failed.add(name)
@@ -163,7 +234,9 @@ def atmosphere(name: str, peers: dict[str, str], options: argparse.Namespace, fo
     path = folder / f"{name}.npz"
     n = write_case(CASES[name], path)
     case = CASES[name]
-    size = f"{case.detectors} detectors, {case.rate:g} Hz, {case.seconds:g} s, {n / 1e6:.1f} M samples"
+    size = (
+        f"{case.detectors} detectors, {case.rate:g} Hz, {case.seconds:g} s, {n / 1e6:.1f} M samples"
+    )
     print(f"\n{name}, the atmosphere alone: {case.about}; {size}")
     runs = {"zonda": (sys.executable, "zonda_atmosphere.py", [str(path)])}
     if "maria" in peers:
@@ -171,16 +244,24 @@ def atmosphere(name: str, peers: dict[str, str], options: argparse.Namespace, fo
     if "toast" in peers:
         runs["toast"] = (peers["toast"], "toast_atmosphere.py", [str(path)])
     found = in_turns(runs, options, folder)
-    columns = f"{'set-up s':>9s} {'evaluation s':>13s} {'ns/sample':>10s} {'x zonda':>8s} {'first run s':>12s} {'peak GB':>8s}"
+    columns = (
+        f"{'set-up s':>9s} {'evaluation s':>13s} {'ns/sample':>10s} {'x zonda':>8s}"
+        f" {'first run s':>12s} {'peak GB':>8s}"
+    )
     print(f"  {'':8s} {'version':8s} {columns} {'before':>7s}")
     unit = middle(found["zonda"], "setup", "evaluation") if "zonda" in found else float("nan")
     for who, reports in found.items():
         total = middle(reports, "setup", "evaluation")
         apart = (
-            f"{middle(reports, 'setup'):9.2f} {middle(reports, 'evaluation'):13.2f} {total / n * 1e9:10.1f} {total / unit:8.1f}"
+            f"{middle(reports, 'setup'):9.2f} {middle(reports, 'evaluation'):13.2f}"
+            f" {total / n * 1e9:10.1f} {total / unit:8.1f}"
         )
         memory = f"{middle(reports, 'peak'):8.2f} {middle(reports, 'before'):7.2f}"
-        print(f"  {who:8s} {reports[0]['version']:8s} {apart} {middle(reports, 'first'):12.1f} {memory}", flush=True)
+        print(
+            f"  {who:8s} {reports[0]['version']:8s} {apart} {middle(reports, 'first'):12.1f}"
+            f" {memory}",
+            flush=True,
+        )
 
 
 def chain(peers: dict[str, str], options: argparse.Namespace, folder: Path) -> None:
@@ -193,10 +274,15 @@ def chain(peers: dict[str, str], options: argparse.Namespace, folder: Path) -> N
     found = in_turns(runs, options, folder)
     for who, reports in found.items():
         total = middle(reports, "simulation", "mapping")
-        figures = f"{total:8.2f} CPU s, {total / n * 1e9:8.1f} ns/sample, peak {middle(reports, 'peak'):.2f} GB"
+        figures = (
+            f"{total:8.2f} CPU s, {total / n * 1e9:8.1f} ns/sample, peak"
+            f" {middle(reports, 'peak'):.2f} GB"
+        )
         print(f"  {who:8s} {reports[0]['version']:8s} {figures}", flush=True)
     if len(found) > 1:
-        ratio = middle(found["maria"], "simulation", "mapping") / middle(found["zonda"], "simulation", "mapping")
+        ratio = middle(found["maria"], "simulation", "mapping") / middle(
+            found["zonda"], "simulation", "mapping"
+        )
         print(f"  maria / zonda: {ratio:.0f}")
 
 
@@ -211,12 +297,19 @@ def statistics(peers: dict[str, str], options: argparse.Namespace, folder: Path)
         path = folder / "stare.npz"
         write_stare(case, offset, path)
         print(
-            f"\nStare of {STARE_SECONDS:g} s, {name} between detectors; measured / expected, {options.realizations} realizations"
+            f"\nStare of {STARE_SECONDS:g} s, {name} between detectors; measured / expected,"
+            f" {options.realizations} realizations"
         )
         for who, (python, script) in runs.items():
             out = folder / f"{who}.npz"
             try:
-                call(python, script, [str(path), str(out), str(options.realizations)], folder, options.limit)
+                call(
+                    python,
+                    script,
+                    [str(path), str(out), str(options.realizations)],
+                    folder,
+                    options.limit,
+                )
             except RuntimeError as error:
                 print(f"  {who:8s} {error}")
                 continue
@@ -225,16 +318,35 @@ def statistics(peers: dict[str, str], options: argparse.Namespace, folder: Path)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--toast", metavar="PYTHON", help="interpreter of an environment with toast (PyPI: toast-cmb)")
-    parser.add_argument("--maria", metavar="PYTHON", help="interpreter of an environment with maria 1.5")
-    parser.add_argument(
-        "--what", nargs="*", choices=["atmosphere", "chain", "statistics"], default=["atmosphere", "chain", "statistics"]
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--case", nargs="*", choices=list(CASES), default=list(CASES), help="of the atmosphere; default: all")
+    parser.add_argument(
+        "--toast",
+        metavar="PYTHON",
+        help="interpreter of an environment with toast (PyPI: toast-cmb)",
+    )
+    parser.add_argument(
+        "--maria", metavar="PYTHON", help="interpreter of an environment with maria 1.5"
+    )
+    parser.add_argument(
+        "--what",
+        nargs="*",
+        choices=["atmosphere", "chain", "statistics"],
+        default=["atmosphere", "chain", "statistics"],
+    )
+    parser.add_argument(
+        "--case",
+        nargs="*",
+        choices=list(CASES),
+        default=list(CASES),
+        help="of the atmosphere; default: all",
+    )
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--realizations", type=int, default=48)
-    parser.add_argument("--limit", type=float, default=1200, help="seconds that a process may take (default 1200)")
+    parser.add_argument(
+        "--limit", type=float, default=1200, help="seconds that a process may take (default 1200)"
+    )
     options = parser.parse_args()
     peers = installed({"toast": options.toast, "maria": options.maria})
     with tempfile.TemporaryDirectory() as name:
@@ -259,11 +371,16 @@ def installed(pythons: dict[str, str | None]) -> dict[str, str]:
             if python is None:
                 raise OSError("no environment named")
             subprocess.run(
-                [python, "-c", f"import importlib.util as u; assert u.find_spec('{name}')"], check=True, capture_output=True
+                [python, "-c", f"import importlib.util as u; assert u.find_spec('{name}')"],
+                check=True,
+                capture_output=True,
             )
             found[name] = python
         except (OSError, subprocess.CalledProcessError) as error:
-            print(f"{name}: not installed ({error if isinstance(error, OSError) else 'not found by ' + str(python)})")
+            print(
+                f"{name}: not installed"
+                f" ({error if isinstance(error, OSError) else 'not found by ' + str(python)})"
+            )
     return found
 
 

@@ -1,11 +1,13 @@
-"""What planning buys: time, memory and the difference in the map, with and without pruning; predicted against actual.
+"""What planning buys: time, memory and the difference in the map, with and without pruning;
+predicted against actual.
 
     python benchmarks/plan.py                 # all scenes, each run in a process of its own
     python benchmarks/plan.py stare survey    # some
 
-CPU seconds are those of a whole process with its imports and planning, compiled code from the cache (a first run, not counted,
-fills it). "plan s" is what planning took of them, most of it imports that the run needs anyway; "steps s" is the CPU time of the
-pipeline's steps alone, without imports, planning and reading.
+CPU seconds are those of a whole process with its imports and planning, compiled code from the cache
+(a first run, not counted, fills it). "plan s" is what planning took of them, most of it imports
+that the run needs anyway; "steps s" is the CPU time of the pipeline's steps alone, without imports,
+planning and reading.
 """
 
 from __future__ import annotations
@@ -48,19 +50,31 @@ def one(scene, folder, prune):
     for label, _, seconds in data.provenance["timings"]:
         timed[label] = timed.get(label, 0.0) + seconds
     found = {
-        "predicted": made.prediction.total, "actual": actual, "planning": planning, "bytes": made.prediction.bytes,
-        "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, "noise": made.noise[1],
+        "predicted": made.prediction.total,
+        "actual": actual,
+        "planning": planning,
+        "bytes": made.prediction.bytes,
+        "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        "noise": made.noise[1],
         "stages": {k: [v, timed.get(k, 0.0)] for k, v in made.prediction.seconds.items()},
         "steps": sum(timed.values()),
         "decided": [f"{d.name}: {d.choice.what}" for d in made.decided if d.chosen > 0],
         "left_out": [f"{r.run} {r.operator}".strip() for r in made.structure.rows],
-    }  # fmt: skip
+    }
     print(json.dumps(found))
 
 
 def launch(scene, folder, prune):
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, __file__, "--one", scene, "--folder", str(folder), *([] if prune else ["--no-prune"])]
+    command = [
+        sys.executable,
+        __file__,
+        "--one",
+        scene,
+        "--folder",
+        str(folder),
+        *([] if prune else ["--no-prune"]),
+    ]
     done = subprocess.run(command, check=True, env=environment, capture_output=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -80,12 +94,16 @@ def difference(a, b, noise):
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scenes", nargs="*", choices=[*SCENES, []], help="default: all")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     parser.add_argument("--folder", help=argparse.SUPPRESS)
     parser.add_argument("--no-prune", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--stages", action="store_true", help="predicted and actual seconds of each operator")
+    parser.add_argument(
+        "--stages", action="store_true", help="predicted and actual seconds of each operator"
+    )
     options = parser.parse_args()
     if options.one:
         one(options.one, Path(options.folder), not options.no_prune)
@@ -102,15 +120,22 @@ def main() -> int:
                 f = launch(scene, folder, prune)
                 what = "planned" if prune else "all on"
                 print(
-                    f"{scene:18s} {what:8s} {f['actual']:7.1f} {f['predicted']:9.1f} {f['predicted'] / f['actual']:8.2f} "
-                    f"{f['peak'] / 1e9:5.2f} {f['bytes'] / 1e9:9.2f} {f['planning']:6.1f} {f['steps']:7.1f}"
+                    f"{scene:18s} {what:8s} {f['actual']:7.1f} {f['predicted']:9.1f}"
+                    f" {f['predicted'] / f['actual']:8.2f} {f['peak'] / 1e9:5.2f}"
+                    f" {f['bytes'] / 1e9:9.2f} {f['planning']:6.1f} {f['steps']:7.1f}"
                 )
                 if options.stages:
                     for label, (predicted, actual) in f["stages"].items():
                         print(f"    {label:24s} {predicted:7.2f} predicted {actual:7.2f} actual")
             ratio = difference(*folders, f["noise"])
-            print(f"    difference of the maps: {'no map asked for' if ratio is None else f'{ratio:.3f} of the noise'}")
-            print(f"    {'; '.join(f['decided']) or 'nothing coarsened'}; left out: {', '.join(f['left_out']) or 'nothing'}")
+            print(
+                "    difference of the maps:"
+                f" {'no map asked for' if ratio is None else f'{ratio:.3f} of the noise'}"
+            )
+            print(
+                f"    {'; '.join(f['decided']) or 'nothing coarsened'}; left out:"
+                f" {', '.join(f['left_out']) or 'nothing'}"
+            )
             sys.stdout.flush()
     return 0
 

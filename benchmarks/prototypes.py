@@ -1,4 +1,6 @@
-"""The chain of the prototypes (research code, not part of zonda), for `stages.py --prototypes`: its stages' CPU times."""
+"""The chain of the prototypes (research code, not part of zonda), for `stages.py --prototypes`: its
+stages' CPU times.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,11 @@ STAGES = {
 }
 """The prototype's names of the stages of `stages.BARS`."""
 
-CASES = {"M2": ("M2", 223, 516.0), "AT-slice": ("AT", 3000, 32.0), "FULL-slice": ("FULL", 1024, 20.0)}
+CASES = {
+    "M2": ("M2", 223, 516.0),
+    "AT-slice": ("AT", 3000, 32.0),
+    "FULL-slice": ("FULL", 1024, 20.0),
+}
 """Its case, detectors and seconds: a multiple of its coarse step, near those of `stages.CASES`."""
 
 
@@ -40,7 +46,9 @@ class Prototype:
         sys.path.append(str(folder))
         with contextlib.suppress(ImportError):
             import finufft  # noqa: F401
-        sys.modules.setdefault("finufft", types.ModuleType("finufft"))  # imported there, and not used by the chain
+        sys.modules.setdefault(
+            "finufft", types.ModuleType("finufft")
+        )  # imported there, and not used by the chain
         self._chain = importlib.import_module("e2e")
         self._case, self._detectors, self._seconds = CASES[case]
         self.stages(32)
@@ -51,4 +59,7 @@ class Prototype:
         with contextlib.redirect_stdout(io.StringIO()):
             times = self._chain.pipeline(self._case, detectors, verify=False, Tobs=self._seconds)
         samples = detectors * int(self._seconds * self._chain.q4.case(self._case).fs)
-        return {stage: sum(times[name] for name in names) / samples * 1e9 for stage, names in STAGES.items()}
+        return {
+            stage: sum(times[name] for name in names) / samples * 1e9
+            for stage, names in STAGES.items()
+        }

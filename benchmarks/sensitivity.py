@@ -1,8 +1,10 @@
-"""The forecast of `zonda sensitivity` against simulations of the same pipelines on four cameras: table of docs/sensitivity.md.
+"""The forecast of `zonda sensitivity` against simulations of the same pipelines on four cameras:
+table of docs/sensitivity.md.
 
     python benchmarks/sensitivity.py [--case NAME ...] [--seeds N] [--json FILE]
 
-The cases are daisies of MUSTANG-2 (one scan), AtLAST's reduced camera and APEX (345 GHz), and azimuth scans of ACT.
+The cases are daisies of MUSTANG-2 (one scan), AtLAST's reduced camera and APEX (345 GHz), and
+azimuth scans of ACT.
 """
 
 from __future__ import annotations
@@ -56,7 +58,9 @@ operators:
 
 
 class Case(NamedTuple):
-    """A pipeline, the radius of the circle that its depth is averaged over, and how often it is simulated."""
+    """A pipeline, the radius of the circle that its depth is averaged over, and how often it is
+    simulated.
+    """
 
     pipeline: str
     settings: tuple[str, ...]
@@ -65,7 +69,12 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "MUSTANG-2": Case("mustang2_cluster", ("PointingDaisy.scans=1", "PointingDaisy.offsets=none"), "0.5 arcmin", 48),
+    "MUSTANG-2": Case(
+        "mustang2_cluster",
+        ("PointingDaisy.scans=1", "PointingDaisy.offsets=none"),
+        "0.5 arcmin",
+        48,
+    ),
     "AtLAST, reduced": Case("atlast_reduced", (), "7.5 arcmin", 4),
     "ACT": Case(ACT, (), "20 arcmin", 16),
     "APEX": Case(APEX, (), "2 arcmin", 24),
@@ -74,7 +83,9 @@ CASES = {
 
 def file_of(case: Case) -> PipelineFile:
     """A case's pipeline."""
-    return parse(case.pipeline) if "\n" in case.pipeline else zonda.load(case.pipeline, case.settings)
+    return (
+        parse(case.pipeline) if "\n" in case.pipeline else zonda.load(case.pipeline, case.settings)
+    )
 
 
 def main() -> None:
@@ -85,9 +96,17 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures to a file, too")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent)
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parent,
+    )
     print(f"commit {commit.stdout.strip()}\n")
-    print("| case | part | forecast [uK_RJ] | simulated | difference | z | stated | CPU of the forecast |")
+    print(
+        "| case | part | forecast [uK_RJ] | simulated | difference | z | stated | CPU of the"
+        " forecast |"
+    )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
     rows = []
     for name in arguments.case or CASES:
@@ -99,12 +118,30 @@ def main() -> None:
         assert audited.audit is not None
         for row in audited.audit.rows:
             stated = found.depth.error.get(row.part, found.depth.total_error(found.seconds))
-            figures = [f"{row.forecast * 1e6:.2f}", f"{row.mean * 1e6:.2f} +- {row.error * 1e6:.2f} ({row.seeds} seeds)"]
-            figures += [f"{100 * row.difference:+.1f} %", f"{row.z:+.1f}", f"{100 * stated:.0f} %", f"{used:.1f} s"]
+            figures = [
+                f"{row.forecast * 1e6:.2f}",
+                f"{row.mean * 1e6:.2f} +- {row.error * 1e6:.2f} ({row.seeds} seeds)",
+            ]
+            figures += [
+                f"{100 * row.difference:+.1f} %",
+                f"{row.z:+.1f}",
+                f"{100 * stated:.0f} %",
+                f"{used:.1f} s",
+            ]
             print(f"| {' | '.join([name, row.part, *figures])} |", flush=True)
-            rows.append({"case": name, "part": row.part, "forecast": row.forecast, "simulated": row.mean, "error": row.error})
+            rows.append(
+                {
+                    "case": name,
+                    "part": row.part,
+                    "forecast": row.forecast,
+                    "simulated": row.mean,
+                    "error": row.error,
+                }
+            )
     if arguments.json:
-        arguments.json.write_text(json.dumps({"commit": commit.stdout.strip(), "rows": rows}, indent=2))
+        arguments.json.write_text(
+            json.dumps({"commit": commit.stdout.strip(), "rows": rows}, indent=2)
+        )
 
 
 if __name__ == "__main__":

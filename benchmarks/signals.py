@@ -1,8 +1,10 @@
-"""What further signals cost: `python benchmarks/signals.py [PIPELINE] [--set KEY=VALUE] [--threads N] [--repeat N]`.
+"""What further signals cost: `python benchmarks/signals.py [PIPELINE] [--set KEY=VALUE] [--threads
+N] [--repeat N]`.
 
-CPU and wall seconds of the scans (least of the repetitions, compiled before), without spectra, files, plots and report, for the
-complete signal alone and with others beside it, in turn; peak memory of a process of its own. It uses nothing that 0.1.0 lacks:
-to compare two versions, run the same file by turns with the Python of each.
+CPU and wall seconds of the scans (least of the repetitions, compiled before), without spectra,
+files, plots and report, for the complete signal alone and with others beside it, in turn; peak
+memory of a process of its own. It uses nothing that 0.1.0 lacks: to compare two versions, run the
+same file by turns with the Python of each.
 """
 
 from __future__ import annotations
@@ -20,9 +22,20 @@ CASES = {
     "the complete signal alone": {},
     "with noiseless and source_free": {"noiseless": SKY, "source_free": REST},
     "with noiseless, own modes": {"noiseless": {"only": ["sky"]}},
-    "with noiseless and an unfiltered sky": {"noiseless": SKY, "raw": {"only": ["sky"], "filters": "none"}},
+    "with noiseless and an unfiltered sky": {
+        "noiseless": SKY,
+        "raw": {"only": ["sky"], "filters": "none"},
+    },
 }
-LEFT_OUT = {"SaveMap", "SaveTOD", "Plots", "Report", "PowerSpectrum", "TimeStreams", "TransferFunction"}
+LEFT_OUT = {
+    "SaveMap",
+    "SaveTOD",
+    "Plots",
+    "Report",
+    "PowerSpectrum",
+    "TimeStreams",
+    "TransferFunction",
+}
 
 
 def one(case: str, options: argparse.Namespace) -> None:
@@ -57,7 +70,9 @@ def main() -> None:
         return
     for case in CASES:
         command = [sys.executable, __file__, *sys.argv[1:], "--case", case]
-        cpu, wall, memory = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+        cpu, wall, memory = json.loads(
+            subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        )
         print(f"{case:38} {cpu:6.2f} s CPU {wall:6.2f} s wall {memory:6.0f} MB")
 
 

@@ -1,14 +1,17 @@
-"""What the chain costs, stage by stage: ns per sample, CPU seconds, peak memory, against what was asked for.
+"""What the chain costs, stage by stage: ns per sample, CPU seconds, peak memory, against what was
+asked for.
 
     python benchmarks/stages.py            # all cases, each in a process of its own
     python benchmarks/stages.py M2         # one case
     python benchmarks/stages.py M2 --threads 2 --repeat 5
-    python benchmarks/stages.py M2 --prototypes FOLDER   # beside the prototypes' chain, run by turns in the same process
+    python benchmarks/stages.py M2 --prototypes FOLDER   # beside the prototypes' chain, run by
+    turns in the same process
 
-The reference is numpy drawing as many float32 normal deviates (``Generator.standard_normal``), the least that any simulation
-of detector noise does with that library: ratios to it compare machines. CPU seconds are those of the whole process, all
-threads, after imports and compilation (a run of a few seconds of data beforehand). Medians of the repeats, with the range for
-the whole chain: on a machine that does other work too, the least is the nearest to the truth.
+The reference is numpy drawing as many float32 normal deviates (``Generator.standard_normal``), the
+least that any simulation of detector noise does with that library: ratios to it compare machines.
+CPU seconds are those of the whole process, all threads, after imports and compilation (a run of a
+few seconds of data beforehand). Medians of the repeats, with the range for the whole chain: on a
+machine that does other work too, the least is the nearest to the truth.
 """
 
 from __future__ import annotations
@@ -45,7 +48,12 @@ class Case:
     steps: dict[str, dict[str, object]] = field(default_factory=dict)
 
 
-GREEN_BANK = {"site": "green_bank", "instrument": "mustang2", "time": "2024-11-25T07:00", "target": "05h +20d"}
+GREEN_BANK = {
+    "site": "green_bank",
+    "instrument": "mustang2",
+    "time": "2024-11-25T07:00",
+    "target": "05h +20d",
+}
 CHAJNANTOR = {"site": "llano_de_chajnantor", "time": "2022-08-01T23:00", "target": "260d -10d"}
 M2_DAISY = {"radius": "4 arcmin", "speed": "50 arcsec/s"}
 M2_STEPS: dict[str, dict[str, object]] = {
@@ -61,30 +69,42 @@ AT_STEPS: dict[str, dict[str, object]] = {
 
 CASES = {
     "M2": Case(
-        "223 detectors x 100 Hz x 516 s, one scan", GREEN_BANK,
-        {**M2_DAISY, "scan_duration": "516 s", "sample_rate": "100 Hz"}, 1.5, 1.0, steps=M2_STEPS,
+        "223 detectors x 100 Hz x 516 s, one scan",
+        GREEN_BANK,
+        {**M2_DAISY, "scan_duration": "516 s", "sample_rate": "100 Hz"},
+        1.5,
+        1.0,
+        steps=M2_STEPS,
     ),
     "M2-45min": Case(
-        "223 detectors x 50 Hz x 45 min, one scan", GREEN_BANK,
-        {**M2_DAISY, "scan_duration": "45 min", "sample_rate": "50 Hz"}, 3.0, 1.0, steps=M2_STEPS,
+        "223 detectors x 50 Hz x 45 min, one scan",
+        GREEN_BANK,
+        {**M2_DAISY, "scan_duration": "45 min", "sample_rate": "50 Hz"},
+        3.0,
+        1.0,
+        steps=M2_STEPS,
     ),
     "AT-slice": Case(
-        "AtLAST's reduced camera, 3000 detectors x 225 Hz x 30 s", {**CHAJNANTOR, "instrument": "atlast"},
-        {"radius": "0.25 deg", "speed": "0.45 deg/s", "scan_duration": "30 s"}, steps=AT_STEPS,
+        "AtLAST's reduced camera, 3000 detectors x 225 Hz x 30 s",
+        {**CHAJNANTOR, "instrument": "atlast"},
+        {"radius": "0.25 deg", "speed": "0.45 deg/s", "scan_duration": "30 s"},
+        steps=AT_STEPS,
     ),
     "LAT": Case(
-        "6 m, 7.8 deg, 2000 detectors x 200 Hz x 60 s", {**CHAJNANTOR, "instrument": "so_lat"},
+        "6 m, 7.8 deg, 2000 detectors x 200 Hz x 60 s",
+        {**CHAJNANTOR, "instrument": "so_lat"},
         {"radius": "3 deg", "speed": "1 deg/s", "scan_duration": "60 s", "sample_rate": "200 Hz"},
         instrument={"detectors": 2000, "field_of_view": math.radians(7.8)},
         steps={**AT_STEPS, "BinMap": {"pixel": "1 arcmin"}},
     ),
     "FULL-slice": Case(
-        "AtLAST's full field of 2 deg at 900 Hz, 1024 of its detectors x 20 s", {**CHAJNANTOR, "instrument": "atlast"},
+        "AtLAST's full field of 2 deg at 900 Hz, 1024 of its detectors x 20 s",
+        {**CHAJNANTOR, "instrument": "atlast"},
         {"radius": "1 deg", "speed": "0.9 deg/s", "scan_duration": "20 s", "sample_rate": "900 Hz"},
         instrument={"detectors": 1024, "field_of_view": math.radians(2)},
         steps={**AT_STEPS, "BinMap": {"pixel": "4 arcsec"}},
     ),
-}  # fmt: skip
+}
 
 BARS = {
     "atmosphere": (["AtmosphereLayers"], 0.5),
@@ -94,7 +114,8 @@ BARS = {
     "common mode": (["CommonModeFilter"], 1.5),
     "binning": (["BinMap"], 2.5),
 }
-"""What prototypes reached on a quiet 2.x GHz Sapphire Rapids core (AVX-512), ns per sample; 1.5 times that is a fair bar.
+"""What prototypes reached on a quiet 2.x GHz Sapphire Rapids core (AVX-512), ns per sample; 1.5
+times that is a fair bar.
 
 The bar of another machine is 1.5 times what the prototypes reach there (``--prototypes``)."""
 
@@ -106,7 +127,9 @@ def scene_of(name):
     case = CASES[name]
     scene = zonda.Scene(**case.scene, seed=1)
     if case.instrument:
-        scene = scene.model_copy(update={"instrument": scene.instrument.model_copy(update=case.instrument)})
+        scene = scene.model_copy(
+            update={"instrument": scene.instrument.model_copy(update=case.instrument)}
+        )
     return scene
 
 
@@ -115,9 +138,19 @@ def pipeline_of(name, short=False, **pointing):
     import zonda
 
     case = CASES[name]
-    cluster = files("zonda.pipelines") / "data" / "merging_cluster.fits"  # in an installed package and in this tree
+    cluster = (
+        files("zonda.pipelines") / "data" / "merging_cluster.fits"
+    )  # in an installed package and in this tree
     pointing = {**case.pointing, **pointing, **({"scan_duration": "10 s"} if short else {})}
-    kinds = ["AtmosphereLayers", "WhiteNoise", "PinkNoise", "Efficiency", "HighpassFilter", "CommonModeFilter", "BinMap"]
+    kinds = [
+        "AtmosphereLayers",
+        "WhiteNoise",
+        "PinkNoise",
+        "Efficiency",
+        "HighpassFilter",
+        "CommonModeFilter",
+        "BinMap",
+    ]
     steps = [getattr(zonda, kind)(**case.steps.get(kind, {})) for kind in kinds]
     sky = zonda.SkyMap(file=cluster, centre="target")
     return zonda.Pipeline([zonda.PointingDaisy(**pointing, check_limits="warn"), sky, *steps])
@@ -164,7 +197,9 @@ def measure(name, threads, repeat, prototypes=None):
         data = chain.run(scene, threads=threads)
         totals.append(time.process_time() - cpu)
         walls.append(time.perf_counter() - wall)
-        runs.append({(label, stage): seconds for label, stage, seconds in data.provenance["timings"]})
+        runs.append(
+            {(label, stage): seconds for label, stage, seconds in data.provenance["timings"]}
+        )
         if prototype:
             theirs.append(prototype.stages())
     peak, per = peak_memory(), reference(3 * repeat)
@@ -174,9 +209,13 @@ def measure(name, threads, repeat, prototypes=None):
     rest = float(np.median([t - sum(r.values()) for t, r in zip(totals, runs, strict=True)]))
 
     def row(what, seconds, more=""):
-        print(f"  {what:34s} {seconds:8.3f} {seconds / n * 1e9:10.2f} {seconds / n / per:12.2f}{more}")
+        print(
+            f"  {what:34s} {seconds:8.3f} {seconds / n * 1e9:10.2f} {seconds / n / per:12.2f}{more}"
+        )
 
-    print(f"\n{name}: {case.about} = {n / 1e6:.1f} M samples; {threads} thread(s), median of {repeat}")
+    print(
+        f"\n{name}: {case.about} = {n / 1e6:.1f} M samples; {threads} thread(s), median of {repeat}"
+    )
     print(f"  {'stage':34s} {'CPU s':>8s} {'ns/sample':>10s} {'x reference':>12s}")
     for (label, stage), seconds in stages.items():
         if seconds > 5e-4:
@@ -185,9 +224,21 @@ def measure(name, threads, repeat, prototypes=None):
     row("whole chain", total, f"   {min(totals):.3f} to {max(totals):.3f} s")
 
     def together(labels, run):
-        return sum(s for (label, stage), s in run.items() if label in labels and stage in ("exec", "measure")) / n * 1e9
+        return (
+            sum(
+                s
+                for (label, stage), s in run.items()
+                if label in labels and stage in ("exec", "measure")
+            )
+            / n
+            * 1e9
+        )
 
-    print(f"\n  {'exec and measure together, ns/sample':38s} {'median':>6s} {'least':>6s} {'bar':>6s}", end="")
+    print(
+        f"\n  {'exec and measure together, ns/sample':38s} {'median':>6s} {'least':>6s}"
+        f" {'bar':>6s}",
+        end="",
+    )
     print(f" {'prototype, least':>18s} {'ratio':>6s}" if prototype else "")
     for what, (labels, best) in BARS.items():
         times = [together(labels, run) for run in runs]
@@ -197,13 +248,24 @@ def measure(name, threads, repeat, prototypes=None):
             bar = 1.5 * min(t[what] for t in theirs)
             line += f" {bar / 1.5:18.2f} {1.5 * least / bar:6.2f}"
         print(line + ("" if least <= bar else "  above"))
-    print(f"\n  CPU {total:.3f} s of {case.cpu:g} s: {verdict(total, case.cpu)}; wall {np.median(walls):.3f} s")
-    print(f"  peak memory {peak:.2f} GB ({before:.2f} GB before) of {case.memory:g} GB: {verdict(peak, case.memory)}")
-    print(f"  reference: numpy float32 normals {per * 1e9:.2f} ns/sample; load of the machine {os.getloadavg()[0]:.1f}")
+    print(
+        f"\n  CPU {total:.3f} s of {case.cpu:g} s: {verdict(total, case.cpu)}; wall"
+        f" {np.median(walls):.3f} s"
+    )
+    print(
+        f"  peak memory {peak:.2f} GB ({before:.2f} GB before) of {case.memory:g} GB:"
+        f" {verdict(peak, case.memory)}"
+    )
+    print(
+        f"  reference: numpy float32 normals {per * 1e9:.2f} ns/sample; load of the machine"
+        f" {os.getloadavg()[0]:.1f}"
+    )
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("case", nargs="*", choices=[*CASES, []], help="default: all")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeat", type=int, default=5)

@@ -1,8 +1,11 @@
-"""From the command to the maps: what a first and a second `zonda run mustang2_cluster` take, stage by stage.
+"""From the command to the maps: what a first and a second `zonda run mustang2_cluster` take, stage
+by stage.
 
-python benchmarks/startup.py             first run with empty caches, then the best of three further runs, and of
+python benchmarks/startup.py             first run with empty caches, then the best of three further
+runs, and of
                                          three that have the compiled kernels but plan anew
-python benchmarks/startup.py --kernels   write the packages' kernels.py, the lists of what a first run compiles in two processes
+python benchmarks/startup.py --kernels   write the packages' kernels.py, the lists of what a first
+run compiles in two processes
 """
 
 from __future__ import annotations
@@ -22,8 +25,13 @@ PIPELINE = "mustang2_cluster"
 
 
 def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dict[str, Any]:
-    """Run the command in this process; (wall, CPU of this process) by stage. ``compiled``: see `listen`."""
-    start, begun = float(os.environ["ZONDA_STARTED"]), 0.0  # wall clock of the command; CPU counts from nothing
+    """Run the command in this process; (wall, CPU of this process) by stage. ``compiled``: see
+    `listen`.
+    """
+    start, begun = (
+        float(os.environ["ZONDA_STARTED"]),
+        0.0,
+    )  # wall clock of the command; CPU counts from nothing
     rows: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
     last = [start, begun]
 
@@ -85,7 +93,9 @@ def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dic
 
 
 def listen(compiled: list[Any]) -> None:
-    """Note every kernel of zonda that is compiled: module, name, types, CPU seconds (own, all), whether within another."""
+    """Note every kernel of zonda that is compiled: module, name, types, CPU seconds (own, all),
+    whether within another.
+    """
     import numba.core.event as events
 
     from zonda.core.compilation.compile_ahead import text_of
@@ -105,19 +115,46 @@ def listen(compiled: list[Any]) -> None:
             function = event.data["dispatcher"].py_func
             if function.__module__.startswith("zonda."):
                 types = [text_of(t) for t in event.data["args"]]
-                compiled.append([function.__module__, function.__name__, types, took - inside, took, bool(self.open)])
+                compiled.append(
+                    [
+                        function.__module__,
+                        function.__name__,
+                        types,
+                        took - inside,
+                        took,
+                        bool(self.open),
+                    ]
+                )
 
     events.register("numba:compile", Listener())
 
 
-def child(folder: Path, caches: Path, pipeline: str, kernels: bool = False, known: str = "zonda") -> dict[str, Any]:
-    """One run in a process of its own; ``known``: the folder of what is remembered beside compiled kernels."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(caches / "numba"), "ZONDA_CACHE_DIR": str(caches / known)}
+def child(
+    folder: Path, caches: Path, pipeline: str, kernels: bool = False, known: str = "zonda"
+) -> dict[str, Any]:
+    """One run in a process of its own; ``known``: the folder of what is remembered beside compiled
+    kernels.
+    """
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(caches / "numba"),
+        "ZONDA_CACHE_DIR": str(caches / known),
+    }
     result = folder / "result.json"
     begun, used = time.time(), os.times()
     environment["ZONDA_STARTED"] = repr(begun)
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # as of a package that pip has installed: it makes the bytecode
-    command = [sys.executable, __file__, "--child", str(folder), "--pipeline", pipeline, *(["--listen"] if kernels else [])]
+    environment.pop(
+        "PYTHONDONTWRITEBYTECODE", None
+    )  # as of a package that pip has installed: it makes the bytecode
+    command = [
+        sys.executable,
+        __file__,
+        "--child",
+        str(folder),
+        "--pipeline",
+        pipeline,
+        *(["--listen"] if kernels else []),
+    ]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(done.stderr)
@@ -127,12 +164,16 @@ def child(folder: Path, caches: Path, pipeline: str, kernels: bool = False, know
 
 
 def write(rows: list[list[str]]) -> None:
-    """The lists of kernels, one in each package: ``rows`` (seconds, module, name, types) with their numbers."""
+    """The lists of kernels, one in each package: ``rows`` (seconds, module, name, types) with their
+    numbers.
+    """
     lists: dict[Path, list[str]] = {}
     for number, row in enumerate(dict.fromkeys(" ".join(row) for row in rows), 1):
         package = row.split()[1].split(".")[1:3]  # operators, sky
         package = package if package[0] == "operators" else package[:1]
-        lists.setdefault(Path(__file__).parents[1].joinpath(*package, "kernels.py"), []).append(f'    "{number} {row}",')
+        lists.setdefault(Path(__file__).parents[1].joinpath(*package, "kernels.py"), []).append(
+            f'    "{number} {row}",'
+        )
     for path, lines in lists.items():
         head = path.read_text().partition("KERNELS =")[0]
         path.write_text(f"{head}KERNELS = (\n" + "\n".join(lines) + "\n)\n")
@@ -144,12 +185,16 @@ def table(title: str, run: dict[str, Any]) -> str:
     for stage, (wall, cpu) in run["stages"].items():
         if wall >= 0.005:
             lines.append(f"| {stage} | {wall:.2f} | {cpu:.2f} |")
-    lines.append(f"| **the command, all processes** | **{run['wall']:.2f}** | **{run['cpu']:.2f}** |")
+    lines.append(
+        f"| **the command, all processes** | **{run['wall']:.2f}** | **{run['cpu']:.2f}** |"
+    )
     return "\n".join(lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--pipeline", default=PIPELINE)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--kernels", action="store_true", help="write the packages' kernels.py")
@@ -165,22 +210,38 @@ def main() -> None:
         folder = Path(place, "out")
         folder.mkdir()
         if options.kernels:
-            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # one processor: nothing is compiled elsewhere
+            os.sched_setaffinity(
+                0, {min(os.sched_getaffinity(0))}
+            )  # one processor: nothing is compiled elsewhere
             made = child(folder, Path(place, "caches"), options.pipeline, kernels=True)["compiled"]
-            rows = [[f"{all_in:.1f}", m, n, *t] for m, n, t, _, all_in, inside in made if not inside and None not in t]
+            rows = [
+                [f"{all_in:.1f}", m, n, *t]
+                for m, n, t, _, all_in, inside in made
+                if not inside and None not in t
+            ]
             write(rows)
             for module, name, types, seconds, *_ in sorted(made, key=lambda row: -row[3]):
                 print(f"{seconds:6.2f} s  {module}.{name} {', '.join(map(str, types))}")
             print(f"{sum(row[3] for row in made):6.2f} s of CPU time in all")
             return
         first = child(folder, Path(place, "caches"), options.pipeline)
-        runs = [child(folder, Path(place, "caches"), options.pipeline) for _ in range(options.repeats)]
-        planned = [child(folder, Path(place, "caches"), options.pipeline, known=f"again-{k}") for k in range(options.repeats)]
+        runs = [
+            child(folder, Path(place, "caches"), options.pipeline) for _ in range(options.repeats)
+        ]
+        planned = [
+            child(folder, Path(place, "caches"), options.pipeline, known=f"again-{k}")
+            for k in range(options.repeats)
+        ]
         second, compiled = (min(some, key=lambda run: run["wall"]) for some in (runs, planned))
         print(table("First run, nothing compiled", first), table("Second run", second), sep="\n\n")
         compiling, planning = first["wall"] - compiled["wall"], compiled["wall"] - second["wall"]
-        print(f"\nCompilation took {compiling:.1f} s of the first run. With compiled kernels but nothing else known, a run also")
-        print(f"plans and measures the processor's speed: {planning:.1f} s more than the second run.")
+        print(
+            f"\nCompilation took {compiling:.1f} s of the first run. With compiled kernels but"
+            " nothing else known, a run also"
+        )
+        print(
+            f"plans and measures the processor's speed: {planning:.1f} s more than the second run."
+        )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""Structure of the product: size of the operator contract, circles of imports, long modules and functions, wrong imports.
+"""Structure of the product: size of the operator contract, circles of imports, long modules and
+functions, wrong imports.
 
     python benchmarks/structure.py             # the figures
     python benchmarks/structure.py --verbose   # and what they consist of
 
-Lazy imports and imports for type checking count like any others. Kernels and click commands may be long and take many parameters.
-`tests/test_structure.py` holds the figures below limits. Only the standard library is needed.
+Lazy imports and imports for type checking count like any others. Kernels and click commands may be
+long and take many parameters. `tests/test_structure.py` holds the figures below limits. Only the
+standard library is needed.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PARTS = ("core", "operators", "plugins", "interop", "pipelines", "zonda")
 LONGEST_MODULE, LONGEST_FUNCTION, MOST_PARAMETERS, LONGEST_OPERATOR = 400, 60, 7, 60
 WORK = {"observe", "check", "configure", "prepare", "measure", "exec", "collect", "finalize"}
-"""Methods in which an operator does its work; other public methods are there for the framework only."""
+"""Methods in which an operator does its work; other public methods are there for the framework
+only.
+"""
 
 
 @dataclass
@@ -64,7 +68,10 @@ def modules(root: Path = ROOT) -> dict[str, Module]:
 
 def imports(product: dict[str, Module]) -> dict[str, set[str]]:
     """The modules of the product that each imports, anywhere in its text."""
-    return {name: {target for target in _targets(module, product) if target != name} for name, module in product.items()}
+    return {
+        name: {target for target in _targets(module, product) if target != name}
+        for name, module in product.items()
+    }
 
 
 def _targets(module: Module, product: dict[str, Module]) -> Iterator[str]:
@@ -78,7 +85,9 @@ def _targets(module: Module, product: dict[str, Module]) -> Iterator[str]:
         else:
             continue
         for name in named:
-            if name.split(".")[0] in PARTS and (target := _module_of(name.removeprefix("zonda."), product)):
+            if name.split(".")[0] in PARTS and (
+                target := _module_of(name.removeprefix("zonda."), product)
+            ):
                 yield target
 
 
@@ -116,7 +125,9 @@ def _reachable(name: str, edges: dict[str, set[str]]) -> set[str]:
     return found
 
 
-def _docstring(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Module) -> ast.Expr | None:
+def _docstring(
+    node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Module,
+) -> ast.Expr | None:
     first = node.body[0] if node.body else None
     return first if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) else None
 
@@ -131,7 +142,9 @@ def _span(node: ast.stmt) -> int:
     return (node.end_lineno or node.lineno) - node.lineno + 1
 
 
-def _functions(product: dict[str, Module]) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
+def _functions(
+    product: dict[str, Module],
+) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
     """Every function but kernels and click commands, with its place."""
     for module in product.values():
         for node in ast.walk(module.tree):
@@ -143,18 +156,33 @@ def _functions(product: dict[str, Module]) -> Iterator[tuple[str, ast.FunctionDe
 
 def _parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     a = node.args
-    return len(a.posonlyargs) + len(a.args) + len(a.kwonlyargs) - (bool(a.args) and a.args[0].arg in ("self", "cls"))
+    return (
+        len(a.posonlyargs)
+        + len(a.args)
+        + len(a.kwonlyargs)
+        - (bool(a.args) and a.args[0].arg in ("self", "cls"))
+    )
 
 
 def _class(product: dict[str, Module], module: str, name: str) -> ast.ClassDef:
-    return next(n for n in product[module].tree.body if isinstance(n, ast.ClassDef) and n.name == name)
+    return next(
+        n for n in product[module].tree.body if isinstance(n, ast.ClassDef) and n.name == name
+    )
 
 
 def shipped(root: Path = ROOT) -> dict[str, str]:
     """Shipped operators and map makers: class name and module."""
-    groups = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
-    places = [value for group in ("zonda.operators", "zonda.mapmakers") for value in groups.get(group, {}).values()]
-    return {place.partition(":")[2]: place.partition(":")[0].removeprefix("zonda.") for place in places}
+    groups = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "entry-points"
+    ]
+    places = [
+        value
+        for group in ("zonda.operators", "zonda.mapmakers")
+        for value in groups.get(group, {}).values()
+    ]
+    return {
+        place.partition(":")[2]: place.partition(":")[0].removeprefix("zonda.") for place in places
+    }
 
 
 def _named_in_core(product: dict[str, Module], operators: set[str]) -> list[str]:
@@ -164,12 +192,25 @@ def _named_in_core(product: dict[str, Module], operators: set[str]) -> list[str]
     for module in product.values():
         if not module.name.startswith("core."):
             continue
-        docs = {id(doc.value) for n in ast.walk(module.tree) if hasattr(n, "body") and isinstance(n.body, list)
-                for doc in [_docstring(n)] if doc}  # fmt: skip
-        docs |= {id(n.value) for n in ast.walk(module.tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)}
+        docs = {
+            id(doc.value)
+            for n in ast.walk(module.tree)
+            if hasattr(n, "body") and isinstance(n.body, list)
+            for doc in [_docstring(n)]
+            if doc
+        }
+        docs |= {
+            id(n.value)
+            for n in ast.walk(module.tree)
+            if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)
+        }
         for node in ast.walk(module.tree):
             text = ""
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs:
+            if (
+                isinstance(node, ast.Constant)
+                and isinstance(node.value, str)
+                and id(node) not in docs
+            ):
                 text = node.value
             elif isinstance(node, ast.Name | ast.alias):
                 text = node.id if isinstance(node, ast.Name) else node.name
@@ -182,16 +223,26 @@ def measure(root: Path = ROOT) -> dict[str, Figure]:
     product = modules(root)
     edges = imports(product)
     operator = _class(product, "core.operator", "Operator")
-    methods = [n.name for n in operator.body if isinstance(n, ast.FunctionDef) and not n.name.startswith("_")]
+    methods = [
+        n.name
+        for n in operator.body
+        if isinstance(n, ast.FunctionDef) and not n.name.startswith("_")
+    ]
     attributes = [
-        ast.unparse(n.target) for n in operator.body if isinstance(n, ast.AnnAssign) and "ClassVar" in ast.unparse(n.annotation)
+        ast.unparse(n.target)
+        for n in operator.body
+        if isinstance(n, ast.AnnAssign) and "ClassVar" in ast.unparse(n.annotation)
     ]
     groups = circles(edges)
     pairs = sorted((a, b) for a, targets in edges.items() for b in targets)
     places = shipped(root)
     sizes = {name: _span(_class(product, module, name)) for name, module in places.items()}
     bin_map = _class(product, places["BinMap"], "BinMap")
-    hooks = [n for n in bin_map.body if isinstance(n, ast.FunctionDef) and not n.name.startswith("_") and n.name not in WORK]
+    hooks = [
+        n
+        for n in bin_map.body
+        if isinstance(n, ast.FunctionDef) and not n.name.startswith("_") and n.name not in WORK
+    ]
 
     def of(items: list[str]) -> Figure:
         return Figure(len(items), items)
@@ -201,23 +252,45 @@ def measure(root: Path = ROOT) -> dict[str, Figure]:
         "product lines": Figure(sum(m.lines for m in product.values()), []),
         "methods and properties of Operator": of(methods),
         "class attributes of Operator": of([a for a in attributes if not a.startswith("zonda_")]),
-        "modules in the largest circle of imports": Figure(len(groups[0]) if groups else 0, [", ".join(g) for g in groups]),
-        "modules over 400 lines": of([f"{m.name}: {m.lines}" for m in product.values() if m.lines > LONGEST_MODULE]),
-        "functions over 60 lines": of([f"{place}: {_size(n)}" for place, n in functions if _size(n) > LONGEST_FUNCTION]),
-        "functions of more than 7 parameters": of(
-            [f"{place}: {_parameters(n)}" for place, n in functions if _parameters(n) > MOST_PARAMETERS]
+        "modules in the largest circle of imports": Figure(
+            len(groups[0]) if groups else 0, [", ".join(g) for g in groups]
         ),
-        "imports between siblings of operators": of([f"{a} -> {b}" for a, b in pairs if _siblings(a, b)]),
+        "modules over 400 lines": of(
+            [f"{m.name}: {m.lines}" for m in product.values() if m.lines > LONGEST_MODULE]
+        ),
+        "functions over 60 lines": of(
+            [f"{place}: {_size(n)}" for place, n in functions if _size(n) > LONGEST_FUNCTION]
+        ),
+        "functions of more than 7 parameters": of(
+            [
+                f"{place}: {_parameters(n)}"
+                for place, n in functions
+                if _parameters(n) > MOST_PARAMETERS
+            ]
+        ),
+        "imports between siblings of operators": of(
+            [f"{a} -> {b}" for a, b in pairs if _siblings(a, b)]
+        ),
         "upward imports": of([f"{a} -> {b}" for a, b in pairs if _upward(a, b)]),
         "operators that core names": of(_named_in_core(product, set(places))),
-        "operators whose class is over 60 lines": of([f"{n}: {s}" for n, s in sizes.items() if s > LONGEST_OPERATOR]),
-        "operators whose class fits 60 lines": of([f"{n}: {s}" for n, s in sizes.items() if s <= LONGEST_OPERATOR]),
-        "lines of framework hooks in BinMap": Figure(sum(_span(n) for n in hooks), [n.name for n in hooks]),
+        "operators whose class is over 60 lines": of(
+            [f"{n}: {s}" for n, s in sizes.items() if s > LONGEST_OPERATOR]
+        ),
+        "operators whose class fits 60 lines": of(
+            [f"{n}: {s}" for n, s in sizes.items() if s <= LONGEST_OPERATOR]
+        ),
+        "lines of framework hooks in BinMap": Figure(
+            sum(_span(n) for n in hooks), [n.name for n in hooks]
+        ),
     }
 
 
 def _siblings(a: str, b: str) -> bool:
-    return a.startswith("operators.") and b.startswith("operators.") and a.split(".")[1] != b.split(".")[1]
+    return (
+        a.startswith("operators.")
+        and b.startswith("operators.")
+        and a.split(".")[1] != b.split(".")[1]
+    )
 
 
 def _upward(a: str, b: str) -> bool:

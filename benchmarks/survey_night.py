@@ -1,14 +1,17 @@
-"""Half an hour of a 6 m survey telescope, two bands, polarized, in one HEALPix map each: CPU time by step, memory, forecast.
+"""Half an hour of a 6 m survey telescope, two bands, polarized, in one HEALPix map each: CPU time
+by step, memory, forecast.
 
     python benchmarks/survey_night.py                                # a tenth of it: half a minute
     python benchmarks/survey_night.py --factor 1                     # 30 min, 6.2e8 samples
     python benchmarks/survey_night.py --factor 1 --memory 2.5 --common-mode
     python benchmarks/survey_night.py --factor 1 --band f090         # one band alone
 
-2 x 1720 detectors in pairs with shared pixels, 100 Hz: constant-elevation scans, atmosphere, white and pink noise, polynomials
-of each detector's scan, the ground's template, maps of I, Q and U and of their half-difference; no stream is saved. With
-`--common-mode` one singular mode of each band is removed too. A first run of 12 s, not counted, compiles. CPU seconds are those
-of a process of its own with imports and planning; by step, those that the pipeline timed. The forecast is that of `zonda plan`.
+2 x 1720 detectors in pairs with shared pixels, 100 Hz: constant-elevation scans, atmosphere, white
+and pink noise, polynomials of each detector's scan, the ground's template, maps of I, Q and U and
+of their half-difference; no stream is saved. With `--common-mode` one singular mode of each band is
+removed too. A first run of 12 s, not counted, compiles. CPU seconds are those of a process of its
+own with imports and planning; by step, those that the pipeline timed. The forecast is that of
+`zonda plan`.
 """
 
 from __future__ import annotations
@@ -31,7 +34,8 @@ def text(seconds: float, options: argparse.Namespace) -> str:
     """The pipeline file."""
     chosen = [band for band in BANDS if options.band in ("", band[0])]
     bands = "".join(
-        f"    - {{name: {n}, low: {a} GHz, high: {b} GHz, net: {net} uK s(1/2), knee: 0.5 Hz, detectors: {2 * PIXELS}}}\n"
+        f"    - {{name: {n}, low: {a} GHz, high: {b} GHz, net: {net} uK s(1/2), knee: 0.5 Hz,"
+        f" detectors: {2 * PIXELS}}}\n"
         for n, a, b, net in chosen
     )
     return f"""
@@ -104,13 +108,23 @@ def launch(folder: Path, seconds: float, options: argparse.Namespace) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--factor", type=float, default=0.1, help="share of the 30 min (default 0.1)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--factor", type=float, default=0.1, help="share of the 30 min (default 0.1)"
+    )
     parser.add_argument("--nside", type=int, default=1024)
     parser.add_argument("--memory", type=float, help="GB that the run may hold")
-    parser.add_argument("--common-mode", action="store_true", help="remove a singular mode of each band")
-    parser.add_argument("--half-difference", default="halves", help="that of BinMap (default halves)")
-    parser.add_argument("--band", default="", choices=["", *(name for name, *_ in BANDS)], help="one band alone")
+    parser.add_argument(
+        "--common-mode", action="store_true", help="remove a singular mode of each band"
+    )
+    parser.add_argument(
+        "--half-difference", default="halves", help="that of BinMap (default halves)"
+    )
+    parser.add_argument(
+        "--band", default="", choices=["", *(name for name, *_ in BANDS)], help="one band alone"
+    )
     parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
     memory = None if options.memory is None else round(options.memory * 1e9)
@@ -125,9 +139,15 @@ def main() -> None:
     print(f"{samples:.3g} samples, {seconds:g} s; CPU s, ns per sample, forecast s")
     for label in {**f["steps"], **f["expected"]}:
         used = f["steps"].get(label, 0.0)
-        print(f"  {label:28s} {used:7.2f} {used / samples * 1e9:7.2f} {f['expected'].get(label, 0.0):7.2f}")
+        print(
+            f"  {label:28s} {used:7.2f} {used / samples * 1e9:7.2f}"
+            f" {f['expected'].get(label, 0.0):7.2f}"
+        )
     print(f"  {'the run':28s} {f['run']:7.2f} {f['run'] / samples * 1e9:7.2f}")
-    print(f"  {'the process, with imports':28s} {f['cpu']:7.2f} {f['cpu'] / samples * 1e9:7.2f} {f['forecast']:7.2f}")
+    print(
+        f"  {'the process, with imports':28s} {f['cpu']:7.2f} {f['cpu'] / samples * 1e9:7.2f}"
+        f" {f['forecast']:7.2f}"
+    )
     print(f"peak memory {f['peak'] / 1e9:.2f} GB, forecast {f['bytes'] / 1e9:.2f} GB")
     print(f"forecast / actual CPU {f['forecast'] / f['cpu']:.2f}")
 

@@ -1,11 +1,13 @@
-"""What a second thread gains, beside what two processes gain that do nothing but read and write memory.
+"""What a second thread gains, beside what two processes gain that do nothing but read and write
+memory.
 
     python benchmarks/threads.py             # M2 and AT-slice
     python benchmarks/threads.py M2 --repeat 5 --profile
 
-One round times, one after the other: the memory stream in one process and in two at once, and the chain with one thread and
-with two. Gains are of rates (work per wall second); a machine whose cores share a memory bus, or that others use too, bounds
-both. The medians of the rounds are printed. ``--profile``: for each stretch of the chain, wall seconds and threads at work.
+One round times, one after the other: the memory stream in one process and in two at once, and the
+chain with one thread and with two. Gains are of rates (work per wall second); a machine whose cores
+share a memory bus, or that others use too, bounds both. The medians of the rounds are printed.
+``--profile``: for each stretch of the chain, wall seconds and threads at work.
 """
 
 from __future__ import annotations
@@ -50,7 +52,9 @@ def stream_seconds(processes: int, passes: int = 10) -> float:
     try:
         return max(done.get(timeout=PATIENCE) for _ in workers)
     except Empty:
-        raise RuntimeError(f"a process has died: exit codes {[worker.exitcode for worker in workers]}") from None
+        raise RuntimeError(
+            f"a process has died: exit codes {[worker.exitcode for worker in workers]}"
+        ) from None
     finally:
         for worker in workers:
             worker.terminate()
@@ -80,7 +84,13 @@ def profile(name: str) -> None:
                 return plain(self, *arguments, **more)
             finally:
                 what = next((a for a in arguments if isinstance(a, str)), "")
-                rows.append((f"{method.strip('_')} {what}", time.perf_counter() - wall, time.process_time() - cpu))
+                rows.append(
+                    (
+                        f"{method.strip('_')} {what}",
+                        time.perf_counter() - wall,
+                        time.process_time() - cpu,
+                    )
+                )
 
         return plain, timed
 
@@ -98,7 +108,9 @@ def profile(name: str) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("case", nargs="*", help=f"of {', '.join(CASES)}; default: M2 and AT-slice")
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--profile", action="store_true")
@@ -107,11 +119,27 @@ def main() -> int:
         pipeline_of(name, short=True).run(scene_of(name), threads=2)  # imports, compilation
         rounds = []
         for _ in range(options.repeat):
-            rounds.append((stream_seconds(1), stream_seconds(2), chain_seconds(name, 1), chain_seconds(name, 2)))
-        one, two, single, double = (statistics.median(column) for column in zip(*rounds, strict=True))
+            rounds.append(
+                (
+                    stream_seconds(1),
+                    stream_seconds(2),
+                    chain_seconds(name, 1),
+                    chain_seconds(name, 2),
+                )
+            )
+        one, two, single, double = (
+            statistics.median(column) for column in zip(*rounds, strict=True)
+        )
         memory, gain = 2 * one / two, single / double
-        print(f"{name}: two processes of a memory stream gain {memory:.2f}x; two threads of the chain {gain:.2f}x", end="")
-        print(f" ({single:.2f} s to {double:.2f} s wall), {gain / memory:.0%} of it; medians of {options.repeat}")
+        print(
+            f"{name}: two processes of a memory stream gain {memory:.2f}x; two threads of the chain"
+            f" {gain:.2f}x",
+            end="",
+        )
+        print(
+            f" ({single:.2f} s to {double:.2f} s wall), {gain / memory:.0%} of it; medians of"
+            f" {options.repeat}"
+        )
         if options.profile:
             profile(name)
     return 0

@@ -28,9 +28,16 @@ print(first - start, table - first, (perf_counter() - table) / 100)
 
 def main() -> None:
     runs = [
-        subprocess.run([sys.executable, "-c", LOAD], capture_output=True, text=True, check=True).stdout.split() for _ in range(5)
+        subprocess.run(
+            [sys.executable, "-c", LOAD], capture_output=True, text=True, check=True
+        ).stdout.split()
+        for _ in range(5)
     ]
-    names = ("climatology loaded and first profile", "absorption table loaded", "each further profile")
+    names = (
+        "climatology loaded and first profile",
+        "absorption table loaded",
+        "each further profile",
+    )
     for name, values in zip(names, zip(*runs, strict=True), strict=True):
         print(f"{name:40s} {1e3 * min(float(v) for v in values):8.2f} ms")
 
@@ -42,7 +49,9 @@ def main() -> None:
     print(f"{'water by month and hour (96 profiles)':40s} {1e3 * (perf_counter() - start):8.2f} ms")
     start = perf_counter()
     plane = instruments.create("atlast_full").focalplane()
-    print(f"{f'focal plane of {len(plane)} detectors':40s} {1e3 * (perf_counter() - start):8.2f} ms")
+    print(
+        f"{f'focal plane of {len(plane)} detectors':40s} {1e3 * (perf_counter() - start):8.2f} ms"
+    )
 
 
 if __name__ == "__main__":

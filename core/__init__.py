@@ -1,1 +1,3 @@
-"""The framework: data, operator, pipeline, configuration, registry, random streams, execution. Knows no operator."""
+"""The framework: data, operator, pipeline, configuration, registry, random streams, execution.
+Knows no operator.
+"""

@@ -1,7 +1,8 @@
 """Focal planes from tables: where detectors look, and what each has of its own.
 
-ECSV, or CSV whose first line names the columns, with units in brackets. A table has `name`, `xi` and `eta`; what else it may have
-is in `QUANTITIES` and `TEXTS`. What it does not have holds as the instrument or its band states it.
+ECSV, or CSV whose first line names the columns, with units in brackets. A table has `name`, `xi`
+and `eta`; what else it may have is in `QUANTITIES` and `TEXTS`. What it does not have holds as the
+instrument or its band states it.
 """
 
 from __future__ import annotations
@@ -26,42 +27,88 @@ if TYPE_CHECKING:
     from .storage.ecsv import Table
 
 QUANTITIES = {
-    "xi": "rad", "eta": "rad", "polarization_angle": "rad", "polarization_efficiency": "", "fwhm": "rad",
-    "main_beam_efficiency": "", "illumination_efficiency": "", "net": "K s(1/2)", "knee": "Hz", "slope": "",
+    "xi": "rad",
+    "eta": "rad",
+    "polarization_angle": "rad",
+    "polarization_efficiency": "",
+    "fwhm": "rad",
+    "main_beam_efficiency": "",
+    "illumination_efficiency": "",
+    "net": "K s(1/2)",
+    "knee": "Hz",
+    "slope": "",
     "pink_minimum_frequency": "Hz",
-}  # fmt: skip
+}
 """Columns of numbers and their units inside."""
 TEXTS = ("name", "band", "wafer", "dead")
 """Columns of text."""
-POSITIVE = ("fwhm", "main_beam_efficiency", "illumination_efficiency", "slope", "pink_minimum_frequency")
-LARGEST = {"polarization_efficiency": 1.0, "main_beam_efficiency": 1.0, "illumination_efficiency": 1.0, "slope": 3.0}
+POSITIVE = (
+    "fwhm",
+    "main_beam_efficiency",
+    "illumination_efficiency",
+    "slope",
+    "pink_minimum_frequency",
+)
+LARGEST = {
+    "polarization_efficiency": 1.0,
+    "main_beam_efficiency": 1.0,
+    "illumination_efficiency": 1.0,
+    "slope": 3.0,
+}
 SIGNED = ("xi", "eta", "polarization_angle")
 FARTHEST = math.tan(0.5)
-"""Largest distance of a detector from the boresight, tan(rad): half the largest field of view of an `Instrument`."""
+"""Largest distance of a detector from the boresight, tan(rad): half the largest field of view of an
+`Instrument`.
+"""
 DEAD = {"true": 1, "yes": 1, "1": 1, "false": 0, "no": 0, "0": 0, "": 0}
 """What stands in the column `dead`."""
 ALIASES = {
-    **dict.fromkeys(("gamma", "pol_angle", "pol_ang", "polangle", "psi_pol", "polarization"), "polarization_angle"),
+    **dict.fromkeys(
+        ("gamma", "pol_angle", "pol_ang", "polangle", "psi_pol", "polarization"),
+        "polarization_angle",
+    ),
     **dict.fromkeys(("pol_eff", "pol_efficiency", "poleff"), "polarization_efficiency"),
-    **dict.fromkeys(("psd_fknee", "fknee", "f_knee"), "knee"), **dict.fromkeys(("psd_alpha", "alpha"), "slope"),
-    **dict.fromkeys(("psd_fmin", "fmin", "f_min"), "pink_minimum_frequency"), "beam_fwhm": "fwhm",
+    **dict.fromkeys(("psd_fknee", "fknee", "f_knee"), "knee"),
+    **dict.fromkeys(("psd_alpha", "alpha"), "slope"),
+    **dict.fromkeys(("psd_fmin", "fmin", "f_min"), "pink_minimum_frequency"),
+    "beam_fwhm": "fwhm",
     **dict.fromkeys(("det", "detector", "det_id", "det_name", "detector_name"), "name"),
-}  # fmt: skip
-"""What sotodlib, so3g and TOAST call columns: their gamma runs from eta towards xi, as `Focalplane.polarization_angle` does."""
+}
+"""What sotodlib, so3g and TOAST call columns: their gamma runs from eta towards xi, as
+`Focalplane.polarization_angle` does.
+"""
 LEAKAGE = "pol_leakage"
 """TOAST's cross-polar leakage e, in place of the efficiency (1 - e) / (1 + e)."""
 ANGLE, PLACE = ("polarization_angle",), ("xi", "eta")
 NOT_READ: dict[str, tuple[tuple[str, ...], str]] = {
-    "psd_net": (("net",), "write net: on the sky, after calibration, in K_RJ s(1/2) (TOAST's is of the CMB's temperature)"),
-    **dict.fromkeys(("psi", "pol", "pol_x", "pol_y"), (ANGLE, "write polarization_angle, from eta towards xi")),
+    "psd_net": (
+        ("net",),
+        (
+            "write net: on the sky, after calibration, in K_RJ s(1/2) (TOAST's is of the CMB's"
+            " temperature)"
+        ),
+    ),
+    **dict.fromkeys(
+        ("psi", "pol", "pol_x", "pol_y"), (ANGLE, "write polarization_angle, from eta towards xi")
+    ),
     **dict.fromkeys(("theta", "phi"), (PLACE, "write xi and eta")),
     "quat": (PLACE + ANGLE, "write xi, eta and polarization_angle"),
-    "x": (("xi",), "write xi"), "y": (("eta",), "write eta"), "nep": (("net",), "write net"),
+    "x": (("xi",), "write xi"),
+    "y": (("eta",), "write eta"),
+    "nep": (("net",), "write net"),
     "tau": ((), "remove it, and give the step of the time constant a value"),
-}  # fmt: skip
-"""Columns that say where detectors look, or how well, in ways that are not read. Of each the columns of ours beside which it is
-not needed (none: it is always refused), and the cure."""
-OF_INSTRUMENT = ("fwhm", "main_beam_efficiency", "illumination_efficiency", "net", "knee", "slope", "pink_minimum_frequency")
+}
+"""Columns that say where detectors look, or how well, in ways that are not read. Of each the
+columns of ours beside which it is not needed (none: it is always refused), and the cure."""
+OF_INSTRUMENT = (
+    "fwhm",
+    "main_beam_efficiency",
+    "illumination_efficiency",
+    "net",
+    "knee",
+    "slope",
+    "pink_minimum_frequency",
+)
 """Columns of what an instrument or a band states for all of its detectors."""
 
 
@@ -102,7 +149,9 @@ class ArrayTable:
         return np.flatnonzero(np.array(self.bands) == band)
 
     def plane(self, band: str, otherwise: Mapping[str, float]) -> Focalplane:
-        """The detectors of a band, in the order of the table; ``otherwise``: `OF_INSTRUMENT` where there is no column."""
+        """The detectors of a band, in the order of the table; ``otherwise``: `OF_INSTRUMENT` where
+        there is no column.
+        """
         rows = self.rows(band)
         found = {key: np.full(len(rows), value) for key, value in otherwise.items()}
         found |= {key: values[rows] for key, values in self.columns.items()}
@@ -110,39 +159,55 @@ class ArrayTable:
         return Focalplane([self.names[row] for row in rows], **found)
 
     def check(self, counts: Mapping[str, int], several: bool) -> None:
-        """Refuse a table that does not suit the bands of an instrument with ``counts`` of detectors (InputError).
+        """Refuse a table that does not suit the bands of an instrument with ``counts`` of detectors
+        (InputError).
 
         A camera of one band may be one of several that the table has.
         """
         if several and not self.bands:
             cure = f"add it, with the name of a band in each row: {', '.join(counts)}"
-            raise InputError("has no column 'band', and the instrument has several", place=self.place, cure=cure)
+            raise InputError(
+                "has no column 'band', and the instrument has several", place=self.place, cure=cure
+            )
         unknown = [k for k, band in enumerate(self.bands) if band not in counts]
         if unknown and (several or len(unknown) == len(self.names)):
             mistakes = Mistakes(self.place)
             for k in unknown:
                 hint = nearest(self.bands[k], list(counts))
                 cure = f"{hint + ' ' if hint else ''}the instrument has: {', '.join(counts)}"
-                mistakes.add(self.lines[k], f"detector {self.names[k]} is of the unknown band {self.bands[k]!r}", cure)
+                mistakes.add(
+                    self.lines[k],
+                    f"detector {self.names[k]} is of the unknown band {self.bands[k]!r}",
+                    cure,
+                )
             mistakes.tell()
         for band, stated in counts.items():
             found = len(self.rows(band))
             if not found:
-                text = f"has no detector of the band {band}; its bands: {', '.join(sorted(set(self.bands)))}"
+                text = (
+                    f"has no detector of the band {band}; its bands:"
+                    f" {', '.join(sorted(set(self.bands)))}"
+                )
                 cure = f"give the band {band} a row or more, or leave it out of the instrument"
                 raise InputError(text, place=self.place, cure=cure)
             if found != stated:
                 of = f" of the band {band}" if self.bands else ""
-                rest = f"; others are of {', '.join(sorted(set(self.bands) - set(counts)))}" if unknown else ""
+                rest = (
+                    f"; others are of {', '.join(sorted(set(self.bands) - set(counts)))}"
+                    if unknown
+                    else ""
+                )
                 text = f"detectors{of}: {found} rows, but the instrument states {stated}{rest}"
-                raise InputError(text, place=self.place, cure=f"leave out detectors, or write detectors: {found}")
+                raise InputError(
+                    text, place=self.place, cure=f"leave out detectors, or write detectors: {found}"
+                )
 
 
 def read_array(path: Path) -> ArrayTable:
     """Read a table of detectors.
 
-    Raises InputError, of all mistakes at once, for missing columns, names that are there twice, values that are not finite or out
-    of their limits, unknown units, and columns that are misspelt.
+    Raises InputError, of all mistakes at once, for missing columns, names that are there twice,
+    values that are not finite or out of their limits, unknown units, and columns that are misspelt.
     """
     try:
         state = path.stat()
@@ -193,7 +258,9 @@ def _read(path: Path, changed: int, size: int) -> ArrayTable:
 
 
 def _by_known_names(table: Table, mistakes: Mistakes) -> tuple[Table, list[str]]:
-    """The table with our names for columns that others call otherwise (`ALIASES`), and notes of them."""
+    """The table with our names for columns that others call otherwise (`ALIASES`), and notes of
+    them.
+    """
     columns, notes = dict[str, tuple[list[str], str]](), list[str]()
     there = {ALIASES.get(written.lower(), written) for written in table.columns}
     for written, column in table.columns.items():
@@ -202,7 +269,11 @@ def _by_known_names(table: Table, mistakes: Mistakes) -> tuple[Table, list[str]]
             if own == "name":
                 own = written  # of several names, one is enough
             else:
-                mistakes.add(table.lines[-1], f"has {written!r} beside {own!r}", "remove one of the two columns")
+                mistakes.add(
+                    table.lines[-1],
+                    f"has {written!r} beside {own!r}",
+                    "remove one of the two columns",
+                )
                 continue
         if own != written:
             notes.append(f"{written} is read as {own}")
@@ -214,27 +285,46 @@ def _by_known_names(table: Table, mistakes: Mistakes) -> tuple[Table, list[str]]
 
 
 def _check_angles(table: Table, mistakes: Mistakes) -> None:
-    """Angles of polarization that are in another unit than written: turns and turns of rad, or degrees that are parts of pi."""
+    """Angles of polarization that are in another unit than written: turns and turns of rad, or
+    degrees that are parts of pi.
+    """
     values, unit = table.values("polarization_angle"), table.columns["polarization_angle"][1]
     size = np.abs(values[np.isfinite(values) & (values != 0)])
     cure = "see that the unit of the angles is right"
     if unit in ("rad", "radian") and size.size and size.max() > 4 * np.pi:
-        mistakes.add(table.lines[-1], f"polarization_angle goes to {size.max():g} rad, more than two turns", cure)
+        mistakes.add(
+            table.lines[-1],
+            f"polarization_angle goes to {size.max():g} rad, more than two turns",
+            cure,
+        )
     parts = size / (np.pi / 24)
-    if unit in ("deg", "degree") and 0 < size.max(initial=0) < 6.3 and (np.abs(parts - np.round(parts)) < 0.02).all():
-        text = f"polarization_angle has {', '.join(f'{v:g}' for v in np.unique(size)[:3])} deg: parts of pi, as in rad"
+    if (
+        unit in ("deg", "degree")
+        and 0 < size.max(initial=0) < 6.3
+        and (np.abs(parts - np.round(parts)) < 0.02).all()
+    ):
+        text = (
+            f"polarization_angle has {', '.join(f'{v:g}' for v in np.unique(size)[:3])} deg: parts"
+            " of pi, as in rad"
+        )
         mistakes.add(table.lines[-1], text, cure)
 
 
 def _add_efficiency(table: Table, columns: dict[str, NDArray[Any]], mistakes: Mistakes) -> None:
     """The efficiency that follows from TOAST's leakage, for detectors with an angle."""
     if "polarization_efficiency" in table.columns:
-        mistakes.add(table.lines[-1], f"has {LEAKAGE!r} beside 'polarization_efficiency'", "remove one of the two columns")
+        mistakes.add(
+            table.lines[-1],
+            f"has {LEAKAGE!r} beside 'polarization_efficiency'",
+            "remove one of the two columns",
+        )
         return
     with mistakes.noted():
         leakage = table.numbers(LEAKAGE)
         for row in np.flatnonzero((leakage < 0) | (leakage > 1)).tolist():
-            mistakes.add(table.lines[row], f"{LEAKAGE} is {table.texts(LEAKAGE)[row]}", "give 0 to 1")
+            mistakes.add(
+                table.lines[row], f"{LEAKAGE} is {table.texts(LEAKAGE)[row]}", "give 0 to 1"
+            )
         if "polarization_angle" in columns:
             columns["polarization_efficiency"] = (1 - leakage) / (1 + leakage)
 
@@ -245,7 +335,9 @@ def _check_columns(table: Table, mistakes: Mistakes) -> None:
     misspelt = {
         c: hint
         for c in table.columns
-        if c not in known and c.lower() not in NOT_READ and (hint := nearest(c, [k for k in known if k not in table.columns]))
+        if c not in known
+        and c.lower() not in NOT_READ
+        and (hint := nearest(c, [k for k in known if k not in table.columns]))
     }
     for column, hint in misspelt.items():
         mistakes.add(table.lines[-1], f"has an unknown column {column!r}", hint)
@@ -271,7 +363,11 @@ def _check_distances(table: Table, names: list[str], away: Floats, mistakes: Mis
     for row in np.flatnonzero(away > FARTHEST).tolist():
         degrees, most = (math.degrees(math.atan(tangent)) for tangent in (away[row], FARTHEST))
         text = f"detector {names[row]} looks {degrees:.4g} deg away from the boresight"
-        mistakes.add(table.lines[row], text, f"give xi and eta within {most:.4g} deg; see that their units are right")
+        mistakes.add(
+            table.lines[row],
+            text,
+            f"give xi and eta within {most:.4g} deg; see that their units are right",
+        )
 
 
 def _numbered(texts: list[str]) -> NDArray[np.int64]:
@@ -291,7 +387,8 @@ def _dead(table: Table, mistakes: Mistakes) -> NDArray[np.int64]:
 
 
 def stated_by(table: ArrayTable, band: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """What a table says of the detectors of a band and ``stated`` lacks, as configuration: their number, and medians of columns.
+    """What a table says of the detectors of a band and ``stated`` lacks, as configuration: their
+    number, and medians of columns.
 
     Of all detectors where the table has none of this band, which `ArrayTable.check` refuses.
     """

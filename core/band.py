@@ -22,7 +22,9 @@ SPEED_OF_LIGHT = 299792458.0
 
 
 class Band(Parameters):
-    """A passband: flat between two edges, or tabulated in a file of two columns (frequency in GHz, transmission)."""
+    """A passband: flat between two edges, or tabulated in a file of two columns (frequency in GHz,
+    transmission).
+    """
 
     name: str
     """Registered name."""
@@ -73,7 +75,9 @@ class Band(Parameters):
 
     @property
     def identity(self) -> tuple[str, ...]:
-        """Name and passband, as text that is the same on every machine: two bands of one name are two bands."""
+        """Name and passband, as text that is the same on every machine: two bands of one name are
+        two bands.
+        """
         if self.file is None:
             return self.name, f"{self.low:.9g}", f"{self.high:.9g}"
         table = ",".join(f"{nu:.9g} {t:.9g}" for nu, t in zip(*self._table, strict=True))
@@ -100,11 +104,17 @@ def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]
     try:
         table = np.loadtxt(io.StringIO(packed.text(path, place)), ndmin=2)
     except OSError:
-        raise InputError("no such file", place=place, cure="check the path; it is relative to the folder zonda runs in") from None
+        raise InputError(
+            "no such file",
+            place=place,
+            cure="check the path; it is relative to the folder zonda runs in",
+        ) from None
     except ValueError as err:
         raise InputError(f"cannot be read as numbers: {err}", place=place, cure=cure) from None
     if table.shape[1] != 2 or len(table) < 2:
-        raise InputError(f"has {len(table)} rows of {table.shape[1]} columns", place=place, cure=cure)
+        raise InputError(
+            f"has {len(table)} rows of {table.shape[1]} columns", place=place, cure=cure
+        )
     if not np.isfinite(table).all():
         raise InputError("contains NaN or infinity", place=place, cure=cure)
     if table[:, 0].max() > GIGAHERTZ_MAX:
@@ -120,13 +130,17 @@ def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 class CameraBand(Band):
-    """One of the bands of a camera that has several: its passband, and what its detectors have of their own.
+    """One of the bands of a camera that has several: its passband, and what its detectors have of
+    their own.
 
-    What is absent holds as the instrument has it. A name without a passband is that of a registered band.
+    What is absent holds as the instrument has it. A name without a passband is that of a registered
+    band.
     """
 
     name: str = Field(pattern=r"^[A-Za-z0-9_]+$")
-    """Name, which products and files of this band bear; a registered name where no passband is given."""
+    """Name, which products and files of this band bear; a registered name where no passband is
+    given.
+    """
     detectors: int | None = Field(None, ge=1, le=1_000_000)
     """Number of its detectors."""
     fwhm: Angle | None = Field(None, gt=0)
@@ -151,12 +165,18 @@ class CameraBand(Band):
             return value if isinstance(value, cls) else value.model_dump(mode="json")
         if isinstance(value, str):
             return named(bands, value).model_dump(mode="json")
-        if isinstance(value, dict) and isinstance(value.get("name"), str) and not PASSBAND & {k for k, v in value.items() if v}:
+        if (
+            isinstance(value, dict)
+            and isinstance(value.get("name"), str)
+            and not PASSBAND & {k for k, v in value.items() if v}
+        ):
             try:
                 return bands.create(value["name"]).model_dump(mode="json") | value
             except RegistryError as err:
                 passband = "a band of your own needs a passband: low and high, or file"
-                raise mistake(err.message, err.label, f"{passband}\n{err.cure}", at=("name",)) from None
+                raise mistake(
+                    err.message, err.label, f"{passband}\n{err.cure}", at=("name",)
+                ) from None
         return value
 
     @property
@@ -176,7 +196,9 @@ if TYPE_CHECKING:
     BandOfCamera = Band
 else:
     BandOfCamera = Band | None
-"""The band of an `Instrument`: there is none where it has several, and nothing that asks for it can go on."""
+"""The band of an `Instrument`: there is none where it has several, and nothing that asks for it can
+go on.
+"""
 
 NO_BAND: Any = None
 

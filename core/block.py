@@ -17,8 +17,8 @@ from .tally import Tally
 from .types import AnyFloats
 
 STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
-"""Streams that zonda's own operators make in every block: the components, and their calibrated sum. Their only use is to be read
-by a later operator of the same run."""
+"""Streams that zonda's own operators make in every block: the components, and their calibrated sum.
+Their only use is to be read by a later operator of the same run."""
 
 
 @dataclass
@@ -32,15 +32,18 @@ class Block:
     detectors, samples
         Absolute ranges (slices with start and stop, step None).
     detdata
-        Named streams, each (n_det_block, n_samp_block) of `dtype`, C-contiguous. The signal components are `sky`
-        (main-beam sky signal above the atmosphere), `atmosphere` (fluctuation of the emission about its mean, before
-        efficiency), `transmission` (relative fluctuation of e^-tau about its mean), `white` and `pink` (at the detector),
-        all K_RJ but `transmission`; `signal` is the calibrated sum.
+        Named streams, each (n_det_block, n_samp_block) of `dtype`, C-contiguous. The signal
+        components are `sky` (main-beam sky signal above the atmosphere), `atmosphere` (fluctuation
+        of the emission about its mean, before efficiency), `transmission` (relative fluctuation of
+        e^-tau about its mean), `white` and `pink` (at the detector), all K_RJ but `transmission`;
+        `signal` is the calibrated sum.
     means
-        What must be added to a stream in float64 to have all of it, by stream name: the smooth mean emission. A step that does
-        not say that it knows of means (`Operator.knows_means`) finds none here: its streams are whole.
+        What must be added to a stream in float64 to have all of it, by stream name: the smooth mean
+        emission. A step that does not say that it knows of means (`Operator.knows_means`) finds
+        none here: its streams are whole.
     dtype
-        float32 or float64: the type of every stream. Where a mean was added for a step that does not know of means, float64.
+        float32 or float64: the type of every stream. Where a mean was added for a step that does
+        not know of means, float64.
     """
 
     observation: Observation
@@ -54,11 +57,14 @@ class Block:
     places: dict[str, AnyFloats] = field(default_factory=dict, repr=False)
     """Where the executor wants a stream to be made, so that it need not be copied there."""
     again: bool = False
-    """These samples were worked on before, and are made again because the streams do not fit in memory: an operator makes the
-    same bits and counts nothing (what it tells ``observation.tally`` is thrown away)."""
+    """These samples were worked on before, and are made again because the streams do not fit in
+    memory: an operator makes the same bits and counts nothing (what it tells ``observation.tally``
+    is thrown away)."""
 
     stays: bool = False
-    """Its streams stay as they are until all bands in step have worked on these samples (`core.shared.SharedScan.put_off`)."""
+    """Its streams stay as they are until all bands in step have worked on these samples
+    (`core.shared.SharedScan.put_off`).
+    """
 
     components: frozenset[Component] = frozenset()
     """What ``signal`` is the sum of."""
@@ -67,18 +73,23 @@ class Block:
 
     @property
     def signals(self) -> list[str]:
-        """Names of the streams of all signals that are here, in the order of `Observation.signals`."""
+        """Names of the streams of all signals that are here, in the order of
+        `Observation.signals`.
+        """
         return [name for name in self.observation.signals if name in self.detdata]
 
     def entering(self, where: Entrance) -> list[str]:
         """Names of the components of ``signal`` that are here and enter there, in a fixed order."""
         return sorted(c for c in self.components if c.enters == where and c in self.detdata)
 
-    def alone(self, stream: str, components: frozenset[Component], others: Collection[str]) -> Block:
-        """The block as a step sees it that knows one signal: under the name ``signal``, with its mean and its components alone.
+    def alone(
+        self, stream: str, components: frozenset[Component], others: Collection[str]
+    ) -> Block:
+        """The block as a step sees it that knows one signal: under the name ``signal``, with its
+        mean and its components alone.
 
-        ``others``: components of the scene that are not part of it. What a step tells of another than the complete signal is
-        thrown away.
+        ``others``: components of the scene that are not part of it. What a step tells of another
+        than the complete signal is thrown away.
         """
         observation = self.observation
         if stream != MAIN:
@@ -86,11 +97,17 @@ class Block:
             observation.tally = Tally()
         hidden = {*others, *self.signals}
         seen = Block(
-            observation, self.detectors, self.samples,
+            observation,
+            self.detectors,
+            self.samples,
             {name: array for name, array in self.detdata.items() if name not in hidden},
             {name: field for name, field in self.means.items() if name not in hidden},
-            self.dtype, self.buffers, again=self.again, components=components, suffix=stream[len(MAIN) :],
-        )  # fmt: skip
+            self.dtype,
+            self.buffers,
+            again=self.again,
+            components=components,
+            suffix=stream[len(MAIN) :],
+        )
         if stream in self.detdata:
             seen.detdata[MAIN] = self.detdata[stream]
         if stream in self.means:
@@ -108,16 +125,22 @@ class Block:
         if MAIN in seen.means:
             self.means[stream] = seen.means[MAIN]
         if stream == MAIN:  # what else it made
-            self.detdata.update((name, array) for name, array in seen.detdata.items() if name != MAIN)
+            self.detdata.update(
+                (name, array) for name, array in seen.detdata.items() if name != MAIN
+            )
 
     @property
     def shape(self) -> tuple[int, int]:
         return self.detectors.stop - self.detectors.start, self.samples.stop - self.samples.start
 
     def new(self, name: str, *, zero: bool = True) -> AnyFloats:
-        """Stream ``name``, made of zeros when it is not there yet; or of anything (not ``zero``), to be overwritten."""
+        """Stream ``name``, made of zeros when it is not there yet; or of anything (not ``zero``),
+        to be overwritten.
+        """
         if name not in self.detdata:
-            self.detdata[name] = self.places[name] if name in self.places else self.buffer(name, self.shape)
+            self.detdata[name] = (
+                self.places[name] if name in self.places else self.buffer(name, self.shape)
+            )
             if zero:
                 self.detdata[name].fill(0)
         return self.detdata[name]

@@ -15,15 +15,17 @@ from .types import AnyFloats, Floats
 
 @dataclass(frozen=True)
 class Changed:
-    """A stream that was changed as a whole: values (n_det, n_samp), and the mean that stands beside them, if it still does."""
+    """A stream that was changed as a whole: values (n_det, n_samp), and the mean that stands beside
+    them, if it still does.
+    """
 
     values: AnyFloats
     mean: SmoothField | None
 
     @classmethod
     def of(cls, values: Floats, stream: Stream, fixed: SmoothField | None = None) -> Changed:
-        """Take the whole (n_det, n_samp), which is used up. The mean of ``stream`` stays beside it where it is nearer than zero;
-        ``fixed``: one that others have, and that stays."""
+        """Take the whole (n_det, n_samp), which is used up. The mean of ``stream`` stays beside it
+        where it is nearer than zero; ``fixed``: one that others have, and that stays."""
         mean, observation = stream.means.get(stream.name), stream.observation
         if mean is not None and not _is_left(values, mean, observation):
             mean = None
@@ -58,5 +60,8 @@ def _is_left(values: AnyFloats, mean: SmoothField, observation: Observation) -> 
     for row in np.flatnonzero(observation.good_detectors):
         part = values[row, good]
         rest = part - mean.evaluate(slice(row, row + 1), slice(0, len(good)))[0, good]
-        with_it, without = with_it + float(np.nansum(rest * rest)), without + float(np.nansum(part * part))
+        with_it, without = (
+            with_it + float(np.nansum(rest * rest)),
+            without + float(np.nansum(part * part)),
+        )
     return with_it < without

@@ -1,7 +1,8 @@
 """Checks of numerical accuracy: figures measured on this machine against a reference and a limit.
 
-`zonda doctor` runs those that are registered; with `tests/checks/` they make up the tests (`tests/test_hard_cases.py`) and the
-published page (`docs/stability.md`). A package adds a `Family` of its own under the entry-point group ``zonda.checks``:
+`zonda doctor` runs those that are registered; with `tests/checks/` they make up the tests
+(`tests/test_hard_cases.py`) and the published page (`docs/stability.md`). A package adds a `Family`
+of its own under the entry-point group ``zonda.checks``:
 
     checks = Family("receiver")
 
@@ -70,7 +71,9 @@ class Check:
                 warnings.simplefilter("ignore")  # what a hard case warns of is part of the case
                 found = self.measure()
         except RAISED as err:  # a check may fail in any way, the others go on
-            return Result(self, math.nan, time.perf_counter() - start, f"{type(err).__name__}: {err}")
+            return Result(
+                self, math.nan, time.perf_counter() - start, f"{type(err).__name__}: {err}"
+            )
         figure, remark = found if isinstance(found, tuple) else (found, "")
         return Result(self, float(figure), time.perf_counter() - start, remark)
 
@@ -110,7 +113,9 @@ class Family:
     def add(
         self, case: Case, *, reference: str, limit: float, unit: str = ""
     ) -> Callable[[Callable[[], Measured]], Callable[[], Measured]]:
-        """Decorator: add a function that returns the figure; the first paragraph of its docstring says what it measures."""
+        """Decorator: add a function that returns the figure; the first paragraph of its docstring
+        says what it measures.
+        """
 
         def added(function: Callable[[], Measured]) -> Callable[[], Measured]:
             what = " ".join((function.__doc__ or "").split("\n\n")[0].split())
@@ -127,7 +132,9 @@ class Family:
 
 
 def registered() -> list[Check]:
-    """Every check of every registered family. Raises `RegistryError` where a plugin's cannot be imported."""
+    """Every check of every registered family. Raises `RegistryError` where a plugin's cannot be
+    imported.
+    """
     return [check for name in checks for check in checks.create(name)]
 
 

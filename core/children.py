@@ -1,6 +1,8 @@
-"""Processes that zonda starts: they find the modules that this one finds, and none in the folder they happen to run in.
+"""Processes that zonda starts: they find the modules that this one finds, and none in the folder
+they happen to run in.
 
-``python -m`` and ``-c`` look into the current folder first: a user's ``zonda.py`` or ``multiprocessing.py`` there would run.
+``python -m`` and ``-c`` look into the current folder first: a user's ``zonda.py`` or
+``multiprocessing.py`` there would run.
 """
 
 from __future__ import annotations
@@ -15,19 +17,28 @@ SAFE = "PYTHONSAFEPATH"
 
 
 def command(module: str, function: str, *arguments: object) -> list[str]:
-    """Command line of a Python process that calls a function, which returns the exit status (None: 0), with this one's path.
+    """Command line of a Python process that calls a function, which returns the exit status (None:
+    0), with this one's path.
 
-    ``arguments`` are written down: text, numbers. Raises OSError where this is no Python interpreter that could be started again.
+    ``arguments`` are written down: text, numbers. Raises OSError where this is no Python
+    interpreter that could be started again.
     """
     if not sys.executable:
         raise OSError("this is no Python interpreter that could be started again")
     call = f"sys.exit({function}(*{arguments!r}))"
-    return [sys.executable, "-P", "-c", f"import sys; sys.path[:] = {sys.path!r}; from {module} import {function}; {call}"]
+    return [
+        sys.executable,
+        "-P",
+        "-c",
+        f"import sys; sys.path[:] = {sys.path!r}; from {module} import {function}; {call}",
+    ]
 
 
 @contextmanager
 def safe_path() -> Iterator[None]:
-    """Processes that others start in the body (`multiprocessing`) do not look into the current folder either."""
+    """Processes that others start in the body (`multiprocessing`) do not look into the current
+    folder either.
+    """
     before = os.environ.get(SAFE)
     os.environ[SAFE] = "1"
     try:
@@ -46,7 +57,8 @@ def restore(before: str | None) -> None:
 
 @contextmanager
 def without_script() -> Iterator[None]:
-    """Processes that `multiprocessing` starts in the body do not import the user's script again: they need nothing of it.
+    """Processes that `multiprocessing` starts in the body do not import the user's script again:
+    they need nothing of it.
 
     So a script that begins a campaign needs no ``if __name__ == "__main__"``.
     """

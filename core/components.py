@@ -1,7 +1,8 @@
 """Registries of components over entry points: lazy and conflict-aware.
 
-Metadata is read once; nothing is imported until a component is used. A plugin that is broken, outdated or doubles
-another is reported, by the name of its distribution, when it is used; the rest works.
+Metadata is read once; nothing is imported until a component is used. A plugin that is broken,
+outdated or doubles another is reported, by the name of its distribution, when it is used; the rest
+works.
 
 `core.registry` has one of each kind.
 """
@@ -35,7 +36,9 @@ class RegistryError(ZondaError):
 
     def __str__(self) -> str:
         text = f"{self.place}: {self.message}" if self.place else self.message
-        return "\n  = ".join([f"{text}; {self.label}" if self.label else text, *self.cure.splitlines()])
+        return "\n  = ".join(
+            [f"{text}; {self.label}" if self.label else text, *self.cure.splitlines()]
+        )
 
 
 class Registry:
@@ -48,21 +51,31 @@ class Registry:
     groups
         Entry-point groups: ``zonda.operators``; more than one separated by spaces.
     base
-        ``module:class`` that what is provided must be: a subclass where ``classes``, else an instance. Empty: anything.
+        ``module:class`` that what is provided must be: a subclass where ``classes``, else an
+        instance. Empty: anything.
     classes
         Whether the components are classes (operators) or objects (sites).
     exact
-        Whether a name must be written as it is registered, as that of a class; else capitals, hyphens, underscores and spaces
-        make no difference (GBT, MUSTANG-2, Green Bank).
+        Whether a name must be written as it is registered, as that of a class; else capitals,
+        hyphens, underscores and spaces make no difference (GBT, MUSTANG-2, Green Bank).
 
     Attributes
     ----------
     hint
-        (label, cure) for a name that is not there, empty where there is nothing to say beyond the nearest name.
+        (label, cure) for a name that is not there, empty where there is nothing to say beyond the
+        nearest name.
     """
 
-    def __init__(self, kind: str, groups: str, base: str = "", *, classes: bool = False, exact: bool = False) -> None:
-        self.kind, self.groups, self.base, self.classes, self.exact = kind, groups.split(), base, classes, exact
+    def __init__(
+        self, kind: str, groups: str, base: str = "", *, classes: bool = False, exact: bool = False
+    ) -> None:
+        self.kind, self.groups, self.base, self.classes, self.exact = (
+            kind,
+            groups.split(),
+            base,
+            classes,
+            exact,
+        )
         self._found: dict[str, list[Found]] | None = None
         self._loaded: dict[Found, Any] = {}
         self._registered: dict[str, Any] = {}
@@ -77,7 +90,9 @@ class Registry:
         return self._found
 
     def refresh(self) -> None:
-        """Read the entry points anew (call `zonda.core.discovery.refresh` first); what was registered by hand stays."""
+        """Read the entry points anew (call `zonda.core.discovery.refresh` first); what was
+        registered by hand stays.
+        """
         self._found = None
 
     @overload
@@ -85,19 +100,28 @@ class Registry:
     @overload
     def register(self, component: T, *, name: str | None = None) -> T: ...
     def register(self, component: Any = None, *, name: str | None = None) -> Any:
-        """Add a component from a script or notebook; a decorator, or a plain call. Packages use entry points instead.
+        """Add a component from a script or notebook; a decorator, or a plain call. Packages use
+        entry points instead.
 
-        Its name is ``name``, or the component's own ``name``, or its ``__name__``. Registering a name again replaces
-        the component (cells are run twice). Raises `RegistryError` where a plugin provides that name.
+        Its name is ``name``, or the component's own ``name``, or its ``__name__``. Registering a
+        name again replaces the component (cells are run twice). Raises `RegistryError` where a
+        plugin provides that name.
         """
         if component is None:
             return lambda c: self.register(c, name=name)
         own = getattr(component, "name", None)
-        key = name or (own if isinstance(own, str) else None) or getattr(component, "__name__", None)
+        key = (
+            name or (own if isinstance(own, str) else None) or getattr(component, "__name__", None)
+        )
         if not key:
-            raise RegistryError(f"this {self.kind} has no name", cure="give one: register(component, name='...')")
+            raise RegistryError(
+                f"this {self.kind} has no name", cure="give one: register(component, name='...')"
+            )
         if taken := self._index.get(key):
-            raise RegistryError(f"{self.kind} '{key}' is already provided by {taken[0].origin}", cure="choose another name")
+            raise RegistryError(
+                f"{self.kind} '{key}' is already provided by {taken[0].origin}",
+                cure="choose another name",
+            )
         self._registered[key] = component
         return component
 
@@ -111,8 +135,12 @@ class Registry:
         return len({*self._index, *self._registered})
 
     def candidates(self) -> list[Found]:
-        """Everything on offer, by name; what was registered by hand comes from "this session". Imports nothing."""
-        local = [Found(name, _reference(value), SESSION, "") for name, value in self._registered.items()]
+        """Everything on offer, by name; what was registered by hand comes from "this session".
+        Imports nothing.
+        """
+        local = [
+            Found(name, _reference(value), SESSION, "") for name, value in self._registered.items()
+        ]
         return sorted([f for found in self._index.values() for f in found] + local)
 
     def suggest(self, name: str) -> str | None:
@@ -122,7 +150,8 @@ class Registry:
         return folded[near[0]] if near else None
 
     def registered(self, name: str) -> str:
-        """The registered name that ``name`` means: itself, or the one that differs from it by what `exact` tells; else ``name``.
+        """The registered name that ``name`` means: itself, or the one that differs from it by what
+        `exact` tells; else ``name``.
 
         Raises `RegistryError` where several do.
         """
@@ -132,17 +161,23 @@ class Registry:
         alike = [known for known in self if fold(known) == fold(short)]
         if len(alike) > 1 and not self._same(alike):
             named = " and ".join(f"'{known}'" for known in alike)
-            raise RegistryError(f"{self.kind} '{name}' may be {named}", label="write one of them as it is spelled here")
+            raise RegistryError(
+                f"{self.kind} '{name}' may be {named}",
+                label="write one of them as it is spelled here",
+            )
         return f"{distribution}{colon}{alike[0]}" if alike else name
 
     def get(self, name: str) -> Any:
         """The component called ``name`` or ``distribution:name``, imported now.
 
-        Raises `RegistryError` for a name that is unknown, doubly provided, broken or written for another plugin API.
+        Raises `RegistryError` for a name that is unknown, doubly provided, broken or written for
+        another plugin API.
         """
         name = self.registered(name)
         if name in self._registered:
-            return self._check(self._registered[name], Found(name, _reference(self._registered[name]), SESSION, ""))
+            return self._check(
+                self._registered[name], Found(name, _reference(self._registered[name]), SESSION, "")
+            )
         found = self._named(name)
         if not found:
             raise self._unknown(name)
@@ -155,7 +190,8 @@ class Registry:
         return self.load(found[0])
 
     def create(self, name: str) -> Any:
-        """The object called ``name``: what the entry point names, or what it returns when called without arguments.
+        """The object called ``name``: what the entry point names, or what it returns when called
+        without arguments.
 
         Raises `RegistryError` as `get`, and where the call fails or returns another kind of thing.
         """
@@ -163,17 +199,25 @@ class Registry:
         component = self.get(name)
         if not callable(component):
             return component
-        found = Found(name, _reference(component), SESSION, "") if name in self._registered else self._named(name)[0]
+        found = (
+            Found(name, _reference(component), SESSION, "")
+            if name in self._registered
+            else self._named(name)[0]
+        )
         try:
             made = component()
         except RAISED as err:
-            if isinstance(err, ZondaError) and not isinstance(err, ValueError):  # a ParameterError is the plugin's fault
+            if isinstance(err, ZondaError) and not isinstance(
+                err, ValueError
+            ):  # a ParameterError is the plugin's fault
                 raise
             raise _broken(self.kind, found, err) from err
         return self._check(made, found, made=True)
 
     def load(self, found: Found) -> Any:
-        """Import one candidate. Raises `RegistryError` where that fails or it is written for another plugin API."""
+        """Import one candidate. Raises `RegistryError` where that fails or it is written for
+        another plugin API.
+        """
         if found.distribution == SESSION:
             return self._check(self._registered[found.name], found)
         if found not in self._loaded:
@@ -196,15 +240,25 @@ class Registry:
     def _unknown(self, name: str) -> RegistryError:
         label, cure = self.hint(name)
         near = None if label else self.suggest(name)
-        names = f"installed: {', '.join(self) or 'none'}; `zonda plugins` lists where each comes from"
+        names = (
+            f"installed: {', '.join(self) or 'none'}; `zonda plugins` lists where each comes from"
+        )
         if (label or near) and len(self) > MANY:
             names = f"`zonda plugins` lists all {len(self)} {self.kind}s"
         label = label or (f"did you mean '{near}'?" if near else "not installed")
-        return RegistryError(f"unknown {self.kind} '{name}'", label=label, cure="\n".join(filter(None, (cure, names))))
+        return RegistryError(
+            f"unknown {self.kind} '{name}'",
+            label=label,
+            cure="\n".join(filter(None, (cure, names))),
+        )
 
     def _named(self, name: str) -> list[Found]:
         distribution, _, short = name.rpartition(":")
-        return [f for f in self._index.get(short, []) if not distribution or f.distribution == distribution]
+        return [
+            f
+            for f in self._index.get(short, [])
+            if not distribution or f.distribution == distribution
+        ]
 
     def _check(self, component: Any, found: Found, *, made: bool = False) -> Any:
         who = f"{self.kind} '{found.name}' from {found.origin}"
@@ -219,9 +273,21 @@ class Registry:
         if self.base and (made or self.classes or not callable(component)):
             module, _, attribute = self.base.partition(":")
             base = getattr(import_module(module), attribute)
-            if not (isinstance(component, type) and issubclass(component, base) if self.classes else isinstance(component, base)):
-                noun = f"a subclass of {attribute}" if self.classes else f"a{'n' * (attribute[0] in 'AEIOU')} {attribute}"
-                raise RegistryError(f"{who} is not {noun}", label=f"it is {component!r:.60}", cure=f"mend {found.reference}")
+            if not (
+                isinstance(component, type) and issubclass(component, base)
+                if self.classes
+                else isinstance(component, base)
+            ):
+                noun = (
+                    f"a subclass of {attribute}"
+                    if self.classes
+                    else f"a{'n' * (attribute[0] in 'AEIOU')} {attribute}"
+                )
+                raise RegistryError(
+                    f"{who} is not {noun}",
+                    label=f"it is {component!r:.60}",
+                    cure=f"mend {found.reference}",
+                )
         return component
 
 
@@ -245,7 +311,9 @@ def _broken(kind: str, found: Found, err: BaseException) -> RegistryError:
 
 
 def _first_words(err: BaseException) -> str:
-    """The first line of what an exception says; of pydantic's, which has none to the point, all fields with their mistakes."""
+    """The first line of what an exception says; of pydantic's, which has none to the point, all
+    fields with their mistakes.
+    """
     from pydantic import ValidationError
 
     from .configuration.diagnostics import ConfigurationError

@@ -21,15 +21,26 @@ from .tally import Tally, percent
 if TYPE_CHECKING:
     from .scene import Scene
 
-__all__ = ["STREAMS", "Block", "Data", "Observation", "Stream", "Tally", "html_table", "in_order", "percent"]
+__all__ = [
+    "STREAMS",
+    "Block",
+    "Data",
+    "Observation",
+    "Stream",
+    "Tally",
+    "html_table",
+    "in_order",
+    "percent",
+]
 
 
 @dataclass
 class Data:
     """The scene, its observations, and what came out of them.
 
-    ``products`` maps names to whatever operators made (maps, spectra, file paths); products of another signal than the
-    complete one (see `core.signal`) carry its name and a slash: ``noiseless/map``.
+    ``products`` maps names to whatever operators made (maps, spectra, file paths); products of
+    another signal than the complete one (see `core.signal`) carry its name and a slash:
+    ``noiseless/map``.
     """
 
     scene: Scene
@@ -45,28 +56,41 @@ class Data:
     """Name of the band that these are the data of, where the camera has several."""
 
     pointed: list[Observation] = field(default_factory=list)
-    """The scans of several bands before each of these got its detectors; empty where there is one band."""
+    """The scans of several bands before each of these got its detectors; empty where there is one
+    band.
+    """
     partial: dict[str, Product] = field(default_factory=dict)
     """What steps have added up so far, by label."""
     layouts: dict[str, Mapping[str, Any]] = field(default_factory=dict)
-    """By label: what all observations have in common (the grid of a map), as plain values and arrays; ``fixed: True`` says
-    that further observations cannot change it. `Operator.observe` makes it, or extends what earlier parts of a campaign made.
-    In `Operator.check` the ``kind`` of a map (its projection, HEALPix, or hits) and the ``product`` that it will be."""
+    """By label: what all observations have in common (the grid of a map), as plain values and
+    arrays; ``fixed: True`` says that further observations cannot change it. `Operator.observe`
+    makes it, or extends what earlier parts of a campaign made. In `Operator.check` the ``kind`` of
+    a map (its projection, HEALPix, or hits) and the ``product`` that it will be."""
     made: frozenset[str] = frozenset()
-    """In `Operator.check` what the steps of the pipeline make: streams and products. Empty: not known."""
+    """In `Operator.check` what the steps of the pipeline make: streams and products. Empty: not
+    known.
+    """
     laid_out: bool = False
-    """The layouts are those of all parts of a campaign: `Operator.observe` takes them as they are."""
+    """The layouts are those of all parts of a campaign: `Operator.observe` takes them as they are.
+    """
 
     @property
     def n_scans(self) -> int:
-        """Number of scans; in `Operator.check`, which sees some of them, that of the last one and those before it."""
-        return max(len(self.observations), self.observations[-1].index + 1) if self.observations else 0
+        """Number of scans; in `Operator.check`, which sees some of them, that of the last one and
+        those before it.
+        """
+        return (
+            max(len(self.observations), self.observations[-1].index + 1) if self.observations else 0
+        )
 
     def check_scan(self, number: int, place: str) -> None:
         """Refuse the number of a scan that is not there (PipelineError)."""
         if number >= self.n_scans:
             there = f"choose 0 to {self.n_scans - 1}" if self.n_scans > 1 else "leave it out"
-            text = f"there is no observation {number}: the pipeline makes {self.n_scans}, counted from 0"
+            text = (
+                f"there is no observation {number}: the pipeline makes {self.n_scans}, counted"
+                " from 0"
+            )
             raise PipelineError(text, place=place, cure=f"{there}, or make more scans")
 
     def add(self, label: str, product: Product) -> None:
@@ -74,14 +98,19 @@ class Data:
         whole = self.partial.setdefault(label, product)
         if type(whole) is not type(product):
             cure = "a step adds up products of one class"
-            raise PipelineError(f"added a {type(product).__name__} to a {type(whole).__name__}", place=label, cure=cure)
+            raise PipelineError(
+                f"added a {type(product).__name__} to a {type(whole).__name__}",
+                place=label,
+                cure=cure,
+            )
         if whole is not product:
             whole += product
             self.partial[label] = whole
 
     @property
     def scans(self) -> list[Observation]:
-        """What was pointed: the observations, of several bands each with the detectors of all of them.
+        """What was pointed: the observations, of several bands each with the detectors of all of
+        them.
 
         Of a campaign of several bands those of the first, which is all that its folder tells.
         """
@@ -89,7 +118,9 @@ class Data:
         return self.pointed or self.observations[:: bands or 1]
 
     def named(self, key: str) -> str:
-        """The name of a product or file of these data, the band's behind it where the camera has several."""
+        """The name of a product or file of these data, the band's behind it where the camera has
+        several.
+        """
         return f"{key}_{self.band}" if self.band else key
 
     def take(self, label: str) -> Any:
@@ -97,7 +128,9 @@ class Data:
         return self.partial.pop(label, None)
 
     def __getitem__(self, name: str) -> Any:
-        """The product of this name: ``data["map"]``, ``data["noiseless/map"]``. Raises InputError where there is none."""
+        """The product of this name: ``data["map"]``, ``data["noiseless/map"]``. Raises InputError
+        where there is none.
+        """
         return product_of(self.products, name)
 
     def __contains__(self, name: object) -> bool:
@@ -109,13 +142,15 @@ class Data:
         return iter(self.products)
 
     def tod(self, stream: str = "signal", scan: str | int | None = None) -> NDArray[np.float64]:
-        """(n_det, n_samp) float64: all of a stream that ``Pipeline.run(..., keep=["signal"])`` kept, its mean emission included.
+        """(n_det, n_samp) float64: all of a stream that ``Pipeline.run(..., keep=["signal"])``
+        kept, its mean emission included.
 
         Parameters
         ----------
         stream
-            ``signal`` or ``signal/noiseless`` as they stand after the last step, or a component as it was made, before
-            efficiencies and calibration (``atmosphere``, ``white``, ``sky`` ...); K_RJ.
+            ``signal`` or ``signal/noiseless`` as they stand after the last step, or a component as
+            it was made, before efficiencies and calibration (``atmosphere``, ``white``, ``sky``
+            ...); K_RJ.
         scan
             Name (``scan-001``) or number of the scan; needed where there are several.
 
@@ -129,9 +164,13 @@ class Data:
     def blocks(
         self, stream: str = "signal", scan: str | int | None = None, detectors: int = 64
     ) -> Iterator[tuple[Observation, slice, NDArray[np.float64]]]:
-        """(observation, detectors, part of `tod`) of one scan, or of all, at most so many ``detectors`` at a time."""
+        """(observation, detectors, part of `tod`) of one scan, or of all, at most so many
+        ``detectors`` at a time.
+        """
         if detectors < 1:
-            raise PipelineError(f"{detectors} detectors at a time", place="data.blocks", cure="take 1 or more")
+            raise PipelineError(
+                f"{detectors} detectors at a time", place="data.blocks", cure="take 1 or more"
+            )
         scans = self.observations if scan is None else [one_scan(self.observations, scan)]
         for observation in scans:
             for first in range(0, observation.n_detectors, detectors):
@@ -140,7 +179,9 @@ class Data:
 
     def __repr__(self) -> str:
         number = len(self.observations)
-        return f"<Data: {number} observation{'s' * (number != 1)}, products {sorted(self.products)}>"
+        return (
+            f"<Data: {number} observation{'s' * (number != 1)}, products {sorted(self.products)}>"
+        )
 
     def _repr_html_(self) -> str:
         return html_table(

@@ -1,4 +1,6 @@
-"""Entry points of every installed distribution, read as metadata only; one broken distribution never hides the rest."""
+"""Entry points of every installed distribution, read as metadata only; one broken distribution
+never hides the rest.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ HOST = "zonda"
 """The distribution of the built-in plugins, which `ZONDA_PLUGINS` never shuts out."""
 
 API_VERSION = 2
-"""Version of the contract of plugins (`core.operator`); a plugin written for another one is refused."""
+"""Version of the contract of plugins (`core.operator`); a plugin written for another one is
+refused.
+"""
 
 RAISED = (Exception, SystemExit, GeneratorExit)
 """What a plugin may raise where it is imported or called; Ctrl-C is the user's."""
@@ -56,7 +60,9 @@ def normalized(distribution: str) -> str:
 
 @lru_cache(maxsize=1)
 def _all() -> dict[str, list[Found]]:
-    """Every entry point of the groups ``zonda.*``, by group. The first distribution of a name on sys.path counts."""
+    """Every entry point of the groups ``zonda.*``, by group. The first distribution of a name on
+    sys.path counts.
+    """
     from importlib.metadata import distributions
 
     groups: dict[str, list[Found]] = {}
@@ -79,7 +85,10 @@ def _all() -> dict[str, list[Found]]:
                         groups[point.group].append(found)
         except Exception as err:  # metadata may be broken in any way
             where = f" ({path})" if (path := getattr(distribution, "_path", None)) else ""
-            message = f"the metadata of plugin {who}{where} cannot be read, it was left out: {type(err).__name__}: {err}"
+            message = (
+                f"the metadata of plugin {who}{where} cannot be read, it was left out:"
+                f" {type(err).__name__}: {err}"
+            )
             warnings.warn(message, PluginWarning, stacklevel=3)
     return groups
 
@@ -87,8 +96,8 @@ def _all() -> dict[str, list[Found]]:
 def discover(group: str) -> list[Found]:
     """Entry points of ``group``.
 
-    The environment variable ``ZONDA_PLUGINS`` (names separated by commas) admits only the named distributions beside
-    zonda's own, to isolate a fault; set but empty, it admits none.
+    The environment variable ``ZONDA_PLUGINS`` (names separated by commas) admits only the named
+    distributions beside zonda's own, to isolate a fault; set but empty, it admits none.
     """
     only = os.environ.get("ZONDA_PLUGINS")
     found = _all().get(group, [])
@@ -99,10 +108,15 @@ def discover(group: str) -> list[Found]:
 
 
 def plugin_of(module: str) -> str:
-    """``distribution version`` of the plugin to whose package a module belongs; empty where it is none's, or zonda's own."""
+    """``distribution version`` of the plugin to whose package a module belongs; empty where it is
+    none's, or zonda's own.
+    """
     root = module.partition(".")[0]
     for found in (f for group in _all().values() for f in group):
-        if normalized(found.distribution) != HOST and found.reference.partition(":")[0].partition(".")[0] == root:
+        if (
+            normalized(found.distribution) != HOST
+            and found.reference.partition(":")[0].partition(".")[0] == root
+        ):
             return found.origin
     return ""
 
@@ -110,17 +124,22 @@ def plugin_of(module: str) -> str:
 def others_may_declare(group: str) -> bool:
     """Whether a distribution beside zonda's own may have entry points in ``group``.
 
-    A look into the folders on sys.path that spares importing `importlib.metadata`, a third of the time of ``zonda --help``.
+    A look into the folders on sys.path that spares importing `importlib.metadata`, a third of the
+    time of ``zonda --help``.
     """
     if os.environ.get("ZONDA_PLUGINS") == "":
         return False
     for folder in dict.fromkeys(path or "." for path in sys.path):
         if not os.path.isdir(folder):
-            if os.path.exists(folder) and not folder.endswith(f"python{sys.version_info[0]}{sys.version_info[1]}.zip"):
+            if os.path.exists(folder) and not folder.endswith(
+                f"python{sys.version_info[0]}{sys.version_info[1]}.zip"
+            ):
                 return True  # a zip file: let importlib.metadata look
             continue
         try:
-            names = [n for n in os.listdir(folder) if n.endswith((".dist-info", ".egg-info", ".egg"))]
+            names = [
+                n for n in os.listdir(folder) if n.endswith((".dist-info", ".egg-info", ".egg"))
+            ]
         except OSError:
             continue
         for name in names:

@@ -1,4 +1,6 @@
-"""Products that draw themselves: what `Plots` and `Report` show without knowing the step that made it."""
+"""Products that draw themselves: what `Plots` and `Report` show without knowing the step that made
+it.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,9 @@ from typing import Any, Protocol, runtime_checkable
 
 @dataclass(frozen=True)
 class Sketch:
-    """A picture that is drawn but not printed: ``name`` without suffix, a title, what it shows, one of its matplotlib Axes."""
+    """A picture that is drawn but not printed: ``name`` without suffix, a title, what it shows, one
+    of its matplotlib Axes.
+    """
 
     name: str
     title: str
@@ -21,4 +25,6 @@ class Drawable(Protocol):
     """A product with pictures of its own. It crosses to another process, which calls `sketches`."""
 
     def sketches(self, name: str) -> list[Sketch]:
-        """Pictures whose names begin with ``name``, on matplotlib figures that belong to nobody else (not to pyplot)."""
+        """Pictures whose names begin with ``name``, on matplotlib figures that belong to nobody
+        else (not to pyplot).
+        """

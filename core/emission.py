@@ -1,4 +1,6 @@
-"""Emission of the atmosphere in a scan: its mean, from the levels that steps resolved, and its spectrum over the passband."""
+"""Emission of the atmosphere in a scan: its mean, from the levels that steps resolved, and its
+spectrum over the passband.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ class LoadSpectra:
     Attributes
     ----------
     frequency
-        (n,) Hz, of the cells, those at the passband's edges in part; each the mean of what the passband lets through of it.
+        (n,) Hz, of the cells, those at the passband's edges in part; each the mean of what the
+        passband lets through of it.
     width, square
         (n,) Hz, integrals of the transmission t and of its square over each cell.
     brightness, transmission
@@ -43,15 +46,19 @@ INSTANTS = 64
 """Instants, evenly over a scan, that the mean is taken of: the emission follows the elevation."""
 
 
-def mean_emission(smooth: Mapping[str, SmoothField], plane: Focalplane, good: NDArray[np.bool_], n: int) -> dict[str, float]:
-    """Means over instants and detectors that are not flagged, K_RJ; empty where the scan has no atmosphere.
+def mean_emission(
+    smooth: Mapping[str, SmoothField], plane: Focalplane, good: NDArray[np.bool_], n: int
+) -> dict[str, float]:
+    """Means over instants and detectors that are not flagged, K_RJ; empty where the scan has no
+    atmosphere.
 
-    ``atmosphere`` is <T_atm>, before any efficiency, and ``scan`` the same on the calibrated scale, eps illumination and zeta
-    main-beam efficiency:
+    ``atmosphere`` is <T_atm>, before any efficiency, and ``scan`` the same on the calibrated scale,
+    eps illumination and zeta main-beam efficiency:
 
-        T_scan = < eps T_atm / (zeta e^-tau) >.                                                              (1)
+        T_scan = < eps T_atm / (zeta e^-tau) >.                                                  (1)
 
-    ``smooth`` and ``plane`` are those of a scan of ``n`` samples, ``good`` (n_det,) its detectors that are not flagged.
+    ``smooth`` and ``plane`` are those of a scan of ``n`` samples, ``good`` (n_det,) its detectors
+    that are not flagged.
     """
     if not ({"atmosphere", "transmission"} <= smooth.keys() and good.any()):
         return {}
@@ -62,7 +69,9 @@ def mean_emission(smooth: Mapping[str, SmoothField], plane: Focalplane, good: ND
         at = slice(int(t), int(t) + 1)
         level = smooth["atmosphere"].evaluate(every, at)[:, 0].astype(np.float64)
         transmission = smooth["transmission"].evaluate(every, at)[:, 0]
-        calibrated = level * (plane.illumination_efficiency / (plane.main_beam_efficiency * transmission))
+        calibrated = level * (
+            plane.illumination_efficiency / (plane.main_beam_efficiency * transmission)
+        )
         for name, values in (("atmosphere", level), ("scan", calibrated)):
             found[name] += float(values[good].mean()) / len(instants)
     return found

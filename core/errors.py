@@ -1,4 +1,6 @@
-"""Errors that a user can mend. Each names the place, the cause and the cure; the CLI prints them without a traceback."""
+"""Errors that a user can mend. Each names the place, the cause and the cure; the CLI prints them
+without a traceback.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ class ZondaError(Exception):
 
 
 class InputError(ZondaError):
-    """A file or array given by the user cannot be used (missing, unreadable, wrong unit, NaN, no WCS ...)."""
+    """A file or array given by the user cannot be used (missing, unreadable, wrong unit, NaN, no
+    WCS ...).
+    """
 
 
 class OutputError(ZondaError):
@@ -41,12 +45,16 @@ class PointingError(ZondaError):
 
 
 class PipelineError(ZondaError):
-    """The operators of a pipeline do not fit together (missing input, wrong order, too little memory ...)."""
+    """The operators of a pipeline do not fit together (missing input, wrong order, too little
+    memory ...).
+    """
 
 
 @contextmanager
 def within(place: str) -> Iterator[None]:
-    """Errors that are raised inside name this place before their own; those with places in a file (`diagnostics`) keep them."""
+    """Errors that are raised inside name this place before their own; those with places in a file
+    (`diagnostics`) keep them.
+    """
     try:
         yield
     except ZondaError as err:

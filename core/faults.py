@@ -1,9 +1,10 @@
 """Errors of plugins: code of a plugin that raised, or left an invalid stream, is named.
 
-What a plugin raises is neither a user's mistake nor a fault of zonda: it is reported as one error that names the step, the
-function and the distribution. The traceback shows whose code it was, so that no call of a plugin needs to be guarded: neither the
-methods of an operator, nor a noise model, a validator or a metric, in whatever thread it ran. ``sys.exit`` in a plugin is such a
-fault, too: it would end the command as if all had gone well. Ctrl-C, signals and lack of memory are not.
+What a plugin raises is neither a user's mistake nor a fault of zonda: it is reported as one error
+that names the step, the function and the distribution. The traceback shows whose code it was, so
+that no call of a plugin needs to be guarded: neither the methods of an operator, nor a noise model,
+a validator or a metric, in whatever thread it ran. ``sys.exit`` in a plugin is such a fault, too:
+it would end the command as if all had gone well. Ctrl-C, signals and lack of memory are not.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ def whose(operator: Operator) -> str:
 def faults_named(*, exceptions: bool = True) -> Iterator[None]:
     """Turn what plugin code raises into a `PluginError`; a decorator, too.
 
-    ``exceptions``: False leaves an `Exception` what it is, with a note; only what would end the program is turned (``sys.exit``).
+    ``exceptions``: False leaves an `Exception` what it is, with a note; only what would end the
+    program is turned (``sys.exit``).
     """
     try:
         yield
@@ -79,7 +81,11 @@ def fault(err: BaseException) -> PluginError | None:
     where = f"{last[0].f_code.co_filename}, line {last[1]}"
     words = str(err).strip().splitlines()[:1]
     what = ": ".join([type(err).__name__, *words])
-    raised = f"raised {what}" if isinstance(err, Exception) else f"asked for the end of the program ({what})"
+    raised = (
+        f"raised {what}"
+        if isinstance(err, Exception)
+        else f"asked for the end of the program ({what})"
+    )
     return PluginError(
         f"{_from(module, name)} {raised}",
         place=step.label if step is not None else "",
@@ -89,7 +95,9 @@ def fault(err: BaseException) -> PluginError | None:
 
 def _root(frame: FrameType) -> str:
     """The package whose code this is."""
-    return str(frame.f_globals.get("__package__") or frame.f_globals.get("__name__", "")).partition(".")[0]
+    return str(frame.f_globals.get("__package__") or frame.f_globals.get("__name__", "")).partition(
+        "."
+    )[0]
 
 
 def _step(frame: FrameType) -> Operator | None:

@@ -1,8 +1,9 @@
 """Figures of a run: single numbers with a unit and, where it is known, a standard error.
 
-A metric that measures one is a subclass of `FigureMetric` in the entry-point group ``zonda.metrics``: its fields are its
-parameters, as an operator's are. It is named in three ways: ``central_rms``, ``{central_rms: {radius: 30 arcsec}}`` in YAML, and
-``central_rms(radius=30 arcsec)`` as text. A function of `Data` that returns one number is a metric, too.
+A metric that measures one is a subclass of `FigureMetric` in the entry-point group
+``zonda.metrics``: its fields are its parameters, as an operator's are. It is named in three ways:
+``central_rms``, ``{central_rms: {radius: 30 arcsec}}`` in YAML, and ``central_rms(radius=30
+arcsec)`` as text. A function of `Data` that returns one number is a metric, too.
 """
 
 from __future__ import annotations
@@ -80,14 +81,19 @@ class FigureMetric(Metric, Parameters):
         return ()
 
     def named_signals(self) -> tuple[str, ...]:
-        """Names of the signals of the pipeline of which it reads products; empty text: the complete one."""
+        """Names of the signals of the pipeline of which it reads products; empty text: the complete
+        one.
+        """
         return ("",)
 
     def look(self, kinds: Mapping[str, str]) -> None:
-        """Raise `ZondaError` before a run whose maps are of these kinds, by product: its projection, HEALPix, or hits."""
+        """Raise `ZondaError` before a run whose maps are of these kinds, by product: its
+        projection, HEALPix, or hits.
+        """
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
-        """(value, standard error or NaN), in `unit`. ``names``: those of the signals in `needs`, in their order.
+        """(value, standard error or NaN), in `unit`. ``names``: those of the signals in `needs`, in
+        their order.
 
         Raises `ZondaError` where the products are not there.
         """
@@ -107,11 +113,19 @@ class FigureMetric(Metric, Parameters):
 
             found = " or ".join(makers(what))
             cure = f"add {found}" if found else "choose another metric"
-            raise PipelineError(f"the metric {self.own_name()} needs {what}, which no step makes", place="--metric", cure=cure)
+            raise PipelineError(
+                f"the metric {self.own_name()} needs {what}, which no step makes",
+                place="--metric",
+                cure=cure,
+            )
 
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
         """Those of `needs` that the pipeline does not have."""
-        return {f"for_figure_{k}": signal for k, signal in enumerate(self.needs()) if signal not in runs.values()}
+        return {
+            f"for_figure_{k}": signal
+            for k, signal in enumerate(self.needs())
+            if signal not in runs.values()
+        }
 
     def measure(self, data: Data) -> Floats:
         """(2,): value and standard error."""
@@ -128,7 +142,9 @@ class FigureMetric(Metric, Parameters):
     @classmethod
     def own_name(cls) -> str:
         """The class's name as metrics are written: ``CentralRms`` is ``central_rms``."""
-        return "".join(f"_{c.lower()}" if c.isupper() and k else c.lower() for k, c in enumerate(cls.__name__))
+        return "".join(
+            f"_{c.lower()}" if c.isupper() and k else c.lower() for k, c in enumerate(cls.__name__)
+        )
 
 
 def names_of(data: Data, wanted: Sequence[Signal]) -> list[str]:
@@ -141,26 +157,48 @@ def names_of(data: Data, wanted: Sequence[Signal]) -> list[str]:
     found = []
     for signal in wanted:
         name = next((name for name, run in runs.items() if run == signal), None)
-        if name is None and signal.only is not None and components and components <= set(signal.only) and signal.filters == "all":
+        if (
+            name is None
+            and signal.only is not None
+            and components
+            and components <= set(signal.only)
+            and signal.filters == "all"
+        ):
             name = ""
         if name is None:
-            what = ", ".join(f"{key}: {value}" for key, value in signal.model_dump(exclude_defaults=True).items())
+            what = ", ".join(
+                f"{key}: {value}" for key, value in signal.model_dump(exclude_defaults=True).items()
+            )
             raise PipelineError(
-                f"the run has no signal {{{what}}}", place="metric", cure=f"add it to runs, e.g. `runs: {{a: {{{what}}}}}`"
+                f"the run has no signal {{{what}}}",
+                place="metric",
+                cure=f"add it to runs, e.g. `runs: {{a: {{{what}}}}}`",
             )
         found.append(name)
     return found
 
 
 class Choice(TextValue):
-    """A metric and the name under which it was asked for: ``central_rms``, a mapping of one name to parameters, or a metric."""
+    """A metric and the name under which it was asked for: ``central_rms``, a mapping of one name to
+    parameters, or a metric.
+    """
 
-    json_schema: ClassVar[dict[str, Any]] = {"anyOf": [{"type": "string"}, {"type": "object", "maxProperties": 1}]}
+    json_schema: ClassVar[dict[str, Any]] = {
+        "anyOf": [{"type": "string"}, {"type": "object", "maxProperties": 1}]
+    }
 
     def __init__(self, name: str, metric: Metric) -> None:
         self.metric = metric
-        given = metric.model_dump(mode="json", include=metric.model_fields_set) if isinstance(metric, FigureMetric) else {}
-        self.name = f"{name}({', '.join(f'{key}={value}' for key, value in given.items())})" if given else name
+        given = (
+            metric.model_dump(mode="json", include=metric.model_fields_set)
+            if isinstance(metric, FigureMetric)
+            else {}
+        )
+        self.name = (
+            f"{name}({', '.join(f'{key}={value}' for key, value in given.items())})"
+            if given
+            else name
+        )
 
     @classmethod
     def parse(cls, value: Any) -> Self:
@@ -177,7 +215,10 @@ class Choice(TextValue):
                 return cls(*_of_one_run(str(name), get(str(name), given or {})))
         except ZondaError as err:
             raise refusal(err) from None
-        raise mistake(f"cannot read {value!r:.60} as a metric; write its name, or {{name: {{parameter: value}}}}")
+        raise mistake(
+            f"cannot read {value!r:.60} as a metric; write its name, or {{name: {{parameter:"
+            " value}}"
+        )
 
     def __str__(self) -> str:
         return self.name
@@ -192,16 +233,30 @@ class Choice(TextValue):
         return hash(self.name)
 
     def figure(self, data: Data, names: Sequence[str] | None = None) -> Figure:
-        """Its value for a run. ``names``: of the signals that it needs; None: those of the run that are like them."""
+        """Its value for a run. ``names``: of the signals that it needs; None: those of the run that
+        are like them.
+        """
         if isinstance(self.metric, FigureMetric):
             names = names_of(data, self.metric.needs()) if names is None else names
             value, error = self.metric.find(data, names)
-            return Figure(self.name, float(value), self.metric.unit, float(error), self.metric.describe(data, names))
+            return Figure(
+                self.name,
+                float(value),
+                self.metric.unit,
+                float(error),
+                self.metric.describe(data, names),
+            )
         found = self.metric.summary(self.metric.measure(data))
         if found.size != 1:
             cure = "choose one that is one number, or name it in zonda accuracy --metric"
-            raise PipelineError(f"{self.name} is {found.size} numbers, not a figure", place=self.name, cure=cure)
-        says = self.metric.function.__doc__ if isinstance(self.metric, OfFunction) else type(self.metric).__doc__
+            raise PipelineError(
+                f"{self.name} is {found.size} numbers, not a figure", place=self.name, cure=cure
+            )
+        says = (
+            self.metric.function.__doc__
+            if isinstance(self.metric, OfFunction)
+            else type(self.metric).__doc__
+        )
         return Figure(self.name, float(found[0]), "", math.nan, (says or "").strip().split("\n")[0])
 
 
@@ -216,11 +271,14 @@ def _of_one_run(name: str, metric: Metric) -> tuple[str, Metric]:
 def measure(data: Data, metric: str | FigureMetric, **parameters: Any) -> Figure:
     """A figure of a finished run: ``zonda.measure(data, "central_rms", radius="30 arcsec").value``.
 
-    Raises `ZondaError` for a metric that there is not, parameters that are wrong, or products that the run has not.
+    Raises `ZondaError` for a metric that there is not, parameters that are wrong, or products that
+    the run has not.
     """
     if isinstance(metric, FigureMetric):
         return Choice(metric.own_name(), metric).figure(data)
-    return Choice(*_of_one_run(metric.partition("(")[0].strip(), get(metric, parameters))).figure(data)
+    return Choice(*_of_one_run(metric.partition("(")[0].strip(), get(metric, parameters))).figure(
+        data
+    )
 
 
 class Figures:
@@ -244,11 +302,15 @@ class Figures:
         return self._known[name]
 
     def write(self, path: str | Path, meta: Mapping[str, Any]) -> Path:
-        """An ECSV table that `astropy.table.Table.read` knows: name, value, error, unit, description."""
+        """An ECSV table that `astropy.table.Table.read` knows: name, value, error, unit,
+        description.
+        """
         columns = [
             Column("name", [f.name for f in self], "", "metric and parameters"),
             Column("value", [f.value for f in self], "", "in `unit`"),
-            Column("error", [f.error for f in self], "", "standard error, in `unit`; nan: not known"),
+            Column(
+                "error", [f.error for f in self], "", "standard error, in `unit`; nan: not known"
+            ),
             Column("unit", [f.unit for f in self], "", "empty: a pure number"),
             Column("description", [f.description for f in self], "", "what was measured"),
         ]

@@ -1,12 +1,13 @@
 """The flags of samples and of detectors: one table of bits, TOAST's where TOAST has one.
 
-TOAST calls flags of samples *shared*. Its map-making leaves out samples with a bit of 15 and detectors with a bit of 7
-("non-science"). zonda leaves out these and its own, `OPAQUE`, `NOT_RECORDED` and `DEAD`, which become *invalid* in a file. The
-bits of the Sun do not exclude a sample.
+TOAST calls flags of samples *shared*. Its map-making leaves out samples with a bit of 15 and
+detectors with a bit of 7 ("non-science"). zonda leaves out these and its own, `OPAQUE`,
+`NOT_RECORDED` and `DEAD`, which become *invalid* in a file. The bits of the Sun do not exclude a
+sample.
 
-What a file flags says nothing of the signal there: no filter uses it, turnarounds excepted. What a filter of this run trims has
-a signal (`TRIMMED`). TOAST knows one bit for both, *processing*; a file of zonda names what was trimmed by the intervals
-`TRIMMED_INTERVALS`.
+What a file flags says nothing of the signal there: no filter uses it, turnarounds excepted. What a
+filter of this run trims has a signal (`TRIMMED`). TOAST knows one bit for both, *processing*; a
+file of zonda names what was trimmed by the intervals `TRIMMED_INTERVALS`.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ SAMPLE_MASK, DETECTOR_MASK = 15, 7
 
 @dataclass(frozen=True)
 class Flag:
-    """A bit: its name, what it means, whether what has it is left out, and the bit that it becomes in a file."""
+    """A bit: its name, what it means, whether what has it is left out, and the bit that it becomes
+    in a file.
+    """
 
     bit: int
     name: str
@@ -55,16 +58,40 @@ SAMPLE_FLAGS = (
     Flag(IRREGULAR, "irregular", "no regular scan: an elevation nod", True, IRREGULAR),
     Flag(SUN_UP, "sun up", "the Sun is above the horizon", False, SUN_UP),
     Flag(SUN_CLOSE, "sun close", "the Sun is near", False, SUN_CLOSE),
-    Flag(OPAQUE, "no signal", "opaque air in the band of a detector; a gap of a recorded scan", True, INVALID),
-    Flag(TRIMMED, "trimmed", "left out by a filter of this run, which has used its signal", True, PROCESSING),
+    Flag(
+        OPAQUE,
+        "no signal",
+        "opaque air in the band of a detector; a gap of a recorded scan",
+        True,
+        INVALID,
+    ),
+    Flag(
+        TRIMMED,
+        "trimmed",
+        "left out by a filter of this run, which has used its signal",
+        True,
+        PROCESSING,
+    ),
 )
 """Of samples (`Observation.flags`)."""
 DETECTOR_FLAGS = (
     Flag(INVALID, "invalid", "do not use", True, INVALID),
     Flag(PROCESSING, "processing", "left out by a step", True, PROCESSING),
-    Flag(SOLAR_SYSTEM_OBJECT, "solar-system object", "a planet is in the beam", True, SOLAR_SYSTEM_OBJECT),
+    Flag(
+        SOLAR_SYSTEM_OBJECT,
+        "solar-system object",
+        "a planet is in the beam",
+        True,
+        SOLAR_SYSTEM_OBJECT,
+    ),
     Flag(OPAQUE, "opaque", "the atmosphere is opaque in its band most of the time", True, INVALID),
-    Flag(DEAD, "dead", "its signal is constant or not finite, or the focal plane says so", True, INVALID),
+    Flag(
+        DEAD,
+        "dead",
+        "its signal is constant or not finite, or the focal plane says so",
+        True,
+        INVALID,
+    ),
 )
 """Of detectors (`Observation.detector_flags`)."""
 
@@ -72,7 +99,9 @@ EXCLUDE_SAMPLE = sum(flag.bit for flag in SAMPLE_FLAGS if flag.excludes)
 EXCLUDE_DETECTOR = sum(flag.bit for flag in DETECTOR_FLAGS if flag.excludes)
 
 HAS_A_SIGNAL = TRIMMED | TURNAROUND
-"""Bits of samples that no map uses but whose signal is one: filters take it as it is, and bridge the other excluded samples."""
+"""Bits of samples that no map uses but whose signal is one: filters take it as it is, and bridge
+the other excluded samples.
+"""
 TRIMMED_INTERVALS = "zonda_trimmed"
 """Name of the intervals of a file in which *processing* means `TRIMMED`."""
 
@@ -91,15 +120,19 @@ def in_file(flags: Flags, table: tuple[Flag, ...]) -> Flags:
 
 
 def has_a_signal(flags: Flags) -> NDArray[np.bool_]:
-    """Where filters take the signal as it is: samples that maps use, turnarounds, and what a filter of this run trims."""
+    """Where filters take the signal as it is: samples that maps use, turnarounds, and what a filter
+    of this run trims.
+    """
     return good(flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
 
 
 def from_file(flags: Flags, mask: int, trimmed: NDArray[np.bool_] | None = None) -> Flags:
-    """Flags of samples as a file in TOAST's layout has them; only those with a bit of ``mask`` are excluded.
+    """Flags of samples as a file in TOAST's layout has them; only those with a bit of ``mask`` are
+    excluded.
 
-    Bits that do not exclude a sample (the Sun's) are kept. A bit of ``mask`` that is none of ours becomes *invalid*; other bits
-    that are not in ``mask`` are dropped. ``trimmed`` (n,): where *processing* means that a filter of zonda trimmed the sample.
+    Bits that do not exclude a sample (the Sun's) are kept. A bit of ``mask`` that is none of ours
+    becomes *invalid*; other bits that are not in ``mask`` are dropped. ``trimmed`` (n,): where
+    *processing* means that a filter of zonda trimmed the sample.
     """
     passing = np.uint8(SUN_UP | SUN_CLOSE)
     other = np.uint8(mask & ~SAMPLE_MASK)
@@ -113,8 +146,8 @@ def from_file(flags: Flags, mask: int, trimmed: NDArray[np.bool_] | None = None)
 def of_before(flags: Flags, *, samples: bool) -> Flags:
     """Flags in a file that an earlier zonda wrote, in today's bits.
 
-    Its bits were 1 invalid, 2 trimmed or in a turnaround (which of the two is not known: both became 2), 4 opaque, 8 dead,
-    16 not recorded; any of them excluded.
+    Its bits were 1 invalid, 2 trimmed or in a turnaround (which of the two is not known: both
+    became 2), 4 opaque, 8 dead, 16 not recorded; any of them excluded.
     """
     processing = np.uint8(PROCESSING if samples else 0)
     return (flags & processing) | np.where(flags & ~processing, np.uint8(INVALID), np.uint8(0))

@@ -14,9 +14,15 @@ from .notebook import html_table
 from .types import Floats
 
 DEFAULTS: dict[str, float] = {
-    "polarization_angle": 0.0, "polarization_efficiency": 0.0, "band": 0, "wafer": 0, "knee": 0.0, "slope": 1.0,
-    "minimum_frequency": 1e-3, "dead": 0,
-}  # fmt: skip
+    "polarization_angle": 0.0,
+    "polarization_efficiency": 0.0,
+    "band": 0,
+    "wafer": 0,
+    "knee": 0.0,
+    "slope": 1.0,
+    "minimum_frequency": 1e-3,
+    "dead": 0,
+}
 """Values of columns that are not given."""
 
 WHOLE = ("band", "wafer", "dead")
@@ -32,13 +38,14 @@ class Focalplane:
     names
         Unique detector names.
     xi, eta
-        Gnomonic tangent-plane offsets from the boresight [tan(rad)], xi towards increasing azimuth, eta towards
-        increasing elevation. In TOAST's boresight frame the direction is proportional to (-eta, -xi, 1).
-        Tangents: sotodlib's xi and eta are sines.
+        Gnomonic tangent-plane offsets from the boresight [tan(rad)], xi towards increasing azimuth,
+        eta towards increasing elevation. In TOAST's boresight frame the direction is proportional
+        to (-eta, -xi, 1). Tangents: sotodlib's xi and eta are sines.
     polarization_angle
         rad, COSMO convention, from the focal plane's +X (TOAST) axis.
     polarization_efficiency
-        0 (not polarized) to 1 (a perfect polarizer): TOAST's (1 - epsilon) / (1 + epsilon) with the cross-polar leakage epsilon.
+        0 (not polarized) to 1 (a perfect polarizer): TOAST's (1 - epsilon) / (1 + epsilon) with the
+        cross-polar leakage epsilon.
     fwhm
         Main-beam full width at half maximum on the sky, rad.
     main_beam_efficiency
@@ -48,12 +55,13 @@ class Focalplane:
     net
         Noise-equivalent temperature on the sky, K_RJ sqrt(s): the rms of one second of integration.
     band
-        Whole numbers: which of the instrument's `bands` each detector observes in; 0 where there is one.
+        Whole numbers: which of the instrument's `bands` each detector observes in; 0 where there is
+        one.
     wafer
         Whole numbers: which part of the focal plane each detector is on.
     knee, slope, minimum_frequency
-        Pink noise: frequency at which it equals white noise of ``net`` [Hz], exponent of the fall f^-slope, frequency below which
-        it is flat [Hz]. The knee is 0 where there is none.
+        Pink noise: frequency at which it equals white noise of ``net`` [Hz], exponent of the fall
+        f^-slope, frequency below which it is flat [Hz]. The knee is 0 where there is none.
     dead
         1 for a detector that gives no data, else 0: an observation begins with it flagged.
     """
@@ -81,20 +89,31 @@ class Focalplane:
                 setattr(self, name, np.full(n, default))
         if len(set(self.names)) != n:
             twice = sorted({d for d in self.names if self.names.count(d) > 1})
-            raise InputError(f"detector names must be unique; {twice[0]!r} is there twice", place="focal plane")
+            raise InputError(
+                f"detector names must be unique; {twice[0]!r} is there twice", place="focal plane"
+            )
         for f in fields(self):
             value: Any = getattr(self, f.name)
             if len(value) != n:
-                raise InputError(f"{f.name} has {len(value)} entries for {n} detectors", place="focal plane")
+                raise InputError(
+                    f"{f.name} has {len(value)} entries for {n} detectors", place="focal plane"
+                )
             if isinstance(value, np.ndarray):
-                setattr(self, f.name, np.asarray(value, np.int64 if f.name in WHOLE else np.float64))
+                setattr(
+                    self, f.name, np.asarray(value, np.int64 if f.name in WHOLE else np.float64)
+                )
                 if not np.isfinite(value).all():
                     bad = self.names[int(np.flatnonzero(~np.isfinite(value))[0])]
-                    raise InputError(f"{f.name} of detector {bad} is not finite", place="focal plane")
+                    raise InputError(
+                        f"{f.name} of detector {bad} is not finite", place="focal plane"
+                    )
         outside = (self.polarization_efficiency < 0) | (self.polarization_efficiency > 1)
         if outside.any():
             bad = self.names[int(np.flatnonzero(outside)[0])]
-            raise InputError(f"polarization_efficiency of detector {bad} is not between 0 and 1", place="focal plane")
+            raise InputError(
+                f"polarization_efficiency of detector {bad} is not between 0 and 1",
+                place="focal plane",
+            )
 
     def __repr__(self) -> str:
         reach = np.degrees(np.arctan(self.radius)) * 60
@@ -110,7 +129,10 @@ class Focalplane:
         rows = [
             ("detectors", len(self)),
             ("bands", len(set(self.band.tolist()))),
-            ("farthest from the boresight", f"{np.degrees(np.arctan(self.radius)) * 60:.4g} arcmin"),
+            (
+                "farthest from the boresight",
+                f"{np.degrees(np.arctan(self.radius)) * 60:.4g} arcmin",
+            ),
             ("FWHM", span(self.fwhm, np.degrees(3600), "arcsec")),
             ("NET on the sky", span(self.net, 1e3, "mK_RJ sqrt(s)")),
             ("main-beam efficiency zeta", span(self.main_beam_efficiency, 1, "")),
@@ -135,24 +157,46 @@ class Focalplane:
 
     @property
     def reach(self) -> float:
-        """Largest distance of a detector from the middle of the array, which need not be the boresight, tan(rad)."""
+        """Largest distance of a detector from the middle of the array, which need not be the
+        boresight, tan(rad).
+        """
         middle = [(v.min() + v.max()) / 2 for v in (self.xi, self.eta)] if len(self) else (0.0, 0.0)
         return float(np.hypot(self.xi - middle[0], self.eta - middle[1]).max(initial=0.0))
 
     def copy(self) -> Focalplane:
-        """An independent copy (an observation may change its own, e.g. `Efficiency` sets the efficiencies)."""
+        """An independent copy (an observation may change its own, e.g. `Efficiency` sets the
+        efficiencies).
+        """
         return Focalplane(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
     def of_band(self, number: int) -> Focalplane:
-        """The detectors of one band, in their order, as those of a camera that has no other: copies."""
+        """The detectors of one band, in their order, as those of a camera that has no other:
+        copies.
+        """
         rows = np.flatnonzero(self.band == number)
-        found: dict[str, Any] = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "names"}
-        return Focalplane([self.names[row] for row in rows], **(found | {"band": np.zeros(len(rows), np.int64)}))
+        found: dict[str, Any] = {
+            f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "names"
+        }
+        return Focalplane(
+            [self.names[row] for row in rows], **(found | {"band": np.zeros(len(rows), np.int64)})
+        )
 
     @classmethod
     def of_bands(cls, planes: Mapping[str, Focalplane], suffix: bool = True) -> Focalplane:
-        """The detectors of several bands by name, one band after the other; with ``suffix`` their names end with the band's."""
+        """The detectors of several bands by name, one band after the other; with ``suffix`` their
+        names end with the band's.
+        """
         columns = [f.name for f in fields(cls) if f.name not in ("names", "band")]
-        found: dict[str, Any] = {c: np.concatenate([getattr(plane, c) for plane in planes.values()]) for c in columns}
-        names = [f"{detector}-{band}" if suffix else detector for band, plane in planes.items() for detector in plane.names]
-        return cls(names, **found, band=np.repeat(np.arange(len(planes)), [len(plane) for plane in planes.values()]))
+        found: dict[str, Any] = {
+            c: np.concatenate([getattr(plane, c) for plane in planes.values()]) for c in columns
+        }
+        names = [
+            f"{detector}-{band}" if suffix else detector
+            for band, plane in planes.items()
+            for detector in plane.names
+        ]
+        return cls(
+            names,
+            **found,
+            band=np.repeat(np.arange(len(planes)), [len(plane) for plane in planes.values()]),
+        )

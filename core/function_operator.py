@@ -37,10 +37,13 @@ class FunctionOperator(Operator):
 
     _call: Any = PrivateAttr(None)
     _idle: bool | None = PrivateAttr(None)
-    """Whether it left all that it provides as it was, in every call so far; None: it was not called."""
+    """Whether it left all that it provides as it was, in every call so far; None: it was not
+    called.
+    """
 
     def measure(self, stream: Stream, model: Any = None) -> Changed | None:
-        """``couples = "all"``: call the function with a block that is the whole scan. Each signal is acted on by itself.
+        """``couples = "all"``: call the function with a block that is the whole scan. Each signal
+        is acted on by itself.
 
         Raises PipelineError as `exec` does.
         """
@@ -49,21 +52,30 @@ class FunctionOperator(Operator):
             fixed = observation.smooth.get(EMISSION)
         name, (n_det, n_samp) = stream.name, stream.shape
         values, every = whole(stream, fixed), (slice(0, n_det), slice(0, n_samp))
-        block = Block(observation, *every, {name: values}, dtype=np.float64, components=stream.components)
+        block = Block(
+            observation, *every, {name: values}, dtype=np.float64, components=stream.components
+        )
         self._act(block)
         if not self.provides:
             return None
         left = block.detdata.get(name)
-        if left is not values and (not isinstance(left, np.ndarray) or left.shape != block.shape or left.dtype.kind != "f"):
+        if left is not values and (
+            not isinstance(left, np.ndarray) or left.shape != block.shape or left.dtype.kind != "f"
+        ):
             text = f"the function {self.function} left no stream {name} of shape {block.shape}"
-            raise PipelineError(text, place=self.label, cure=f'change block.detdata["{name}"] in place, or return it')
+            raise PipelineError(
+                text,
+                place=self.label,
+                cure=f'change block.detdata["{name}"] in place, or return it',
+            )
         return Changed.of(np.asarray(left, np.float64), stream, fixed)
 
     def exec(self, block: Block, state: Any) -> None:
-        """Call the function; an array that it returns becomes the stream that it provides. With ``couples = "all"`` put what
-        `measure` found.
+        """Call the function; an array that it returns becomes the stream that it provides. With
+        ``couples = "all"`` put what `measure` found.
 
-        Raises PipelineError from whatever the function raises, with the step, the function and its place.
+        Raises PipelineError from whatever the function raises, with the step, the function and its
+        place.
         """
         if self.couples != "all":
             self._act(block)
@@ -73,7 +85,9 @@ class FunctionOperator(Operator):
     def finalize(self, data: Data) -> None:
         """Warn where it did nothing."""
         if self._idle and self.provides:
-            text = f"the function {self.function} left {' and '.join(sorted(self.provides))} as it was"
+            text = (
+                f"the function {self.function} left {' and '.join(sorted(self.provides))} as it was"
+            )
             warnings.warn(f"{self.label}: {text}: does it lack a return?", stacklevel=2)
         self._idle = None
 
@@ -86,10 +100,17 @@ class FunctionOperator(Operator):
             raise
         except Exception as err:
             words = "".join(str(err).strip().splitlines()[:1])
-            text = f"the function {self.function} raised {type(err).__name__}{': ' * bool(words)}{words}"
-            raise PipelineError(text, place=self.label, cure=f"mend it: {_where(err) or self.source}") from err
+            text = (
+                f"the function {self.function} raised"
+                f" {type(err).__name__}{': ' * bool(words)}{words}"
+            )
+            raise PipelineError(
+                text, place=self.label, cure=f"mend it: {_where(err) or self.source}"
+            ) from err
         if made is None:
-            after = {name: _bits(block.detdata[name]) for name in self.provides & block.detdata.keys()}
+            after = {
+                name: _bits(block.detdata[name]) for name in self.provides & block.detdata.keys()
+            }
             if before != after:
                 self._idle = False
             elif self._idle is None:
@@ -98,11 +119,23 @@ class FunctionOperator(Operator):
         self._idle = False
         values = np.asarray(made)
         if len(self.provides) != 1 or values.dtype.kind not in "fiu" or values.shape != block.shape:
-            what = f"an array of shape {values.shape}" if values.dtype.kind in "fiu" else f"{made!r:.40}"
-            wanted = f"nothing: it provides {len(self.provides) or 'no'} streams; several stand in block.detdata"
+            what = (
+                f"an array of shape {values.shape}"
+                if values.dtype.kind in "fiu"
+                else f"{made!r:.40}"
+            )
+            wanted = (
+                f"nothing: it provides {len(self.provides) or 'no'} streams; several stand in"
+                " block.detdata"
+            )
             if len(self.provides) == 1:
-                wanted = f"nothing, or the stream {next(iter(self.provides))}, an array of shape {block.shape}"
-            raise PipelineError(f"the function returned {what}", place=self.label, cure=f"return {wanted}")
+                wanted = (
+                    f"nothing, or the stream {next(iter(self.provides))}, an array of shape"
+                    f" {block.shape}"
+                )
+            raise PipelineError(
+                f"the function returned {what}", place=self.label, cure=f"return {wanted}"
+            )
         block.new(next(iter(self.provides)), zero=False)[...] = values
 
 
@@ -141,14 +174,15 @@ def operator(
 ) -> FunctionOperator | Callable[[Function], FunctionOperator]:
     """A step that calls ``function(block)`` for every block; a plain call, or a decorator.
 
-    With ``couples="all"`` the block is the whole scan: all detectors (of a band) and all samples, in float64, once for each scan
-    and signal. Any other coupling sees parts: ``detectors`` all detectors at some of the samples, ``time`` all samples of some of
-    the detectors.
+    With ``couples="all"`` the block is the whole scan: all detectors (of a band) and all samples,
+    in float64, once for each scan and signal. Any other coupling sees parts: ``detectors`` all
+    detectors at some of the samples, ``time`` all samples of some of the detectors.
 
-    The function returns the stream that it provides, (n_det_block, n_samp_block), or changes ``block.detdata`` and returns
-    nothing. Streams have their mean in them, as for every step that does not say ``knows_means`` (`Operator`). It may be called
-    from several threads, and its result must not depend on where a block begins. The step is for Python: a pipeline file and a
-    campaign do not know it.
+    The function returns the stream that it provides, (n_det_block, n_samp_block), or changes
+    ``block.detdata`` and returns nothing. Streams have their mean in them, as for every step that
+    does not say ``knows_means`` (`Operator`). It may be called from several threads, and its result
+    must not depend on where a block begins. The step is for Python: a pipeline file and a campaign
+    do not know it.
 
     Parameters
     ----------
@@ -157,7 +191,8 @@ def operator(
     requires, provides
         Names of streams that it reads and writes. What adds to the data provides a `Component`.
     couples, linear
-        As of `Operator`. With ``all`` it reads one stream, and provides that or nothing; it needs no `measure`.
+        As of `Operator`. With ``all`` it reads one stream, and provides that or nothing; it needs
+        no `measure`.
 
     Raises
     ------
@@ -165,28 +200,50 @@ def operator(
         For what is no function, names that are no texts, or another coupling.
     """
     if function is None:
-        return lambda made: operator(made, name=name, requires=requires, provides=provides, couples=couples, linear=linear)
+        return lambda made: operator(
+            made, name=name, requires=requires, provides=provides, couples=couples, linear=linear
+        )
     place = "zonda.operator"
     if not callable(function) or isinstance(function, type | Operator):
-        raise PipelineError(f"expected a function of a block, got {function!r:.60}", place=place, cure="write lambda block: ...")
+        raise PipelineError(
+            f"expected a function of a block, got {function!r:.60}",
+            place=place,
+            cure="write lambda block: ...",
+        )
     for what, names in (("requires", requires), ("provides", provides)):
         if isinstance(names, str) or not all(isinstance(one, str) for one in names):
-            raise PipelineError(f"{what} is a list of names, not {names!r:.60}", place=place, cure=f"write {what}=['signal']")
+            raise PipelineError(
+                f"{what} is a list of names, not {names!r:.60}",
+                place=place,
+                cure=f"write {what}=['signal']",
+            )
     if couples not in ("sample", "detectors", "time", "all"):
         cure = "choose from 'sample', 'detectors', 'time', 'all'"
         raise PipelineError(f"a function cannot couple {couples!r:.40}", place=place, cure=cure)
     if couples == "all" and (len(set(requires)) != 1 or not set(provides) <= set(requires)):
         cure = "write requires=['signal'], and the same or nothing as provides"
-        raise PipelineError("a function of a whole scan reads one stream, and provides that or nothing", place=place, cure=cure)
+        raise PipelineError(
+            "a function of a whole scan reads one stream, and provides that or nothing",
+            place=place,
+            cure=cure,
+        )
     own = getattr(function, "__name__", type(function).__name__)
     label = name or ("function" if own == "<lambda>" else own)
     given = {
-        "requires": frozenset(requires), "provides": frozenset(provides), "couples": couples, "linear": bool(linear),
+        "requires": frozenset(requires),
+        "provides": frozenset(provides),
+        "couples": couples,
+        "linear": bool(linear),
         "knows_means": couples == "all",
-        "__doc__": getattr(function, "__doc__", None) or "A function.", "__module__": __name__,
-    }  # fmt: skip
-    made = cast(Any, type(FunctionOperator))(label if label.isidentifier() else "function", (FunctionOperator,), given)
-    step: FunctionOperator = made(name=label, function=_named(function, own), source=_place(function))
+        "__doc__": getattr(function, "__doc__", None) or "A function.",
+        "__module__": __name__,
+    }
+    made = cast(Any, type(FunctionOperator))(
+        label if label.isidentifier() else "function", (FunctionOperator,), given
+    )
+    step: FunctionOperator = made(
+        name=label, function=_named(function, own), source=_place(function)
+    )
     step._call = function
     return step
 
@@ -197,14 +254,24 @@ def _bits(values: Any) -> int:
 
 
 def _where(err: Exception) -> str:
-    """``file.py, line 12`` of the innermost code that raised it and is no library's: the function's own or what it calls."""
-    frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(err.__traceback__)][1:]
-    own = [place for place in frames if "site-packages" not in place[0] and not place[0].startswith("<")]
+    """``file.py, line 12`` of the innermost code that raised it and is no library's: the function's
+    own or what it calls.
+    """
+    frames = [
+        (frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(err.__traceback__)
+    ][1:]
+    own = [
+        place
+        for place in frames
+        if "site-packages" not in place[0] and not place[0].startswith("<")
+    ]
     return f"{own[-1][0]}, line {own[-1][1]}" if own else ""
 
 
 def _named(function: Any, own: str) -> str:
-    return f"{getattr(function, '__module__', None) or '?'}.{getattr(function, '__qualname__', own)}"
+    return (
+        f"{getattr(function, '__module__', None) or '?'}.{getattr(function, '__qualname__', own)}"
+    )
 
 
 def _place(function: Any) -> str:

@@ -1,10 +1,12 @@
 """Behaviour hooks (pluggy): what a plugin may *do*, as against what it *provides* (`registry`).
 
-A plugin declares a module or an object in the entry-point group ``zonda.hooks``; its functions marked with
-`hookimpl` are called at the places that `Hooks` describes. They may take fewer arguments than offered.
+A plugin declares a module or an object in the entry-point group ``zonda.hooks``; its functions
+marked with `hookimpl` are called at the places that `Hooks` describes. They may take fewer
+arguments than offered.
 
-pluggy's own loader stops at the first plugin that fails to import and skips a second entry point of a name already
-taken, so plugins are loaded one by one here; a hook that fails later is reported once and then left alone.
+pluggy's own loader stops at the first plugin that fails to import and skips a second entry point of
+a name already taken, so plugins are loaded one by one here; a hook that fails later is reported
+once and then left alone.
 """
 
 from __future__ import annotations
@@ -54,21 +56,31 @@ class Hooks:
         """After the last operator of a run."""
 
     @hookspec
-    def zonda_before_operator(self, operator: Operator, observation: Observation | None, stage: str) -> None:
-        """Before a stage of an operator (``observe``, ``prepare``, ``exec``, ``collect``, ``finalize`` ...)."""
+    def zonda_before_operator(
+        self, operator: Operator, observation: Observation | None, stage: str
+    ) -> None:
+        """Before a stage of an operator (``observe``, ``prepare``, ``exec``, ``collect``,
+        ``finalize`` ...).
+        """
 
     @hookspec
-    def zonda_after_operator(self, operator: Operator, observation: Observation | None, stage: str, seconds: float) -> None:
+    def zonda_after_operator(
+        self, operator: Operator, observation: Observation | None, stage: str, seconds: float
+    ) -> None:
         """After a stage of an operator, which took so many seconds."""
 
     @hookspec
     def zonda_progress(self, done: int, total: int, what: str) -> None:
-        """``done`` of ``total`` steps of ``what`` are finished; may come from any thread. ``total`` 0: it has ended."""
+        """``done`` of ``total`` steps of ``what`` are finished; may come from any thread. ``total``
+        0: it has ended.
+        """
 
     @hookspec
-    def zonda_campaign_progress(self, done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float) -> None:
-        """``done`` of ``total`` tasks of a campaign are finished, with ``samples`` of ``all_samples``, after ``seconds``; and
-        ``failed`` attempts have failed."""
+    def zonda_campaign_progress(
+        self, done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float
+    ) -> None:
+        """``done`` of ``total`` tasks of a campaign are finished, with ``samples`` of
+        ``all_samples``, after ``seconds``; and ``failed`` attempts have failed."""
 
     @hookspec
     def zonda_campaign_end(self) -> None:
@@ -81,7 +93,9 @@ class Hooks:
 
 @lru_cache(maxsize=1)
 def manager() -> pluggy.PluginManager:
-    """The plugin manager, with every plugin that could be loaded. Cached; `manager.cache_clear()` reads anew."""
+    """The plugin manager, with every plugin that could be loaded. Cached; `manager.cache_clear()`
+    reads anew.
+    """
     plugins = pluggy.PluginManager("zonda")
     plugins.add_hookspecs(Hooks)
     for found in discover(GROUP):
@@ -93,7 +107,8 @@ def manager() -> pluggy.PluginManager:
 
 
 def load(plugins: pluggy.PluginManager, found: Found) -> None:
-    """Import one plugin and register its hooks; misspelt and unmarked ones are left out with a warning.
+    """Import one plugin and register its hooks; misspelt and unmarked ones are left out with a
+    warning.
 
     Raises whatever the plugin raises at import, or pluggy where a hook's arguments are unknown.
     """
@@ -121,7 +136,9 @@ def load(plugins: pluggy.PluginManager, found: Found) -> None:
 
 
 def _isolated(function: Callable[..., Any], found: Found) -> Callable[..., Any]:
-    """``function``, which after its first failure is reported and then left alone. A `ZondaError` stops the run."""
+    """``function``, which after its first failure is reported and then left alone. A `ZondaError`
+    stops the run.
+    """
     failed = False
 
     @wraps(function)
@@ -135,7 +152,11 @@ def _isolated(function: Callable[..., Any], found: Found) -> Callable[..., Any]:
             raise
         except RAISED as err:
             failed = True
-            _leave_out(found, f"{function.__name__} failed and is left out from now on: {type(err).__name__}: {err}")
+            _leave_out(
+                found,
+                f"{function.__name__} failed and is left out from now on: {type(err).__name__}:"
+                f" {err}",
+            )
             return None
 
     call.__signature__ = inspect.signature(function)  # type: ignore[attr-defined]

@@ -23,7 +23,16 @@ from .band import NO_BAND, PER_BAND, SPEED_OF_LIGHT, Band, BandOfCamera, CameraB
 from .configuration.diagnostics import nearest
 from .configuration.files import InputPath, find
 from .configuration.parameters import Parameters, named, named_or_written, quantity
-from .configuration.units import Angle, AngularAcceleration, AngularJerk, AngularSpeed, Fraction, Hertz, KelvinRootSecond, Metres
+from .configuration.units import (
+    Angle,
+    AngularAcceleration,
+    AngularJerk,
+    AngularSpeed,
+    Fraction,
+    Hertz,
+    KelvinRootSecond,
+    Metres,
+)
 from .configuration.values import mistake, refusal
 from .errors import InputError, ZondaError
 from .focalplane import Focalplane
@@ -39,11 +48,20 @@ LATTICES = {"hexagon": hexagonal_packing, "rings": rings}
 """Layouts without wafers, by name: functions of the number of pixels that return their places."""
 
 ARRAY = 0.475
-"""Radius of an array of one of several bands, in units of the distance between the centres of two that are neighbours."""
+"""Radius of an array of one of several bands, in units of the distance between the centres of two
+that are neighbours.
+"""
 
 
-STAND_INS: dict[str, Any] = {"detectors": 1, "net": "0 K s(1/2)", "main_beam_efficiency": 1.0, "illumination_efficiency": 1.0}
-"""Of what an instrument must state, where bands or a table state it and are mistaken: only their mistakes are told."""
+STAND_INS: dict[str, Any] = {
+    "detectors": 1,
+    "net": "0 K s(1/2)",
+    "main_beam_efficiency": 1.0,
+    "illumination_efficiency": 1.0,
+}
+"""Of what an instrument must state, where bands or a table state it and are mistaken: only their
+mistakes are told.
+"""
 
 
 class Telescope(Parameters):
@@ -54,7 +72,9 @@ class Telescope(Parameters):
     diameter: Metres = Field(gt=0)
     """Primary diameter."""
     site: str = Field("", exclude=True)
-    """Registered name of the site where it stands; `zonda check` says so where the scene has another."""
+    """Registered name of the site where it stands; `zonda check` says so where the scene has
+    another.
+    """
     elevation_min: Angle = quantity("5 deg", ge=0)
     """Lowest elevation the mount reaches."""
     elevation_max: Angle = quantity("90 deg", gt=0)
@@ -81,7 +101,9 @@ class Telescope(Parameters):
 
 
 class Instrument(Parameters):
-    """A camera on a telescope: detectors in a round field of view, laid out or from a table. Subclass to lay out others."""
+    """A camera on a telescope: detectors in a round field of view, laid out or from a table.
+    Subclass to lay out others.
+    """
 
     polarized_by: ClassVar[str] = "set polarization: pairs of the instrument"
     """What makes detectors polarized that are not those of a table."""
@@ -93,27 +115,33 @@ class Instrument(Parameters):
     telescope: Telescope
     """The dish it is mounted on."""
     band: BandOfCamera = NO_BAND
-    """The passband: a registered name, or a Band. Not needed with `bands`; beside them the name of the one to observe with."""
+    """The passband: a registered name, or a Band. Not needed with `bands`; beside them the name of
+    the one to observe with.
+    """
     bands: list[CameraBand] = Field(default_factory=list, max_length=32)
-    """Bands that are observed at the same time, each with what its detectors have of their own; what a band does not state holds
-    as it is stated for the instrument. Maps and other products are made for each."""
+    """Bands that are observed at the same time, each with what its detectors have of their own;
+    what a band does not state holds as it is stated for the instrument. Maps and other products are
+    made for each."""
     pixels: Literal["shared", "separate", "overlaid"] = "shared"
-    """Of several bands: every pixel has detectors of every band; the bands have arrays side by side; or each has an array of its
-    own that fills the field of view, as behind dichroic beam splitters."""
+    """Of several bands: every pixel has detectors of every band; the bands have arrays side by
+    side; or each has an array of its own that fills the field of view, as behind dichroic beam
+    splitters."""
     detectors: int = Field(ge=1, le=1_000_000)
     """Number of detectors. Of several bands, that of each."""
     field_of_view: Angle = Field(ge=0, le=1.0)
     """Diameter of the circle that holds all detectors."""
     layout: str = "hexagon"
-    """`hexagon`: pixels on a hexagonal lattice from the centre outward; `rings`; `wafers`: on hexagonal wafers that share them
-    equally; or a registered layout (`zonda plugins`)."""
+    """`hexagon`: pixels on a hexagonal lattice from the centre outward; `rings`; `wafers`: on
+    hexagonal wafers that share them equally; or a registered layout (`zonda plugins`)."""
     wafers: int = Field(1, ge=1, le=1000)
     """Number of wafers, for `layout: wafers`."""
     focalplane_table: InputPath | None = Field(None, alias="focalplane")
-    """Table of detectors (ECSV or CSV) in place of a layout: columns `name`, `xi`, `eta`, and what they have of their own. The
-    number of detectors and the field of view follow from it."""
+    """Table of detectors (ECSV or CSV) in place of a layout: columns `name`, `xi`, `eta`, and what
+    they have of their own. The number of detectors and the field of view follow from it."""
     polarization: Literal["none", "pairs"] = "none"
-    """`pairs`: each pixel has two detectors, A and B, polarized at right angles; A is at 0 and at 45 deg in alternate pixels."""
+    """`pairs`: each pixel has two detectors, A and B, polarized at right angles; A is at 0 and at
+    45 deg in alternate pixels.
+    """
     fwhm: Angle | None = Field(None, gt=0)
     """Main-beam FWHM; where absent, the diffraction limit 1.22 lambda / D at the band centre."""
     main_beam_efficiency: Fraction = Field(gt=0, le=1)
@@ -121,7 +149,8 @@ class Instrument(Parameters):
     illumination_efficiency: Fraction = Field(gt=0, le=1)
     """epsilon: share of the atmosphere's emission that reaches a detector."""
     net: KelvinRootSecond = Field(ge=0)
-    """White noise on the sky after calibration, K_RJ sqrt(s): the rms of one second of integration."""
+    """White noise on the sky after calibration, K_RJ sqrt(s): the rms of one second of integration.
+    """
     knee: Hertz = quantity("0 Hz", ge=0)
     """Frequency at which pink noise equals white noise (0: no pink noise)."""
     slope: float = Field(1.0, gt=0, le=3)
@@ -139,24 +168,49 @@ class Instrument(Parameters):
     @model_validator(mode="before")
     @classmethod
     def _one_or_several_bands(cls, value: Any, info: ValidationInfo) -> Any:
-        """What all bands state need not be stated for the instrument; ``band`` beside ``bands`` chooses one of them."""
+        """What all bands state need not be stated for the instrument; ``band`` beside ``bands``
+        chooses one of them.
+        """
         if isinstance(value, dict) and value.get("focalplane") is not None:
             value = _completed(value, info)
-        if not isinstance(value, dict) or not isinstance(value.get("bands"), list) or not value["bands"]:
+        if (
+            not isinstance(value, dict)
+            or not isinstance(value.get("bands"), list)
+            or not value["bands"]
+        ):
             return value
         if (chosen := value.get("band")) is not None:
-            whole = cls.model_validate({k: v for k, v in value.items() if k != "band"}, context=info.context)
+            whole = cls.model_validate(
+                {k: v for k, v in value.items() if k != "band"}, context=info.context
+            )
             if not isinstance(chosen, str) or chosen not in whole.cameras:
                 unknown = f"{whole.name} has no band '{chosen}'"
-                text = unknown if isinstance(chosen, str) else "band beside bands is the name of one of them"
+                text = (
+                    unknown
+                    if isinstance(chosen, str)
+                    else "band beside bands is the name of one of them"
+                )
                 cure = f"write one of {', '.join(whole.cameras)}, or leave band or bands out"
                 raise mistake(text, nearest(chosen, whole.cameras), cure, at=("band",))
             camera = whole.cameras[chosen]
-            return camera.model_dump(mode="json") | {"telescope": camera.telescope, "band": camera.band}
-        own = [band.model_dump(mode="json") if isinstance(band, CameraBand) else band for band in value["bands"]]
-        stated = [key for key in PER_BAND if all(isinstance(band, dict) and band.get(key) is not None for band in own)]
+            return camera.model_dump(mode="json") | {
+                "telescope": camera.telescope,
+                "band": camera.band,
+            }
+        own = [
+            band.model_dump(mode="json") if isinstance(band, CameraBand) else band
+            for band in value["bands"]
+        ]
+        stated = [
+            key
+            for key in PER_BAND
+            if all(isinstance(band, dict) and band.get(key) is not None for band in own)
+        ]
         try:
-            CameraBand.model_validate({"name": "first", "low": "1 Hz", "high": "2 Hz"} | {key: own[0][key] for key in stated})
+            CameraBand.model_validate(
+                {"name": "first", "low": "1 Hz", "high": "2 Hz"}
+                | {key: own[0][key] for key in stated}
+            )
         except ValidationError:  # which the band's own validation tells, at its place
             return {key: STAND_INS[key] for key in stated if key in STAND_INS} | value
         return {key: own[0][key] for key in stated} | value
@@ -169,23 +223,40 @@ class Instrument(Parameters):
             help = "give each a name of its own: products and files bear it"
             raise mistake(f"two bands are called {twice}", "", help, at=("bands", second, "name"))
         if self.band is None and not self.bands:
-            raise mistake("a camera needs a band", "", "name one with band, or several with bands", at=("band",))
+            raise mistake(
+                "a camera needs a band",
+                "",
+                "name one with band, or several with bands",
+                at=("band",),
+            )
         if self.focalplane_table is not None:
             return self._table_fits(self.focalplane_table)
         counts = self._counts
         if self.pixels == "shared" and len(set(counts.values())) > 1:
             listed = ", ".join(f"{name} has {number}" for name, number in counts.items())
             text = f"shared pixels need as many detectors in every band: {listed}"
-            raise mistake(text, "", "give all bands the same number of detectors, or write pixels: separate", at=("bands",))
+            raise mistake(
+                text,
+                "",
+                "give all bands the same number of detectors, or write pixels: separate",
+                at=("bands",),
+            )
         if self.wafers > 1 and self.layout != "wafers":
             help = "write layout: wafers, or leave out wafers"
-            raise mistake(f"{self.wafers} wafers go with layout: wafers, not {self.layout}", "", help, at=("wafers",))
+            raise mistake(
+                f"{self.wafers} wafers go with layout: wafers, not {self.layout}",
+                "",
+                help,
+                at=("wafers",),
+            )
         for k, (name, number) in enumerate(counts.items()):
             self._check_number(k, name if self.bands else "", number)
         return self
 
     def _check_number(self, k: int, band: str, number: int) -> None:
-        """Raise what a validator does where the ``number`` of detectors of the ``k``-th band does not suit pixels and wafers."""
+        """Raise what a validator does where the ``number`` of detectors of the ``k``-th band does
+        not suit pixels and wafers.
+        """
         own = bool(self.bands) and self.bands[k].detectors is not None
         at: tuple[str | int, ...] = ("bands", k, "detectors") if own else ("detectors",)
         who = f"detectors of {band} is" if band else "detectors is"
@@ -194,10 +265,16 @@ class Instrument(Parameters):
         below = number // share * share
         cure = f"write {below} or {below + share}" if below else f"write {share}"
         if self.polarization == "pairs" and number % 2:
-            text = f"polarization: pairs needs an even number of detectors, two in each pixel; {who} {number}"
+            text = (
+                f"polarization: pairs needs an even number of detectors, two in each pixel; {who}"
+                f" {number}"
+            )
             raise mistake(text, "", cure, at=at)
         if number % share:
-            text = f"{number_of_wafers} wafers share their pixels equally; {who} {number}, no multiple of {share}"
+            text = (
+                f"{number_of_wafers} wafers share their pixels equally; {who} {number}, no multiple"
+                f" of {share}"
+            )
             raise mistake(text, "", f"{cure}, or layout: hexagon", at=at)
 
     def _table_fits(self, path: Path) -> Instrument:
@@ -207,7 +284,11 @@ class Instrument(Parameters):
             if table.reach > math.tan(self.field_of_view / 2) * (1 + 1e-9):
                 field = f"{math.degrees(2 * math.atan(table.reach)):.6g} deg"
                 cure = f"leave out field_of_view, or write at least {field}"
-                raise InputError(f"has detectors in a field of {field}, more than field_of_view", place=table.place, cure=cure)
+                raise InputError(
+                    f"has detectors in a field of {field}, more than field_of_view",
+                    place=table.place,
+                    cure=cure,
+                )
             if self.polarization == "pairs" and "polarization_angle" not in table.columns:
                 cure = "add it, or leave out polarization: pairs, which belongs to layouts"
                 raise InputError("has no column 'polarization_angle'", place=table.place, cure=cure)
@@ -226,14 +307,20 @@ class Instrument(Parameters):
     @property
     def _counts(self) -> dict[str, int]:
         """Detectors of each band."""
-        return {band.name: band.detectors or self.detectors for band in self.bands} or {self.band.name: self.detectors}
+        return {band.name: band.detectors or self.detectors for band in self.bands} or {
+            self.band.name: self.detectors
+        }
 
     @property
     def _wafers(self) -> int:
         """Wafers that share the pixels of a band equally."""
         if self.layout in LATTICES:
             return 1
-        return self.wafers if self.layout == "wafers" else int(getattr(layouts.get(self.layout), "wafers", 1))
+        return (
+            self.wafers
+            if self.layout == "wafers"
+            else int(getattr(layouts.get(self.layout), "wafers", 1))
+        )
 
     @property
     def _pair(self) -> int:
@@ -260,7 +347,9 @@ class Instrument(Parameters):
         except RegistryError as err:
             label = nearest(name, [*LATTICES, "wafers", *layouts], err.label)
             cure = f"write hexagon, rings, wafers or a registered layout: {', '.join(layouts)}"
-            raise mistake(f"unknown layout {name!r}" if name not in layouts else err.message, label, cure) from None
+            raise mistake(
+                f"unknown layout {name!r}" if name not in layouts else err.message, label, cure
+            ) from None
         return layouts.registered(name)
 
     @field_validator("band", mode="before")
@@ -269,13 +358,16 @@ class Instrument(Parameters):
         return named(bands, value)
 
     def varied(self, **changes: Any) -> Instrument:
-        """This instrument with fields changed, as ``{like: ..., ...}`` in a pipeline file (`core.variants.variant`)."""
+        """This instrument with fields changed, as ``{like: ..., ...}`` in a pipeline file
+        (`core.variants.variant`).
+        """
         made: Instrument = variant({LIKE: self, **changes})
         return made
 
     @property
     def cameras(self) -> dict[str, Instrument]:
-        """By name of the band, the camera that has this band alone; one entry where there is one band.
+        """By name of the band, the camera that has this band alone; one entry where there is one
+        band.
 
         Of bands with arrays side by side the field of view is that of one array.
         """
@@ -284,7 +376,10 @@ class Instrument(Parameters):
         field = 2 * math.atan(math.tan(self.field_of_view / 2) * self._arrays[2])
         apart = self.pixels == "separate" and self.focalplane_table is None
         common = {"bands": [], "field_of_view": field if apart else self.field_of_view}
-        return {b.name: self.model_copy(update={**common, "band": b.alone, **b.stated}) for b in self.bands}
+        return {
+            b.name: self.model_copy(update={**common, "band": b.alone, **b.stated})
+            for b in self.bands
+        }
 
     def check_one_band(self, what: str) -> None:
         """Raise `InputError` about ``what``, which is of one band, where there are several."""
@@ -295,7 +390,9 @@ class Instrument(Parameters):
 
     @property
     def _arrays(self) -> tuple[Floats, Floats, float]:
-        """Centres of the arrays of separate bands, and their radius, in units of the radius of the field of view."""
+        """Centres of the arrays of separate bands, and their radius, in units of the radius of the
+        field of view.
+        """
         x, y = hexagonal_packing(len(self.bands))
         x, y = x - x.mean(), y - y.mean()
         whole = float(np.hypot(x, y).max()) + ARRAY
@@ -303,12 +400,16 @@ class Instrument(Parameters):
 
     @property
     def identity(self) -> tuple[str, ...]:
-        """What tells its detectors' random numbers from those of another instrument or band: names and passband."""
+        """What tells its detectors' random numbers from those of another instrument or band: names
+        and passband.
+        """
         return "instrument", self.name, "band", *self.band.identity
 
     @property
     def beam_fwhm(self) -> float:
-        """`fwhm`, or the diffraction limit 1.22 lambda / D at the band centre, rad; of several bands the smallest."""
+        """`fwhm`, or the diffraction limit 1.22 lambda / D at the band centre, rad; of several
+        bands the smallest.
+        """
         if self.bands:
             return min(camera.beam_fwhm for camera in self.cameras.values())
         if self.fwhm is not None:
@@ -316,10 +417,12 @@ class Instrument(Parameters):
         return 1.22 * SPEED_OF_LIGHT / self.band.centre / self.telescope.diameter
 
     def focalplane(self) -> Focalplane:
-        """The detector table: that of a file, or pixels that are laid out so that they just fill `field_of_view`.
+        """The detector table: that of a file, or pixels that are laid out so that they just fill
+        `field_of_view`.
 
-        A pixel has one detector, or two with ``polarization: pairs``: A and B, at right angles, next to each other in the table.
-        A of every second pixel lies at 0, of the others at 45 deg. Several bands follow each other, in the order of `bands`.
+        A pixel has one detector, or two with ``polarization: pairs``: A and B, at right angles,
+        next to each other in the table. A of every second pixel lies at 0, of the others at 45 deg.
+        Several bands follow each other, in the order of `bands`.
         """
         if self.bands:
             return self._of_several_bands()
@@ -335,7 +438,11 @@ class Instrument(Parameters):
         axes = np.pi / 4 * (np.arange(pixels) % 2) if layout.angle is None else layout.angle
         angle = np.add.outer(axes, [0.0, np.pi / 2]).ravel() if pair == 2 else np.zeros(n)
         return Focalplane(
-            names=[f"d{k:0{width}d}{side}" for k in range(pixels) for side in ("AB" if pair == 2 else ("",))],
+            names=[
+                f"d{k:0{width}d}{side}"
+                for k in range(pixels)
+                for side in ("AB" if pair == 2 else ("",))
+            ],
             xi=np.repeat(layout.x * scale, pair),
             eta=np.repeat(layout.y * scale, pair),
             polarization_angle=angle,
@@ -358,7 +465,10 @@ class Instrument(Parameters):
             return Layout(*LATTICES[self.layout](number), np.zeros(number, np.int64))
         made: Layout = layouts.get(self.layout)(number)
         if not len(made.x) == len(made.y) == len(made.wafer) == number:
-            raise InputError(f"the layout {self.layout} gives {len(made.x)} places for {number} pixels", place=self.name)
+            raise InputError(
+                f"the layout {self.layout} gives {len(made.x)} places for {number} pixels",
+                place=self.name,
+            )
         return made
 
     def _of_several_bands(self) -> Focalplane:
@@ -373,11 +483,16 @@ class Instrument(Parameters):
 
 
 def _completed(given: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-    """What is ``given`` for an instrument, with what its table of detectors states: number, field, medians."""
+    """What is ``given`` for an instrument, with what its table of detectors states: number, field,
+    medians.
+    """
     rest = {key: value for key, value in given.items() if value is not None}
     try:
         table = read_array(find(given["focalplane"], info))
-    except (ZondaError, PydanticCustomError):  # which the field's own validation tells, at its place
+    except (
+        ZondaError,
+        PydanticCustomError,
+    ):  # which the field's own validation tells, at its place
         return STAND_INS | {"field_of_view": "0 deg"} | rest
     found: dict[str, Any] = {"field_of_view": f"{2 * math.atan(table.reach)!r} rad"}
     if isinstance(several := given.get("bands"), list) and several:

@@ -1,8 +1,9 @@
 """Named intervals of a scan, TOAST's names and TOAST's rule of which samples belong to them.
 
-Names: scanning, turnaround, throw, throw_leftright, throw_rightleft, scan_leftright, scan_rightleft, turn_leftright,
-turn_rightleft, elnod, sun_up, sun_close. Times are seconds since the start of the scan. An interval holds the samples from its
-start up to, but not including, its stop; where it stops at the last sample, or between the last two, it holds the last one too.
+Names: scanning, turnaround, throw, throw_leftright, throw_rightleft, scan_leftright,
+scan_rightleft, turn_leftright, turn_rightleft, elnod, sun_up, sun_close. Times are seconds since
+the start of the scan. An interval holds the samples from its start up to, but not including, its
+stop; where it stops at the last sample, or between the last two, it holds the last one too.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ Intervals = dict[str, list[tuple[float, float]]]
 def runs(inside: NDArray[np.bool_], seconds: AnyFloats) -> list[tuple[float, float]]:
     """The intervals of those samples (n,) that are ``inside``, taken at ``seconds`` (n,).
 
-    A run of the last sample alone has no length, and is left out: TOAST's rule gives that sample to the interval before.
+    A run of the last sample alone has no length, and is left out: TOAST's rule gives that sample to
+    the interval before.
     """
     edges = np.flatnonzero(np.diff(np.r_[False, inside, False]))
     stops = np.minimum(edges[1::2], len(seconds) - 1)
@@ -44,8 +46,14 @@ def samples_in(spans: list[tuple[float, float]], seconds: AnyFloats) -> NDArray[
 
 
 def part(intervals: Mapping[str, list[tuple[float, float]]], begin: float, end: float) -> Intervals:
-    """What lies between ``begin`` and ``end`` [s], counted from ``begin``; names of which nothing does are kept."""
+    """What lies between ``begin`` and ``end`` [s], counted from ``begin``; names of which nothing
+    does are kept.
+    """
     return {
-        name: [(max(a, begin) - begin, min(b, end) - begin) for a, b in spans if min(b, end) > max(a, begin)]
+        name: [
+            (max(a, begin) - begin, min(b, end) - begin)
+            for a, b in spans
+            if min(b, end) > max(a, begin)
+        ]
         for name, spans in intervals.items()
     }

@@ -19,7 +19,11 @@ EMISSION = "atmosphere"
 def product_of(products: Mapping[str, Any], name: str) -> Any:
     """A product by its name. Raises InputError where there is none."""
     if name not in products:
-        have = f"there are: {', '.join(sorted(products))}" if products else "the pipeline made none: add a step that makes one"
+        have = (
+            f"there are: {', '.join(sorted(products))}"
+            if products
+            else "the pipeline made none: add a step that makes one"
+        )
         cure = "\n".join(filter(None, (nearest(name, products), have)))
         raise InputError(f"there is no product {name!r}", place="data", cure=cure)
     return products[name]
@@ -45,14 +49,26 @@ def one_scan(observations: Sequence[Observation], scan: str | int | None) -> Obs
 
 
 def kept(observation: Observation, stream: str, rows: slice = slice(None)) -> NDArray[np.float64]:
-    """These detectors of a kept stream, with the mean that belongs to it. Raises InputError where it was not kept."""
+    """These detectors of a kept stream, with the mean that belongs to it. Raises InputError where
+    it was not kept.
+    """
     if stream not in observation.detdata:
         have = sorted(observation.detdata)
         what = f"only {' and '.join(have)}" if have else "no stream was"
-        cure = f"run it again with pipeline.run(scene, keep={[*have, stream]!r}): 8 bytes for each sample of each stream"
-        raise InputError(f"the stream {stream!r} was not kept, {what}", place=observation.name, cure=cure)
+        cure = (
+            f"run it again with pipeline.run(scene, keep={[*have, stream]!r}): 8 bytes for each"
+            " sample of each stream"
+        )
+        raise InputError(
+            f"the stream {stream!r} was not kept, {what}", place=observation.name, cure=cure
+        )
     found = np.asarray(observation.detdata[stream][rows], np.float64)
     if stream == EMISSION and EMISSION in observation.smooth:
         first, stop, _ = rows.indices(observation.n_detectors)
-        return observation.smooth[EMISSION].evaluate(slice(first, stop), slice(0, observation.n_samples)) + found
+        return (
+            observation.smooth[EMISSION].evaluate(
+                slice(first, stop), slice(0, observation.n_samples)
+            )
+            + found
+        )
     return found

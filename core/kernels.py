@@ -1,4 +1,6 @@
-"""Kernels to compile ahead (`core.compilation.compile_ahead`); `python benchmarks/startup.py --kernels` writes this file."""
+"""Kernels to compile ahead (`core.compilation.compile_ahead`); `python benchmarks/startup.py
+--kernels` writes this file.
+"""
 
 KERNELS = (
     "1 1.0 zonda.core.numerics.smooth _prefilter f8:2C f8:1C f8:2C",

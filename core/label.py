@@ -30,5 +30,7 @@ class Labelled(Parameters):
 
     @property
     def label(self) -> str:
-        """Unique name of this step in its pipeline (the pipeline numbers namesakes: ``WhiteNoise``, ``WhiteNoise.2``)."""
+        """Unique name of this step in its pipeline (the pipeline numbers namesakes: ``WhiteNoise``,
+        ``WhiteNoise.2``).
+        """
         return self._label or self.name or type(self).__name__

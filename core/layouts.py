@@ -1,4 +1,6 @@
-"""Where the pixels of a camera lie: hexagonal lattices, rings, and wafers of them. Lengths are in units of the layout's own."""
+"""Where the pixels of a camera lie: hexagonal lattices, rings, and wafers of them. Lengths are in
+units of the layout's own.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +13,28 @@ from numpy.typing import NDArray
 from .types import Floats
 
 GAP = 0.03
-"""Of wafers: distance between their edges, beyond one pitch, in units of the distance between their centres."""
+"""Of wafers: distance between their edges, beyond one pitch, in units of the distance between their
+centres.
+"""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where ``n`` pixels lie: what a registered layout (entry points ``zonda.layouts``), called with their number, returns.
+    """Where ``n`` pixels lie: what a registered layout (entry points ``zonda.layouts``), called
+    with their number, returns.
 
     The callable may have an attribute ``wafers``: a number that divides that of the pixels.
 
     Attributes
     ----------
     x, y
-        (n,) places on the tangent plane, towards increasing azimuth and elevation, in a unit of its own.
+        (n,) places on the tangent plane, towards increasing azimuth and elevation, in a unit of its
+        own.
     wafer
         (n,) whole numbers: the wafer of each.
     angle
-        (n,) angles of the axes of A from +y towards +x [rad], for pairs of polarized detectors; None: 0 and 45 deg in turn.
+        (n,) angles of the axes of A from +y towards +x [rad], for pairs of polarized detectors;
+        None: 0 and 45 deg in turn.
     radius
         That of the field of view in the same unit; None: the distance of the farthest pixel.
     """
@@ -45,14 +52,18 @@ class Layout:
 
 
 def hexagonal_packing(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The ``n`` points of a unit-pitch hexagonal lattice nearest its origin. Two arrays (n,), nearest first."""
+    """The ``n`` points of a unit-pitch hexagonal lattice nearest its origin. Two arrays (n,),
+    nearest first.
+    """
     x, y = _lattice(n)
     order = np.lexsort((np.round(np.arctan2(y, x), 9), np.round(np.hypot(x, y), 9)))[:n]
     return x[order], y[order]
 
 
 def rings(n: int) -> tuple[Floats, Floats]:
-    """``n`` points on rings one unit apart: one in the centre, 6 k on ring k, what is left evenly on the last."""
+    """``n`` points on rings one unit apart: one in the centre, 6 k on ring k, what is left evenly
+    on the last.
+    """
     x, y, k = [np.zeros(1)], [np.zeros(1)], 0
     left = n - 1
     while left > 0:
@@ -66,15 +77,20 @@ def rings(n: int) -> tuple[Floats, Floats]:
 
 
 def hexagon(n: int) -> tuple[Floats, Floats]:
-    """The first ``n`` points of a unit-pitch lattice in hexagons about its origin, with corners at 0 and 60 deg."""
+    """The first ``n`` points of a unit-pitch lattice in hexagons about its origin, with corners at
+    0 and 60 deg.
+    """
     x, y = _lattice(n)
-    shell = np.max(np.abs([x - y / math.sqrt(3), 2 * y / math.sqrt(3), x + y / math.sqrt(3)]), axis=0)
+    shell = np.max(
+        np.abs([x - y / math.sqrt(3), 2 * y / math.sqrt(3), x + y / math.sqrt(3)]), axis=0
+    )
     order = np.lexsort((np.round(np.arctan2(y, x), 9), np.round(shell, 9)))[:n]
     return x[order], y[order]
 
 
 def wafers(n: int, number: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """``n`` points shared equally by ``number`` hexagonal wafers, edge to edge about the origin: x, y and the wafer of each.
+    """``n`` points shared equally by ``number`` hexagonal wafers, edge to edge about the origin: x,
+    y and the wafer of each.
 
     Wafer after wafer; ``number`` divides ``n``.
     """
@@ -83,11 +99,17 @@ def wafers(n: int, number: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
     distance = (2 * apothem + 1) * (1 + GAP)
     v, u = _compact(number)  # neighbours at 30 deg: across the edges of a wafer
     u, v = distance * (u - u.mean()), distance * (v - v.mean())
-    return np.add.outer(u, x).ravel(), np.add.outer(v, y).ravel(), np.repeat(np.arange(number), n // number)
+    return (
+        np.add.outer(u, x).ravel(),
+        np.add.outer(v, y).ravel(),
+        np.repeat(np.arange(number), n // number),
+    )
 
 
 def _compact(n: int) -> tuple[Floats, Floats]:
-    """``n`` points of a unit-pitch hexagonal lattice, about a point, a middle of two or of three: where they reach least far."""
+    """``n`` points of a unit-pitch hexagonal lattice, about a point, a middle of two or of three:
+    where they reach least far.
+    """
     x, y = _lattice(n)
     found = []
     for a, b in ((0.0, 0.0), (0.5, 0.0), (0.5, math.sqrt(3) / 6)):
@@ -101,4 +123,6 @@ def _lattice(n: int) -> tuple[Floats, Floats]:
     """Points of a hexagonal lattice, in rows; more than the ``n`` nearest its origin."""
     reach = math.ceil(math.sqrt(n)) + 1
     i, j = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    return np.asarray((i + j / 2.0).ravel(), np.float64), np.asarray((j * math.sqrt(3) / 2).ravel(), np.float64)
+    return np.asarray((i + j / 2.0).ravel(), np.float64), np.asarray(
+        (j * math.sqrt(3) / 2).ravel(), np.float64
+    )

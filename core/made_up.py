@@ -31,7 +31,8 @@ class Points(Operator):
 
 
 class Given(Operator):
-    """Provides every stream: a slow wave, common to all detectors, with noise of each detector's own.
+    """Provides every stream: a slow wave, common to all detectors, with noise of each detector's
+    own.
 
     ``mean`` names one that has a mean of some 30 K, ``beside`` it or in it.
     """
@@ -44,7 +45,9 @@ class Given(Operator):
 
     def prepare(self, observation: Observation) -> SmoothField:
         """The mean: of each detector its own, falling slowly."""
-        field = SmoothField.from_values(*slow(observation.n_samples), MEAN_STEP, observation.n_samples)
+        field = SmoothField.from_values(
+            *slow(observation.n_samples), MEAN_STEP, observation.n_samples
+        )
         if self.mean == "atmosphere" and self.beside:
             observation.smooth["atmosphere"] = field
         return field
@@ -68,8 +71,12 @@ MEAN_STEP = 256
 
 
 def slow(n_samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weights (detector, node) and node values of a mean: 30 K and more, falling by 0.3 K in a straight line."""
-    weights = np.stack([30 + 0.1 * np.arange(N_DETECTORS), np.linspace(0.5, 1, N_DETECTORS)], axis=1)
+    """Weights (detector, node) and node values of a mean: 30 K and more, falling by 0.3 K in a
+    straight line.
+    """
+    weights = np.stack(
+        [30 + 0.1 * np.arange(N_DETECTORS), np.linspace(0.5, 1, N_DETECTORS)], axis=1
+    )
     n = -(-n_samples // MEAN_STEP) + 3
     return weights, np.stack([np.ones(n + 24), -0.3 * np.arange(n + 24) / n])
 
@@ -89,8 +96,20 @@ def made_up_scene() -> Scene:
         pink_minimum_frequency="10 mHz",
         sample_rate=f"{RATE} Hz",
     )
-    site = Site(name="somewhere", latitude="38.4 deg", longitude="-79.8 deg", altitude="800 m", climatology="green_bank")
-    return Scene(site=site, instrument=camera, time=Instant.parse("2024-11-25T07:00"), target="05h +20d", seed=11)
+    site = Site(
+        name="somewhere",
+        latitude="38.4 deg",
+        longitude="-79.8 deg",
+        altitude="800 m",
+        climatology="green_bank",
+    )
+    return Scene(
+        site=site,
+        instrument=camera,
+        time=Instant.parse("2024-11-25T07:00"),
+        target="05h +20d",
+        seed=11,
+    )
 
 
 def made_up_scan() -> Observation:
@@ -101,9 +120,19 @@ def made_up_scan() -> Observation:
     reach = np.radians(5 / 60)
     x, y = reach * np.cos(t / 3), reach * np.sin(t / 3)
     return Observation(
-        "scan-000", 0, scene.site, scene.instrument, scene.instrument.focalplane(), scene.time, t, RATE,
-        from_angles(-1.0 - x / np.cos(1.05), 1.05 + y), from_angles(ra + x / np.cos(dec), dec + y), (ra, dec), scene.seed,
-    )  # fmt: skip
+        "scan-000",
+        0,
+        scene.site,
+        scene.instrument,
+        scene.instrument.focalplane(),
+        scene.time,
+        t,
+        RATE,
+        from_angles(-1.0 - x / np.cos(1.05), 1.05 + y),
+        from_angles(ra + x / np.cos(dec), dec + y),
+        (ra, dec),
+        scene.seed,
+    )
 
 
 def given_signal(observation: Observation, factor: float) -> NDArray[np.float32]:

@@ -1,4 +1,6 @@
-"""Kinds of steps that the executor treats in a way of their own: map makers, and the step that adds up what is calibrated."""
+"""Kinds of steps that the executor treats in a way of their own: map makers, and the step that adds
+up what is calibrated.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +17,13 @@ from .signal import MAIN, Component, is_stream
 
 
 class MapMaker(Operator):
-    """A step that makes products of every signal: its `exec` sees all of them, under the names `Block.signals`.
+    """A step that makes products of every signal: its `exec` sees all of them, under the names
+    `Block.signals`.
 
     What is not finite in one of them is NaN in all.
 
-    Where it is `linear`, the product of a remainder is subtracted (`core.product.Product.subtract`), not simulated.
+    Where it is `linear`, the product of a remainder is subtracted
+    (`core.product.Product.subtract`), not simulated.
     """
 
 
@@ -31,10 +35,11 @@ class _Reads:
 
 
 class CalibratedSignal(Operator):
-    """Adds up the sky and the components that enter calibrated, where no step makes anything else: nothing is to be calibrated.
+    """Adds up the sky and the components that enter calibrated, where no step makes anything else:
+    nothing is to be calibrated.
 
-    The pipeline puts it before the first step that reads ``signal``, where no step provides that and nothing else is provided up
-    to there. It is not one of the pipeline's own steps.
+    The pipeline puts it before the first step that reads ``signal``, where no step provides that
+    and nothing else is provided up to there. It is not one of the pipeline's own steps.
     """
 
     requires: ClassVar[Any] = _Reads()
@@ -52,7 +57,9 @@ class CalibratedSignal(Operator):
 
     def exec(self, block: Block, state: Any) -> None:
         out, empty = block.new(MAIN, zero=False), True
-        names = [name for name in sorted(self._reads) if name in block.detdata]  # a signal without the sky has none
+        names = [
+            name for name in sorted(self._reads) if name in block.detdata
+        ]  # a signal without the sky has none
         for name in names:
             if empty:
                 out[...] = block.detdata[name]
@@ -66,7 +73,9 @@ class CalibratedSignal(Operator):
 
 
 def place_of_signal(operators: Sequence[Operator]) -> int | None:
-    """Index of the first step that reads ``signal`` where what is calibrated makes up the signal, else None."""
+    """Index of the first step that reads ``signal`` where what is calibrated makes up the signal,
+    else None.
+    """
     if any(forms(o) for o in operators):
         return None
     for index, operator in enumerate(operators):
@@ -77,8 +86,17 @@ def place_of_signal(operators: Sequence[Operator]) -> int | None:
 
 def _calibrated(operators: Sequence[Operator]) -> frozenset[str]:
     """What these steps provide, where all of it is sky or enters calibrated; else nothing."""
-    made = [name for o in operators if not changes_components(o) for name in o.provides if name != "boresight"]
-    known = all(name == "sky" or (isinstance(name, Component) and name.enters == "calibrated") for name in made)
+    made = [
+        name
+        for o in operators
+        if not changes_components(o)
+        for name in o.provides
+        if name != "boresight"
+    ]
+    known = all(
+        name == "sky" or (isinstance(name, Component) and name.enters == "calibrated")
+        for name in made
+    )
     return frozenset(made) if known else frozenset()
 
 
@@ -103,10 +121,12 @@ def filters(operator: Operator) -> bool:
 
 
 def changes_components(operator: Operator) -> bool:
-    """Whether it changes streams that other steps make, before a signal is formed of them, and makes none: it reads all that it
-    provides, and is no part of any signal itself."""
+    """Whether it changes streams that other steps make, before a signal is formed of them, and
+    makes none: it reads all that it provides, and is no part of any signal itself."""
     return (
-        MAIN not in operator.provides and bool(operator.provides) and operator.provides <= operator.requires | operator.optional
+        MAIN not in operator.provides
+        and bool(operator.provides)
+        and operator.provides <= operator.requires | operator.optional
     )
 
 
@@ -116,13 +136,19 @@ def made_by(operator: Operator) -> frozenset[str]:
 
 
 def makes_products(operator: Operator) -> bool:
-    """Whether all that it makes are products in memory: map makers, spectra. (What a step writes while it runs, it does not
-    provide.)"""
+    """Whether all that it makes are products in memory: map makers, spectra. (What a step writes
+    while it runs, it does not provide.)"""
     names = operator.provides
-    return bool(names) and not any(n == "boresight" or is_stream(n) for n in names) and not isinstance(operator, Output)
+    return (
+        bool(names)
+        and not any(n == "boresight" or is_stream(n) for n in names)
+        and not isinstance(operator, Output)
+    )
 
 
 def acts(operator: Operator) -> bool:
-    """Whether it works on observations: neither an output nor a step that points the telescope and has no ``exec``."""
+    """Whether it works on observations: neither an output nor a step that points the telescope and
+    has no ``exec``.
+    """
     points = "boresight" in operator.provides and type(operator).exec is Operator.exec
     return not isinstance(operator, Output) and not points

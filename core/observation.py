@@ -56,40 +56,49 @@ class Observation:
     start
         Exact start instant.
     seconds
-        (n_samp,) float64, increasing, seconds since ``start``: when each sample is taken. They need not be a perfect comb:
-        pointing and atmosphere follow them, noise and filters count samples (see `jitter`).
+        (n_samp,) float64, increasing, seconds since ``start``: when each sample is taken. They need
+        not be a perfect comb: pointing and atmosphere follow them, noise and filters count samples
+        (see `jitter`).
     sample_rate
         Hz; of the comb that comes nearest to ``seconds``.
     boresight_azel, boresight_radec
-        (n_samp, 4) float64 quaternions (x, y, z, w), exactly TOAST's: Rz(lon) Ry(pi/2 - lat) Rz(psi), lon = -az for azel.
+        (n_samp, 4) float64 quaternions (x, y, z, w), exactly TOAST's: Rz(lon) Ry(pi/2 - lat)
+        Rz(psi), lon = -az for azel.
     pointed_radec
-        (n_samp, 4) where the boresight in fact is on the sky, where a step makes that differ from what is recorded; else None.
+        (n_samp, 4) where the boresight in fact is on the sky, where a step makes that differ from
+        what is recorded; else None.
     centre
-        ICRS (ra, dec) [rad] of the scan's target without its per-scan offset: the default map centre.
+        ICRS (ra, dec) [rad] of the scan's target without its per-scan offset: the default map
+        centre.
     flags, detector_flags
-        (n_samp,) and (n_det,) uint8, bits of `core.flags`; most of them mean: do not use (`good_samples`, `good_detectors`).
+        (n_samp,) and (n_det,) uint8, bits of `core.flags`; most of them mean: do not use
+        (`good_samples`, `good_detectors`).
     intervals
-        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`). Default: all is *scanning*.
+        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`).
+        Default: all is *scanning*.
     weather
         At the telescope; None: not known.
     smooth
-        Slowly varying float64 fields: ``atmosphere`` (mean emission at the detector before efficiency, K_RJ) and
-        ``transmission`` (band-mean e^-tau at the mean PWV), each a `SmoothField`. Set by operators in ``configure``, so that the
-        levels which follow from them are known before any step is prepared.
+        Slowly varying float64 fields: ``atmosphere`` (mean emission at the detector before
+        efficiency, K_RJ) and ``transmission`` (band-mean e^-tau at the mean PWV), each a
+        `SmoothField`. Set by operators in ``configure``, so that the levels which follow from them
+        are known before any step is prepared.
     detdata
         (n_det, n_samp) arrays that an output asked to keep.
     expected_load
-        Tells the atmosphere's mean emission [K_RJ] and transmission in the middle of the scan, before ``smooth`` is known; None:
-        there is no atmosphere.
+        Tells the atmosphere's mean emission [K_RJ] and transmission in the middle of the scan,
+        before ``smooth`` is known; None: there is no atmosphere.
     load_spectra
         Tells the atmosphere over the passband; None: it is not known, and taken to be flat.
     noise_levels
         Levels of the white noise by step, in their order. Pink noise refers to the last.
     closed_forms
-        By component: power spectra on the calibrated sky, one for each step that makes it. Functions of frequencies (n,) [Hz]
-        that return one-sided densities (n,) [K_RJ^2/Hz], the mean over detectors, once all steps are prepared.
+        By component: power spectra on the calibrated sky, one for each step that makes it.
+        Functions of frequencies (n,) [Hz] that return one-sided densities (n,) [K_RJ^2/Hz], the
+        mean over detectors, once all steps are prepared.
     quoted_net
-        (n_det,) ``focalplane.net`` before a step with white noise set it to what it comes to on the sky; None: there is none.
+        (n_det,) ``focalplane.net`` before a step with white noise set it to what it comes to on the
+        sky; None: there is none.
     windows
         By step, (n_samp,) factors by which it multiplied the filtered signals (`window`).
     components
@@ -101,15 +110,18 @@ class Observation:
     tally
         What was counted or approximated.
     hwp_angle
-        (n_samp,) rad, of a half-wave plate in the focal plane (`core.polarization`); None: there is none.
+        (n_samp,) rad, of a half-wave plate in the focal plane (`core.polarization`); None: there is
+        none.
     recorded_azimuth
-        (n_samp,) rad, of the mount, as a file states it beside the boresight; None: it follows from ``boresight_azel``.
+        (n_samp,) rad, of the mount, as a file states it beside the boresight; None: it follows from
+        ``boresight_azel``.
     shared
         What the bands of a camera share of the scan; None: there is one band.
     output
         Folder (Path) for files that are written while the scan runs (see `Data.output`).
     seen_of
-        Samples and sample rate [Hz] of the scan of which this is a look at fewer instants (`Operator.check`); None: of itself.
+        Samples and sample rate [Hz] of the scan of which this is a look at fewer instants
+        (`Operator.check`); None: of itself.
     """
 
     name: str
@@ -131,7 +143,9 @@ class Observation:
     smooth: dict[str, SmoothField] = field(default_factory=dict)
     detdata: dict[str, AnyFloats] = field(default_factory=dict)
     noise_levels: dict[str, WhiteLevel] = field(default_factory=dict)
-    closed_forms: dict[str, list[Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = field(default_factory=dict)
+    closed_forms: dict[str, list[Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = field(
+        default_factory=dict
+    )
     quoted_net: NDArray[np.float64] | None = None
     tally: Tally = field(default_factory=Tally)
     output: Any = None
@@ -164,7 +178,9 @@ class Observation:
         return len(self.focalplane)
 
     def expected_net(self) -> NDArray[np.float64]:
-        """(n_det,) about what ``focalplane.net`` will be once the steps with white noise are prepared."""
+        """(n_det,) about what ``focalplane.net`` will be once the steps with white noise are
+        prepared.
+        """
         levels = [level.expected_sky_net(self) for level in self.noise_levels.values()]
         return np.asarray(reduce(np.hypot, levels) if levels else self.focalplane.net, np.float64)
 
@@ -185,7 +201,9 @@ class Observation:
 
     @property
     def window(self) -> NDArray[np.float64] | None:
-        """(n_samp,) product of `windows`, 0 to 1, by which maps weigh samples; None: there is none."""
+        """(n_samp,) product of `windows`, 0 to 1, by which maps weigh samples; None: there is
+        none.
+        """
         return reduce(np.multiply, self.windows.values()) if self.windows else None
 
     @property
@@ -199,16 +217,23 @@ class Observation:
         return self.seen_of or (self.n_samples, self.sample_rate)
 
     def of_each_band(self) -> list[Observation]:
-        """The scan as a camera with each of the instrument's bands alone sees it; itself where there is one."""
+        """The scan as a camera with each of the instrument's bands alone sees it; itself where
+        there is one.
+        """
         if not self.instrument.bands:
             return [self]
         cameras = enumerate(self.instrument.cameras.values())
         none = np.zeros(0, np.uint8)
-        return [replace(self, instrument=c, focalplane=self.focalplane.of_band(k), detector_flags=none) for k, c in cameras]
+        return [
+            replace(self, instrument=c, focalplane=self.focalplane.of_band(k), detector_flags=none)
+            for k, c in cameras
+        ]
 
     @property
     def departures(self) -> NDArray[np.float64]:
-        """(n_samp,) s by which samples are later than a comb of `sample_rate` with the same mean; zeros for a perfect one."""
+        """(n_samp,) s by which samples are later than a comb of `sample_rate` with the same mean;
+        zeros for a perfect one.
+        """
         late = self.seconds - (self.seconds[0] + np.arange(self.n_samples) / self.sample_rate)
         return np.asarray(late - late.mean(), np.float64) if late.any() else late
 
@@ -232,27 +257,38 @@ class Observation:
         """The scan at some of its samples alone."""
         azimuth = None if self.recorded_azimuth is None else self.recorded_azimuth[at]
         return replace(
-            self, seconds=self.seconds[at], boresight_azel=self.boresight_azel[at],
-            boresight_radec=self.boresight_radec[at], flags=self.flags[at], recorded_azimuth=azimuth,
-        )  # fmt: skip
+            self,
+            seconds=self.seconds[at],
+            boresight_azel=self.boresight_azel[at],
+            boresight_radec=self.boresight_radec[at],
+            flags=self.flags[at],
+            recorded_azimuth=azimuth,
+        )
 
     def key(self, *names: str | int) -> NDArray[np.uint32]:
-        """Random-stream key (2,) uint32 that belongs to this seed, this observation and ``names``."""
+        """Random-stream key (2,) uint32 that belongs to this seed, this observation and
+        ``names``.
+        """
         return stream_key(self.seed, "observation", self.index, *names)
 
     def detector_key(self, *names: str | int) -> NDArray[np.uint32]:
-        """As `key`, for what belongs to the detectors: noise, gains. Another instrument or another band has numbers of its own.
+        """As `key`, for what belongs to the detectors: noise, gains. Another instrument or another
+        band has numbers of its own.
 
         The atmosphere is keyed without them: all bands of one seed look through the same.
         """
         return self.key(*self.instrument.identity, *names)
 
     def camera_key(self, *names: str | int) -> NDArray[np.uint32]:
-        """As `detector_key`, for what stays as it is from scan to scan: time constants, sidelobes."""
+        """As `detector_key`, for what stays as it is from scan to scan: time constants,
+        sidelobes.
+        """
         return stream_key(self.seed, "camera", *self.instrument.identity, *names)
 
     def derotate(self, which: str) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
-        """(lon, lat, psi) of ``boresight_azel`` or ``boresight_radec`` [rad]; for azel lon = -azimuth."""
+        """(lon, lat, psi) of ``boresight_azel`` or ``boresight_radec`` [rad]; for azel lon =
+        -azimuth.
+        """
         x, y, z, w = getattr(self, which).T
         lat = np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x))
         lon = np.arctan2(2 * (y * z - w * x), 2 * (x * z + w * y))
@@ -263,14 +299,21 @@ class Observation:
     def azimuth(self) -> AnyFloats:
         """(n_samp,) rad, north through east, 0 to below 2 pi; as recorded, where it is."""
         recorded = self.recorded_azimuth
-        found = (-self.derotate("boresight_azel")[0] if recorded is None else recorded) % (2 * np.pi)
-        return np.where(found < 2 * np.pi, found, 0.0)  # the remainder of what is a rounding below zero
+        found = (-self.derotate("boresight_azel")[0] if recorded is None else recorded) % (
+            2 * np.pi
+        )
+        return np.where(
+            found < 2 * np.pi, found, 0.0
+        )  # the remainder of what is a rounding below zero
 
     @property
     def elevation(self) -> AnyFloats:
         """(n_samp,) rad."""
         x, y, z, w = self.boresight_azel.T
-        return np.asarray(np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x)), np.float64)
+        return np.asarray(
+            np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x)),
+            np.float64,
+        )
 
     @property
     def ra(self) -> AnyFloats:
@@ -284,11 +327,16 @@ class Observation:
 
     @property
     def mean_emission(self) -> dict[str, float]:
-        """Of the atmosphere, K_RJ: ``atmosphere`` as it is, ``scan`` calibrated (`core.emission`); empty where there is none."""
+        """Of the atmosphere, K_RJ: ``atmosphere`` as it is, ``scan`` calibrated (`core.emission`);
+        empty where there is none.
+        """
         return mean_emission(self.smooth, self.focalplane, self.good_detectors, self.n_samples)
 
     def __repr__(self) -> str:
-        return f"<Observation {self.name}: {self.n_detectors} detectors x {self.n_samples} samples at {self.sample_rate:g} Hz>"
+        return (
+            f"<Observation {self.name}: {self.n_detectors} detectors x {self.n_samples} samples at"
+            f" {self.sample_rate:g} Hz>"
+        )
 
     def _repr_html_(self) -> str:
         rows = [
@@ -297,6 +345,12 @@ class Observation:
             ("start", str(self.start)),
             ("duration", f"{self.duration:.1f} s at {self.sample_rate:g} Hz"),
             ("detectors", self.n_detectors),
-            ("elevation", f"{np.degrees(self.elevation.min()):.2f} to {np.degrees(self.elevation.max()):.2f} deg"),
+            (
+                "elevation",
+                (
+                    f"{np.degrees(self.elevation.min()):.2f} to"
+                    f" {np.degrees(self.elevation.max()):.2f} deg"
+                ),
+            ),
         ]
         return html_table(f"Observation {self.name}", rows)

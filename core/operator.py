@@ -17,41 +17,48 @@ class Operator(Labelled):
 
     A pipeline calls, in this order:
 
-    1. ``observe(data)`` once, in order: pointing operators append `Observation`s; map makers lay out what all of them share
-       (`Data.layouts`).
-    2. For each observation, ``configure(observation)`` of every operator (resolve values that others need: efficiencies,
-       NET), then ``prepare(observation) -> state`` of every operator (draw turbulence, build coefficients). Both may be called
-       for the next observation, from another thread, while `exec`, `measure` and `collect` work on the one before: they change
+    1. ``observe(data)`` once, in order: pointing operators append `Observation`s; map makers lay
+       out what all of them share (`Data.layouts`).
+    2. For each observation, ``configure(observation)`` of every operator (resolve values that
+       others need: efficiencies, NET), then ``prepare(observation) -> state`` of every operator
+       (draw turbulence, build coefficients). Both may be called for the next observation, from
+       another thread, while `exec`, `measure` and `collect` work on the one before: they change
        only that observation and what a lock guards.
-    3. ``exec(block, state)`` for every block. Called from several threads at once: the state is read only, or guarded.
-       Its result may depend on absolute detector and sample indices only, never on where the block begins or ends. A block may
-       come again (`Block.again`) where the streams between operators do not fit in memory.
-    4. ``collect(data, observation, state)`` once per observation, in observation order: hand partial products to `Data.add`.
-    5. ``finalize(data)`` once at the end of the run: turn partial products (`Data.take`) into products, write files.
+    3. ``exec(block, state)`` for every block. Called from several threads at once: the state is
+       read only, or guarded. Its result may depend on absolute detector and sample indices only,
+       never on where the block begins or ends. A block may come again (`Block.again`) where the
+       streams between operators do not fit in memory.
+    4. ``collect(data, observation, state)`` once per observation, in observation order: hand
+       partial products to `Data.add`.
+    5. ``finalize(data)`` once at the end of the run: turn partial products (`Data.take`) into
+       products, write files.
 
-    A step that requires and provides ``signal`` is called once for every signal (`core.signal`), as if that were the only one. A
-    step that reads ``signal`` alone sees the complete one; a `MapMaker` sees all of them. What adds to the data provides a
-    `Component`.
+    A step that requires and provides ``signal`` is called once for every signal (`core.signal`), as
+    if that were the only one. A step that reads ``signal`` alone sees the complete one; a
+    `MapMaker` sees all of them. What adds to the data provides a `Component`.
 
     Attributes
     ----------
     requires, provides
-        Names of data read and written; checked before anything runs. ``boresight`` comes from a pointing operator; block
-        streams are ``sky, atmosphere, transmission, white, pink, signal``; products are named by their makers.
+        Names of data read and written; checked before anything runs. ``boresight`` comes from a
+        pointing operator; block streams are ``sky, atmosphere, transmission, white, pink, signal``;
+        products are named by their makers.
     optional
         Names it uses when an earlier or later operator provides them.
     couples
-        What one output sample depends on: ``sample`` (itself alone, plus `halo` neighbours), ``detectors`` (all detectors
-        at that instant), ``time`` (one detector's whole scan), ``all``. An ``all`` operator implements `measure`; its ``exec``
-        then works like that of a ``sample`` operator.
+        What one output sample depends on: ``sample`` (itself alone, plus `halo` neighbours),
+        ``detectors`` (all detectors at that instant), ``time`` (one detector's whole scan),
+        ``all``. An ``all`` operator implements `measure`; its ``exec`` then works like that of a
+        ``sample`` operator.
     linear
-        True where what `exec` makes of ``signal`` is linear in it: zero of zero, and additive; for ``couples = "all"`` with what
-        `measure` found given.
+        True where what `exec` makes of ``signal`` is linear in it: zero of zero, and additive; for
+        ``couples = "all"`` with what `measure` found given.
     knows_means
-        True where it handles the means that stand beside streams (`Block.means`, ``observation.smooth["atmosphere"]``). Without
-        it `exec` sees whole streams: where one that it declares has a mean, a float64 block with the mean in it, and no entry in
-        `Block.means`; the same mean is subtracted from what it leaves there (`core.run.whole`). `measure` likewise. A class that
-        overrides `exec` or `measure` must say so anew.
+        True where it handles the means that stand beside streams (`Block.means`,
+        ``observation.smooth["atmosphere"]``). Without it `exec` sees whole streams: where one that
+        it declares has a mean, a float64 block with the mean in it, and no entry in `Block.means`;
+        the same mean is subtracted from what it leaves there (`core.run.whole`). `measure`
+        likewise. A class that overrides `exec` or `measure` must say so anew.
     """
 
     zonda_api: ClassVar[int] = API_VERSION
@@ -63,13 +70,17 @@ class Operator(Labelled):
     knows_means: ClassVar[bool] = False
 
     def observe(self, data: Data) -> None:
-        """Append observations to ``data`` (pointing operators), or look at those that are there (map makers: a common grid)."""
+        """Append observations to ``data`` (pointing operators), or look at those that are there
+        (map makers: a common grid).
+        """
 
     def check(self, data: Data) -> list[str]:
-        """What `zonda check` finds out beyond the parameters, in well under a second: lines to print, or a `ZondaError`.
+        """What `zonda check` finds out beyond the parameters, in well under a second: lines to
+        print, or a `ZondaError`.
 
-        Pointing operators append observations to ``data``, on which later steps may look: of a long scan fewer instants, with
-        what the run will take in `Observation.seen_of` (`Observation.sampling`). ``data.made`` names what the steps make.
+        Pointing operators append observations to ``data``, on which later steps may look: of a long
+        scan fewer instants, with what the run will take in `Observation.seen_of`
+        (`Observation.sampling`). ``data.made`` names what the steps make.
         """
         return []
 
@@ -77,20 +88,24 @@ class Operator(Labelled):
         """Resolve values that other operators read, e.g. the focal plane's efficiencies."""
 
     def prepare(self, observation: Observation) -> Any:
-        """Return what `exec` needs for this observation. It may set ``observation.smooth`` fields."""
+        """Return what `exec` needs for this observation. It may set ``observation.smooth``
+        fields.
+        """
         return None
 
     def halo(self, observation: Observation) -> int:
-        """Samples on each side of a block that `exec` needs to be right inside it (a finite filter's half-length)."""
+        """Samples on each side of a block that `exec` needs to be right inside it (a finite
+        filter's half-length).
+        """
         return 0
 
     def measure(self, stream: Stream, model: Any = None) -> Any:
-        """Read a whole stream (``couples = "all"`` only) and return what `exec` needs for it, in place of what `prepare` returned
-        (``stream.state``).
+        """Read a whole stream (``couples = "all"`` only) and return what `exec` needs for it, in
+        place of what `prepare` returned (``stream.state``).
 
-        Called for every signal, the complete one first (``stream.signal``); that one decides which detectors are flagged.
-        ``model``: what it returned for the complete signal, where this one is to be treated as a part of that (``modes: full``);
-        else None.
+        Called for every signal, the complete one first (``stream.signal``); that one decides which
+        detectors are flagged. ``model``: what it returned for the complete signal, where this one
+        is to be treated as a part of that (``modes: full``); else None.
         """
         return stream.state
 
@@ -101,7 +116,9 @@ class Operator(Labelled):
         """Hand this observation's partial products to `Data.add`."""
 
     def discard(self, observation: Observation, state: Any) -> None:
-        """Undo what `prepare` and `exec` began (temporary files): called instead of `collect` when the run fails."""
+        """Undo what `prepare` and `exec` began (temporary files): called instead of `collect` when
+        the run fails.
+        """
 
     def finalize(self, data: Data) -> None:
         """Finish products."""

@@ -1,4 +1,6 @@
-"""Outputs: what shows or compares products once all of them are there (reports, plots, transfer functions)."""
+"""Outputs: what shows or compares products once all of them are there (reports, plots, transfer
+functions).
+"""
 
 from __future__ import annotations
 
@@ -22,25 +24,29 @@ Progress = Literal["pointing", "scan", "maps"]
 class Output(Operator):
     """A step that acts in `finalize` alone, once, after all signals of all scans are mapped.
 
-    Its `observe` is called before that of all other steps: what it refuses (an output folder) is refused at once.
+    Its `observe` is called before that of all other steps: what it refuses (an output folder) is
+    refused at once.
     """
 
     one_band: ClassVar[bool] = False
-    """It makes products of those of one band: of a camera with several bands it acts once for each, on that band's data
-    (`Data.band`). Others act once, on all that there is; products there bear the band's name (``map_f090``)."""
+    """It makes products of those of one band: of a camera with several bands it acts once for each,
+    on that band's data (`Data.band`). Others act once, on all that there is; products there bear
+    the band's name (``map_f090``)."""
 
     _shown: tuple[str, ...] = PrivateAttr(())
 
     def signals(self) -> tuple[Signal, ...]:
         """The signals whose products this step reads; empty: whatever signals there are.
 
-        The pipeline adds one where none of the user's is like it. The products of such a signal are for this step alone: no other
-        writes or draws them.
+        The pipeline adds one where none of the user's is like it. The products of such a signal are
+        for this step alone: no other writes or draws them.
         """
         return ()
 
     def named_signals(self) -> tuple[str, ...]:
-        """Names of signals of the pipeline that its parameters name; a name that `runs` does not have is refused."""
+        """Names of signals of the pipeline that its parameters name; a name that `runs` does not
+        have is refused.
+        """
         return ()
 
     @property
@@ -53,8 +59,9 @@ class Output(Operator):
         return signal in self.shown if self.signals() or signal.startswith("_") else True
 
     def watch(self, data: Data, done: Progress) -> None:
-        """Called once the telescope is pointed, after every scan, and when all maps are made: time to begin, in the background,
-        with what `finalize` will do, as far as it depends on products that will not change."""
+        """Called once the telescope is pointed, after every scan, and when all maps are made: time
+        to begin, in the background, with what `finalize` will do, as far as it depends on products
+        that will not change."""
 
 
 class StreamOutput(Operator):
@@ -67,23 +74,30 @@ def is_output(operator: Operator) -> bool:
 
 
 def changes_observations(operator: Operator) -> bool:
-    """Whether all that a step does is to change observations (a plate's angles): it provides nothing, and neither works on their
-    data nor writes."""
+    """Whether all that a step does is to change observations (a plate's angles): it provides
+    nothing, and neither works on their data nor writes."""
     works = any(
-        getattr(type(operator), step) is not getattr(Operator, step) for step in ("exec", "measure", "collect", "finalize")
+        getattr(type(operator), step) is not getattr(Operator, step)
+        for step in ("exec", "measure", "collect", "finalize")
     )
     return not operator.provides and not works and not is_output(operator)
 
 
 def may_write(operator: Operator) -> bool:
-    """Whether a step may leave a file: an output, or one that works on the data and provides nothing of it."""
+    """Whether a step may leave a file: an output, or one that works on the data and provides
+    nothing of it.
+    """
     return is_output(operator) or not (operator.provides or changes_observations(operator))
 
 
 def output_folder(of: Data | Observation, place: str) -> Path:
-    """The output folder of a run, which is there and can be written to; raises `OutputError` where it is not."""
+    """The output folder of a run, which is there and can be written to; raises `OutputError` where
+    it is not.
+    """
     if of.output is None:
         raise OutputError(
-            "there is no output folder", place=place, cure="give one: zonda run --output FOLDER, or run(scene, output=...)"
+            "there is no output folder",
+            place=place,
+            cure="give one: zonda run --output FOLDER, or run(scene, output=...)",
         )
     return check_output_folder(of.output)

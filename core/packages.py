@@ -9,9 +9,13 @@ from .errors import InputError
 
 
 def needed(module: str, extra: str, place: str = "") -> Any:
-    """A module of a package that the extra ``extra`` installs. Raises InputError at ``place`` where it is not installed."""
+    """A module of a package that the extra ``extra`` installs. Raises InputError at ``place`` where
+    it is not installed.
+    """
     try:
         return import_module(module)
     except ImportError as err:
         cure = f"pip install 'zonda[{extra}]'"
-        raise InputError(f"cannot import {module}: {err}", place=place or f"zonda.interop.{extra}", cure=cure) from None
+        raise InputError(
+            f"cannot import {module}: {err}", place=place or f"zonda.interop.{extra}", cure=cure
+        ) from None

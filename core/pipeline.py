@@ -21,7 +21,15 @@ from .observation import Observation
 from .operator import Operator
 from .output import Output, Progress
 from .run import arguments
-from .run.bands import data_of_bands, distribute, gather, hand_over, of_one_band, points, use_recorded
+from .run.bands import (
+    data_of_bands,
+    distribute,
+    gather,
+    hand_over,
+    of_one_band,
+    points,
+    use_recorded,
+)
 from .run.budget import held_of, least_memory, longest_of
 from .run.in_step import joins
 from .run.in_turn import Band, Budget, execute
@@ -37,7 +45,8 @@ from .versions import versions
 
 @dataclass
 class Part:
-    """Some of the scans of a run, whose products stay unfinished, to be combined with those of other parts (`core.campaign`).
+    """Some of the scans of a run, whose products stay unfinished, to be combined with those of
+    other parts (`core.campaign`).
 
     Attributes
     ----------
@@ -66,15 +75,17 @@ class Pipeline:
     operators
         The steps. Namesakes are numbered (``WhiteNoise``, ``WhiteNoise.2``).
     runs
-        Further signals by name, e.g. ``{"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}``: what a subset of
-        the components makes, filtered and mapped beside the complete signal.
+        Further signals by name, e.g. ``{"noiseless": {"only": ["sky"]}, "source_free": {"without":
+        ["sky"]}}``: what a subset of the components makes, filtered and mapped beside the complete
+        signal.
     only
-        Components that the complete signal is narrowed to; empty: all. Levels, flags and random numbers stay those of the scene.
+        Components that the complete signal is narrowed to; empty: all. Levels, flags and random
+        numbers stay those of the scene.
     name, description
         Shown in products.
     precision
-        Type of the time streams. float32 carries fluctuations of some kelvin to 1e-7 K (the mean emission is kept apart in
-        float64); float64 is for common modes 1e6 times the signal.
+        Type of the time streams. float32 carries fluctuations of some kelvin to 1e-7 K (the mean
+        emission is kept apart in float64); float64 is for common modes 1e6 times the signal.
 
     Raises
     ------
@@ -93,7 +104,11 @@ class Pipeline:
         precision: Literal["float32", "float64"] = "float32",
     ) -> None:
         self.operators = arguments.steps(operators, name)  # copies: labels are this pipeline's own
-        self.name, self.description, self.precision = name, description, arguments.precision(precision, name)
+        self.name, self.description, self.precision = (
+            name,
+            description,
+            arguments.precision(precision, name),
+        )
         self.only = tuple(arguments.components(only, name))
         for operator, label in zip(self.operators, labels(self.operators), strict=True):
             operator._label = label
@@ -138,17 +153,25 @@ class Pipeline:
         threads
             Threads; default: the CPUs this process may use. Results do not depend on it.
         memory
-            Bytes for streams and blocks; default: what the ceiling leaves. Results do not depend on it.
+            Bytes for streams and blocks; default: what the ceiling leaves. Results do not depend on
+            it.
         ceiling
-            Bytes that the process may hold (``--memory``); default, where no ``memory`` is given: what it holds now and half
-            of the free memory. A run that would not fit is refused before it starts.
+            Bytes that the process may hold (``--memory``); default, where no ``memory`` is given:
+            what it holds now and half of the free memory. A run that would not fit is refused
+            before it starts.
         keep
-            Streams to keep for `Data.tod`, as they stand after the last step: 8 bytes for each sample of each scan, which count
-            in the budget.
+            Streams to keep for `Data.tod`, as they stand after the last step: 8 bytes for each
+            sample of each scan, which count in the budget.
         provenance
             Entries added to ``data.provenance``.
         """
-        data, settings = self._begin(scene, output, {"threads": threads, "memory": memory, "ceiling": ceiling}, keep, provenance)
+        data, settings = self._begin(
+            scene,
+            output,
+            {"threads": threads, "memory": memory, "ceiling": ceiling},
+            keep,
+            provenance,
+        )
         self.signals.check_kept(keep)
         if data.output is not None:
             check_output_folder(data.output)
@@ -163,7 +186,9 @@ class Pipeline:
         return data
 
     def _of_bands(self, data: Data) -> Bands:
-        """The pipeline and the data of each band (`core.run.bands`): this one, and all data, where there is one."""
+        """The pipeline and the data of each band (`core.run.bands`): this one, and all data, where
+        there is one.
+        """
         use_recorded(data, self.operators)
         found = data_of_bands(data)
         if not found:
@@ -171,22 +196,40 @@ class Pipeline:
         made = []
         for own in found.values():
             pipeline = Pipeline(
-                self.operators, runs=self._asked, only=self.only, name=self.name, description=self.description,
+                self.operators,
+                runs=self._asked,
+                only=self.only,
+                name=self.name,
+                description=self.description,
                 precision=self.precision,
-            )  # fmt: skip
-            pipeline.operators = [o for o in pipeline.operators if of_one_band(o) and (not isinstance(o, Output) or o.one_band)]
+            )
+            pipeline.operators = [
+                o
+                for o in pipeline.operators
+                if of_one_band(o) and (not isinstance(o, Output) or o.one_band)
+            ]
             made.append((pipeline, own))
         return made
 
-    def _observe(self, data: Data, bands: Bands, timer: Timer, *, outputs: bool = True, prefix: str = "") -> None:
-        """Let all steps observe, outputs first: they may refuse at once. Bands share the pointing. ``prefix``: of scans."""
+    def _observe(
+        self, data: Data, bands: Bands, timer: Timer, *, outputs: bool = True, prefix: str = ""
+    ) -> None:
+        """Let all steps observe, outputs first: they may refuse at once. Bands share the pointing.
+        ``prefix``: of scans.
+        """
         several = bands[0][1] is not data
         for operator in sorted(self.operators, key=lambda o: not isinstance(o, Output)):
-            once = points(operator) if not isinstance(operator, Output) else outputs and not operator.one_band
+            once = (
+                points(operator)
+                if not isinstance(operator, Output)
+                else outputs and not operator.one_band
+            )
             if once or not (several or isinstance(operator, Output)) or (outputs and not several):
                 before = len(data.observations)
                 self._timed(timer, operator, "observe", data)
-                for observation in data.observations[before:]:  # unique names, before other steps see them
+                for observation in data.observations[
+                    before:
+                ]:  # unique names, before other steps see them
                     observation.name = prefix + observation.name
         if several:
             distribute(data, [own for _, own in bands])
@@ -205,15 +248,25 @@ class Pipeline:
         ceiling: int | None = None,
         provenance: Mapping[str, Any] | None = None,
     ) -> Data:
-        """Observe some of the scans only; their partial products stay in ``data.partial``, nothing is finished."""
-        data, settings = self._begin(scene, output, {"threads": threads, "memory": memory, "ceiling": ceiling}, (), provenance)
+        """Observe some of the scans only; their partial products stay in ``data.partial``, nothing
+        is finished.
+        """
+        data, settings = self._begin(
+            scene,
+            output,
+            {"threads": threads, "memory": memory, "ceiling": ceiling},
+            (),
+            provenance,
+        )
         timer = Timer()
         data.layouts, data.laid_out = dict(part.layouts), True
         manager().hook.zonda_pipeline_start(pipeline=self, data=data)
         bands = self._of_bands(data)
         self._observe(data, bands, timer, outputs=False, prefix=part.prefix)
         if part.scans is not None:
-            data.pointed = [data.pointed[k] for k in part.scans] if data.pointed else []  # the tally counts these alone
+            data.pointed = (
+                [data.pointed[k] for k in part.scans] if data.pointed else []
+            )  # the tally counts these alone
             for _, own in bands:
                 own.observations = [own.observations[k] for k in part.scans]
         self._execute(bands, settings, (), timer, memory, fresh=False)
@@ -224,7 +277,9 @@ class Pipeline:
 
     @faults_named(exceptions=False)
     def finish(self, data: Data) -> Data:
-        """Finish partial products that were combined, with the layouts that they have in common, and let the outputs act."""
+        """Finish partial products that were combined, with the layouts that they have in common,
+        and let the outputs act.
+        """
         bands = self._of_bands(data)
         hand_over(data, [own for _, own in bands])
         for pipeline, own in bands:
@@ -236,8 +291,12 @@ class Pipeline:
         return data
 
     @faults_named(exceptions=False)
-    def point(self, scene: Scene, layouts: Mapping[str, Any], output: Path, *, laid_out: bool = False) -> Data:
-        """The observations of a scene, and ``layouts`` extended to them, or taken as they are where all is ``laid_out``."""
+    def point(
+        self, scene: Scene, layouts: Mapping[str, Any], output: Path, *, laid_out: bool = False
+    ) -> Data:
+        """The observations of a scene, and ``layouts`` extended to them, or taken as they are where
+        all is ``laid_out``.
+        """
         data = Data(scene, output=output, layouts=dict(layouts), laid_out=laid_out)
         bands = self._of_bands(data)
         self._observe(data, bands, Timer(), outputs=False)
@@ -246,12 +305,20 @@ class Pipeline:
         return data
 
     def least_memory(self, observations: Sequence[Observation]) -> int:
-        """Bytes with which a process runs the pipeline over these observations on one thread, libraries included."""
+        """Bytes with which a process runs the pipeline over these observations on one thread,
+        libraries included.
+        """
         if len(self._pointed) > 1:
-            shares = [(p, [o for o in observations if o.instrument == own.scene.instrument]) for p, own in self._pointed]
+            shares = [
+                (p, [o for o in observations if o.instrument == own.scene.instrument])
+                for p, own in self._pointed
+            ]
             in_step = any(map(joins, shares[0][0].chain.steps))
             held = [held_of(p.chain, longest_of(scans), in_step) for p, scans in shares]
-            return max(p._least_memory(scans, sum(held) - mine) for (p, scans), mine in zip(shares, held, strict=True))
+            return max(
+                p._least_memory(scans, sum(held) - mine)
+                for (p, scans), mine in zip(shares, held, strict=True)
+            )
         return self._least_memory(observations)
 
     def _least_memory(self, observations: Sequence[Observation], others: int = 0) -> int:
@@ -265,7 +332,12 @@ class Pipeline:
         return np.float64 if self.precision == "float64" else np.float32
 
     def _begin(
-        self, scene: Scene, output: str | Path | None, numbers: Mapping[str, Any], keep: Sequence[str], provenance: Any
+        self,
+        scene: Scene,
+        output: str | Path | None,
+        numbers: Mapping[str, Any],
+        keep: Sequence[str],
+        provenance: Any,
     ) -> tuple[Data, Settings]:
         threads, memory, ceiling = arguments.check_run(scene, output, numbers, keep, self.name)
         data = Data(scene=scene, output=None if output is None else Path(output))
@@ -275,34 +347,53 @@ class Pipeline:
         hooks = manager().hook
         settings = Settings(
             threads=threads or available_threads(),
-            memory=memory or available_memory() // 2,  # less, once the operators have said what they hold
+            memory=memory
+            or available_memory() // 2,  # less, once the operators have said what they hold
             dtype=self._dtype,
-            progress=lambda done, total, what: hooks.zonda_progress(done=done, total=total, what=what),
+            progress=lambda done, total, what: hooks.zonda_progress(
+                done=done, total=total, what=what
+            ),
             asked=ceiling,
         )
         data.threads = settings.threads
         return data, settings
 
     def _execute(
-        self, bands: Bands, settings: Settings, keep: tuple[str, ...], timer: Timer, memory: int | None, fresh: bool = True
+        self,
+        bands: Bands,
+        settings: Settings,
+        keep: tuple[str, ...],
+        timer: Timer,
+        memory: int | None,
+        fresh: bool = True,
     ) -> None:
         """Run all observations with all bands."""
         for pipeline, own in bands:
             pipeline._make_ready(own)
-        parts = [Band(replace(pipeline.chain, keep=keep), own, pipeline._watch) for pipeline, own in bands]
+        parts = [
+            Band(replace(pipeline.chain, keep=keep), own, pipeline._watch)
+            for pipeline, own in bands
+        ]
         execute(parts, settings, timer, Budget(memory, fresh, self.name))
 
     def _make_ready(self, data: Data) -> None:
         """Note in the observations what is made of them, and let outputs see them."""
         if not data.observations:
-            raise PipelineError("the pointing steps made no observation", place=self.name, cure="ask for at least one scan")
+            raise PipelineError(
+                "the pointing steps made no observation",
+                place=self.name,
+                cure="ask for at least one scan",
+            )
         for observation in data.observations:
             observation.output, observation.focalplane = data.output, observation.focalplane.copy()
         note_signals(data.observations, self.signals.components, self.signals.formed)
         self._watch(data, "pointing")
         for name, signal in self.signals.runs.items():
             if self.signals.not_linear and signal.modes == "full":
-                text = f"its own from {self.signals.not_linear} on, which is not linear, instead of those of the complete signal"
+                text = (
+                    f"its own from {self.signals.not_linear} on, which is not linear, instead of"
+                    " those of the complete signal"
+                )
                 data.tally.state(name, "modes", text)
 
     def _finish(self, data: Data, bands: Bands, timer: Timer) -> None:
@@ -339,7 +430,9 @@ class Pipeline:
             if isinstance(operator, Output):
                 operator.watch(data, done)
 
-    def _timed(self, timer: Timer, operator: Operator, stage: Literal["observe", "finalize"], data: Data) -> None:
+    def _timed(
+        self, timer: Timer, operator: Operator, stage: Literal["observe", "finalize"], data: Data
+    ) -> None:
         """Call an operator with all data and time it; hooks are called around ``finalize``."""
         hooks = manager().hook
         if stage == "finalize":
@@ -349,19 +442,30 @@ class Pipeline:
         used = time.thread_time() - start
         timer.add(operator.label, stage, used)
         if stage == "finalize":
-            hooks.zonda_after_operator(operator=operator, observation=None, stage=stage, seconds=used)
+            hooks.zonda_after_operator(
+                operator=operator, observation=None, stage=stage, seconds=used
+            )
 
     def provenance(self, scene: Scene) -> dict[str, Any]:
-        """What made the products: name, seed, versions, signals, operators with their parameters."""
+        """What made the products: name, seed, versions, signals, operators with their
+        parameters.
+        """
         return {
             "name": self.name,
             "description": self.description,
             "seed": scene.seed,
             "precision": self.precision,
-            "runs": {k: s.model_dump(exclude_none=True, exclude_defaults=True) for k, s in self.signals.runs.items()},
+            "runs": {
+                k: s.model_dump(exclude_none=True, exclude_defaults=True)
+                for k, s in self.signals.runs.items()
+            },
             "versions": versions(),
             "operators": [
-                (o.label, type(o).__name__, {k: str(v) for k, v in o.model_dump(mode="json", exclude_none=True).items()})
+                (
+                    o.label,
+                    type(o).__name__,
+                    {k: str(v) for k, v in o.model_dump(mode="json", exclude_none=True).items()},
+                )
                 for o in self.operators
             ],
         }

@@ -1,18 +1,21 @@
-"""How detectors see linear polarization: angles on the sky, and turning Q and U from one meridian to another.
+"""How detectors see linear polarization: angles on the sky, and turning Q and U from one meridian
+to another.
 
-Angles are COSMO's (from south to east, the same as from north to west): Q + i U = P exp(2 i psi). A detector of polarization
-efficiency p sees
+Angles are COSMO's (from south to east, the same as from north to west): Q + i U = P exp(2 i psi). A
+detector of polarization efficiency p sees
 
-    d = I + p (Q cos 2 psi + U sin 2 psi)                                                               (1)
+    d = I + p (Q cos 2 psi + U sin 2 psi)                                                        (1)
 
-with psi the angle of its axis from the local meridian. In the boresight's frame let X and Y be the detector's axes and n the pole
-of the meridians. At the angular distance b from the pole X n = sin b cos psi and Y n = -sin b sin psi, so that
+with psi the angle of its axis from the local meridian. In the boresight's frame let X and Y be the
+detector's axes and n the pole of the meridians. At the angular distance b from the pole X n = sin b
+cos psi and Y n = -sin b sin psi, so that
 
-    exp(2 i psi) = (X n - i Y n)^2 / |X n - i Y n|^2                                                    (2)
+    exp(2 i psi) = (X n - i Y n)^2 / |X n - i Y n|^2                                             (2)
 
-needs no trigonometry. Behind a half-wave plate at the angle chi, gamma the detector's angle, both in the focal plane,
+needs no trigonometry. Behind a half-wave plate at the angle chi, gamma the detector's angle, both
+in the focal plane,
 
-    2 psi becomes 2 psi + 4 (chi - gamma),                                                              (3)
+    2 psi becomes 2 psi + 4 (chi - gamma),   (3)
 
 as in TOAST (`StokesWeights`).
 """
@@ -60,7 +63,9 @@ class PolarizationAngles:
 
     @classmethod
     def of(cls, observation: Observation, boresight: Floats, pole: Floats) -> PolarizationAngles:
-        """``boresight``: (n_samp, 4), as recorded or where it is in fact (`Observation`); ``pole``: ICRS direction (3,)."""
+        """``boresight``: (n_samp, 4), as recorded or where it is in fact (`Observation`); ``pole``:
+        ICRS direction (3,).
+        """
         plane = observation.focalplane
         quaternions = detector_quaternions(plane.xi, plane.eta, plane.polarization_angle)
         axes = np.ascontiguousarray(np.moveaxis(rotation_matrices(quaternions)[:, :, :2], 2, 1))
@@ -68,16 +73,20 @@ class PolarizationAngles:
         chi, plate = observation.hwp_angle, np.zeros((2, 0))
         if chi is not None:
             plate = np.stack([np.cos(4 * chi), np.sin(4 * chi)])
-        return cls(seen_from(boresight, pole), axes, plate, np.stack([np.cos(turn), -np.sin(turn)], axis=1))
+        return cls(
+            seen_from(boresight, pole), axes, plate, np.stack([np.cos(turn), -np.sin(turn)], axis=1)
+        )
 
     @property
     def nbytes(self) -> int:
         return self.poles.nbytes + self.axes.nbytes + self.plate.nbytes + self.gamma.nbytes
 
     def fill(self, detectors: NDArray[np.intp], start: int, cosine: Floats, sine: Floats) -> None:
-        """cos 2 psi and sin 2 psi of ``detectors`` (numbers, n) from sample ``start`` on, into arrays (n, m).
+        """cos 2 psi and sin 2 psi of ``detectors`` (numbers, n) from sample ``start`` on, into
+        arrays (n, m).
 
-        At the pole itself, where psi is not defined, 1 and 0. The bits depend on detector and sample alone.
+        At the pole itself, where psi is not defined, 1 and 0. The bits depend on detector and
+        sample alone.
         """
         _fill(self.poles, self.axes, self.plate, self.gamma, detectors, start, cosine, sine)
 
@@ -99,13 +108,17 @@ class PolarizationAngles:
 
 
 def seen_from(quaternions: Floats, direction: Floats) -> Floats:
-    """(3, n) an ICRS direction in the frames of boresights (n, 4), all of which ``quaternions`` turn to ICRS."""
+    """(3, n) an ICRS direction in the frames of boresights (n, 4), all of which ``quaternions``
+    turn to ICRS.
+    """
     return np.ascontiguousarray(np.einsum("nij,i->jn", rotation_matrices(quaternions), direction))
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def fill_row(poles, axis, plate, gamma, start, c, s):  # type: ignore[no-untyped-def]
-    """`PolarizationAngles.fill` of one detector, with its ``axis`` (2, 3) and ``gamma`` (2,), into ``c``, ``s`` (n,)."""
+    """`PolarizationAngles.fill` of one detector, with its ``axis`` (2, 3) and ``gamma`` (2,), into
+    ``c``, ``s`` (n,).
+    """
     n = c.size
     x, y, z = poles[0, start : start + n], poles[1, start : start + n], poles[2, start : start + n]
     x0, x1, x2, y0, y1, y2 = axis[0, 0], axis[0, 1], axis[0, 2], axis[1, 0], axis[1, 1], axis[1, 2]
@@ -124,14 +137,18 @@ def fill_row(poles, axis, plate, gamma, start, c, s):  # type: ignore[no-untyped
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _fill(poles, axes, plate, gamma, detectors, start, cosine, sine):  # type: ignore[no-untyped-def]
+def _fill(  # type: ignore[no-untyped-def]
+    poles, axes, plate, gamma, detectors, start, cosine, sine
+):
     for k in range(detectors.size):
         d = detectors[k]
         fill_row(poles, axes[d], plate, gamma[d], start, cosine[k], sine[k])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _add(poles, axes, plate, gamma, detectors, start, efficiency, q, u, rows, out):  # type: ignore[no-untyped-def]
+def _add(  # type: ignore[no-untyped-def]
+    poles, axes, plate, gamma, detectors, start, efficiency, q, u, rows, out
+):
     n, cast = out.shape[1], out.dtype.type
     cosine, sine = np.empty(AT_ONCE), np.empty(AT_ONCE)
     for k in range(detectors.size):
@@ -140,13 +157,19 @@ def _add(poles, axes, plate, gamma, detectors, start, efficiency, q, u, rows, ou
             stop = min(first + AT_ONCE, n)
             c, s = cosine[: stop - first], sine[: stop - first]
             fill_row(poles, axes[d], plate, gamma[d], start + first, c, s)
-            row, one, two, p = out[rows[k], first:stop], q[k, first:stop], u[k, first:stop], efficiency[k]
+            row, one, two, p = (
+                out[rows[k], first:stop],
+                q[k, first:stop],
+                u[k, first:stop],
+                efficiency[k],
+            )
             for t in range(stop - first):
                 row[t] += cast(p * (np.float64(one[t]) * c[t] + np.float64(two[t]) * s[t]))
 
 
 def between_meridians(directions: Floats, of: Floats, to: Floats) -> NDArray[np.complex128]:
-    """Factors (...) that turn Q + i U from meridians through the pole ``of`` to those through ``to``; 1 at either pole.
+    """Factors (...) that turn Q + i U from meridians through the pole ``of`` to those through
+    ``to``; 1 at either pole.
 
     With delta the angle of the new meridian in the old axes, Q' + i U' = (Q + i U) exp(-2 i delta).
 

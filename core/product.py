@@ -1,4 +1,6 @@
-"""Partial products: what a step adds up from observation to observation, until `Operator.finalize` makes products of it."""
+"""Partial products: what a step adds up from observation to observation, until `Operator.finalize`
+makes products of it.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +16,30 @@ from .errors import PipelineError
 class Product(ABC):
     """Something that observations add to: sums in pixels, spectra, lists of files.
 
-    `Operator.collect` hands one observation's share to `Data.add`, `Operator.finalize` takes the sum with `Data.take`. A campaign
-    adds up the shares of its tasks without knowing the operator: what crosses from one process to another are `arrays`. Its
-    class is then found by its name in the registry (entry-point group ``zonda.products``).
+    `Operator.collect` hands one observation's share to `Data.add`, `Operator.finalize` takes the
+    sum with `Data.take`. A campaign adds up the shares of its tasks without knowing the operator:
+    what crosses from one process to another are `arrays`. Its class is then found by its name in
+    the registry (entry-point group ``zonda.products``).
     """
 
     zonda_api: ClassVar[int] = API_VERSION
 
     signals: tuple[str, ...] = ()
-    """Streams of the signals that it holds (`core.signal`), the complete one first; empty: it is of no signal in particular."""
+    """Streams of the signals that it holds (`core.signal`), the complete one first; empty: it is of
+    no signal in particular.
+    """
 
     @abstractmethod
     def __iadd__(self, other: Self) -> Self:
-        """Add what later observations made. Raises PipelineError where the two cannot be added up."""
+        """Add what later observations made. Raises PipelineError where the two cannot be added
+        up.
+        """
 
     @abstractmethod
     def arrays(self) -> Mapping[str, Any]:
-        """Its content as plain values (numbers, texts, lists and mappings of these) and numpy arrays."""
+        """Its content as plain values (numbers, texts, lists and mappings of these) and numpy
+        arrays.
+        """
 
     @classmethod
     @abstractmethod
@@ -38,14 +47,19 @@ class Product(ABC):
         """What `arrays` gave, put together again."""
 
     def subtract(self, stream: str, parts: Sequence[str]) -> None:
-        """Add what belongs to the signal ``stream``: that of ``signal`` minus those of ``parts``, all of which are in `signals`.
+        """Add what belongs to the signal ``stream``: that of ``signal`` minus those of ``parts``,
+        all of which are in `signals`.
 
-        Called for products of linear map makers only (`core.mapmaker`). Raises PipelineError where the class does not have it.
+        Called for products of linear map makers only (`core.mapmaker`). Raises PipelineError where
+        the class does not have it.
         """
         raise PipelineError(
-            f"a {type(self).__name__} cannot subtract signals from one another, which a linear map maker needs",
+            f"a {type(self).__name__} cannot subtract signals from one another, which a linear map"
+            " maker needs",
             place=stream,
-            cure=f"write {type(self).__name__}.subtract, or leave linear = True out of its map maker",
+            cure=(
+                f"write {type(self).__name__}.subtract, or leave linear = True out of its map maker"
+            ),
         )
 
 
@@ -54,7 +68,8 @@ class Record(Product):
 
     def arrays(self) -> Mapping[str, Any]:
         """Its fields."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        own = fields(self)  # type: ignore[arg-type]
+        return {field.name: getattr(self, field.name) for field in own}
 
     @classmethod
     def of(cls, arrays: Mapping[str, Any]) -> Self:

@@ -17,38 +17,72 @@ from .components import Registry
 from .components import RegistryError as RegistryError
 from .components import fold as fold
 
-operators = Registry("operator", "zonda.operators zonda.mapmakers", "zonda.core.operator:Operator", classes=True, exact=True)
+operators = Registry(
+    "operator",
+    "zonda.operators zonda.mapmakers",
+    "zonda.core.operator:Operator",
+    classes=True,
+    exact=True,
+)
 instruments = Registry("instrument", "zonda.instruments", "zonda.core.instrument:Instrument")
 sites = Registry("site", "zonda.sites", "zonda.core.site:Site")
 bands = Registry("band", "zonda.bands", "zonda.core.instrument:Band")
-layouts = Registry("layout", "zonda.layouts", classes=True)  # functions of a number of pixels: core.layouts.Layout
+layouts = Registry(
+    "layout", "zonda.layouts", classes=True
+)  # functions of a number of pixels: core.layouts.Layout
 noise_models = Registry("noise model", "zonda.noise_models")
 spectra = Registry("spectra", "zonda.spectra")
 checks = Registry("checks", "zonda.checks", "zonda.core.checks:Family")
-metrics = Registry("metric", "zonda.metrics", classes=True)  # classes, or functions of `Data`: core.accuracy.metrics
-ground_weather = Registry("weather on the ground", "zonda.ground_weather", classes=True)  # a function of the scene
-weather_sources = Registry("weather source", "zonda.weather_sources", "zonda.core.weather:WeatherSource", classes=True)
+metrics = Registry(
+    "metric", "zonda.metrics", classes=True
+)  # classes, or functions of `Data`: core.accuracy.metrics
+ground_weather = Registry(
+    "weather on the ground", "zonda.ground_weather", classes=True
+)  # a function of the scene
+weather_sources = Registry(
+    "weather source", "zonda.weather_sources", "zonda.core.weather:WeatherSource", classes=True
+)
 
 sections = Registry(
-    "section of pipeline files", "zonda.sections", "zonda.core.configuration.section:Section", classes=True, exact=True
+    "section of pipeline files",
+    "zonda.sections",
+    "zonda.core.configuration.section:Section",
+    classes=True,
+    exact=True,
 )
 """By the key in a pipeline file."""
 
 planning = Registry("planning", "zonda.planning", classes=True, exact=True)
 """By the name of the operator's class: its `core.plan.planning.Planning`."""
 
-products = Registry("product", "zonda.products", "zonda.core.product:Product", classes=True, exact=True)
+products = Registry(
+    "product", "zonda.products", "zonda.core.product:Product", classes=True, exact=True
+)
 
 sites.hint = partial(hints.for_site, sites, instruments)
 instruments.hint = partial(hints.for_instrument, sites, instruments)
 
 register = operators.register
-"""Decorator: register an operator for this process, in scripts and notebooks. Packages use entry points."""
+"""Decorator: register an operator for this process, in scripts and notebooks. Packages use entry
+points.
+"""
 
 registries = (
-    operators, instruments, layouts, sites, bands, noise_models, weather_sources, ground_weather, spectra, checks, metrics,
-    planning, products, sections,
-)  # fmt: skip
+    operators,
+    instruments,
+    layouts,
+    sites,
+    bands,
+    noise_models,
+    weather_sources,
+    ground_weather,
+    spectra,
+    checks,
+    metrics,
+    planning,
+    products,
+    sections,
+)
 
 
 def operators_that(test: Callable[[Any], bool]) -> list[str]:
@@ -66,8 +100,12 @@ def makers(what: str) -> list[str]:
 
     def makes(step: Any) -> bool:
         declared = (step.provides, step.requires, step.optional)
-        provides, requires, optional = (n if isinstance(n, frozenset) else frozenset() for n in declared)
-        return what in provides - requires - optional  # a property says nothing before there is an operator
+        provides, requires, optional = (
+            n if isinstance(n, frozenset) else frozenset() for n in declared
+        )
+        return (
+            what in provides - requires - optional
+        )  # a property says nothing before there is an operator
 
     return operators_that(makes)
 

@@ -29,21 +29,25 @@ HIGHER = 200.0
 
 
 class Scene(Parameters):
-    """What exists while the pipeline observes. `site` and `instrument` take a registered name or an object."""
+    """What exists while the pipeline observes. `site` and `instrument` take a registered name or an
+    object.
+    """
 
     site: Site
     """Where the telescope stands: a registered name (`zonda plugins`) or a Site."""
     instrument: Instrument
-    """Telescope and camera: a registered name (`zonda plugins`), an Instrument, or a variant of one, e.g. {like: mustang2,
-    detectors: 170}."""
+    """Telescope and camera: a registered name (`zonda plugins`), an Instrument, or a variant of
+    one, e.g. {like: mustang2, detectors: 170}."""
     time: Instant
-    """Start of the first scan, UTC unless it carries an offset, e.g. 2024-11-25T07:00 or 2024-11-25T02:00-05:00."""
+    """Start of the first scan, UTC unless it carries an offset, e.g. 2024-11-25T07:00 or
+    2024-11-25T02:00-05:00.
+    """
     target: Target | None = None
-    """Default centre of the scans, e.g. 05h00m00s +20d00m00s (ICRS), 'galactic 120 deg -30 deg' or {az: 180 deg, el: 60 deg};
-    in a pipeline file also map, the centre of the input map."""
+    """Default centre of the scans, e.g. 05h00m00s +20d00m00s (ICRS), 'galactic 120 deg -30 deg' or
+    {az: 180 deg, el: 60 deg}; in a pipeline file also map, the centre of the input map."""
     weather: Annotated[SerializeAsAny[WeatherSource], BeforeValidator(weather_source)] | None = None
-    """The atmosphere: {pwv: 1.2 mm}, {pwv: 25 %}, {pwv: random}, {file: era5.nc}, {table: air.csv}; None: the
-    climatology's median."""
+    """The atmosphere: {pwv: 1.2 mm}, {pwv: 25 %}, {pwv: random}, {file: era5.nc}, {table: air.csv};
+    None: the climatology's median."""
     seed: int = Field(0, ge=0, lt=2**63)
     """Root of every random stream; the same seed gives the same bits."""
 
@@ -58,8 +62,12 @@ class Scene(Parameters):
         return variant(value, info.context) if is_variant(value) else named(instruments, value)
 
     def replace(self, **changes: Any) -> Scene:
-        """The scene with other values, checked: ``scene.replace(seed=8)``. Raises `ParameterError`."""
-        return type(self)(**({name: getattr(self, name) for name in self.model_fields_set} | changes))
+        """The scene with other values, checked: ``scene.replace(seed=8)``. Raises
+        `ParameterError`.
+        """
+        return type(self)(
+            **({name: getattr(self, name) for name in self.model_fields_set} | changes)
+        )
 
 
 @runtime_checkable
@@ -67,7 +75,8 @@ class WithScene(Protocol):
     """A step with recorded data, whose instrument, site and time a pipeline file need not give."""
 
     def own_scene(self, given: Instrument | None) -> Mapping[str, Any]:
-        """``site``, ``instrument`` and ``time`` of the data; what they do not state of the instrument is that of ``given``.
+        """``site``, ``instrument`` and ``time`` of the data; what they do not state of the
+        instrument is that of ``given``.
 
         Raises InputError where the data cannot be read, or do not state what a scene needs.
         """
@@ -75,36 +84,60 @@ class WithScene(Protocol):
 
 
 def site_at(location: Any) -> Site:
-    """The site at an astropy `EarthLocation`, with the climatology of a registered site that is nearer than `NEAR`.
+    """The site at an astropy `EarthLocation`, with the climatology of a registered site that is
+    nearer than `NEAR`.
 
     Raises PydanticCustomError for more than one place.
     """
     if not getattr(location, "isscalar", True):
         raise mistake(f"expected one place, got {location.size}")
     place = location.to_geodetic("WGS84")
-    latitude, longitude, altitude = float(place.lat.rad), float(place.lon.rad), float(place.height.to_value("m"))
-    name = str(getattr(getattr(location, "info", None), "name", None) or f"{place.lat.deg:.4f} deg {place.lon.deg:.4f} deg")
+    latitude, longitude, altitude = (
+        float(place.lat.rad),
+        float(place.lon.rad),
+        float(place.height.to_value("m")),
+    )
+    name = str(
+        getattr(getattr(location, "info", None), "name", None)
+        or f"{place.lat.deg:.4f} deg {place.lon.deg:.4f} deg"
+    )
     given: dict[str, Any] = {
-        "name": name, "latitude": f"{latitude!r} rad", "longitude": f"{longitude!r} rad", "altitude": f"{altitude!r} m",
+        "name": name,
+        "latitude": f"{latitude!r} rad",
+        "longitude": f"{longitude!r} rad",
+        "altitude": f"{altitude!r} m",
         "provenance": "astropy EarthLocation",
-    }  # fmt: skip
+    }
     for known in sites:
         with suppress(ZondaError):
             other = sites.create(known)
-            if distance((latitude, longitude), other) < NEAR and abs(other.altitude - altitude) < HIGHER:
-                return Site(**given, climatology=other.climatology, description=f"near {other.name}")
+            if (
+                distance((latitude, longitude), other) < NEAR
+                and abs(other.altitude - altitude) < HIGHER
+            ):
+                return Site(
+                    **given, climatology=other.climatology, description=f"near {other.name}"
+                )
     return Site(**given)
 
 
 def distance(here: tuple[float, float], site: Site) -> float:
-    """m along the ground between (latitude, longitude) [rad] and a site: Haversine formula on a sphere."""
+    """m along the ground between (latitude, longitude) [rad] and a site: Haversine formula on a
+    sphere.
+    """
     a, b = np.array(here), np.array([site.latitude, site.longitude])
     half = np.sin((a - b) / 2) ** 2
-    return 2 * EARTH * float(np.arcsin(np.sqrt(min(1.0, half[0] + np.cos(a[0]) * np.cos(b[0]) * half[1]))))
+    return (
+        2
+        * EARTH
+        * float(np.arcsin(np.sqrt(min(1.0, half[0] + np.cos(a[0]) * np.cos(b[0]) * half[1]))))
+    )
 
 
 def elsewhere(scene: Scene) -> str:
-    """What to say of a telescope that the scene puts on another site than its own; empty where it does not."""
+    """What to say of a telescope that the scene puts on another site than its own; empty where it
+    does not.
+    """
     telescope = scene.instrument.telescope
     try:
         home = sites.create(telescope.site) if telescope.site else None
@@ -116,6 +149,6 @@ def elsewhere(scene: Scene) -> str:
     if away < NEAR:
         return ""
     return (
-        f"{telescope.name} stands at {home.name}, {away / 1e3:.0f} km away: here it looks through the atmosphere of "
-        f"{scene.site.name}; write 'site: {telescope.site}' for its own"
+        f"{telescope.name} stands at {home.name}, {away / 1e3:.0f} km away: here it looks through"
+        f" the atmosphere of {scene.site.name}; write 'site: {telescope.site}' for its own"
     )

@@ -1,6 +1,8 @@
-"""What the bands of a camera share of a scan, or of a block: made by the band that needs it first, released after the last.
+"""What the bands of a camera share of a scan, or of a block: made by the band that needs it first,
+released after the last.
 
-Nothing that a band computes may depend on the others: what is shared has the bits that each band would make by itself.
+Nothing that a band computes may depend on the others: what is shared has the bits that each band
+would make by itself.
 """
 
 from __future__ import annotations
@@ -14,7 +16,9 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 ROOM = 64 << 20
-"""Most bytes that are kept of the blocks of a scan at a time; of short scans, no more than a stream of one band takes."""
+"""Most bytes that are kept of the blocks of a scan at a time; of short scans, no more than a stream
+of one band takes.
+"""
 
 
 def room_for(n_detectors: int, n_samples: int) -> int:
@@ -42,11 +46,15 @@ class SharedScan:
         self._of_thread = threading.local()
 
     def announce(self, label: str, band: str, part: Any) -> None:
-        """Say what a band adds to what the step ``label`` makes for all; in `Operator.observe`, in the order of the bands."""
+        """Say what a band adds to what the step ``label`` makes for all; in `Operator.observe`, in
+        the order of the bands.
+        """
         self._announced.setdefault(label, {})[band] = part
 
     def made(self, label: str, make: Callable[[Mapping[str, Any]], T]) -> T:
-        """What the step ``label`` made for all bands; the first one that asks makes it, of what was announced by each."""
+        """What the step ``label`` made for all bands; the first one that asks makes it, of what was
+        announced by each.
+        """
         return self.once(label, lambda: make(self._announced.get(label, {})))
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
@@ -59,7 +67,9 @@ class SharedScan:
 
     @contextmanager
     def block(self) -> Iterator[None]:
-        """While one thread works on a block with one band after the other: `of_block` keeps what it makes until the end."""
+        """While one thread works on a block with one band after the other: `of_block` keeps what it
+        makes until the end.
+        """
         kept: dict[Hashable, tuple[Any, int]] = {}
         self._of_thread.kept, self._of_thread.put_off = kept, {}
         try:
@@ -68,8 +78,11 @@ class SharedScan:
             self._of_thread.kept = self._of_thread.put_off = None
             self.claim(-sum(size for _, size in kept.values()))
 
-    def put_off(self, label: str, key: Hashable, part: Any, work: Callable[[list[Any]], None]) -> bool:
-        """Let ``work`` be called once for the parts of all bands that have this ``key``, after the last of them.
+    def put_off(
+        self, label: str, key: Hashable, part: Any, work: Callable[[list[Any]], None]
+    ) -> bool:
+        """Let ``work`` be called once for the parts of all bands that have this ``key``, after the
+        last of them.
 
         The step ``label`` must be the same. False, and nothing is put off, outside of `block`.
         """
@@ -85,7 +98,8 @@ class SharedScan:
             yield label, partial(work, parts)
 
     def of_block(self, key: Hashable, size: int, make: Callable[[], T]) -> T:
-        """What is the same in a block for all bands that have this ``key``, of ``size`` bytes: made by the first that asks.
+        """What is the same in a block for all bands that have this ``key``, of ``size`` bytes: made
+        by the first that asks.
 
         Made for this band alone outside of `block`, and where there is no room to keep it.
         """

@@ -1,7 +1,8 @@
-"""Signals: what all components of a scene make together, and what subsets of them make, filtered and mapped side by side.
+"""Signals: what all components of a scene make together, and what subsets of them make, filtered
+and mapped side by side.
 
-The calibrated sum of all components is the stream ``signal``; that of a subset, named ``noiseless`` in a pipeline file, is
-``signal/noiseless``, and its map is ``noiseless/map``.
+The calibrated sum of all components is the stream ``signal``; that of a subset, named ``noiseless``
+in a pipeline file, is ``signal/noiseless``, and its map is ``noiseless/map``.
 """
 
 from __future__ import annotations
@@ -23,11 +24,12 @@ Entrance = Literal["above the atmosphere", "at the detector", "calibrated"]
 
 
 class Component(str):
-    """The name of a stream that becomes part of the signal; an operator that adds something to the data provides one.
+    """The name of a stream that becomes part of the signal; an operator that adds something to the
+    data provides one.
 
-    ``enters`` says where: ``above the atmosphere`` (as the sky does, seen through its transmission), ``at the detector`` (as
-    noise does, before calibration), or ``calibrated`` (in K_RJ on the calibrated sky, added last). Raises ValueError for
-    any other.
+    ``enters`` says where: ``above the atmosphere`` (as the sky does, seen through its
+    transmission), ``at the detector`` (as noise does, before calibration), or ``calibrated`` (in
+    K_RJ on the calibrated sky, added last). Raises ValueError for any other.
     """
 
     enters: Entrance
@@ -61,8 +63,9 @@ class Signal(Parameters):
     without: list[str] | None = Field(None, min_length=1)
     """Components that are absent (e.g. [sky]: the source-free map)."""
     modes: Literal["own", "full"] = "own"
-    """Singular modes of filters: those of this signal (`own`), or those of the complete data (`full`: with their modes and the
-    same transmission of the atmosphere all is linear, and what is left of each part adds up to the complete map)."""
+    """Singular modes of filters: those of this signal (`own`), or those of the complete data
+    (`full`: with their modes and the same transmission of the atmosphere all is linear, and what is
+    left of each part adds up to the complete map)."""
     filters: Literal["all", "none"] = "all"
     """`none`: map it as it was formed, without any step that changes the signal."""
 
@@ -93,13 +96,15 @@ class Formed:
     stream
         ``signal``, ``signal/noiseless`` ...
     components
-        What it is the sum of; with ``transmission`` where the sky is seen through the fluctuating transmission.
+        What it is the sum of; with ``transmission`` where the sky is seen through the fluctuating
+        transmission.
     model
         It takes the singular modes of ``signal`` (`Signal.modes`).
     filtered
         Filters act on it.
     own
-        Labels of the filters that measure it by itself although it has a ``model``: the first that is not linear, and all behind.
+        Labels of the filters that measure it by itself although it has a ``model``: the first that
+        is not linear, and all behind.
     """
 
     stream: str
@@ -119,14 +124,18 @@ class Formed:
 
 
 def needed_name(signal: Signal) -> str:
-    """The name of a signal that an output asks for and no author has named, such as ``_sky_unfiltered``."""
+    """The name of a signal that an output asks for and no author has named, such as
+    ``_sky_unfiltered``.
+    """
     parts = [*(signal.only or ["without", *(signal.without or ())])]
     parts += ["unfiltered"] * (signal.filters == "none") + ["full"] * (signal.modes == "full")
     return "_" + "_".join(parts)
 
 
 def can_be_named(name: str) -> bool:
-    """Whether a pipeline's author may call a signal so; names that begin with an underscore are those of outputs."""
+    """Whether a pipeline's author may call a signal so; names that begin with an underscore are
+    those of outputs.
+    """
     return name.isidentifier() and not name.startswith("_")
 
 
@@ -141,7 +150,8 @@ def is_signal(stream: str) -> bool:
 
 
 def is_stream(name: str) -> bool:
-    """Whether what an operator provides under this name is nothing but a stream of a block: a component, or a signal.
+    """Whether what an operator provides under this name is nothing but a stream of a block: a
+    component, or a signal.
 
     Its only use is to be read by a later step. Any other name may be a product as well.
     """

@@ -23,7 +23,9 @@ class Site(Parameters):
     altitude: Metres = quantity("0 m", ge=-500, le=9000)
     """Height above the ellipsoid."""
     climatology: str | None = None
-    """Name of the embedded climatology, where there is one: those of the built-in sites that have one (docs/weather.md)."""
+    """Name of the embedded climatology, where there is one: those of the built-in sites that have
+    one (docs/weather.md).
+    """
     provenance: str = ""
     """Where these numbers come from."""
 

@@ -25,8 +25,9 @@ class Stream:
     Attributes
     ----------
     array
-        (n_det, n_samp) float32 or float64, C order; in memory, or a memory map of a temporary file. A stream that is made again
-        when it is read (`core.run.streams`) has none: it is read by `sweep`.
+        (n_det, n_samp) float32 or float64, C order; in memory, or a memory map of a temporary file.
+        A stream that is made again when it is read (`core.run.streams`) has none: it is read by
+        `sweep`.
     means
         What must be added in float64 to have all of it, see `Block.means`.
     threads
@@ -42,7 +43,9 @@ class Stream:
     threads: int
     room: int = 0
     signal: str = MAIN
-    """Which signal it is, where it is one: ``signal/noiseless``. Its ``name`` is ``signal`` for the step that measures it."""
+    """Which signal it is, where it is one: ``signal/noiseless``. Its ``name`` is ``signal`` for the
+    step that measures it.
+    """
     components: frozenset[Component] = frozenset()
     """What the signal is the sum of."""
     state: Any = None
@@ -58,12 +61,16 @@ class Stream:
         """float32 or float64."""
         return self.array.dtype
 
-    def sweep(self, work: Callable[[slice, slice, AnyFloats], Any]) -> Iterator[tuple[slice, slice, Any]]:
-        """(detectors, samples, result) of ``work(detectors, samples, part)`` over blocks that cover the stream once.
+    def sweep(
+        self, work: Callable[[slice, slice, AnyFloats], Any]
+    ) -> Iterator[tuple[slice, slice, Any]]:
+        """(detectors, samples, result) of ``work(detectors, samples, part)`` over blocks that cover
+        the stream once.
 
-        ``work`` is called from several threads and must not change or keep the part. Results come in an order in which no
-        detector's samples and no sample's detectors are ever out of order, whatever the blocks and threads: what is added up
-        tile by tile (`core.numerics.tiles`) has the same bits.
+        ``work`` is called from several threads and must not change or keep the part. Results come
+        in an order in which no detector's samples and no sample's detectors are ever out of order,
+        whatever the blocks and threads: what is added up tile by tile (`core.numerics.tiles`) has
+        the same bits.
         """
         n_det, n_samp = self.shape
         blocks = [
@@ -84,8 +91,12 @@ SWEEP_DETECTORS, SWEEP_SAMPLES = 4 * TILE_DETECTORS, 32 * TILE_SAMPLES
 """What is read at a time of a stream that is kept."""
 
 
-def in_order(work: Callable[..., Any], items: Iterable[tuple[Any, ...]], threads: int) -> Iterator[Any]:
-    """Results of ``work(*item)``, in order, made on several threads that run ahead by at most two items each."""
+def in_order(
+    work: Callable[..., Any], items: Iterable[tuple[Any, ...]], threads: int
+) -> Iterator[Any]:
+    """Results of ``work(*item)``, in order, made on several threads that run ahead by at most two
+    items each.
+    """
     if threads == 1:
         yield from (work(*item) for item in items)
         return

@@ -16,10 +16,12 @@ if TYPE_CHECKING:
     from .observation import Observation
 
 StreamName = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
-"""What a parameter ``streams`` may list: ``signal``, a component (``sky``, or one of a plugin), or what else a step makes
-(``pwv``)."""
+"""What a parameter ``streams`` may list: ``signal``, a component (``sky``, or one of a plugin), or
+what else a step makes (``pwv``)."""
 
-AnyStream = Annotated[str, Field(pattern=rf"^([A-Za-z_][A-Za-z0-9_]*|{MAIN}/[A-Za-z][A-Za-z0-9_]*)$")]
+AnyStream = Annotated[
+    str, Field(pattern=rf"^([A-Za-z_][A-Za-z0-9_]*|{MAIN}/[A-Za-z][A-Za-z0-9_]*)$")
+]
 """The same, or the stream of a signal of `runs` (``signal/noiseless``)."""
 
 COMPONENTS = frozenset(map(str, BUILT_IN))
@@ -30,30 +32,39 @@ UNITS = {"transmission": "", "opacity": "", "flags": "", "pwv": "m", "path_delay
 
 
 class StreamsAsked:
-    """The ``optional`` of an operator with a parameter ``streams``: all components for the class, those asked for in an object,
-    and the streams of signals among them.
+    """The ``optional`` of an operator with a parameter ``streams``: all components for the class,
+    those asked for in an object, and the streams of signals among them.
 
     So the executor keeps no stream that nobody reads, see `core.run.execution`.
     """
 
     def __get__(self, operator: Any, owner: type) -> frozenset[str]:
         asked = getattr(operator, "streams", None)
-        return COMPONENTS if asked is None else frozenset(name for name in asked if name in COMPONENTS or f"{MAIN}/" in name)
+        return (
+            COMPONENTS
+            if asked is None
+            else frozenset(name for name in asked if name in COMPONENTS or f"{MAIN}/" in name)
+        )
 
 
 class StreamsNeeded:
-    """The ``requires`` of such an operator: ``signal``, and streams that are no components of zonda's own.
+    """The ``requires`` of such an operator: ``signal``, and streams that are no components of
+    zonda's own.
 
     Nobody makes these by default: a name that no step provides is an error.
     """
 
     def __get__(self, operator: Any, owner: type) -> frozenset[str]:
-        asked = (MAIN if is_signal(name) else name for name in getattr(operator, "streams", None) or ())
+        asked = (
+            MAIN if is_signal(name) else name for name in getattr(operator, "streams", None) or ()
+        )
         return frozenset({MAIN, *asked}) - COMPONENTS
 
 
 def check_signals(streams: Iterable[str], observation: Observation, place: str) -> None:
-    """Refuse the stream of a signal that is not formed: that `runs` does not have, or that is a remainder (PipelineError)."""
+    """Refuse the stream of a signal that is not formed: that `runs` does not have, or that is a
+    remainder (PipelineError).
+    """
     for name in streams:
         if is_signal(name) and name not in observation.signals:
             have = [one for one in observation.signals if not one.partition("/")[2].startswith("_")]

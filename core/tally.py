@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 
 class Tally:
-    """Counts and figures that the user must know of: what was clipped, dropped, approximated. Thread-safe.
+    """Counts and figures that the user must know of: what was clipped, dropped, approximated.
+    Thread-safe.
 
     Keys are (who, what): the operator's label and a short phrase with its unit, e.g.
     ``("SkyMap", "samples outside the input map")``.
@@ -20,8 +21,8 @@ class Tally:
         self._totals: dict[tuple[str, str], int] = {}
 
     def count(self, who: str, what: str, number: int, of: int = 0) -> None:
-        """Add ``number`` to a count (a count of zero is kept: it says that nothing happened); ``of``: among how many, where its
-        share is worth telling."""
+        """Add ``number`` to a count (a count of zero is kept: it says that nothing happened);
+        ``of``: among how many, where its share is worth telling."""
         with self._lock:
             self._counts[who, what] = self._counts.get((who, what), 0) + int(number)
             if of:
@@ -33,7 +34,9 @@ class Tally:
             self._figures[who, what] = text
 
     def update(self, other: Tally, prefix: str = "", suffix: str = "") -> None:
-        """Add another tally's counts and statements, ``prefix`` before their operators' labels, ``suffix`` behind them."""
+        """Add another tally's counts and statements, ``prefix`` before their operators' labels,
+        ``suffix`` behind them.
+        """
         for (who, what), number in other._counts.items():
             self.count(prefix + who + suffix, what, number, other._totals.get((who, what), 0))
         for (who, what), text in other._figures.items():
@@ -42,7 +45,9 @@ class Tally:
     def __iter__(self) -> Iterator[tuple[str, str, str]]:
         """Rows (who, what, value) in a fixed order."""
         with self._lock:
-            rows = [(*k, f"{v}") for k, v in self._counts.items()] + [(*k, v) for k, v in self._figures.items()]
+            rows = [(*k, f"{v}") for k, v in self._counts.items()] + [
+                (*k, v) for k, v in self._figures.items()
+            ]
         return iter(sorted(rows))
 
     def counts(self) -> list[tuple[str, str, int]]:
@@ -64,7 +69,13 @@ class Tally:
         """Rows as `__iter__`, with the share of counts that have one: ``2623184 (20.3 %)``."""
         for who, what, value in self:
             whole = self._totals.get((who, what), 0)
-            yield who, what, f"{value} ({percent(self.get(who, what) / whole)})" if whole and self.get(who, what) else value
+            yield (
+                who,
+                what,
+                f"{value} ({percent(self.get(who, what) / whole)})"
+                if whole and self.get(who, what)
+                else value,
+            )
 
     def get(self, who: str, what: str) -> int:
         """A count, 0 where there is none."""

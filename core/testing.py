@@ -1,10 +1,12 @@
-"""The conformance kit: `check_operator` finds out whether an operator keeps the contract of `core.operator`.
+"""The conformance kit: `check_operator` finds out whether an operator keeps the contract of
+`core.operator`.
 
 A plugin's test is one line::
 
     zonda.testing.check_operator(MyOperator(width="3 s"))
 
-The operator is run over a made-up scan with made-up streams: whatever it requires or can use is there.
+The operator is run over a made-up scan with made-up streams: whatever it requires or can use is
+there.
 """
 
 from __future__ import annotations
@@ -21,7 +23,15 @@ from pydantic import ValidationError
 
 from .configuration.docstrings import described, source_is_known
 from .data import STREAMS, Block, Data, Observation, Stream
-from .made_up import N_DETECTORS, N_SAMPLES, Given, Points, given_signal, made_up_scan, made_up_scene
+from .made_up import (
+    N_DETECTORS,
+    N_SAMPLES,
+    Given,
+    Points,
+    given_signal,
+    made_up_scan,
+    made_up_scene,
+)
 from .mapmaker import MapMaker, filters
 from .numerics.tiles import TILE_SAMPLES
 from .operator import Operator
@@ -32,7 +42,9 @@ from .product import Product
 from .signal import is_stream
 
 
-def check_operator(operator: Operator, *, expected_failures: Mapping[str, str] | None = None) -> None:
+def check_operator(
+    operator: Operator, *, expected_failures: Mapping[str, str] | None = None
+) -> None:
     """Run every check that applies; raise AssertionError with all that fail.
 
     Parameters
@@ -40,7 +52,8 @@ def check_operator(operator: Operator, *, expected_failures: Mapping[str, str] |
     operator
         An instance, with parameters that suit a scan of 37 detectors and 129 s at 50 Hz.
     expected_failures
-        Names of checks that are known to fail, each with the reason. One that passes all the same is reported too.
+        Names of checks that are known to fail, each with the reason. One that passes all the same
+        is reported too.
     """
     expected = dict(expected_failures or {})
     wrong = []
@@ -52,14 +65,19 @@ def check_operator(operator: Operator, *, expected_failures: Mapping[str, str] |
                 wrong.append(f"{check.__name__}: {err}")
         else:
             if check.__name__ in expected:
-                wrong.append(f"{check.__name__} passes, though it was expected to fail: {expected[check.__name__]}")
+                wrong.append(
+                    f"{check.__name__} passes, though it was expected to fail:"
+                    f" {expected[check.__name__]}"
+                )
     assert not wrong, f"{type(operator).__name__} does not keep the contract:\n" + "\n".join(wrong)
 
 
 def check_parameters_are_documented(operator: Operator) -> None:
-    """The class and every field have a docstring: messages, schema and documentation are made of them.
+    """The class and every field have a docstring: messages, schema and documentation are made of
+    them.
 
-    Those of fields are read from the source. A class that was typed at the prompt of `python` has none: its fields pass.
+    Those of fields are read from the source. A class that was typed at the prompt of `python` has
+    none: its fields pass.
     """
     assert (type(operator).__doc__ or "").strip(), "the class has no docstring"
     if source_is_known(type(operator)):
@@ -77,24 +95,34 @@ def check_parameters_survive_text(operator: Operator) -> None:
 def check_knobs(operator: Operator) -> None:
     """Knobs turn parameters that exist, on ladders of at least two values that these accept."""
     for knob in planning_of(operator).knobs:
-        assert knob.parameter in type(operator).model_fields, f"knob {knob.parameter} is not a parameter"
+        assert knob.parameter in type(operator).model_fields, (
+            f"knob {knob.parameter} is not a parameter"
+        )
         assert len(knob.ladder) >= 2, f"knob {knob.parameter} needs a ladder of at least two values"
         try:
             values = knob.values(type(operator))
         except ValidationError as err:
             raise AssertionError(f"knob {knob.parameter}: {err}") from None
-        assert len(set(map(repr, values))) == len(values), f"knob {knob.parameter} has two equal rungs"
+        assert len(set(map(repr, values))) == len(values), (
+            f"knob {knob.parameter} has two equal rungs"
+        )
 
 
 def check_declared_streams(operator: Operator) -> None:
-    """`exec` reads only what is declared as required or optional, makes only what is provided, and changes nothing else."""
+    """`exec` reads only what is declared as required or optional, makes only what is provided, and
+    changes nothing else.
+    """
     if isinstance(operator, Output) or "boresight" in operator.provides:
         return
     before, watched = _one_block(operator)
     allowed = operator.requires | operator.optional | operator.provides
     made = set(watched) - set(before)
-    assert made <= operator.provides, f"makes {sorted(made - operator.provides)}, which it does not provide"
-    assert not (undeclared := watched.read - allowed), f"reads {sorted(undeclared)}, which it does not declare"
+    assert made <= operator.provides, (
+        f"makes {sorted(made - operator.provides)}, which it does not provide"
+    )
+    assert not (undeclared := watched.read - allowed), (
+        f"reads {sorted(undeclared)}, which it does not declare"
+    )
     for name in set(before) - operator.provides:
         assert np.array_equal(before[name], dict.__getitem__(watched, name), equal_nan=True), (
             f"changes {name}, which it does not provide"
@@ -110,7 +138,10 @@ def check_components(operator: Operator) -> None:
         return
     before, watched = _one_block(operator)
     plain = sorted(set(watched) - set(before) - _streams_of(operator))
-    assert not plain, f"makes {plain}, which is not part of the signal: provide zonda.Component({plain[0]!r}, 'at the detector')"
+    assert not plain, (
+        f"makes {plain}, which is not part of the signal: provide zonda.Component({plain[0]!r}, 'at"
+        " the detector')"
+    )
 
 
 def _one_block(operator: Operator) -> tuple[dict[str, Any], _Watched]:
@@ -130,7 +161,9 @@ def _one_block(operator: Operator) -> tuple[dict[str, Any], _Watched]:
         before = {name: stream.copy() for name, stream in block.detdata.items()}
         if operator.couples == "all":
             (name,) = operator.requires - {"boresight"}
-            states[1] = operator.measure(_stream(observation, block.detdata[name], states[1], name=name))
+            states[1] = operator.measure(
+                _stream(observation, block.detdata[name], states[1], name=name)
+            )
         watched = _Watched(block.detdata)
         block.detdata = watched
         operator.exec(block, states[1])
@@ -144,7 +177,9 @@ def _streams_of(operator: Operator) -> set[str]:
 
 
 def check_same_bits(operator: Operator) -> None:
-    """The same seed gives the same bits for every block size and thread count; two seeds of a random operator do not."""
+    """The same seed gives the same bits for every block size and thread count; two seeds of a
+    random operator do not.
+    """
     one = _products(operator, threads=1, memory=1 << 30)
     for threads, memory in ((1, _small(operator)), (3, 3 * _small(operator)), (2, 1 << 30)):
         other = _products(operator, threads=threads, memory=memory)
@@ -152,8 +187,8 @@ def check_same_bits(operator: Operator) -> None:
 
 
 def check_linear(operator: Operator) -> None:
-    """A filter that says that it is `linear` makes zero of zero, and of a sum the sum of what it makes of the parts, with what
-    `Operator.measure` found in the sum (``modes: full``)."""
+    """A filter that says that it is `linear` makes zero of zero, and of a sum the sum of what it
+    makes of the parts, with what `Operator.measure` found in the sum (``modes: full``)."""
     if not (operator.linear and filters(operator)):
         return
     observation = made_up_scan()
@@ -162,10 +197,14 @@ def check_linear(operator: Operator) -> None:
     parts = [given_signal(observation, factor) for factor in (1.0, -0.3)]
     parts[1][:, ::7] += np.float32(2e-3)
     whole, nothing = parts[0] + parts[1], np.zeros_like(parts[0])
-    model = operator.measure(_stream(observation, whole, state)) if operator.couples == "all" else None
+    model = (
+        operator.measure(_stream(observation, whole, state)) if operator.couples == "all" else None
+    )
 
     def act(signal: NDArray[np.float32], own: Any = None) -> NDArray[np.float64]:
-        block = Block(observation, slice(0, N_DETECTORS), slice(0, N_SAMPLES), {"signal": signal.copy()})
+        block = Block(
+            observation, slice(0, N_DETECTORS), slice(0, N_SAMPLES), {"signal": signal.copy()}
+        )
         if operator.couples == "all" and own is None:
             own = operator.measure(_stream(observation, signal, state, "signal/part"), model)
         operator.exec(block, state if own is None else own)
@@ -173,46 +212,64 @@ def check_linear(operator: Operator) -> None:
 
     made = act(whole, model)
     scale = 1e-5 * float(np.std(made)) + 1e-6 * float(np.std(whole))  # float32
-    assert np.abs(act(nothing)).max() <= scale, "says that it is linear, but makes something of nothing"
+    assert np.abs(act(nothing)).max() <= scale, (
+        "says that it is linear, but makes something of nothing"
+    )
     assert np.allclose(act(parts[0]) + act(parts[1]), made, rtol=0, atol=4 * scale), (
-        "says that it is linear, but what it makes of two parts does not add up to what it makes of their sum"
+        "says that it is linear, but what it makes of two parts does not add up to what it makes of"
+        " their sum"
     )
 
 
 def check_means(operator: Operator) -> None:
-    """What comes out is the same whether the mean, tens of kelvin, stands beside the stream or in it (`Operator.knows_means`).
+    """What comes out is the same whether the mean, tens of kelvin, stands beside the stream or in
+    it (`Operator.knows_means`).
 
-    Both in float64, where 30 K are rounded to 4e-15 K; what a run in float32 would round, 2^-24 of the largest value, is allowed.
+    Both in float64, where 30 K are rounded to 4e-15 K; what a run in float32 would round, 2^-24 of
+    the largest value, is allowed.
     """
     changed = operator.provides & frozenset(STREAMS)
     for name in sorted({"signal"} | ({"atmosphere"} if changed else set())):
         if isinstance(operator, Output) or name not in operator.requires | operator.optional:
             continue
         beside, inside = (
-            _products(operator, threads=1, memory=1 << 30, given=Given(mean=name, beside=b), precision="float64")
+            _products(
+                operator,
+                threads=1,
+                memory=1 << 30,
+                given=Given(mean=name, beside=b),
+                precision="float64",
+            )
             for b in (True, False)
         )
         assert (wrong := _unlike(beside, inside)) is None, (
-            f"{wrong} is another where the mean of {name} stands beside the stream (block.means, observation.smooth), not in it: "
-            "leave knows_means out, or add that mean"
+            f"{wrong} is another where the mean of {name} stands beside the stream (block.means,"
+            " observation.smooth), not in it: leave knows_means out, or add that mean"
         )
 
 
 def check_products(operator: Operator) -> None:
-    """Partial products are restored from their `arrays`; those of a linear map maker can be subtracted."""
+    """Partial products are restored from their `arrays`; those of a linear map maker can be
+    subtracted.
+    """
     if isinstance(operator, Output) or "boresight" in operator.provides:
         return
     with tempfile.TemporaryDirectory() as folder:
         pipeline = Pipeline([Points(), Given(), operator])
         layouts = pipeline.point(made_up_scene(), {}, Path(folder)).layouts
-        data = pipeline.run_part(made_up_scene(), Part(layouts=layouts), threads=1, memory=1 << 30, output=folder)
+        data = pipeline.run_part(
+            made_up_scene(), Part(layouts=layouts), threads=1, memory=1 << 30, output=folder
+        )
     for product in data.partial.values():
         kind = type(product)
         arrays = _comparable(product.arrays())
-        assert _same(_comparable(kind.of(product.arrays()).arrays()), arrays), f"{kind.__name__}.of does not restore its arrays()"
-        assert not (isinstance(operator, MapMaker) and operator.linear) or kind.subtract is not Product.subtract, (
-            f"a linear map maker, but {kind.__name__} has no subtract()"
+        assert _same(_comparable(kind.of(product.arrays()).arrays()), arrays), (
+            f"{kind.__name__}.of does not restore its arrays()"
         )
+        assert (
+            not (isinstance(operator, MapMaker) and operator.linear)
+            or kind.subtract is not Product.subtract
+        ), f"a linear map maker, but {kind.__name__} has no subtract()"
 
 
 def check_finite(operator: Operator) -> None:
@@ -246,33 +303,48 @@ def _products(
     given: Operator | None = None,
     precision: Literal["float32", "float64"] = "float32",
 ) -> dict[str, Any]:
-    """Everything that a run of the operator over given streams makes: streams, their means included, and products."""
+    """Everything that a run of the operator over given streams makes: streams, their means
+    included, and products.
+    """
     if isinstance(operator, Output):
         return {}
     pointing = "boresight" in operator.provides
     steps = [operator] if pointing else [Points(), given or Given(), operator]
     keep = sorted(_streams_of(operator))
     with tempfile.TemporaryDirectory() as folder:
-        data = Pipeline(steps, precision=precision).run(made_up_scene(), threads=threads, memory=memory, keep=keep, output=folder)
+        data = Pipeline(steps, precision=precision).run(
+            made_up_scene(), threads=threads, memory=memory, keep=keep, output=folder
+        )
     found: dict[str, Any] = {}
     for observation in data.observations:
         if "atmosphere" in observation.detdata and "atmosphere" in observation.smooth:
             whole = slice(0, observation.n_detectors), slice(0, observation.n_samples)
             observation.detdata["atmosphere"] += observation.smooth["atmosphere"].evaluate(*whole)
-        found |= {f"{observation.name} {name}": stream for name, stream in observation.detdata.items()}
+        found |= {
+            f"{observation.name} {name}": stream for name, stream in observation.detdata.items()
+        }
         if pointing:
-            found |= {f"{observation.name} {name}": getattr(observation, name) for name in ("boresight_azel", "boresight_radec")}
+            found |= {
+                f"{observation.name} {name}": getattr(observation, name)
+                for name in ("boresight_azel", "boresight_radec")
+            }
     return found | {name: _comparable(product) for name, product in data.products.items()}
 
 
-def _stream(observation: Observation, array: Any, state: Any, signal: str = "signal", name: str = "signal") -> Stream:
+def _stream(
+    observation: Observation, array: Any, state: Any, signal: str = "signal", name: str = "signal"
+) -> Stream:
     """A whole stream for a step that measures."""
     return Stream(name, observation, array, {}, 1, signal=signal, state=state)
 
 
 def _small(operator: Operator) -> int:
-    """A budget in which blocks are small: whole scans of 16 detectors where the operator needs them, else short pieces."""
-    least = {"time": 16 * N_SAMPLES, "detectors": N_DETECTORS * TILE_SAMPLES}.get(operator.couples, 16 * TILE_SAMPLES)
+    """A budget in which blocks are small: whole scans of 16 detectors where the operator needs
+    them, else short pieces.
+    """
+    least = {"time": 16 * N_SAMPLES, "detectors": N_DETECTORS * TILE_SAMPLES}.get(
+        operator.couples, 16 * TILE_SAMPLES
+    )
     return 2 * 4 * least * (len(STREAMS) + 6)
 
 
@@ -294,18 +366,26 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _unlike(a: Any, b: Any, name: str = "") -> str | None:
-    """The name of the first array or number of ``a`` that is not that of ``b`` within 2^-24 of the largest value; None: alike."""
+    """The name of the first array or number of ``a`` that is not that of ``b`` within 2^-24 of the
+    largest value; None: alike.
+    """
     if isinstance(b, Mapping):
         if not isinstance(a, Mapping) or a.keys() != b.keys():
             return name or "what is made"
-        return next((w for k in b if (w := _unlike(a[k], b[k], f"{name}.{k}" if name else str(k)))), None)
+        return next(
+            (w for k in b if (w := _unlike(a[k], b[k], f"{name}.{k}" if name else str(k)))), None
+        )
     if b is None or a is None:
         return None if a is b else name
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     if a.shape != b.shape or (np.isfinite(a) != np.isfinite(b)).any():
         return name
     good = np.isfinite(b)
-    return None if (np.abs(a[good] - b[good]) <= 2.0**-24 * np.abs(b[good]).max(initial=0.0)).all() else name
+    return (
+        None
+        if (np.abs(a[good] - b[good]) <= 2.0**-24 * np.abs(b[good]).max(initial=0.0)).all()
+        else name
+    )
 
 
 class _Watched(dict[str, Any]):

@@ -1,4 +1,6 @@
-"""What results depend on besides the pipeline: this program, down to its files, libraries and instruction sets of the CPU."""
+"""What results depend on besides the pipeline: this program, down to its files, libraries and
+instruction sets of the CPU.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,18 @@ def versions() -> dict[str, str]:
     import platform
 
     found = {"python": platform.python_version(), "machine": platform.machine()}
-    for package in ("zonda", "numpy", "scipy", "astropy", "astropy-iers-data", "pyerfa", "numba", "llvmlite", "healpy", "h5py"):
+    for package in (
+        "zonda",
+        "numpy",
+        "scipy",
+        "astropy",
+        "astropy-iers-data",
+        "pyerfa",
+        "numba",
+        "llvmlite",
+        "healpy",
+        "h5py",
+    ):
         installed = _version(package)
         if installed is not None:
             found[package] = installed
@@ -25,10 +38,11 @@ def versions() -> dict[str, str]:
 
 
 def arithmetic() -> dict[str, str]:
-    """What bits depend on besides the pipeline: libraries, the C library's functions, and the instructions that each may use.
+    """What bits depend on besides the pipeline: libraries, the C library's functions, and the
+    instructions that each may use.
 
-    ``cpu`` and ``instructions`` are those that numba compiles for, ``numpy instructions`` those that numpy chooses among;
-    ``processor`` is its name. Where all of it is the same, bits are.
+    ``cpu`` and ``instructions`` are those that numba compiles for, ``numpy instructions`` those
+    that numpy chooses among; ``processor`` is its name. Where all of it is the same, bits are.
     """
     import platform
 
@@ -45,10 +59,16 @@ def arithmetic() -> dict[str, str]:
         **versions(),
         "processor": processor(),
         "cpu": config.CPU_NAME or binding.get_host_cpu_name(),
-        "instructions": " ".join(sorted(f[1:] for f in (features or "").split(",") if f.startswith("+"))),
+        "instructions": " ".join(
+            sorted(f[1:] for f in (features or "").split(",") if f.startswith("+"))
+        ),
         "numpy instructions": " ".join(_of_numpy()),
         "libc": " ".join(filter(None, platform.libc_ver())),
-        **{name: os.environ[name] for name in ("GLIBC_TUNABLES", "OPENBLAS_CORETYPE") if os.environ.get(name)},
+        **{
+            name: os.environ[name]
+            for name in ("GLIBC_TUNABLES", "OPENBLAS_CORETYPE")
+            if os.environ.get(name)
+        },
     }
 
 

@@ -1,6 +1,8 @@
-"""Write the tables of docs/accuracy.md from the stored fronts: python docs/make_accuracy.py (a test holds the two together).
+"""Write the tables of docs/accuracy.md from the stored fronts: python docs/make_accuracy.py (a test
+holds the two together).
 
-The fronts are made by `zonda accuracy PIPELINE --quick --store`, and the picture beside the page by the same command.
+The fronts are made by `zonda accuracy PIPELINE --quick --store`, and the picture beside the page by
+the same command.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ MARK = "<!-- made by docs/make_accuracy.py from pipelines/fronts: do not edit be
 def page() -> str:
     """The page with its tables made anew."""
     written, _, _ = PAGE.read_text(encoding="utf-8").partition(MARK)
-    fronts = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(FRONTS.glob("*.json"))]
+    fronts = [
+        json.loads(path.read_text(encoding="utf-8")) for path in sorted(FRONTS.glob("*.json"))
+    ]
     return written + MARK + "".join("\n".join(lines(front)) + "\n" for front in fronts)
 
 
@@ -27,17 +31,26 @@ def lines(front: dict[str, Any]) -> Iterator[str]:
     reference = front["points"][0]
     shorter = ", ".join(f"{k} = {v}" for k, v in front["shorter"].items()) or "none"
     yield from ("", f"## {front['pipeline']}, {front['metric']}", "")
-    yield f"Error: {front['says']}. Shortened by: {shorter}. zonda {front['versions']['zonda']}, seed {front['seed']}."
+    yield (
+        f"Error: {front['says']}. Shortened by: {shorter}. zonda {front['versions']['zonda']}, seed"
+        f" {front['seed']}."
+    )
     staying = " ".join(f"`{k}={v}`" for k, v in front["staying"].items())
     yield (
-        f"Instrument noise in units of the error: {percent(front['noise_floor'])}; realization scatter: "
-        f"{percent(front['realization_scatter'])}. Reference: {cost(reference)} CPU s, {reference['memory'] / 1e6:.0f} MB; "
-        f"its own error by its last steps: {percent(front['reference_error'])}, with {staying}."
+        f"Instrument noise in units of the error: {percent(front['noise_floor'])}; realization"
+        f" scatter: {percent(front['realization_scatter'])}. Reference: {cost(reference)} CPU s,"
+        f" {reference['memory'] / 1e6:.0f} MB; its own error by its last steps:"
+        f" {percent(front['reference_error'])}, with {staying}."
     )
     picture = PAGE.with_name(f"accuracy_{front['pipeline']}_{front['metric']}.png")
     if picture.exists():
         yield from ("", f"![work-precision diagram]({picture.name})")
-    yield from ("", "Each knob alone:", "", "| knob | value | error | CPU s | saved in its step, s | left at the tightest |")
+    yield from (
+        "",
+        "Each knob alone:",
+        "",
+        "| knob | value | error | CPU s | saved in its step, s | left at the tightest |",
+    )
     yield "|---|---|---|---|---|---|"
     for alone in front["alone"]:
         last = alone["rungs"][-1]
@@ -47,16 +60,30 @@ def lines(front: dict[str, Any]) -> Iterator[str]:
             saved = (
                 ""
                 if rung is last
-                else f"{last['own'] - rung['own']:+.3f} ± {(last['own_spread'] ** 2 + rung['own_spread'] ** 2) ** 0.5:.3f}"
+                else (
+                    f"{last['own'] - rung['own']:+.3f} ±"
+                    f" {(last['own_spread'] ** 2 + rung['own_spread'] ** 2) ** 0.5:.3f}"
+                )
             )
             name = f"`{alone['knob']}`" if rung is alone["rungs"][0] else ""
             left = percent(alone["left"]) if rung is last else ""
             yield f"| {name} | {rung['value']} | {error} | {cost(rung)} | {saved} | {left} |"
-    yield from ("", "The joint Pareto front:", "", "| error | CPU s | MB | what differs from the tightest |", "|---|---|---|---|")
+    yield from (
+        "",
+        "The joint Pareto front:",
+        "",
+        "| error | CPU s | MB | what differs from the tightest |",
+        "|---|---|---|---|",
+    )
     for point in front["front"]:
-        different = [f"`{k}={v}`" for k, v in point["setting"].items() if front["reference"].get(k) != v]
+        different = [
+            f"`{k}={v}`" for k, v in point["setting"].items() if front["reference"].get(k) != v
+        ]
         chosen = " (chosen)" if point == front["chosen"] else ""
-        yield f"| {percent(point['error'])}{chosen} | {cost(point)} | {point['memory'] / 1e6:.0f} | {' '.join(different)} |"
+        yield (
+            f"| {percent(point['error'])}{chosen} | {cost(point)} | {point['memory'] / 1e6:.0f} |"
+            f" {' '.join(different)} |"
+        )
     present = front["present"]
     yield from ("", f"The file's own setting: {percent(present['error'])}, {cost(present)} CPU s.")
 

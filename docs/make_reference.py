@@ -1,4 +1,6 @@
-"""Write docs/operators.md from the docstrings of the classes: python docs/make_reference.py (a test compares the two)."""
+"""Write docs/operators.md from the docstrings of the classes: python docs/make_reference.py (a test
+compares the two).
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ SCENE = {
 
 
 def folder_of(cls: type) -> str:
-    """``filters`` of zonda.operators.filters.highpass, ``interop`` of zonda.interop.toast_operator."""
+    """``filters`` of zonda.operators.filters.highpass, ``interop`` of
+    zonda.interop.toast_operator.
+    """
     parts = cls.__module__.split(".")
     return parts[2] if parts[1] == "operators" else parts[1]
 
@@ -49,28 +53,53 @@ def page() -> str:
     lines = [
         "# Reference of the operators",
         "",
-        "All operators, [noise models](#noise-models), [sites and instruments](#sites-and-instruments) with their parameters.",
-        "`docs/make_reference.py` makes this page from the docstrings. Where the default is *none*, the value is taken from the",
+        (
+            "All operators, [noise models](#noise-models), [sites and"
+            " instruments](#sites-and-instruments) with their parameters."
+        ),
+        (
+            "`docs/make_reference.py` makes this page from the docstrings. Where the default is"
+            " *none*, the value is taken from the"
+        ),
         "instrument, the site or the scene, as the text says.",
     ]
     for folder, title in FOLDERS.items():
         lines += ["", f"## {title}"]
         for cls in sorted((c for c in classes if folder_of(c) == folder), key=lambda c: c.__name__):
             lines += ["", f"### {cls.__name__}", "", own_doc(cls), ""]
-            needs, gives = (", ".join(f"`{n}`" for n in sorted(names)) or "nothing" for names in (cls.requires, cls.provides))
+            needs, gives = (
+                ", ".join(f"`{n}`" for n in sorted(names)) or "nothing"
+                for names in (cls.requires, cls.provides)
+            )
             lines += [f"Requires {needs}; provides {gives}.", "", *table(cls, but="name")]
             for knob in planning_class(cls).knobs or getattr(cls, "knobs", ()):
                 ladder = ", ".join(f"`{value}`" for value in knob.ladder)
-                lines += ["", f"Knob ([accuracy](accuracy.md)): `{knob.parameter}`, {ladder}: {knob.approximates}."]
-    lines += ["", "## Noise models", "", "Values of `WhiteNoise.model`: a name, or `{name: background_limited, modes: 1}`."]
-    for found in sorted((c for c in noise_models.candidates() if c.distribution == "zonda"), key=lambda c: c.name):
+                lines += [
+                    "",
+                    (
+                        f"Knob ([accuracy](accuracy.md)): `{knob.parameter}`, {ladder}:"
+                        f" {knob.approximates}."
+                    ),
+                ]
+    lines += [
+        "",
+        "## Noise models",
+        "",
+        "Values of `WhiteNoise.model`: a name, or `{name: background_limited, modes: 1}`.",
+    ]
+    for found in sorted(
+        (c for c in noise_models.candidates() if c.distribution == "zonda"), key=lambda c: c.name
+    ):
         cls = noise_models.get(found.name)
         lines += ["", f"### {found.name}", "", own_doc(cls), "", *table(cls, but="name")]
     lines += [
         "",
         "## Sites and instruments",
         "",
-        "Keys of `site:` and `instrument:` in a pipeline file ([pipelines.md](pipelines.md)), which",
+        (
+            "Keys of `site:` and `instrument:` in a pipeline file ([pipelines.md](pipelines.md)),"
+            " which"
+        ),
     ]
     lines += ["are also the arguments of the classes in Python ([plugins.md](plugins.md))."]
     for cls, key in SCENE.items():
@@ -91,14 +120,25 @@ def table(cls: typing.Any, but: str = "") -> list[str]:
 
 def written_choices(field: typing.Any) -> str:
     """The choices as Markdown, empty where there are none."""
-    chosen = [f"`{value}`" if isinstance(value, str) else f"`{json.dumps(value)}`" for value in choices(field)]
+    chosen = [
+        f"`{value}`" if isinstance(value, str) else f"`{json.dumps(value)}`"
+        for value in choices(field)
+    ]
     if not chosen:
         return ""
-    others = [m for m in members(field) if m is not type(None) and typing.get_origin(m) is not typing.Literal]
+    others = [
+        m
+        for m in members(field)
+        if m is not type(None) and typing.get_origin(m) is not typing.Literal
+    ]
     named = f"one of {', '.join(chosen)}" if len(chosen) > 1 else chosen[0]
     if any(typing.get_origin(t) is typing.Literal for other in others for t in types_in(other)):
         named, others = f"one or several of {', '.join(chosen)}", []
-    return f"Or {named}." if others else f"{named[0].upper()}{named[1:]}{'.' if len(chosen) > 1 else ' only.'}"
+    return (
+        f"Or {named}."
+        if others
+        else f"{named[0].upper()}{named[1:]}{'.' if len(chosen) > 1 else ' only.'}"
+    )
 
 
 def default(field: typing.Any) -> str:
@@ -109,7 +149,11 @@ def default(field: typing.Any) -> str:
     if value is None or value == "":
         return "*none*"
     has_unit = any(isinstance(m, Unit) for m in field.metadata)
-    return f"`{value}`" if has_unit or isinstance(value, str) else f"`{json.dumps(value, default=str)}`"
+    return (
+        f"`{value}`"
+        if has_unit or isinstance(value, str)
+        else f"`{json.dumps(value, default=str)}`"
+    )
 
 
 if __name__ == "__main__":

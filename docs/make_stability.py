@@ -1,4 +1,6 @@
-"""Write docs/stability.md from the output of the checks: python docs/make_stability.py (a test compares the two)."""
+"""Write docs/stability.md from the output of the checks: python docs/make_stability.py (a test
+compares the two).
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,10 @@ def page(results: list[Result]) -> str:
     lines = [HEAD]
     for case in MATRIX:
         lines += [f"## {_text(case.text)}", "", f"Accepted: {_text(case.acceptance)}.", ""]
-        lines += ["| check | reference | limit | reached | in doctor | remark |", "|---|---|---|---|---|---|"]
+        lines += [
+            "| check | reference | limit | reached | in doctor | remark |",
+            "|---|---|---|---|---|---|",
+        ]
         lines += [_row(r) for r in results if r.check.case is case] + [""]
     return "\n".join(lines)
 
@@ -49,8 +54,16 @@ def rows(text: str) -> dict[str, tuple[str, str, str, str]]:
 
 def _row(result: Result) -> str:
     check = result.check
-    cells = [f"`{check.name}`: {_text(check.what)}", _text(check.reference), result.accepted, result.reached]
-    return f"| {' | '.join(cells)} | {'yes' if check.name in DOCTOR else ''} | {_text(result.remark)} |"
+    cells = [
+        f"`{check.name}`: {_text(check.what)}",
+        _text(check.reference),
+        result.accepted,
+        result.reached,
+    ]
+    return (
+        f"| {' | '.join(cells)} | {'yes' if check.name in DOCTOR else ''} |"
+        f" {_text(result.remark)} |"
+    )
 
 
 def _text(text: str) -> str:

@@ -5,8 +5,6 @@ cp out/validate/claims.ecsv docs/validation.ecsv
 python docs/make_validation.py
 """
 
-# ruff: noqa: E501 - tables of Markdown
-
 from __future__ import annotations
 
 import math
@@ -96,7 +94,10 @@ side. `zonda validate` draws these; each is in the folder of its row.
 
 FORMULAS = (
     (r"FWHM = D sqrt\(z\^-2 \+ z_r\^-2\)", r"$\\mathrm{FWHM} = D \\sqrt{z^{-2} + z_r^{-2}}$"),
-    (r"\((1\.7) mK sqrt\(s\) / 148 uK\)\^2", r"$(1.7\\,\\mathrm{mK}\\sqrt{\\mathrm{s}} / 148\\,\\mathrm{µK})^2$"),
+    (
+        r"\((1\.7) mK sqrt\(s\) / 148 uK\)\^2",
+        r"$(1.7\\,\\mathrm{mK}\\sqrt{\\mathrm{s}} / 148\\,\\mathrm{µK})^2$",
+    ),
     (r"pi \(6\.1 arcmin\)\^2", r"$\\pi\\,(6.1\\,\\mathrm{arcmin})^2$"),
     (r"2 k T nu\^2 / c\^2", r"$2 k T \\nu^2 / c^2$"),
     (r"lambda z / D\^2", r"$\\lambda z / D^2$"),
@@ -122,25 +123,65 @@ def stored() -> Any:
 
 def page(table: Any) -> str:
     """The whole page."""
-    counts = ", ".join(f"{verdict}: {number}" for verdict, number in Counter(map(str, table["verdict"])).most_common())
-    far = [str(row["id"]) for row in table if row["verdict"] == "agrees" and row["distance_mean"] > LIMIT]
-    lines = [HEAD, "## The claims", "", f"{len(table)} rows with zonda {table.meta['zonda']}, {RUN}. {counts}.", ""]
+    counts = ", ".join(
+        f"{verdict}: {number}"
+        for verdict, number in Counter(map(str, table["verdict"])).most_common()
+    )
+    far = [
+        str(row["id"])
+        for row in table
+        if row["verdict"] == "agrees" and row["distance_mean"] > LIMIT
+    ]
+    lines = [
+        HEAD,
+        "## The claims",
+        "",
+        f"{len(table)} rows with zonda {table.meta['zonda']}, {RUN}. {counts}.",
+        "",
+    ]
     if far:
         lines += [f"Likely as one realization, though not the expectation: {', '.join(far)}.", ""]
-    lines += ["| claim | paper | zonda | scatter | of the mean | distance of one | of the mean | verdict |"]
-    lines += ["|---|---:|---:|---:|---:|---:|---:|---|", *map(_row, table), "", PICTURES, "## Why", ""]
-    lines += [f"**{row['id']}.** {_text(row['claim'])} {_text(row['remark'])}\n" for row in table if row["remark"]]
+    lines += [
+        "| claim | paper | zonda | scatter | of the mean | distance of one | of the mean |"
+        " verdict |"
+    ]
+    lines += [
+        "|---|---:|---:|---:|---:|---:|---:|---|",
+        *map(_row, table),
+        "",
+        PICTURES,
+        "## Why",
+        "",
+    ]
+    lines += [
+        f"**{row['id']}.** {_text(row['claim'])} {_text(row['remark'])}\n"
+        for row in table
+        if row["remark"]
+    ]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def _row(row: Any) -> str:
     sign = {"equal": "", "at_least": "≥ ", "at_most": "≤ "}[row["relation"]]
     error = row["paper_error"] or row["paper_rounding"]
-    paper = f"{sign}{row['paper']:.4g}" + (f" ± {error:.2g}" if error else "") + f" {_text(row['unit'])}".rstrip()
+    paper = (
+        f"{sign}{row['paper']:.4g}"
+        + (f" ± {error:.2g}" if error else "")
+        + f" {_text(row['unit'])}".rstrip()
+    )
     known = not math.isnan(row["zonda"])
-    cells = [f"{row['zonda']:.4g}", *(f"{row[k]:.2g}" if row["scatter"] else "" for k in ("scatter", "standard_error"))]
-    cells += [f"{row[key]:.2g}" if math.isfinite(row[key]) else "–" for key in ("distance_one", "distance_mean")]
-    return f"| **{row['id']}** {_text(row['claim'])} | {paper} | {' | '.join(cells if known else [''] * 5)} | {row['verdict']} |"
+    cells = [
+        f"{row['zonda']:.4g}",
+        *(f"{row[k]:.2g}" if row["scatter"] else "" for k in ("scatter", "standard_error")),
+    ]
+    cells += [
+        f"{row[key]:.2g}" if math.isfinite(row[key]) else "–"
+        for key in ("distance_one", "distance_mean")
+    ]
+    return (
+        f"| **{row['id']}** {_text(row['claim'])} | {paper} |"
+        f" {' | '.join(cells if known else [''] * 5)} | {row['verdict']} |"
+    )
 
 
 def _text(text: str) -> str:
@@ -152,7 +193,11 @@ def _text(text: str) -> str:
 
 def _formula(found: re.Match[str]) -> str:
     """One of `FORMULAS` as the page writes it."""
-    return next(re.sub(plain, written, found[0]) for plain, written in FORMULAS if re.fullmatch(plain, found[0]))
+    return next(
+        re.sub(plain, written, found[0])
+        for plain, written in FORMULAS
+        if re.fullmatch(plain, found[0])
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""Pages of the site that are made while `mkdocs build` runs: executed tutorials, the gallery, the Python reference, and pages
-that stand elsewhere in the repository. `mkdocs.yml` names it as a hook.
+"""Pages of the site that are made while `mkdocs build` runs: executed tutorials, the gallery, the
+Python reference, and pages that stand elsewhere in the repository. `mkdocs.yml` names it as a hook.
 
-What is executed is kept in ``build/site_cache`` until the page or the code of zonda changes. With ``SITE_PREVIEW=1`` older
-results are shown as they are, so that a page can be written with ``mkdocs serve``.
+What is executed is kept in ``build/site_cache`` until the page or the code of zonda changes. With
+``SITE_PREVIEW=1`` older results are shown as they are, so that a page can be written with ``mkdocs
+serve``.
 """
 
 from __future__ import annotations
@@ -30,14 +31,21 @@ ELSEWHERE = {
 """Page of the site -> file of the repository that it shows."""
 API = {
     "scene": ("Scene and pipeline", "Scene Site Instrument Telescope Band Pipeline load plan"),
-    "data": ("Data and maps", "Data Observation Focalplane Product zonda.core.maps.map_product.MapProduct"),
+    "data": (
+        "Data and maps",
+        "Data Observation Focalplane Product zonda.core.maps.map_product.MapProduct",
+    ),
     "authors": (
         "For authors of operators",
-        "Operator Block Stream Component Signal product_name MapMaker Output Planning Knob NoiseModel WeatherSource Column "
-        "register hookimpl normals uniforms quantity",
+        (
+            "Operator Block Stream Component Signal product_name MapMaker Output Planning Knob"
+            " NoiseModel WeatherSource Column register hookimpl normals uniforms quantity"
+        ),
     ),
 }
-"""Page of the Python reference -> its title and the names on it; a name that no page has is on the first one."""
+"""Page of the Python reference -> its title and the names on it; a name that no page has is on the
+first one.
+"""
 
 
 # -- the pages ------------------------------------------------------------------------------------
@@ -45,7 +53,9 @@ API = {
 
 def made_pages() -> list[str]:
     """Paths of all pages that are made here, as `mkdocs.yml` names them."""
-    notebooks = [f"tutorials/{path.stem}.md" for path in sorted((DOCS / "tutorials").glob("*.ipynb"))]
+    notebooks = [
+        f"tutorials/{path.stem}.md" for path in sorted((DOCS / "tutorials").glob("*.ipynb"))
+    ]
     return [*notebooks, "gallery/index.md", *ELSEWHERE, *api_pages()]
 
 
@@ -67,7 +77,9 @@ def on_files(files: Any, config: Any) -> Any:
         for name, content in tutorial(notebook).items():
             add(f"tutorials/{name}", content)
     text = GALLERY
-    for pipeline in sorted((DOCS / "gallery").glob("*.yaml"), key=lambda path: int(path.stem.partition("_")[0])):
+    for pipeline in sorted(
+        (DOCS / "gallery").glob("*.yaml"), key=lambda path: int(path.stem.partition("_")[0])
+    ):
         add(f"gallery/{pipeline.stem}.png", cached(pipeline, gallery_picture)["picture.png"])
         text += gallery_entry(pipeline)
     code = (DOCS / "gallery" / "filament.py").read_text("utf-8")
@@ -77,7 +89,9 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Links as the site has them: to a made page instead of the file it is made from; none to files that it does not have."""
+    """Links as the site has them: to a made page instead of the file it is made from; none to files
+    that it does not have.
+    """
     path = page.file.src_uri
     source = ROOT / ELSEWHERE.get(path, f"docs/{path}")
     pages = {(ROOT / file).resolve(): page for page, file in ELSEWHERE.items()}
@@ -92,13 +106,20 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         elif found in pages:
             found = DOCS / pages[found]
         elif not found.is_relative_to(DOCS):
-            return f"`{found.relative_to(ROOT)}`" if text == target or "`" in text else f"{text} (`{found.relative_to(ROOT)}`)"
+            return (
+                f"`{found.relative_to(ROOT)}`"
+                if text == target or "`" in text
+                else f"{text} (`{found.relative_to(ROOT)}`)"
+            )
         elif path not in ELSEWHERE:
             return f"[{text}]({target}{anchor})"
         return f"[{text}]({os.path.relpath(found, (DOCS / path).parent)}{anchor})"
 
     parts = re.split(r"(^```.*?^```|`[^`\n]+`(?!\]))", markdown, flags=re.S | re.M)
-    return "".join(p if i % 2 else re.sub(r"\[([^\]]*)\]\(([^)#:\s]+)(#[^)]*)?\)", link, p) for i, p in enumerate(parts))
+    return "".join(
+        p if i % 2 else re.sub(r"\[([^\]]*)\]\(([^)#:\s]+)(#[^)]*)?\)", link, p)
+        for i, p in enumerate(parts)
+    )
 
 
 def title(path: Path) -> str:
@@ -137,7 +158,9 @@ def cached(source: Path, make: Any) -> dict[str, bytes]:
             (scratch / name).parent.mkdir(parents=True, exist_ok=True)
             (scratch / name).write_bytes(content)
         scratch.rename(folder)
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
 
 
 def executed(path: Path) -> dict[str, bytes]:
@@ -149,11 +172,15 @@ def executed(path: Path) -> dict[str, bytes]:
     from traitlets.config import Config
 
     notebook = nbformat.read(path, as_version=4)
-    os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])  # for cells that run `zonda`
+    os.environ["PATH"] = os.pathsep.join(
+        [str(Path(sys.executable).parent), os.environ["PATH"]]
+    )  # for cells that run `zonda`
     with TemporaryDirectory() as folder, TemporaryDirectory() as sockets:
         local = Config({"KernelManager": {"transport": "ipc", "ip": f"{sockets}/kernel"}})
         place = {"metadata": {"path": folder}}
-        NotebookClient(notebook, timeout=600, coalesce_streams=True, config=local, resources=place).execute()
+        NotebookClient(
+            notebook, timeout=600, coalesce_streams=True, config=local, resources=place
+        ).execute()
     for cell in notebook.cells:
         if cell.cell_type == "code":
             cell.outputs = [output for output in cell.outputs if without_progress(output)]
@@ -161,7 +188,9 @@ def executed(path: Path) -> dict[str, bytes]:
 
 
 def without_progress(output: Any) -> bool:
-    """Remove lines of the progress bar, which depend on the machine, from a cell's output; False if nothing else is in it."""
+    """Remove lines of the progress bar, which depend on the machine, from a cell's output; False if
+    nothing else is in it.
+    """
     if output.output_type != "stream":
         return True
     output.text = re.sub(r"^.*\[[#.]+\] +\d+ %.*\n?", "", output.text, flags=re.M)
@@ -188,10 +217,17 @@ def printed(text: str) -> str:
         lines = [line[4:] for line in match[0].strip("\n").split("\n")]
         if not any(line.strip() for line in lines):
             return "\n\n"
-        return '\n\n<div class="output" markdown>\n\n```text\n' + "\n".join(lines) + "\n```\n\n</div>\n\n"
+        return (
+            '\n\n<div class="output" markdown>\n\n```text\n'
+            + "\n".join(lines)
+            + "\n```\n\n</div>\n\n"
+        )
 
     parts = re.split(r"(^```.*?^```)", text, flags=re.S | re.M)
-    return "".join(p if i % 2 else re.sub(r"\n\n(?:    [^\n]*\n|\n(?=    ))+", block, p) for i, p in enumerate(parts))
+    return "".join(
+        p if i % 2 else re.sub(r"\n\n(?:    [^\n]*\n|\n(?=    ))+", block, p)
+        for i, p in enumerate(parts)
+    )
 
 
 def gallery_picture(path: Path) -> dict[str, bytes]:
@@ -199,14 +235,24 @@ def gallery_picture(path: Path) -> dict[str, bytes]:
     from tempfile import TemporaryDirectory
 
     with TemporaryDirectory() as folder:
-        shutil.copy(ROOT / "pipelines" / "data" / "merging_cluster.fits", Path(folder) / "my_cluster.fits")
+        shutil.copy(
+            ROOT / "pipelines" / "data" / "merging_cluster.fits", Path(folder) / "my_cluster.fits"
+        )
         if "filament.fits" in path.read_text("utf-8"):
-            subprocess.run([sys.executable, DOCS / "gallery" / "filament.py"], cwd=folder, check=True)
+            subprocess.run(
+                [sys.executable, DOCS / "gallery" / "filament.py"], cwd=folder, check=True
+            )
         zonda = Path(sys.executable).with_name("zonda")
-        done = subprocess.run([zonda, "run", path, "--output", "out"], cwd=folder, capture_output=True, text=True)
+        done = subprocess.run(
+            [zonda, "run", path, "--output", "out"], cwd=folder, capture_output=True, text=True
+        )
         if done.returncode:
             raise SystemExit(f"{path.relative_to(ROOT)}: {done.stderr}")
-        return {"picture.png": beside([Path(folder) / "out" / name for name in header(path)["picture"].split(", ")])}
+        return {
+            "picture.png": beside(
+                [Path(folder) / "out" / name for name in header(path)["picture"].split(", ")]
+            )
+        }
 
 
 def beside(pictures: list[Path]) -> bytes:
@@ -242,7 +288,9 @@ def header(path: Path) -> dict[str, str]:
     lines = re.match(r"(?:#.*\n)+", path.read_text("utf-8"))
     assert lines is not None, path
     found = dict(re.findall(r"^# (title|picture): (.*)$", lines[0], re.M))
-    text = [line[2:] for line in lines[0].splitlines() if not re.match(r"# (title|picture): ", line)]
+    text = [
+        line[2:] for line in lines[0].splitlines() if not re.match(r"# (title|picture): ", line)
+    ]
     return {**found, "text": " ".join(text)}
 
 
@@ -252,7 +300,8 @@ def gallery_entry(path: Path) -> str:
     code = re.sub(r"^(?:#.*\n)+", "", path.read_text("utf-8"))
     figure = f"![{about['title']}]({path.stem}.png)"
     return (
-        f'\n## {about["title"]}\n\n{about["text"]}\n\n<div class="beside" markdown>\n\n{figure}\n\n```yaml\n{code}```\n\n</div>\n'
+        f'\n## {about["title"]}\n\n{about["text"]}\n\n<div class="beside"'
+        f" markdown>\n\n{figure}\n\n```yaml\n{code}```\n\n</div>\n"
     )
 
 
@@ -260,7 +309,9 @@ def gallery_entry(path: Path) -> str:
 
 
 def api_pages() -> dict[str, str]:
-    """Pages that mkdocstrings fills from docstrings: zonda's public names, and every operator by folder."""
+    """Pages that mkdocstrings fills from docstrings: zonda's public names, and every operator by
+    folder.
+    """
     import zonda
     from zonda.core import errors
     from zonda.core.configuration import units
@@ -269,7 +320,11 @@ def api_pages() -> dict[str, str]:
     folders, folder_of = of_reference("FOLDERS"), of_reference("folder_of")
     public = [name for name in zonda.__all__ if not name.startswith("_")]
     quantities = [name for name in public if hasattr(units, name)]
-    raised = [name for name, cls in vars(errors).items() if isinstance(cls, type) and issubclass(cls, errors.ZondaError)]
+    raised = [
+        name
+        for name, cls in vars(errors).items()
+        if isinstance(cls, type) and issubclass(cls, errors.ZondaError)
+    ]
     placed = {*quantities, *raised} | {name for _, names in API.values() for name in names.split()}
     first = next(iter(API))
     pages, lists = {}, []
@@ -280,7 +335,10 @@ def api_pages() -> dict[str, str]:
         lists.append((title, key, [n.rsplit(".", 1)[-1] for n in shown]))
     pages["api/units.md"] = units_page(quantities)
     pages["api/errors.md"] = page("Errors", [f"zonda.core.errors.{n}" for n in raised])
-    pages["api/testing.md"] = "# Testing\n\n::: zonda.testing\n    options: {show_root_heading: false, heading_level: 2}\n"
+    pages["api/testing.md"] = (
+        "# Testing\n\n::: zonda.testing\n    options: {show_root_heading: false, heading_level:"
+        " 2}\n"
+    )
     lists += [("Units of parameters", "units", quantities), ("Errors", "errors", raised)]
     found = [operators.get(c.name) for c in operators.candidates() if c.distribution == "zonda"]
     for folder, title in folders.items():
@@ -306,11 +364,20 @@ def of_reference(name: str) -> Any:
 
 
 def operator(cls: Any) -> str:
-    """What mkdocstrings says of an operator, with the parameters that it has from its base classes."""
+    """What mkdocstrings says of an operator, with the parameters that it has from its base
+    classes.
+    """
     from zonda.core.configuration.describe import described
 
-    inherited = [name for name in described(cls) if name not in vars(cls).get("__annotations__", {}) and name != "name"]
-    return f"::: {cls.__module__}.{cls.__qualname__}\n    options: {{inherited_members: {inherited}}}\n\n"
+    inherited = [
+        name
+        for name in described(cls)
+        if name not in vars(cls).get("__annotations__", {}) and name != "name"
+    ]
+    return (
+        f"::: {cls.__module__}.{cls.__qualname__}\n    options: {{inherited_members:"
+        f" {inherited}}}\n\n"
+    )
 
 
 def units_page(names: list[str]) -> str:
@@ -318,14 +385,37 @@ def units_page(names: list[str]) -> str:
     from zonda.core.configuration import units
 
     rows = [f"| `zonda.{n}` | {getattr(units, n).__metadata__[0].unit} |" for n in names]
-    head = "# Units of parameters\n\nTypes of an operator's parameters. Each takes text with a unit and is kept as a float.\n"
-    return "\n".join([head, "| type | kept in |", "|---|---|", *rows, "", "::: zonda.core.configuration.parameters.quantity", ""])
+    head = (
+        "# Units of parameters\n\nTypes of an operator's parameters. Each takes text with a unit"
+        " and is kept as a float.\n"
+    )
+    return "\n".join(
+        [
+            head,
+            "| type | kept in |",
+            "|---|---|",
+            *rows,
+            "",
+            "::: zonda.core.configuration.parameters.quantity",
+            "",
+        ]
+    )
 
 
 def index(lists: list[tuple[str, str, list[str]]]) -> str:
     """All names, with links to their pages."""
-    lines = ["# Python", "", "`import zonda` gives all of these; operators are `zonda.PointingDaisy` and so on. Nothing heavy is"]
-    lines += ["imported until a name is used. A first example is [on the front page](../index.md).", ""]
+    lines = [
+        "# Python",
+        "",
+        (
+            "`import zonda` gives all of these; operators are `zonda.PointingDaisy` and so on."
+            " Nothing heavy is"
+        ),
+    ]
+    lines += [
+        "imported until a name is used. A first example is [on the front page](../index.md).",
+        "",
+    ]
     for title, key, names in lists:
         lines += [f"**[{title}]({key}.md)**: " + ", ".join(f"`{n}`" for n in names) + "", ""]
     return "\n".join(lines)

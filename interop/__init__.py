@@ -1,1 +1,3 @@
-"""Bridges: scans as objects of other packages, and back. Each module needs the extra of its name."""
+"""Bridges: scans as objects of other packages, and back. Each module needs the extra of its
+name.
+"""

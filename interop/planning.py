@@ -15,5 +15,11 @@ class ToastPlanning(Planning[ToastOperator]):
     smaller = "make the scan shorter: TOAST holds all of it in float64"
 
     def memory(self, observation: Observation) -> int:
-        """For TOAST the signal in float64, its flags and as much again to work with; what it made of each signal."""
-        return (8 + 2 + 1 + 8 + 8 * len(observation.signals)) * observation.n_detectors * observation.n_samples
+        """For TOAST the signal in float64, its flags and as much again to work with; what it made
+        of each signal.
+        """
+        return (
+            (8 + 2 + 1 + 8 + 8 * len(observation.signals))
+            * observation.n_detectors
+            * observation.n_samples
+        )

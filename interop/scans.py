@@ -1,4 +1,6 @@
-"""One scan with one stream, from a run in Python or from a file: what the bridges turn into objects of other packages."""
+"""One scan with one stream, from a run in Python or from a file: what the bridges turn into objects
+of other packages.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ from zonda.operators.io.save_tod import reader
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 
 Source = Data | Observation | TimeOrderedData | str | os.PathLike[str]
-"""The result of `Pipeline.run`, one of its observations, what `load_tod` returned, or the path of such a file."""
+"""The result of `Pipeline.run`, one of its observations, what `load_tod` returned, or the path of
+such a file.
+"""
 
 
 @dataclass
@@ -34,7 +38,8 @@ class Scan:
     stream
         Its name.
     spoilt
-        (n_det, n_samp) True where a single sample of a detector is not finite, or the file flags it.
+        (n_det, n_samp) True where a single sample of a detector is not finite, or the file flags
+        it.
     """
 
     tod: TimeOrderedData
@@ -48,7 +53,8 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
     Parameters
     ----------
     source
-        See `Source`. Of a run and its observations the stream must have been kept: ``pipeline.run(scene, keep=["signal"])``.
+        See `Source`. Of a run and its observations the stream must have been kept:
+        ``pipeline.run(scene, keep=["signal"])``.
     stream
         Its name.
     scan
@@ -63,11 +69,17 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
     if isinstance(source, Data):
         scene, source = source.scene, one_scan(source.observations, scan)
     elif scan is not None:
-        raise InputError("scan chooses from the scans of a run", place=f"scan={scan!r}", cure="leave it out: there is one")
+        raise InputError(
+            "scan chooses from the scans of a run",
+            place=f"scan={scan!r}",
+            cure="leave it out: there is one",
+        )
     if isinstance(source, Observation):
         values, flagged = kept(source, stream), None
         tod = TimeOrderedData.of(source)
-        if scene is not None and tod.weather is None:  # no step made an atmosphere of it; as SaveTOD writes it
+        if (
+            scene is not None and tod.weather is None
+        ):  # no step made an atmosphere of it; as SaveTOD writes it
             with contextlib.suppress(InputError):
                 tod.weather = ground_weather.get("scene")(scene)
     elif isinstance(source, TimeOrderedData):
@@ -82,7 +94,9 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
     return Scan(replace(tod, streams={stream: values}), stream, spoilt)
 
 
-def _read(path: str | os.PathLike[str], stream: str) -> tuple[TimeOrderedData, NDArray[np.float64], NDArray[np.bool_] | None]:
+def _read(
+    path: str | os.PathLike[str], stream: str
+) -> tuple[TimeOrderedData, NDArray[np.float64], NDArray[np.bool_] | None]:
     """All of a file but other streams; which single samples it flags."""
     opened = reader(path)
     try:
@@ -90,11 +104,17 @@ def _read(path: str | os.PathLike[str], stream: str) -> tuple[TimeOrderedData, N
         if stream not in opened.streams:
             raise _absent(stream, opened.streams, str(path))
         every, whole = np.arange(tod.n_detectors), slice(0, tod.n_samples)
-        values, _ = RecordedStream(opened, stream, every, np.uint8(0)).read(slice(0, tod.n_detectors), whole)
+        values, _ = RecordedStream(opened, stream, every, np.uint8(0)).read(
+            slice(0, tod.n_detectors), whole
+        )
         flags = opened.flags(every, whole)
     finally:
         opened.close()
-    return tod, values, None if flags is None else np.asarray((flags & np.uint8(DETECTOR_MASK)) != 0, np.bool_)
+    return (
+        tod,
+        values,
+        None if flags is None else np.asarray((flags & np.uint8(DETECTOR_MASK)) != 0, np.bool_),
+    )
 
 
 def _absent(stream: str, streams: Iterable[str], place: str) -> InputError:

@@ -35,36 +35,46 @@ FLAGS = {
     "sun_up": SUN_UP,
     "sun_close": SUN_CLOSE,
 }
-"""Flags of samples by their names in the AxisManager, of all detectors; the turnarounds are one for all (`_scans`)."""
+"""Flags of samples by their names in the AxisManager, of all detectors; the turnarounds are one for
+all (`_scans`).
+"""
 SCANS = {"left_scan": "rightleft", "right_scan": "leftright"}
 """Names of sotodlib: to the left is towards smaller azimuth; ends of the intervals' names."""
 
 
 def to_axismanager(
-    source: Source, stream: str = "signal", *, scan: str | int | None = None, dtype: Literal["float32", "float64"] = "float32"
+    source: Source,
+    stream: str = "signal",
+    *,
+    scan: str | int | None = None,
+    dtype: Literal["float32", "float64"] = "float32",
 ) -> Any:
     """A scan as a `sotodlib.core.AxisManager` with sotodlib's names.
 
-    ========================  ==========================================================================================
-    signal                    (dets, samps) K_RJ, the atmosphere's mean emission included
-    timestamps                (samps,) POSIX seconds
-    boresight.az, el, roll    (samps,) rad; the azimuth without jumps of 360 deg
-    boresight_equ.ra ...      ra, dec, psi (samps,) rad, ICRS: zonda's own pointing, which sotodlib's maps use where it is there
-    focal_plane.xi ...        xi, eta (sines, not zonda's tangents) and gamma (dets,) rad
-    flags                     FlagManager of RangesMatrix (dets, samps): those of `FLAGS`; ``detectors``, whole rows; ``samples``,
-                              single samples that are not finite or flagged in the file; ``excluded``, all that no map uses.
-                              ``turnarounds``, ``left_scan``, ``right_scan``: Ranges (samps,); the last two where there are throws
-    det_info                  name, readout_id, det_id, band, wafer_slot, wafer.bandpass, wafer.array and wafer.type (dets,)
-    iir_params                empty: no filter of the read-out is to be taken off
-    obs_info                  obs_id, telescope, timestamp, start_time, stop_time, duration
-    hwp_angle                 (samps,) rad, where there is a half-wave plate
-    ========================  ==========================================================================================
+    ========================
+    ==========================================================================================
+    signal                    (dets, samps) K_RJ, the atmosphere's mean emission included timestamps
+    (samps,) POSIX seconds boresight.az, el, roll    (samps,) rad; the azimuth without jumps of 360
+    deg boresight_equ.ra ...      ra, dec, psi (samps,) rad, ICRS: zonda's own pointing, which
+    sotodlib's maps use where it is there focal_plane.xi ...        xi, eta (sines, not zonda's
+    tangents) and gamma (dets,) rad flags                     FlagManager of RangesMatrix (dets,
+    samps): those of `FLAGS`; ``detectors``, whole rows; ``samples``,
+                              single samples that are not finite or flagged in the file;
+                              ``excluded``, all that no map uses. ``turnarounds``, ``left_scan``,
+                              ``right_scan``: Ranges (samps,); the last two where there are throws
+    det_info                  name, readout_id, det_id, band, wafer_slot, wafer.bandpass,
+    wafer.array and wafer.type (dets,) iir_params                empty: no filter of the read-out is
+    to be taken off obs_info                  obs_id, telescope, timestamp, start_time, stop_time,
+    duration hwp_angle                 (samps,) rad, where there is a half-wave plate
+    ========================
+    ==========================================================================================
 
     Parameters
     ----------
     source
-        The result of ``pipeline.run(scene, keep=["signal"])``, one of its observations, a file of `SaveTOD` (or another in
-        TOAST's HDF5 layout), or what `load_tod` returned. Of a camera of several bands each has scans of its own.
+        The result of ``pipeline.run(scene, keep=["signal"])``, one of its observations, a file of
+        `SaveTOD` (or another in TOAST's HDF5 layout), or what `load_tod` returned. Of a camera of
+        several bands each has scans of its own.
     stream
         Name of the stream.
     scan
@@ -75,21 +85,37 @@ def to_axismanager(
     Raises
     ------
     InputError
-        sotodlib is not installed; the stream was not kept or is not in the file; there is no azimuth and elevation.
+        sotodlib is not installed; the stream was not kept or is not in the file; there is no
+        azimuth and elevation.
     """
     core = needed("sotodlib.core", EXTRA)
     found = scan_of(source, stream, scan)
     tod = found.tod
     _check_azel(tod)
-    aman = core.AxisManager(core.LabelAxis("dets", list(tod.names)), core.OffsetAxis("samps", tod.n_samples, 0, tod.name))
+    aman = core.AxisManager(
+        core.LabelAxis("dets", list(tod.names)),
+        core.OffsetAxis("samps", tod.n_samples, 0, tod.name),
+    )
     aman.wrap("timestamps", tod.times, [(0, "samps")])
-    aman.wrap("signal", np.ascontiguousarray(tod.streams[stream], dtype), [(0, "dets"), (1, "samps")])
+    aman.wrap(
+        "signal", np.ascontiguousarray(tod.streams[stream], dtype), [(0, "dets"), (1, "samps")]
+    )
     azimuth, elevation, roll = _angles(tod.boresight_azel)
-    _wrap(core, aman, "boresight", "samps", {"az": np.unwrap(-azimuth), "el": elevation, "roll": roll})
+    _wrap(
+        core, aman, "boresight", "samps", {"az": np.unwrap(-azimuth), "el": elevation, "roll": roll}
+    )
     if len(tod.boresight_radec):
         ra, dec, psi = _angles(tod.boresight_radec)
-        _wrap(core, aman, "boresight_equ", "samps", {"ra": ra % (2 * np.pi), "dec": dec, "psi": psi})
-    _wrap(core, aman, "focal_plane", "dets", dict(zip(("xi", "eta", "gamma"), tod.xieta_sotodlib(), strict=True)))
+        _wrap(
+            core, aman, "boresight_equ", "samps", {"ra": ra % (2 * np.pi), "dec": dec, "psi": psi}
+        )
+    _wrap(
+        core,
+        aman,
+        "focal_plane",
+        "dets",
+        dict(zip(("xi", "eta", "gamma"), tod.xieta_sotodlib(), strict=True)),
+    )
     if tod.hwp_angle is not None:
         aman.wrap("hwp_angle", tod.hwp_angle, [(0, "samps")])
     aman.wrap("flags", _flags(core, aman, found))
@@ -100,30 +126,46 @@ def to_axismanager(
 
 
 def sight_line(source: Source, *, scan: str | int | None = None, stream: str = "signal") -> Any:
-    """The boresight on the sky as so3g computes it from azimuth, elevation and roll: a `so3g.proj.CelestialSightLine`.
+    """The boresight on the sky as so3g computes it from azimuth, elevation and roll: a
+    `so3g.proj.CelestialSightLine`.
 
-    At the site of the scan, without refraction (zonda points above the atmosphere), with UT1-UTC and polar motion of the IERS.
-    zonda's own directions are in ``boresight_equ`` of `to_axismanager`.
+    At the site of the scan, without refraction (zonda points above the atmosphere), with UT1-UTC
+    and polar motion of the IERS. zonda's own directions are in ``boresight_equ`` of
+    `to_axismanager`.
 
     Raises InputError as `to_axismanager`.
     """
     proj = needed("so3g.proj", EXTRA)
     tod = scan_of(source, stream, scan).tod
     _check_azel(tod)
-    middle = 40587.0 + (tod.times[0] + tod.times[-1]) / 2 / 86400  # POSIX seconds as a modified Julian date
+    middle = (
+        40587.0 + (tod.times[0] + tod.times[-1]) / 2 / 86400
+    )  # POSIX seconds as a modified Julian date
     earth = orientation(np.array([middle]))
     longitude, latitude, turned = _moved_by_the_pole(tod.site, float(earth.x[0]), float(earth.y[0]))
-    site = proj.EarthlySite(float(np.degrees(longitude)), float(np.degrees(latitude)), float(tod.site[3]))
+    site = proj.EarthlySite(
+        float(np.degrees(longitude)), float(np.degrees(latitude)), float(tod.site[3])
+    )
     azimuth, elevation, roll = _angles(tod.boresight_azel)
     return proj.CelestialSightLine.az_el(
-        tod.times, turned - azimuth, elevation, roll=roll, site=site, weather="vacuum", dut1=float(earth.ut1_utc[0])
+        tod.times,
+        turned - azimuth,
+        elevation,
+        roll=roll,
+        site=site,
+        weather="vacuum",
+        dut1=float(earth.ut1_utc[0]),
     )
 
 
-def _moved_by_the_pole(site: tuple[str, float, float, float], x: float, y: float) -> tuple[float, float, float]:
-    """Longitude and latitude of a site about the celestial pole, and the azimuth of its north there, rad.
+def _moved_by_the_pole(
+    site: tuple[str, float, float, float], x: float, y: float
+) -> tuple[float, float, float]:
+    """Longitude and latitude of a site about the celestial pole, and the azimuth of its north
+    there, rad.
 
-    x, y: polar motion [rad], which `CelestialSightLine.az_el` has no argument for. IERS Conventions (2010), equation 5.3.
+    x, y: polar motion [rad], which `CelestialSightLine.az_el` has no argument for. IERS Conventions
+    (2010), equation 5.3.
     """
     import erfa
 
@@ -136,13 +178,21 @@ def _moved_by_the_pole(site: tuple[str, float, float, float], x: float, y: float
     _, north, up = axes(longitude, latitude) @ erfa.pom00(x, y, 0.0)
     longitude, latitude = np.arctan2(up[1], up[0]), np.arcsin(up[2])
     east_there, north_there, _ = axes(longitude, latitude)
-    return float(longitude), float(latitude), float(np.arctan2(north @ east_there, north @ north_there))
+    return (
+        float(longitude),
+        float(latitude),
+        float(np.arctan2(north @ east_there, north @ north_there)),
+    )
 
 
 def _check_azel(tod: TimeOrderedData) -> None:
     if not len(tod.boresight_azel):
-        cure = "load the file with LoadTOD and save it again: azimuth and elevation are then computed"
-        raise InputError("has no azimuth and elevation (shared/boresight_azel)", place=tod.name, cure=cure)
+        cure = (
+            "load the file with LoadTOD and save it again: azimuth and elevation are then computed"
+        )
+        raise InputError(
+            "has no azimuth and elevation (shared/boresight_azel)", place=tod.name, cure=cure
+        )
 
 
 def _angles(quaternions: Floats) -> tuple[Floats, Floats, Floats]:
@@ -176,37 +226,64 @@ def _flags(core: Any, aman: Any, scan: Scan) -> Any:
         flags.wrap(name, so3g.Ranges.from_mask(where), [(0, "samps")])
     dead = (tod.detector_flags & np.uint8(DETECTOR_MASK)) != 0
     flags.wrap_dets("detectors", dead)
-    flags.wrap_dets_samps("samples", so3g.RangesMatrix([so3g.Ranges.from_mask(row) for row in scan.spoilt]))
-    excluded = of_samples((tod.flags & np.uint8(SAMPLE_MASK)) != 0) + flags.detectors + flags.samples
+    flags.wrap_dets_samps(
+        "samples", so3g.RangesMatrix([so3g.Ranges.from_mask(row) for row in scan.spoilt])
+    )
+    excluded = (
+        of_samples((tod.flags & np.uint8(SAMPLE_MASK)) != 0) + flags.detectors + flags.samples
+    )
     flags.wrap_dets_samps("excluded", excluded)
     return flags
 
 
 def _scans(tod: TimeOrderedData) -> dict[str, NDArray[np.bool_]]:
-    """(n_samp,) turnarounds and, where the scan has throws, the direction of each sample: that of the throw it is in."""
+    """(n_samp,) turnarounds and, where the scan has throws, the direction of each sample: that of
+    the throw it is in.
+    """
     found = {"turnarounds": np.asarray((tod.flags & np.uint8(TURNAROUND)) != 0, np.bool_)}
     if any(tod.intervals.get(f"throw_{end}") for end in SCANS.values()):
-        found |= {name: samples_in(tod.intervals.get(f"throw_{end}", []), tod.seconds) for name, end in SCANS.items()}
+        found |= {
+            name: samples_in(tod.intervals.get(f"throw_{end}", []), tod.seconds)
+            for name, end in SCANS.items()
+        }
     return found
 
 
 def _det_info(core: Any, aman: Any, tod: TimeOrderedData) -> Any:
     names, n = np.array(tod.names), tod.n_detectors
     centre = tod.columns.get("band_centre", np.full(n, np.nan))
-    band = np.array([str(tod.metadata["band"])] * n if "band" in tod.metadata else [f"{c / 1e9:.4g} GHz" for c in centre])
+    band = np.array(
+        [str(tod.metadata["band"])] * n
+        if "band" in tod.metadata
+        else [f"{c / 1e9:.4g} GHz" for c in centre]
+    )
     wafer = tod.columns.get("wafer", np.zeros(n)).astype(int)
     info = core.AxisManager(aman.dets)
     slots = np.array([f"ws{number}" for number in wafer])
-    for name, values in {"name": names, "readout_id": names, "det_id": names, "band": band, "wafer_slot": slots}.items():
+    for name, values in {
+        "name": names,
+        "readout_id": names,
+        "det_id": names,
+        "band": band,
+        "wafer_slot": slots,
+    }.items():
         info.wrap(name, values, [(0, "dets")])
-    _wrap(core, info, "wafer", "dets", {"bandpass": band, "array": slots, "type": np.full(n, "OPTC")})
+    _wrap(
+        core, info, "wafer", "dets", {"bandpass": band, "array": slots, "type": np.full(n, "OPTC")}
+    )
     return info
 
 
 def _obs_info(core: Any, tod: TimeOrderedData) -> Any:
     info = core.AxisManager()
     first, last = float(tod.times[0]), float(tod.times[-1])
-    about = {"obs_id": tod.name, "telescope": tod.telescope, "timestamp": first, "start_time": first, "stop_time": last}
+    about = {
+        "obs_id": tod.name,
+        "telescope": tod.telescope,
+        "timestamp": first,
+        "start_time": first,
+        "stop_time": last,
+    }
     for name, value in {**about, "duration": last - first}.items():
         info.wrap(name, value)
     return info

@@ -1,4 +1,6 @@
-"""Scans as TOAST's Observations and back, without a file; zonda's operators in a pipeline of TOAST. Needs the extra toast."""
+"""Scans as TOAST's Observations and back, without a file; zonda's operators in a pipeline of TOAST.
+Needs the extra toast.
+"""
 
 from __future__ import annotations
 
@@ -43,19 +45,22 @@ for _part in ("instrument", "noise", "ops", "traits", "weather"):
 START = "zonda_start_utc"
 
 
-def to_toast(source: Source, stream: str = "signal", *, scan: str | int | None = None, comm: Any = None) -> Any:
+def to_toast(
+    source: Source, stream: str = "signal", *, scan: str | int | None = None, comm: Any = None
+) -> Any:
     """A scan as a `toast.Observation`: what TOAST reads from a file of `SaveTOD`, without the file.
 
-    ``detdata`` has the stream [K] and ``flags``, whose bit 1 marks single samples that are not finite or flagged in the file;
-    ``shared`` the times, the boresight and the flags; the noise model is the nominal one. Bands of one scan are one session.
+    ``detdata`` has the stream [K] and ``flags``, whose bit 1 marks single samples that are not
+    finite or flagged in the file; ``shared`` the times, the boresight and the flags; the noise
+    model is the nominal one. Bands of one scan are one session.
 
     Parameters
     ----------
     source, stream, scan
         As for `zonda.interop.sotodlib.to_axismanager`.
     comm
-        A `toast.Comm`. Where absent: ``toast.Comm()``. In a group of several processes each calls this with the same scan and
-        holds its share of the detectors.
+        A `toast.Comm`. Where absent: ``toast.Comm()``. In a group of several processes each calls
+        this with the same scan and holds its share of the detectors.
 
     Raises
     ------
@@ -64,14 +69,23 @@ def to_toast(source: Source, stream: str = "signal", *, scan: str | int | None =
     """
     found = scan_of(source, stream, scan)
     ob = unfilled(found.tod, toast.Comm() if comm is None else comm)
-    fill(ob, stream, found.tod.detector_flags, lambda row: (found.tod.streams[stream][row], found.spoilt[row]))
+    fill(
+        ob,
+        stream,
+        found.tod.detector_flags,
+        lambda row: (found.tod.streams[stream][row], found.spoilt[row]),
+    )
     return ob
 
 
 def unfilled(tod: TimeOrderedData, comm: Any) -> Any:
     """A `toast.Observation` of all but the streams of a scan."""
-    session = toast.instrument.Session(session_of(tod), start=_datetime(tod.times[0]), end=_datetime(tod.times[-1]))
-    ob = toast.Observation(comm, _telescope(tod), n_samples=tod.n_samples, name=tod.name, session=session)
+    session = toast.instrument.Session(
+        session_of(tod), start=_datetime(tod.times[0]), end=_datetime(tod.times[-1])
+    )
+    ob = toast.Observation(
+        comm, _telescope(tod), n_samples=tod.n_samples, name=tod.name, session=session
+    )
     _fill_shared(ob, tod)
     if (noise := _noise(tod, list(ob.local_detectors))) is not None:
         ob["noise_model"] = noise
@@ -91,20 +105,32 @@ def _telescope(tod: TimeOrderedData) -> Any:
     name, latitude, longitude, altitude = tod.site
     table = detectors_table(tod)
     plane = toast.instrument.Focalplane(
-        detector_data=table, sample_rate=table.meta["sample_rate"], field_of_view=table.meta["field_of_view"]
+        detector_data=table,
+        sample_rate=table.meta["sample_rate"],
+        field_of_view=table.meta["field_of_view"],
     )
     site = toast.instrument.GroundSite(
-        name, latitude * u.rad, longitude * u.rad, altitude * u.m, weather=tod.weather and _weather(tod.weather)
+        name,
+        latitude * u.rad,
+        longitude * u.rad,
+        altitude * u.m,
+        weather=tod.weather and _weather(tod.weather),
     )
     return toast.instrument.Telescope(tod.telescope, focalplane=plane, site=site)
 
 
 def _weather(weather: GroundWeather) -> Any:
-    """The weather as TOAST has it. Its west wind blows towards east, as ours; there are no clouds."""
+    """The weather as TOAST has it. Its west wind blows towards east, as ours; there are no
+    clouds.
+    """
     import astropy.units as u
 
-    found = {theirs: u.Quantity(getattr(weather, ours), unit) for ours, (theirs, unit) in WEATHER.items()}
-    return toast.weather.Weather(time=_datetime(weather.time), ice_water=0 * u.mm, liquid_water=0 * u.mm, **found)
+    found = {
+        theirs: u.Quantity(getattr(weather, ours), unit) for ours, (theirs, unit) in WEATHER.items()
+    }
+    return toast.weather.Weather(
+        time=_datetime(weather.time), ice_water=0 * u.mm, liquid_water=0 * u.mm, **found
+    )
 
 
 def _fill_shared(ob: Any, tod: TimeOrderedData) -> None:
@@ -124,8 +150,8 @@ def _fill_shared(ob: Any, tod: TimeOrderedData) -> None:
 def fill(ob: Any, stream: str, flags: Any, row_of: Callable[[int], tuple[AnyFloats, Any]]) -> None:
     """Give an observation its stream [K] and the flags of detectors and single samples.
 
-    ``flags``: (n_det,) of detectors. ``row_of``: values (n_samp,) of a detector by its number, and which of them (n_samp,) cannot
-    be used.
+    ``flags``: (n_det,) of detectors. ``row_of``: values (n_samp,) of a detector by its number, and
+    which of them (n_samp,) cannot be used.
     """
     import astropy.units as u
 
@@ -134,7 +160,9 @@ def fill(ob: Any, stream: str, flags: Any, row_of: Callable[[int], tuple[AnyFloa
     ob.detdata.create("flags", dtype=np.uint8)
     for name in ob.local_detectors:
         ob.detdata[stream][name], spoilt = row_of(rows[name])
-        ob.detdata["flags"][name] = flags[rows[name]] | np.where(spoilt, np.uint8(INVALID), np.uint8(0))
+        ob.detdata["flags"][name] = flags[rows[name]] | np.where(
+            spoilt, np.uint8(INVALID), np.uint8(0)
+        )
     ob.update_local_detector_flags({name: int(flags[rows[name]]) for name in ob.local_detectors})
 
 
@@ -158,26 +186,43 @@ def _noise(tod: TimeOrderedData, local: list[str]) -> Any:
 
 
 def from_toast(ob: Any, stream: str | None = "signal") -> TimeOrderedData:
-    """A `toast.Observation` as `TimeOrderedData`, which `save_tod` writes and `to_axismanager` takes.
+    """A `toast.Observation` as `TimeOrderedData`, which `save_tod` writes and `to_axismanager`
+    takes.
 
-    Its pointing, focal plane, flags, intervals, weather and one stream (None: no stream), converted to K. A sample with a bit of
-    ``detdata/flags`` that excludes it becomes NaN.
+    Its pointing, focal plane, flags, intervals, weather and one stream (None: no stream), converted
+    to K. A sample with a bit of ``detdata/flags`` that excludes it becomes NaN.
 
-    Raises InputError where it has no site on the ground, no pointing, or no such stream in kelvin, or is spread over processes.
+    Raises InputError where it has no site on the ground, no pointing, or no such stream in kelvin,
+    or is spread over processes.
     """
     place = f"TOAST's observation {ob.name}"
     if ob.comm.group_size != 1:
-        raise InputError("is spread over several processes", place=place, cure="use toast.Comm(groupsize=1)")
+        raise InputError(
+            "is spread over several processes", place=place, cure="use toast.Comm(groupsize=1)"
+        )
     if not hasattr(ob.telescope.site, "earthloc"):
-        raise InputError("has no site on the ground", place=place, cure="give its telescope a toast.instrument.GroundSite")
+        raise InputError(
+            "has no site on the ground",
+            place=place,
+            cure="give its telescope a toast.instrument.GroundSite",
+        )
     names, table = list(ob.local_detectors), ob.telescope.focalplane.detector_data
     order = {str(name): row for row, name in enumerate(table["name"])}
     rows = np.array([order[name] for name in names], np.intp)
     times = np.array(ob.shared["times"].data)
     location = ob.telescope.site.earthloc.geodetic
-    site = (ob.telescope.site.name, location.lat.rad, location.lon.rad, float(location.height.to_value("m")))
+    site = (
+        ob.telescope.site.name,
+        location.lat.rad,
+        location.lon.rad,
+        float(location.height.to_value("m")),
+    )
     seconds = np.array(ob.shared["seconds"].data) if "seconds" in ob.shared else times - times[0]
-    own = {key.removeprefix("zonda_"): value for key, value in _metadata(ob).items() if key not in (START, FLAGS_ARE)}
+    own = {
+        key.removeprefix("zonda_"): value
+        for key, value in _metadata(ob).items()
+        if key not in (START, FLAGS_ARE)
+    }
     tod = TimeOrderedData(
         name=ob.name,
         start=str(_metadata(ob).get(START, Instant(round(float(times[0]) * 1e9)).isoformat())),
@@ -189,13 +234,21 @@ def from_toast(ob: Any, stream: str | None = "signal") -> TimeOrderedData:
         site=site,
         boresight_azel=_boresight(ob, "boresight_azel"),
         boresight_radec=_boresight(ob, "boresight_radec"),
-        flags=np.array(ob.shared["flags"].data, np.uint8) if "flags" in ob.shared else np.zeros(len(times), np.uint8),
+        flags=(
+            np.array(ob.shared["flags"].data, np.uint8)
+            if "flags" in ob.shared
+            else np.zeros(len(times), np.uint8)
+        ),
         detector_flags=np.array([ob.local_detector_flags[name] for name in names], np.uint8),
         names=names,
         quats=np.asarray(table["quat"][rows], np.float64),
         columns=columns_of(table, rows),
         streams={} if stream is None else {stream: _stream(ob, stream, place)},
-        intervals={name: _spans(ob.intervals[name], times, seconds) for name in ob.intervals if name != ob.intervals.all_name},
+        intervals={
+            name: _spans(ob.intervals[name], times, seconds)
+            for name in ob.intervals
+            if name != ob.intervals.all_name
+        },
         weather=_ground_weather(ob.telescope.site.weather),
         hwp_angle=np.array(ob.shared["hwp_angle"].data) if "hwp_angle" in ob.shared else None,
         azimuth=np.array(ob.shared["azimuth"].data, np.float64) if "azimuth" in ob.shared else None,
@@ -229,7 +282,11 @@ def _stream(ob: Any, stream: str, place: str) -> Floats:
     data = ob.detdata[stream]
     if not data.units.is_equivalent("K"):
         cure = "calibrate it to a temperature"
-        raise InputError(f"the stream {stream} is in {str(data.units) or 'no unit'!r}, not in kelvin", place=place, cure=cure)
+        raise InputError(
+            f"the stream {stream} is in {str(data.units) or 'no unit'!r}, not in kelvin",
+            place=place,
+            cure=cure,
+        )
     values: Floats = np.array(data.data, np.float64) * float(data.units.to("K"))
     if "flags" in ob.detdata:
         dead = np.array([ob.local_detector_flags[name] for name in ob.local_detectors], np.uint8)
@@ -242,7 +299,10 @@ def _ground_weather(weather: Any) -> GroundWeather | None:
     """None where there is none."""
     if weather is None:
         return None
-    stated = {ours: float(getattr(weather, theirs).to_value(unit)) for ours, (theirs, unit) in WEATHER.items()}
+    stated = {
+        ours: float(getattr(weather, theirs).to_value(unit))
+        for ours, (theirs, unit) in WEATHER.items()
+    }
     return GroundWeather(time=weather.time.timestamp(), **stated)
 
 
@@ -251,14 +311,16 @@ def _datetime(seconds: float) -> datetime:
 
 
 class Simulate(toast.ops.Operator):  # type: ignore[misc, name-defined]
-    """Operator of TOAST that adds what zonda's operators simulate on each observation's pointing to its ``detdata``.
+    """Operator of TOAST that adds what zonda's operators simulate on each observation's pointing to
+    its ``detdata``.
 
     For example, in place of SimAtmosphere::
 
         Simulate([zonda.AtmosphereLayers(pwv="1 mm"), zonda.Efficiency()], seed=1).apply(data)
 
-    Observations of one session see the same turbulence (one draw for each ``seed`` and session). Site, focal plane, beams and
-    band are the observation's; what it does not state is the instrument's of ``scene``. A flagged detector gets a signal too.
+    Observations of one session see the same turbulence (one draw for each ``seed`` and session).
+    Site, focal plane, beams and band are the observation's; what it does not state is the
+    instrument's of ``scene``. A flagged detector gets a signal too.
 
     Parameters
     ----------
@@ -269,19 +331,28 @@ class Simulate(toast.ops.Operator):  # type: ignore[misc, name-defined]
     scene
         Further parameters of `zonda.Scene`: ``instrument``, ``weather`` ...
     traits
-        ``det_data``: name of the stream to add to, made [K] where it is not there; and those of every operator of TOAST.
+        ``det_data``: name of the stream to add to, made [K] where it is not there; and those of
+        every operator of TOAST.
     """
 
-    det_data = toast.traits.Unicode("signal", help="Observation detdata key for accumulating the simulated signal")
+    det_data = toast.traits.Unicode(
+        "signal", help="Observation detdata key for accumulating the simulated signal"
+    )
 
     def __init__(
-        self, operators: Sequence[Operator] = (), seed: int = 0, scene: dict[str, Any] | None = None, **traits: Any
+        self,
+        operators: Sequence[Operator] = (),
+        seed: int = 0,
+        scene: dict[str, Any] | None = None,
+        **traits: Any,
     ) -> None:
         self._operators, self._seed, self._scene = list(operators), seed, dict(scene or {})
         super().__init__(**traits)
         if any("boresight" in operator.provides for operator in self._operators):
             cure = "leave it out: the observations are pointed already"
-            raise PipelineError("an operator points the telescope", place="zonda.interop.toast.Simulate", cure=cure)
+            raise PipelineError(
+                "an operator points the telescope", place="zonda.interop.toast.Simulate", cure=cure
+            )
 
     def _exec(self, data: Any, detectors: Any = None, **kwargs: Any) -> None:
         import astropy.units as u

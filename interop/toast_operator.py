@@ -33,12 +33,15 @@ ALONE = threading.Lock()
 
 
 class ToastOperator(Operator):
-    """Let an operator of TOAST 3 act on the signal of each scan, e.g. a filter. Needs the extra toast.
+    """Let an operator of TOAST 3 act on the signal of each scan, e.g. a filter. Needs the extra
+    toast.
 
-    For example ``ToastOperator: {operator: PolyFilter, traits: {order: 3, view: throw}}``. It is given what TOAST reads from a
-    file of `SaveTOD`: one scan of one band with all detectors and samples in float64, flags, intervals, pointing, weather and
-    nominal noise. Samples that are not finite are flagged for it. What it flags no map uses. Its random numbers, if any, are
-    TOAST's: they follow from the trait `realization` and the names of scan and detectors, not from the scene's seed.
+    For example ``ToastOperator: {operator: PolyFilter, traits: {order: 3, view: throw}}``. It is
+    given what TOAST reads from a file of `SaveTOD`: one scan of one band with all detectors and
+    samples in float64, flags, intervals, pointing, weather and nominal noise. Samples that are not
+    finite are flagged for it. What it flags no map uses. Its random numbers, if any, are TOAST's:
+    they follow from the trait `realization` and the names of scan and detectors, not from the
+    scene's seed.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -49,11 +52,15 @@ class ToastOperator(Operator):
     operator: str
     """Its name in `toast.ops`, e.g. PolyFilter, GroundFilter, CommonModeFilter."""
     traits: dict[str, JsonValue] = Field(default_factory=dict)
-    """Its traits by name; what has a unit as text (`1 deg`). A trait that is an operator: {operator: NAME, traits: ...}."""
+    """Its traits by name; what has a unit as text (`1 deg`). A trait that is an operator:
+    {operator: NAME, traits: ...}.
+    """
 
     @model_validator(mode="after")
     def _traits(self) -> ToastOperator:
-        """Errors at their place in the file, where TOAST is installed; where it is not, the run and `zonda check` say so."""
+        """Errors at their place in the file, where TOAST is installed; where it is not, the run and
+        `zonda check` say so.
+        """
         if find_spec("toast") is not None:
             try:
                 made(self.operator, self.traits)
@@ -66,13 +73,19 @@ class ToastOperator(Operator):
         needed("toast.ops", EXTRA)
 
     def check(self, data: Data) -> list[str]:
-        """Raises InputError where TOAST is not installed, PipelineError where a scan lacks what the operator needs."""
+        """Raises InputError where TOAST is not installed, PipelineError where a scan lacks what the
+        operator needs.
+        """
         self.observe(data)
         for scan in data.observations[:1]:
             whole = scan.instrument
             camera = next(iter(whole.cameras.values())) if whole.bands else whole
             flags = np.zeros(0, np.uint8)
-            self.prepare(replace(scan, instrument=camera, focalplane=camera.focalplane(), detector_flags=flags))
+            self.prepare(
+                replace(
+                    scan, instrument=camera, focalplane=camera.focalplane(), detector_flags=flags
+                )
+            )
         return []
 
     def prepare(self, observation: Observation) -> None:
@@ -80,7 +93,9 @@ class ToastOperator(Operator):
         _check_needs(self, observation)
 
     def measure(self, stream: Stream, model: Any = None) -> Changed:
-        """What TOAST's operator makes of a signal. ``model`` is not used: each signal is acted on by itself."""
+        """What TOAST's operator makes of a signal. ``model`` is not used: each signal is acted on
+        by itself.
+        """
         return _changed(self, stream)
 
     def exec(self, block: Block, state: Changed) -> None:
@@ -88,7 +103,12 @@ class ToastOperator(Operator):
         state.put(block, "signal")
 
 
-WHAT = {"shared": "shared data", "intervals": "intervals", "detdata": "detector data", "meta": "metadata"}
+WHAT = {
+    "shared": "shared data",
+    "intervals": "intervals",
+    "detdata": "detector data",
+    "meta": "metadata",
+}
 
 
 def _check_needs(step: ToastOperator, observation: Observation) -> None:
@@ -99,14 +119,25 @@ def _check_needs(step: ToastOperator, observation: Observation) -> None:
         wanted, makes = operator.requires(), operator.provides()
     except Exception:  # SimAtmosphere of TOAST 3.0.6 cannot say it
         return
-    for kind, there in {"shared": ob.shared, "intervals": ob.intervals, "detdata": ("signal", "flags"), "meta": ob}.items():
+    for kind, there in {
+        "shared": ob.shared,
+        "intervals": ob.intervals,
+        "detdata": ("signal", "flags"),
+        "meta": ob,
+    }.items():
         for name in wanted[kind]:
             if name is not None and name not in there and name not in makes[kind]:
-                names = [n for n in there if not (kind == "intervals" and n == ob.intervals.all_name)]
+                names = [
+                    n for n in there if not (kind == "intervals" and n == ob.intervals.all_name)
+                ]
                 raise PipelineError(
-                    f"toast.ops.{step.operator} needs {name!r} of {WHAT[kind]}, which the scan does not have",
+                    f"toast.ops.{step.operator} needs {name!r} of {WHAT[kind]}, which the scan does"
+                    " not have",
                     place=f"{step.label}, {observation.name}",
-                    cure=f"name another in its traits: {', '.join(map(str, names)) or 'there is none'}",
+                    cure=(
+                        "name another in its traits:"
+                        f" {', '.join(map(str, names)) or 'there is none'}"
+                    ),
                 )
 
 
@@ -121,7 +152,9 @@ def _apply(step: ToastOperator, ob: Any, observation: Observation) -> None:
         made(step.operator, step.traits).apply(data)
     except Exception as err:  # of any kind, also mistakes of TOAST's own
         cure = "see the description of its traits in TOAST's documentation"
-        raise PipelineError(f"toast.ops.{step.operator}: {type(err).__name__}: {err}", place=place, cure=cure) from err
+        raise PipelineError(
+            f"toast.ops.{step.operator}: {type(err).__name__}: {err}", place=place, cure=cure
+        ) from err
     finally:
         there = list(data.obs)
         data.obs.clear()  # else they are emptied with it
@@ -129,7 +162,10 @@ def _apply(step: ToastOperator, ob: Any, observation: Observation) -> None:
     if not same or ob.detdata["signal"].data.shape != shape:
         cure = "save the streams (SaveTOD) and go on in TOAST"
         raise PipelineError(
-            f"toast.ops.{step.operator} leaves other detectors, samples or streams than it was given", place=place, cure=cure
+            f"toast.ops.{step.operator} leaves other detectors, samples or streams than it was"
+            " given",
+            place=place,
+            cure=cure,
         )
 
 
@@ -141,7 +177,11 @@ def _changed(step: ToastOperator, stream: Stream) -> Changed:
         before, sums = ob.detdata["flags"].data.copy(), _sums(ob)
         _apply(step, ob, observation)
         if np.array_equal(sums, _sums(ob)) and np.array_equal(before, ob.detdata["flags"].data):
-            observation.tally.state(step.label, "no effect", f"{step.operator} left the signal and its flags as they were")
+            observation.tally.state(
+                step.label,
+                "no effect",
+                f"{step.operator} left the signal and its flags as they were",
+            )
         values = np.array(ob.detdata["signal"].data)
         values[spoilt] = np.nan
         values[_newly_flagged(step.label, stream, ob, before)] = np.nan
@@ -149,12 +189,16 @@ def _changed(step: ToastOperator, stream: Stream) -> Changed:
 
 
 def made(name: str, traits: Mapping[str, Any]) -> Any:
-    """An operator of `toast.ops`. Raises InputError where there is none of that name or no such trait, or where it takes no such
-    value."""
+    """An operator of `toast.ops`. Raises InputError where there is none of that name or no such
+    trait, or where it takes no such value."""
     ops = needed("toast.ops", EXTRA)
-    known = {n: v for n, v in vars(ops).items() if isinstance(v, type) and issubclass(v, ops.Operator)}
+    known = {
+        n: v for n, v in vars(ops).items() if isinstance(v, type) and issubclass(v, ops.Operator)
+    }
     if (cls := known.get(name.removeprefix("toast.ops."))) is None:
-        cure = nearest(name, list(known)) or "give the name of a class of toast.ops, e.g. PolyFilter"
+        cure = (
+            nearest(name, list(known)) or "give the name of a class of toast.ops, e.g. PolyFilter"
+        )
         raise InputError(f"toast.ops has no operator {name!r}", cure=cure)
     own = cls.class_traits()  # type: ignore[attr-defined]
     for trait in traits:
@@ -163,7 +207,10 @@ def made(name: str, traits: Mapping[str, Any]) -> Any:
             raise InputError(f"toast.ops.{name} has no trait {trait!r}", cure=cure)
     if traits.get("det_data", "signal") != "signal":
         raise InputError("there is no stream for TOAST but the signal", cure="leave det_data out")
-    values = {trait: _value(own[trait], value, f"toast.ops.{name}, trait {trait}") for trait, value in traits.items()}
+    values = {
+        trait: _value(own[trait], value, f"toast.ops.{name}, trait {trait}")
+        for trait, value in traits.items()
+    }
     if "det_data" in own:
         values["det_data"] = "signal"
     traitlets = needed("traitlets", EXTRA)
@@ -200,7 +247,9 @@ def _unfilled(observation: Observation) -> Any:
 
 
 def _filled(stream: Stream, mean: SmoothField | None) -> tuple[Any, Any]:
-    """The scan in TOAST with all of its signal, 0 where that is not finite; and where (n_det, n_samp) it is not."""
+    """The scan in TOAST with all of its signal, 0 where that is not finite; and where (n_det,
+    n_samp) it is not.
+    """
     from . import toast as bridge
 
     ob, spoilt = _unfilled(stream.observation), np.zeros(stream.shape, bool)
@@ -224,10 +273,12 @@ def _sums(ob: Any) -> AnyFloats:
 
 
 def _newly_flagged(label: str, stream: Stream, ob: Any, before: Any) -> Any:
-    """(n_det, n_samp) single samples that no map may use any more. The complete signal decides which whole detectors, and which
-    instants of all of them, are flagged."""
+    """(n_det, n_samp) single samples that no map may use any more. The complete signal decides
+    which whole detectors, and which instants of all of them, are flagged."""
     observation = stream.observation
-    own = np.array([ob.local_detector_flags[name] for name in ob.local_detectors], np.uint8) & np.uint8(DETECTOR_MASK)
+    own = np.array(
+        [ob.local_detector_flags[name] for name in ob.local_detectors], np.uint8
+    ) & np.uint8(DETECTOR_MASK)
     used, good = observation.good_detectors, observation.good_samples
     new = (ob.detdata["flags"].data & ~before & np.uint8(DETECTOR_MASK)) != 0
     new[:, ~good] = False
@@ -242,6 +293,13 @@ def _newly_flagged(label: str, stream: Stream, ob: Any, before: Any) -> Any:
         observation.flags[instants] |= PROCESSING
         tally = observation.tally
         tally.count(label, "detectors that TOAST flagged", int(dead.sum()), observation.n_detectors)
-        tally.count(label, "instants that TOAST flagged", int(instants.sum()), observation.n_samples)
-        tally.count(label, "further single samples that TOAST flagged", int((new & ~instants).sum()), new.size)
+        tally.count(
+            label, "instants that TOAST flagged", int(instants.sum()), observation.n_samples
+        )
+        tally.count(
+            label,
+            "further single samples that TOAST flagged",
+            int((new & ~instants).sum()),
+            new.size,
+        )
     return new & ~instants

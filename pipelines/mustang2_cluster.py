@@ -48,9 +48,14 @@ def pipeline() -> zonda.Pipeline:
             zonda.Plots(),
             zonda.Report(),
         ],
-        runs={"noiseless": {"only": ["sky"], "modes": "full"}, "source_free": {"without": ["sky"], "modes": "full"}},
+        runs={
+            "noiseless": {"only": ["sky"], "modes": "full"},
+            "source_free": {"without": ["sky"], "modes": "full"},
+        },
         name="mustang2_cluster",
-        description="MUSTANG-2 on the GBT maps a merging galaxy cluster, 45 min of daisy scans at 90 GHz",
+        description=(
+            "MUSTANG-2 on the GBT maps a merging galaxy cluster, 45 min of daisy scans at 90 GHz"
+        ),
     )
 
 

@@ -1,16 +1,25 @@
-"""Built-in passbands, flat between two edges: each name in `EDGES` is an attribute of this module, for an entry point."""
+"""Built-in passbands, flat between two edges: each name in `EDGES` is an attribute of this module,
+for an entry point.
+"""
 
 from __future__ import annotations
 
 from zonda.core.instrument import Band
 
 PAPER = "van Marrewijk, Morris et al. 2024, Table 1"
-ROUND = "stand-in: flat, with round edges after public descriptions; give a file of your own for the measured band"
+ROUND = (
+    "stand-in: flat, with round edges after public descriptions; give a file of your own for the"
+    " measured band"
+)
 
 EDGES = {
     # name: (GHz, GHz, provenance)
     "mustang2_90ghz": (78, 108, PAPER),
-    "flat_150ghz": (128, 172, "the 2 mm atmospheric window, a common choice for cosmic-microwave-background cameras"),
+    "flat_150ghz": (
+        128,
+        172,
+        "the 2 mm atmospheric window, a common choice for cosmic-microwave-background cameras",
+    ),
     "atlast_92ghz": (66, 118, PAPER),
     "act_98ghz": (80, 116, ROUND),
     "act_150ghz": (126, 172, ROUND),

@@ -1,6 +1,7 @@
 """Built-in instruments: each name in `names()` is an attribute of this module, for an entry point.
 
-A camera of several bands is one instrument per band, ``act_98ghz`` and ``act_150ghz``; ``act`` is its first.
+A camera of several bands is one instrument per band, ``act_98ghz`` and ``act_150ghz``; ``act`` is
+its first.
 """
 
 from __future__ import annotations
@@ -10,15 +11,20 @@ from typing import NamedTuple
 from zonda.core.instrument import Instrument, Telescope
 
 PAPER = "van Marrewijk, Morris et al. 2024, Table 1"
-ROUND = "stand-in: every number is round, after public descriptions of the instrument; efficiencies, NET and knee are assumed"
+ROUND = (
+    "stand-in: every number is round, after public descriptions of the instrument; efficiencies,"
+    " NET and knee are assumed"
+)
 NO_PINK = "it gives no pink-noise level: knee and slope are our choice"
 
-# Limits of the axes. AtLAST: "3 deg/s scanning and 1 deg/s2 acceleration" (Mroczkowski et al. 2025, A&A 694, A142), taken on the
-# sky, as the paper's own scans need them. GBT: 36 deg/min in azimuth (17 in the cold; Minter, GBT keyhole memo). APEX: an ALMA
-# antenna, 6 and 3 deg/s (Saito et al. 2011 for the ACA's). FYST: limits of its control system, 3 deg/s and 6 deg/s2 in azimuth,
-# 1.5 deg/s in elevation (ccatobs/fyst-trajectories, src/fyst_trajectories/site.py); the same for the SO LAT, which is one design
-# (Parshley et al. 2018). Round values after public descriptions: GBT's elevation and accelerations, LMT, ACT, SPT, SO SAT,
-# CMB-S4's (3 deg/s2 of its reference scans). None is known to us where none stands.
+# Limits of the axes. AtLAST: "3 deg/s scanning and 1 deg/s2 acceleration" (Mroczkowski et al. 2025,
+# A&A 694, A142), taken on the sky, as the paper's own scans need them. GBT: 36 deg/min in azimuth
+# (17 in the cold; Minter, GBT keyhole memo). APEX: an ALMA antenna, 6 and 3 deg/s (Saito et al.
+# 2011 for the ACA's). FYST: limits of its control system, 3 deg/s and 6 deg/s2 in azimuth, 1.5
+# deg/s in elevation (ccatobs/fyst-trajectories, src/fyst_trajectories/site.py); the same for the SO
+# LAT, which is one design (Parshley et al. 2018). Round values after public descriptions: GBT's
+# elevation and accelerations, LMT, ACT, SPT, SO SAT, CMB-S4's (3 deg/s2 of its reference scans).
+# None is known to us where none stands.
 TELESCOPES = {
     "GBT": Telescope(
         name="GBT",
@@ -32,10 +38,18 @@ TELESCOPES = {
         elevation_acceleration_max="0.05 deg/s2",
     ),
     "AtLAST": Telescope(
-        name="AtLAST", diameter="50 m", site="llano_de_chajnantor", speed_max="3 deg/s", acceleration_max="1 deg/s2"
+        name="AtLAST",
+        diameter="50 m",
+        site="llano_de_chajnantor",
+        speed_max="3 deg/s",
+        acceleration_max="1 deg/s2",
     ),
     "LMT": Telescope(
-        name="LMT", diameter="50 m", site="sierra_negra", azimuth_speed_max="1 deg/s", elevation_speed_max="1 deg/s"
+        name="LMT",
+        diameter="50 m",
+        site="sierra_negra",
+        azimuth_speed_max="1 deg/s",
+        elevation_speed_max="1 deg/s",
     ),
     "ACT": Telescope(name="ACT", diameter="6 m", site="cerro_toco", azimuth_speed_max="2 deg/s"),
     "SO LAT": Telescope(
@@ -71,10 +85,18 @@ TELESCOPES = {
         elevation_speed_max="1.5 deg/s",
     ),
     "CMB-S4 LAT": Telescope(
-        name="CMB-S4 LAT", diameter="6 m", site="cerro_toco", azimuth_speed_max="3 deg/s", azimuth_acceleration_max="3 deg/s2"
+        name="CMB-S4 LAT",
+        diameter="6 m",
+        site="cerro_toco",
+        azimuth_speed_max="3 deg/s",
+        azimuth_acceleration_max="3 deg/s2",
     ),
     "APEX": Telescope(
-        name="APEX", diameter="12 m", site="llano_de_chajnantor", azimuth_speed_max="6 deg/s", elevation_speed_max="3 deg/s"
+        name="APEX",
+        diameter="12 m",
+        site="llano_de_chajnantor",
+        azimuth_speed_max="6 deg/s",
+        elevation_speed_max="3 deg/s",
     ),
     "generic 6 m": Telescope(name="generic 6 m", diameter="6 m"),
 }
@@ -105,9 +127,10 @@ class Camera(NamedTuple):
 
 CAMERAS = {
     "mustang2": Camera(
-        # 223 detectors fill 4.2 arcmin, which makes the pitch about 16 arcsec; 1.9 f-lambda as quoted (12.6 arcsec) would span
-        # only 3.3 arcmin. Count and field are kept, the pitch follows.
-        # The observatory's page says 223 feedhorns, 4.2 arcmin, 75 to 105 GHz and 9 arcsec (greenbankobservatory.org, MUSTANG-2).
+        # 223 detectors fill 4.2 arcmin, which makes the pitch about 16 arcsec; 1.9 f-lambda as
+        # quoted (12.6 arcsec) would span only 3.3 arcmin. Count and field are kept, the pitch
+        # follows. The observatory's page says 223 feedhorns, 4.2 arcmin, 75 to 105 GHz and 9 arcsec
+        # (greenbankobservatory.org, MUSTANG-2).
         "MUSTANG-2 on the 100 m Green Bank Telescope",
         *("GBT", "4.2 arcmin", 0.3, 0.8, "0.5 Hz", "100 Hz"),
         (Channel("mustang2_90ghz", 223, "1.7 mK s(1/2)", "8.5 arcsec"),),
@@ -180,7 +203,10 @@ CAMERAS = {
     "ccat": Camera(
         "a Prime-Cam module on the 6 m Fred Young Submillimeter Telescope (CCAT)",
         *("FYST", "1.3 deg", 0.6, 0.95, "0.1 Hz", "200 Hz"),
-        (Channel("ccat_280ghz", 10_368, "0.2 mK s(1/2)"), Channel("ccat_350ghz", 10_368, "0.4 mK s(1/2)")),
+        (
+            Channel("ccat_280ghz", 10_368, "0.2 mK s(1/2)"),
+            Channel("ccat_350ghz", 10_368, "0.4 mK s(1/2)"),
+        ),
         ROUND,
     ),
     "cmb_s4": Camera(
@@ -196,11 +222,12 @@ CAMERAS = {
         "a camera like LABOCA on the 12 m Atacama Pathfinder Experiment",
         *("APEX", "11.4 arcmin", 0.6, 0.9, "0.1 Hz", "25 Hz"),
         (Channel("laboca_345ghz", 295, "2 mK s(1/2)", "19 arcsec"),),
-        "detectors: 295 bolometers, Siringo et al. 2009, A&A 497, 945, abstract; "
-        "layout: a hexagonal lattice, 37 arcsec between neighbours, 38 to 40 in maps of the beams (crush/config/laboca/*.rcp, "
-        "attipaci/crush, 982ba3f), its outline round here; "
-        "stand-in: field of view, beam (19.2 arcsec), band of 60 GHz about 345 GHz: Siringo et al. 2009, not verified; "
-        "stand-in: NET: about 75 mJy s(1/2) in this beam, not verified; stand-in: efficiencies, knee and sample rate: assumed",
+        "detectors: 295 bolometers, Siringo et al. 2009, A&A 497, 945, abstract; layout: a"
+        " hexagonal lattice, 37 arcsec between neighbours, 38 to 40 in maps of the beams"
+        " (crush/config/laboca/*.rcp, attipaci/crush, 982ba3f), its outline round here; stand-in:"
+        " field of view, beam (19.2 arcsec), band of 60 GHz about 345 GHz: Siringo et al. 2009, not"
+        " verified; stand-in: NET: about 75 mJy s(1/2) in this beam, not verified; stand-in:"
+        " efficiencies, knee and sample rate: assumed",
     ),
     "hexagonal_array": Camera(
         "a generic hexagonal array on a 6 m telescope",
@@ -216,7 +243,9 @@ ALIASES = {"gbt": "mustang2", "fyst": "ccat", "toltec": "lmt", "spt3g": "spt", "
 
 
 def names() -> dict[str, tuple[str, int]]:
-    """(camera, channel) of every name: each camera's, its aliases', and where it has several bands one for each."""
+    """(camera, channel) of every name: each camera's, its aliases', and where it has several bands
+    one for each.
+    """
     found = {}
     for camera, entry in CAMERAS.items():
         for name in (camera, *(alias for alias, of in ALIASES.items() if of == camera)):
@@ -236,7 +265,10 @@ def __getattr__(name: str) -> Instrument:
     channel = camera.channels[k]
     return Instrument(
         name=name if name not in ALIASES else key,
-        description=f"{camera.description}: {channel.detectors} detectors, {channel.band.rpartition('_')[2]}",
+        description=(
+            f"{camera.description}: {channel.detectors} detectors,"
+            f" {channel.band.rpartition('_')[2]}"
+        ),
         telescope=TELESCOPES[camera.telescope],
         band=channel.band,
         detectors=channel.detectors,

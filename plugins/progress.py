@@ -52,13 +52,21 @@ class Progress:
             self._show(now, done == total, line(done, total, what, now - self._began))
 
     @hookimpl
-    def zonda_campaign_progress(self, done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float) -> None:
+    def zonda_campaign_progress(
+        self, done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float
+    ) -> None:
         """One line: ``tasks 12 of 100 [##........] 12 %, 3.1e+06 samples/s, 80 s left``."""
         with self._lock:
-            self._show(self._clock(), done == total, campaign_line(done, total, failed, samples, all_samples, seconds))
+            self._show(
+                self._clock(),
+                done == total,
+                campaign_line(done, total, failed, samples, all_samples, seconds),
+            )
 
     def _show(self, now: float, last: bool, text: str) -> None:
-        """Write where it is time: on a terminal over the line before, in a log as a line of its own."""
+        """Write where it is time: on a terminal over the line before, in a log as a line of its
+        own.
+        """
         if not sys.stderr.isatty():
             if self._logged is None:
                 self._logged = now
@@ -97,14 +105,30 @@ def line(done: int, total: int, what: str, seconds: float, width: int = 20) -> s
     return f"{what[:60]} [{bar:.<{width}}] {100 * share:.0f} %{left}"
 
 
-def campaign_line(done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float, width: int = 20) -> str:
-    """The text of a campaign's progress line. Time left: as the samples that are left take at the rate so far."""
+def campaign_line(
+    done: int,
+    total: int,
+    failed: int,
+    samples: int,
+    all_samples: int,
+    seconds: float,
+    width: int = 20,
+) -> str:
+    """The text of a campaign's progress line. Time left: as the samples that are left take at the
+    rate so far.
+    """
     share = min(1.0, samples / all_samples) if all_samples > 0 else 1.0
     bar = "#" * int(width * share)
     text = f"tasks {done} of {total} [{bar:.<{width}}] {100 * share:.0f} %"
     if samples and seconds > 0:
         left = seconds * (1 - share) / share
-        words = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min" if left < 7200 else f"{left / 3600:.1f} h"
+        words = (
+            f"{left:.0f} s"
+            if left < 120
+            else f"{left / 60:.0f} min"
+            if left < 7200
+            else f"{left / 3600:.1f} h"
+        )
         text += f", {samples / seconds:.3g} samples/s, {words} left"
     return text + (f", {failed} attempts failed" if failed else "")
 

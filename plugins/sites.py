@@ -1,4 +1,5 @@
-"""Built-in sites, from data/sites.csv: each name and alias in the table is an attribute of this module, for an entry point.
+"""Built-in sites, from data/sites.csv: each name and alias in the table is an attribute of this
+module, for an entry point.
 
 >>> from zonda.plugins import sites
 >>> sites.chajnantor.altitude
@@ -20,7 +21,11 @@ TABLE = Path(__file__).parent / "data" / "sites.csv"
 def table() -> dict[str, dict[str, str]]:
     """Rows of the table by name and by alias."""
     with TABLE.open(encoding="utf-8", newline="") as file:
-        return {name: row for row in csv.DictReader(file) for name in (row["name"], *row["aliases"].split())}
+        return {
+            name: row
+            for row in csv.DictReader(file)
+            for name in (row["name"], *row["aliases"].split())
+        }
 
 
 def __getattr__(name: str) -> Site:

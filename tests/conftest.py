@@ -1,5 +1,6 @@
-"""For all tests: nothing is read from or left in the user's cache folder (compiled kernels aside); what a test registers goes
-with it; hypothesis draws the same examples each time (`pytest --hypothesis-profile=default` draws others)."""
+"""For all tests: nothing is read from or left in the user's cache folder (compiled kernels aside);
+what a test registers goes with it; hypothesis draws the same examples each time (`pytest
+--hypothesis-profile=default` draws others)."""
 
 from __future__ import annotations
 
@@ -11,7 +12,12 @@ from hypothesis import HealthCheck, settings
 from zonda.core.registry import registries
 
 # how quickly examples are made depends on what else the machine does
-settings.register_profile("the same each time", derandomize=True, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+settings.register_profile(
+    "the same each time",
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
+    deadline=None,
+)
 settings.load_profile("the same each time")
 
 

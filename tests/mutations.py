@@ -43,7 +43,9 @@ def one_minus_correlation(patch: Patch) -> None:
 
 def difference_of_covariances(patch: Patch) -> None:
     def subtracted(r: Any, outer_scale: float, sigma: float) -> Any:
-        return covariance.beam_correlation(0.0, outer_scale, sigma) - covariance.beam_correlation(r, outer_scale, sigma)
+        return covariance.beam_correlation(0.0, outer_scale, sigma) - covariance.beam_correlation(
+            r, outer_scale, sigma
+        )
 
     patch.setattr(covariance, "beam_structure", subtracted)
 
@@ -73,7 +75,9 @@ def exponentials_before_logarithms(patch: Patch) -> None:
 
 def differences_by_subtraction(patch: Patch) -> None:
     def subtracted(self: Any, which: int, pwv: Any, dpwv: Any, elevation: Any) -> Any:
-        return self._evaluate(which, np.add(pwv, dpwv), elevation) - self._evaluate(which, pwv, elevation)
+        return self._evaluate(which, np.add(pwv, dpwv), elevation) - self._evaluate(
+            which, pwv, elevation
+        )
 
     patch.setattr(bands.BandAtmosphere, "_difference", subtracted)
 
@@ -82,13 +86,19 @@ def highpass_without_detrending(patch: Patch) -> None:
     low = brick_wall.HighpassPlan._low
 
     def without(self: Any, s: Any) -> Any:
-        return low(replace(self, modes=0 * self.modes, spread_modes=0 * self.spread_modes, sums=()), s)
+        return low(
+            replace(self, modes=0 * self.modes, spread_modes=0 * self.spread_modes, sums=()), s
+        )
 
     patch.setattr(brick_wall.HighpassPlan, "_low", without)
 
 
 def gaps_that_ring(patch: Patch) -> None:
-    patch.setattr(brick_wall, "bridge", lambda row, gaps: row.__setitem__(gaps, np.nan_to_num(row[gaps], posinf=0.0, neginf=0.0)))
+    patch.setattr(
+        brick_wall,
+        "bridge",
+        lambda row, gaps: row.__setitem__(gaps, np.nan_to_num(row[gaps], posinf=0.0, neginf=0.0)),
+    )
 
 
 def modes_beyond_the_rank(patch: Patch) -> None:
@@ -116,18 +126,26 @@ def mean_emission_in_float32(patch: Patch) -> None:
     def together(self: Any, block: Block, state: Any) -> None:
         calibrated(self, block, state)
         if mean := block.means.pop("signal", None):
-            block.detdata["signal"] += mean.evaluate(block.detectors, block.samples).astype(block.dtype)
+            block.detdata["signal"] += mean.evaluate(block.detectors, block.samples).astype(
+                block.dtype
+            )
 
     patch.setattr(Efficiency, "exec", together)
 
 
 def nan_pixels_that_stay(patch: Patch) -> None:
-    patch.setattr(read, "filled", lambda place, values, missing, first: int((~np.isfinite(values)).sum()))
+    patch.setattr(
+        read, "filled", lambda place, values, missing, first: int((~np.isfinite(values)).sum())
+    )
 
 
 def nan_samples_that_count_as_zero(patch: Patch) -> None:
     add = bin_map.add_image
-    patch.setattr(bin_map, "add_image", lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest))
+    patch.setattr(
+        bin_map,
+        "add_image",
+        lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest),
+    )
 
 
 def sums_rounded_by_block(patch: Patch) -> None:
@@ -144,12 +162,20 @@ def sums_rounded_by_block(patch: Patch) -> None:
 
 def noise_that_starts_again_in_each_block(patch: Patch) -> None:
     add = white._add_normals
-    patch.setattr(white, "_add_normals", lambda key, first, start, lines, cell, *rest: add(key, first, 0, lines, 0, *rest))
+    patch.setattr(
+        white,
+        "_add_normals",
+        lambda key, first, start, lines, cell, *rest: add(key, first, 0, lines, 0, *rest),
+    )
 
 
 def pink_noise_with_a_period(patch: Patch) -> None:
     add = pink.Streams.add
-    patch.setattr(pink.Streams, "add", lambda self, detector, sample, *rest: add(self, detector, sample % 200_000, *rest))
+    patch.setattr(
+        pink.Streams,
+        "add",
+        lambda self, detector, sample, *rest: add(self, detector, sample % 200_000, *rest),
+    )
 
 
 def pink_noise_that_starts_from_nothing(patch: Patch) -> None:
@@ -196,29 +222,81 @@ def steps_that_see_no_mean(patch: Patch) -> None:
 MUTATIONS = (
     Mutation("1 - C by subtraction", "covariance.structure_function", one_minus_correlation),
     Mutation("C(0) - C(r) by subtraction", "covariance.behind_a_beam", difference_of_covariances),
-    Mutation("kriging weights that do not sum to 1", "lattice.structure_function", weights_that_do_not_sum_to_one),
-    Mutation("e^-<tau> instead of <e^-tau>", "opacity.band_average", transmission_of_the_mean_opacity),
-    Mutation("logarithms of exponentials that underflow", "opacity.saturated_line", exponentials_before_logarithms),
-    Mutation("T(pwv + d) - T(pwv) instead of log1p and a recurrence", "opacity.small_differences", differences_by_subtraction),
-    Mutation("the high-pass does not detrend", "numerics.elevation_drift", highpass_without_detrending),
-    Mutation("flagged samples are not bridged", "filters.gaps_and_nan", gaps_that_ring),
-    Mutation("modes are removed whatever the rank", "filters.one_or_identical", modes_beyond_the_rank),
-    Mutation("dead detectors are not flagged", "filters.useless_detectors", dead_detectors_that_take_part),
-    Mutation("float32 whatever the common mode", "filters.common_mode_in_float32", float32_whatever_the_ratio),
-    Mutation("the mean emission is part of the float32 stream", "filters.transfer", mean_emission_in_float32),
-    Mutation("NaN pixels of the input spread", "maps.nan_in_the_input_map", nan_pixels_that_stay),
-    Mutation("NaN samples are mapped as 0", "maps.nan_in_the_signal", nan_samples_that_count_as_zero),
-    Mutation("map sums rounded block by block", "determinism.blocks_in_time", sums_rounded_by_block),
     Mutation(
-        "random numbers counted from the block's start", "determinism.blocks_in_time", noise_that_starts_again_in_each_block
+        "kriging weights that do not sum to 1",
+        "lattice.structure_function",
+        weights_that_do_not_sum_to_one,
+    ),
+    Mutation(
+        "e^-<tau> instead of <e^-tau>", "opacity.band_average", transmission_of_the_mean_opacity
+    ),
+    Mutation(
+        "logarithms of exponentials that underflow",
+        "opacity.saturated_line",
+        exponentials_before_logarithms,
+    ),
+    Mutation(
+        "T(pwv + d) - T(pwv) instead of log1p and a recurrence",
+        "opacity.small_differences",
+        differences_by_subtraction,
+    ),
+    Mutation(
+        "the high-pass does not detrend", "numerics.elevation_drift", highpass_without_detrending
+    ),
+    Mutation("flagged samples are not bridged", "filters.gaps_and_nan", gaps_that_ring),
+    Mutation(
+        "modes are removed whatever the rank", "filters.one_or_identical", modes_beyond_the_rank
+    ),
+    Mutation(
+        "dead detectors are not flagged", "filters.useless_detectors", dead_detectors_that_take_part
+    ),
+    Mutation(
+        "float32 whatever the common mode",
+        "filters.common_mode_in_float32",
+        float32_whatever_the_ratio,
+    ),
+    Mutation(
+        "the mean emission is part of the float32 stream",
+        "filters.transfer",
+        mean_emission_in_float32,
+    ),
+    Mutation("NaN pixels of the input spread", "maps.nan_in_the_input_map", nan_pixels_that_stay),
+    Mutation(
+        "NaN samples are mapped as 0", "maps.nan_in_the_signal", nan_samples_that_count_as_zero
+    ),
+    Mutation(
+        "map sums rounded block by block", "determinism.blocks_in_time", sums_rounded_by_block
+    ),
+    Mutation(
+        "random numbers counted from the block's start",
+        "determinism.blocks_in_time",
+        noise_that_starts_again_in_each_block,
     ),
     Mutation("1/f noise with a period", "noise.no_period", pink_noise_with_a_period),
-    Mutation("1/f noise that starts from nothing", "numerics.first_sample", pink_noise_that_starts_from_nothing),
+    Mutation(
+        "1/f noise that starts from nothing",
+        "numerics.first_sample",
+        pink_noise_that_starts_from_nothing,
+    ),
     Mutation("the time in one float64", "numerics.exact_start", times_in_one_float),
-    Mutation("the air is sampled by a comb", "timing.jittered_atmosphere", air_that_ignores_the_times),
-    Mutation("NaN rows and gaps are interpolated", "timing.recorded_gaps_and_nan", gaps_filled_in_silence),
+    Mutation(
+        "the air is sampled by a comb", "timing.jittered_atmosphere", air_that_ignores_the_times
+    ),
+    Mutation(
+        "NaN rows and gaps are interpolated", "timing.recorded_gaps_and_nan", gaps_filled_in_silence
+    ),
     Mutation("days of 86400 s", "pointing.leap_second", days_of_86400_seconds),
-    Mutation("noise keyed without instrument and band", "noise.two_bands", noise_that_all_bands_share),
-    Mutation("the noise of a map follows from the instrument's NET", "noise.stated", the_instruments_net_whatever_the_load),
-    Mutation("a plugin's step multiplies the stream without its mean", "means.gain_of_the_whole", steps_that_see_no_mean),
+    Mutation(
+        "noise keyed without instrument and band", "noise.two_bands", noise_that_all_bands_share
+    ),
+    Mutation(
+        "the noise of a map follows from the instrument's NET",
+        "noise.stated",
+        the_instruments_net_whatever_the_load,
+    ),
+    Mutation(
+        "a plugin's step multiplies the stream without its mean",
+        "means.gain_of_the_whole",
+        steps_that_see_no_mean,
+    ),
 )

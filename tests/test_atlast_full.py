@@ -1,4 +1,6 @@
-"""A thin slice of the shipped pipeline of the full AtLAST camera: streams made again give the same map as streams kept."""
+"""A thin slice of the shipped pipeline of the full AtLAST camera: streams made again give the same
+map as streams kept.
+"""
 
 import numpy as np
 import pytest
@@ -11,11 +13,19 @@ DETECTORS, SECONDS = 400, 4
 
 
 def slice_of(seconds=SECONDS, detectors=DETECTORS, pixel="60 arcsec", **changes):
-    """Pipeline without its files, and scene, with fewer detectors over the same field. ``changes``: of the common mode."""
-    file = load("atlast_full", (f"PointingDaisy.scan_duration={seconds} s", f"BinMap.pixel={pixel}"))
+    """Pipeline without its files, and scene, with fewer detectors over the same field. ``changes``:
+    of the common mode.
+    """
+    file = load(
+        "atlast_full", (f"PointingDaisy.scan_duration={seconds} s", f"BinMap.pixel={pixel}")
+    )
     scene = file.scene()
     fewer = scene.instrument.model_copy(update={"detectors": detectors})
-    steps = [o.model_copy(update=changes) if o.couples == "all" else o for o in file.operators if "map_file" not in o.provides]
+    steps = [
+        o.model_copy(update=changes) if o.couples == "all" else o
+        for o in file.operators
+        if "map_file" not in o.provides
+    ]
     return zonda.Pipeline(steps), scene.model_copy(update={"instrument": fewer})
 
 
@@ -47,7 +57,9 @@ def test_made_again_is_the_same_map():
 def test_singular_modes_of_a_stream_beyond_memory_and_disk_are_refused_with_a_way_out(monkeypatch):
     pipeline, scene = slice_of(method="svd")
     monkeypatch.setattr("zonda.core.run.streams.free_disk", lambda: 1000)
-    with pytest.raises(PipelineError, match=r"(?s)neither in memory nor on the disk.*CommonModeFilter.*--memory"):
+    with pytest.raises(
+        PipelineError, match=r"(?s)neither in memory nor on the disk.*CommonModeFilter.*--memory"
+    ):
         pipeline.run(scene, threads=2, memory=int(1.7 * 4 * DETECTORS * SECONDS * 900))
 
 
@@ -68,5 +80,7 @@ def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     found = schedule(pipeline.chain, longest, left)
     assert found.bytes < left.memory
     assert any("made again" in what for what in found.elsewhere)
-    with pytest.raises(PipelineError, match=r"(?s)the run would hold .*BinMap .* GB.*budget is 1 GB.*larger pixel"):
+    with pytest.raises(
+        PipelineError, match=r"(?s)the run would hold .*BinMap .* GB.*budget is 1 GB.*larger pixel"
+    ):
         divided(pipeline.chain, longest, Settings(threads=2, asked=10**9), "test")

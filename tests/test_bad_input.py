@@ -1,4 +1,6 @@
-"""What a user gets for bad input, from the command line: where, what, what would mend it, and nothing half done."""
+"""What a user gets for bad input, from the command line: where, what, what would mend it, and
+nothing half done.
+"""
 
 import os
 import subprocess
@@ -34,8 +36,22 @@ def write_map(path: Path, values: np.ndarray | None = None, **cards: object) -> 
     from astropy.io import fits
 
     image = fits.PrimaryHDU(np.ones((11, 11)) if values is None else values)
-    header = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 6, "CRPIX2": 6, "CRVAL1": 75.0, "CRVAL2": 20.0}
-    header |= {"CDELT1": -1 / 60, "CDELT2": 1 / 60, "CUNIT1": "deg", "CUNIT2": "deg", "BUNIT": "K", "TEMPSCAL": "K_RJ"}
+    header = {
+        "CTYPE1": "RA---TAN",
+        "CTYPE2": "DEC--TAN",
+        "CRPIX1": 6,
+        "CRPIX2": 6,
+        "CRVAL1": 75.0,
+        "CRVAL2": 20.0,
+    }
+    header |= {
+        "CDELT1": -1 / 60,
+        "CDELT2": 1 / 60,
+        "CUNIT1": "deg",
+        "CUNIT2": "deg",
+        "BUNIT": "K",
+        "TEMPSCAL": "K_RJ",
+    }
     image.header.update({k: v for k, v in (header | cards).items() if v is not None})
     image.writeto(path)
 
@@ -50,11 +66,17 @@ def here(tmp_path, monkeypatch):
 
 def refused(capsys, command="run", *more):
     """The message of a command that must fail as a user's mistake."""
-    status = cli.main([command, "my.yaml", *(["--output", "out"] if command == "run" else []), *more])
+    status = cli.main(
+        [command, "my.yaml", *(["--output", "out"] if command == "run" else []), *more]
+    )
     message = capsys.readouterr().err
     assert status == 2, message
     assert "Traceback" not in message
-    left = [p for p in Path().rglob("*") if p.is_file() and p.name not in ("my.yaml", "map.fits", "resolved.yaml")]
+    left = [
+        p
+        for p in Path().rglob("*")
+        if p.is_file() and p.name not in ("my.yaml", "map.fits", "resolved.yaml")
+    ]
     assert not left, left
     return message
 
@@ -69,14 +91,32 @@ def test_the_pipeline_itself_is_good(here, capsys):
     ("change", "words"),
     [
         (("map.fits", "nowhere.fits"), ["nowhere.fits", "no such file"]),
-        (("- SkyMap", "- SkyMpa"), ["my.yaml:8:5", "unknown operator 'SkyMpa'", "did you mean 'SkyMap'?"]),
-        (("mustang2", "mustang3"), ["my.yaml:2:13", "unknown instrument 'mustang3'", "did you mean 'mustang2'?"]),
-        (("green_bank", "green_bnak"), ["my.yaml:1:7", "unknown site 'green_bnak'", "did you mean 'green_bank'?"]),
+        (
+            ("- SkyMap", "- SkyMpa"),
+            ["my.yaml:8:5", "unknown operator 'SkyMpa'", "did you mean 'SkyMap'?"],
+        ),
+        (
+            ("mustang2", "mustang3"),
+            ["my.yaml:2:13", "unknown instrument 'mustang3'", "did you mean 'mustang2'?"],
+        ),
+        (
+            ("green_bank", "green_bnak"),
+            ["my.yaml:1:7", "unknown site 'green_bnak'", "did you mean 'green_bank'?"],
+        ),
         (("2 s}", "-2 s}"), ["my.yaml:7:36", "scan_duration: must be greater than 0", "got -2 s"]),
-        (("2 s}", "2 s, sample_rate: 0 Hz}"), ["my.yaml:7:54", "sample_rate: must be greater than 0 Hz, got 0 Hz"]),
+        (
+            ("2 s}", "2 s, sample_rate: 0 Hz}"),
+            ["my.yaml:7:54", "sample_rate: must be greater than 0 Hz, got 0 Hz"],
+        ),
         (("2 s}", "2 arcsec}"), ["my.yaml:7:38", "'arcsec' is a unit of angle"]),
-        (("  - WhiteNoise\n  - Efficiency\n", "  - Efficiency\n  - WhiteNoise\n"), ["WhiteNoise", "only after Efficiency"]),
-        (("  - BinMap\n  - SaveMap\n", "  - SaveMap\n  - BinMap\n"), ["SaveMap needs map", "move it below BinMap"]),
+        (
+            ("  - WhiteNoise\n  - Efficiency\n", "  - Efficiency\n  - WhiteNoise\n"),
+            ["WhiteNoise", "only after Efficiency"],
+        ),
+        (
+            ("  - BinMap\n  - SaveMap\n", "  - SaveMap\n  - BinMap\n"),
+            ["SaveMap needs map", "move it below BinMap"],
+        ),
     ],
 )
 @pytest.mark.parametrize("command", ["check", "run"])
@@ -95,9 +135,15 @@ def test_what_the_file_shows(here, capsys, command, change, words):
         ({"BUNIT": None}, ["map.fits", "BUNIT", "unit"]),
         ({"BUNIT": 3.0}, ["map.fits", "BUNIT = 3.0"]),
         ({"BUNIT": "Jy/beam"}, ["map.fits", "BMAJ", "input_beam"]),
-        ({"BUNIT": "Jy/beam", "BMAJ": "20 arcsec"}, ["map.fits", "BMAJ = '20 arcsec'", "input_beam"]),
+        (
+            {"BUNIT": "Jy/beam", "BMAJ": "20 arcsec"},
+            ["map.fits", "BMAJ = '20 arcsec'", "input_beam"],
+        ),
         ({"BUNIT": "Jy/beam", "BMAJ": 20.0}, ["map.fits", "20 deg", "BMAJ", "input_beam"]),
-        ({"BUNIT": "Jy/beam", "BMAJ": 20 / 206265}, ["map.fits", "0.3491 arcsec", "BMAJ", "input_beam"]),
+        (
+            {"BUNIT": "Jy/beam", "BMAJ": 20 / 206265},
+            ["map.fits", "0.3491 arcsec", "BMAJ", "input_beam"],
+        ),
         ({"TEMPSCAL": None}, ["map.fits", "K_RJ", "K_CMB"]),
         ({"TEMPSCAL": 2.0}, ["map.fits", "TEMPSCAL = 2.0"]),
         (dict.fromkeys(WORLD), ["CDELT", "pixel_size"]),
@@ -107,7 +153,7 @@ def test_what_the_file_shows(here, capsys, command, change, words):
         ({"RADESYS": "GAPPT"}, ["map.fits", "RADESYS = 'GAPPT'", "ICRS"]),
         ({"RADESYS": "FK5", "EQUINOX": "J2000"}, ["map.fits", "EQUINOX = 'J2000'"]),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("command", ["check", "run"])
 def test_what_the_map_lacks(here, capsys, command, cards, words):
     (here / "map.fits").unlink()
@@ -122,8 +168,12 @@ def test_what_a_cube_and_a_polarized_map_lack(here, capsys, command):
     write_map(here / "map.fits", np.ones((3, 11, 11)))
     assert "set the operator's parameter plane" in refused(capsys, command)
     (here / "map.fits").unlink()
-    write_map(here / "map.fits", np.ones((3, 11, 11)), CTYPE3="STOKES", CRPIX3=1.0, CRVAL3=1.0, CDELT3=1.0)
-    (here / "my.yaml").write_text(PIPELINE.replace("mustang2", "{like: mustang2, detectors: 8, polarization: pairs}"))
+    write_map(
+        here / "map.fits", np.ones((3, 11, 11)), CTYPE3="STOKES", CRPIX3=1.0, CRVAL3=1.0, CDELT3=1.0
+    )
+    (here / "my.yaml").write_text(
+        PIPELINE.replace("mustang2", "{like: mustang2, detectors: 8, polarization: pairs}")
+    )
     assert "polarization_convention" in refused(capsys, command)
 
 
@@ -146,7 +196,10 @@ def test_frames_by_other_names(here, capsys, system):
         (here / "map.fits").unlink()
         values = np.random.default_rng(0).normal(size=(11, 11))
         write_map(here / "map.fits", values, RADESYS=written)
-        assert cli.main(["run", "my.yaml", "--output", name, "--set", "instrument.sample_rate=20 Hz"]) == 0
+        assert (
+            cli.main(["run", "my.yaml", "--output", name, "--set", "instrument.sample_rate=20 Hz"])
+            == 0
+        )
         made.append(fits.getdata(here / name / "map.fits"))
     assert np.isfinite(made[0]).any()
     assert np.array_equal(made[0], made[1], equal_nan=True)
@@ -178,11 +231,15 @@ def test_nan_in_the_map(here, capsys, bad, command):
 def test_a_target_that_is_never_up(here, capsys):
     (here / "my.yaml").write_text(PIPELINE.replace("+20d00m00s", "-80d00m00s"))
     message = refused(capsys)
-    assert all(w in message for w in ("never rises", "green_bank", "choose another target or site")), message
+    assert all(
+        w in message for w in ("never rises", "green_bank", "choose another target or site")
+    ), message
 
 
 def test_a_target_that_is_never_up_is_told_beside_other_mistakes(here, capsys):
-    text = PIPELINE.replace("+20d00m00s", "-70d00m00s").replace("- BinMap", "- BinMap: {pixel: 5 arcsecs}")
+    text = PIPELINE.replace("+20d00m00s", "-70d00m00s").replace(
+        "- BinMap", "- BinMap: {pixel: 5 arcsecs}"
+    )
     (here / "my.yaml").write_text(text)
     message = refused(capsys, "check")
     assert "2 mistakes in my.yaml" in message
@@ -195,9 +252,15 @@ def test_a_target_that_is_never_up_is_told_beside_other_mistakes(here, capsys):
     ("change", "told"),
     [
         ({"instrument: mustang2": "instrument: mustang3"}, "unknown instrument"),
-        ({"05h00m00s +20d00m00s": "map", "map.fits": "none.fits"}, "no such file"),  # there is no target to point at
         (
-            {"scan_duration: 2 s": "scan_duration: 2 m", "- SaveMap": "- TimeStreams: {observation: 0}\n  - SaveMap"},
+            {"05h00m00s +20d00m00s": "map", "map.fits": "none.fits"},
+            "no such file",
+        ),  # there is no target to point at
+        (
+            {
+                "scan_duration: 2 s": "scan_duration: 2 m",
+                "- SaveMap": "- TimeStreams: {observation: 0}\n  - SaveMap",
+            },
             "expected a time",
         ),
     ],
@@ -212,12 +275,20 @@ def test_where_the_telescope_cannot_be_pointed_nothing_else_is_said(here, capsys
     assert "1 mistake in my.yaml" in message
 
 
-def test_mistakes_in_the_files_of_several_steps_stand_at_their_parameters(here, capsys, tmp_path_factory):
+def test_mistakes_in_the_files_of_several_steps_stand_at_their_parameters(
+    here, capsys, tmp_path_factory
+):
     files = tmp_path_factory.mktemp("tables")
     (files / "night.txt").write_text("no schedule")
     (files / "sources.csv").write_text("ra [deg], dec [deg], flux [Jy]\n75, 20, 1\n75, 95, 1\n")
-    text = PIPELINE.replace("PointingDaisy: {scan_duration: 2 s}", f"PointingSchedule: {{schedule: {files}/night.txt}}")
-    (here / "my.yaml").write_text(text.replace("SkyMap: {file: map.fits}", f"PointSources: {{catalogue: {files}/sources.csv}}"))
+    text = PIPELINE.replace(
+        "PointingDaisy: {scan_duration: 2 s}", f"PointingSchedule: {{schedule: {files}/night.txt}}"
+    )
+    (here / "my.yaml").write_text(
+        text.replace(
+            "SkyMap: {file: map.fits}", f"PointSources: {{catalogue: {files}/sources.csv}}"
+        )
+    )
     for command in ("check", "run"):
         message = refused(capsys, command)
         assert "my.yaml:7:34" in message
@@ -234,13 +305,20 @@ def test_a_target_that_is_up_later(here, capsys):
 
 
 def test_a_plugin_that_cannot_be_imported(here):
-    """It is named with its distribution and its fault, by the run that needs it; a run that does not is not stopped."""
+    """It is named with its distribution and its fault, by the run that needs it; a run that does
+    not is not stopped.
+    """
     info = here / "site" / "broken_camera-0.4.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-camera\nVersion: 0.4\n")
-    (info / "entry_points.txt").write_text("[zonda.instruments]\nbroken_camera = broken_camera:camera\n")
+    (info / "entry_points.txt").write_text(
+        "[zonda.instruments]\nbroken_camera = broken_camera:camera\n"
+    )
     (here / "site" / "broken_camera.py").write_text("import a_module_that_is_not_there\n")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(here / "site"), os.environ.get("PYTHONPATH", "")])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(here / "site"), os.environ.get("PYTHONPATH", "")]),
+    }
 
     def run(*arguments):
         command = [sys.executable, "-m", "zonda.core.cli", *arguments]
@@ -250,7 +328,10 @@ def test_a_plugin_that_cannot_be_imported(here):
     (here / "my.yaml").write_text(PIPELINE.replace("mustang2", "broken_camera"))
     done = run("check", "my.yaml")
     assert done.returncode == 2
-    assert all(w in done.stderr for w in ("broken-camera 0.4", "a_module_that_is_not_there", "my.yaml:2:13")), done.stderr
+    assert all(
+        w in done.stderr
+        for w in ("broken-camera 0.4", "a_module_that_is_not_there", "my.yaml:2:13")
+    ), done.stderr
     assert "Traceback" not in done.stderr
     listed = run("plugins", "--check")
     assert listed.returncode != 0
@@ -293,7 +374,9 @@ def warned(monkeypatch):
 
 
 def test_a_run_begins_with_what_check_finds(here, capsys, monkeypatch):
-    """400 h of scan are refused in the words of `zonda check`, and no more instants are pointed than it looks at."""
+    """400 h of scan are refused in the words of `zonda check`, and no more instants are pointed
+    than it looks at.
+    """
     from zonda.operators.pointing import base
 
     pointed, seconds = [], base.Pointing._seconds
@@ -321,7 +404,11 @@ def test_a_long_scan_is_looked_at_first_from_python_too(here, monkeypatch):
     monkeypatch.setattr(base, "LONG", 100)
     looked = []
     check = base.Pointing.check
-    monkeypatch.setattr(base.Pointing, "check", lambda self, data: looked.append(len(data.observations)) or check(self, data))
+    monkeypatch.setattr(
+        base.Pointing,
+        "check",
+        lambda self, data: looked.append(len(data.observations)) or check(self, data),
+    )
     file = parse(PIPELINE.replace("2 s}", "30 h, sample_rate: 1 Hz}"), name="p", folder=here)
     with pytest.raises(PointingError, match="goes down to elevation"):
         file.pipeline().run(file.scene(), output=here / "out")
@@ -347,7 +434,10 @@ def test_a_pipeline_that_writes_nothing_says_so(here, capsys, warned, command):
     (here / "my.yaml").write_text(PIPELINE.replace("  - SaveMap\n", ""))
     assert cli.main([command, "my.yaml"]) == 0
     said = capsys.readouterr().err
-    assert "warning: my: no step writes a product, so what is computed is lost; add a step that saves or shows it" in said
+    assert (
+        "warning: my: no step writes a product, so what is computed is lost; add a step that saves"
+        " or shows it" in said
+    )
     if command == "run":
         assert said.index("no step writes") < said.index("of CPU time")
 
@@ -358,10 +448,21 @@ def test_a_target_off_the_map_warns_with_its_centre(here, capsys, warned, comman
     assert "is not on the input map" not in capsys.readouterr().err
     assert cli.main([command, "my.yaml", "--set", "target=06h +20d"]) == 0
     said = capsys.readouterr().err
-    assert "the target 90.00000 deg 20.00000 deg is not on the input map, whose centre, 75.00000 deg 20.00000 deg, is" in said
-    assert cli.main([command, "my.yaml", "--set", "target=06h +20d", "--set", "SkyMap.centre=target"]) == 0
+    assert (
+        "the target 90.00000 deg 20.00000 deg is not on the input map, whose centre, 75.00000 deg"
+        " 20.00000 deg, is" in said
+    )
+    assert (
+        cli.main([command, "my.yaml", "--set", "target=06h +20d", "--set", "SkyMap.centre=target"])
+        == 0
+    )
     assert "is not on the input map" not in capsys.readouterr().err
-    assert cli.main([command, "my.yaml", "--set", "target=06h +20d", "--set", "SkyMap.centre=06h +20d"]) == 0
+    assert (
+        cli.main(
+            [command, "my.yaml", "--set", "target=06h +20d", "--set", "SkyMap.centre=06h +20d"]
+        )
+        == 0
+    )
     assert "is not on the input map" not in capsys.readouterr().err
 
 
@@ -373,8 +474,12 @@ def test_target_map_is_the_centre_of_the_input_map(here, capsys):
     (here / "my.yaml").write_text(PIPELINE)
     assert cli.main(["run", "my.yaml", "--output", "by_hand"]) == 0
     text = (here / "by_map/resolved.yaml").read_text()
-    assert text.replace("name: by_map", "") == (here / "by_hand/resolved.yaml").read_text().replace("name: by_hand", "")
-    assert (here / "by_map/map.fits").read_bytes()[5760:] == (here / "by_hand/map.fits").read_bytes()[5760:]
+    assert text.replace("name: by_map", "") == (here / "by_hand/resolved.yaml").read_text().replace(
+        "name: by_hand", ""
+    )
+    assert (here / "by_map/map.fits").read_bytes()[5760:] == (
+        here / "by_hand/map.fits"
+    ).read_bytes()[5760:]
 
 
 @pytest.mark.parametrize(
@@ -386,7 +491,10 @@ def test_target_map_is_the_centre_of_the_input_map(here, capsys):
             ["my.yaml:4:9", "each refer to the other", "give the target as coordinates"],
         ),
         (("map.fits}", "nowhere.fits}"), ["nowhere.fits", "no such file"]),
-        (("{scan_duration: 2 s}", "{scan_duration: 2 s, target: map}"), ["my.yaml:7", "top level of a pipeline file"]),
+        (
+            ("{scan_duration: 2 s}", "{scan_duration: 2 s, target: map}"),
+            ["my.yaml:7", "top level of a pipeline file"],
+        ),
     ],
 )
 def test_target_map_without_a_centre(here, capsys, change, words):
@@ -400,12 +508,32 @@ def test_target_map_without_a_centre(here, capsys, change, words):
     ("cards", "value", "words"),
     [
         ({}, 1e297, ["map.fits", "its largest value is 1e+297", "check the map"]),
-        ({}, -1e20, ["map.fits", "its largest value is 1e+20 K_RJ, more than 1e+15", "check its unit"]),
+        (
+            {},
+            -1e20,
+            ["map.fits", "its largest value is 1e+20 K_RJ, more than 1e+15", "check its unit"],
+        ),
         ({"CDELT1": 1e-300}, 1.0, ["map.fits", "1e-300 deg is no size of a pixel", "check CDELT1"]),
         ({"CDELT2": 1e300}, 1.0, ["map.fits", "1e+300 deg is no size of a pixel", "check CDELT1"]),
-        ({"CRPIX2": 1e30}, 1.0, ["map.fits", "the reference point is pixel 6, 1e+30", "CRPIX1 and CRPIX2 may be up to 1e+09"]),
-        ({"RADESYS": "FK5", "EQUINOX": 1e300}, 1.0, ["map.fits", "EQUINOX = 1e+300 is no year", "set EQUINOX"]),
-        ({"BUNIT": "Jy/beam", "BMAJ": 1e-300}, 1.0, ["map.fits", "1e-300 deg is no size of a pixel or beam", "BMAJ and BMIN"]),
+        (
+            {"CRPIX2": 1e30},
+            1.0,
+            [
+                "map.fits",
+                "the reference point is pixel 6, 1e+30",
+                "CRPIX1 and CRPIX2 may be up to 1e+09",
+            ],
+        ),
+        (
+            {"RADESYS": "FK5", "EQUINOX": 1e300},
+            1.0,
+            ["map.fits", "EQUINOX = 1e+300 is no year", "set EQUINOX"],
+        ),
+        (
+            {"BUNIT": "Jy/beam", "BMAJ": 1e-300},
+            1.0,
+            ["map.fits", "1e-300 deg is no size of a pixel or beam", "BMAJ and BMIN"],
+        ),
     ],
 )
 def test_numbers_in_a_map_that_no_sky_has(here, capsys, cards, value, words):
@@ -424,13 +552,25 @@ SIGNALS = "  - Efficiency\n"
     [
         (FILTERS, "HighpassFilter: {frequency: 600 Hz}", "removes everything"),
         (FILTERS, "HighpassFilter: {frequency: 600 Hz, response: bessel}", "removes everything"),
-        (FILTERS, "HighpassFilter: {frequency: 1 Hz, trim: 1 s}", "leaves nothing of a scan of 2 s"),
-        (FILTERS, "HighpassFilter: {frequency: 1 Hz, mask: {radius: 10 deg}}", "covers the whole scan"),
+        (
+            FILTERS,
+            "HighpassFilter: {frequency: 1 Hz, trim: 1 s}",
+            "leaves nothing of a scan of 2 s",
+        ),
+        (
+            FILTERS,
+            "HighpassFilter: {frequency: 1 Hz, mask: {radius: 10 deg}}",
+            "covers the whole scan",
+        ),
         (FILTERS, "Detrend: {mask: {radius: 10 deg}}", "covers the whole scan"),
         (FILTERS, "PolynomialFilter: {interval: throw}", "the scan has no interval 'throw'"),
         (FILTERS, "PolynomialFilter: {mask: {radius: 10 deg}}", "covers the whole scan"),
         (FILTERS, "Despline: {knots: 0.5 ms}", "more than 2000"),
-        (FILTERS, "HighpassFilter: {frequency: 1 Hz, mask: {file: map.fits}}", "covers the whole scan"),
+        (
+            FILTERS,
+            "HighpassFilter: {frequency: 1 Hz, mask: {file: map.fits}}",
+            "covers the whole scan",
+        ),
         (FILTERS, "HighpassFilter: {frequency: 1 Hz, mask: {file: nan.fits}}", "NaN"),
         (FILTERS, "CommonModeFilter: {mask: {file: nan.fits}}", "NaN"),
         (FILTERS, "ModeSpectrum: {delays: 60}", "more than 4096 rows"),
@@ -440,20 +580,28 @@ SIGNALS = "  - Efficiency\n"
         ("  - SaveMap\n", "CompareMaps: {file: nan.fits}", "no pixel has a value"),
         ("  - SaveMap\n", "CompareMaps: {file: my.yaml}", "my.yaml"),
         ("  - SaveMap\n", "CompareMaps: {map: nope}", "there is no map 'nope'"),
-        ("  - SaveMap\n", "CompareMaps: {reference: noiseless/nope}", "there is no map 'noiseless/nope'"),
+        (
+            "  - SaveMap\n",
+            "CompareMaps: {reference: noiseless/nope}",
+            "there is no map 'noiseless/nope'",
+        ),
         ("  - SaveMap\n", "MapSpectrum: {maps: [nope]}", "there is no map 'nope'"),
         ("  - SaveMap\n", "TransferFunction: {map: nope}", "there is no map 'nope'"),
         ("  - SaveMap\n", "AtmosphereScreens", "there is no atmosphere to show"),
         (FILTERS, "CompareStreams: {reference: atmosphere}", "there is no stream 'atmosphere'"),
     ],
 )
-def test_what_a_scan_does_not_allow_is_refused_by_check_as_by_run(here, capsys, before, step, words):
+def test_what_a_scan_does_not_allow_is_refused_by_check_as_by_run(
+    here, capsys, before, step, words
+):
     """At the step's place in the file, before anything is simulated."""
     write_map(here / "nan.fits", np.full((11, 11), np.nan))
     (here / "my.yaml").write_text(PIPELINE.replace(before, f"  - {step}\n{before}"))
     assert before in PIPELINE
     for command in ("check", "run"):
-        assert cli.main([command, "my.yaml", *(["--output", "out"] if command == "run" else [])]) == 2
+        assert (
+            cli.main([command, "my.yaml", *(["--output", "out"] if command == "run" else [])]) == 2
+        )
         message = capsys.readouterr().err
         assert "Traceback" not in message
         assert words in message, message
@@ -465,12 +613,21 @@ def test_what_a_scan_does_not_allow_is_refused_by_check_as_by_run(here, capsys, 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("- BinMap", "- BinMap: {pixel: 1e30 arcsec}"), ["my.yaml:11:22", "1e30 arcsec is more than 1e+06 rad"]),
-        (("- BinMap", "- BinMap: {pixel: 1e-300 arcsec}"), ["my.yaml:11:22", "1e-300 arcsec is less than 1e-30 rad"]),
+        (
+            ("- BinMap", "- BinMap: {pixel: 1e30 arcsec}"),
+            ["my.yaml:11:22", "1e30 arcsec is more than 1e+06 rad"],
+        ),
+        (
+            ("- BinMap", "- BinMap: {pixel: 1e-300 arcsec}"),
+            ["my.yaml:11:22", "1e-300 arcsec is less than 1e-30 rad"],
+        ),
         (("- BinMap", "- BinMap: {smooth: 1e9 arcsec}"), ["my.yaml:11:23", "at most 0.1 rad"]),
         (("map.fits}", "map.fits, scale: 1e300}"), ["my.yaml:8:36", "must be at most 1e+30"]),
         (("map.fits}", "map.fits, outside: 1e300 K}"), ["my.yaml:8:38", "more than 1e+15 K"]),
-        (("map.fits}", "map.fits, pixel_size: 1e-300 arcsec}"), ["my.yaml:8:41", "less than 1e-30 rad"]),
+        (
+            ("map.fits}", "map.fits, pixel_size: 1e-300 arcsec}"),
+            ["my.yaml:8:41", "less than 1e-30 rad"],
+        ),
         (("2 s}", "2 s, sample_rate: 1e-300 Hz}"), ["my.yaml:7:54", "less than 1e-30 Hz"]),
     ],
 )
@@ -478,5 +635,7 @@ def test_parameters_that_nothing_has(here, capsys, change, words):
     (here / "my.yaml").write_text(PIPELINE.replace(*change))
     message = refused(capsys, "check")
     assert "Traceback" not in message
-    assert words[0].rpartition(":")[0] in message, message  # on that line; where in it is up to the kind of mistake
+    assert words[0].rpartition(":")[0] in message, (
+        message
+    )  # on that line; where in it is up to the kind of mistake
     assert all(w in message for w in words[1:]), message

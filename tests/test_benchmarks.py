@@ -1,4 +1,6 @@
-"""Benchmarks find the shipped map in an installed package, which has no folders beside it as this tree has."""
+"""Benchmarks find the shipped map in an installed package, which has no folders beside it as this
+tree has.
+"""
 
 import shutil
 import subprocess
@@ -33,7 +35,9 @@ EXPRESSIONS = {
 def site(tmp_path_factory):
     """The package alone, as a wheel unpacks it."""
     folder = tmp_path_factory.mktemp("site")
-    shutil.copytree(Path(zonda.__file__).parent, folder / "zonda", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        Path(zonda.__file__).parent, folder / "zonda", ignore=shutil.ignore_patterns("__pycache__")
+    )
     return folder
 
 

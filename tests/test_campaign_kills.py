@@ -1,7 +1,9 @@
-"""Campaigns that are killed: what is resumed has the bits of an undisturbed run, and no file is half-written at any moment.
+"""Campaigns that are killed: what is resumed has the bits of an undisturbed run, and no file is
+half-written at any moment.
 
-SIGKILL gives a process no chance to clean up. The processes are forked from one that has imported everything, so that twenty
-kills take seconds; those of the process pool start as they do for a user.
+SIGKILL gives a process no chance to clean up. The processes are forked from one that has imported
+everything, so that twenty kills take seconds; those of the process pool start as they do for a
+user.
 """
 
 from __future__ import annotations
@@ -31,7 +33,9 @@ from zonda.core.configuration.pipeline_file import load
 
 from .scenes import camera, write_sky
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked and killed as POSIX does")
+pytestmark = pytest.mark.skipif(
+    not hasattr(os, "fork"), reason="processes are forked and killed as POSIX does"
+)
 
 CAMPAIGN = f"""\
 {camera(7)}budget: 0 %
@@ -86,22 +90,33 @@ for line in sys.stdin:
 
 
 class Nursery:
-    """Commands of zonda, one at a time, each in a fresh fork of a process that has imported everything.
+    """Commands of zonda, one at a time, each in a fresh fork of a process that has imported
+    everything.
 
-    ``first``: a command that it runs itself, before, so that its forks find everything compiled and loaded.
+    ``first``: a command that it runs itself, before, so that its forks find everything compiled and
+    loaded.
     """
 
     def __init__(self, folder: Path, *first: str) -> None:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
-        self.process = subprocess.Popen([sys.executable, "-c", NURSERY, *first], env=environment, cwd=folder, **pipes)
+        pipes: dict[str, Any] = {
+            "stdin": subprocess.PIPE,
+            "stdout": subprocess.PIPE,
+            "text": True,
+            "bufsize": 1,
+        }
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", NURSERY, *first], env=environment, cwd=folder, **pipes
+        )
         self.log = folder / "log"
 
     def begin(self, *arguments: str, clock: str = "") -> int:
         """Start a command; its process number."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
-        self.process.stdin.write(json.dumps({"arguments": arguments, "log": str(self.log), "clock": clock}) + "\n")
+        self.process.stdin.write(
+            json.dumps({"arguments": arguments, "log": str(self.log), "clock": clock}) + "\n"
+        )
         return int(self.process.stdout.readline())
 
     def end(self) -> tuple[int, str]:
@@ -133,7 +148,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def nursery(place: Path) -> Iterator[Nursery]:
-    made = Nursery(place, "run", "c.yaml", "--output", "first", "--engine", "serial", "--threads", "1")
+    made = Nursery(
+        place, "run", "c.yaml", "--output", "first", "--engine", "serial", "--threads", "1"
+    )
     yield made
     made.close()
 
@@ -142,7 +159,9 @@ def nursery(place: Path) -> Iterator[Nursery]:
 def whole_run(place: Path, nursery: Nursery) -> tuple[dict[str, list[np.ndarray]], float]:
     """Products of an undisturbed campaign, and how long it takes."""
     begin = time.monotonic()
-    status, said = nursery.run("run", "c.yaml", "--output", "undisturbed", "--engine", "serial", "--threads", "1")
+    status, said = nursery.run(
+        "run", "c.yaml", "--output", "undisturbed", "--engine", "serial", "--threads", "1"
+    )
     assert status == 0, said
     found = products(place / "undisturbed")
     assert len([name for name in found if Path(name).name.startswith("tod")]) == TASKS_IN_ALL
@@ -152,7 +171,9 @@ def whole_run(place: Path, nursery: Nursery) -> tuple[dict[str, list[np.ndarray]
 
 @lru_cache(None)
 def numbers(path: Path, stamp: tuple[int, ...]) -> list[np.ndarray]:
-    """All numbers of a map or a scan; raises where the file is not whole. ``stamp``: says when it is another one."""
+    """All numbers of a map or a scan; raises where the file is not whole. ``stamp``: says when it
+    is another one.
+    """
     from astropy.io import fits
 
     found: list[np.ndarray] = []
@@ -160,7 +181,11 @@ def numbers(path: Path, stamp: tuple[int, ...]) -> list[np.ndarray]:
         for hdu in hdus:
             hdu.verify("exception")
             if hdu.data is not None and hdu.name not in ("PROVENANCE", "TALLY", "PLAN"):
-                found += [np.array(hdu.data)] if hdu.is_image else [np.array(hdu.data.field(k)) for k in range(len(hdu.columns))]
+                found += (
+                    [np.array(hdu.data)]
+                    if hdu.is_image
+                    else [np.array(hdu.data.field(k)) for k in range(len(hdu.columns))]
+                )
     assert path.stat().st_size % 2880 == 0
     return found
 
@@ -169,7 +194,10 @@ def products(folder: Path) -> dict[str, list[np.ndarray]]:
     """Numbers in all finished maps and scans, by file name."""
     paths = [p for p in sorted(folder.rglob("*.fits")) if not p.name.startswith(".")]
     stamps = [(s.st_ino, s.st_mtime_ns, s.st_size) for s in (p.stat() for p in paths)]
-    return {p.relative_to(folder).as_posix(): numbers(p, stamp) for p, stamp in zip(paths, stamps, strict=True)}
+    return {
+        p.relative_to(folder).as_posix(): numbers(p, stamp)
+        for p, stamp in zip(paths, stamps, strict=True)
+    }
 
 
 def same(one: dict[str, list[np.ndarray]], other: dict[str, list[np.ndarray]]) -> bool:
@@ -188,7 +216,12 @@ def check_whole(folder: Path) -> None:
     job = Job.read(folder) if (folder / FILE).exists() else None
     keys = {task.product: task.key for task in job.tasks} if job else {}
     for path in folder.rglob("*"):
-        if path.name.startswith(".") or path.suffix == ".fits" or "damaged" in path.name or not path.is_file():
+        if (
+            path.name.startswith(".")
+            or path.suffix == ".fits"
+            or "damaged" in path.name
+            or not path.is_file()
+        ):
             continue  # hidden names are temporary files and the lock; damaged logs are put aside
         if path.parent.name == TASKS:
             if path.name in keys or path.name.startswith("layout"):
@@ -213,8 +246,11 @@ def done(place: Path, name: str) -> int:
     return len(list((place / name / TASKS).glob("[0-9]*.npz")))
 
 
-def killed(place: Path, nursery: Nursery, name: str, moments: random.Random, *arguments: str) -> bool:
-    """Begin or resume, or what ``arguments`` say, and kill at a random moment: after some more tasks and a while.
+def killed(
+    place: Path, nursery: Nursery, name: str, moments: random.Random, *arguments: str
+) -> bool:
+    """Begin or resume, or what ``arguments`` say, and kill at a random moment: after some more
+    tasks and a while.
 
     Whether that came in time.
     """
@@ -259,7 +295,9 @@ def finish(place: Path, nursery: Nursery, name: str, **options: str) -> str:
     return said
 
 
-def test_the_main_process_killed_at_random_moments(place: Path, nursery: Nursery, whole_run: Any) -> None:
+def test_the_main_process_killed_at_random_moments(
+    place: Path, nursery: Nursery, whole_run: Any
+) -> None:
     expected = whole_run[0]
     moments, kills, rounds = random.Random(20241121), 0, 0
     while kills < KILLS_OF_THE_MAIN_PROCESS:
@@ -276,7 +314,9 @@ def test_the_main_process_killed_at_random_moments(place: Path, nursery: Nursery
 
 
 def workers_of(pid: int) -> list[int]:
-    """Worker processes of a pool, by Linux's table of processes (the pool's helper is no worker)."""
+    """Worker processes of a pool, by Linux's table of processes (the pool's helper is no
+    worker).
+    """
     found = []
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         command = Path(f"/proc/{child}/cmdline").read_bytes()
@@ -292,11 +332,18 @@ def test_workers_killed_at_random_moments(place: Path, nursery: Nursery, whole_r
     moments, kills, name = random.Random(7), 0, "workers"
     more = ["--engine", "processes", "--workers", "2"]
     while kills < KILLS_OF_WORKERS or not (place / name / "map.fits").exists():
-        arguments = ["resume", name] if (place / name / FILE).exists() else ["run", "c.yaml", "--output", name, "--threads", "1"]
+        arguments = (
+            ["resume", name]
+            if (place / name / FILE).exists()
+            else ["run", "c.yaml", "--output", name, "--threads", "1"]
+        )
         pid = nursery.begin(*arguments, *more)
         while kills < KILLS_OF_WORKERS and Path(f"/proc/{pid}").exists():
             before = len(list((place / name / TASKS).glob("[0-9]*.npz")))
-            while Path(f"/proc/{pid}/task").exists() and len(list((place / name / TASKS).glob("[0-9]*.npz"))) == before:
+            while (
+                Path(f"/proc/{pid}/task").exists()
+                and len(list((place / name / TASKS).glob("[0-9]*.npz"))) == before
+            ):
                 time.sleep(0.01)
                 if "Z" in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2][:3]:
                     break
@@ -330,14 +377,23 @@ def test_a_damaged_job_log(place: Path, nursery: Nursery, whole_run: Any, damage
         path.unlink()
     else:
         content[100:4000] = bytes(3900) if damage == "bytes" else content[100:4000]
-        path.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "text": b"hello " * 99, "bytes": content}[damage])
+        path.write_bytes(
+            {
+                "cut": content[: len(content) // 2],
+                "empty": b"",
+                "text": b"hello " * 99,
+                "bytes": content,
+            }[damage]
+        )
     said = finish(place, nursery, name)
     assert "Traceback" not in said
     assert same(products(place / name), whole_run[0])
 
 
 @pytest.mark.parametrize("damage", ["bytes", "another's"])
-def test_a_damaged_partial_product(place: Path, nursery: Nursery, whole_run: Any, damage: str) -> None:
+def test_a_damaged_partial_product(
+    place: Path, nursery: Nursery, whole_run: Any, damage: str
+) -> None:
     name = f"part-{damage[:3]}"
     partly(place, nursery, name)
     path, other = sorted((place / name / TASKS).glob("[0-9]*.npz"))[:2]
@@ -355,7 +411,9 @@ def test_a_damaged_partial_product(place: Path, nursery: Nursery, whole_run: Any
     assert same(products(place / name), whole_run[0])
 
 
-def test_an_input_removed_before_it_is_resumed(place: Path, nursery: Nursery, whole_run: Any) -> None:
+def test_an_input_removed_before_it_is_resumed(
+    place: Path, nursery: Nursery, whole_run: Any
+) -> None:
     name = "input"
     partly(place, nursery, name)
     os.rename(place / "sky.fits", place / "away.fits")
@@ -370,14 +428,18 @@ def test_an_input_removed_before_it_is_resumed(place: Path, nursery: Nursery, wh
     assert same(products(place / name), whole_run[0])
 
 
-def test_a_clock_that_jumps_before_it_is_resumed(place: Path, nursery: Nursery, whole_run: Any) -> None:
+def test_a_clock_that_jumps_before_it_is_resumed(
+    place: Path, nursery: Nursery, whole_run: Any
+) -> None:
     partly(place, nursery, "clock")
     finish(place, nursery, "clock", clock="backwards")
     assert same(products(place / "clock"), whole_run[0])
 
 
 def test_two_main_processes_at_once(place: Path, nursery: Nursery, whole_run: Any) -> None:
-    """The second is refused and changes nothing, even while the first stands still; when that is killed, the folder is free."""
+    """The second is refused and changes nothing, even while the first stands still; when that is
+    killed, the folder is free.
+    """
     name = "two"
     pid = nursery.begin(*forward(place, name))
     while len(list((place / name / TASKS).glob("[0-9]*.npz"))) < 2:
@@ -412,6 +474,8 @@ def test_sigterm_ends_a_campaign_cleanly(place: Path, nursery: Nursery, whole_ru
             break
         shutil.rmtree(place / name)  # it was quicker
     assert status == 143, said
-    assert not [p for p in (place / name).rglob(".*") if p.is_file()], "a lock or a temporary file is left"
+    assert not [p for p in (place / name).rglob(".*") if p.is_file()], (
+        "a lock or a temporary file is left"
+    )
     finish(place, nursery, name)
     assert same(products(place / name), whole_run[0])

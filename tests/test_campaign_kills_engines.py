@@ -1,4 +1,6 @@
-"""As `test_campaign_kills`, of processes that are not forks: Dask's workers, MPI's, the jobs of an array."""
+"""As `test_campaign_kills`, of processes that are not forks: Dask's workers, MPI's, the jobs of an
+array.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ from .test_campaign_kills import (
 
 __all__ = ["nursery", "place", "whole_run"]
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds processes in /proc")
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/self/task").exists(), reason="finds processes in /proc"
+)
 
 
 def wait_for(condition: Callable[[], bool], alive: Callable[[], bool]) -> None:
@@ -49,8 +53,16 @@ def wait_for(condition: Callable[[], bool], alive: Callable[[], bool]) -> None:
 
 @pytest.fixture(scope="module")
 def cluster(place: Path) -> Iterator[Any]:
-    distributed = pytest.importorskip("distributed", reason="distributed is not installed: pip install 'zonda[dask]'")
-    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None, "host": "127.0.0.1"}
+    distributed = pytest.importorskip(
+        "distributed", reason="distributed is not installed: pip install 'zonda[dask]'"
+    )
+    options = {
+        "n_workers": 2,
+        "threads_per_worker": 1,
+        "processes": True,
+        "dashboard_address": None,
+        "host": "127.0.0.1",
+    }
     with distributed.LocalCluster(**options) as made, distributed.Client(made) as client:
         client.run(lambda: __import__("zonda.core.campaign.reduce") and None)
         yield made
@@ -60,7 +72,9 @@ def test_a_dask_worker_killed(place: Path, nursery: Nursery, whole_run: Any, clu
     """Another worker does its task; its nanny starts it again."""
     moments, kills, name = random.Random(3), 0, "dask-worker"
     for _ in range(ROUNDS):
-        pid = nursery.begin("run", "c.yaml", "--output", name, "--scheduler", cluster.scheduler_address)
+        pid = nursery.begin(
+            "run", "c.yaml", "--output", name, "--scheduler", cluster.scheduler_address
+        )
         wait_for(lambda: done(place, name) > 0, Path(f"/proc/{pid}/exe").exists)
         time.sleep(moments.uniform(0, 0.05))
         worker = moments.choice(list(cluster.workers.values())).pid
@@ -78,7 +92,9 @@ def test_a_dask_worker_killed(place: Path, nursery: Nursery, whole_run: Any, clu
     pytest.fail("no worker could be killed in time")
 
 
-def test_the_main_process_of_a_dask_campaign_killed(place: Path, nursery: Nursery, whole_run: Any, cluster: Any) -> None:
+def test_the_main_process_of_a_dask_campaign_killed(
+    place: Path, nursery: Nursery, whole_run: Any, cluster: Any
+) -> None:
     moments, more, kills = random.Random(4), ["--scheduler", cluster.scheduler_address], 0
     for number in range(ROUNDS):
         name = f"dask-main-{number}"
@@ -96,13 +112,31 @@ def test_the_main_process_of_a_dask_campaign_killed(place: Path, nursery: Nurser
 
 def test_the_dask_scheduler_killed(place: Path, nursery: Nursery, whole_run: Any) -> None:
     """The campaign ends with one clean error, and goes on elsewhere."""
-    pytest.importorskip("distributed", reason="distributed is not installed: pip install 'zonda[dask]'")
+    pytest.importorskip(
+        "distributed", reason="distributed is not installed: pip install 'zonda[dask]'"
+    )
     name, at = "dask-scheduler", place / "scheduler.json"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    options: dict[str, Any] = {"cwd": place, "env": environment, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    dask = [sys.executable, "-m", "distributed.cli.dask_{}", "--scheduler-file", str(at), "--no-dashboard", "--host", "127.0.0.1"]
+    options: dict[str, Any] = {
+        "cwd": place,
+        "env": environment,
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+    }
+    dask = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_{}",
+        "--scheduler-file",
+        str(at),
+        "--no-dashboard",
+        "--host",
+        "127.0.0.1",
+    ]
     scheduler = subprocess.Popen([*(a.format("scheduler") for a in dask), "--port", "0"], **options)
-    worker = subprocess.Popen([*(a.format("worker") for a in dask), "--no-nanny", "--nthreads", "1"], **options)
+    worker = subprocess.Popen(
+        [*(a.format("worker") for a in dask), "--no-nanny", "--nthreads", "1"], **options
+    )
     try:
         wait_for(at.exists, lambda: scheduler.poll() is None)
         pid = nursery.begin("run", "c.yaml", "--output", name, "--scheduler", str(at))
@@ -117,7 +151,9 @@ def test_the_dask_scheduler_killed(place: Path, nursery: Nursery, whole_run: Any
     if status:  # it was not quicker
         assert status == 2, said
         error, cure = said.splitlines()[-2:]
-        assert error.startswith(f"error: {name}: the engine "), said  # it is gone, or failed when it combined
+        assert error.startswith(f"error: {name}: the engine "), (
+            said
+        )  # it is gone, or failed when it combined
         assert cure == f"  = zonda resume {name}", said
         assert "Traceback" not in said
         finish(place, nursery, name)
@@ -126,7 +162,9 @@ def test_the_dask_scheduler_killed(place: Path, nursery: Nursery, whole_run: Any
 
 def _forward(place: Path, name: str) -> list[str]:
     """As `forward`, leaving the engine open."""
-    return ["resume", name] if (place / name / FILE).exists() else ["run", "c.yaml", "--output", name]
+    return (
+        ["resume", name] if (place / name / FILE).exists() else ["run", "c.yaml", "--output", name]
+    )
 
 
 # ---- MPI
@@ -141,7 +179,11 @@ def ranks_of(pid: int) -> dict[int, int]:
             below += map(int, Path(f"/proc/{parent}/task/{parent}/children").read_text().split())
             variables = Path(f"/proc/{parent}/environ").read_bytes().split(b"\0")
             if Path(f"/proc/{parent}/cmdline").read_bytes().startswith(sys.executable.encode()):
-                found |= {int(v.partition(b"=")[2]): parent for v in variables if v.startswith(b"PMI_RANK=")}
+                found |= {
+                    int(v.partition(b"=")[2]): parent
+                    for v in variables
+                    if v.startswith(b"PMI_RANK=")
+                }
     return found
 
 
@@ -157,14 +199,26 @@ def test_an_mpi_process_killed(place: Path, nursery: Nursery, whole_run: Any, vi
     moments = random.Random(victim)
 
     def begin(*arguments: str) -> subprocess.Popen[str]:
-        command = [mpiexec, "-n", "2", sys.executable, "-m", "zonda.core.cli", *arguments, "--engine", "mpi"]
+        command = [
+            mpiexec,
+            "-n",
+            "2",
+            sys.executable,
+            "-m",
+            "zonda.core.cli",
+            *arguments,
+            "--engine",
+            "mpi",
+        ]
         pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
         return subprocess.Popen(command, cwd=place, env=environment, text=True, **pipes)  # type: ignore[call-overload,no-any-return]
 
     for number in range(ROUNDS):
         name = f"mpi-{victim}-{number}"
         process = begin("run", "c.yaml", "--output", name)
-        wait_for(lambda name=name: done(place, name) > 0, lambda process=process: process.poll() is None)  # type: ignore[misc]
+        wait_for(
+            lambda name=name: done(place, name) > 0, lambda process=process: process.poll() is None
+        )  # type: ignore[misc]
         time.sleep(moments.uniform(0, 0.02))
         victims = ranks_of(process.pid)
         if victim in victims:
@@ -194,7 +248,18 @@ def test_a_job_of_an_array_killed(place: Path, nursery: Nursery, whole_run: Any)
     moments, kills, name, number = random.Random(5), 0, "array", 0
     while kills < 6 and number < ROUNDS:
         number += 1
-        share = ["run", "c.yaml", "--output", name, "--engine", "serial", "--threads", "1", "--task", f"{1 + kills % 2}/2"]
+        share = [
+            "run",
+            "c.yaml",
+            "--output",
+            name,
+            "--engine",
+            "serial",
+            "--threads",
+            "1",
+            "--task",
+            f"{1 + kills % 2}/2",
+        ]
         kills += killed(place, nursery, name, moments, *share)
         if kills == 3:  # once in between
             assert nursery.run("status", name)[0] == (0 if (place / name / FILE).exists() else 2)
@@ -205,7 +270,9 @@ def test_a_job_of_an_array_killed(place: Path, nursery: Nursery, whole_run: Any)
             assert same(products(place / name), whole_run[0])
             shutil.rmtree(place / name)
     assert kills == 6
-    status, said = nursery.run("run", "c.yaml", "--output", name, "--engine", "serial", "--threads", "1", "--task", "2/2")
+    status, said = nursery.run(
+        "run", "c.yaml", "--output", name, "--engine", "serial", "--threads", "1", "--task", "2/2"
+    )
     assert status == 0, said
     assert forward(place, name)[0] == "resume"
     finish(place, nursery, name)

@@ -19,8 +19,15 @@ def source(tmp_path_factory):
     values[150, 150] = 5.0
     image = fits.PrimaryHDU(values)
     image.header.update(
-        CTYPE1="RA---TAN", CTYPE2="DEC--TAN", CRPIX1=151, CRPIX2=151, CRVAL1=75, CRVAL2=20, CDELT1=-1 / 3600, CDELT2=1 / 3600
-    )  # fmt: skip
+        CTYPE1="RA---TAN",
+        CTYPE2="DEC--TAN",
+        CRPIX1=151,
+        CRPIX2=151,
+        CRVAL1=75,
+        CRVAL2=20,
+        CDELT1=-1 / 3600,
+        CDELT2=1 / 3600,
+    )
     image.header.update(CUNIT1="deg", CUNIT2="deg", RADESYS="ICRS", BUNIT="K", TEMPSCAL="K_RJ")
     path = tmp_path_factory.mktemp("maps") / "source.fits"
     image.writeto(path)
@@ -29,14 +36,25 @@ def source(tmp_path_factory):
 
 def scene(seed=1, **more):
     return zonda.Scene(
-        **{"site": "green_bank", "instrument": "mustang2", "time": "2024-11-25T07:00", "target": "05h +20d", "seed": seed, **more}
+        **{
+            "site": "green_bank",
+            "instrument": "mustang2",
+            "time": "2024-11-25T07:00",
+            "target": "05h +20d",
+            "seed": seed,
+            **more,
+        }
     )
 
 
 def steps(source, scan_duration="20 s", modes=1, scans=1, highpass=True, **binning):
     chain = [
         zonda.PointingDaisy(
-            radius="1.5 arcmin", speed="50 arcsec/s", scan_duration=scan_duration, scans=scans, sample_rate="100 Hz"
+            radius="1.5 arcmin",
+            speed="50 arcsec/s",
+            scan_duration=scan_duration,
+            scans=scans,
+            sample_rate="100 Hz",
         ),
         zonda.SkyMap(file=source),
         zonda.AtmosphereLayers(pwv="7.7 mm", pwv_rms="0.5 %"),
@@ -52,7 +70,10 @@ def steps(source, scan_duration="20 s", modes=1, scans=1, highpass=True, **binni
 
 
 def same(a, b):
-    return all(np.array_equal(getattr(a, n), getattr(b, n), equal_nan=True) for n in ("signal", "hits", "weights", "noise"))
+    return all(
+        np.array_equal(getattr(a, n), getattr(b, n), equal_nan=True)
+        for n in ("signal", "hits", "weights", "noise")
+    )
 
 
 def test_same_bits_for_every_block_size_and_thread_count(source):
@@ -72,17 +93,26 @@ def test_same_bits_where_nothing_needs_whole_scans(source):
 
 
 def test_linear_in_the_sky_without_singular_modes(source):
-    """signal(sky + rest) - signal(rest) = signal(sky): float32 streams of 0.3 K carry 2e-8 K each, 30 hits a pixel."""
+    """signal(sky + rest) - signal(rest) = signal(sky): float32 streams of 0.3 K carry 2e-8 K each,
+    30 hits a pixel.
+    """
     runs = {"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}
     data = zonda.Pipeline(steps(source, modes=0), runs=runs).run(scene())
-    whole, sky, rest = (data.products[n].signal for n in ("map", "noiseless/map", "source_free/map"))
-    # e^-tau fluctuates by 4e-4 under the whole sky, not in the noiseless run: 4e-4 of the 70 mK peak
+    whole, sky, rest = (
+        data.products[n].signal for n in ("map", "noiseless/map", "source_free/map")
+    )
+    # e^-tau fluctuates by 4e-4 under the whole sky, not in the noiseless run: 4e-4 of the 70 mK
+    # peak
     assert np.nanmax(np.abs(whole - rest - sky)) < 1e-3 * np.nanmax(np.abs(sky))
 
 
 def test_a_point_source_keeps_place_and_flux(source):
-    """Noiseless, no filters: the map is the beam at CRVAL. 5 K x 1 pixel spreads to 5 / (2 pi sigma^2) K."""
-    data = zonda.Pipeline(steps(source, "60 s", modes=0, highpass=False), runs={"noiseless": {"only": ["sky"]}}).run(scene())
+    """Noiseless, no filters: the map is the beam at CRVAL. 5 K x 1 pixel spreads to 5 / (2 pi
+    sigma^2) K.
+    """
+    data = zonda.Pipeline(
+        steps(source, "60 s", modes=0, highpass=False), runs={"noiseless": {"only": ["sky"]}}
+    ).run(scene())
     product = data.products["noiseless/map"]
     sigma = 8.5 / 2.3548
     peak = 5 / (2 * np.pi * sigma**2)
@@ -94,14 +124,19 @@ def test_a_point_source_keeps_place_and_flux(source):
     ra, dec = WCS(product.header).celestial.pixel_to_world_values(centre_x, centre_y)
     assert abs((ra - 75) * np.cos(np.radians(20)) * 3600) < 0.1
     assert abs(dec - 20) * 3600 < 0.1
-    # the centre is the corner of four 2 arcsec pixels: each averages the beam from 0 to 2 arcsec along both axes
+    # the centre is the corner of four 2 arcsec pixels: each averages the beam from 0 to 2 arcsec
+    # along both axes
     average = (sigma * math.sqrt(math.pi / 2) * math.erf(2 / sigma / math.sqrt(2)) / 2) ** 2
-    assert abs(np.nanmax(signal) / (peak * average) - 1) < 0.02  # pixels are not quite evenly filled
+    assert (
+        abs(np.nanmax(signal) / (peak * average) - 1) < 0.02
+    )  # pixels are not quite evenly filled
     assert abs(np.sum(signal) * 4 / 5 - 1) < 0.01
 
 
 def test_white_noise_in_the_map_is_what_the_net_says(source):
-    """White noise alone: the rms of map x sqrt(hits) is NET sqrt(f_s), chi-square with as many degrees as hit pixels."""
+    """White noise alone: the rms of map x sqrt(hits) is NET sqrt(f_s), chi-square with as many
+    degrees as hit pixels.
+    """
     chain = [
         s
         for s in steps(source, modes=0, highpass=False)
@@ -114,12 +149,21 @@ def test_white_noise_in_the_map_is_what_the_net_says(source):
 
 
 def test_half_difference_holds_no_sky(source):
-    """Scans differ in noise, not in sky: the half-difference of a bright source is that of noise alone."""
+    """Scans differ in noise, not in sky: the half-difference of a bright source is that of noise
+    alone.
+    """
     runs = {"source_free": {"without": ["sky"]}}
-    data = zonda.Pipeline(steps(source, "40 s", scans=2, modes=0, half_difference=True), runs=runs).run(scene())
-    bright, free = data.products["map"].half_difference, data.products["source_free/map"].half_difference
+    data = zonda.Pipeline(
+        steps(source, "40 s", scans=2, modes=0, half_difference=True), runs=runs
+    ).run(scene())
+    bright, free = (
+        data.products["map"].half_difference,
+        data.products["source_free/map"].half_difference,
+    )
     peak = np.nanmax(np.abs(data.products["map"].signal))
-    assert np.nanmax(np.abs(bright - free)) < 0.2 * peak  # what is left: different sampling of the steep beam inside a pixel
+    assert (
+        np.nanmax(np.abs(bright - free)) < 0.2 * peak
+    )  # what is left: different sampling of the steep beam inside a pixel
     assert abs(np.nanstd(bright) / np.nanstd(free) - 1) < 0.2
 
 
@@ -128,7 +172,10 @@ def test_very_short_runs(source, duration):
     """What the filters leave of one sample is nothing: it is flagged and counted, not averaged."""
     data = zonda.Pipeline(steps(source, duration)).run(scene())
     product = data.products["map"]
-    assert product.hits.sum() + data.tally.get("BinMap", "samples dropped: flagged") == data.observations[0].n_samples * 223
+    assert (
+        product.hits.sum() + data.tally.get("BinMap", "samples dropped: flagged")
+        == data.observations[0].n_samples * 223
+    )
     assert (product.hits.sum() > 0) == (duration == "0.5 s")
     assert np.isfinite(product.signal[product.hits > 0]).all()
 

@@ -17,13 +17,20 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 
 
 CODE = ("yaml", "yml", "python", "py", "pycon", "json", "toml")
-"""Languages of blocks that say what a user writes; others are shells' commands and what they print."""
+"""Languages of blocks that say what a user writes; others are shells' commands and what they print.
+"""
 
 ELSEWHERE = {
     ("CONTRIBUTING.md", 1): "test_the_operator_that_contributing_shows_keeps_the_contract",
-    ("CONTRIBUTING.md", 2): "needs the operator above; test_the_operator_that_contributing_shows_keeps_the_contract",
+    (
+        "CONTRIBUTING.md",
+        2,
+    ): "needs the operator above; test_the_operator_that_contributing_shows_keeps_the_contract",
     ("coming_from_toast.md", 1): "needs TOAST: tests/interop/test_toast.py",
-    **{("interop.md", k): "needs TOAST or sotodlib: tests/interop, in the environments of .ci" for k in (1, 2, 3, 5, 6, 7, 8)},
+    **{
+        ("interop.md", k): "needs TOAST or sotodlib: tests/interop, in the environments of .ci"
+        for k in (1, 2, 3, 5, 6, 7, 8)
+    },
     ("sky.md", 3): "needs PySM: tests/operators/sky/test_pysm.py, in the environment of .ci/pysm",
     ("sky.md", 4): "needs PySM: tests/operators/sky/test_pysm.py, in the environment of .ci/pysm",
 }
@@ -50,13 +57,23 @@ def test_every_block_is_executed_or_said_to_be_elsewhere():
     every = {(page.name, number): language for page, number, language, _ in fenced()}
     code = {place for place, language in every.items() if language in CODE}
     assert ELSEWHERE.keys() <= code
-    executed = {p.id.rpartition("-")[::2] for p in [*blocks("python", "py"), *blocks("yaml", "yml"), *blocks("toml")]}
+    executed = {
+        p.id.rpartition("-")[::2]
+        for p in [*blocks("python", "py"), *blocks("yaml", "yml"), *blocks("toml")]
+    }
     assert {(page, int(number)) for page, number in executed} == code - ELSEWHERE.keys()
-    assert set(every.values()) - set(CODE) <= {"sh", "text", "csv", ""}, "another language: add it to CODE, or here"
+    assert set(every.values()) - set(CODE) <= {
+        "sh",
+        "text",
+        "csv",
+        "",
+    }, "another language: add it to CODE, or here"
 
 
 def in_a_folder_with_a_map(folder, monkeypatch):
-    (folder / "my_cluster.fits").write_bytes((ROOT / "pipelines" / "data" / "merging_cluster.fits").read_bytes())
+    (folder / "my_cluster.fits").write_bytes(
+        (ROOT / "pipelines" / "data" / "merging_cluster.fits").read_bytes()
+    )
     monkeypatch.chdir(folder)
 
 
@@ -73,7 +90,9 @@ def with_recorded_data(folder, text):
     import zonda
 
     camera = {"like": "mustang2", "detectors": 20}
-    scene = zonda.Scene(site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=1)
+    scene = zonda.Scene(
+        site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=1
+    )
     scan = zonda.PointingDaisy(radius="1 arcmin", scan_duration="30 s", sample_rate="25 Hz")
     steps = [scan, zonda.WhiteNoise(), zonda.PinkNoise(), zonda.Efficiency(), zonda.SaveTOD()]
     zonda.Pipeline(steps).run(scene, output=folder, threads=1)
@@ -98,7 +117,11 @@ def with_survey_data(folder, text):
     (folder / "survey.yaml").write_text(re.search(r"```yaml\n(.*?)```", page, re.S)[1])
     changes = ["instrument.detectors=4", "PointingSchedule.sample_rate=10 Hz"]
     file = zonda.load(folder / "survey.yaml", overrides=changes)
-    steps = [o for o in file.operators if type(o).__name__ in ("PointingSchedule", "WhiteNoise", "Efficiency", "SaveTOD")]
+    steps = [
+        o
+        for o in file.operators
+        if type(o).__name__ in ("PointingSchedule", "WhiteNoise", "Efficiency", "SaveTOD")
+    ]
     zonda.Pipeline(steps).run(file.scene(), output=folder, threads=1)
 
 
@@ -118,7 +141,9 @@ def test_python(text, tmp_path, monkeypatch):
     in_a_folder_with_a_map(tmp_path, monkeypatch)
     with_recorded_data(tmp_path, text)
     names = defined_before(text)
-    exec(compile(text.replace('"5 min"', '"20 s"'), "documentation", "exec"), names)  # shorter scans, same code
+    exec(
+        compile(text.replace('"5 min"', '"20 s"'), "documentation", "exec"), names
+    )  # shorter scans, same code
     assert names
 
 
@@ -127,7 +152,12 @@ def test_toml(text):
     """Entry points of groups that there are."""
     from zonda.core import registry
 
-    known = {group for r in vars(registry).values() if isinstance(r, registry.Registry) for group in r.groups}
+    known = {
+        group
+        for r in vars(registry).values()
+        if isinstance(r, registry.Registry)
+        for group in r.groups
+    }
     assert tomllib.loads(text)["project"]["entry-points"].keys() <= known
 
 
@@ -137,7 +167,9 @@ def gallery():
 
 
 LONG = {"psd_slope": "80 s", "PointingRaster": "3 min"}
-"""What a pipeline may hold that needs longer scans than those of `small`: a spectrum at 16 mHz, a field that is covered once."""
+"""What a pipeline may hold that needs longer scans than those of `small`: a spectrum at 16 mHz, a
+field that is covered once.
+"""
 
 
 def small(text):
@@ -156,7 +188,9 @@ def small(text):
                 parameters["sample_rate"] = "20 Hz"
     campaign, sweep = tree.get("campaign"), tree.get("sweep")
     for many in (many for many in (campaign, sweep) if many):
-        many |= {"engine": "serial"} | {key: min(many[key], 2) for key in ("nights", "realizations", "seeds") if key in many}
+        many |= {"engine": "serial"} | {
+            key: min(many[key], 2) for key in ("nights", "realizations", "seeds") if key in many
+        }
     return yaml.safe_dump(tree, sort_keys=False)
 
 
@@ -165,7 +199,10 @@ instrument: {name: camera, telescope: {name: dish, diameter: 12 m}, band: {name:
   detectors: 38, field_of_view: 10 arcmin, main_beam_efficiency: 0.6, illumination_efficiency: 0.9, net: 500 uK s(1/2),
   knee: 0.2 Hz, sample_rate: 25 Hz, polarization: pairs}
 """
-PLACE = "site: {name: here, latitude: 40.3 deg, longitude: 10.1 deg, altitude: 600 m, climatology: green_bank}\n"
+PLACE = (
+    "site: {name: here, latitude: 40.3 deg, longitude: 10.1 deg, altitude: 600 m, climatology:"
+    " green_bank}\n"
+)
 SCENE = "time: 2024-03-01T02:00\ntarget: az 100 deg el 60 deg\nseed: 3\n"
 SCAN = "- PointingDaisy: {radius: 10 arcmin, speed: 1 arcmin/s, scan_duration: 20 s}\n"
 MAPPED = "- AtmosphereLayers\n- WhiteNoise\n- Efficiency\n- BinMap: {pixel: 30 arcsec}\n- SaveMap\n"
@@ -176,18 +213,27 @@ def in_a_scene(text):
     if text.startswith("accuracy:"):
         return [PLACE + CAMERA + SCENE + text + "operators:\n" + SCAN + MAPPED]
     if text.startswith("weather:"):
-        return [PLACE + CAMERA + SCENE + line + "\noperators:\n" + SCAN + MAPPED for line in text.splitlines()]
+        return [
+            PLACE + CAMERA + SCENE + line + "\noperators:\n" + SCAN + MAPPED
+            for line in text.splitlines()
+        ]
     if text.startswith("site:"):
         return [text + CAMERA + SCENE + "weather: {pwv: 2 mm}\noperators:\n" + SCAN + MAPPED]
     if "LoadTOD" in text:
-        return ["operators:\n" + text + "- HighpassFilter: {frequency: 0.1 Hz}\n- BinMap: {pixel: 5 arcsec}\n- SaveMap\n"]
+        return [
+            "operators:\n"
+            + text
+            + "- HighpassFilter: {frequency: 0.1 Hz}\n- BinMap: {pixel: 5 arcsec}\n- SaveMap\n"
+        ]
     plate, *others = text.splitlines(keepends=True)
     steps = plate + others[0] + "- WhiteNoise\n- Efficiency\n" + "".join(others[1:]) + "- SaveMap\n"
     return [PLACE + CAMERA + SCENE + "operators:\n" + SCAN + steps]
 
 
 def with_what_fragments_read(folder, text):
-    """Files that fragments name: a polarized map, the weather, the noise that `zonda noise` finds."""
+    """Files that fragments name: a polarized map, the weather, the noise that `zonda noise`
+    finds.
+    """
     from zonda.core import cli
 
     if "iqu.fits" in text:
@@ -195,18 +241,32 @@ def with_what_fragments_read(folder, text):
         with_a_filament(text)
         (folder / "filament.fits").rename(folder / "iqu.fits")
     if "era5.nc" in text:
-        files = runpy.run_path(str(ROOT / "tests" / "operators" / "atmosphere" / "weather" / "era5_files.py"))
+        files = runpy.run_path(
+            str(ROOT / "tests" / "operators" / "atmosphere" / "weather" / "era5_files.py")
+        )
         files["new_layout"](folder / "era5.nc")
-        rows = ["height [km], pressure [hPa], temperature [degC], relative humidity [%], wind east [m/s], wind north [m/s]"]
-        rows += ["0.5, 955, 10, 50, 3, 1", "1.5, 845, 4, 40, 5, 1", "3.0, 700, -5, 30, 9, 2", "5.0, 540, -18, 20, 14, 3"]
+        rows = [
+            "height [km], pressure [hPa], temperature [degC], relative humidity [%], wind east"
+            " [m/s], wind north [m/s]"
+        ]
+        rows += [
+            "0.5, 955, 10, 50, 3, 1",
+            "1.5, 845, 4, 40, 5, 1",
+            "3.0, 700, -5, 30, 9, 2",
+            "5.0, 540, -18, 20, 14, 3",
+        ]
         (folder / "profile.csv").write_text("\n".join([*rows, "9.0, 308, -44, 10, 25, 0"]) + "\n")
     if "night.noise.ecsv" in text:
-        assert cli.main(["noise", "night.h5", "--segment", "4 s", "--output", "night.noise.ecsv"]) == 0
+        assert (
+            cli.main(["noise", "night.h5", "--segment", "4 s", "--output", "night.noise.ecsv"]) == 0
+        )
 
 
 @pytest.mark.parametrize("text", [*blocks("yaml", "yml"), *gallery()])
 def test_yaml(text, tmp_path, monkeypatch, capsys):
-    """A pipeline as `zonda check` sees it in full, and run with few detectors and short scans; a fragment in a small scene."""
+    """A pipeline as `zonda check` sees it in full, and run with few detectors and short scans; a
+    fragment in a small scene.
+    """
     from zonda.core import cli
 
     in_a_folder_with_a_map(tmp_path, monkeypatch)
@@ -235,11 +295,20 @@ def test_the_readme_shows_one_pipeline_twice(tmp_path, monkeypatch):
 
     in_a_folder_with_a_map(tmp_path, monkeypatch)
     page = (ROOT / "README.md").read_text()
-    (tmp_path / "my.yaml").write_text(next(t for t in re.findall(r"```yaml\n(.*?)```", page, re.S) if "operators:" in t))
+    (tmp_path / "my.yaml").write_text(
+        next(t for t in re.findall(r"```yaml\n(.*?)```", page, re.S) if "operators:" in t)
+    )
     file = load(tmp_path / "my.yaml")
     python = next(t for t in re.findall(r"```python\n(.*?)```", page, re.S))
     names = {}
-    exec(compile(python[: python.index(".run(")].replace("data = ", "pipeline = "), "documentation", "exec"), names)
+    exec(
+        compile(
+            python[: python.index(".run(")].replace("data = ", "pipeline = "),
+            "documentation",
+            "exec",
+        ),
+        names,
+    )
     assert names["scene"] == file.scene()
     assert [repr(o) for o in names["pipeline"].operators] == [repr(o) for o in file.operators]
 
@@ -264,10 +333,16 @@ def test_every_page_is_in_the_navigation_of_the_site_once():
     def pages(entry):
         if isinstance(entry, str):
             return [entry]
-        return [page for part in (entry.values() if isinstance(entry, dict) else entry) for page in pages(part)]
+        return [
+            page
+            for part in (entry.values() if isinstance(entry, dict) else entry)
+            for page in pages(part)
+        ]
 
     named = pages(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
-    written = [str(page.relative_to(ROOT / "docs")) for page in PAGES if page.is_relative_to(ROOT / "docs")]
+    written = [
+        str(page.relative_to(ROOT / "docs")) for page in PAGES if page.is_relative_to(ROOT / "docs")
+    ]
     assert len(named) == len(set(named))
     assert set(named) == {*written, *script("site_pages").made_pages()}
 
@@ -282,7 +357,9 @@ def test_every_public_name_is_in_the_python_reference():
         assert re.search(rf"^::: .*\.{name}$|`zonda\.{name}`", pages, re.M), name
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "docs" / "tutorials").glob("*.ipynb")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "docs" / "tutorials").glob("*.ipynb")), ids=lambda p: p.stem
+)
 def test_notebooks_are_kept_without_results(path):
     """`.ci/site` executes them."""
     cells = json.loads(path.read_text())["cells"]
@@ -319,15 +396,23 @@ def test_what_is_in_the_gallery_says_what_it_shows():
 
 
 def test_the_site_links_to_files_that_it_has(tmp_path):
-    """What stands elsewhere in the repository is named; a notebook is its page; benchmarks/README.md is a page of the site."""
+    """What stands elsewhere in the repository is named; a notebook is its page;
+    benchmarks/README.md is a page of the site.
+    """
     from types import SimpleNamespace
 
     change = script("site_pages").on_page_markdown
     shown = SimpleNamespace(file=SimpleNamespace(src_uri="performance.md"))
     code = "\n```sh\n[x](../LICENSE)\n```\n"
-    text = "[b](../benchmarks/README.md#x) [t](tutorials/plugin.ipynb) [`l`](../LICENSE) [m](maps.md#y) [plan.md](plan.md)"
+    text = (
+        "[b](../benchmarks/README.md#x) [t](tutorials/plugin.ipynb) [`l`](../LICENSE)"
+        " [m](maps.md#y) [plan.md](plan.md)"
+    )
     title = (ROOT / "docs" / "plan.md").read_text().splitlines()[0].removeprefix("# ")
-    wanted = f"[b](development/benchmarks.md#x) [t](tutorials/plugin.md) `LICENSE` [m](maps.md#y) [{title}](plan.md)"
+    wanted = (
+        "[b](development/benchmarks.md#x) [t](tutorials/plugin.md) `LICENSE` [m](maps.md#y)"
+        f" [{title}](plan.md)"
+    )
     assert change(text + code, shown, None, None) == wanted + code
 
 
@@ -337,15 +422,24 @@ def test_the_reference_is_made_from_the_operators():
 
 
 def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
-    """The gain drift multiplies all of the signal, tens of kelvin of mean included, and loses no microkelvin."""
+    """The gain drift multiplies all of the signal, tens of kelvin of mean included, and loses no
+    microkelvin.
+    """
     import numpy as np
 
     import zonda
     import zonda.testing
 
-    first, *others = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.S)
-    assert set(re.findall(r"^(?:import|from) .*", first, re.M)) == {"import numpy as np", "import zonda"}
-    (tmp_path / "page_for_authors.py").write_text(first + "".join(others))  # a file: docstrings of fields are read from it
+    first, *others = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.S
+    )
+    assert set(re.findall(r"^(?:import|from) .*", first, re.M)) == {
+        "import numpy as np",
+        "import zonda",
+    }
+    (tmp_path / "page_for_authors.py").write_text(
+        first + "".join(others)
+    )  # a file: docstrings of fields are read from it
     monkeypatch.syspath_prepend(str(tmp_path))
     page = importlib.import_module("page_for_authors")
     drift, demean = page.SwingingGain(period="20 s"), page.Demean()
@@ -356,7 +450,13 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     zonda.testing.check_operator(page.Peak())
 
     def signal(*steps):
-        scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=5)
+        scene = zonda.Scene(
+            site="green_bank",
+            instrument="mustang2",
+            time="2024-11-25T07:00",
+            target="05h +20d",
+            seed=5,
+        )
         chain = [
             zonda.PointingStare(scan_duration="5 s"),
             zonda.AtmosphereLayers(pwv="5 mm"),
@@ -373,13 +473,16 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     phase = 2 * np.pi * observation.seconds / 20
     gain = 1 + drift.prepare(observation) @ np.stack([np.cos(phase), np.sin(phase)])
     assert np.abs(gain - 1).max() > 0.02
-    # what stands beside the mean, below 2 K (4 sigma of 1 % of 50 K), is rounded to 2^-24 of it, before and after
+    # what stands beside the mean, below 2 K (4 sigma of 1 % of 50 K), is rounded to 2^-24 of it,
+    # before and after
     assert np.abs(drifting - gain * plain).max() < 2 * 2 * 2.0**-24
     left, _ = signal(demean)
     true = plain - plain.mean(axis=1, keepdims=True)
     assert np.abs(left - true).max() < 2.0**-24 * np.abs(true).max()
 
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=5)
+    scene = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=5
+    )
     steps = [
         zonda.PointingStare(scan_duration="5 s"),
         zonda.WhiteNoise(),

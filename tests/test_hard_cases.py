@@ -1,4 +1,6 @@
-"""Every row of the stability matrix: the checks of `zonda doctor` and those of tests/checks, which docs/stability.md shows."""
+"""Every row of the stability matrix: the checks of `zonda doctor` and those of tests/checks, which
+docs/stability.md shows.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ GIVEN = ROOT.parent / "shared" / "hard_cases.md"
 CHECKS = matrix()
 
 FACTOR = 10
-"""Figures vary by CPU; published and measured ones differ by less than this, or both are below limit / FACTOR."""
+"""Figures vary by CPU; published and measured ones differ by less than this, or both are below
+limit / FACTOR.
+"""
 
 
 @cache
@@ -39,17 +43,24 @@ def result(check: Check) -> Result:
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
 def test_within_its_limit(check: Check) -> None:
     found = result(check)
-    assert found.passed, f"{check.what}, against {check.reference}: {found.reached}, limit {found.accepted} {found.remark}"
+    assert found.passed, (
+        f"{check.what}, against {check.reference}: {found.reached}, limit {found.accepted}"
+        f" {found.remark}"
+    )
 
 
 @pytest.mark.skipif(not GIVEN.exists(), reason="the given matrix is not beside this checkout")
 def test_the_rows_are_those_given() -> None:
     rows = [
-        [cell.strip() for cell in line.strip().strip("|").split("|")] for line in GIVEN.read_text().splitlines() if "|" in line
+        [cell.strip() for cell in line.strip().strip("|").split("|")]
+        for line in GIVEN.read_text().splitlines()
+        if "|" in line
     ]
     given = [(row[0], row[2]) for row in rows[2:]]
     ours = [(case.text, case.acceptance) for case in MATRIX]
-    assert [row for row in given if row in ours] == ours, "a row is not the given one, or stands elsewhere"
+    assert [row for row in given if row in ours] == ours, (
+        "a row is not the given one, or stands elsewhere"
+    )
     if missing := [case for case, _ in given if (case, _) not in ours]:
         pytest.skip(f"rows that no check covers yet: {'; '.join(missing)}")
 
@@ -62,7 +73,9 @@ def test_every_row_has_a_check_and_names_are_unique() -> None:
 
 @cache
 def page_maker() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_stability", ROOT / "docs" / "make_stability.py")
+    spec = importlib.util.spec_from_file_location(
+        "make_stability", ROOT / "docs" / "make_stability.py"
+    )
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -76,11 +89,15 @@ def test_the_page_says_what_is_measured() -> None:
     published, now = maker.rows(maker.PAGE.read_text()), maker.rows(maker.page(results))
     assert len(now) == len(results)
     why = "run python docs/make_stability.py"
-    assert {name: row[:3] for name, row in published.items()} == {name: row[:3] for name, row in now.items()}, why
+    assert {name: row[:3] for name, row in published.items()} == {
+        name: row[:3] for name, row in now.items()
+    }, why
     for r in results:
         figures = [float(row[r.check.name][3].split()[0]) for row in (published, now)]
         low, high = sorted(figures)
-        assert high <= FACTOR * low or high <= r.check.limit / FACTOR, f"{r.check.name}: {figures}; {why}"
+        assert high <= FACTOR * low or high <= r.check.limit / FACTOR, (
+            f"{r.check.name}: {figures}; {why}"
+        )
 
 
 def test_constants_are_those_of_mpmath() -> None:
@@ -137,7 +154,12 @@ def test_a_check_that_raises_or_is_not_a_number_has_failed() -> None:
     assert (raised.passed, nan.passed, good.passed) == (False, False, True)
     assert raised.remark == "ZeroDivisionError: by zero"
     assert nan.reached == "nan K"
-    assert (good.check.what, good.reached, good.remark, good.check.name) == ("nothing", "0", "a remark", "mine.exact")
+    assert (good.check.what, good.reached, good.remark, good.check.name) == (
+        "nothing",
+        "0",
+        "a remark",
+        "mine.exact",
+    )
     with pytest.raises(ValueError, match="no docstring"):
         family.add(case, reference="nothing", limit=0)(lambda: 0.0)
 
@@ -155,12 +177,20 @@ def test_a_third_party_adds_checks() -> None:
 
 
 def some(*figures: float) -> list[Check]:
-    return [Check(MACHINE, f"f.c{k}", "what", "reference", 1.0, "", lambda f=f: f) for k, f in enumerate(figures)]
+    return [
+        Check(MACHINE, f"f.c{k}", "what", "reference", 1.0, "", lambda f=f: f)
+        for k, f in enumerate(figures)
+    ]
 
 
-@pytest.mark.parametrize(("figures", "status"), [((0.5, 0.0), 0), ((0.5, 2.0), 1), ((math.nan,), 1)])
+@pytest.mark.parametrize(
+    ("figures", "status"), [((0.5, 0.0), 0), ((0.5, 2.0), 1), ((math.nan,), 1)]
+)
 def test_doctor(
-    figures: tuple[float, ...], status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    figures: tuple[float, ...],
+    status: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(core_checks, "registered", lambda: some(*figures))
     assert main(["doctor"]) == status
@@ -181,12 +211,22 @@ def test_doctor_measures_what_is_registered_the_machine_first(
     monkeypatch.setattr(core_checks, "measure", lambda checks: ran.extend(checks) or [])
     assert main(["doctor", "--json"]) == 0
     assert sorted(check.name for check in ran) == sorted(check.name for check in registered())
-    assert [check.case is MACHINE for check in ran] == sorted((check.case is MACHINE for check in ran), reverse=True)
+    assert [check.case is MACHINE for check in ran] == sorted(
+        (check.case is MACHINE for check in ran), reverse=True
+    )
     capsys.readouterr()
 
 
 @pytest.mark.parametrize(
-    "name", ["denormals", "rounding", "elementary_functions", "writable_cache", "memory", "earth_orientation"]
+    "name",
+    [
+        "denormals",
+        "rounding",
+        "elementary_functions",
+        "writable_cache",
+        "memory",
+        "earth_orientation",
+    ],
 )
 def test_checks_of_the_machine_give_figures(name: str) -> None:
     (check,) = (c for c in machine.checks if c.name == f"machine.{name}")

@@ -1,4 +1,6 @@
-"""Headers of input maps with each card removed or set to what it is not: `zonda check` and a run agree, in clean words."""
+"""Headers of input maps with each card removed or set to what it is not: `zonda check` and a run
+agree, in clean words.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,18 @@ from zonda.core.errors import ZondaError
 from zonda.core.run.first_look import looks
 
 WORLD = {
-    "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 6.0, "CRPIX2": 6.0, "CRVAL1": 75.0, "CRVAL2": 20.0, "CDELT1": -1 / 60,
-    "CDELT2": 1 / 60, "CUNIT1": "deg", "CUNIT2": "deg", "RADESYS": "ICRS",
-}  # fmt: skip
+    "CTYPE1": "RA---TAN",
+    "CTYPE2": "DEC--TAN",
+    "CRPIX1": 6.0,
+    "CRPIX2": 6.0,
+    "CRVAL1": 75.0,
+    "CRVAL2": 20.0,
+    "CDELT1": -1 / 60,
+    "CDELT2": 1 / 60,
+    "CUNIT1": "deg",
+    "CUNIT2": "deg",
+    "RADESYS": "ICRS",
+}
 KELVIN = {"BUNIT": "K", "TEMPSCAL": "K_RJ"}
 JANSKY = {"BUNIT": "Jy/beam", "BMAJ": 0.05, "BMIN": 0.05}
 STOKES = {"CTYPE3": "STOKES", "CRPIX3": 1.0, "CRVAL3": 1.0, "CDELT3": 1.0, "POLCCONV": "COSMO"}
@@ -28,10 +39,20 @@ IMAGES = {
     "stokes": ((3, 11, 11), WORLD | KELVIN | STOKES),
     "slanted": ((11, 11), WORLD | KELVIN | OTHER),
 }
-SKY = {"PIXTYPE": "HEALPIX", "ORDERING": "RING", "NSIDE": 64, "COORDSYS": "C", "BAD_DATA": -1.6375e30, "INDXSCHM": "IMPLICIT"}
+SKY = {
+    "PIXTYPE": "HEALPIX",
+    "ORDERING": "RING",
+    "NSIDE": 64,
+    "COORDSYS": "C",
+    "BAD_DATA": -1.6375e30,
+    "INDXSCHM": "IMPLICIT",
+}
 TABLES = {
     "full": (["TEMPERATURE"], SKY),
-    "partial": (["PIXEL", "I_STOKES", "Q_STOKES", "U_STOKES"], SKY | {"INDXSCHM": "EXPLICIT", "POLCCONV": "IAU"}),
+    "partial": (
+        ["PIXEL", "I_STOKES", "Q_STOKES", "U_STOKES"],
+        SKY | {"INDXSCHM": "EXPLICIT", "POLCCONV": "IAU"},
+    ),
 }
 VALUES = [None, "x", 0, -1, 1e30, True]
 """None: the card is removed."""
@@ -56,7 +77,12 @@ def write(path: Path, name: str, changes: dict[str, Any]) -> None:
         pixels = np.arange(12 * 64**2) if name == "full" else np.arange(16000, 20000)
         values = np.random.default_rng(0).normal(size=len(pixels))
         columns = [
-            fits.Column(n, "K", array=pixels) if n == "PIXEL" else fits.Column(n, "D", unit="K_RJ", array=values) for n in names
+            (
+                fits.Column(n, "K", array=pixels)
+                if n == "PIXEL"
+                else fits.Column(n, "D", unit="K_RJ", array=values)
+            )
+            for n in names
         ]
         hdus = [fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]
         cards = cards | {f"TUNIT{k}": "K_RJ" for k, n in enumerate(names, 1) if n != "PIXEL"}
@@ -71,12 +97,22 @@ def write(path: Path, name: str, changes: dict[str, Any]) -> None:
 
 
 def verdicts(path: Path) -> tuple[str, str]:
-    """What a look and a run say, each in the first line of its error; empty: they accept the file."""
+    """What a look and a run say, each in the first line of its error; empty: they accept the
+    file.
+    """
     camera = {"like": "mustang2", "detectors": 8, "sample_rate": "10 Hz", "polarization": "pairs"}
-    scene = zonda.Scene(site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=1)
-    steps = [zonda.PointingDaisy(radius="1 arcmin", speed="20 arcsec/s", scan_duration="1 s"), zonda.SkyMap(file=path)]
+    scene = zonda.Scene(
+        site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=1
+    )
+    steps = [
+        zonda.PointingDaisy(radius="1 arcmin", speed="20 arcsec/s", scan_duration="1 s"),
+        zonda.SkyMap(file=path),
+    ]
     pipeline, said = zonda.Pipeline([*steps, zonda.Efficiency()]), []
-    for act in (lambda: [str(err) for _, err in looks(pipeline.operators, scene)[1]], lambda: run(pipeline, scene)):
+    for act in (
+        lambda: [str(err) for _, err in looks(pipeline.operators, scene)[1]],
+        lambda: run(pipeline, scene),
+    ):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             found = act()
@@ -99,12 +135,21 @@ def cards_of(name: str) -> list[str]:
     """What is its own."""
     if name in TABLES:
         names, cards = TABLES[name]
-        columns = [f"{key}{k}" for k, n in enumerate(names, 1) for key in ("TTYPE", "TUNIT") if (n, key) != ("PIXEL", "TUNIT")]
+        columns = [
+            f"{key}{k}"
+            for k, n in enumerate(names, 1)
+            for key in ("TTYPE", "TUNIT")
+            if (n, key) != ("PIXEL", "TUNIT")
+        ]
         return [*cards, *columns] if name == "full" else [*columns, "INDXSCHM", "POLCCONV"]
-    return list({"kelvin": WORLD | KELVIN, "jansky": JANSKY, "stokes": STOKES, "slanted": OTHER}[name])
+    return list(
+        {"kelvin": WORLD | KELVIN, "jansky": JANSKY, "stokes": STOKES, "slanted": OTHER}[name]
+    )
 
 
-@pytest.mark.parametrize(("name", "card"), [(name, card) for name in (*IMAGES, *TABLES) for card in cards_of(name)])
+@pytest.mark.parametrize(
+    ("name", "card"), [(name, card) for name in (*IMAGES, *TABLES) for card in cards_of(name)]
+)
 def test_check_and_run_agree(tmp_path: Path, name: str, card: str) -> None:
     """Whatever a card is; what either raises that is no `ZondaError` fails the test."""
     write(tmp_path / "map.fits", name, {})

@@ -37,7 +37,9 @@ def test_there_are_ten_at_least() -> None:
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.breaks.__name__)
-def test_a_check_fails_without_the_safeguard(mutation: Mutation, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_check_fails_without_the_safeguard(
+    mutation: Mutation, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert passes(mutation.check)
     mutation.breaks(monkeypatch)
     broken = run_anew(mutation.check)

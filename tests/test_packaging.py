@@ -1,4 +1,6 @@
-"""Every importable folder is listed in pyproject.toml (an editable install would hide an omission)."""
+"""Every importable folder is listed in pyproject.toml (an editable install would hide an
+omission).
+"""
 
 import json
 import pathlib
@@ -43,8 +45,12 @@ def test_what_the_badges_and_the_archive_say_is_what_pyproject_says():
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     versions = re.findall(r"Python :: (3\.\d+)", " ".join(project["classifiers"]))
-    assert f"Python: {' | '.join(versions)}" in (ROOT / "docs" / "images" / "python.svg").read_text()
-    assert f"licence: {project['license']}" in (ROOT / "docs" / "images" / "licence.svg").read_text()
+    assert (
+        f"Python: {' | '.join(versions)}" in (ROOT / "docs" / "images" / "python.svg").read_text()
+    )
+    assert (
+        f"licence: {project['license']}" in (ROOT / "docs" / "images" / "licence.svg").read_text()
+    )
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     archive = json.loads((ROOT / ".zenodo.json").read_text())
     assert archive["license"] == citation["license"] == project["license"]

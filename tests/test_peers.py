@@ -1,4 +1,6 @@
-"""`benchmarks/peers.py`: environments that are not there, and the statistics against a process drawn from its covariance."""
+"""`benchmarks/peers.py`: environments that are not there, and the statistics against a process
+drawn from its covariance.
+"""
 
 import importlib.util
 import sys
@@ -27,9 +29,14 @@ def module(path: Path) -> ModuleType:
 
 def test_a_missing_environment_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     peers = module(BENCHMARKS / "peers.py")
-    assert peers.installed({"toast": None, "maria": "/nowhere/python", "numpy": sys.executable}) == {"numpy": sys.executable}
+    assert peers.installed(
+        {"toast": None, "maria": "/nowhere/python", "numpy": sys.executable}
+    ) == {"numpy": sys.executable}
     said = capsys.readouterr().out.splitlines()
-    assert [line.split(" (")[0] for line in said] == ["toast: not installed", "maria: not installed"]
+    assert [line.split(" (")[0] for line in said] == [
+        "toast: not installed",
+        "maria: not installed",
+    ]
     assert peers.installed({"no_such_package": sys.executable}) == {}
 
 
@@ -48,8 +55,9 @@ def test_scans_move_at_the_speed_of_the_case() -> None:
 
 
 def test_statistics_of_a_process_with_the_wanted_covariance(tmp_path: Path) -> None:
-    # Two detectors on one frozen layer, drawn from the exact covariance: ratios are 1 within 4 of the errors they state (8 of
-    # them, 400 realizations: a false alarm in 2000), and not where one detector's amplitude is 1.5 times what is stated.
+    # Two detectors on one frozen layer, drawn from the exact covariance: ratios are 1 within 4 of
+    # the errors they state (8 of them, 400 realizations: a false alarm in 2000), and not where one
+    # detector's amplitude is 1.5 times what is stated.
     table = module(BENCHMARKS / "peers" / "statistics_table.py").table
     n, step, speed, r0, sigma, apart = 64, 1.0, 10.0, 300.0, 10.0, 25.0
     x = speed * step * np.arange(n)

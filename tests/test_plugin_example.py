@@ -1,4 +1,6 @@
-"""A real third-party distribution, installed from its folder, is found by its entry points and used by a pipeline."""
+"""A real third-party distribution, installed from its folder, is found by its entry points and used
+by a pipeline.
+"""
 
 import os
 import subprocess
@@ -15,15 +17,23 @@ EXAMPLE = HERE / "plugin_example"
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
-    """An environment in which the plugin is installed (into a folder of its own, so that other tests do not see it)."""
+    """An environment in which the plugin is installed (into a folder of its own, so that other
+    tests do not see it).
+    """
     source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
-    subprocess.run(["cp", "-r", str(EXAMPLE), str(source)], check=True)  # building writes into the source folder
+    subprocess.run(
+        ["cp", "-r", str(EXAMPLE), str(source)], check=True
+    )  # building writes into the source folder
     return installed_plugin(source / "plugin_example", target)
 
 
 def zonda(environment, *arguments, cwd=None):
     return subprocess.run(
-        [sys.executable, "-m", "zonda.core.cli", *map(str, arguments)], env=environment, capture_output=True, text=True, cwd=cwd
+        [sys.executable, "-m", "zonda.core.cli", *map(str, arguments)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        cwd=cwd,
     )
 
 
@@ -36,7 +46,14 @@ def test_listed_and_importable(installed):
 
 
 def test_a_pipeline_uses_it(installed, tmp_path):
-    done = zonda(installed, "run", EXAMPLE / "pipelines" / "example.yaml", "--output", tmp_path / "out", cwd=tmp_path)
+    done = zonda(
+        installed,
+        "run",
+        EXAMPLE / "pipelines" / "example.yaml",
+        "--output",
+        tmp_path / "out",
+        cwd=tmp_path,
+    )
     assert done.returncode == 0, done.stderr
     assert list((tmp_path / "out").glob("*.fits"))
 
@@ -46,12 +63,16 @@ def test_its_operator_keeps_the_contract(installed):
         "import zonda.testing; from zonda_example.readout_lag import ReadoutLag; "
         "zonda.testing.check_operator(ReadoutLag(tau='50 ms'))"
     )
-    done = subprocess.run([sys.executable, "-c", code], env=installed, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=installed, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
 
 
 def test_absent_plugin_is_named(tmp_path):
-    done = zonda({**os.environ, "ZONDA_PLUGINS": ""}, "check", EXAMPLE / "pipelines" / "example.yaml")
+    done = zonda(
+        {**os.environ, "ZONDA_PLUGINS": ""}, "check", EXAMPLE / "pipelines" / "example.yaml"
+    )
     assert done.returncode == 2
     assert "zonda-example" in done.stderr
     assert "example_camera" in done.stderr

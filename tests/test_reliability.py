@@ -1,4 +1,6 @@
-"""What goes wrong around a run (disks, folders, signals, clocks): a clear error or the right result, nothing half-written."""
+"""What goes wrong around a run (disks, folders, signals, clocks): a clear error or the right
+result, nothing half-written.
+"""
 
 from __future__ import annotations
 
@@ -50,8 +52,19 @@ def write_map(path: Path) -> None:
     from astropy.io import fits
 
     image = fits.PrimaryHDU(np.ones((11, 11)))
-    image.header.update({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 6, "CRPIX2": 6, "CRVAL1": 75.0, "CRVAL2": 20.0})
-    image.header.update({"CDELT1": -1 / 60, "CDELT2": 1 / 60, "CUNIT1": "deg", "CUNIT2": "deg", "BUNIT": "K_RJ"})
+    image.header.update(
+        {
+            "CTYPE1": "RA---TAN",
+            "CTYPE2": "DEC--TAN",
+            "CRPIX1": 6,
+            "CRPIX2": 6,
+            "CRVAL1": 75.0,
+            "CRVAL2": 20.0,
+        }
+    )
+    image.header.update(
+        {"CDELT1": -1 / 60, "CDELT2": 1 / 60, "CUNIT1": "deg", "CUNIT2": "deg", "BUNIT": "K_RJ"}
+    )
     image.writeto(path)
 
 
@@ -61,14 +74,22 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_map(tmp_path / "map.fits")
     (tmp_path / "p.yaml").write_text(PIPELINE)
     (tmp_path / "small.yaml").write_text(
-        "".join(line for line in PIPELINE.splitlines(True) if "Plots" not in line and "Report" not in line)
+        "".join(
+            line
+            for line in PIPELINE.splitlines(True)
+            if "Plots" not in line and "Report" not in line
+        )
     )
     return tmp_path
 
 
 def products(folder: Path) -> dict[str, bytes]:
     """Every file under a folder, but for the inputs, by name."""
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name not in INPUTS}
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes()
+        for p in folder.rglob("*")
+        if p.is_file() and p.name not in INPUTS
+    }
 
 
 def whole(folder: Path) -> list[str]:
@@ -85,7 +106,10 @@ def whole(folder: Path) -> list[str]:
             assert load_tod(path).n_samples
         elif path.suffix == ".fits":
             with fits.open(path) as hdus:
-                assert all(hdu.verify("exception") is None and (hdu.data is None or len(hdu.data)) for hdu in hdus)
+                assert all(
+                    hdu.verify("exception") is None and (hdu.data is None or len(hdu.data))
+                    for hdu in hdus
+                )
         elif path.suffix == ".png":
             assert path.read_bytes().endswith(b"IEND\xaeB`\x82")
         elif path.suffix == ".html":
@@ -103,7 +127,8 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return message
 
 
-# ----------------------------------------------------------------------------------------------------------- full disks
+# --------------------------------------------------------------------------------------------------
+# full disks
 
 
 def limited(size: int) -> Callable[[], None]:
@@ -114,12 +139,22 @@ def limited(size: int) -> Callable[[], None]:
 
 
 @pytest.mark.parametrize(
-    ("size", "file"), [(0, "small.yaml"), (40_000, "small.yaml"), (SCAN - 1000, "small.yaml"), (SCAN + 20_000, "p.yaml")]
+    ("size", "file"),
+    [
+        (0, "small.yaml"),
+        (40_000, "small.yaml"),
+        (SCAN - 1000, "small.yaml"),
+        (SCAN + 20_000, "p.yaml"),
+    ],
 )
 def test_files_that_may_not_grow(here: Path, size: int, file: str) -> None:
-    """The system refuses every write beyond a size, in whichever library it happens: HDF5, FITS, matplotlib, our own."""
+    """The system refuses every write beyond a size, in whichever library it happens: HDF5, FITS,
+    matplotlib, our own.
+    """
     command = [*ZONDA, "run", file, "--output", "out", "--no-prune"]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, preexec_fn=limited(size))
+    done = subprocess.run(
+        command, env=ENVIRONMENT, capture_output=True, text=True, preexec_fn=limited(size)
+    )
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     assert "the file grew beyond what this file system allows" in done.stderr
@@ -133,24 +168,37 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     folder = tmp_path / "disk"
     folder.mkdir()
     mount = shutil.which("mount")
-    if not mount or subprocess.run([mount, "-t", "tmpfs", "-o", "size=300k", "none", folder], capture_output=True).returncode:
+    if (
+        not mount
+        or subprocess.run(
+            [mount, "-t", "tmpfs", "-o", "size=300k", "none", folder], capture_output=True
+        ).returncode
+    ):
         pytest.skip("a small disk can only be made by root on Linux")
     yield folder
     subprocess.run(["umount", "-l", folder], check=True)
 
 
-def test_a_disk_that_fills_up(here: Path, small_disk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_disk_that_fills_up(
+    here: Path, small_disk: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     message = refused(capsys, "run", "p.yaml", "--output", str(small_disk / "out"), "--no-prune")
     assert "no space left on the disk" in message
     assert "free some space" in message
     whole(small_disk)
     (small_disk / "filler").write_bytes(bytes((shutil.disk_usage(small_disk).free // 4096) * 4096))
-    message = refused(capsys, "run", "p.yaml", "--output", str(small_disk / "new"), "--no-prune")  # before anything is worked out
+    message = refused(
+        capsys, "run", "p.yaml", "--output", str(small_disk / "new"), "--no-prune"
+    )  # before anything is worked out
     assert "no space left on the disk" in message
 
 
-def test_streams_that_do_not_fit_the_folder_for_temporary_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Refused when they are begun: a mapping of a file that cannot grow later kills the process (SIGBUS)."""
+def test_streams_that_do_not_fit_the_folder_for_temporary_files(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Refused when they are begun: a mapping of a file that cannot grow later kills the process
+    (SIGBUS).
+    """
     import errno
 
     from zonda.core.run.streams import Ledger, Store
@@ -169,8 +217,12 @@ def test_streams_that_do_not_fit_the_folder_for_temporary_files(monkeypatch: pyt
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="this system does not reserve blocks")
-def test_spilled_streams_have_their_blocks_from_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.skipif(
+    not hasattr(os, "posix_fallocate"), reason="this system does not reserve blocks"
+)
+def test_spilled_streams_have_their_blocks_from_the_start(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     from zonda.core.run.streams import Ledger, Store
 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
@@ -187,7 +239,9 @@ def test_spilled_streams_have_their_blocks_from_the_start(monkeypatch: pytest.Mo
 def test_a_part_of_a_spilled_stream_is_read_without_mapping_its_neighbours(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A system maps 64 kB around every page that is touched: short pieces of many rows would map the whole stream."""
+    """A system maps 64 kB around every page that is touched: short pieces of many rows would map
+    the whole stream.
+    """
     from zonda.core.run.streams import Ledger, Store, columns
     from zonda.core.stream import forget_pages
 
@@ -212,7 +266,8 @@ def test_a_part_of_a_spilled_stream_is_read_without_mapping_its_neighbours(
     store.close()
 
 
-# ------------------------------------------------------------------------------------------- files and folders that go
+# ------------------------------------------------------------------------------------------- files
+# and folders that go
 
 
 class Meanwhile(zonda.Operator):
@@ -233,7 +288,9 @@ def run_with(do: Callable[[], None], output: Path, threads: int = 2) -> Any:
     step._do = do  # type: ignore[method-assign]
     steps = file.operators
     at = next(k for k, o in enumerate(steps) if type(o).__name__ == "BinMap")
-    return zonda.Pipeline([*steps[:at], step, *steps[at:]]).run(file.scene(), output=output, threads=threads)
+    return zonda.Pipeline([*steps[:at], step, *steps[at:]]).run(
+        file.scene(), output=output, threads=threads
+    )
 
 
 def test_the_output_folder_is_removed_during_the_run(here: Path) -> None:
@@ -268,8 +325,9 @@ def test_the_input_is_cut_while_it_is_read(here: Path, capsys: pytest.CaptureFix
 
 @pytest.mark.parametrize(("threads", "last"), [(1, 0), (2, 1)])
 def test_an_input_removed_between_two_scans(here: Path, threads: int, last: int) -> None:
-    """Each scan looks whether it is still the same file: an error that names it, and the scans before it are whole. With two
-    threads the next scan may have been prepared before, with what the file held then; the one after it has not."""
+    """Each scan looks whether it is still the same file: an error that names it, and the scans
+    before it are whole. With two threads the next scan may have been prepared before, with what the
+    file held then; the one after it has not."""
     small = here / "small.yaml"
     small.write_text(small.read_text().replace("scans: 2", "scans: 3"))
     with pytest.raises(InputError, match="no such file") as caught:
@@ -280,7 +338,8 @@ def test_an_input_removed_between_two_scans(here: Path, threads: int, last: int)
     assert all(name.startswith(f"tod_scan-{k:03d}") for k, name in enumerate(found))
 
 
-# -------------------------------------------------------------------------------------------------- two runs, one folder
+# --------------------------------------------------------------------------------------------------
+# two runs, one folder
 
 HOLD = """
 import sys
@@ -292,31 +351,49 @@ with lock("out"):
 
 
 def test_two_runs_into_one_folder(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The second is refused at once and writes nothing; when the first has ended, however it ended, the folder is free."""
+    """The second is refused at once and writes nothing; when the first has ended, however it ended,
+    the folder is free.
+    """
     (here / "out").mkdir()
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", HOLD], env=ENVIRONMENT, cwd=here, **pipes) as holder:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD], env=ENVIRONMENT, cwd=here, **pipes
+    ) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
-        assert "is writing to this folder" in refused(capsys, "run", "small.yaml", "--output", "out")
+        assert "is writing to this folder" in refused(
+            capsys, "run", "small.yaml", "--output", "out"
+        )
         assert {p.name for p in (here / "out").iterdir()} == {".zonda-lock"}
         holder.kill()  # no chance to clean up
     assert cli.main(["run", "small.yaml", "--output", "out"]) == 0
     assert {"noise_map.fits", "resolved.yaml"} <= set(whole(here / "out"))
 
 
-# ------------------------------------------------------------------------------------------------- signals and clocks
+# -------------------------------------------------------------------------------------------------
+# signals and clocks
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent as POSIX does")
 def test_a_run_that_is_terminated_leaves_whole_files_only(here: Path) -> None:
-    """As a batch system does it: SIGTERM in the middle, exit status 143, and the next run has the bits of an undisturbed one."""
-    text = (here / "small.yaml").read_text().replace("scan_duration: 2 s, scans: 2", "scan_duration: 120 s, scans: 40")
+    """As a batch system does it: SIGTERM in the middle, exit status 143, and the next run has the
+    bits of an undisturbed one.
+    """
+    text = (
+        (here / "small.yaml")
+        .read_text()
+        .replace("scan_duration: 2 s, scans: 2", "scan_duration: 120 s, scans: 40")
+    )
     (here / "small.yaml").write_text(text)
     process = subprocess.Popen(
-        [*ZONDA, "run", "small.yaml", "--output", "out", "--no-prune"], env=ENVIRONMENT, stderr=subprocess.PIPE, text=True
+        [*ZONDA, "run", "small.yaml", "--output", "out", "--no-prune"],
+        env=ENVIRONMENT,
+        stderr=subprocess.PIPE,
+        text=True,
     )
-    while process.poll() is None and not list((here / "out").glob("tod*.h5") if (here / "out").exists() else []):
+    while process.poll() is None and not list(
+        (here / "out").glob("tod*.h5") if (here / "out").exists() else []
+    ):
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=60)
@@ -329,7 +406,9 @@ def test_a_run_that_is_terminated_leaves_whole_files_only(here: Path) -> None:
 
 
 def test_clocks_that_jump_change_nothing(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The wall clock runs backwards by an hour at every look, in every thread: same files, same bytes."""
+    """The wall clock runs backwards by an hour at every look, in every thread: same files, same
+    bytes.
+    """
     assert cli.main(["run", "small.yaml", "--output", "steady"]) == 0
     lock, now = threading.Lock(), [4e9]
 
@@ -348,15 +427,21 @@ def test_clocks_that_jump_change_nothing(here: Path, monkeypatch: pytest.MonkeyP
             assert one[name] == other[name], name
 
 
-# --------------------------------------------------------------------------------------------------- zonda's own files
+# --------------------------------------------------------------------------------------------------
+# zonda's own files
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut", "bytes", "text", "other"])
 @pytest.mark.parametrize("name", ["absorption", "climatology"])
-def test_damaged_package_data(name: str, damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_package_data(
+    name: str, damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from zonda.operators.atmosphere.weather import absorption, climatology
 
-    module, key = {"absorption": (absorption, "TABLE"), "climatology": (climatology, "CLIMATOLOGY")}[name]
+    module, key = {
+        "absorption": (absorption, "TABLE"),
+        "climatology": (climatology, "CLIMATOLOGY"),
+    }[name]
     data = getattr(module, key).read_bytes()
     path = tmp_path / f"{name}.npz"
     if damage == "other":
@@ -364,7 +449,14 @@ def test_damaged_package_data(name: str, damage: str, tmp_path: Path, monkeypatc
     elif damage != "missing":
         spoilt = bytearray(data)
         spoilt[len(data) // 2 : len(data) // 2 + 64] = bytes(64)
-        path.write_bytes({"empty": b"", "cut": data[: len(data) // 3], "bytes": bytes(spoilt), "text": b"hello " * 99}[damage])
+        path.write_bytes(
+            {
+                "empty": b"",
+                "cut": data[: len(data) // 3],
+                "bytes": bytes(spoilt),
+                "text": b"hello " * 99,
+            }[damage]
+        )
     monkeypatch.setattr(module, key, path)
 
     def read() -> None:
@@ -378,7 +470,9 @@ def test_damaged_package_data(name: str, damage: str, tmp_path: Path, monkeypatc
     climatology.coefficients.cache_clear()
     try:
         if name == "climatology" and damage == "other":
-            assert climatology.climatologies() == ("something",)  # whole, but not ours: the site's is said not to exist
+            assert climatology.climatologies() == (
+                "something",
+            )  # whole, but not ours: the site's is said not to exist
             return
         with pytest.raises(InputError) as caught:
             read()

@@ -1,4 +1,6 @@
-"""What a pipeline file or a data file cannot do: run code, open other files, write outside its folder, reach the network."""
+"""What a pipeline file or a data file cannot do: run code, open other files, write outside its
+folder, reach the network.
+"""
 
 from __future__ import annotations
 
@@ -22,30 +24,90 @@ from zonda.core.errors import InputError, OutputError, ZondaError
 from zonda.core.storage.files import product_path, write_text
 
 ROOT = Path(__file__).parents[1]
-PRODUCT = sorted(p for f in ("core", "operators", "plugins", "interop", "pipelines", "zonda") for p in (ROOT / f).rglob("*.py"))
+PRODUCT = sorted(
+    p
+    for f in ("core", "operators", "plugins", "interop", "pipelines", "zonda")
+    for p in (ROOT / f).rglob("*.py")
+)
 
-# ---------------------------------------------------------------------------------------------------------------- code
+# --------------------------------------------------------------------------------------------------
+# code
 
 CALLS = {
-    "eval", "exec", "compile", "__import__", "os.system", "os.popen", "pickle.load", "pickle.loads", "marshal.loads",
-    "shelve.open", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "dill.loads", "joblib.load", "subprocess.run",
-    "subprocess.Popen", "subprocess.call", "subprocess.check_output", "importlib.import_module", "import_module",
-    "runpy.run_path", "urlopen", "urllib.request.urlopen", "socket.socket", "requests.get",
-}  # fmt: skip
+    "eval",
+    "exec",
+    "compile",
+    "__import__",
+    "os.system",
+    "os.popen",
+    "pickle.load",
+    "pickle.loads",
+    "marshal.loads",
+    "shelve.open",
+    "yaml.load",
+    "yaml.unsafe_load",
+    "yaml.full_load",
+    "dill.loads",
+    "joblib.load",
+    "subprocess.run",
+    "subprocess.Popen",
+    "subprocess.call",
+    "subprocess.check_output",
+    "importlib.import_module",
+    "import_module",
+    "runpy.run_path",
+    "urlopen",
+    "urllib.request.urlopen",
+    "socket.socket",
+    "requests.get",
+}
 ALLOWED = {
-    ("core/accuracy/measure.py", "subprocess.run"): "zonda itself, as a child; no shell; its own arguments",
-    ("core/accuracy/measure.py", "pickle.load"): "the child's answer, in a folder that only this user can read, made for it",
+    (
+        "core/accuracy/measure.py",
+        "subprocess.run",
+    ): "zonda itself, as a child; no shell; its own arguments",
+    (
+        "core/accuracy/measure.py",
+        "pickle.load",
+    ): "the child's answer, in a folder that only this user can read, made for it",
     ("core/cli/group.py", "import_module"): "names from the table in zonda/commands.py",
-    ("core/compilation/compile_ahead.py", "import_module"): "modules that packages list in their kernels.py",
-    ("core/compilation/compile_ahead.py", "subprocess.Popen"): "zonda itself, as a child; no shell; its own arguments",
-    ("core/compilation/kernel_cache.py", "pickle.loads"): "machine code that this user compiled; numba's own cache does the same",
+    (
+        "core/compilation/compile_ahead.py",
+        "import_module",
+    ): "modules that packages list in their kernels.py",
+    (
+        "core/compilation/compile_ahead.py",
+        "subprocess.Popen",
+    ): "zonda itself, as a child; no shell; its own arguments",
+    (
+        "core/compilation/kernel_cache.py",
+        "pickle.loads",
+    ): "machine code that this user compiled; numba's own cache does the same",
     ("core/discovery.py", "import_module"): "names from the metadata of installed packages",
-    ("core/storage/packed.py", "import_module"): "gzip, bz2, lzma, uncompresspy, from tables in the same file",
-    ("core/storage/hdf5_files.py", "subprocess.run"): "zonda itself, as a child; no shell; the file's path is one argument",
-    ("operators/atmosphere/weather/era5.py", "import_module"): "cdsapi, by its name, when the user asks to fetch",
-    ("operators/diagnostics/drawing/artist.py", "import_module"): "names from a table in the same file",
-    ("operators/diagnostics/drawing/artist.py", "pickle.load"): "between parent and child, through pipes that nobody else has",
-    ("operators/diagnostics/drawing/artist.py", "pickle.loads"): "the same: what came through such a pipe",
+    (
+        "core/storage/packed.py",
+        "import_module",
+    ): "gzip, bz2, lzma, uncompresspy, from tables in the same file",
+    (
+        "core/storage/hdf5_files.py",
+        "subprocess.run",
+    ): "zonda itself, as a child; no shell; the file's path is one argument",
+    (
+        "operators/atmosphere/weather/era5.py",
+        "import_module",
+    ): "cdsapi, by its name, when the user asks to fetch",
+    (
+        "operators/diagnostics/drawing/artist.py",
+        "import_module",
+    ): "names from a table in the same file",
+    (
+        "operators/diagnostics/drawing/artist.py",
+        "pickle.load",
+    ): "between parent and child, through pipes that nobody else has",
+    (
+        "operators/diagnostics/drawing/artist.py",
+        "pickle.loads",
+    ): "the same: what came through such a pipe",
     (
         "operators/diagnostics/drawing/artist.py",
         "subprocess.Popen",
@@ -55,7 +117,10 @@ ALLOWED = {
         "operators/pointing/schedule_files.py",
         "yaml.load",
     ): "astropy's, as its own reader of ECSV: yaml.SafeLoader, numbers and units",
-    ("plugins/checks/dispatch.py", "subprocess.run"): "zonda itself, as a child; no shell; the folder's path is one argument",
+    (
+        "plugins/checks/dispatch.py",
+        "subprocess.run",
+    ): "zonda itself, as a child; no shell; the folder's path is one argument",
     ("core/packages.py", "import_module"): "names that bridges and steps state",
     ("zonda/__init__.py", "import_module"): "names from a table in the same file",
 }
@@ -80,22 +145,38 @@ def test_no_code_from_data() -> None:
             if name in CALLS:
                 found.add((where.as_posix(), name))
             for keyword in call.keywords:
-                assert not (keyword.arg == "shell" and ast.unparse(keyword.value) != "False"), f"{where}: a shell"
-                assert not (keyword.arg == "allow_pickle" and ast.unparse(keyword.value) != "False"), (
-                    f"{where}: pickles in arrays"
+                assert not (keyword.arg == "shell" and ast.unparse(keyword.value) != "False"), (
+                    f"{where}: a shell"
                 )
-                assert not (keyword.arg == "character_as_bytes" and "pickle" in ast.unparse(call)), where
-    assert found <= set(ALLOWED), f"say in ALLOWED why these are safe: {sorted(found - set(ALLOWED))}"
+                assert not (
+                    keyword.arg == "allow_pickle" and ast.unparse(keyword.value) != "False"
+                ), f"{where}: pickles in arrays"
+                assert not (
+                    keyword.arg == "character_as_bytes" and "pickle" in ast.unparse(call)
+                ), where
+    assert found <= set(ALLOWED), (
+        f"say in ALLOWED why these are safe: {sorted(found - set(ALLOWED))}"
+    )
 
 
 def test_the_walk_sees_what_it_looks_for() -> None:
     text = "import os\nos.system('x')\neval('1')\nyaml.load(t)\nnp.load(f, allow_pickle=True)\n"
-    assert {name for name, _ in calls(ast.parse(text))} == {"os.system", "eval", "yaml.load", "np.load"}
+    assert {name for name, _ in calls(ast.parse(text))} == {
+        "os.system",
+        "eval",
+        "yaml.load",
+        "np.load",
+    }
 
 
 @pytest.mark.parametrize(
     "tag",
-    ["python/object/apply:os.system [touch owned]", "python/name:os.system ''", "python/module:os ''", "python/object:x.Y {}"],
+    [
+        "python/object/apply:os.system [touch owned]",
+        "python/name:os.system ''",
+        "python/module:os ''",
+        "python/object:x.Y {}",
+    ],
 )
 def test_yaml_makes_no_objects(tag: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -104,15 +185,23 @@ def test_yaml_makes_no_objects(tag: str, tmp_path: Path, monkeypatch: pytest.Mon
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["os:system", "subprocess.Popen", "zonda.core.cli:main", "../../evil", "builtins:eval"])
+@pytest.mark.parametrize(
+    "name", ["os:system", "subprocess.Popen", "zonda.core.cli:main", "../../evil", "builtins:eval"]
+)
 def test_operators_are_only_those_of_installed_packages(name: str) -> None:
     with pytest.raises(ZondaError, match="unknown operator"):
-        parse(f"site: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\noperators: ['{name}']\n")
+        parse(
+            "site: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\noperators:"
+            f" ['{name}']\n"
+        )
     with pytest.raises(ZondaError, match="unknown site"):
-        parse(f"site: '{name}'\ninstrument: mustang2\ntime: 2024-11-25T07:00\noperators: [BinMap]\n")
+        parse(
+            f"site: '{name}'\ninstrument: mustang2\ntime: 2024-11-25T07:00\noperators: [BinMap]\n"
+        )
 
 
-# ---------------------------------------------------------------------------------------------------------- data files
+# --------------------------------------------------------------------------------------------------
+# data files
 
 
 def hdf5(path: Path) -> Path:
@@ -140,7 +229,12 @@ def test_hdf5_files_lead_to_no_other_file(how: str, tmp_path: Path) -> None:
         if how == "external link":
             file["shared/times"] = h5py.ExternalLink(tmp_path / "secret.h5", "/times")
         elif how == "external storage":
-            file.create_dataset("shared/times", (5,), "f8", external=[(str(tmp_path / "secret.h5"), 0, h5py.h5f.UNLIMITED)])
+            file.create_dataset(
+                "shared/times",
+                (5,),
+                "f8",
+                external=[(str(tmp_path / "secret.h5"), 0, h5py.h5f.UNLIMITED)],
+            )
         else:
             layout = h5py.VirtualLayout((5,), "f8")
             layout[:] = h5py.VirtualSource(tmp_path / "secret.h5", "times", (5,))
@@ -166,13 +260,15 @@ def test_a_table_of_air_is_numbers_only(tmp_path: Path) -> None:
     from zonda.operators.atmosphere.weather.table import read_table
 
     (tmp_path / "air.csv").write_text(
-        "height [m], pressure [hPa], temperature [K], relative humidity [%]\n__import__('os'), 1, 2, 3\n"
+        "height [m], pressure [hPa], temperature [K], relative humidity [%]\n__import__('os'), 1,"
+        " 2, 3\n"
     )
     with pytest.raises(InputError, match="is not a number"):
         read_table(tmp_path / "air.csv", Site(name="s", latitude="0 deg", longitude="0 deg"))
 
 
-# --------------------------------------------------------------------------------------------------------- output folder
+# --------------------------------------------------------------------------------------------------
+# output folder
 
 
 @settings(max_examples=300, derandomize=True, deadline=None, database=None)
@@ -190,10 +286,14 @@ def test_no_name_leaves_the_output_folder(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["../up", "/etc/x", "a/b", ".", "a\\nb", "a\\0b", "~"])
 def test_names_in_a_pipeline_file(name: str) -> None:
-    """The pipeline's name makes the folder, so it is refused; a step's name makes files, see `product_path`."""
+    """The pipeline's name makes the folder, so it is refused; a step's name makes files, see
+    `product_path`.
+    """
     head = "site: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\ntarget: 05h +20d\n"
     steps = "operators: [PointingDaisy, WhiteNoise, Efficiency, BinMap]\n"
-    assert parse(head + steps).output == Path("out/_text_".strip("_")) or parse(head + steps).output.parent == Path("out")
+    assert parse(head + steps).output == Path("out/_text_".strip("_")) or parse(
+        head + steps
+    ).output.parent == Path("out")
     with pytest.raises(ZondaError):
         parse(f'name: "{name}"\n{head}{steps}')
     with pytest.raises(ZondaError):
@@ -202,11 +302,16 @@ def test_names_in_a_pipeline_file(name: str) -> None:
 
 def test_a_null_character_in_the_folder_is_refused() -> None:
     with pytest.raises(ZondaError, match="null character"):
-        parse('outputs: "a\\0b"\nsite: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\noperators: [BinMap]\n')
+        parse(
+            'outputs: "a\\0b"\nsite: green_bank\ninstrument: mustang2\ntime:'
+            " 2024-11-25T07:00\noperators: [BinMap]\n"
+        )
 
 
 def test_a_link_in_the_output_folder_is_replaced_not_followed(tmp_path: Path) -> None:
-    """Whoever may write into the folder could otherwise have the run overwrite any file of its user's."""
+    """Whoever may write into the folder could otherwise have the run overwrite any file of its
+    user's.
+    """
     out = tmp_path / "out"
     out.mkdir()
     precious = tmp_path / "precious"
@@ -229,11 +334,16 @@ STEPS = """\
 """
 
 
-def test_a_run_with_names_like_paths_stays_in_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_with_names_like_paths_stays_in_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     deep = tmp_path / "a" / "b" / "c"
     deep.mkdir(parents=True)
     monkeypatch.chdir(deep)
-    head = "site: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\ntarget: 05h +20d\noperators:\n"
+    head = (
+        "site: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\ntarget: 05h"
+        " +20d\noperators:\n"
+    )
     (deep / "p.yaml").write_text(head + STEPS)
     status = cli.main(["run", "p.yaml", "--output", "out"])
     assert status == 0
@@ -242,7 +352,8 @@ def test_a_run_with_names_like_paths_stays_in_its_folder(tmp_path: Path, monkeyp
     assert len(files) >= 5
 
 
-# --------------------------------------------------------------------------------------------------------------- network
+# --------------------------------------------------------------------------------------------------
+# network
 
 OFFLINE = """
 import sys
@@ -290,8 +401,11 @@ def test_nothing_reaches_for_the_network(arguments: list[str], tmp_path: Path) -
 
 def test_the_guard_sees_a_connection(tmp_path: Path) -> None:
     text = OFFLINE.replace(
-        "from zonda.core.cli", "import socket\nsocket.create_connection(('127.0.0.1', 9))\nfrom zonda.core.cli"
+        "from zonda.core.cli",
+        "import socket\nsocket.create_connection(('127.0.0.1', 9))\nfrom zonda.core.cli",
     )
-    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, cwd=tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-c", text], capture_output=True, text=True, cwd=tmp_path
+    )
     assert done.returncode == 77
     assert zonda.__version__

@@ -1,4 +1,5 @@
-"""The same seed gives the same bits, two seeds have nothing in common: noise, atmosphere and maps of a whole run.
+"""The same seed gives the same bits, two seeds have nothing in common: noise, atmosphere and maps
+of a whole run.
 
 Two bands, or two instruments, of one seed have noise of their own and see one atmosphere."""
 
@@ -11,10 +12,18 @@ NOISE = ("white", "pink", "atmosphere")
 
 
 def run(seed, scans=1, duration="82 s", camera=(), **more):
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=seed)
+    scene = zonda.Scene(
+        site="green_bank",
+        instrument="mustang2",
+        time="2024-11-25T07:00",
+        target="05h +20d",
+        seed=seed,
+    )
     camera = scene.instrument.model_copy(update={"detectors": 37, **dict(camera)})
     steps = [
-        zonda.PointingDaisy(scan_duration=duration, radius="1 arcmin", sample_rate="50 Hz", scans=scans),
+        zonda.PointingDaisy(
+            scan_duration=duration, radius="1 arcmin", sample_rate="50 Hz", scans=scans
+        ),
         zonda.AtmosphereLayers(pwv="7.7 mm"),
         zonda.WhiteNoise(scatter="5 %"),
         zonda.PinkNoise(**more),
@@ -23,7 +32,9 @@ def run(seed, scans=1, duration="82 s", camera=(), **more):
         zonda.CommonModeFilter(),
         zonda.BinMap(pixel="4 arcsec", width="6 arcmin"),
     ]
-    return zonda.Pipeline(steps).run(scene.model_copy(update={"instrument": camera}), keep=[*NOISE, "signal"])
+    return zonda.Pipeline(steps).run(
+        scene.model_copy(update={"instrument": camera}), keep=[*NOISE, "signal"]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +49,19 @@ def whitened(stream):
 
 
 def correlation(a, b):
-    """Correlation of two series of n samples, in its standard error. Second differences of white noise have, over lags, a sum
-    of squared autocorrelations of 1 + 2 (4/9 + 1/36) = 35/18, so r^2 = 35/18 / n."""
+    """Correlation of two series of n samples, in its standard error. Second differences of white
+    noise have, over lags, a sum of squared autocorrelations of 1 + 2 (4/9 + 1/36) = 35/18, so r^2 =
+    35/18 / n."""
     return np.abs((a * b).mean()) / np.sqrt(35 / 18 / a.size)
 
 
 @pytest.mark.parametrize("stream", ["white", "pink"])
 def test_noise_of_two_seeds_scans_and_detectors_is_incoherent(runs, stream):
-    made = {(seed, o.index): whitened(o.detdata[stream]) for seed, data in runs.items() for o in data.observations}
+    made = {
+        (seed, o.index): whitened(o.detdata[stream])
+        for seed, data in runs.items()
+        for o in data.observations
+    }
     keys = list(made)
     for k, one in enumerate(keys):
         for other in keys[k + 1 :]:
@@ -55,7 +71,9 @@ def test_noise_of_two_seeds_scans_and_detectors_is_incoherent(runs, stream):
 
 
 def test_air_of_two_seeds_is_incoherent(runs):
-    """The air is smooth: its part above 0.2 Hz, about 82 s x 0.5 Hz independent values, all detectors alike."""
+    """The air is smooth: its part above 0.2 Hz, about 82 s x 0.5 Hz independent values, all
+    detectors alike.
+    """
     from scipy.signal import butter, sosfiltfilt
 
     fast = {}
@@ -67,7 +85,9 @@ def test_air_of_two_seeds_is_incoherent(runs):
     for k, a in enumerate(seeds):
         for b in seeds[k + 1 :]:
             spectra = [np.abs(np.fft.rfft(fast[s])) ** 2 for s in (a, b)]
-            error = np.sqrt((spectra[0] * spectra[1]).sum() / (spectra[0].sum() * spectra[1].sum()))  # Bartlett
+            error = np.sqrt(
+                (spectra[0] * spectra[1]).sum() / (spectra[0].sum() * spectra[1].sum())
+            )  # Bartlett
             assert abs((fast[a] * fast[b]).mean()) < 4.5 * error
             assert error < 0.4
 
@@ -75,7 +95,11 @@ def test_air_of_two_seeds_is_incoherent(runs):
 def test_maps_of_two_seeds_are_incoherent_and_of_one_the_same(runs):
     again = run(1, scans=2)
     for name in ("signal", "weights", "noise", "half_difference", "hits"):
-        assert np.array_equal(getattr(again.products["map"], name), getattr(runs[1].products["map"], name), equal_nan=True)
+        assert np.array_equal(
+            getattr(again.products["map"], name),
+            getattr(runs[1].products["map"], name),
+            equal_nan=True,
+        )
     for name in (*NOISE, "signal"):
         for a, b in zip(again.observations, runs[1].observations, strict=True):
             assert np.array_equal(a.detdata[name], b.detdata[name])
@@ -108,18 +132,32 @@ def test_two_bands_have_noise_of_their_own_and_one_atmosphere(one_band, other):
     common = [streams["pink"].mean(axis=0, keepdims=True) for streams in whole]
     assert correlation(*(whitened(streams["white"]) for streams in whole)) < 5
     assert correlation(*(whitened(mean) for mean in common)) < 5  # mostly what detectors share
-    assert correlation(*(whitened(streams["pink"] - mean) for streams, mean in zip(whole, common, strict=True))) < 5
+    assert (
+        correlation(
+            *(whitened(streams["pink"] - mean) for streams, mean in zip(whole, common, strict=True))
+        )
+        < 5
+    )
     n = one_band.n_detectors
-    for drawn in ("net", "main_beam_efficiency"):  # scattered: correlations of n pairs have a standard error of n^-1/2
-        assert abs(np.corrcoef(getattr(one_band.focalplane, drawn), getattr(two.focalplane, drawn))[0, 1]) < 4 / np.sqrt(n)
+    for drawn in (
+        "net",
+        "main_beam_efficiency",
+    ):  # scattered: correlations of n pairs have a standard error of n^-1/2
+        assert abs(
+            np.corrcoef(getattr(one_band.focalplane, drawn), getattr(two.focalplane, drawn))[0, 1]
+        ) < 4 / np.sqrt(n)
     air = [o.detdata["atmosphere"].astype(np.float64) for o in (one_band, two)]
     # one turbulence, seen through opacities that differ by the passband alone
     assert np.corrcoef(*(a.ravel() - a.mean() for a in air))[0, 1] > 0.9999
 
 
 def test_a_band_has_its_noise_whatever_else_is_changed(one_band):
-    """Where one setting is compared with another, the random numbers stay: detectors, NET and beams do not draw anew."""
-    changed = run(1, camera={"band": BAND, "detectors": 20, "fwhm": 1e-4, "description": "other"}, shared=0.8).observations[0]
+    """Where one setting is compared with another, the random numbers stay: detectors, NET and beams
+    do not draw anew.
+    """
+    changed = run(
+        1, camera={"band": BAND, "detectors": 20, "fwhm": 1e-4, "description": "other"}, shared=0.8
+    ).observations[0]
     for stream in ("white", "pink"):
         a, b = (whitened(o.detdata[stream]) for o in (one_band, changed))
         assert np.corrcoef(a[:20].ravel(), b.ravel())[0, 1] > 0.9999

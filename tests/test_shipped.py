@@ -87,13 +87,22 @@ def test_the_twin_in_python_is_the_same():
 def test_the_twin_gives_identical_bits():
     loaded = zonda.load("mustang2_cluster", overrides=SHORT)
     whole = loaded.pipeline()
-    one = zonda.Pipeline(whole.operators[:-3], runs=whole.runs).run(loaded.scene())  # without files and pictures
+    one = zonda.Pipeline(whole.operators[:-3], runs=whole.runs).run(
+        loaded.scene()
+    )  # without files and pictures
     short = twin.pipeline()
-    steps = [short.operators[0].model_copy(update={"scan_duration": 12.0, "scans": 2}), *short.operators[1:-3]]
+    steps = [
+        short.operators[0].model_copy(update={"scan_duration": 12.0, "scans": 2}),
+        *short.operators[1:-3],
+    ]
     other = zonda.Pipeline(steps, runs=short.runs).run(twin.scene(), threads=1)
     for name in ("map", "noiseless/map", "source_free/map"):
         for part in ("signal", "hits", "weights", "noise", "half_difference"):
-            assert np.array_equal(getattr(one.products[name], part), getattr(other.products[name], part), equal_nan=True)
+            assert np.array_equal(
+                getattr(one.products[name], part),
+                getattr(other.products[name], part),
+                equal_nan=True,
+            )
 
 
 def test_the_run_tells_of_losses_alone(tmp_path, capsys):
@@ -128,23 +137,34 @@ def test_full_disk_leaves_nothing_half_written(tmp_path, monkeypatch, capsys):
     message = capsys.readouterr().err
     assert "no space left on the disk" in message
     assert "Traceback" not in message
-    assert not [p for p in (tmp_path / "out").iterdir() if ".part" in p.name or p.name == "noiseless_map.fits"]
+    assert not [
+        p
+        for p in (tmp_path / "out").iterdir()
+        if ".part" in p.name or p.name == "noiseless_map.fits"
+    ]
 
 
 def test_atlast_reduced_on_a_thin_slice(tmp_path):
-    """Two scans of 4 s, all detectors: a map and its noise map, whose noise is that of the detectors' NET."""
+    """Two scans of 4 s, all detectors: a map and its noise map, whose noise is that of the
+    detectors' NET.
+    """
     from astropy.io import fits
 
     out = tmp_path / "out"
     loaded = zonda.load("atlast_reduced", overrides=["PointingDaisy.scan_duration=4 s"])
-    chain = zonda.Pipeline([o for o in loaded.pipeline().operators if type(o).__name__ not in ("Plots", "Report")])
+    chain = zonda.Pipeline(
+        [o for o in loaded.pipeline().operators if type(o).__name__ not in ("Plots", "Report")]
+    )
     with pytest.warns(UserWarning, match="acceleration|samples per FWHM"):
         data = chain.run(loaded.scene(), output=out)
-    assert [(o.n_detectors, o.n_samples, o.sample_rate) for o in data.observations] == [(3000, 900, 225.0)] * 2
+    assert [(o.n_detectors, o.n_samples, o.sample_rate) for o in data.observations] == [
+        (3000, 900, 225.0)
+    ] * 2
     product = data.products["map"]
     assert product.hits.sum() == 2 * 900 * 3000
     both = np.isfinite(product.half_difference) & (product.hits > 40)
-    # the half-difference over each pixel's noise from NET has unit variance, and what filters leave of 1/f noise and air more
+    # the half-difference over each pixel's noise from NET has unit variance, and what filters leave
+    # of 1/f noise and air more
     ratio = (product.half_difference / product.noise)[both].std()
     assert 0.9 < ratio < 1.5
     with fits.open(out / "map.fits") as file:

@@ -1,4 +1,6 @@
-"""The fronts that come with the shipped pipelines: they are of these pipelines, and their errors have not grown."""
+"""The fronts that come with the shipped pipelines: they are of these pipelines, and their errors
+have not grown.
+"""
 
 import importlib.util
 from pathlib import Path
@@ -18,11 +20,17 @@ FRONTS = sorted((ROOT / "pipelines" / "fronts").glob("*.json"))
 def test_a_front_is_of_its_pipeline_and_holds(path):
     pipeline = path.name.partition(".")[0]
     file, front = zonda.load(pipeline), store.read(path)
-    again = "make it anew: zonda accuracy PIPELINE --metric METRIC --quick --store; python docs/make_accuracy.py"
+    again = (
+        "make it anew: zonda accuracy PIPELINE --metric METRIC --quick --store; python"
+        " docs/make_accuracy.py"
+    )
     assert front.fingerprint == store.fingerprint(file), again
     assert set(front.reference) == {k.key for k in knobs_of(file) if not k.redraws}, again
     choice = store.settings_for(file, 0.01, front.metric)
-    if front.metric in ("psd", "structure"):  # of two scans of 30 s four seeds do not resolve what other layers would change
+    if front.metric in (
+        "psd",
+        "structure",
+    ):  # of two scans of 30 s four seeds do not resolve what other layers would change
         assert choice.error is None
         assert "meets 1 %" in choice.reason
     else:
@@ -36,7 +44,9 @@ def test_there_is_one():
 
 
 def test_the_page_is_made_from_the_fronts():
-    spec = importlib.util.spec_from_file_location("make_accuracy", ROOT / "docs" / "make_accuracy.py")
+    spec = importlib.util.spec_from_file_location(
+        "make_accuracy", ROOT / "docs" / "make_accuracy.py"
+    )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.PAGE.read_text() == module.page(), "run python docs/make_accuracy.py"

@@ -1,4 +1,6 @@
-"""The structure of the product stays within limits; `benchmarks/structure.py --verbose` says what each figure consists of."""
+"""The structure of the product stays within limits; `benchmarks/structure.py --verbose` says what
+each figure consists of.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ LIMITS = {
     "imports between siblings of operators": 0,
     "upward imports": 0,
     "operators that core names": 0,
-    "lines of framework hooks in BinMap": 5,
+    "lines of framework hooks in BinMap": 7,
 }
 
 pytestmark = pytest.mark.skipif(not SCRIPT.exists(), reason="benchmarks are not in this copy")
@@ -52,7 +54,9 @@ def test_lazy_and_relative_imports_count(tmp_path: Path) -> None:
     (tmp_path / "core" / "__init__.py").write_text("")
     (core / "__init__.py").write_text("")
     (tmp_path / "core" / "one.py").write_text("def f():\n    from .run import two\n")
-    (core / "two.py").write_text("if TYPE_CHECKING:\n    from ..one import f\nimport zonda.core.one\nimport numpy\n")
+    (core / "two.py").write_text(
+        "if TYPE_CHECKING:\n    from ..one import f\nimport zonda.core.one\nimport numpy\n"
+    )
     measured = structure()
     edges = measured["imports"](measured["modules"](tmp_path))
     assert edges["core.one"] == {"core.run.two"}

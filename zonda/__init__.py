@@ -1,7 +1,9 @@
-"""Simulation of the data of ground-based (sub-)millimetre telescopes, and of the maps made from them.
+"""Simulation of the data of ground-based (sub-)millimetre telescopes, and of the maps made from
+them.
 
 >>> import zonda
->>> scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
+>>> scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00",
+target="05h +20d", seed=1)
 
 Nothing heavy is imported until a name is used.
 """
@@ -55,11 +57,19 @@ _WHERE = {
     "Column": "zonda.core.weather",
 } | dict.fromkeys(
     (
-        "Angle", "AngularSpeed", "AngularAcceleration", "Seconds", "Hertz", "Metres", "MetresPerSecond", "Kelvin",
-        "KelvinRootSecond", "Fraction",
+        "Angle",
+        "AngularSpeed",
+        "AngularAcceleration",
+        "Seconds",
+        "Hertz",
+        "Metres",
+        "MetresPerSecond",
+        "Kelvin",
+        "KelvinRootSecond",
+        "Fraction",
     ),
     "zonda.core.configuration.units",
-)  # fmt: skip
+)
 
 __all__ = ["__version__", *_WHERE]
 
@@ -113,7 +123,8 @@ if TYPE_CHECKING:
     from zonda.operators.noise.models import NoiseModel as NoiseModel
 
     sensitivity: Any
-    # imported here by its module, it would close a circle: the forecast knows map makers, whose files name this version
+    # imported here by its module, it would close a circle: the forecast knows map makers, whose
+    # files name this version
 
 
 def __getattr__(name: str) -> Any:
@@ -127,7 +138,10 @@ def __getattr__(name: str) -> Any:
         from difflib import get_close_matches
 
         near = get_close_matches(name, __dir__(), n=1)
-        raise AttributeError(f"module 'zonda' has no attribute {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""))
+        raise AttributeError(
+            f"module 'zonda' has no attribute {name!r}"
+            + (f"; did you mean {near[0]!r}?" if near else "")
+        )
     raise AttributeError(f"module 'zonda' has no attribute {name!r}")
 
 

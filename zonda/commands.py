@@ -1,6 +1,7 @@
 """The built-in commands and where they are, imported when they are named or listed.
 
-Through the hook `zonda_commands`, as a third party's, they would cost ``zonda --help`` 60 ms more: pluggy and the metadata.
+Through the hook `zonda_commands`, as a third party's, they would cost ``zonda --help`` 60 ms more:
+pluggy and the metadata.
 """
 
 COMMANDS = {

@@ -1,4 +1,6 @@
-"""What every script here shares: the case it is given, and the figures it gives back. Needs numpy only."""
+"""What every script here shares: the case it is given, and the figures it gives back. Needs numpy
+only.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ import numpy as np
 
 def cpu() -> float:
     """CPU seconds of this process, all its threads, and its ended children."""
-    own, children = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    own, children = (
+        resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
     return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
 
 
@@ -52,7 +56,9 @@ def case() -> dict[str, Any]:
 
 
 def twice(run: Callable[[], dict[str, Any]], **more: Any) -> None:
-    """Report the second of two runs, and with ``first`` what the first took, compilation included."""
+    """Report the second of two runs, and with ``first`` what the first took, compilation
+    included.
+    """
     before = peak()
     first = run()
     report(first=first["setup"] + first["evaluation"], before=before, **run(), peak=peak(), **more)

@@ -15,12 +15,19 @@ GENERATION = Stopwatch()
 
 
 def run(c: dict[str, Any]) -> dict[str, Any]:
-    """Set-up: planes and their turbulence. Evaluation: water, emission, and both at the rate of the detectors."""
+    """Set-up: planes and their turbulence. Evaluation: water, emission, and both at the rate of the
+    detectors.
+    """
     where = site(c)
     simulation = Simulation(
-        instrument=instrument(c), plans=[plan(c, where)], site=where, atmosphere="2d", noise=False, progress_bars=False,
+        instrument=instrument(c),
+        plans=[plan(c, where)],
+        site=where,
+        atmosphere="2d",
+        noise=False,
+        progress_bars=False,
         atmosphere_kwargs=atmosphere_options(c),
-    )  # fmt: skip
+    )
     (o,) = simulation.obs_list
     generated = GENERATION.total
     start = cpu()

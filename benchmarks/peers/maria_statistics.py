@@ -1,8 +1,10 @@
-"""Realizations of maria's water for a stare, and what its layers should give: python maria_statistics.py CASE.npz OUT.npz N
+"""Realizations of maria's water for a stare, and what its layers should give: python
+maria_statistics.py CASE.npz OUT.npz N
 
-y: (realizations, detectors, times), fluctuation of the water, relative to its mean. Per layer: amplitude (rms of y before the
-beam), sigma of the beam [m], outer scale r0 of the von Karman covariance [m], positions (detectors, 2) and speed, in the plane
-in which maria measures distances (horizontal, at the layer's height).
+y: (realizations, detectors, times), fluctuation of the water, relative to its mean. Per layer:
+amplitude (rms of y before the beam), sigma of the beam [m], outer scale r0 of the von Karman
+covariance [m], positions (detectors, 2) and speed, in the plane in which maria measures distances
+(horizontal, at the layer's height).
 """
 
 from __future__ import annotations
@@ -23,9 +25,14 @@ def main() -> None:
     c = case()
     where = site(c)
     simulation = Simulation(
-        instrument=instrument(c), plans=[plan(c, where)], site=where, atmosphere="2d", noise=False, progress_bars=False,
+        instrument=instrument(c),
+        plans=[plan(c, where)],
+        site=where,
+        atmosphere="2d",
+        noise=False,
+        progress_bars=False,
         atmosphere_kwargs=atmosphere_options(c),
-    )  # fmt: skip
+    )
     (o,) = simulation.obs_list
     air = o.atmosphere
     air.initialize(o)
@@ -42,7 +49,9 @@ def main() -> None:
         y=np.array(y, np.float32),
         step=air.timestep,
         amplitude=[layer.pwv_rms / air.weather.pwv for _, layer in layers],
-        sigma=[o.instrument.dets.physical_fwhm(layer.z).mean().meters / 2.355 for _, layer in layers],
+        sigma=[
+            o.instrument.dets.physical_fwhm(layer.z).mean().meters / 2.355 for _, layer in layers
+        ],
         outer_scale=[p.callback_kwargs["r0"] / np.sqrt(2 * NU) for p, _ in layers],
         positions=[layer.h * unit_height for _, layer in layers],
         speed=[float(np.hypot(p.vx, p.vy).mean()) for p, _ in layers],

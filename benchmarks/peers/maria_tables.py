@@ -1,6 +1,8 @@
-"""Files of weather and spectra in the layout that maria 1.5 downloads, from zonda's climatology and absorption table.
+"""Files of weather and spectra in the layout that maria 1.5 downloads, from zonda's climatology and
+absorption table.
 
-With them maria runs without a network, in the same air as zonda. Axes of the spectra are as fine as those maria publishes.
+With them maria runs without a network, in the same air as zonda. Axes of the spectra are as fine as
+those maria publishes.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ GRAVITY = 9.80665
 def write_tables(folder: Path, region: str, site: Site, time: Instant) -> None:
     profile = profile_of(None, site, time, 1)
     _weather(folder / "atmosphere" / "weather" / "era5" / f"{region}.h5", profile, site.altitude)
-    _spectra(folder / "atmosphere" / "spectra" / "am" / "v3" / f"{region}.h5", profile, site.altitude)
+    _spectra(
+        folder / "atmosphere" / "spectra" / "am" / "v3" / f"{region}.h5", profile, site.altitude
+    )
 
 
 def _weather(path: Path, profile, altitude: float) -> None:

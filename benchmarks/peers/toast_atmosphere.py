@@ -49,7 +49,9 @@ def observation(c: dict[str, Any]) -> toast.Data:
     o.shared.create_column("times", (o.n_local_samples,), dtype=np.float64)
     o.shared["times"].set(c["start"] + c["seconds"])
     o.shared.create_column("boresight_azel", (o.n_local_samples, 4), dtype=np.float64)
-    o.shared["boresight_azel"].set(qarray.from_lonlat_angles(-c["azimuth"], c["elevation"], np.zeros(len(c["seconds"]))))
+    o.shared["boresight_azel"].set(
+        qarray.from_lonlat_angles(-c["azimuth"], c["elevation"], np.zeros(len(c["seconds"])))
+    )
     o.detdata.create("flags", dtype=np.uint8)
     data = toast.Data(comm)
     data.obs.append(o)
@@ -57,17 +59,30 @@ def observation(c: dict[str, Any]) -> toast.Data:
 
 
 def run(c: dict[str, Any]) -> dict[str, Any]:
-    """Set-up: the slabs of turbulence. Evaluation: pointing, integrals along the lines of sight, loading of the band."""
+    """Set-up: the slabs of turbulence. Evaluation: pointing, integrals along the lines of sight,
+    loading of the band.
+    """
     data = observation(c)
-    pointing = toast.ops.PointingDetectorSimple(boresight="boresight_azel", quats="quats_azel", shared_flags=None)
+    pointing = toast.ops.PointingDetectorSimple(
+        boresight="boresight_azel", quats="quats_azel", shared_flags=None
+    )
     generated, start = GENERATION.total, cpu()
     toast.ops.SimAtmosphere(
-        detector_pointing=pointing, det_data="atmosphere", det_data_units=u.K, shared_flags=None, turnaround_interval=None
+        detector_pointing=pointing,
+        det_data="atmosphere",
+        det_data_units=u.K,
+        shared_flags=None,
+        turnaround_interval=None,
     ).apply(data)
     total, generated = cpu() - start, GENERATION.total - generated
     signal = np.asarray(data.obs[0].detdata["atmosphere"].data)
     rms = float(np.std(signal, axis=1).mean())
-    return {"setup": generated, "evaluation": total - generated, "rms": rms, "finite": bool(np.isfinite(signal).all())}
+    return {
+        "setup": generated,
+        "evaluation": total - generated,
+        "rms": rms,
+        "finite": bool(np.isfinite(signal).all()),
+    }
 
 
 if __name__ == "__main__":

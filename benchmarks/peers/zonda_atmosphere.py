@@ -18,7 +18,11 @@ BLOCK = 16, 16384
 
 
 def chajnantor(c: dict) -> Site:
-    place = {"latitude": f"{c['latitude']} rad", "longitude": f"{c['longitude']} rad", "altitude": f"{c['altitude']} m"}
+    place = {
+        "latitude": f"{c['latitude']} rad",
+        "longitude": f"{c['longitude']} rad",
+        "altitude": f"{c['altitude']} m",
+    }
     return Site(name="here", **place, climatology="chajnantor")
 
 
@@ -36,16 +40,31 @@ def observation(c: dict) -> Observation:
         net="1 mK s(1/2)",
         sample_rate=f"{c['rate']} Hz",
     )
-    plane = Focalplane([str(k) for k in range(n)], c["xi"], c["eta"], one * camera.beam_fwhm, one, one, one * 1e-3)
+    plane = Focalplane(
+        [str(k) for k in range(n)], c["xi"], c["eta"], one * camera.beam_fwhm, one, one, one * 1e-3
+    )
     a, b = c["azimuth"] / 2, (np.pi / 2 - c["elevation"]) / 2
-    q = np.stack([np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), -np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
+    q = np.stack(
+        [
+            np.sin(a) * np.sin(b),
+            np.cos(a) * np.sin(b),
+            -np.sin(a) * np.cos(b),
+            np.cos(a) * np.cos(b),
+        ],
+        axis=1,
+    )
     start, seconds = Instant.parse(c["date"]), c["seconds"]
-    return Observation("case", 0, chajnantor(c), camera, plane, start, seconds, c["rate"], q, q, (0.0, 0.0), 1)
+    return Observation(
+        "case", 0, chajnantor(c), camera, plane, start, seconds, c["rate"], q, q, (0.0, 0.0), 1
+    )
 
 
 def run(c: dict) -> dict[str, float]:
     rms = f"{100 * c['pwv_rms']} %"
-    o, operator = observation(c), AtmosphereLayers(pwv=f"{c['pwv']} m", pwv_rms=rms, layer_response="column")
+    o, operator = (
+        observation(c),
+        AtmosphereLayers(pwv=f"{c['pwv']} m", pwv_rms=rms, layer_response="column"),
+    )
     start = cpu()
     state = operator.prepare(o)
     setup = cpu() - start
@@ -53,7 +72,10 @@ def run(c: dict) -> dict[str, float]:
     buffers: dict = {}
     for first in range(0, o.n_detectors, BLOCK[0]):
         for begin in range(0, o.n_samples, BLOCK[1]):
-            detectors, part = slice(first, min(first + BLOCK[0], o.n_detectors)), slice(begin, min(begin + BLOCK[1], o.n_samples))
+            detectors, part = (
+                slice(first, min(first + BLOCK[0], o.n_detectors)),
+                slice(begin, min(begin + BLOCK[1], o.n_samples)),
+            )
             operator.exec(Block(o, detectors, part, buffers=buffers), state)
     return {"setup": setup, "evaluation": cpu() - start}
 

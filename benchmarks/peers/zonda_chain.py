@@ -1,4 +1,6 @@
-"""zonda's whole MUSTANG-2 chain, sky to map: python zonda_chain.py CASE.npz. The second of two runs, and the first."""
+"""zonda's whole MUSTANG-2 chain, sky to map: python zonda_chain.py CASE.npz. The second of two
+runs, and the first.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +11,23 @@ from common import case, cpu, peak, report
 
 import zonda
 
-CLUSTER = files("zonda.pipelines") / "data" / "merging_cluster.fits"  # in an installed package and in this tree
+CLUSTER = (
+    files("zonda.pipelines") / "data" / "merging_cluster.fits"
+)  # in an installed package and in this tree
 
 
 def run(c: dict[str, Any]) -> dict[str, float]:
     start = cpu()
-    scene = zonda.Scene(site="chajnantor", instrument="mustang2", time=c["date"], target="17h20m -23d", seed=1)
+    scene = zonda.Scene(
+        site="chajnantor", instrument="mustang2", time=c["date"], target="17h20m -23d", seed=1
+    )
     zonda.Pipeline(
         [
             zonda.PointingDaisy(
-                radius="4 arcmin", speed="50 arcsec/s", scan_duration=f"{c['duration']} s", sample_rate=f"{c['rate']} Hz"
+                radius="4 arcmin",
+                speed="50 arcsec/s",
+                scan_duration=f"{c['duration']} s",
+                sample_rate=f"{c['rate']} Hz",
             ),
             zonda.SkyMap(file=CLUSTER, centre="target"),
             zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="3 %"),

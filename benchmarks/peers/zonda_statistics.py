@@ -1,4 +1,5 @@
-"""zonda's water for a stare, as `maria_statistics.py`: python zonda_statistics.py CASE.npz OUT.npz N
+"""zonda's water for a stare, as `maria_statistics.py`: python zonda_statistics.py CASE.npz OUT.npz
+N
 
 Distances are those across the line of sight.
 """
@@ -27,7 +28,11 @@ def main() -> None:
     c = case()
     rms = c["pwv_rms"]
     operator = AtmosphereLayers(
-        pwv=f"{c['pwv']} m", pwv_rms=f"{100 * rms} %", outer_scale=f"{OUTER_SCALE} m", outputs=["pwv"], tolerance="0.1 %"
+        pwv=f"{c['pwv']} m",
+        pwv_rms=f"{100 * rms} %",
+        outer_scale=f"{OUTER_SCALE} m",
+        outputs=["pwv"],
+        tolerance="0.1 %",
     )
     y = []
     for seed in range(int(sys.argv[3])):
@@ -49,7 +54,9 @@ def main() -> None:
         step=1 / c["rate"],
         amplitude=[rms * layer.amplitude for layer in layers],
         sigma=[
-            widened(c["diameter"], SPEED_OF_LIGHT / c["band_centre"], layer.height / sin) / FWHM_PER_SIGMA for layer in layers
+            widened(c["diameter"], SPEED_OF_LIGHT / c["band_centre"], layer.height / sin)
+            / FWHM_PER_SIGMA
+            for layer in layers
         ],
         outer_scale=[OUTER_SCALE] * len(layers),
         positions=[layer.height / sin * offsets for layer in layers],

@@ -17,17 +17,23 @@ if TYPE_CHECKING:
 
 
 def metric_of(file: PipelineFile, name: str) -> Metric:
-    """The metric that ``name`` stands for, of each band where the file's camera has several. Raises as `metrics.get`."""
+    """The metric that ``name`` stands for, of each band where the file's camera has several. Raises
+    as `metrics.get`.
+    """
     found = get(name)
     return OfBands(found) if file.scene().instrument.bands else found
 
 
 def each_band(data: Data) -> dict[str, Data]:
-    """By name of the band, its scans and products of a finished run, under the names that they have in a camera of one band."""
+    """By name of the band, its scans and products of a finished run, under the names that they have
+    in a camera of one band.
+    """
     found = data_of_bands(data)
     longest_first = sorted(found, key=len, reverse=True)
     for own in found.values():
-        own.observations = [scan for scan in data.observations if scan.instrument == own.scene.instrument]
+        own.observations = [
+            scan for scan in data.observations if scan.instrument == own.scene.instrument
+        ]
     for key, product in data.products.items():
         band = next((name for name in longest_first if key.endswith(f"_{name}")), None)
         if band is not None:
@@ -66,7 +72,8 @@ class OfBands(Metric):
         return max(self.each.mean_error(*both) for both in bands)
 
     def summary(self, found: Any) -> Floats:
-        raise NotImplementedError  # numbers of different bands are not compared as one list: `mean_error`
+        # numbers of different bands are not compared as one list: `mean_error`
+        raise NotImplementedError
 
     def floor(self, reference: Mapping[str, Any]) -> float | None:
         """The lowest of all bands; None where one has none."""

@@ -73,11 +73,17 @@ def by_step(data: Data, used: float) -> dict[str, float]:
 
 
 def peak_memory() -> int:
-    """Largest resident memory of this process so far, bytes (on Linux ``ru_maxrss`` begins with what the parent held)."""
+    """Largest resident memory of this process so far, bytes (on Linux ``ru_maxrss`` begins with
+    what the parent held).
+    """
     with suppress(OSError, StopIteration, ValueError, IndexError):
-        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+        status = (
+            Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+        )
         return 1024 * int(next(line for line in status if line.startswith("VmHWM:")).split()[1])
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
+        1 if sys.platform == "darwin" else 1024
+    )
 
 
 def run(request: Request, metric: Metric, seed: int | None, timed: bool) -> tuple[Data, bool]:
@@ -89,7 +95,9 @@ def run(request: Request, metric: Metric, seed: int | None, timed: bool) -> tupl
 
 
 def execute(file: Any, metric: Metric, threads: int | None, timed: bool) -> tuple[Data, bool]:
-    """Run a pipeline file without what acts at its end; ``timed``: without the steps and signals that the metric adds, too."""
+    """Run a pipeline file without what acts at its end; ``timed``: without the steps and signals
+    that the metric adds, too.
+    """
     from ..output import Output
     from ..pipeline import Pipeline
 
@@ -97,7 +105,9 @@ def execute(file: Any, metric: Metric, threads: int | None, timed: bool) -> tupl
     more, signals = metric.steps(list(own)), metric.signals(file.runs)
     steps, runs = (own, file.runs) if timed else (more, {**file.runs, **signals})
     header = file.header
-    pipeline = Pipeline(steps, runs=runs, only=header.only, name=header.name, precision=header.precision)
+    pipeline = Pipeline(
+        steps, runs=runs, only=header.only, name=header.name, precision=header.precision
+    )
     with tempfile.TemporaryDirectory(prefix="zonda-accuracy-") as folder:
         data = pipeline.run(file.scene(), output=folder, threads=threads)
     return data, not timed or (len(more) == len(own) and not signals)

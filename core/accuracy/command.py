@@ -1,4 +1,6 @@
-"""``zonda accuracy``: what accuracy costs in time, for the user's own pipeline and metric. Imports click alone."""
+"""``zonda accuracy``: what accuracy costs in time, for the user's own pipeline and metric. Imports
+click alone.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
 
 NOT_MET = 1
-"""Exit status where no setting meets the target, or a stored Pareto front does not hold any more."""
+"""Exit status where no setting meets the target, or a stored Pareto front does not hold any more.
+"""
 
 
 @click.command()
@@ -24,10 +27,25 @@ NOT_MET = 1
     default="map_rms",
     show_default=True,
     metavar="NAME",
-    help="map_rms, peak, transfer, psd, structure; a figure, e.g. 'central_rms(radius=30 arcsec)'; or a plugin's.",
+    help=(
+        "map_rms, peak, transfer, psd, structure; a figure, e.g. 'central_rms(radius=30 arcsec)';"
+        " or a plugin's."
+    ),
 )
-@click.option("--target", default="1 %", show_default=True, metavar="ERROR", help="Error that the metric may have.")
-@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value of the file, as for `zonda run`.")
+@click.option(
+    "--target",
+    default="1 %",
+    show_default=True,
+    metavar="ERROR",
+    help="Error that the metric may have.",
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change one value of the file, as for `zonda run`.",
+)
 @click.option(
     "--knob",
     "knobs",
@@ -37,13 +55,44 @@ NOT_MET = 1
 )
 @click.option("--quick", is_flag=True, help="Shorten the scans to at most two of 30 s.")
 @click.option("--duration", metavar="TIME", help="Length of each scan, e.g. '2 min'.")
-@click.option("--repeats", default=3, show_default=True, type=click.IntRange(2, 100), help="Timed runs of each setting.")
-@click.option("--seeds", default=4, show_default=True, type=click.IntRange(1, 1000), help="For scatter, and knobs that redraw.")
-@click.option("--threads", default=1, show_default=True, type=click.IntRange(min=1), metavar="N", help="Threads of each run.")
-@click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder.  [default: out/accuracy/NAME.METRIC]")
-@click.option("--store", is_flag=True, help="Keep the Pareto front beside the pipeline file, for `accuracy: 1 %` in it.")
 @click.option(
-    "--check", "check", is_flag=True, help="Measure the errors of the stored Pareto front again; exit status 1 where one grew."
+    "--repeats",
+    default=3,
+    show_default=True,
+    type=click.IntRange(2, 100),
+    help="Timed runs of each setting.",
+)
+@click.option(
+    "--seeds",
+    default=4,
+    show_default=True,
+    type=click.IntRange(1, 1000),
+    help="For scatter, and knobs that redraw.",
+)
+@click.option(
+    "--threads",
+    default=1,
+    show_default=True,
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Threads of each run.",
+)
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder.  [default: out/accuracy/NAME.METRIC]",
+)
+@click.option(
+    "--store",
+    is_flag=True,
+    help="Keep the Pareto front beside the pipeline file, for `accuracy: 1 %` in it.",
+)
+@click.option(
+    "--check",
+    "check",
+    is_flag=True,
+    help="Measure the errors of the stored Pareto front again; exit status 1 where one grew.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def accuracy(
@@ -64,9 +113,9 @@ def accuracy(
 ) -> int:
     """Show what accuracy costs in time: error against CPU seconds and memory.
 
-    Every knob that the pipeline's operators declare is turned alone and jointly, with the same random numbers, and compared with
-    all knobs at their tightest. Prints the tables, draws the work-precision diagram and writes the setting that
-    meets the target at least cost.
+    Every knob that the pipeline's operators declare is turned alone and jointly, with the same
+    random numbers, and compared with all knobs at their tightest. Prints the tables, draws the
+    work-precision diagram and writes the setting that meets the target at least cost.
     """
     from ..configuration.pipeline_file import load
     from .metrics import get
@@ -82,10 +131,21 @@ def accuracy(
     turned = knobs_of(file, knobs)
     numbers = tuple(file.scene().seed + k for k in range(seeds))
     shorter = shortened(file, duration, quick)
-    setup = Setup(pipeline, tuple(settings), metric, wanted, shorter, repeats=repeats, seeds=numbers, threads=threads)
+    setup = Setup(
+        pipeline,
+        tuple(settings),
+        metric,
+        wanted,
+        shorter,
+        repeats=repeats,
+        seeds=numbers,
+        threads=threads,
+    )
     from ..storage.files import check_output_folder, product_path, write_text
 
-    folder = product_path("out/accuracy", f"{file.header.name}.{metric}") if output is None else output
+    folder = (
+        product_path("out/accuracy", f"{file.header.name}.{metric}") if output is None else output
+    )
     check_output_folder(folder)
     found = study(file, setup, turned, say=_progress if sys.stderr.isatty() else lambda what: None)
     _clear()
@@ -100,7 +160,8 @@ def accuracy(
     save(found, folder / "work_precision.png")
     if found.chosen:
         heading = (
-            f"{file.header.name}: {metric} within {percent(found.chosen.error + found.sweep.left)}, measured by zonda accuracy"
+            f"{file.header.name}: {metric} within {percent(found.chosen.error + found.sweep.left)},"
+            " measured by zonda accuracy"
         )
         write_text(folder / "fragment.yaml", fragment(found.chosen.setting, heading))
     if as_json:
@@ -127,7 +188,8 @@ def _retest(file: PipelineFile, pipeline: str, metric: str) -> int:
     for result in results:
         verdict = "ok" if result.good else "GREW"
         click.echo(
-            f"{verdict:>4}  {percent(result.stored):>9} -> {percent(result.now):>9}  {' '.join(overrides(result.setting))}"
+            f"{verdict:>4}  {percent(result.stored):>9} -> {percent(result.now):>9} "
+            f" {' '.join(overrides(result.setting))}"
         )
     return 0 if all(r.good for r in results) else NOT_MET
 
@@ -140,7 +202,11 @@ def _fraction(text: str) -> float:
     try:
         return Unit("").parse(text)
     except (PydanticCustomError, ValueError) as err:
-        message = err.message() if isinstance(err, PydanticCustomError) else f"expected a fraction such as '1 %', got {text!r}"
+        message = (
+            err.message()
+            if isinstance(err, PydanticCustomError)
+            else f"expected a fraction such as '1 %', got {text!r}"
+        )
         raise click.BadParameter(message, param_hint="--target") from None
 
 

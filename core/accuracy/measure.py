@@ -1,10 +1,12 @@
-"""One setting measured: in a process of its own, so that peak memory and first-call costs are that setting's.
+"""One setting measured: in a process of its own, so that peak memory and first-call costs are that
+setting's.
 
-A process loads the pipeline file with the setting's overrides and runs it once: that run pays for imports, compiled code and
-caches and is reported apart. Then the setting and the yardstick (all knobs at their tightest) run in turn, each time from the
-file anew, so what an operator object keeps is made again. Costs are ratios to the yardstick's run beside it: what other programs
-on the machine do to both cancels. Operators that act at the end of a run (pictures, reports, files of maps) are left out: they
-cost the same at every setting.
+A process loads the pipeline file with the setting's overrides and runs it once: that run pays for
+imports, compiled code and caches and is reported apart. Then the setting and the yardstick (all
+knobs at their tightest) run in turn, each time from the file anew, so what an operator object keeps
+is made again. Costs are ratios to the yardstick's run beside it: what other programs on the machine
+do to both cancels. Operators that act at the end of a run (pictures, reports, files of maps) are
+left out: they cost the same at every setting.
 """
 
 from __future__ import annotations
@@ -57,7 +59,8 @@ class Measured:
     found
         What the metric measured, by seed.
     steps
-        CPU seconds of each step (label), one for each timed run; `REST` is what else the process used.
+        CPU seconds of each step (label), one for each timed run; `REST` is what else the process
+        used.
     yardstick
         CPU seconds of the yardstick's run beside each; empty: none ran.
     first
@@ -65,7 +68,8 @@ class Measured:
     memory
         Peak resident memory of the process, bytes, libraries included.
     compiled
-        Whether code was compiled on the way, which takes memory of its own; the next process finds it in the cache.
+        Whether code was compiled on the way, which takes memory of its own; the next process finds
+        it in the cache.
     """
 
     found: tuple[Any, ...]
@@ -76,9 +80,11 @@ class Measured:
     compiled: bool = False
 
     def cost(self, step: str = "") -> tuple[float, float]:
-        """CPU time of a step, or of all, in units of the yardstick's run beside it: (median, half the range) over the runs.
+        """CPU time of a step, or of all, in units of the yardstick's run beside it: (median, half
+        the range) over the runs.
 
-        Medians are added over steps, and half ranges in quadrature: a run that was disturbed in one step counts in the others.
+        Medians are added over steps, and half ranges in quadrature: a run that was disturbed in one
+        step counts in the others.
         """
         chosen = [self.steps.get(step, (0.0,))] if step else list(self.steps.values())
         units = self.yardstick or (1.0,) * max((len(s) for s in chosen), default=0)
@@ -88,7 +94,9 @@ class Measured:
 
 
 def measure(request: Request) -> Measured:
-    """Run a child process, again where it had to compile. Raises `ZondaError` as the run does, or where the process dies."""
+    """Run a child process, again where it had to compile. Raises `ZondaError` as the run does, or
+    where the process dies.
+    """
     found = _measure(request)
     return _measure(request) if found.compiled and request.repeats else found
 
@@ -103,9 +111,17 @@ def _measure(request: Request) -> Measured:
             place = " ".join(request.overrides) or request.pipeline
             if done.returncode < 0:
                 cure = "it may have run out of memory: shorten the scans with --duration"
-                raise ZondaError(f"the measuring process was killed by signal {-done.returncode}", place=place, cure=cure)
+                raise ZondaError(
+                    f"the measuring process was killed by signal {-done.returncode}",
+                    place=place,
+                    cure=cure,
+                )
             said = "\n".join(done.stderr.strip().splitlines()[-12:])
-            raise ZondaError(f"the measuring process failed:\n{said}", place=place, cure="`zonda run` shows the same fault")
+            raise ZondaError(
+                f"the measuring process failed:\n{said}",
+                place=place,
+                cure="`zonda run` shows the same fault",
+            )
         with answer.open("rb") as file:
             result = pickle.load(file)  # written by our own child into our own folder
     if isinstance(result, Measured):

@@ -1,7 +1,9 @@
-"""What may be wrong: a metric turns the products of a run into numbers, and two runs into one relative error.
+"""What may be wrong: a metric turns the products of a run into numbers, and two runs into one
+relative error.
 
-A metric is a subclass of `Metric` in the entry-point group ``zonda.metrics``, or just a function there that takes a `Data` and
-returns a number or an array: its error is then |m - m0| / |m0| (Euclidean norms).
+A metric is a subclass of `Metric` in the entry-point group ``zonda.metrics``, or just a function
+there that takes a `Data` and returns a number or an array: its error is then |m - m0| / |m0|
+(Euclidean norms).
 """
 
 from __future__ import annotations
@@ -25,17 +27,19 @@ if TYPE_CHECKING:
 
 
 class Metric:
-    """Base of metrics. `measure` is required; the rest has defaults for a metric that is a number or an array.
+    """Base of metrics. `measure` is required; the rest has defaults for a metric that is a number
+    or an array.
 
     Class attributes
     ----------------
     says
         What the error is, half a line.
     needs_end
-        True where `measure` reads products of an `Output` (plots, reports); these are left out otherwise.
+        True where `measure` reads products of an `Output` (plots, reports); these are left out
+        otherwise.
     instead
-        Of a metric that is no number of one run, only an error between two: what to measure of one run in its place. None: a
-        number of one run.
+        Of a metric that is no number of one run, only an error between two: what to measure of one
+        run in its place. None: a number of one run.
     """
 
     says: ClassVar[str] = "|m - m0| / |m0|"
@@ -43,14 +47,20 @@ class Metric:
     instead: ClassVar[str | None] = None
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        """Raise `PipelineError` where a pipeline of these steps and signals cannot have this metric."""
+        """Raise `PipelineError` where a pipeline of these steps and signals cannot have this
+        metric.
+        """
 
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
-        """Signals that `measure` reads beside those of the pipeline, ``runs``. They are not timed."""
+        """Signals that `measure` reads beside those of the pipeline, ``runs``. They are not
+        timed.
+        """
         return {}
 
     def steps(self, operators: list[Operator]) -> list[Operator]:
-        """The steps to measure with: more than the pipeline's own where the metric needs more. They are not timed."""
+        """The steps to measure with: more than the pipeline's own where the metric needs more. They
+        are not timed.
+        """
         return operators
 
     def measure(self, data: Data) -> Any:
@@ -58,21 +68,28 @@ class Metric:
         raise NotImplementedError
 
     def error(self, found: Any, reference: Any) -> float:
-        """Relative error of one run against another with the same random numbers; 0 only where they are alike."""
+        """Relative error of one run against another with the same random numbers; 0 only where they
+        are alike.
+        """
         a, b = self.summary(found), self.summary(reference)
         size = float(np.linalg.norm(b))
         return float(np.linalg.norm(a - b)) / size if size > 0 else float(np.any(a != b))
 
     def errors(self, found: Any, reference: Any) -> Mapping[str, float]:
-        """`error` by the names of parts of which the largest counts (bands, planes of a map); empty where there is one part."""
+        """`error` by the names of parts of which the largest counts (bands, planes of a map); empty
+        where there is one part.
+        """
         return {}
 
     def mean_error(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:
-        """(E, R): change of the mean over seeds of `summary`, relative, and its standard error, equation (1).
+        """(E, R): change of the mean over seeds of `summary`, relative, and its standard error,
+        equation (1).
 
-        With d_s the difference of the two summaries at seed s (n values each), m the mean summary of the reference,
+        With d_s the difference of the two summaries at seed s (n values each), m the mean summary
+        of the reference,
 
-            E^2 = mean_n (mean_s d)^2 / mean_n m^2,    R^2 = mean_n (var_s d / S) / mean_n m^2                   (1)
+            E^2 = mean_n (mean_s d)^2 / mean_n m^2,
+            R^2 = mean_n (var_s d / S) / mean_n m^2                   (1)
 
         What the same seed leaves in common in both cancels in d.
         """
@@ -103,19 +120,26 @@ class OfFunction(Metric):
 
 
 def get(name: str, parameters: Mapping[str, Any] | None = None) -> Metric:
-    """The metric that ``name`` stands for: a name, or name(parameter=value, ...) with values as in YAML.
+    """The metric that ``name`` stands for: a name, or name(parameter=value, ...) with values as in
+    YAML.
 
-    ``parameters``: more of them. Raises `RegistryError` with the nearest name where there is none, `ParameterError` for
-    parameters that are wrong, `InputError` where a metric has none.
+    ``parameters``: more of them. Raises `RegistryError` with the nearest name where there is none,
+    `ParameterError` for parameters that are wrong, `InputError` where a metric has none.
     """
     head, parenthesis, rest = name.strip().partition("(")
     if parenthesis and not rest.endswith(")"):
-        raise InputError(f"cannot read the metric {name!r}", place="metric", cure="write name(parameter=value, ...)")
+        raise InputError(
+            f"cannot read the metric {name!r}",
+            place="metric",
+            cure="write name(parameter=value, ...)",
+        )
     given = {**_arguments(name, rest[:-1]), **(parameters or {})}
     found = registry.metrics.get(head.strip())
     is_class = isinstance(found, type) and issubclass(found, Metric)
     if given and not (is_class and issubclass(found, Parameters)):
-        raise InputError(f"the metric {head} has no parameters", place="metric", cure=f"write {head} alone")
+        raise InputError(
+            f"the metric {head} has no parameters", place="metric", cure=f"write {head} alone"
+        )
     if is_class:
         return found(**given)  # type: ignore[no-any-return]
     return found if isinstance(found, Metric) else OfFunction(found)
@@ -128,6 +152,10 @@ def _arguments(name: str, text: str) -> dict[str, Any]:
         key, equals, value = part.partition("=")
         new = yaml_places.load(yaml_places.Source("metric", name), text=value.strip())
         if not equals or not key.strip() or new.faults:
-            raise InputError(f"cannot read {part.strip()!r} in the metric {name!r}", place="metric", cure="write parameter=value")
+            raise InputError(
+                f"cannot read {part.strip()!r} in the metric {name!r}",
+                place="metric",
+                cure="write parameter=value",
+            )
         found[key.strip()] = new.value
     return found

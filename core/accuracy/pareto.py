@@ -1,10 +1,13 @@
-"""The Pareto front: which settings of all knobs together nothing beats in error, CPU seconds and memory.
+"""The Pareto front: which settings of all knobs together nothing beats in error, CPU seconds and
+memory.
 
-The search begins with every knob at its tightest and relaxes one knob at a time, that with the best saving per added error as
-the knobs alone predict it; each joint setting is then measured, never added up. While the measured error stays within what is
-allowed the step is kept; a step that exceeds it is undone and not tried again. When nothing more may be relaxed it tries
-exchanges: one knob relaxed further and others tightened to pay for it. Then it goes on beyond the target, so that the front shows
-what more error would buy. It measures about one setting per rung: the sum of the ladders, not their product.
+The search begins with every knob at its tightest and relaxes one knob at a time, that with the best
+saving per added error as the knobs alone predict it; each joint setting is then measured, never
+added up. While the measured error stays within what is allowed the step is kept; a step that
+exceeds it is undone and not tried again. When nothing more may be relaxed it tries exchanges: one
+knob relaxed further and others tightened to pay for it. Then it goes on beyond the target, so that
+the front shows what more error would buy. It measures about one setting per rung: the sum of the
+ladders, not their product.
 """
 
 from __future__ import annotations
@@ -22,9 +25,11 @@ SAME_MEMORY = 1.02
 
 @dataclass(frozen=True)
 class Point:
-    """A joint setting, measured: error against the reference, CPU seconds and their spread, peak memory in bytes.
+    """A joint setting, measured: error against the reference, CPU seconds and their spread, peak
+    memory in bytes.
 
-    ``bands``: the error of each band by its name, of which ``error`` is the largest; empty where the camera has one.
+    ``bands``: the error of each band by its name, of which ``error`` is the largest; empty where
+    the camera has one.
     """
 
     setting: Setting
@@ -48,11 +53,19 @@ class _Step:
 def point(bench: Bench, setting: Setting, reference: Setting) -> Point:
     """Measure a joint setting."""
     error = bench.error(setting, reference)
-    return Point(setting, error, *bench.seconds(setting), bench.measure(setting).memory, bench.errors(setting, reference))
+    return Point(
+        setting,
+        error,
+        *bench.seconds(setting),
+        bench.measure(setting).memory,
+        bench.errors(setting, reference),
+    )
 
 
 def search(bench: Bench, found: Sweep, allowed: float, most: int = 40) -> list[Point]:
-    """Every joint setting that was tried, in order; the first is the reference. ``allowed``: error that a kept step may reach."""
+    """Every joint setting that was tried, in order; the first is the reference. ``allowed``: error
+    that a kept step may reach.
+    """
     turning = [a for a in found.alone if not a.knob.redraws and not a.inert]
     points: list[Point] = []
 
@@ -74,9 +87,15 @@ def search(bench: Bench, found: Sweep, allowed: float, most: int = 40) -> list[P
 
 
 def _relaxed(
-    turning: Sequence[Alone], here: Point, limit: float, tried: Callable[[Setting], Point], may_go_on: Callable[[], bool]
+    turning: Sequence[Alone],
+    here: Point,
+    limit: float,
+    tried: Callable[[Setting], Point],
+    may_go_on: Callable[[], bool],
 ) -> Point:
-    """Relax one knob after the other while the measured error stays within ``limit``; the point that is reached."""
+    """Relax one knob after the other while the measured error stays within ``limit``; the point
+    that is reached.
+    """
     refused: set[tuple[str, str]] = set()
     while may_go_on():
         options = [s for s in _steps(turning, here.setting) if (s.key, s.value) not in refused]
@@ -92,16 +111,26 @@ def _relaxed(
 
 
 def _exchange(turning: Sequence[Alone], here: Point, allowed: float) -> Setting | None:
-    """The setting that saves most, as predicted: one knob relaxed, and others tightened until the error is allowed again."""
+    """The setting that saves most, as predicted: one knob relaxed, and others tightened until the
+    error is allowed again.
+    """
     best, most = None, 0.0
     for step in _steps(turning, here.setting):
-        setting, error, saving = here.setting | {step.key: step.value}, here.error + step.error, step.saving
+        setting, error, saving = (
+            here.setting | {step.key: step.value},
+            here.error + step.error,
+            step.saving,
+        )
         while error > allowed:
             ways = [t for a in turning if a.knob.key != step.key for t in _tighter(a, setting)]
             if not ways:
                 break
             way = max(ways, key=lambda t: -t.error / max(-t.saving, 1e-12))
-            setting, error, saving = setting | {way.key: way.value}, error + way.error, saving + way.saving
+            setting, error, saving = (
+                setting | {way.key: way.value},
+                error + way.error,
+                saving + way.saving,
+            )
         if error <= allowed and saving > max(most, here.spread):
             best, most = setting, saving
     return best
@@ -110,8 +139,15 @@ def _exchange(turning: Sequence[Alone], here: Point, allowed: float) -> Setting 
 def _tighter(alone: Alone, here: Setting) -> list[_Step]:
     """Finer values of a knob than here that lower its error; savings and errors are negative."""
     at = alone.rung(here[alone.knob.key])
-    finer = [r for r in alone.rungs[alone.rungs.index(at) + 1 :] if r.error is not None and r.error < (at.error or 0.0)]
-    return [_Step(alone.knob.key, r.value, at.own - r.own, (r.error or 0.0) - (at.error or 0.0)) for r in finer]
+    finer = [
+        r
+        for r in alone.rungs[alone.rungs.index(at) + 1 :]
+        if r.error is not None and r.error < (at.error or 0.0)
+    ]
+    return [
+        _Step(alone.knob.key, r.value, at.own - r.own, (r.error or 0.0) - (at.error or 0.0))
+        for r in finer
+    ]
 
 
 def _steps(turning: Sequence[Alone], here: Setting) -> list[_Step]:
@@ -124,7 +160,11 @@ def _steps(turning: Sequence[Alone], here: Setting) -> list[_Step]:
                 break
             saving = at.own - rung.own
             if rung.error is not None and saving > math.hypot(at.own_spread, rung.own_spread):
-                steps.append(_Step(alone.knob.key, rung.value, saving, max(0.0, rung.error - (at.error or 0.0))))
+                steps.append(
+                    _Step(
+                        alone.knob.key, rung.value, saving, max(0.0, rung.error - (at.error or 0.0))
+                    )
+                )
     return steps
 
 
@@ -136,18 +176,25 @@ def pareto(points: Sequence[Point]) -> list[Point]:
 
 
 def cheapest(points: Sequence[Point], target: float, left: float = 0.0) -> Point | None:
-    """The cheapest point whose error, with what is ``left`` in the reference, meets the target; among those that cost the same
-    within its spread, the most accurate. None where there is none."""
+    """The cheapest point whose error, with what is ``left`` in the reference, meets the target;
+    among those that cost the same within its spread, the most accurate. None where there is
+    none."""
     best = least(points, target, left)
     if best is None:
         return None
-    good = [p for p in points if p.error + left <= target and p.seconds <= best.seconds + best.spread]
+    good = [
+        p for p in points if p.error + left <= target and p.seconds <= best.seconds + best.spread
+    ]
     return min(good, key=lambda p: (p.error, p.seconds))
 
 
 def least(points: Sequence[Point], target: float, left: float = 0.0) -> Point | None:
-    """The point that was measured to cost least of those that meet the target; None where there is none."""
-    return min((p for p in points if p.error + left <= target), key=lambda p: p.seconds, default=None)
+    """The point that was measured to cost least of those that meet the target; None where there is
+    none.
+    """
+    return min(
+        (p for p in points if p.error + left <= target), key=lambda p: p.seconds, default=None
+    )
 
 
 def _beats(q: Point, p: Point) -> bool:

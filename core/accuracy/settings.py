@@ -21,7 +21,9 @@ Setting = dict[str, str]
 
 QUICK_SECONDS, QUICK_SCANS = 30.0, 2
 QUICK_SAMPLES, QUICK_SHORTEST = 6e6, 5.0
-"""Samples of all detectors in all scans above which ``--quick`` makes scans shorter still, down to so many seconds."""
+"""Samples of all detectors in all scans above which ``--quick`` makes scans shorter still, down to
+so many seconds.
+"""
 LENGTH = ("scan_duration", "scans")
 """Parameters of pointing steps that say how long is observed: what `shortened` changes."""
 
@@ -63,7 +65,8 @@ def overrides(setting: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def knobs_of(file: PipelineFile, only: Iterable[str] = ()) -> list[PipelineKnob]:
-    """The knobs of a pipeline's steps, in order; ``only``: those of these keys, operators or parameters.
+    """The knobs of a pipeline's steps, in order; ``only``: those of these keys, operators or
+    parameters.
 
     Raises
     ------
@@ -80,21 +83,38 @@ def knobs_of(file: PipelineFile, only: Iterable[str] = ()) -> list[PipelineKnob]
             present = _on_ladder(knob, step.operator) or text(values[knob.parameter])
             found.append(_knob(knob, f"{name}.{knob.parameter}", label, present, given))
     header = file.header
-    found.append(_knob(PRECISION, PRECISION.parameter, "", text(header.precision), "precision" in header.model_fields_set))
+    found.append(
+        _knob(
+            PRECISION,
+            PRECISION.parameter,
+            "",
+            text(header.precision),
+            "precision" in header.model_fields_set,
+        )
+    )
     chosen = []
     keys = [knob.key for knob in found]
     for word in only:
-        those = [k for k in found if word == k.key or word in (k.key.rpartition(".")[0], k.key.rpartition(".")[2])]
+        those = [
+            k
+            for k in found
+            if word == k.key or word in (k.key.rpartition(".")[0], k.key.rpartition(".")[2])
+        ]
         if not those:
             hint = nearest(word, [*keys, *{k.rpartition(".")[2] for k in keys}])
-            raise InputError(f"no knob is called '{word}'{'; ' + hint if hint else ''}", place="--knob", cure=_list(keys))
+            raise InputError(
+                f"no knob is called '{word}'{'; ' + hint if hint else ''}",
+                place="--knob",
+                cure=_list(keys),
+            )
         chosen += [k for k in those if k not in chosen]
     return chosen if only else found
 
 
 def shortened(file: PipelineFile, duration: str | None, quick: bool) -> Setting:
-    """Overrides of the pointing steps' `scan_duration` (and `scans`); ``quick``: at most two scans of 30 s,
-    of less where they would hold more than `QUICK_SAMPLES` samples, but not of less than `QUICK_SHORTEST` seconds.
+    """Overrides of the pointing steps' `scan_duration` (and `scans`); ``quick``: at most two scans
+    of 30 s, of less where they would hold more than `QUICK_SAMPLES` samples, but not of less than
+    `QUICK_SHORTEST` seconds.
 
     Raises InputError where no pointing step has a `scan_duration`.
     """
@@ -112,13 +132,17 @@ def shortened(file: PipelineFile, duration: str | None, quick: bool) -> Setting:
         if quick and getattr(operator, "scans", 0) > QUICK_SCANS:
             setting[f"{name}.scans"] = str(QUICK_SCANS)
     if not setting and duration:
-        raise InputError("no pointing step has a scan_duration", place="--duration", cure="leave --duration out")
+        raise InputError(
+            "no pointing step has a scan_duration", place="--duration", cure="leave --duration out"
+        )
     return setting
 
 
 def _quick_seconds(file: PipelineFile, pointing: Any) -> float:
     instrument = file.scene().instrument
-    rate = len(instrument.focalplane()) * (getattr(pointing, "sample_rate", None) or instrument.sample_rate)
+    rate = len(instrument.focalplane()) * (
+        getattr(pointing, "sample_rate", None) or instrument.sample_rate
+    )
     scans = min(max(getattr(pointing, "scans", 1), 1), QUICK_SCANS)
     return min(max(float(round(QUICK_SAMPLES / (rate * scans))), QUICK_SHORTEST), QUICK_SECONDS)
 
@@ -137,12 +161,20 @@ def _on_ladder(knob: Knob, operator: Operator) -> str:
     """The rung that the operator stands on, as text; empty where it stands between two."""
     present = getattr(operator, knob.parameter)
     values = knob.values(type(operator))
-    return next((text(rung) for rung, value in zip(knob.ladder, values, strict=True) if value == present), "")
+    return next(
+        (text(rung) for rung, value in zip(knob.ladder, values, strict=True) if value == present),
+        "",
+    )
 
 
 def _names(file: PipelineFile) -> list[str]:
-    """What ``--set`` calls each step: its own name or its operator's, numbered where several answer to it."""
-    answers = [{s.key, s.key.rpartition(":")[2], *([s.operator.name] if s.operator.name else [])} for s in file.steps]
+    """What ``--set`` calls each step: its own name or its operator's, numbered where several answer
+    to it.
+    """
+    answers = [
+        {s.key, s.key.rpartition(":")[2], *([s.operator.name] if s.operator.name else [])}
+        for s in file.steps
+    ]
     names = []
     for number, step in enumerate(file.steps):
         name = step.operator.name or step.key
@@ -152,4 +184,8 @@ def _names(file: PipelineFile) -> list[str]:
 
 
 def _list(keys: list[str]) -> str:
-    return f"this pipeline has {', '.join(keys)}" if keys else "no step of this pipeline declares a knob"
+    return (
+        f"this pipeline has {', '.join(keys)}"
+        if keys
+        else "no step of this pipeline declares a knob"
+    )

@@ -1,7 +1,9 @@
-"""Pareto fronts as files: what `accuracy: 1 %` in a pipeline chooses from, and a regression test of the errors.
+"""Pareto fronts as files: what `accuracy: 1 %` in a pipeline chooses from, and a regression test of
+the errors.
 
-The front of ``pipelines/my.yaml`` for the metric ``peak`` is ``pipelines/fronts/my.peak.json``. It holds for the pipeline it was
-made of: a fingerprint of scene and steps, without seed, knobs and the length of the scans, is compared.
+The front of ``pipelines/my.yaml`` for the metric ``peak`` is ``pipelines/fronts/my.peak.json``. It
+holds for the pipeline it was made of: a fingerprint of scene and steps, without seed, knobs and the
+length of the scans, is compared.
 """
 
 from __future__ import annotations
@@ -34,8 +36,9 @@ FORMAT = 2
 
 @dataclass(frozen=True)
 class StoredFront:
-    """A stored Pareto front: its points, what the reference is itself wrong by, and what it was measured on. ``staying``: values
-    of the knobs that redraw, which are those of the file in all points."""
+    """A stored Pareto front: its points, what the reference is itself wrong by, and what it was
+    measured on. ``staying``: values of the knobs that redraw, which are those of the file in all
+    points."""
 
     metric: str
     fingerprint: str
@@ -49,7 +52,9 @@ class StoredFront:
 
 @dataclass(frozen=True)
 class Choice:
-    """Overrides to run with, the error they were measured to have (None: not known), and why they were chosen."""
+    """Overrides to run with, the error they were measured to have (None: not known), and why they
+    were chosen.
+    """
 
     overrides: tuple[str, ...]
     error: float | None
@@ -57,15 +62,22 @@ class Choice:
 
 
 def fingerprint(file: PipelineFile) -> str:
-    """Of what a Pareto front belongs to: the scene without its seed, the steps without their knobs, the length of the scans and
-    the outputs. Files count by name and size, parameters at their defaults not at all.
+    """Of what a Pareto front belongs to: the scene without its seed, the steps without their knobs,
+    the length of the scans and the outputs. Files count by name and size, parameters at their
+    defaults not at all.
     """
     scene = file.scene()
     described: list[Any] = [
         {k: _plain(getattr(scene, k)) for k in type(scene).model_fields if k != "seed"},
-        [(step.key, _described(step.operator)) for step in file.steps if not isinstance(step.operator, Output)],
+        [
+            (step.key, _described(step.operator))
+            for step in file.steps
+            if not isinstance(step.operator, Output)
+        ],
     ]
-    return hashlib.blake2b(json.dumps(described, sort_keys=True).encode(), digest_size=8).hexdigest()
+    return hashlib.blake2b(
+        json.dumps(described, sort_keys=True).encode(), digest_size=8
+    ).hexdigest()
 
 
 def as_json(study: Study, file: PipelineFile) -> dict[str, Any]:
@@ -93,7 +105,13 @@ def as_json(study: Study, file: PipelineFile) -> dict[str, Any]:
         "staying": {a.knob.key: a.knob.present for a in study.sweep.alone if a.knob.redraws},
         "first_run_seconds": study.first,
         "alone": [
-            {"knob": a.knob.key, "approximates": a.knob.approximates, "redraws": a.knob.redraws, "left": a.left, "how": a.how}
+            {
+                "knob": a.knob.key,
+                "approximates": a.knob.approximates,
+                "redraws": a.knob.redraws,
+                "left": a.left,
+                "how": a.how,
+            }
             | {"rungs": [asdict(r) for r in a.rungs]}
             for a in study.sweep.alone
         ],
@@ -123,7 +141,11 @@ def read(path: Path) -> StoredFront:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         if values["format"] != FORMAT:
-            raise InputError(f"is a Pareto front of format {values['format']}, not {FORMAT}", place=str(path), cure=cure)
+            raise InputError(
+                f"is a Pareto front of format {values['format']}, not {FORMAT}",
+                place=str(path),
+                cure=cure,
+            )
         return TypeAdapter(StoredFront).validate_python(values)
     except ValidationError as err:
         first = err.errors()[0]
@@ -134,10 +156,12 @@ def read(path: Path) -> StoredFront:
 
 
 def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> Choice:
-    """The knobs with which this pipeline meets ``target`` at least cost, by its stored Pareto front; else all at their tightest.
+    """The knobs with which this pipeline meets ``target`` at least cost, by its stored Pareto
+    front; else all at their tightest.
 
-    Knobs that the file states are left as they are. The errors of a front are measured on the scans it was made with; what this
-    run has is measured by ``zonda run --verify``. Raises `RegistryError` for a metric that is not there.
+    Knobs that the file states are left as they are. The errors of a front are measured on the scans
+    it was made with; what this run has is measured by ``zonda run --verify``. Raises
+    `RegistryError` for a metric that is not there.
     """
     get(metric)
     knobs = knobs_of(file)
@@ -149,7 +173,11 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
         front = read(path)
         if front.fingerprint != fingerprint(file) or not front.reference.keys() <= known:
             why = f"the stored Pareto front of {metric} ({path}) is of other steps or another scene"
-        elif changed := [f"{k.key}={front.staying[k.key]}" for k in knobs if front.staying.get(k.key, k.present) != k.present]:
+        elif changed := [
+            f"{k.key}={front.staying[k.key]}"
+            for k in knobs
+            if front.staying.get(k.key, k.present) != k.present
+        ]:
             why = f"the stored Pareto front of {metric} ({path}) was made with {' '.join(changed)}"
         elif (point := cheapest(front.points, target, front.reference_error)) is None:
             why = f"no point of the stored Pareto front of {metric} meets {100 * target:g} %"
@@ -157,11 +185,18 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
         setting = {k: v for k, v in point.setting.items() if k not in given}
         error = point.error + front.reference_error
         reason = (
-            f"stored Pareto front of {metric}: {100 * error:.2g} % with {' '.join(overrides(setting)) or 'the knobs as they are'}"
+            f"stored Pareto front of {metric}: {100 * error:.2g} % with"
+            f" {' '.join(overrides(setting)) or 'the knobs as they are'}"
         )
     else:
         setting = {k: v for k, v in tightest(knobs).items() if k not in given}
-        error, reason = None, f"{why}: the knobs are at their tightest; `zonda accuracy {file.header.name} --store` makes one"
+        error, reason = (
+            None,
+            (
+                f"{why}: the knobs are at their tightest; `zonda accuracy {file.header.name}"
+                " --store` makes one"
+            ),
+        )
     if kept := [f"{k.key}={k.present}" for k in knobs if k.given and not k.redraws]:
         reason += f"; as the file states: {' '.join(kept)}"
         error = None
@@ -169,17 +204,30 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
 
 
 def _plain(value: Any) -> str:
-    """All fields in SI, but for those that are no part of a resolved file: they change no result."""
+    """All fields in SI, but for those that are no part of a resolved file: they change no
+    result.
+    """
     if not isinstance(value, BaseModel):
         return repr(value)
-    fields = [(name, getattr(value, name)) for name, field in type(value).model_fields.items() if not field.exclude]
-    return f"{type(value).__name__}({', '.join(f'{name}={_plain(inner)}' for name, inner in fields)})"
+    fields = [
+        (name, getattr(value, name))
+        for name, field in type(value).model_fields.items()
+        if not field.exclude
+    ]
+    return (
+        f"{type(value).__name__}({', '.join(f'{name}={_plain(inner)}' for name, inner in fields)})"
+    )
 
 
 def _described(operator: Operator) -> dict[str, Any]:
     length = LENGTH if "boresight" in operator.provides else ()
-    fields = operator.model_dump(exclude_defaults=True, exclude={*length, *(k.parameter for k in planning_of(operator).knobs)})
-    return {k: [v.name, v.stat().st_size] if isinstance(v, Path) else repr(v) for k, v in fields.items()}
+    fields = operator.model_dump(
+        exclude_defaults=True,
+        exclude={*length, *(k.parameter for k in planning_of(operator).knobs)},
+    )
+    return {
+        k: [v.name, v.stat().st_size] if isinstance(v, Path) else repr(v) for k, v in fields.items()
+    }
 
 
 def _rounded(value: Any) -> Any:

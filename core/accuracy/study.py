@@ -1,4 +1,6 @@
-"""A whole study of one pipeline and metric: every knob alone, the Pareto front, and the setting that is recommended."""
+"""A whole study of one pipeline and metric: every knob alone, the Pareto front, and the setting
+that is recommended.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ class Setup:
     shorter
         Overrides that shorten the scans (`settings.shortened`).
     repeats, seeds, threads
-        Timed runs of each setting; seeds for the realization scatter and for knobs that redraw; threads of each run.
+        Timed runs of each setting; seeds for the realization scatter and for knobs that redraw;
+        threads of each run.
     """
 
     pipeline: str
@@ -44,12 +47,22 @@ class Setup:
 
     def __post_init__(self) -> None:
         if not self.target > 0:
-            raise InputError(f"the target must be above 0, got {100 * self.target:g} %", place="--target", cure="e.g. 1 %")
+            raise InputError(
+                f"the target must be above 0, got {100 * self.target:g} %",
+                place="--target",
+                cure="e.g. 1 %",
+            )
 
     def run(self, setting: Setting, seeds: Sequence[int | None], yardstick: Setting) -> Measured:
         """Measure a setting in a process of its own."""
-        mine, other = ((*self.settings, *overrides(self.shorter), *overrides(s)) for s in (setting, yardstick))
-        return measure(Request(self.pipeline, mine, self.metric, other, tuple(seeds), self.repeats, self.threads))
+        mine, other = (
+            (*self.settings, *overrides(self.shorter), *overrides(s)) for s in (setting, yardstick)
+        )
+        return measure(
+            Request(
+                self.pipeline, mine, self.metric, other, tuple(seeds), self.repeats, self.threads
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -69,7 +82,8 @@ class Study:
     chosen
         Of those that meet the target, see `pareto.cheapest`; None where none does.
     floor, scatter
-        Instrument noise and realization scatter in units of the error; None where they have no meaning or were not measured.
+        Instrument noise and realization scatter in units of the error; None where they have no
+        meaning or were not measured.
     first
         CPU seconds of the first run of the reference: compilation, imports and caches included.
     """
@@ -110,7 +124,11 @@ def study(
     metric = metric_of(file, setup.metric)
     metric.check(file.operators, file.runs)
     if not knobs:
-        raise InputError("no step declares a knob", place=file.place, cure="docs/accuracy.md says how an operator does")
+        raise InputError(
+            "no step declares a knob",
+            place=file.place,
+            cure="docs/accuracy.md says how an operator does",
+        )
     bench = Bench(run or setup.run, metric, tightest(knobs), setup.seeds, say)
     found = sweep(bench, knobs)
     reference = bench.measure(found.reference)

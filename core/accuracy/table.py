@@ -13,7 +13,9 @@ from .sweep import Alone, Rung, differences
 
 
 def lines(study: Study, width: int = 130) -> Iterator[str]:
-    """The whole report, top down: what was measured, each knob alone, the Pareto front, the recommendation."""
+    """The whole report, top down: what was measured, each knob alone, the Pareto front, the
+    recommendation.
+    """
     yield from _heading(study)
     for alone in study.sweep.alone:
         yield ""
@@ -37,7 +39,8 @@ def by_band(errors: Mapping[str, float]) -> str:
 
 
 def fragment(setting: Mapping[str, str], heading: str) -> str:
-    """YAML of the setting: parameters under the step they belong to, to be merged into the file's steps by hand.
+    """YAML of the setting: parameters under the step they belong to, to be merged into the file's
+    steps by hand.
 
     A comment line holds the same for the command line.
     """
@@ -69,22 +72,32 @@ def _heading(study: Study) -> Iterator[str]:
     yield f"error of {setup.metric}: {study.says}"
     if setup.shorter:
         shorter = ", ".join(f"{k} = {v}" for k, v in setup.shorter.items())
-        yield f"shortened scans: {shorter}. Per-scan costs weigh more, slow modes and coverage less than in whole scans."
+        yield (
+            f"shortened scans: {shorter}. Per-scan costs weigh more, slow modes and coverage less"
+            " than in whole scans."
+        )
     yield (
-        f"CPU seconds are medians of {setup.repeats} runs on {setup.threads} thread{'s' if setup.threads > 1 else ''}, "
-        "± half their range, each against a run of the reference beside it;"
+        f"CPU seconds are medians of {setup.repeats} runs on {setup.threads}"
+        f" thread{'s' if setup.threads > 1 else ''}, ± half their range, each against a run of the"
+        " reference beside it;"
     )
-    yield ("steps that act at the end (pictures, reports, files) are left out.")
+    yield "steps that act at the end (pictures, reports, files) are left out."
     yield (
-        f"reference, all knobs at their tightest: {_cost(reference.seconds, reference.spread)} CPU s, "
-        f"{_megabytes(reference.memory)} ({study.first:.1f} s the first time, with imports and caches); "
-        f"its own error by its last steps: {percent(study.sweep.left)}"
+        f"reference, all knobs at their tightest: {_cost(reference.seconds, reference.spread)} CPU"
+        f" s, {_megabytes(reference.memory)} ({study.first:.1f} s the first time, with imports and"
+        f" caches); its own error by its last steps: {percent(study.sweep.left)}"
     )
     if staying := study.sweep.staying:
         parts = ", ".join(f"{a.knob.key}={a.knob.present} {percent(a.stays)}" for a in staying)
-        yield f"  of it {percent(study.sweep.left - study.sweep.left_of_turned)} of knobs that stay as in the file: {parts}"
+        yield (
+            f"  of it {percent(study.sweep.left - study.sweep.left_of_turned)} of knobs that stay"
+            f" as in the file: {parts}"
+        )
     floor = "none" if study.floor is None else percent(study.floor)
-    yield f"instrument noise in units of the error: {floor}; realization scatter: {percent(study.scatter)}"
+    yield (
+        f"instrument noise in units of the error: {floor}; realization scatter:"
+        f" {percent(study.scatter)}"
+    )
 
 
 def _alone(alone: Alone) -> Iterator[str]:
@@ -100,14 +113,24 @@ def _alone(alone: Alone) -> Iterator[str]:
         if rung.error is None:
             yield f"  {rung.value:>10}  {rung.note}{mark}"
             continue
-        saved = "" if rung is last else f"{last.own - rung.own:+.3f} ± {(last.own_spread**2 + rung.own_spread**2) ** 0.5:.3f}"
+        saved = (
+            ""
+            if rung is last
+            else (
+                f"{last.own - rung.own:+.3f} ±"
+                f" {(last.own_spread**2 + rung.own_spread**2) ** 0.5:.3f}"
+            )
+        )
         yield (
-            f"  {rung.value:>10}  {_error(rung):>17}  {_cost(rung.seconds, rung.spread):>15}  {saved:>18}  "
-            f"{_megabytes(rung.memory):>8}{mark}"
+            f"  {rung.value:>10}  {_error(rung):>17}  {_cost(rung.seconds, rung.spread):>15} "
+            f" {saved:>18}  {_megabytes(rung.memory):>8}{mark}"
         )
     yield f"  what is left at {knob.tightest}: {percent(alone.left)} ({alone.how})"
     if knob.redraws:
-        yield "  draws other random numbers: change of the mean over seeds ± its standard error; stays as in the file below"
+        yield (
+            "  draws other random numbers: change of the mean over seeds ± its standard error;"
+            " stays as in the file below"
+        )
 
 
 def _front(study: Study, width: int) -> Iterator[str]:
@@ -116,7 +139,10 @@ def _front(study: Study, width: int) -> Iterator[str]:
     for point in study.front:
         yield f"  {_point(point)}  {_short(_pairs(point, study), width - 42)}{_marks(point, study)}"
     if study.present not in study.front:
-        yield f"  {_point(study.present)}  {_short(_pairs(study.present, study), width - 42)}{_marks(study.present, study)}"
+        yield (
+            f"  {_point(study.present)} "
+            f" {_short(_pairs(study.present, study), width - 42)}{_marks(study.present, study)}"
+        )
     if study.present.bands:
         yield "error of each band, of which the largest counts"
         for name, found in (("file", study.present), ("chosen", study.chosen)):
@@ -130,31 +156,59 @@ def _recommended(study: Study) -> Iterator[str]:
         yield from not_met(study)
         return
     chosen, reference, best = study.chosen, study.points[0], least(study.points, target, left)
-    words, cost = f"{percent(chosen.error)} (+ {percent(left)} of the reference)", _cost(chosen.seconds, chosen.spread)
+    words, cost = (
+        f"{percent(chosen.error)} (+ {percent(left)} of the reference)",
+        _cost(chosen.seconds, chosen.spread),
+    )
     if best is None or chosen.seconds <= best.seconds:
         ratio = reference.seconds / chosen.seconds if chosen.seconds else float("nan")
-        than = "; it is the tightest" if chosen.setting == reference.setting else f", {ratio:.2g} times cheaper than the tightest"
+        than = (
+            "; it is the tightest"
+            if chosen.setting == reference.setting
+            else f", {ratio:.2g} times cheaper than the tightest"
+        )
         yield f"cheapest setting within {percent(target)}: {words}, {cost} CPU s{than}"
     else:
-        yield f"setting within {percent(target)}: {words}, {cost} CPU s, the most accurate of those that cost as much as the"
-        yield f"  cheapest within its spread; that is {percent(best.error)}, {_cost(best.seconds, best.spread)} CPU s"
+        yield (
+            f"setting within {percent(target)}: {words}, {cost} CPU s, the most accurate of those"
+            " that cost as much as the"
+        )
+        yield (
+            f"  cheapest within its spread; that is {percent(best.error)},"
+            f" {_cost(best.seconds, best.spread)} CPU s"
+        )
     yield f"  {arguments(chosen.setting)}"
 
 
 def not_met(study: Study) -> Iterator[str]:
-    """Why no setting is shown to meet the target, what the reference's own error comes from most, and what to do about it."""
+    """Why no setting is shown to meet the target, what the reference's own error comes from most,
+    and what to do about it.
+    """
     setup, left = study.setup, study.sweep.left
-    yield f"no setting is shown to meet {percent(setup.target)}: the reference is not known to better than {percent(left)}"
+    yield (
+        f"no setting is shown to meet {percent(setup.target)}: the reference is not known to better"
+        f" than {percent(left)}"
+    )
     worst = max(study.sweep.alone, key=lambda a: a.stays if a.knob.redraws else a.left)
     key, cures = worst.knob.key, []
     if not worst.knob.redraws:
         yield f"  cause: {key}, {percent(worst.left)}: {worst.how}"
     elif any(r.resolution and (r.error or 0.0) <= 2 * r.resolution for r in worst.rungs):
         seeds = len(setup.seeds)
-        yield f"  cause: {key}, {percent(worst.stays)}: twice the standard error of means over {seeds} seeds"
-        cures.append(f"--seeds {math.ceil(seeds * (left / setup.target) ** 2)}" if left < 10 * setup.target else "more --seeds")
+        yield (
+            f"  cause: {key}, {percent(worst.stays)}: twice the standard error of means over"
+            f" {seeds} seeds"
+        )
+        cures.append(
+            f"--seeds {math.ceil(seeds * (left / setup.target) ** 2)}"
+            if left < 10 * setup.target
+            else "more --seeds"
+        )
     else:
-        yield f"  cause: {key}, {percent(worst.stays)}: it stays at {worst.knob.present}, as in the file"
+        yield (
+            f"  cause: {key}, {percent(worst.stays)}: it stays at {worst.knob.present}, as in the"
+            " file"
+        )
         cures.append(f"--set {key}={worst.knob.tightest}")
     if setup.shorter:
         cures.append("longer scans (--duration)")
@@ -167,7 +221,11 @@ def not_met(study: Study) -> Iterator[str]:
 def _marks(point: Point, study: Study) -> str:
     words = [
         name
-        for name, p in (("tightest", study.points[0]), ("file", study.present), ("chosen", study.chosen))
+        for name, p in (
+            ("tightest", study.points[0]),
+            ("file", study.present),
+            ("chosen", study.chosen),
+        )
         if p and p.setting == point.setting
     ]
     return f"  <- {', '.join(words)}" if words else ""
@@ -183,7 +241,10 @@ def _short(pairs: Iterable[str], width: int) -> str:
 
 
 def _point(point: Point) -> str:
-    return f"{percent(point.error):>9}  {_cost(point.seconds, point.spread):>15}  {_megabytes(point.memory):>8}"
+    return (
+        f"{percent(point.error):>9}  {_cost(point.seconds, point.spread):>15} "
+        f" {_megabytes(point.memory):>8}"
+    )
 
 
 def _error(rung: Rung) -> str:

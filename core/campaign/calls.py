@@ -21,13 +21,18 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Lost:
-    """The result of a call that did not end: its worker was killed, or the engine could not send it."""
+    """The result of a call that did not end: its worker was killed, or the engine could not send
+    it.
+    """
 
     error: Exception
 
     def __str__(self) -> str:
         if isinstance(self.error, BrokenExecutor):
-            return "its worker process was killed (by the system for want of memory?), or another one beside it"
+            return (
+                "its worker process was killed (by the system for want of memory?), or another one"
+                " beside it"
+            )
         return f"{type(self.error).__name__}: {self.error}"
 
 
@@ -59,8 +64,8 @@ class Work(ABC, Generic[T, R]):
 def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) -> None:
     """Make all calls; where this raises, workers of this machine have ended.
 
-    A broken pool is replaced. Whatever was at work when it broke is tried again at the end, one call at a time, so that one that
-    kills its worker does not take others with it.
+    A broken pool is replaced. Whatever was at work when it broke is tried again at the end, one
+    call at a time, so that one that kills its worker does not take others with it.
 
     Raises
     ------
@@ -79,7 +84,11 @@ def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) ->
                     item, result = at_work.pop(future), _result(future, folder, shown)
                     if work.ended(item, result):
                         (suspects if isinstance(result, Lost) else waiting).append(item)
-                while waiting and not work.stop and len(at_work) + len(batch) < pool.workers + pool.ahead:
+                while (
+                    waiting
+                    and not work.stop
+                    and len(at_work) + len(batch) < pool.workers + pool.ahead
+                ):
                     batch.append(waiting.popleft())
                 if suspects and not batch and not at_work and not work.stop:
                     batch.append(suspects.popleft())
@@ -103,13 +112,17 @@ def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) ->
         raise
 
 
-def _submit(pool: Pool, function: Callable[..., R], *arguments: Any) -> Future[tuple[R, list[Warned]]]:
+def _submit(
+    pool: Pool, function: Callable[..., R], *arguments: Any
+) -> Future[tuple[R, list[Warned]]]:
     assert pool.executor is not None
     try:
         return pool.executor.submit(call, here(), function, *arguments)
     except Exception as err:
         future: Future[tuple[R, list[Warned]]] = Future()
-        future.set_exception(err if isinstance(err, BrokenExecutor) else CancelledError())  # a worker was killed; all is gone
+        future.set_exception(
+            err if isinstance(err, BrokenExecutor) else CancelledError()
+        )  # a worker was killed; all is gone
         return future
 
 
@@ -118,7 +131,9 @@ def _result(future: Future[tuple[R, list[Warned]]], folder: Path, shown: Registr
         result, found = future.result()
     except CancelledError:
         raise _gone(folder) from None
-    except Exception as err:  # of the engine: a Dask worker that died again and again, a task that cannot be sent
+    except (
+        Exception
+    ) as err:  # of the engine: a Dask worker that died again and again, a task that cannot be sent
         return Lost(err)
     show(found, shown)
     return result

@@ -1,4 +1,6 @@
-"""``zonda status``, ``zonda resume``, and ``zonda run`` of a campaign. Only click is imported with this module."""
+"""``zonda status``, ``zonda resume``, and ``zonda run`` of a campaign. Only click is imported with
+this module.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,13 @@ def run(request: RunRequest) -> None:
 
     sources = [source(p, request.settings, len(request.pipelines) > 1) for p in request.pipelines]
     if len({s.name for s in sources}) < len(sources):
-        raise click.UsageError("two of the pipeline files have the same name: give one of them another with the key `name:`")
-    folder = request.output or (sources[0].file.output if len(sources) == 1 else Path("out/campaign"))
+        raise click.UsageError(
+            "two of the pipeline files have the same name: give one of them another with the key"
+            " `name:`"
+        )
+    folder = request.output or (
+        sources[0].file.output if len(sources) == 1 else Path("out/campaign")
+    )
     options = _engine(sources[0].campaign, request.engine, request.workers, request.scheduler)
     with engine(**options, threads=request.threads, memory=request.memory) as pool:
         if pool.executor is None:
@@ -47,13 +54,20 @@ def run(request: RunRequest) -> None:
             _say(f"share {k} of {n} is done; when all are: zonda resume {folder}")
         else:
             with lock(folder), _resumable(folder):
-                _show(campaign.begin(sources, folder, request.command, pool, _say, pruning), request.verbose)
+                _show(
+                    campaign.begin(sources, folder, request.command, pool, _say, pruning),
+                    request.verbose,
+                )
     click.echo(f"{folder}/")
 
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--anyway", is_flag=True, help="Go on although zonda, the pipeline file or an input has changed.")
+@click.option(
+    "--anyway",
+    is_flag=True,
+    help="Go on although zonda, the pipeline file or an input has changed.",
+)
 @click.option(
     "--same-machine/--any-machine",
     default=None,
@@ -64,11 +78,27 @@ def run(request: RunRequest) -> None:
     type=click.Choice(["serial", "processes", "mpi", "dask"]),
     help="What works on the tasks.  [default: as in the file]",
 )
-@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes.")
-@click.option("--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file.")
-@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads of each task.  [default: a worker's share]")
-@click.option("--memory", type=Bytes(), metavar="SIZE", help="As of `zonda run`, e.g. 4GB.  [default: half of the free]")
-@click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated.")
+@click.option(
+    "--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes."
+)
+@click.option(
+    "--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file."
+)
+@click.option(
+    "--threads",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Threads of each task.  [default: a worker's share]",
+)
+@click.option(
+    "--memory",
+    type=Bytes(),
+    metavar="SIZE",
+    help="As of `zonda run`, e.g. 4GB.  [default: half of the free]",
+)
+@click.option(
+    "-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated."
+)
 def resume(
     folder: Path,
     anyway: bool,
@@ -82,8 +112,9 @@ def resume(
 ) -> None:
     """Go on with the campaign in DIR.
 
-    The checksums of all partial products are verified, what is missing is run, failed tasks are tried again, and what is complete
-    is combined. The maps are the same bits as those of an undisturbed campaign.
+    The checksums of all partial products are verified, what is missing is run, failed tasks are
+    tried again, and what is complete is combined. The maps are the same bits as those of an
+    undisturbed campaign.
     """
     from ..compilation.compiled import ensure_cache, one_blas_thread
 
@@ -102,7 +133,10 @@ def resume(
             return
         check_output_folder(folder)
         with lock(folder), _resumable(folder):
-            _show(campaign.resume(folder, pool, _say, anyway=anyway, same_machine=same_machine), verbose)
+            _show(
+                campaign.resume(folder, pool, _say, anyway=anyway, same_machine=same_machine),
+                verbose,
+            )
     click.echo(f"{folder}/")
 
 
@@ -141,10 +175,14 @@ def source(pipeline: str, settings: tuple[str, ...], several: bool) -> CampaignF
         _say(f"accuracy: {choice.reason}")
         settings = (*settings, *choice.overrides)
         file = load(pipeline, settings)
-    return CampaignFile(file, lambda more: load(pipeline, (*settings, *more)), file.header.name if several else "")
+    return CampaignFile(
+        file, lambda more: load(pipeline, (*settings, *more)), file.header.name if several else ""
+    )
 
 
-def _engine(campaign: Campaign, engine: str | None, workers: int | None, scheduler: str | None) -> dict[str, Any]:
+def _engine(
+    campaign: Campaign, engine: str | None, workers: int | None, scheduler: str | None
+) -> dict[str, Any]:
     name = engine or ("dask" if scheduler else campaign.engine)
     dask = name == "dask"
     return {
@@ -161,7 +199,9 @@ def _campaign_of(job: Job) -> Campaign:
     from .settings import Campaign
 
     value = yaml_places.load(yaml_places.Source("resolved.yaml", job.source[0])).value
-    return Campaign.model_validate((value.get("campaign") if isinstance(value, dict) else None) or {})
+    return Campaign.model_validate(
+        (value.get("campaign") if isinstance(value, dict) else None) or {}
+    )
 
 
 @contextlib.contextmanager
@@ -208,7 +248,9 @@ def _lines(job: Job, table: Table, listed: bool) -> list[str]:
     samples = sum(task.samples for task, _ in done)
     seconds = sum(row.seconds for _, row in done)
     lines = [f"{job.name}: {plural(len(job.tasks), 'task')}, {job.sets}"]
-    lines += [f"  {state:<8} {number}" for state, number in counts.items() if number or state == "done"]
+    lines += [
+        f"  {state:<8} {number}" for state, number in counts.items() if number or state == "done"
+    ]
     share = samples / job.samples if job.samples else 1.0
     rate = f", {samples / seconds:.3g} samples/s of each worker" if seconds else ""
     lines.append(f"  samples  {samples:.3g} of {job.samples:.3g} ({100 * share:.0f} %){rate}")
@@ -218,12 +260,19 @@ def _lines(job: Job, table: Table, listed: bool) -> list[str]:
         for task, row in table:
             scans = f"scan {task.scans[0]}" if len(task.scans) == 1 else f"{len(task.scans)} scans"
             about = ", ".join(filter(None, (task.about, scans)))
-            lines.append(f"  {task.number:>4}  {row.state:<7}  {row.attempts:>8}  {row.seconds:>7.1f}  {row.host:<22}  {about}")
+            lines.append(
+                f"  {task.number:>4}  {row.state:<7}  {row.attempts:>8}  {row.seconds:>7.1f} "
+                f" {row.host:<22}  {about}"
+            )
     troubled = [(task, row) for task, row in table if row.error and (row.state != "done" or listed)]
     for task, row in troubled[:20]:
         text = row.error.strip().splitlines()
         shown = text if listed or not row.error.startswith("Traceback") else text[-1:]
-        lines += ["", f"task {task.number} ({', '.join(filter(None, (row.state, task.about)))}):", *(f"  {t}" for t in shown)]
+        lines += [
+            "",
+            f"task {task.number} ({', '.join(filter(None, (row.state, task.about)))}):",
+            *(f"  {t}" for t in shown),
+        ]
     if len(troubled) > 20:
         lines += ["", f"and {len(troubled) - 20} more: zonda status --json"]
     return lines
@@ -239,7 +288,10 @@ def _machines(done: Table) -> list[str]:
         return [f"  machine  {short(machine)}" for machine, _ in found]
     lines = [f"  machine  {len(found)} kinds: {EFFECT}"]
     lines += [f"           {plural(count, 'task')}: {short(machine)}" for machine, count in found]
-    lines += [f"           the {n}. has {differences(machine, found[0][0])}" for n, (machine, _) in enumerate(found[1:], 2)]
+    lines += [
+        f"           the {n}. has {differences(machine, found[0][0])}"
+        for n, (machine, _) in enumerate(found[1:], 2)
+    ]
     return lines
 
 
@@ -257,7 +309,10 @@ def _as_dict(job: Job, table: Table) -> dict[str, Any]:
         "tasks": [
             {
                 "number": task.number,
-                **{key: getattr(row, key) for key in ("state", "attempts", "error", "host", "seconds")},
+                **{
+                    key: getattr(row, key)
+                    for key in ("state", "attempts", "error", "host", "seconds")
+                },
                 "machine": made_on.index(row.machine) if row.machine else None,
                 "samples": task.samples,
                 "entry": task.about,

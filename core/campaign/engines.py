@@ -36,9 +36,11 @@ class Pool:
     workers
         Tasks that run at once.
     ahead
-        Tasks that may wait in the executor's own queue, so that no worker is idle while results are noted down.
+        Tasks that may wait in the executor's own queue, so that no worker is idle while results are
+        noted down.
     threads, memory
-        For each task; None: the worker decides (all it may use). The memory is that of its whole process.
+        For each task; None: the worker decides (all it may use). The memory is that of its whole
+        process.
     asked
         Memory that the user asked for; None: nothing.
     fixed
@@ -77,8 +79,12 @@ class SerialExecutor(Executor):
 
 
 def engine_failed(err: BaseException) -> bool:
-    """Whether a call did not run to its end for a reason of the engine: a worker that is gone, a scheduler that is not there."""
-    return isinstance(err, BrokenExecutor | CancelledError) or type(err).__module__.partition(".")[0] in ("distributed", "dask")
+    """Whether a call did not run to its end for a reason of the engine: a worker that is gone, a
+    scheduler that is not there.
+    """
+    return isinstance(err, BrokenExecutor | CancelledError) or type(err).__module__.partition(".")[
+        0
+    ] in ("distributed", "dask")
 
 
 def engine(
@@ -97,8 +103,9 @@ def engine(
     workers
         Of ``processes``; default: as many as CPUs. MPI and Dask have those that were started.
     threads, memory
-        Threads for each task, and memory of the whole campaign on this machine (with MPI and Dask: of each process); default:
-        the machine's CPUs, and half of its free memory, shared among the workers. `memory.share_out` divides and checks it.
+        Threads for each task, and memory of the whole campaign on this machine (with MPI and Dask:
+        of each process); default: the machine's CPUs, and half of its free memory, shared among the
+        workers. `memory.share_out` divides and checks it.
 
     Raises
     ------
@@ -134,7 +141,12 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
         stop()
         safe = os.environ.get(children.SAFE)
         with children.safe_path():  # its queues start a process that counts them
-            return Workers(opened.workers, mp_context=get_context("spawn"), initializer=begin_worker, initargs=(safe,))
+            return Workers(
+                opened.workers,
+                mp_context=get_context("spawn"),
+                initializer=begin_worker,
+                initargs=(safe,),
+            )
 
     def stop() -> None:
         """End the processes, at work or not."""
@@ -162,7 +174,9 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
 
 @contextlib.contextmanager
 def _ctrl_c_held_back() -> Iterator[None]:
-    """Block SIGINT in this thread and in the processes that it starts, where the system can; one that came is delivered after."""
+    """Block SIGINT in this thread and in the processes that it starts, where the system can; one
+    that came is delivered after.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -177,7 +191,8 @@ def _ctrl_c_held_back() -> Iterator[None]:
 
 
 def begin_worker(safe: str | None = None) -> None:
-    """In a new worker process: leave Ctrl-C and warnings to the main process, and end when that is gone, however it went.
+    """In a new worker process: leave Ctrl-C and warnings to the main process, and end when that is
+    gone, however it went.
 
     ``safe``: ``PYTHONSAFEPATH`` of the main process.
     """
@@ -220,59 +235,101 @@ def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
     here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).Get_size()  # processes on this machine
     with MPICommExecutor(MPI.COMM_WORLD, root=0) as executor:
         mine = max(1, here - 1) if size == here else here
-        bound = available_threads() < (os.cpu_count() or 1)  # each process has CPUs of its own, as srun gives them
+        bound = available_threads() < (
+            os.cpu_count() or 1
+        )  # each process has CPUs of its own, as srun gives them
         threads = threads or (available_threads() if bound else max(1, available_threads() // mine))
         yield Pool(
-            cast(Executor | None, executor), size - 1, size - 1, threads, memory or available_memory() // 2 // mine, asked=memory
+            cast(Executor | None, executor),
+            size - 1,
+            size - 1,
+            threads,
+            memory or available_memory() // 2 // mine,
+            asked=memory,
         )
 
 
 @contextlib.contextmanager
-def _dask(scheduler: str | None, tls: Tls | None, threads: int | None, memory: int | None) -> Iterator[Pool]:
+def _dask(
+    scheduler: str | None, tls: Tls | None, threads: int | None, memory: int | None
+) -> Iterator[Pool]:
     try:
         import dask.config
         import distributed
     except ImportError as err:
         raise _missing("dask.distributed", "dask", err) from None
-    for logger in ("distributed", "distributed.client", "distributed.core", "tornado", "tornado.application"):
-        logging.getLogger(logger).setLevel(logging.CRITICAL)  # errors are reported without Dask's traceback
+    for logger in (
+        "distributed",
+        "distributed.client",
+        "distributed.core",
+        "tornado",
+        "tornado.application",
+    ):
+        logging.getLogger(logger).setLevel(
+            logging.CRITICAL
+        )  # errors are reported without Dask's traceback
     if scheduler is None:
         raise PipelineError(
             "no Dask scheduler is named",
             place="engine dask",
-            cure="write campaign.scheduler: tcp://host:8786, or use --scheduler; zonda connects nowhere of itself",
+            cure=(
+                "write campaign.scheduler: tcp://host:8786, or use --scheduler; zonda connects"
+                " nowhere of itself"
+            ),
         )
     security, cure = None, "is it running there?"
     if tls is not None:
         security = distributed.Security(
-            tls_ca_file=tls.ca_file, tls_client_cert=tls.cert, tls_client_key=tls.key, require_encryption=True
+            tls_ca_file=tls.ca_file,
+            tls_client_cert=tls.cert,
+            tls_client_key=tls.key,
+            require_encryption=True,
         )
     try:
         address = _address(scheduler)
         if address.startswith("tls://"):
-            cure = "is it running there, and are its certificates and yours signed by the same authority (ca_file)?"
-            if security is not None or not dask.config.get("distributed.client.security-loader", None):
+            cure = (
+                "is it running there, and are its certificates and yours signed by the same"
+                " authority (ca_file)?"
+            )
+            if security is not None or not dask.config.get(
+                "distributed.client.security-loader", None
+            ):
                 _check_certificates(security or distributed.Security(), address)
         client = distributed.Client(address, security=security, timeout=20, set_as_default=False)
     except (OSError, ValueError, TypeError, KeyError) as err:
         why = str(err).splitlines()[0] if str(err) else type(err).__name__
-        raise PipelineError(f"cannot reach the Dask scheduler: {why}", place=scheduler, cure=cure) from None
+        raise PipelineError(
+            f"cannot reach the Dask scheduler: {why}", place=scheduler, cure=cure
+        ) from None
     with client:
         try:
             client.wait_for_workers(1, timeout=600)
         except TimeoutError:
-            raise PipelineError("the Dask scheduler has had no worker for ten minutes", place=scheduler) from None
+            raise PipelineError(
+                "the Dask scheduler has had no worker for ten minutes", place=scheduler
+            ) from None
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
-        count = max(1, sum(int(w["nthreads"]) for w in workers))  # a Dask worker does as many tasks at once as it has threads
-        limits = [int(w["memory_limit"]) // int(w["nthreads"]) for w in workers if w.get("memory_limit")]
+        count = max(
+            1, sum(int(w["nthreads"]) for w in workers)
+        )  # a Dask worker does as many tasks at once as it has threads
+        limits = [
+            int(w["memory_limit"]) // int(w["nthreads"]) for w in workers if w.get("memory_limit")
+        ]
         yield Pool(
-            client.get_executor(pure=False, retries=0), count, count, threads or 1, memory or min(limits, default=0) // 2 or None,
+            client.get_executor(pure=False, retries=0),
+            count,
+            count,
+            threads or 1,
+            memory or min(limits, default=0) // 2 or None,
             asked=memory,
-        )  # fmt: skip
+        )
 
 
 def _address(scheduler: str) -> str:
-    """What is named, or the address in the scheduler file of that name: one that is starting may not have written it yet."""
+    """What is named, or the address in the scheduler file of that name: one that is starting may
+    not have written it yet.
+    """
     if "://" in scheduler or not (scheduler.endswith(".json") or Path(scheduler).is_file()):
         return scheduler
     end = time.monotonic() + SCHEDULER_FILE_WAIT
@@ -287,18 +344,35 @@ def _address(scheduler: str) -> str:
 
 
 def _check_certificates(security: Any, address: str) -> None:
-    """Raise `PipelineError` where this side's certificates are missing or unfit; Dask would say neither which nor where."""
-    cure = "name them in campaign.tls, or in Dask's own configuration: distributed.comm.tls.ca-file, client.cert, client.key"
-    for name, path in [("ca_file", security.tls_ca_file), ("cert", security.tls_client_cert), ("key", security.tls_client_key)]:
+    """Raise `PipelineError` where this side's certificates are missing or unfit; Dask would say
+    neither which nor where.
+    """
+    cure = (
+        "name them in campaign.tls, or in Dask's own configuration: distributed.comm.tls.ca-file,"
+        " client.cert, client.key"
+    )
+    for name, path in [
+        ("ca_file", security.tls_ca_file),
+        ("cert", security.tls_client_cert),
+        ("key", security.tls_client_key),
+    ]:
         if not path and name != "key":  # which may be in the same file as cert
             raise PipelineError(f"no {name} for TLS is named", place=address, cure=cure)
-        if path and "\n" not in path and not Path(path).is_file():  # Dask takes the text of a certificate, too
+        if (
+            path and "\n" not in path and not Path(path).is_file()
+        ):  # Dask takes the text of a certificate, too
             raise PipelineError(f"{name} of TLS: there is no file {path}", place=address, cure=cure)
     try:
         security.get_connection_args("client")
     except (OSError, ValueError) as err:
-        raise PipelineError(f"the certificates for TLS cannot be used: {err}", place=address, cure=cure) from None
+        raise PipelineError(
+            f"the certificates for TLS cannot be used: {err}", place=address, cure=cure
+        ) from None
 
 
 def _missing(package: str, extra: str, err: ImportError) -> PipelineError:
-    return PipelineError(f"{package} cannot be imported: {err}", place=f"engine {extra}", cure=f"pip install 'zonda[{extra}]'")
+    return PipelineError(
+        f"{package} cannot be imported: {err}",
+        place=f"engine {extra}",
+        cure=f"pip install 'zonda[{extra}]'",
+    )

@@ -1,4 +1,6 @@
-"""From a campaign's axes to its entries: what each observes, with which random numbers, and what it is co-added with."""
+"""From a campaign's axes to its entries: what each observes, with which random numbers, and what it
+is co-added with.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,8 @@ from ..errors import InputError
 from .settings import MOST_TASKS, Campaign, Nights
 
 TURN = 86400.0 / 1.00273781191135448
-"""Length of one turn of the Earth against the stars, s: 86400 / (d ERA / d UT1) (IAU 2000, Capitaine et al. 2000), after which
-a target fixed on the sky is at the same hour angle."""
+"""Length of one turn of the Earth against the stars, s: 86400 / (d ERA / d UT1) (IAU 2000,
+Capitaine et al. 2000), after which a target fixed on the sky is at the same hour angle."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +27,8 @@ class Entry:
     Attributes
     ----------
     values
-        Its place on every axis, as the file gives it: the grid's and the observations' keys, ``observation``, ``night`` and
-        ``realization`` (counted from 0).
+        Its place on every axis, as the file gives it: the grid's and the observations' keys,
+        ``observation``, ``night`` and ``realization`` (counted from 0).
     settings
         Those that change the pipeline file, as ``--set`` takes them (``key=value``); not the seed.
     seed, time
@@ -42,7 +44,9 @@ class Entry:
     combination: tuple[tuple[str, Any], ...]
 
 
-def entries(campaign: Campaign, seed: int, time_of: Callable[[tuple[str, ...]], Instant]) -> list[Entry]:
+def entries(
+    campaign: Campaign, seed: int, time_of: Callable[[tuple[str, ...]], Instant]
+) -> list[Entry]:
     """All entries, the first axis slowest.
 
     Parameters
@@ -71,20 +75,36 @@ def entries(campaign: Campaign, seed: int, time_of: Callable[[tuple[str, ...]], 
                     place["night"] = night
                 if campaign.realizations > 1:
                     place["realization"] = realization
-                combination = tuple((k, v) for k, v in place.items() if not _combined(campaign, k, values))
-                alike = _plain(tuple(item for item in combination if item[0] not in _drawn_anew(campaign, values))), base
+                combination = tuple(
+                    (k, v) for k, v in place.items() if not _combined(campaign, k, values)
+                )
+                alike = (
+                    _plain(
+                        tuple(
+                            item
+                            for item in combination
+                            if item[0] not in _drawn_anew(campaign, values)
+                        )
+                    ),
+                    base,
+                )
                 same = used.get(alike, 0)
                 used[alike] = same + 1
                 found.append(Entry(place, settings, separate(base, same), moment, combination))
                 if len(found) > MOST_TASKS:
-                    raise InputError(f"a campaign of more than {MOST_TASKS} entries", cure="make its axes shorter")
+                    raise InputError(
+                        f"a campaign of more than {MOST_TASKS} entries",
+                        cure="make its axes shorter",
+                    )
     return found
 
 
 def separate(seed: int, number: int) -> int:
-    """Seed of the ``number``-th of those that are co-added and have the same ``seed``: its own is the first one's.
+    """Seed of the ``number``-th of those that are co-added and have the same ``seed``: its own is
+    the first one's.
 
-    The others have 63 bits of a hash of both (`core.numerics.random.stream_key`): seed + 1 would be another user's seed.
+    The others have 63 bits of a hash of both (`core.numerics.random.stream_key`): seed + 1 would be
+    another user's seed.
     """
     if not number:
         return seed
@@ -101,7 +121,9 @@ def setting(key: str, value: Any) -> str:
 
 def _points(campaign: Campaign) -> Iterator[dict[str, Any]]:
     """Values of grid and observations."""
-    listed: list[dict[str, Any]] = [{"observation": k, **entry} for k, entry in enumerate(campaign.observations)] or [{}]
+    listed: list[dict[str, Any]] = [
+        {"observation": k, **entry} for k, entry in enumerate(campaign.observations)
+    ] or [{}]
     for entry in listed:
         for point in itertools.product(*campaign.grid.values()):
             yield {**entry, **dict(zip(campaign.grid, point, strict=True))}
@@ -136,8 +158,9 @@ def _combined(campaign: Campaign, axis: str, values: dict[str, Any]) -> bool:
 
 
 def _drawn_anew(campaign: Campaign, values: dict[str, Any]) -> set[str]:
-    """The axes along which random numbers are others whether or not it is co-added over them: other observations, made at another
-    time or of another target. A seed that is given stays as it is; `observation` counts what its keys say."""
+    """The axes along which random numbers are others whether or not it is co-added over them: other
+    observations, made at another time or of another target. A seed that is given stays as it is;
+    `observation` counts what its keys say."""
     found = {"realization", "observation"}
     if not campaign.paired:
         found |= {"night"} if "seed" in values else {"night", "time", "target"}

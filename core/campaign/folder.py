@@ -1,4 +1,6 @@
-"""A campaign's output folder: the files in it besides products, and whether it may be used again."""
+"""A campaign's output folder: the files in it besides products, and whether it may be used
+again.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +28,16 @@ def check_free(folder: Path) -> None:
     """Raise `OutputError` where the folder holds an unfinished campaign."""
     if (folder / FILE).exists() and not finished(folder):
         raise OutputError(
-            "holds an unfinished campaign", place=str(folder), cure=f"zonda resume {folder}, remove it, or choose another folder"
+            "holds an unfinished campaign",
+            place=str(folder),
+            cure=f"zonda resume {folder}, remove it, or choose another folder",
         )
 
 
 def make_way(folder: Path) -> None:
-    """Remove what an earlier campaign left besides its products. The caller holds the folder's lock."""
+    """Remove what an earlier campaign left besides its products. The caller holds the folder's
+    lock.
+    """
     for old in (folder / FILE, folder / LOG, *folder.glob("jobs.*.sqlite")):
         with contextlib.suppress(FileNotFoundError):
             old.unlink()
@@ -69,7 +75,9 @@ def publish(job: Job, folder: Path) -> None:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def verify(tasks: Sequence[Task], folder: Path, log: Log, say: Say, same_machine: bool = False) -> list[Task]:
+def verify(
+    tasks: Sequence[Task], folder: Path, log: Log, say: Say, same_machine: bool = False
+) -> list[Task]:
     """Tasks whose products are missing or damaged, which is recorded in the log.
 
     ``same_machine``: products of another kind of machine than the first task's are removed.
@@ -77,7 +85,10 @@ def verify(tasks: Sequence[Task], folder: Path, log: Log, say: Say, same_machine
     rows = {row.number: row for row in log.rows()}
     others = {row.number: row for path in shares(folder) for row in readable(path)}
     missing, lost, strange = [], set(), 0
-    first = next(filter(None, (machines.kind((others.get(n) or rows[n]).machine) for n in sorted(rows))), None)
+    first = next(
+        filter(None, (machines.kind((others.get(n) or rows[n]).machine) for n in sorted(rows))),
+        None,
+    )
     with log.together():
         for task in tasks:
             row, other = rows[task.number], others.get(task.number)
@@ -94,7 +105,9 @@ def verify(tasks: Sequence[Task], folder: Path, log: Log, say: Say, same_machine
                 known = other or row
                 log.done(task.number, known.host, known.seconds, digest, known.machine)
         log.put_off(task.number for task in missing if task.number not in lost)
-        log.put_off(lost, "its partial product was missing or damaged when the campaign was resumed")
+        log.put_off(
+            lost, "its partial product was missing or damaged when the campaign was resumed"
+        )
     if strange:
         say(f"{plural(strange, 'task')} ran on another kind of machine than the first: run again")
     if lost:
@@ -123,7 +136,9 @@ def open_log(path: Path, tasks: Sequence[Task]) -> Log:
 
 
 def opened(path: Path, tasks: Sequence[Task], layouts: Mapping[int, str], say: Say) -> Log:
-    """As `open_log`; a log that is damaged or of another campaign is put aside and made anew. ``layouts``: see `Log.combined`."""
+    """As `open_log`; a log that is damaged or of another campaign is put aside and made anew.
+    ``layouts``: see `Log.combined`.
+    """
     try:
         log = open_log(path, tasks)
         if {row.number for row in log.rows()} != {task.number for task in tasks}:
@@ -132,16 +147,25 @@ def opened(path: Path, tasks: Sequence[Task], layouts: Mapping[int, str], say: S
         log.combined(layouts)
         return log
     except InputError:
-        aside = next(p for k in range(1, 1000) if not (p := path.with_name(f"jobs.damaged-{k}.sqlite")).exists())
+        aside = next(
+            p
+            for k in range(1, 1000)
+            if not (p := path.with_name(f"jobs.damaged-{k}.sqlite")).exists()
+        )
         os.replace(path, aside)
         for journal in path.parent.glob(f"{path.name}-*"):
             discard(journal)
-        say(f"the job log was damaged: it is kept as {aside.name} and made anew from the partial products")
+        say(
+            f"the job log was damaged: it is kept as {aside.name} and made anew from the partial"
+            " products"
+        )
         return open_log(path, tasks)
 
 
 def clean(folder: Path) -> None:
-    """Remove temporary files that killed workers left anywhere in the folder. No worker may be active there."""
+    """Remove temporary files that killed workers left anywhere in the folder. No worker may be
+    active there.
+    """
     for path in [p for p in folder.rglob(".*.part*") if PART.search(p.name)]:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)

@@ -1,6 +1,8 @@
-"""The plan of a campaign: made once, before the first task starts; every engine and every resumption follows it.
+"""The plan of a campaign: made once, before the first task starts; every engine and every
+resumption follows it.
 
-``campaign.json`` in the output folder holds it. A task is named by a hash of all that its product depends on.
+``campaign.json`` in the output folder holds it. A task is named by a hash of all that its product
+depends on.
 """
 
 from __future__ import annotations
@@ -94,7 +96,9 @@ class Task:
 
 @dataclass(frozen=True)
 class Combination:
-    """One set of co-added products, in ``folder`` ('': the output folder); its tasks share a layout."""
+    """One set of co-added products, in ``folder`` ('': the output folder); its tasks share a
+    layout.
+    """
 
     name: str
     folder: str
@@ -119,8 +123,8 @@ class Job:
     same_machine
         Whether what ran on another kind of machine than the first task is refused.
     files
-        The pipeline files: path and digest of the text; input files: path, size and time of change; of arrays in Python: path
-        and hash.
+        The pipeline files: path and digest of the text; input files: path, size and time of change;
+        of arrays in Python: path and hash.
     """
 
     name: str
@@ -170,7 +174,9 @@ class Job:
 
     @classmethod
     def read(cls, folder: Path) -> Job:
-        """The campaign in a folder. Raises `InputError` where there is none, or its file is damaged or of another format."""
+        """The campaign in a folder. Raises `InputError` where there is none, or its file is damaged
+        or of another format.
+        """
         path = folder / FILE
         try:
             head, _, text = path.read_text(encoding="utf-8").partition("\n")
@@ -178,7 +184,10 @@ class Job:
                 raise ValueError("its checksum is wrong")
             values = json.loads(text)
             if values.pop("format") != FORMAT:
-                what = f"holds a campaign of zonda {values['version']}, whose partial products cannot be used any more"
+                what = (
+                    f"holds a campaign of zonda {values['version']}, whose partial products cannot"
+                    " be used any more"
+                )
                 cure = "remove it, choose another output folder, or finish it with that version"
                 raise OtherFormat(what, place=str(folder), cure=cure)
             job: Job = TypeAdapter(cls).validate_python(values)
@@ -188,9 +197,16 @@ class Job:
                 raise ValueError("it names files outside its folder")
             return job
         except FileNotFoundError:
-            raise InputError("holds no campaign", place=str(folder), cure="zonda run FILE --output DIR begins one") from None
+            raise InputError(
+                "holds no campaign",
+                place=str(folder),
+                cure="zonda run FILE --output DIR begins one",
+            ) from None
         except (OSError, ValueError, KeyError, TypeError) as err:
-            cure = f"remove {folder} and run the campaign again: its tasks are known from this file only"
+            cure = (
+                f"remove {folder} and run the campaign again: its tasks are known from this file"
+                " only"
+            )
             raise InputError(f"cannot be used: {err}", place=str(path), cure=cure) from None
 
 
@@ -199,7 +215,15 @@ def layout_path(folder: Path, combination: int) -> Path:
     return folder / TASKS / f"layout-{combination:04d}.npz"
 
 
-def key_of(version: str, pipeline: str, seed: int, time: int, scans: tuple[int, ...], first: bool, layout: str) -> str:
+def key_of(
+    version: str,
+    pipeline: str,
+    seed: int,
+    time: int,
+    scans: tuple[int, ...],
+    first: bool,
+    layout: str,
+) -> str:
     """Hash of all that a task's product depends on."""
     parts = [version, pipeline, seed, time, list(scans), first, layout]
     return hashlib.blake2b(json.dumps(parts).encode(), digest_size=16).hexdigest()

@@ -23,8 +23,11 @@ DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 STATES = ("waiting", "claimed", "done", "failed")
 
 TABLES = (
-    "tasks (number INTEGER PRIMARY KEY, state TEXT NOT NULL, attempts INTEGER NOT NULL, error TEXT NOT NULL, host TEXT NOT NULL, "
-    "seconds REAL NOT NULL, digest TEXT NOT NULL, machine INTEGER NOT NULL)",
+    (
+        "tasks (number INTEGER PRIMARY KEY, state TEXT NOT NULL, attempts INTEGER NOT NULL, error"
+        " TEXT NOT NULL, host TEXT NOT NULL, seconds REAL NOT NULL, digest TEXT NOT NULL, machine"
+        " INTEGER NOT NULL)"
+    ),
     "combined (number INTEGER PRIMARY KEY, layout TEXT NOT NULL)",
     "machines (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE)",
 )
@@ -59,7 +62,9 @@ WAITING = TaskRow(-1, "waiting", 0, "", "", 0.0, "", "")
 
 
 class Log:
-    """An open job log. Raises `OutputError` where it cannot be written, `InputError` where it is damaged."""
+    """An open job log. Raises `OutputError` where it cannot be written, `InputError` where it is
+    damaged.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -77,7 +82,9 @@ class Log:
                 raise sqlite3.DatabaseError(found[0])
 
     def combined(self, layouts: Mapping[int, str]) -> set[int]:
-        """Combinations whose products are written. ``layouts``: by number, their layouts' digests, which the log must know."""
+        """Combinations whose products are written. ``layouts``: by number, their layouts' digests,
+        which the log must know.
+        """
         with self._errors():
             found: dict[int, str] = dict(self._db.execute("SELECT number, layout FROM combined"))
             if not found.items() <= layouts.items():
@@ -90,11 +97,17 @@ class Log:
 
     def begin(self, numbers: Iterable[int]) -> None:
         """Enter tasks that are not there yet, as waiting."""
-        self._write("INSERT OR IGNORE INTO tasks VALUES (?, 'waiting', 0, '', '', 0, '', 0)", ((n,) for n in numbers))
+        self._write(
+            "INSERT OR IGNORE INTO tasks VALUES (?, 'waiting', 0, '', '', 0, '', 0)",
+            ((n,) for n in numbers),
+        )
 
     def claim(self, numbers: Iterable[int]) -> None:
         """Record that tasks are given to workers."""
-        self._write("UPDATE tasks SET state = 'claimed', attempts = attempts + 1 WHERE number = ?", ((n,) for n in numbers))
+        self._write(
+            "UPDATE tasks SET state = 'claimed', attempts = attempts + 1 WHERE number = ?",
+            ((n,) for n in numbers),
+        )
 
     def done(self, number: int, host: str, seconds: float, digest: str, machine: str = "") -> None:
         """Record that a task's product is complete."""
@@ -109,12 +122,15 @@ class Log:
     def failed(self, number: int, host: str, seconds: float, error: str, again: bool) -> None:
         """An attempt failed; ``again``: the task waits for another one."""
         self._write(
-            "UPDATE tasks SET state = ?, host = ?, seconds = ?, error = ?, digest = '', machine = 0 WHERE number = ?",
+            "UPDATE tasks SET state = ?, host = ?, seconds = ?, error = ?, digest = '', machine = 0"
+            " WHERE number = ?",
             [("waiting" if again else "failed", host, seconds, error, number)],
         )
 
     def put_off(self, numbers: Iterable[int], error: str = "") -> None:
-        """Tasks wait again, with all their attempts before them. ``error``: why; empty: the one before is kept."""
+        """Tasks wait again, with all their attempts before them. ``error``: why; empty: the one
+        before is kept.
+        """
         self._write(
             "UPDATE tasks SET state = 'waiting', attempts = 0, digest = '', machine = 0, "
             "error = CASE WHEN ?1 = '' THEN error ELSE ?1 END WHERE number = ?2",
@@ -160,10 +176,17 @@ class Log:
 
 
 def read(path: Path) -> list[TaskRow]:
-    """The rows of a log that another process may be writing. Raises `InputError` where it is damaged."""
-    for mode in ("ro", "rw"):  # a log whose writer was killed must be mended first, which takes leave to write
+    """The rows of a log that another process may be writing. Raises `InputError` where it is
+    damaged.
+    """
+    for mode in (
+        "ro",
+        "rw",
+    ):  # a log whose writer was killed must be mended first, which takes leave to write
         try:
-            database = sqlite3.connect(f"{path.resolve().as_uri()}?mode={mode}", uri=True, timeout=30)
+            database = sqlite3.connect(
+                f"{path.resolve().as_uri()}?mode={mode}", uri=True, timeout=30
+            )
             try:
                 return _rows(database)
             finally:
@@ -180,7 +203,11 @@ def read(path: Path) -> list[TaskRow]:
 
 def damaged(path: Path, err: Exception) -> InputError:
     """The error of a log that cannot be read."""
-    return InputError(f"is damaged: {err}", place=str(path), cure=f"zonda resume {path.parent} makes it anew from what is there")
+    return InputError(
+        f"is damaged: {err}",
+        place=str(path),
+        cure=f"zonda resume {path.parent} makes it anew from what is there",
+    )
 
 
 def _rows(database: sqlite3.Connection) -> list[TaskRow]:
@@ -188,16 +215,22 @@ def _rows(database: sqlite3.Connection) -> list[TaskRow]:
     query = f"SELECT {columns} FROM tasks LEFT JOIN machines ON id = machine ORDER BY number"
     found = [TaskRow(*values) for values in database.execute(query)]
     kinds = (int, str, int, str, str, float | int, str, str)
-    if any(row.state not in STATES or not all(map(isinstance, astuple(row), kinds)) for row in found):
+    if any(
+        row.state not in STATES or not all(map(isinstance, astuple(row), kinds)) for row in found
+    ):
         raise sqlite3.DatabaseError("it holds an unknown state of a task")
     return found
 
 
 def _error(err: Exception, path: Path) -> Exception:
-    """`OutputError` for a fault of the disk or a locked file; `InputError` (damaged) for all else."""
+    """`OutputError` for a fault of the disk or a locked file; `InputError` (damaged) for all
+    else.
+    """
     kind = (getattr(err, "sqlite_errorname", None) or "").removeprefix("SQLITE_").partition("_")[0]
     number = {"FULL": errno.ENOSPC, "READONLY": errno.EROFS, "PERM": errno.EACCES}.get(kind)
-    of_the_header = kind == "READONLY" and os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)
+    of_the_header = (
+        kind == "READONLY" and os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)
+    )
     if of_the_header or (number is None and kind not in ("IOERR", "CANTOPEN", "BUSY", "LOCKED")):
         return damaged(path, err)
     return output_error(OSError(number, str(err)) if number else OSError(str(err)), path)

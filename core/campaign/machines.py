@@ -1,4 +1,6 @@
-"""The CPU and libraries that each task ran with: results have the same bits only on one kind of machine."""
+"""The CPU and libraries that each task ran with: results have the same bits only on one kind of
+machine.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ from ..versions import arithmetic
 from .job import Say
 
 WITHOUT_INFLUENCE = frozenset({"processor", "python"})
-"""What is recorded, and changes no bit: the model's name (its instructions count), and Python, which computes nothing."""
+"""What is recorded, and changes no bit: the model's name (its instructions count), and Python,
+which computes nothing.
+"""
 
 EFFECT = "maps of the two may differ in the last bits, by about 1e-7 K"
 
@@ -37,7 +41,9 @@ def kind(text: str) -> frozenset[tuple[str, str]]:
 
 
 def differences(one: str, other: str) -> str:
-    """How two machines differ: ``numpy 2.3.1 (2.4.6 there), ...``; of instructions, those that one of the two lacks."""
+    """How two machines differ: ``numpy 2.3.1 (2.4.6 there), ...``; of instructions, those that one
+    of the two lacks.
+    """
     a, b = read(one), read(other)
     found = []
     for key in sorted((a.keys() | b.keys()) - WITHOUT_INFLUENCE):
@@ -45,7 +51,10 @@ def differences(one: str, other: str) -> str:
         if mine == theirs:
             continue
         if key.endswith("instructions"):
-            more, less = sorted(set(mine.split()) - set(theirs.split())), sorted(set(theirs.split()) - set(mine.split()))
+            more, less = (
+                sorted(set(mine.split()) - set(theirs.split())),
+                sorted(set(theirs.split()) - set(mine.split())),
+            )
             words = [
                 f"{sign} {' '.join(names[:3])}{' ...' * (len(names) > 3)}"
                 for sign, names in (("with", more), ("without", less))
@@ -66,7 +75,8 @@ def short(text: str) -> str:
 
 
 class Watch:
-    """Compares the machine of each task with that of the first one, and reports every other kind once.
+    """Compares the machine of each task with that of the first one, and reports every other kind
+    once.
 
     Parameters
     ----------
@@ -91,12 +101,17 @@ class Watch:
             self._first = machine
         if kind(machine) == kind(self._first):
             return ""
-        what = f"{who} ran on another kind of machine or with other libraries than the first: {differences(machine, self._first)}"
+        what = (
+            f"{who} ran on another kind of machine or with other libraries than the first:"
+            f" {differences(machine, self._first)}"
+        )
         if self._strict if strict is None else strict:
             return f"{what}; same_machine refuses it"
         if kind(machine) not in self._told:
             self._told.add(kind(machine))
-            self.say(f"{what}; {EFFECT} (zonda status {self._folder}; campaign.same_machine refuses it)")
+            self.say(
+                f"{what}; {EFFECT} (zonda status {self._folder}; campaign.same_machine refuses it)"
+            )
         return ""
 
 

@@ -1,6 +1,8 @@
-"""``--memory`` of a campaign: the budget of all its processes on this machine, divided among workers before it starts.
+"""``--memory`` of a campaign: the budget of all its processes on this machine, divided among
+workers before it starts.
 
-With MPI and Dask, whose processes are started by others, and for a job of an array (``--task``) it is that of one process or job.
+With MPI and Dask, whose processes are started by others, and for a job of an array (``--task``) it
+is that of one process or job.
 """
 
 from __future__ import annotations
@@ -10,7 +12,9 @@ from ..machine import available_memory, resident_memory
 from .engines import Pool
 
 MAIN = 320_000_000
-"""Bytes of the main process, which plans, and of the small helper that Python starts beside the workers."""
+"""Bytes of the main process, which plans, and of the small helper that Python starts beside the
+workers.
+"""
 GROWTH = 20_000_000
 """Bytes more than it holds now that it may come to hold."""
 
@@ -53,7 +57,8 @@ def _each(pool: Pool, need: int, place: str) -> None:
         pool.memory = None  # half of a share: the task may have more, if that is free where it runs
     if pool.memory is not None and pool.memory < need:
         raise PipelineError(
-            f"a task needs {_megabytes(need)}; the memory budget of each process is {_megabytes(pool.memory)}",
+            f"a task needs {_megabytes(need)}; the memory budget of each process is"
+            f" {_megabytes(pool.memory)}",
             place=place,
             cure=f"use --memory {_megabytes(need, '')}, or shorter scans",
         )
@@ -61,13 +66,24 @@ def _each(pool: Pool, need: int, place: str) -> None:
 
 def _refuse(pool: Pool, need: int, main: int, place: str) -> None:
     workers = pool.workers if pool.fixed else 1
-    has = f"the memory budget is {_megabytes(pool.asked)}" if pool.asked else f"{_megabytes(available_memory())} are free"
+    has = (
+        f"the memory budget is {_megabytes(pool.asked)}"
+        if pool.asked
+        else f"{_megabytes(available_memory())} are free"
+    )
     each = f"each of {workers} workers needs" if workers > 1 else "a worker needs"
-    cures = [f"use --memory {_megabytes(workers * need + main * 23 // 20, '')}"] if pool.asked else []
+    cures = (
+        [f"use --memory {_megabytes(workers * need + main * 23 // 20, '')}"] if pool.asked else []
+    )
     if workers > 1:
-        cures.append(f"--workers 1 with --memory {_megabytes(need + main * 23 // 20, '')}" if pool.asked else "use --workers 1")
+        cures.append(
+            f"--workers 1 with --memory {_megabytes(need + main * 23 // 20, '')}"
+            if pool.asked
+            else "use --workers 1"
+        )
     raise PipelineError(
-        f"{each} {_megabytes(need)} for its tasks, and the main process holds {_megabytes(main)}; {has}",
+        f"{each} {_megabytes(need)} for its tasks, and the main process holds {_megabytes(main)};"
+        f" {has}",
         place=place,
         cure="; or ".join([*cures, "make the scans shorter"]),
     )

@@ -1,4 +1,6 @@
-"""The results of tasks that are not yet combined: partial products, counts, and scans with a subset of their directions."""
+"""The results of tasks that are not yet combined: partial products, counts, and scans with a subset
+of their directions.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ from ..tally import Tally
 from . import parts
 
 POINTS = 512
-"""Boresight directions that are kept of a scan for pictures and tables; of those beyond `SCANS`, 16."""
+"""Boresight directions that are kept of a scan for pictures and tables; of those beyond `SCANS`,
+16.
+"""
 SCANS = 32
 LEVELS = ("main_beam_efficiency", "illumination_efficiency", "net", "knee", "slope")
 """What the steps made of the focal plane, for the report."""
@@ -49,7 +53,8 @@ class Partial:
 
     @classmethod
     def of(cls, data: Data, before: int, prefix: str) -> Partial:
-        """That of the scans of a task. ``before``: number of scans before them; ``prefix``: of their names.
+        """That of the scans of a task. ``before``: number of scans before them; ``prefix``: of
+        their names.
 
         Raises `NotCombined` for a product that no campaign can add up.
         """
@@ -58,20 +63,37 @@ class Partial:
         for label, kind in kinds.items():
             if not _registered(kind):
                 raise NotCombined(
-                    f"{label} adds up a {kind.__name__}, a class that is not registered: other processes cannot find it",
+                    f"{label} adds up a {kind.__name__}, a class that is not registered: other"
+                    " processes cannot find it",
                     place=place,
-                    cure=f"register it in the entry-point group zonda.products under the name {kind.__name__}",
+                    cure=(
+                        "register it in the entry-point group zonda.products under the name"
+                        f" {kind.__name__}"
+                    ),
                 )
         for name in data.products:
             raise NotCombined(
                 f"the product {name!r} cannot be combined with those of other observations",
                 place=place,
-                cure="its operator must hand a zonda.Product to data.add(), see docs/plugins.md; or run them one by one",
+                cure=(
+                    "its operator must hand a zonda.Product to data.add(), see docs/plugins.md; or"
+                    " run them one by one"
+                ),
             )
-        # figures of scans of one number share a row, whatever the entry: there may be a million entries
-        tally = _tally({**_rows(data.tally), "figures": [(a, b.removeprefix(prefix), c) for a, b, c in data.tally.figures()]})
+        # figures of scans of one number share a row, whatever the entry: there may be a million
+        # entries
+        tally = _tally(
+            {
+                **_rows(data.tally),
+                "figures": [(a, b.removeprefix(prefix), c) for a, b, c in data.tally.figures()],
+            }
+        )
         bands = max(1, len(data.scene.instrument.bands))
-        return cls(data.partial, tally, [_thinned(o, k // bands + before) for k, o in enumerate(data.observations)])
+        return cls(
+            data.partial,
+            tally,
+            [_thinned(o, k // bands + before) for k, o in enumerate(data.observations)],
+        )
 
     def __iadd__(self, other: Partial) -> Partial:
         """Add what follows."""
@@ -86,30 +108,47 @@ class Partial:
 
     def write(self, path: Path, identity: str) -> str:
         """Write it to a file; return the digest."""
-        products = {label: {"kind": type(p).__name__, "arrays": p.arrays()} for label, p in self.products.items()}
-        return parts.write(path, identity, {"products": products, "scans": self.scans, "tally": _rows(self.tally)})
+        products = {
+            label: {"kind": type(p).__name__, "arrays": p.arrays()}
+            for label, p in self.products.items()
+        }
+        return parts.write(
+            path, identity, {"products": products, "scans": self.scans, "tally": _rows(self.tally)}
+        )
 
     @classmethod
     def read(cls, path: Path, identity: str, digest: str) -> Partial:
         """Read it from a file. Raises `InputError` where that is missing or damaged."""
         tree = parts.read(path, identity, digest)
-        products = {label: registry.products.get(p["kind"]).of(p["arrays"]) for label, p in tree["products"].items()}
+        products = {
+            label: registry.products.get(p["kind"]).of(p["arrays"])
+            for label, p in tree["products"].items()
+        }
         return cls(products, _tally(tree["tally"]), tree["scans"])
 
     def observations(self, scene: Scene) -> list[Observation]:
-        """All scans, thinned, each of its bands in turn; the focal plane is as the steps left it in the very first one."""
+        """All scans, thinned, each of its bands in turn; the focal plane is as the steps left it in
+        the very first one.
+        """
         whole, cameras = scene.instrument.focalplane(), list(scene.instrument.cameras.values())
         planes = [whole.of_band(k) if len(cameras) > 1 else whole for k in range(len(cameras))]
         for plane, first in zip(planes, self.scans, strict=False):
             for name, values in first["focal_plane"].items():
                 setattr(plane, name, values)
-        bands = [(scene.model_copy(update={"instrument": c}), plane) for c, plane in zip(cameras, planes, strict=True)]
-        return [Thinned.made(scan, k // len(bands), *bands[k % len(bands)]) for k, scan in enumerate(self.scans)]
+        bands = [
+            (scene.model_copy(update={"instrument": c}), plane)
+            for c, plane in zip(cameras, planes, strict=True)
+        ]
+        return [
+            Thinned.made(scan, k // len(bands), *bands[k % len(bands)])
+            for k, scan in enumerate(self.scans)
+        ]
 
 
 @dataclass
 class Thinned(Observation):
-    """A scan with a subset of its boresight directions: `seconds`, `boresight_azel` and `boresight_radec` hold those alone.
+    """A scan with a subset of its boresight directions: `seconds`, `boresight_azel` and
+    `boresight_radec` hold those alone.
 
     ``flags`` and ``detector_flags`` hold as many ones as there are flagged samples and detectors.
     """
@@ -142,12 +181,24 @@ class Thinned(Observation):
     def made(cls, scan: dict[str, Any], index: int, scene: Scene, plane: Focalplane) -> Thinned:
         """Restore a scan from what `_thinned` kept."""
         samples, detectors = (np.ones(number, np.uint8) for number in scan["flagged"])
-        own = {k: v for k, v in scan.items() if k not in ("start", "centre", "origin", "focal_plane", "flagged")}
+        own = {
+            k: v
+            for k, v in scan.items()
+            if k not in ("start", "centre", "origin", "focal_plane", "flagged")
+        }
         return cls(
-            index=index, site=scene.site, instrument=scene.instrument, focalplane=plane, start=Instant(scan["start"]),
-            centre=(scan["centre"][0], scan["centre"][1]), seed=scene.seed, flags=samples, detector_flags=detectors,
-            names=tuple(scan["origin"]), **own,
-        )  # fmt: skip
+            index=index,
+            site=scene.site,
+            instrument=scene.instrument,
+            focalplane=plane,
+            start=Instant(scan["start"]),
+            centre=(scan["centre"][0], scan["centre"][1]),
+            seed=scene.seed,
+            flags=samples,
+            detector_flags=detectors,
+            names=tuple(scan["origin"]),
+            **own,
+        )
 
 
 def _registered(kind: type[Product]) -> bool:
@@ -169,7 +220,9 @@ def _tally(rows: Mapping[str, Any]) -> Tally:
 
 
 def _thinned(observation: Observation, number: int) -> dict[str, Any]:
-    """What a report shows of a scan, with a subset of its boresight directions. ``number``: its place among all."""
+    """What a report shows of a scan, with a subset of its boresight directions. ``number``: its
+    place among all.
+    """
     n, elevation = observation.n_samples, observation.elevation
     kept = np.linspace(0, n - 1, min(n, POINTS if number < SCANS else 16)).round().astype(int)
     kept = np.unique([*kept, elevation.argmin(), elevation.argmax()])
@@ -185,6 +238,11 @@ def _thinned(observation: Observation, number: int) -> dict[str, Any]:
         "centre": list(observation.centre),
         "origin": list(observation.origin),
         "emission": observation.mean_emission,
-        "focal_plane": {name: getattr(observation.focalplane, name) for name in LEVELS} if number == 0 else {},
-        "flagged": [int(np.count_nonzero(~observation.good_samples)), int(np.count_nonzero(~observation.good_detectors))],
+        "focal_plane": (
+            {name: getattr(observation.focalplane, name) for name in LEVELS} if number == 0 else {}
+        ),
+        "flagged": [
+            int(np.count_nonzero(~observation.good_samples)),
+            int(np.count_nonzero(~observation.good_detectors)),
+        ],
     }

@@ -1,8 +1,9 @@
-"""Partial products and layouts as files: plain values and arrays in a zip archive that knows its own checksum. No pickles.
+"""Partial products and layouts as files: plain values and arrays in a zip archive that knows its
+own checksum. No pickles.
 
-A file holds ``values.json``, a tree of mappings, lists and plain values in which ``{"array": k}`` stands for the k-th array, and
-``0.npy``, ``1.npy`` ... The first line of the tree is a BLAKE2b digest of everything else: a file that was cut short, changed or
-taken for another one is refused.
+A file holds ``values.json``, a tree of mappings, lists and plain values in which ``{"array": k}``
+stands for the k-th array, and ``0.npy``, ``1.npy`` ... The first line of the tree is a BLAKE2b
+digest of everything else: a file that was cut short, changed or taken for another one is refused.
 """
 
 from __future__ import annotations
@@ -25,15 +26,20 @@ VALUES = "values.json"
 
 
 def write(path: Path, identity: str, tree: Mapping[str, Any]) -> str:
-    """Write a tree atomically; its digest. ``identity``: of what it is the product, checked by `read`.
+    """Write a tree atomically; its digest. ``identity``: of what it is the product, checked by
+    `read`.
 
-    Raises `OutputError` where it cannot be written, TypeError for a value that is neither plain nor an array.
+    Raises `OutputError` where it cannot be written, TypeError for a value that is neither plain nor
+    an array.
     """
     arrays: list[Any] = []
     text = json.dumps(_flatten(tree, arrays), allow_nan=True)
     content = [_npy(array) for array in arrays]
     digest = _digest(identity, text, content)
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+    with (
+        atomic_path(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive,
+    ):
         _put(archive, VALUES, json.dumps({"identity": identity, "digest": digest}) + "\n" + text)
         for k, data in enumerate(content):
             _put(archive, f"{k}.npy", data)
@@ -41,7 +47,9 @@ def write(path: Path, identity: str, tree: Mapping[str, Any]) -> str:
 
 
 def read(path: Path, identity: str, digest: str | None = None) -> dict[str, Any]:
-    """The tree in a file that `write` made. Raises `InputError` where it is damaged, another's, or not the one meant."""
+    """The tree in a file that `write` made. Raises `InputError` where it is damaged, another's, or
+    not the one meant.
+    """
     return _opened(path, identity, digest)[0]
 
 
@@ -64,16 +72,32 @@ def _opened(path: Path, identity: str, digest: str | None) -> tuple[dict[str, An
             raise ValueError("its checksum is wrong")
         if given["identity"] != identity or digest not in (None, found):
             raise ValueError("it is the product of another task")
-        tree = _restore(json.loads(text), [np.load(io.BytesIO(data), allow_pickle=False) for data in content])
-    except (OSError, ValueError, KeyError, TypeError, EOFError, IndexError, zipfile.BadZipFile, zlib.error, RuntimeError) as err:
+        tree = _restore(
+            json.loads(text), [np.load(io.BytesIO(data), allow_pickle=False) for data in content]
+        )
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        EOFError,
+        IndexError,
+        zipfile.BadZipFile,
+        zlib.error,
+        RuntimeError,
+    ) as err:
         cure = "zonda resume looks for such files and makes them anew"
-        raise InputError(f"cannot be used: {str(err) or type(err).__name__}", place=str(path), cure=cure) from None
+        raise InputError(
+            f"cannot be used: {str(err) or type(err).__name__}", place=str(path), cure=cure
+        ) from None
     assert isinstance(tree, dict)
     return tree, found
 
 
 def _put(archive: zipfile.ZipFile, name: str, data: str | bytes) -> None:
-    archive.writestr(zipfile.ZipInfo(name), data)  # without the time of day: the same product is the same bytes
+    archive.writestr(
+        zipfile.ZipInfo(name), data
+    )  # without the time of day: the same product is the same bytes
 
 
 def _npy(array: Any) -> bytes:
@@ -108,5 +132,9 @@ def _flatten(value: Any, arrays: list[Any]) -> Any:
 
 def _restore(value: Any, arrays: list[Any]) -> Any:
     if isinstance(value, dict):
-        return arrays[value["array"]] if set(value) == {"array"} else {k: _restore(v, arrays) for k, v in value.items()}
+        return (
+            arrays[value["array"]]
+            if set(value) == {"array"}
+            else {k: _restore(v, arrays) for k, v in value.items()}
+        )
     return [_restore(v, arrays) for v in value] if isinstance(value, list) else value

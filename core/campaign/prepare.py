@@ -31,7 +31,9 @@ MEASURED = 8
 
 @dataclass(frozen=True)
 class CampaignFile:
-    """A pipeline file and the settings from the command line. ``load(settings)`` reads it with further ones."""
+    """A pipeline file and the settings from the command line. ``load(settings)`` reads it with
+    further ones.
+    """
 
     file: PipelineFile
     load: Callable[[tuple[str, ...]], PipelineFile]
@@ -76,13 +78,15 @@ def job(
 ) -> Job:
     """Plan a campaign and write the layouts of its maps to ``folder``.
 
-    Entries that differ in more than seed and night are planned one by one. Where n scans are co-added, the budget for the errors
-    of the plan is that of one observation divided by sqrt(n): such errors may add up while noise averages down.
+    Entries that differ in more than seed and night are planned one by one. Where n scans are
+    co-added, the budget for the errors of the plan is that of one observation divided by sqrt(n):
+    such errors may add up while noise averages down.
 
     Raises
     ------
     ZondaError
-        As planning and pointing do, with the entry in its place; and for names of products that are not unique.
+        As planning and pointing do, with the entry in its place; and for names of products that are
+        not unique.
     """
     from zonda import __version__
 
@@ -110,7 +114,9 @@ def job(
 class _Draft:
     """A campaign that is being planned, one pipeline file after the other."""
 
-    def __init__(self, folder: Path, pruning: Pruning, say: Callable[[int, int, str], None]) -> None:
+    def __init__(
+        self, folder: Path, pruning: Pruning, say: Callable[[int, int, str], None]
+    ) -> None:
         self._folder, self._pruning, self._say = folder, pruning, say
         self.pipelines: list[str] = []
         self.plans: list[tuple[tuple[str, ...], ...]] = []
@@ -136,9 +142,14 @@ class _Draft:
             for _, entry in members:
                 self._say(done, len(found), "campaign: plans and grids")
                 done += 1
-                if (entry.settings, share) not in planned:  # those that differ in seed and night alone share a plan
+                if (
+                    entry.settings,
+                    share,
+                ) not in planned:  # those that differ in seed and night alone share a plan
                     planned[entry.settings, share] = self._plan(source, entry, share)
-                looks.append(Look(planned[entry.settings, share], entry.seed, entry.time, about(entry)))
+                looks.append(
+                    Look(planned[entry.settings, share], entry.seed, entry.time, about(entry))
+                )
             self._combine(source, members, looks)
 
     def _plan(self, source: CampaignFile, entry: Entry, share: float) -> int:
@@ -153,14 +164,21 @@ class _Draft:
                 first_look(file.pipeline(), scene)
             else:
                 file.look(scene=scene)
-            made = plan(file, keep=self._pruning.keep, drop=self._pruning.drop, prune_all=self._pruning.prune_all)
+            made = plan(
+                file,
+                keep=self._pruning.keep,
+                drop=self._pruning.drop,
+                prune_all=self._pruning.prune_all,
+            )
         self._files.append(made.apply(file))
         self.pipelines.append(self._files[-1].resolved_yaml(self._folder))
         self.plans.append(tuple(tuple(map(str, row)) for row in made.summary.short))
         self.inputs |= _inputs(self._files[-1], self._folder)
         return len(self.pipelines) - 1
 
-    def _combine(self, source: CampaignFile, members: Sequence[tuple[int, Entry]], looks: Sequence[Look]) -> None:
+    def _combine(
+        self, source: CampaignFile, members: Sequence[tuple[int, Entry]], looks: Sequence[Look]
+    ) -> None:
         """One set of products: the layout of all that is co-added, and its tasks."""
         layouts, scans = common_layouts(looks, self._files, self._folder)
         firsts = {look.pipeline: look for look in reversed(looks)}
@@ -169,7 +187,9 @@ class _Draft:
             data = pipeline.point(look.scene(self._files), layouts, self._folder, laid_out=True)
             self.need = max(self.need, pipeline.least_memory(data.observations))
         name, subfolder = _names(source, members[0][1], self.combinations)
-        digest = parts.write(layout_path(self._folder, len(self.combinations)), "layout", {"layouts": layouts})
+        digest = parts.write(
+            layout_path(self._folder, len(self.combinations)), "layout", {"layouts": layouts}
+        )
         self.combinations.append(Combination(name, subfolder, digest, members[0][1].combination))
         before = 0
         for (number, _), look, samples in zip(members, looks, scans, strict=True):
@@ -178,7 +198,9 @@ class _Draft:
                 self._task(number, look, own, before, sum(samples[k] for k in own))
                 before += len(own)
 
-    def _task(self, entry: int, look: Look, scans: tuple[int, ...], before: int, samples: int) -> None:
+    def _task(
+        self, entry: int, look: Look, scans: tuple[int, ...], before: int, samples: int
+    ) -> None:
         from zonda import __version__
 
         time, combination = look.time.nanoseconds, len(self.combinations) - 1
@@ -186,33 +208,62 @@ class _Draft:
         key = key_of(__version__, pipeline, look.seed, time, scans, before == 0, layout)
         number = len(self.tasks)
         if number == MOST_TASKS:
-            raise InputError(f"a campaign of more than {MOST_TASKS} tasks", cure="set campaign.task: entry, or make it smaller")
+            raise InputError(
+                f"a campaign of more than {MOST_TASKS} tasks",
+                cure="set campaign.task: entry, or make it smaller",
+            )
         self.tasks.append(
-            Task(number, key, look.pipeline, combination, entry, scans, before, look.seed, time, samples, look.place)
+            Task(
+                number,
+                key,
+                look.pipeline,
+                combination,
+                entry,
+                scans,
+                before,
+                look.seed,
+                time,
+                samples,
+                look.place,
+            )
         )
 
 
 def _entries(source: CampaignFile) -> list[Entry]:
     if source.campaign.realizations > 1:
         _check_draws(source.file)
-    return entries(source.campaign, source.file.scene().seed, lambda settings: source.load(settings).scene().time)
+    return entries(
+        source.campaign,
+        source.file.scene().seed,
+        lambda settings: source.load(settings).scene().time,
+    )
 
 
 def _check_draws(file: PipelineFile) -> None:
-    """Refuse realizations of recorded data alone (`InputError`): they have the same bits for every seed."""
+    """Refuse realizations of recorded data alone (`InputError`): they have the same bits for every
+    seed.
+    """
     pipeline = file.pipeline()
     for step in pipeline.operators:
-        if isinstance(step, WithScene) and pipeline.signals.components and pipeline.signals.components <= step.provides:
+        if (
+            isinstance(step, WithScene)
+            and pipeline.signals.components
+            and pipeline.signals.components <= step.provides
+        ):
             raise InputError(
                 "recorded data are the same in every realization: nothing is simulated beside them",
                 place=f"campaign, realizations, {step.label}",
-                cure="leave realizations out, or simulate a twin (signal: none); where a step draws random numbers, list seeds: "
-                "observations: [{seed: 1}, {seed: 2}]",
+                cure=(
+                    "leave realizations out, or simulate a twin (signal: none); where a step draws"
+                    " random numbers, list seeds: observations: [{seed: 1}, {seed: 2}]"
+                ),
             )
 
 
 def outline(source: CampaignFile) -> tuple[str, PipelineFile]:
-    """A campaign in one line; and its first entry as a pipeline file, with its share of the budget."""
+    """A campaign in one line; and its first entry as a pipeline file, with its share of the
+    budget.
+    """
     found = _entries(source)
     first = found[0]
     together = sum(e.combination == first.combination for e in found)
@@ -234,16 +285,21 @@ def scene_of(file: PipelineFile, seed: int, time: Instant) -> Scene:
 
 def changed(job: Job, folder: Path) -> list[str]:
     """Files that have changed since the campaign in ``folder`` was planned."""
-    return [path for path, stamp in job.files.items() if _stamp(folder / path, stamp.partition(":")[0]) != stamp]
+    return [
+        path
+        for path, stamp in job.files.items()
+        if _stamp(folder / path, stamp.partition(":")[0]) != stamp
+    ]
 
 
 def common_layouts(
     looks: Sequence[Look], files: Sequence[PipelineFile], folder: Path
 ) -> tuple[dict[str, Mapping[str, Any]], list[tuple[int, ...]]]:
-    """The layouts of all scans of a combination; and the samples (detectors x samples) of each entry's scans.
+    """The layouts of all scans of a combination; and the samples (detectors x samples) of each
+    entry's scans.
 
-    The telescope is pointed for one entry after the other, once for those that begin at the same time, and only as long as that
-    can change something. Raises `PointingError` where it cannot be.
+    The telescope is pointed for one entry after the other, once for those that begin at the same
+    time, and only as long as that can change something. Raises `PointingError` where it cannot be.
     """
     layouts: dict[str, Mapping[str, Any]] = {}
     by_start: dict[tuple[int, int], tuple[int, ...]] = {}
@@ -259,21 +315,31 @@ def common_layouts(
             layouts = data.layouts
             bands = len(data.observations) // len(data.scans)
             sizes = [o.n_detectors * o.n_samples for o in data.observations]
-            by_pipeline[look.pipeline] = tuple(sum(sizes[k : k + bands]) for k in range(0, len(sizes), bands))
+            by_pipeline[look.pipeline] = tuple(
+                sum(sizes[k : k + bands]) for k in range(0, len(sizes), bands)
+            )
         by_start[at] = by_pipeline[look.pipeline]
     return layouts, [by_start[look.pipeline, look.time.nanoseconds] for look in looks]
 
 
 def restore_layout(job: Job, folder: Path, number: int) -> None:
-    """Write the layout of a combination again, from its tasks. Raises InputError where it is not the same as before."""
+    """Write the layout of a combination again, from its tasks. Raises InputError where it is not
+    the same as before.
+    """
     from ..configuration.pipeline_file import parse
     from ..configuration.time import Instant
 
     first = {task.entry: task for task in reversed(job.tasks_of(number))}
-    looks = [Look(t.pipeline, t.seed, Instant(t.time), t.about) for t in sorted(first.values(), key=lambda t: t.number)]
+    looks = [
+        Look(t.pipeline, t.seed, Instant(t.time), t.about)
+        for t in sorted(first.values(), key=lambda t: t.number)
+    ]
     files = [parse(text, name="campaign", folder=folder) for text in job.pipelines]
     path = layout_path(folder, number)
-    if parts.write(path, "layout", {"layouts": common_layouts(looks, files, folder)[0]}) != job.combinations[number].layout:
+    if (
+        parts.write(path, "layout", {"layouts": common_layouts(looks, files, folder)[0]})
+        != job.combinations[number].layout
+    ):
         raise InputError(
             "differs from the layout that was planned",
             place=str(path),
@@ -284,7 +350,11 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
 def _names(source: CampaignFile, entry: Entry, others: Sequence[Combination]) -> tuple[str, str]:
     """Name of a combination and the folder of its products."""
     name = ", ".join(f"{k}={v}" for k, v in entry.combination)
-    texts = [f"{k}={_short(v)}" for k, v in entry.combination if k != "observation" or len(entry.combination) == 1]
+    texts = [
+        f"{k}={_short(v)}"
+        for k, v in entry.combination
+        if k != "observation" or len(entry.combination) == 1
+    ]
     folder = product_path("", "_".join(texts)).name if texts else ""
     folder = "/".join(filter(None, (source.name, folder)))
     taken = {c.folder for c in others}
@@ -295,22 +365,32 @@ def _names(source: CampaignFile, entry: Entry, others: Sequence[Combination]) ->
 
 
 def _short(value: Any) -> str:
-    return str(value) if not isinstance(value, dict) else "_".join(f"{k}={v}" for k, v in value.items())
+    return (
+        str(value)
+        if not isinstance(value, dict)
+        else "_".join(f"{k}={v}" for k, v in value.items())
+    )
 
 
 def _with_budget(file: PipelineFile, share: float) -> PipelineFile:
     budget = file.header.budget
     budget = budget * share if isinstance(budget, float | int) else budget
-    return dataclasses.replace(file, header=file.header.model_copy(update={"budget": budget, "campaign": None}))
+    return dataclasses.replace(
+        file, header=file.header.model_copy(update={"budget": budget, "campaign": None})
+    )
 
 
 def _inputs(file: PipelineFile, folder: Path) -> dict[str, str]:
-    """The file and the inputs that it names, each with its stamp; of those in the campaign's own ``folder`` a hash."""
+    """The file and the inputs that it names, each with its stamp; of those in the campaign's own
+    ``folder`` a hash.
+    """
     own, root = [Path(file.place).resolve()] if Path(file.place).is_file() else [], folder.resolve()
     arrays = root / INPUTS
     inputs = [path for path in paths_in([file.scene(), *file.operators]) if path.is_file()]
     stamps = {str(p): _stamp(p, "file") for p in inputs if not p.is_relative_to(arrays)}
-    stamps |= {str(p.relative_to(root)): _stamp(p, "bytes") for p in inputs if p.is_relative_to(arrays)}
+    stamps |= {
+        str(p.relative_to(root)): _stamp(p, "bytes") for p in inputs if p.is_relative_to(arrays)
+    }
     return {str(p): _stamp(p, "text") for p in own} | stamps
 
 

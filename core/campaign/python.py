@@ -1,7 +1,9 @@
-"""A campaign from Python: a pipeline and a scene become a pipeline file, arrays files beside the job; then it is any campaign.
+"""A campaign from Python: a pipeline and a scene become a pipeline file, arrays files beside the
+job; then it is any campaign.
 
 >>> import zonda
->>> zonda.campaign(pipeline, scene, output="out/nights", nights=10, realizations=2)  # doctest: +SKIP
+>>> zonda.campaign(pipeline, scene, output="out/nights", nights=10, realizations=2)  # doctest:
++SKIP
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ class Products:
     folder
         The campaign's output folder, as `zonda status` and `zonda resume` take it.
     sets
-        For each set of co-added products: values on the axes over which nothing is co-added, and the folder of its files.
+        For each set of co-added products: values on the axes over which nothing is co-added, and
+        the folder of its files.
     tally
         What was counted, chosen and approximated: rows (set, who, what, value).
     """
@@ -70,10 +73,12 @@ def campaign(
     prune: bool = False,
     **axes: Any,
 ) -> Products:
-    """Run a pipeline over many observations as tasks, on one machine or many, and combine their maps.
+    """Run a pipeline over many observations as tasks, on one machine or many, and combine their
+    maps.
 
-    Arrays that steps hold are written to ``output/inputs``, the whole as ``output/resolved.yaml``. From then on it is the
-    campaign of that file: the same bits, and `zonda status` and `zonda resume` work on the folder.
+    Arrays that steps hold are written to ``output/inputs``, the whole as ``output/resolved.yaml``.
+    From then on it is the campaign of that file: the same bits, and `zonda status` and `zonda
+    resume` work on the folder.
 
     Parameters
     ----------
@@ -82,17 +87,21 @@ def campaign(
     output
         Folder for products. The pipeline needs a step that writes them.
     threads, memory
-        Threads of each task; bytes of the whole campaign on this machine. Default: all, and half of the free memory.
+        Threads of each task; bytes of the whole campaign on this machine. Default: all, and half of
+        the free memory.
     prune
-        Leave out what the products do not depend on, and what the errors allow, as `zonda run` does; default: all is simulated.
+        Leave out what the products do not depend on, and what the errors allow, as `zonda run`
+        does; default: all is simulated.
     axes
-        The keys of ``campaign:`` in a pipeline file: ``grid``, ``observations``, ``nights``, ``realizations``, ``combine``,
-        ``engine``, ``workers`` ... Values may be astropy's quantities and times.
+        The keys of ``campaign:`` in a pipeline file: ``grid``, ``observations``, ``nights``,
+        ``realizations``, ``combine``, ``engine``, ``workers`` ... Values may be astropy's
+        quantities and times.
 
     Raises
     ------
     PipelineError
-        For a step that workers cannot know: a function, a class that is not installed; and where nothing is written.
+        For a step that workers cannot know: a function, a class that is not installed; and where
+        nothing is written.
     ConfigurationError
         For axes that the pipeline does not have.
     OutputError
@@ -100,52 +109,84 @@ def campaign(
     ZondaError
         At the end where tasks have failed.
     """
-    threads, memory, _ = arguments.check_run(scene, output, {"threads": threads, "memory": memory, "ceiling": None}, (), PLACE)
+    threads, memory, _ = arguments.check_run(
+        scene, output, {"threads": threads, "memory": memory, "ceiling": None}, (), PLACE
+    )
     keys = _keys(pipeline)
-    settings, folder = Campaign(**{key: _plain(value, key) for key, value in axes.items()}), Path(output)
+    settings, folder = (
+        Campaign(**{key: _plain(value, key) for key, value in axes.items()}),
+        Path(output),
+    )
     options = {"workers": settings.workers, "scheduler": settings.scheduler, "tls": settings.tls}
-    with engine(settings.engine, **options, threads=threads, memory=memory) as pool:  # type: ignore[arg-type]
+    with engine(
+        settings.engine,
+        **options,  # type: ignore[arg-type]
+        threads=threads,
+        memory=memory,
+    ) as pool:
         if pool.executor is None:  # a worker of MPI
             return Products(folder, (), ())
         check_output_folder(folder)
         with lock(folder), _inputs(folder) as inputs:
             source = _source(pipeline, scene, keys, settings, (inputs, folder))
-            call = f"{PLACE}({pipeline.name}, {', '.join(f'{key}={value!r}' for key, value in axes.items())})"
+            call = (
+                f"{PLACE}({pipeline.name},"
+                f" {', '.join(f'{key}={value!r}' for key, value in axes.items())})"
+            )
             result = run.begin([source], folder, call, pool, _say, Pruning(prune_all=prune))
     sets = tuple((dict(c.axes), folder / c.folder) for c in Job.read(folder).combinations)
     return Products(folder, sets, tuple(row[:4] for row in result.tally))
 
 
 def _keys(pipeline: Any) -> list[str]:
-    """The names of the steps' classes. Raises `PipelineError` for a pipeline that cannot be a campaign."""
+    """The names of the steps' classes. Raises `PipelineError` for a pipeline that cannot be a
+    campaign.
+    """
     if not isinstance(pipeline, Pipeline):
-        cure = "write zonda.campaign(zonda.Pipeline([...]), scene, output=...); a pipeline file: zonda.load(file).pipeline()"
-        raise PipelineError(f"a campaign is made of a Pipeline, not of {pipeline!r:.60}", place=PLACE, cure=cure)
+        cure = (
+            "write zonda.campaign(zonda.Pipeline([...]), scene, output=...); a pipeline file:"
+            " zonda.load(file).pipeline()"
+        )
+        raise PipelineError(
+            f"a campaign is made of a Pipeline, not of {pipeline!r:.60}", place=PLACE, cure=cure
+        )
     keys = [_key(step) for step in pipeline.operators]
     if not any(map(may_write, pipeline.operators)):
         writers = ", ".join(operators_that(lambda step: issubclass(step, Output)))
-        raise PipelineError("no step writes anything", place=PLACE, cure=f"add one that does: {writers}")
+        raise PipelineError(
+            "no step writes anything", place=PLACE, cure=f"add one that does: {writers}"
+        )
     return keys
 
 
 def _key(step: Operator) -> str:
-    """The name by which workers know a step's class. Raises `PipelineError` for one that they cannot know."""
+    """The name by which workers know a step's class. Raises `PipelineError` for one that they
+    cannot know.
+    """
     kind = type(step)
     reference = f"{kind.__module__}:{kind.__qualname__}"
     for found in operators.candidates():
-        named = found.distribution != SESSION and (found.name == kind.__name__ or found.reference == reference)
+        named = found.distribution != SESSION and (
+            found.name == kind.__name__ or found.reference == reference
+        )
         if named and operators.get(found.qualified) is kind:
             return found.name
     raise PipelineError(
-        f"{step.label} is a function or a class of this session, which the campaign's workers do not know",
+        f"{step.label} is a function or a class of this session, which the campaign's workers do"
+        " not know",
         place=PLACE,
-        cure="make it a plugin (zonda new plugin NAME, pip install -e NAME), or run(scene) once for each observation",
+        cure=(
+            "make it a plugin (zonda new plugin NAME, pip install -e NAME), or run(scene) once for"
+            " each observation"
+        ),
     )
 
 
 @contextlib.contextmanager
 def _inputs(folder: Path) -> Iterator[Path]:
-    """Folder for arrays; removed again where the campaign does not begin. Raises `OutputError` in an unfinished campaign."""
+    """Folder for arrays; removed again where the campaign does not begin. Raises `OutputError` in
+    an unfinished campaign.
+    """
     check_free(folder)
     try:
         yield folder.resolve() / INPUTS
@@ -155,7 +196,13 @@ def _inputs(folder: Path) -> Iterator[Path]:
         raise
 
 
-def _source(pipeline: Pipeline, scene: Scene, keys: list[str], settings: Campaign, folders: tuple[Path, Path]) -> CampaignFile:
+def _source(
+    pipeline: Pipeline,
+    scene: Scene,
+    keys: list[str],
+    settings: Campaign,
+    folders: tuple[Path, Path],
+) -> CampaignFile:
     """The pipeline file that says the same. ``folders``: of arrays, and of products.
 
     Raises `PipelineError` for what no file can say.
@@ -164,7 +211,9 @@ def _source(pipeline: Pipeline, scene: Scene, keys: list[str], settings: Campaig
     header = CampaignHeader(
         name=pipeline.name,
         description=pipeline.description,
-        runs={name: signal for name, signal in pipeline.runs.items() if not name.startswith("_")},  # others: outputs ask again
+        runs={
+            name: signal for name, signal in pipeline.runs.items() if not name.startswith("_")
+        },  # others: outputs ask again
         only=list(pipeline.only),
         precision=pipeline.precision,
         campaign=settings,
@@ -173,11 +222,18 @@ def _source(pipeline: Pipeline, scene: Scene, keys: list[str], settings: Campaig
     named = {"site": _named(scene.site, sites), "instrument": _named(scene.instrument, instruments)}
     text = PipelineFile(header, named, tuple(map(Step, keys, steps)), PLACE, scene).resolved_yaml()
     file = parse(text, name=PLACE)
-    pairs = [("the scene", scene, file.scene()), *((s.label, s, o) for s, o in zip(steps, file.operators, strict=True))]
+    pairs = [
+        ("the scene", scene, file.scene()),
+        *((s.label, s, o) for s, o in zip(steps, file.operators, strict=True)),
+    ]
     for label, ours, read in pairs:
-        if type(read) is not type(ours) or read.model_dump(mode="json") != ours.model_dump(mode="json"):
+        if type(read) is not type(ours) or read.model_dump(mode="json") != ours.model_dump(
+            mode="json"
+        ):
             cure = "use what files can say: registered names, numbers, text, files"
-            raise PipelineError(f"{label} cannot be written in a pipeline file", place=PLACE, cure=cure)
+            raise PipelineError(
+                f"{label} cannot be written in a pipeline file", place=PLACE, cure=cure
+            )
     return CampaignFile(file, lambda more: parse(text, name=PLACE, overrides=more), "")
 
 
@@ -199,7 +255,9 @@ def _named(component: Any, names: Any) -> Any:
 
 
 def _plain(value: Any, place: str) -> Any:
-    """A value of an axis as a pipeline file writes it: astropy's quantities and times, numpy's numbers, zonda's objects."""
+    """A value of an axis as a pipeline file writes it: astropy's quantities and times, numpy's
+    numbers, zonda's objects.
+    """
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Mapping):
@@ -219,7 +277,9 @@ def _plain(value: Any, place: str) -> Any:
     if isinstance(value, Path):
         return str(value)
     cure = "give a number, text such as '0.3 deg/s', a quantity or a time"
-    raise PipelineError(f"{place}: {value!r:.60} cannot be written in a pipeline file", place=PLACE, cure=cure)
+    raise PipelineError(
+        f"{place}: {value!r:.60} cannot be written in a pipeline file", place=PLACE, cure=cure
+    )
 
 
 def _say(text: str) -> None:

@@ -1,8 +1,9 @@
-"""Combine partial products in a fixed tree: the same bits for any engine, any number of workers, any order of completion.
+"""Combine partial products in a fixed tree: the same bits for any engine, any number of workers,
+any order of completion.
 
-The parts of a combination are numbered in the order of their scans. Runs of `FAN` parts are added up from left to right,
-the sums likewise, until one is left. Sums of maps are integers and exact anyway; means of spectra are floats and owe their bits
-to the tree.
+The parts of a combination are numbered in the order of their scans. Runs of `FAN` parts are added
+up from left to right, the sums likewise, until one is left. Sums of maps are integers and exact
+anyway; means of spectra are floats and owe their bits to the tree.
 """
 
 from __future__ import annotations
@@ -28,14 +29,17 @@ FAN = 32
 
 @dataclass(frozen=True)
 class Combined:
-    """What became of a combination: its tally (who, what, value, whether it is a count), or what went wrong."""
+    """What became of a combination: its tally (who, what, value, whether it is a count), or what
+    went wrong.
+    """
 
     tally: tuple[tuple[str, str, str, bool], ...] = ()
     error: ZondaError | None = None
 
 
 def combine(folder: Path, number: int, digests: Mapping[int, str]) -> Combined:
-    """Add up one combination's parts, finish its products and write them. Errors are returned, not raised.
+    """Add up one combination's parts, finish its products and write them. Errors are returned, not
+    raised.
 
     ``digests``: of the tasks' products, by the task's number.
     """
@@ -44,12 +48,16 @@ def combine(folder: Path, number: int, digests: Mapping[int, str]) -> Combined:
     except ZondaError as err:
         return Combined(error=err)
     counts = {(who, what) for who, what, _ in data.tally.counts()}
-    return Combined(tuple((who, what, value, (who, what) in counts) for who, what, value in data.tally.told()))
+    return Combined(
+        tuple((who, what, value, (who, what) in counts) for who, what, value in data.tally.told())
+    )
 
 
 @faults_named()
 def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) -> Data:
-    """As `combine`; the finished data. Raises `InputError` where a partial product is missing or damaged."""
+    """As `combine`; the finished data. Raises `InputError` where a partial product is missing or
+    damaged.
+    """
     combination, tasks = job.combinations[number], job.tasks_of(number)
     first = tasks[0]
     file = pipeline_of(job.pipelines[first.pipeline], folder)
@@ -62,19 +70,28 @@ def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) ->
         "plan": job.plans[first.pipeline],
         "campaign": f"{combination.name or job.name}: {plural(len(tasks), 'task')}",
     }
-    data.layouts, data.laid_out = dict(layouts_in(layout_path(folder, number), combination.layout)), True
+    data.layouts, data.laid_out = (
+        dict(layouts_in(layout_path(folder, number), combination.layout)),
+        True,
+    )
     depth = 1
     while FAN**depth < len(tasks):
         depth += 1
     whole = _sum(tasks, folder, digests, 0, depth)
-    data.partial, data.tally, data.observations = whole.products, whole.tally, whole.observations(scene)
+    data.partial, data.tally, data.observations = (
+        whole.products,
+        whole.tally,
+        whole.observations(scene),
+    )
     pipeline.finish(data)
     if job.figures:
         table.keep(folder, number, data)
     return data
 
 
-def _sum(tasks: Sequence[Task], folder: Path, digests: Mapping[int, str], first: int, level: int) -> Partial:
+def _sum(
+    tasks: Sequence[Task], folder: Path, digests: Mapping[int, str], first: int, level: int
+) -> Partial:
     """Sum of ``FAN**level`` parts from the ``first`` on; one sum is held for each level."""
     if level == 0:
         task = tasks[first]

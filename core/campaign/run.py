@@ -55,7 +55,10 @@ def begin(
     check_output_folder(folder)
     check_free(folder)
     if (folder / RESOLVED).exists() and not (folder / FILE).exists():
-        say(f"{folder} holds products of an earlier run: those of the same names are replaced, others stay")
+        say(
+            f"{folder} holds products of an earlier run: those of the same names are replaced,"
+            " others stay"
+        )
     make_way(folder)
     try:
         made = prepare(sources, folder, command, pruning, _progress())
@@ -67,18 +70,30 @@ def begin(
     write_sources(made, folder)
     with contextlib.closing(open_log(folder / LOG, made.tasks)) as log:
         made.write(folder)
-        return _work(made, folder, log, pool, _watch(made.same_machine, folder, [log.rows()], say), made.tasks)
+        return _work(
+            made,
+            folder,
+            log,
+            pool,
+            _watch(made.same_machine, folder, [log.rows()], say),
+            made.tasks,
+        )
 
 
-def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_machine: bool | None = None) -> CampaignResult:
-    """Go on with a campaign: what is done is verified, what is missing is run. The caller holds the folder's lock.
+def resume(
+    folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_machine: bool | None = None
+) -> CampaignResult:
+    """Go on with a campaign: what is done is verified, what is missing is run. The caller holds the
+    folder's lock.
 
-    ``same_machine``: refuse what another kind of machine made, or do not; default: as the campaign has it.
+    ``same_machine``: refuse what another kind of machine made, or do not; default: as the campaign
+    has it.
 
     Raises
     ------
     InputError
-        Where there is no campaign, its file is damaged, or zonda or a file has changed (not with ``anyway``).
+        Where there is no campaign, its file is damaged, or zonda or a file has changed (not with
+        ``anyway``).
     """
     job = Job.read(folder)
     strict = job.same_machine if same_machine is None else same_machine
@@ -93,16 +108,26 @@ def resume(folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_mac
                     parts.read(layout_path(folder, number), "layout", combination.layout)
                 except InputError:
                     restore_layout(job, folder, number)
-        missing = verify([t for t in job.tasks if t.combination not in combined], folder, log, say, strict)
+        missing = verify(
+            [t for t in job.tasks if t.combination not in combined], folder, log, say, strict
+        )
         return _work(job, folder, log, pool, _watch(strict, folder, [log.rows()], say), missing)
 
 
 def share(
-    sources: Sequence[CampaignFile], folder: Path, command: str, pool: Pool, say: Say, pruning: Pruning, which: tuple[int, int]
+    sources: Sequence[CampaignFile],
+    folder: Path,
+    command: str,
+    pool: Pool,
+    say: Say,
+    pruning: Pruning,
+    which: tuple[int, int],
 ) -> CampaignResult:
-    """Run every n-th task from the k-th on (counted from 1), where ``which`` is (k, n): a job of an array. Combines nothing.
+    """Run every n-th task from the k-th on (counted from 1), where ``which`` is (k, n): a job of an
+    array. Combines nothing.
 
-    The first job there works the campaign out; all write their own job log. The caller holds the lock of its share.
+    The first job there works the campaign out; all write their own job log. The caller holds the
+    lock of its share.
     """
     from zonda import __version__
 
@@ -112,15 +137,22 @@ def share(
         write_sources(made, folder)
         publish(made, folder)
     job = Job.read(folder)
-    if job.source != tuple(s.file.resolved_yaml(folder) for s in sources) or job.version != __version__:
-        raise OutputError("holds another campaign", place=str(folder), cure="choose another output folder")
+    if (
+        job.source != tuple(s.file.resolved_yaml(folder) for s in sources)
+        or job.version != __version__
+    ):
+        raise OutputError(
+            "holds another campaign", place=str(folder), cure="choose another output folder"
+        )
     share_out(pool, job.need, job.name)
     mine = [task for task in job.tasks if task.number % which[1] == which[0] - 1]
     path = folder / f"jobs.{which[0]}-of-{which[1]}.sqlite"
     with contextlib.closing(opened(path, mine, {}, say)) as log:
         missing = verify(mine, folder, log, say)
         theirs = [readable(path) for path in shares(folder)]
-        result = Tasks(job, folder, log, pool, _watch(job.same_machine, folder, theirs, say)).run(missing)
+        result = Tasks(job, folder, log, pool, _watch(job.same_machine, folder, theirs, say)).run(
+            missing
+        )
     _tell(result, say)
     _fail(result, len(mine))
     return result
@@ -134,14 +166,19 @@ def check_unchanged(job: Job, folder: Path, anyway: bool) -> None:
     if job.version != __version__:
         reasons.append(f"it began with zonda {job.version}, this is {__version__}")
     for path, text in zip(sources_of(job, folder), job.source, strict=True):
-        if not path.is_file() or digest_of_text(path.read_text(encoding="utf-8", errors="replace")) != digest_of_text(text):
+        if not path.is_file() or digest_of_text(
+            path.read_text(encoding="utf-8", errors="replace")
+        ) != digest_of_text(text):
             reasons.append(f"{path} has changed")
     reasons += [f"{path} has changed or is gone" for path in changed(job, folder)]
     if reasons and not anyway:
         raise InputError(
             "; ".join(reasons),
             place=str(folder),
-            cure="the maps would mix two versions: run the campaign anew in another folder, or continue with --anyway",
+            cure=(
+                "the maps would mix two versions: run the campaign anew in another folder, or"
+                " continue with --anyway"
+            ),
         )
 
 
@@ -150,18 +187,26 @@ def _watch(strict: bool, folder: Path, logs: Iterable[Iterable[TaskRow]], say: S
     return Watch(known, strict, folder, say)
 
 
-def _work(job: Job, folder: Path, log: Log, pool: Pool, watch: Watch, missing: Sequence[Task]) -> CampaignResult:
+def _work(
+    job: Job, folder: Path, log: Log, pool: Pool, watch: Watch, missing: Sequence[Task]
+) -> CampaignResult:
     """Run tasks, combine what is complete, remove partial products."""
     result = Tasks(job, folder, log, pool, watch).run(missing)
     if result.tasks:
         _tell(result, watch.say)
     done = {row.number for row in log.rows() if row.state == "done"}
     waiting = log.combined(job.layouts) | job.incomplete(done)
-    Combinations(job, folder, log, result).run([n for n in range(len(job.combinations)) if n not in waiting], pool)
+    Combinations(job, folder, log, result).run(
+        [n for n in range(len(job.combinations)) if n not in waiting], pool
+    )
     clean(folder)  # of workers that were killed while they wrote
     _fail(result, len(job.tasks))
     if len(done) < len(job.tasks):
-        raise PipelineError(f"{len(job.tasks) - len(done)} tasks were not run", place=str(folder), cure=f"zonda resume {folder}")
+        raise PipelineError(
+            f"{len(job.tasks) - len(done)} tasks were not run",
+            place=str(folder),
+            cure=f"zonda resume {folder}",
+        )
     if job.figures:
         table.write(job, folder)
     if not job.keep_tasks:
@@ -176,7 +221,11 @@ def _progress() -> Callable[[int, int, str], None]:
 
 def _describe(job: Job, folder: Path, say: Say) -> None:
     entries = len({task.entry for task in job.tasks})
-    counts = ["1 entry" if entries == 1 else f"{entries} entries", plural(len(job.tasks), "task"), job.sets]
+    counts = [
+        "1 entry" if entries == 1 else f"{entries} entries",
+        plural(len(job.tasks), "task"),
+        job.sets,
+    ]
     say(f"campaign: {', '.join(counts)}, {job.samples:.3g} samples; zonda status {folder}")
 
 
@@ -192,5 +241,8 @@ def _fail(result: CampaignResult, total: int) -> None:
         raise ZondaError(
             f"{len(result.failed)} of {total} tasks failed; the first is {number}: {last}",
             place=str(result.folder),
-            cure=f"zonda status {result.folder} lists them; zonda resume {result.folder} tries them again",
+            cure=(
+                f"zonda status {result.folder} lists them; zonda resume {result.folder} tries them"
+                " again"
+            ),
         )

@@ -1,7 +1,8 @@
-"""The figures of all sets of products of a campaign as one table: ``sweep.ecsv``, ``sweep.html`` and ``sweep.png``.
+"""The figures of all sets of products of a campaign as one table: ``sweep.ecsv``, ``sweep.html``
+and ``sweep.png``.
 
-At each point of the axes a figure has n values over realizations: their mean, their scatter s, and s / sqrt(n), the standard
-error of the mean.
+At each point of the axes a figure has n values over realizations: their mean, their scatter s, and
+s / sqrt(n), the standard error of the mean.
 """
 
 from __future__ import annotations
@@ -50,7 +51,9 @@ class Point:
 
     @property
     def scatter(self) -> float:
-        """Standard deviation of one realization; of a single one the error that its metric states, NaN: not known."""
+        """Standard deviation of one realization; of a single one the error that its metric states,
+        NaN: not known.
+        """
         return float(np.std(self.values, ddof=1)) if len(self.values) > 1 else self.errors[0]
 
     @property
@@ -61,25 +64,51 @@ class Point:
 
 def keep(folder: Path, number: int, data: Data) -> None:
     """Write the figures of a combination's finished data to the campaign's folder."""
-    found = [figure for product in data.products.values() if isinstance(product, Figures) for figure in product]
+    found = [
+        figure
+        for product in data.products.values()
+        if isinstance(product, Figures)
+        for figure in product
+    ]
     rows = [[f.name, f.value, f.unit, f.error, f.description] for f in found]
     write_text(_path(folder, number), json.dumps(rows))
 
 
 def write(job: Job, folder: Path) -> None:
-    """Write the table of a campaign whose combinations are all finished. Raises InputError where figures are missing."""
+    """Write the table of a campaign whose combinations are all finished. Raises InputError where
+    figures are missing.
+    """
     points = collected(job, folder)
     axes = list(dict.fromkeys(key for point in points for key, _ in point.axes))
-    columns = [Column(key, [_text(dict(p.axes).get(key)) for p in points], "", "value on this axis") for key in axes]
+    columns = [
+        Column(key, [_text(dict(p.axes).get(key)) for p in points], "", "value on this axis")
+        for key in axes
+    ]
     columns += [
         Column("figure", [p.name for p in points], "", "metric and parameters"),
-        Column("unit", [p.unit for p in points], "", "of mean, scatter and standard_error; empty: a pure number"),
+        Column(
+            "unit",
+            [p.unit for p in points],
+            "",
+            "of mean, scatter and standard_error; empty: a pure number",
+        ),
         Column("mean", [p.mean for p in points], "", "over realizations"),
-        Column("scatter", [p.scatter for p in points], "", "standard deviation of one realization; nan: not known"),
-        Column("standard_error", [p.standard_error for p in points], "", "of the mean; nan: not known"),
+        Column(
+            "scatter",
+            [p.scatter for p in points],
+            "",
+            "standard deviation of one realization; nan: not known",
+        ),
+        Column(
+            "standard_error", [p.standard_error for p in points], "", "of the mean; nan: not known"
+        ),
         Column("realizations", [len(p.values) for p in points], "", "number of realizations"),
     ]
-    write_ecsv(folder / "sweep.ecsv", columns, {"PIPELINE": job.name, "ZONDA": job.version, "COMMAND": job.command})
+    write_ecsv(
+        folder / "sweep.ecsv",
+        columns,
+        {"PIPELINE": job.name, "ZONDA": job.version, "COMMAND": job.command},
+    )
     with atomic_path(folder / "sweep.png") as temporary:
         draw(points).savefig(temporary)
     write_text(folder / "sweep.html", _html(job.name, columns))
@@ -89,21 +118,38 @@ def collected(job: Job, folder: Path) -> list[Point]:
     """All figures at all points, figure by figure."""
     found: dict[tuple[str, str], tuple[tuple[tuple[str, Any], ...], list[Figure]]] = {}
     for number, combination in enumerate(job.combinations):
-        axes = tuple((key, value) for key, value in combination.axes if key not in ("realization", "observation"))
-        place = json.dumps([[combination.folder.partition("/")[0] if len(job.source) > 1 else "", *map(list, axes)]])
+        axes = tuple(
+            (key, value)
+            for key, value in combination.axes
+            if key not in ("realization", "observation")
+        )
+        place = json.dumps(
+            [
+                [
+                    combination.folder.partition("/")[0] if len(job.source) > 1 else "",
+                    *map(list, axes),
+                ]
+            ]
+        )
         for figure in _read(folder, number):
             found.setdefault((figure.name, place), (axes, []))[1].append(figure)
     order = list(dict.fromkeys(name for name, _ in found))
     points = [
-        Point(axes, name, figures[0].unit, tuple(f.value for f in figures), tuple(f.error for f in figures))
+        Point(
+            axes,
+            name,
+            figures[0].unit,
+            tuple(f.value for f in figures),
+            tuple(f.error for f in figures),
+        )
         for (name, _), (axes, figures) in found.items()
     ]
     return sorted(points, key=lambda point: order.index(point.name))
 
 
 def draw(points: Sequence[Point]) -> Any:
-    """A matplotlib figure with a panel for each figure: mean and standard error (scatter, thin) against the first axis that
-    changes; one line for each combination of the others."""
+    """A matplotlib figure with a panel for each figure: mean and standard error (scatter, thin)
+    against the first axis that changes; one line for each combination of the others."""
     from matplotlib.figure import Figure as Canvas
 
     names = list(dict.fromkeys(point.name for point in points))
@@ -120,7 +166,9 @@ def _panel(ax: Any, points: Sequence[Point]) -> None:
     places, label, ticks = _positions([dict(p.axes).get(first) for p in points])
     lines: dict[str, list[tuple[float, Point]]] = {}
     for place, point in zip(places, points, strict=True):
-        lines.setdefault(", ".join(f"{k}={_text(dict(point.axes).get(k))}" for k in others), []).append((place, point))
+        lines.setdefault(
+            ", ".join(f"{k}={_text(dict(point.axes).get(k))}" for k in others), []
+        ).append((place, point))
     for number, (name, line) in enumerate(lines.items()):
         line.sort(key=lambda item: item[0])
         x, y = [x for x, _ in line], [p.mean for _, p in line]
@@ -140,24 +188,47 @@ def _panel(ax: Any, points: Sequence[Point]) -> None:
         ax.legend(fontsize=7, frameon=False)
 
 
-def _bars(ax: Any, x: Sequence[float], y: Sequence[float], sizes: Sequence[float], colour: str, **style: Any) -> None:
+def _bars(
+    ax: Any,
+    x: Sequence[float],
+    y: Sequence[float],
+    sizes: Sequence[float],
+    colour: str,
+    **style: Any,
+) -> None:
     known = [k for k, size in enumerate(sizes) if math.isfinite(size)]
     if known:
-        ax.vlines([x[k] for k in known], [y[k] - sizes[k] for k in known], [y[k] + sizes[k] for k in known], colour, **style)
+        ax.vlines(
+            [x[k] for k in known],
+            [y[k] - sizes[k] for k in known],
+            [y[k] + sizes[k] for k in known],
+            colour,
+            **style,
+        )
 
 
 _QUANTITY = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
 
 
 def _positions(values: Sequence[Any]) -> tuple[list[float], str, list[str]]:
-    """Places of values on an axis, the unit (that of the first), and the ticks where they are names."""
+    """Places of values on an axis, the unit (that of the first), and the ticks where they are
+    names.
+    """
     matches = [_QUANTITY.match(_text(value)) for value in values]
     units = [read_unit(match[2]) if match and match[2] else None for match in matches]
-    if matches and all(matches) and (all(units) or not any(match and match[2] for match in matches)):
+    if (
+        matches
+        and all(matches)
+        and (all(units) or not any(match and match[2] for match in matches))
+    ):
         numbers = [float(match[1]) for match in matches if match]
         first = matches[0]
         factors = [unit.factor / units[0].factor if unit and units[0] else 1.0 for unit in units]
-        return [n * factor for n, factor in zip(numbers, factors, strict=True)], first[2] if first else "", []
+        return (
+            [n * factor for n, factor in zip(numbers, factors, strict=True)],
+            first[2] if first else "",
+            [],
+        )
     names = list(dict.fromkeys(map(_text, values)))
     return [float(names.index(_text(value))) for value in values], "", names
 
@@ -177,20 +248,27 @@ def _read(folder: Path, number: int) -> Iterator[Figure]:
             yield Figure(str(name), float(value), str(unit), float(error), str(description))
     except (OSError, ValueError, TypeError) as err:
         cure = "remove the output folder and run the sweep again"
-        raise InputError(f"the figures of a run cannot be read: {err}", place=str(path), cure=cure) from None
+        raise InputError(
+            f"the figures of a run cannot be read: {err}", place=str(path), cure=cure
+        ) from None
 
 
 def _html(title: str, columns: Sequence[Column]) -> str:
     """One page with the picture and the table."""
     head = "".join(f"<th>{escape(c.name)}</th>" for c in columns)
     rows = zip(*(c.values for c in columns), strict=True)
-    body = "\n".join("<tr>" + "".join(f"<td>{escape(_shown(v))}</td>" for v in row) + "</tr>" for row in rows)
+    body = "\n".join(
+        "<tr>" + "".join(f"<td>{escape(_shown(v))}</td>" for v in row) + "</tr>" for row in rows
+    )
     style = (
-        "body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem; } td, th { text-align: left; padding: .2rem 1rem .2rem 0; }"
+        "body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem; } td, th { text-align: left;"
+        " padding: .2rem 1rem .2rem 0; }"
     )
     return f"""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title><style>{style}</style></head>
-<body><h1>{escape(title)}</h1><p><img src="sweep.png" alt="figures against the swept values" style="max-width: 100%"></p>
+<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>
+<style>{style}</style></head>
+<body><h1>{escape(title)}</h1>
+<p><img src="sweep.png" alt="figures against the swept values" style="max-width: 100%"></p>
 <table><thead><tr>{head}</tr></thead>
 <tbody>
 {body}

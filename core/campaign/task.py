@@ -1,4 +1,6 @@
-"""Run one task: scans of one entry, to a file of partial products. The bits do not depend on where and when it runs."""
+"""Run one task: scans of one entry, to a file of partial products. The bits do not depend on where
+and when it runs.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +87,9 @@ def perform(order: Order) -> Outcome:
 
         if __version__ != order.version:
             raise PipelineError(
-                f"this worker has zonda {__version__}, the campaign {order.version}", place=host, cure="install the same one"
+                f"this worker has zonda {__version__}, the campaign {order.version}",
+                place=host,
+                cure="install the same one",
             )
         digest = _run(order)
     except ZondaError as err:
@@ -108,7 +112,11 @@ def _run(order: Order) -> str:
     from .prepare import scene_of
 
     task, folder, file = order.task, order.folder, pipeline_of(order.pipeline, order.folder)
-    part = Part(task.scans, layouts_in(layout_path(folder, task.combination), order.layout), f"{task.entry:06d}-")
+    part = Part(
+        task.scans,
+        layouts_in(layout_path(folder, task.combination), order.layout),
+        f"{task.entry:06d}-",
+    )
     data = file.pipeline().run_part(
         scene_of(file, task.seed, Instant(task.time)),
         part,
@@ -122,7 +130,9 @@ def _run(order: Order) -> str:
 
 @lru_cache(4)
 def pipeline_of(text: str, folder: Path) -> PipelineFile:
-    """A pipeline of the campaign in ``folder``, kept by the worker with what its operators remember (maps read and convolved)."""
+    """A pipeline of the campaign in ``folder``, kept by the worker with what its operators remember
+    (maps read and convolved).
+    """
     from ..configuration.pipeline_file import parse
 
     return parse(text, name="campaign", folder=folder)
@@ -134,5 +144,7 @@ def layouts_in(path: Path, digest: str) -> Mapping[str, Any]:
     try:
         layouts: Mapping[str, Any] = parts.read(path, "layout", digest)["layouts"]
     except InputError as err:
-        raise InputError(err.message, place=err.place, cure="can this worker see the campaign's folder?") from None
+        raise InputError(
+            err.message, place=err.place, cure="can this worker see the campaign's folder?"
+        ) from None
     return layouts

@@ -1,4 +1,6 @@
-"""Warnings of worker processes: kept there, sent with the results, and shown by the main process as its own."""
+"""Warnings of worker processes: kept there, sent with the results, and shown by the main process as
+its own.
+"""
 
 from __future__ import annotations
 
@@ -30,12 +32,16 @@ def here() -> str:
 
 
 def keep() -> None:
-    """In a new worker process: keep warnings for the main process instead of writing them to stderr."""
+    """In a new worker process: keep warnings for the main process instead of writing them to
+    stderr.
+    """
     warnings.showwarning = _keep
 
 
 def call(main: str, function: Callable[..., R], *arguments: Any) -> tuple[R, list[Warned]]:
-    """The result of a call, and the warnings that this process has kept; none in ``main`` (`here`), which shows them itself."""
+    """The result of a call, and the warnings that this process has kept; none in ``main`` (`here`),
+    which shows them itself.
+    """
     if here() == main:
         return function(*arguments), []
     with _kept_during():
@@ -48,7 +54,9 @@ def call(main: str, function: Callable[..., R], *arguments: Any) -> tuple[R, lis
 
 @contextlib.contextmanager
 def _kept_during() -> Iterator[None]:
-    """Keep the warnings of all threads; as before when the last call in this process is done (Dask's may have several)."""
+    """Keep the warnings of all threads; as before when the last call in this process is done
+    (Dask's may have several).
+    """
     with _lock:
         _at_work.append(warnings.showwarning)
         keep()
@@ -62,11 +70,22 @@ def _kept_during() -> Iterator[None]:
 
 
 def show(found: Sequence[Warned], shown: Registry) -> None:
-    """Warn here. ``shown``: a registry of what was shown; a text in it is not shown again, unless the user's filters say so."""
+    """Warn here. ``shown``: a registry of what was shown; a text in it is not shown again, unless
+    the user's filters say so.
+    """
     for text, category, file, line in found:
         warnings.warn_explicit(text, category, file, line, registry=shown)
 
 
-def _keep(message: Warning | str, category: type[Warning], filename: str, lineno: int, *more: Any, **others: Any) -> None:
-    known = category if category.__module__ == "builtins" else UserWarning  # others may not be importable there
+def _keep(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    *more: Any,
+    **others: Any,
+) -> None:
+    known = (
+        category if category.__module__ == "builtins" else UserWarning
+    )  # others may not be importable there
     _kept.append((str(message), known, filename, lineno))

@@ -1,4 +1,6 @@
-"""Run a campaign's tasks, and combine what they made: each on workers, each noted in the job log."""
+"""Run a campaign's tasks, and combine what they made: each on workers, each noted in the job
+log.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,10 @@ class Tasks(Work[Task, Outcome]):
 
     def run(self, tasks: Sequence[Task]) -> CampaignResult:
         """Run these tasks; on an interrupt, those at work wait again."""
-        self._all, self._begin = {"total": len(tasks), "all_samples": sum(task.samples for task in tasks)}, time.monotonic()
+        self._all, self._begin = (
+            {"total": len(tasks), "all_samples": sum(task.samples for task in tasks)},
+            time.monotonic(),
+        )
         try:
             carry_out(self, tasks, self.pool, self.folder)
         except BaseException:
@@ -82,9 +87,14 @@ class Tasks(Work[Task, Outcome]):
         """See `Work.call`."""
         from zonda import __version__
 
-        layout, pipeline = self.job.combinations[item.combination].layout, self.job.pipelines[item.pipeline]
+        layout, pipeline = (
+            self.job.combinations[item.combination].layout,
+            self.job.pipelines[item.pipeline],
+        )
         folder, pool = self.folder.resolve(), self.pool
-        return perform, Order(item, pipeline, layout, folder, pool.threads, pool.memory, __version__)
+        return perform, Order(
+            item, pipeline, layout, folder, pool.threads, pool.memory, __version__
+        )
 
     def began(self, items: list[Task]) -> None:
         """See `Work.began`."""
@@ -96,10 +106,14 @@ class Tasks(Work[Task, Outcome]):
         number = item.number
         outcome = Outcome(LOST, 0.0, error=str(result)) if isinstance(result, Lost) else result
         self._claimed.discard(number)
-        if not outcome.error and (error := self.watch.meet(outcome.machine, f"task {number} on {outcome.host}")):
+        if not outcome.error and (
+            error := self.watch.meet(outcome.machine, f"task {number} on {outcome.host}")
+        ):
             discard(item.path(self.folder))
             outcome = replace(outcome, error=error, final=True, stop=True)
-        again = bool(outcome.error) and not outcome.final and self.attempts[item] <= self.job.retries
+        again = (
+            bool(outcome.error) and not outcome.final and self.attempts[item] <= self.job.retries
+        )
         if not outcome.error:
             self.log.done(number, outcome.host, outcome.seconds, outcome.digest, outcome.machine)
             self.result.tasks += 1
@@ -118,7 +132,9 @@ class Tasks(Work[Task, Outcome]):
 
 
 class Combinations(Work[int, Combined]):
-    """The sets of products, by number. They are combined on workers: pictures and reports take time and memory."""
+    """The sets of products, by number. They are combined on workers: pictures and reports take time
+    and memory.
+    """
 
     def __init__(self, job: Job, folder: Path, log: Log, result: CampaignResult) -> None:
         super().__init__()
@@ -134,7 +150,12 @@ class Combinations(Work[int, Combined]):
 
     def call(self, item: int) -> tuple[Callable[..., Combined], Path, int, dict[int, str]]:
         """See `Work.call`."""
-        return combine, self.folder.resolve(), item, {t.number: self._digests[t.number] for t in self.job.tasks_of(item)}
+        return (
+            combine,
+            self.folder.resolve(),
+            item,
+            {t.number: self._digests[t.number] for t in self.job.tasks_of(item)},
+        )
 
     def ended(self, item: int, result: Combined | Lost) -> bool:
         """Record that products are written, and remove their parts."""
@@ -144,7 +165,9 @@ class Combinations(Work[int, Combined]):
             if self.attempts[item] <= self.job.retries:
                 return True
             message = f"the engine failed when it combined the maps: {result}"
-            error: ZondaError | None = PipelineError(message, place=str(self.folder), cure=f"zonda resume {self.folder}")
+            error: ZondaError | None = PipelineError(
+                message, place=str(self.folder), cure=f"zonda resume {self.folder}"
+            )
         else:
             error = result.error
         if error is not None:

@@ -12,13 +12,20 @@ from .run import load
 
 @click.command()
 @click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
-@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, as for `zonda run`.")
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change one value, as for `zonda run`.",
+)
 def check(pipeline: str, settings: tuple[str, ...]) -> None:
     """Check a pipeline file without running it.
 
-    Every mistake in the file is shown at once, with its place. The telescope is pointed at some instants of the scans: whether
-    the target is up, how near they come to the telescope's speed and acceleration, how many samples there are in a beam; and
-    whether it is on the input maps. Files are read by the code with which a run reads them, which begins with the same look.
+    Every mistake in the file is shown at once, with its place. The telescope is pointed at some
+    instants of the scans: whether the target is up, how near they come to the telescope's speed and
+    acceleration, how many samples there are in a beam; and whether it is on the input maps. Files
+    are read by the code with which a run reads them, which begins with the same look.
     """
     file = load(pipeline, settings)
     from ..scene import elsewhere

@@ -19,7 +19,9 @@ def pipelines(context: click.Context, parameter: click.Parameter, incomplete: st
     names = [name for name in shipped() if name.startswith(incomplete)]
     try:
         beside = sorted(
-            p for p in Path(folder or ("/" if incomplete.startswith("/") else ".")).iterdir() if p.name.startswith(begin)
+            p
+            for p in Path(folder or ("/" if incomplete.startswith("/") else ".")).iterdir()
+            if p.name.startswith(begin)
         )
     except OSError:
         beside = []
@@ -47,4 +49,8 @@ def _names(group: str, incomplete: str) -> list[Any]:
 
     from ..discovery import discover
 
-    return [CompletionItem(name) for name in sorted({found.name for found in discover(group)}) if name.startswith(incomplete)]
+    return [
+        CompletionItem(name)
+        for name in sorted({found.name for found in discover(group)})
+        if name.startswith(incomplete)
+    ]

@@ -1,4 +1,6 @@
-"""The entry point of the command line: exit statuses, signals, warnings and errors as a user reads them."""
+"""The entry point of the command line: exit statuses, signals, warnings and errors as a user reads
+them.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ USER_ERROR = 2
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; the exit status: 0, 1 (a plugin's fault), 2 (a user's mistake), 128 + a signal that ended it."""
+    """Run the command line; the exit status: 0, 1 (a plugin's fault), 2 (a user's mistake), 128 + a
+    signal that ended it.
+    """
     with _plain_warnings(), _stoppable():
         try:
             result = zonda.main(arguments, prog_name="zonda", standalone_mode=False)
@@ -39,10 +43,18 @@ def main(arguments: list[str] | None = None) -> int:
                 click.echo("interrupted: unfinished files were removed", err=True)
             return int(getattr(err, "status", INTERRUPTED))
         except MemoryError as err:
-            cure = "make the scans shorter, the sample rate lower or the detectors fewer, or use a larger machine"
+            cure = (
+                "make the scans shorter, the sample rate lower or the detectors fewer, or use a"
+                " larger machine"
+            )
             _report(ZondaError(f"not enough memory{f': {err}' if str(err) else ''}", cure=cure))
         except OSError as err:
-            if err.filename is None and err.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
+            if err.filename is None and err.errno not in (
+                errno.ENOSPC,
+                errno.EDQUOT,
+                errno.EROFS,
+                errno.EFBIG,
+            ):
                 raise
             _report(ZondaError(err.strerror or str(err), place=str(err.filename or "")))
         return USER_ERROR
@@ -54,7 +66,9 @@ def _report(err: ZondaError) -> None:
     if render := getattr(err, "render", None):
         click.echo(render(colour), err=True)
     else:
-        click.echo(f"{click.style('error', fg='red', bold=True) if colour else 'error'}: {err}", err=True)
+        click.echo(
+            f"{click.style('error', fg='red', bold=True) if colour else 'error'}: {err}", err=True
+        )
 
 
 def _clear() -> None:
@@ -65,7 +79,8 @@ def _clear() -> None:
 
 @contextlib.contextmanager
 def _stoppable() -> Iterator[None]:
-    """SIGTERM (batch systems, containers) and SIGHUP (a terminal that closes) end a command as Ctrl-C does: cleaned up, once.
+    """SIGTERM (batch systems, containers) and SIGHUP (a terminal that closes) end a command as
+    Ctrl-C does: cleaned up, once.
 
     A signal that somebody handles or ignores (nohup) already is left alone.
     """
@@ -97,7 +112,9 @@ def _plain_warnings() -> Iterator[None]:
     usual, usual_show = warnings.formatwarning, warnings.showwarning
     shown: set[str] = set()
 
-    def one_line(message: Any, category: Any, filename: str, lineno: int, line: str | None = None) -> str:
+    def one_line(
+        message: Any, category: Any, filename: str, lineno: int, line: str | None = None
+    ) -> str:
         return f"warning: {message}\n"
 
     def show(message: Any, *place: Any, **more: Any) -> None:

@@ -1,4 +1,6 @@
-"""The group of commands ``zonda``: the built-in ones and those of plugins, imported when they are named or listed."""
+"""The group of commands ``zonda``: the built-in ones and those of plugins, imported when they are
+named or listed.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ INTERRUPTED = 130
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal that asks the process to end; it is handled as Ctrl-C is. ``status``: the exit status, 128 + its number."""
+    """A signal that asks the process to end; it is handled as Ctrl-C is. ``status``: the exit
+    status, 128 + its number.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -32,7 +36,9 @@ class Interrupted(Exception):
 
 
 class Commands(click.Group):
-    """The built-in commands, and those of plugins: plugins are loaded only when a command is not built in, or for help."""
+    """The built-in commands, and those of plugins: plugins are loaded only when a command is not
+    built in, or for help.
+    """
 
     _extended = False
 
@@ -49,8 +55,12 @@ class Commands(click.Group):
             self._extend()
         return super().get_command(ctx, name)
 
-    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click's, but an unknown command names the nearest one, and a pipeline file the command to use."""
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click's, but an unknown command names the nearest one, and a pipeline file the command
+        to use.
+        """
         name = args[0]
         if self.get_command(ctx, name) is None and not name.startswith("-"):
             from ..configuration.diagnostics import nearest

@@ -15,8 +15,8 @@ from ..errors import ZondaError
 def plugins(check: bool) -> None:
     """List operators, instruments, sites and other components.
 
-    These are operators, instruments, sites, bands, noise models, weather sources, spectra, checks, metrics and hooks,
-    each with the distribution and the module that it comes from.
+    These are operators, instruments, sites, bands, noise models, weather sources, spectra, checks,
+    metrics and hooks, each with the distribution and the module that it comes from.
     """
     from .. import hooks
     from ..discovery import discover
@@ -31,22 +31,35 @@ def plugins(check: bool) -> None:
             note = "provided twice" if twice else ""
             if check:
                 try:
-                    registry.load(found) if registry.classes or twice else registry.create(found.name)
+                    registry.load(found) if registry.classes or twice else registry.create(
+                        found.name
+                    )
                 except ZondaError as err:
                     failures.append(err)
                     note = "FAILED"
             rows.append((registry.kind, found.name, found.origin, found.reference, note))
-    rows += [("hook", found.name, found.origin, found.reference, "") for found in discover(hooks.GROUP)]
+    rows += [
+        ("hook", found.name, found.origin, found.reference, "") for found in discover(hooks.GROUP)
+    ]
     widths = [max((len(row[k]) for row in rows), default=0) for k in range(4)]
     for row in rows:
-        click.echo("  ".join([*(text.ljust(width) for text, width in zip(row, widths, strict=False)), row[4]]).rstrip())
+        click.echo(
+            "  ".join(
+                [*(text.ljust(width) for text, width in zip(row, widths, strict=False)), row[4]]
+            ).rstrip()
+        )
     if check:
         failures += _failing_hooks()
         for failure in failures:
             click.echo(f"\n{failure}", err=True)
             if failure.__cause__ is not None:
-                click.echo("".join(traceback.format_exception(failure.__cause__)).rstrip(), err=True)
-        click.echo(f"\n{len(rows)} components, {len(failures)} fault{'s' if len(failures) != 1 else ''}", err=True)
+                click.echo(
+                    "".join(traceback.format_exception(failure.__cause__)).rstrip(), err=True
+                )
+        click.echo(
+            f"\n{len(rows)} components, {len(failures)} fault{'s' if len(failures) != 1 else ''}",
+            err=True,
+        )
         if failures:
             raise click.exceptions.Exit(1)
 

@@ -30,11 +30,22 @@ class RunRequest:
     @property
     def is_campaign(self) -> bool:
         """Whether this is a campaign, whatever the file says."""
-        return bool(len(self.pipelines) > 1 or self.engine or self.workers or self.scheduler or self.share)
+        return bool(
+            len(self.pipelines) > 1 or self.engine or self.workers or self.scheduler or self.share
+        )
 
     @property
     def command(self) -> str:
-        """The command that makes the same products elsewhere: what changes no result (threads, memory, folder) is left out."""
-        options = [("--set", self.settings), ("--keep", self.keep), ("--drop", self.drop), ("--only", self.only)]
+        """The command that makes the same products elsewhere: what changes no result (threads,
+        memory, folder) is left out.
+        """
+        options = [
+            ("--set", self.settings),
+            ("--keep", self.keep),
+            ("--drop", self.drop),
+            ("--only", self.only),
+        ]
         parts = [part for option, texts in options for text in texts for part in (option, text)]
-        return shlex.join(["zonda", "run", *self.pipelines, *parts, *(["--no-prune"] if self.no_prune else [])])
+        return shlex.join(
+            ["zonda", "run", *self.pipelines, *parts, *(["--no-prune"] if self.no_prune else [])]
+        )

@@ -20,39 +20,92 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("pipelines", metavar="FILE_OR_NAME...", nargs=-1, required=True, shell_complete=complete.pipelines)
-@click.option(
-    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, e.g. Step.parameter='0.5 Hz' or seed=8."
+@click.argument(
+    "pipelines",
+    metavar="FILE_OR_NAME...",
+    nargs=-1,
+    required=True,
+    shell_complete=complete.pipelines,
 )
-@click.option("--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full, see `zonda plan`.")
-@click.option("--drop", multiple=True, metavar="NAME", help="Leave this effect or operator out, whatever that costs.")
-@click.option("--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone.")
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change one value, e.g. Step.parameter='0.5 Hz' or seed=8.",
+)
+@click.option(
+    "--keep",
+    multiple=True,
+    metavar="NAME",
+    help="Simulate this effect or operator in full, see `zonda plan`.",
+)
+@click.option(
+    "--drop",
+    multiple=True,
+    metavar="NAME",
+    help="Leave this effect or operator out, whatever that costs.",
+)
+@click.option(
+    "--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone."
+)
 @click.option("--no-prune", is_flag=True, help="Simulate everything in full.")
-@click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder for products.  [default: as in the file]")
-@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads; results do not depend on it.  [default: all]")
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder for products.  [default: as in the file]",
+)
+@click.option(
+    "--threads",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Threads; results do not depend on it.  [default: all]",
+)
 @click.option(
     "--memory",
     type=Bytes(),
     metavar="SIZE",
-    help="Most memory to hold, of a campaign all its workers' on this machine (with MPI and Dask each process's), e.g. 4GB; "
-    "results do not depend on it.  [default: half of the free]",
+    help=(
+        "Most memory to hold, of a campaign all its workers' on this machine (with MPI and Dask"
+        " each process's), e.g. 4GB; results do not depend on it.  [default: half of the free]"
+    ),
 )
-@click.option("-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated, not only what was lost.")
-@click.option("--verify", is_flag=True, help="Measure the error of this run's approximations: one more run, at their tightest.")
+@click.option(
+    "-v",
+    "--verbose",
+    is_flag=True,
+    help="Say all that was counted, chosen and approximated, not only what was lost.",
+)
+@click.option(
+    "--verify",
+    is_flag=True,
+    help="Measure the error of this run's approximations: one more run, at their tightest.",
+)
 @click.option(
     "--engine",
     type=click.Choice(["serial", "processes", "mpi", "dask"]),
     help="Run scans as tasks of a campaign.  [default: as in the file's campaign]",
 )
-@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes.")
-@click.option("--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file.")
-@click.option("--task", "share", type=Share(), help="Run this share of a campaign's tasks, e.g. 3/8: for job arrays.")
+@click.option(
+    "--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes."
+)
+@click.option(
+    "--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file."
+)
+@click.option(
+    "--task",
+    "share",
+    type=Share(),
+    help="Run this share of a campaign's tasks, e.g. 3/8: for job arrays.",
+)
 def run(**given: Any) -> None:
-    """Run a pipeline file, or a shipped pipeline by its name; a campaign of observations where the file has `campaign:`, or where
-    there are several files.
+    """Run a pipeline file, or a shipped pipeline by its name; a campaign of observations where the
+    file has `campaign:`, or where there are several files.
 
-    What its outputs do not depend on is left out, and effects are dropped or coarsened while the errors stay within the budget
-    (by default a tenth of the noise): `zonda plan` shows what. The products are in the folder that the last line names.
+    What its outputs do not depend on is left out, and effects are dropped or coarsened while the
+    errors stay within the budget (by default a tenth of the noise): `zonda plan` shows what. The
+    products are in the folder that the last line names.
     """
     from .. import early
     from ..compilation.compile_ahead import Helper
@@ -95,7 +148,9 @@ def load(pipeline: str, settings: tuple[str, ...], only: tuple[str, ...] = ()) -
 
 def _run_campaign(request: RunRequest) -> None:
     if request.verify or request.only:
-        raise click.UsageError(f"{'--verify' if request.verify else '--only'} is for one run, not for a campaign")
+        raise click.UsageError(
+            f"{'--verify' if request.verify else '--only'} is for one run, not for a campaign"
+        )
     gc.enable()
     from ..campaign import command as campaign
 
@@ -126,7 +181,12 @@ def _run_one(request: RunRequest, file: PipelineFile, helper: Helper) -> None:
         check_free(folder)
     helper.begin()
     made = remembered.summary(
-        file, keep=request.keep, drop=request.drop, prune_all=not request.no_prune, threads=request.threads, memory=request.memory
+        file,
+        keep=request.keep,
+        drop=request.drop,
+        prune_all=not request.no_prune,
+        threads=request.threads,
+        memory=request.memory,
     )
     click.echo(str(made), err=True)
     if omitted := made.omitted(file):
@@ -139,7 +199,11 @@ def _run_one(request: RunRequest, file: PipelineFile, helper: Helper) -> None:
     gc.freeze()
     gc.enable()
     data = file.pipeline().run(
-        file.scene(), output=folder, threads=request.threads, ceiling=request.memory, provenance=provenance
+        file.scene(),
+        output=folder,
+        threads=request.threads,
+        ceiling=request.memory,
+        provenance=provenance,
     )
     helper.succeeded()
     write_text(folder / "resolved.yaml", resolved)
@@ -167,7 +231,9 @@ def _show(data: Data, verbose: bool) -> None:
             click.echo(f"{who}: {what}: {value}", err=True)
 
 
-def _verify(file: PipelineFile, request: RunRequest, settings: tuple[str, ...], data: Data | None) -> None:
+def _verify(
+    file: PipelineFile, request: RunRequest, settings: tuple[str, ...], data: Data | None
+) -> None:
     """Measure the error of a run; ``data``: what it made, if that is the whole pipeline."""
     from ..accuracy.table import by_band
     from ..accuracy.verify import achieved
@@ -177,4 +243,6 @@ def _verify(file: PipelineFile, request: RunRequest, settings: tuple[str, ...], 
     error, bands = achieved(file, request.pipelines[0], settings, metric, request.threads, data)
     wanted = f" (target {100 * target.target:g} %)" if target else ""
     each = f" (the largest of {by_band(bands)})" if bands else ""
-    click.echo(f"error of {metric} against the tightest knobs: {100 * error:.2g} %{each}{wanted}", err=True)
+    click.echo(
+        f"error of {metric} against the tightest knobs: {100 * error:.2g} %{each}{wanted}", err=True
+    )

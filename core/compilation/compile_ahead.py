@@ -1,10 +1,12 @@
-"""The first run on a machine: a second process compiles the kernels that come last, while this one compiles as it needs them.
+"""The first run on a machine: a second process compiles the kernels that come last, while this one
+compiles as it needs them.
 
-Packages with kernels list them in the entry-point group ``zonda.kernels``: rows of text with the order of first use in the
-shipped pipelines, the seconds [s] that one takes to compile with what it calls, its module, its name and its types (`text_of`).
-The child begins with the second half, the dearest first; each process finds in the cache what the other has made, and waits for
-what the other is making (`kernel_cache.share`). Whatever goes wrong there only means that this process compiles it. Later runs
-load the kernels in a thread while they point the telescope.
+Packages with kernels list them in the entry-point group ``zonda.kernels``: rows of text with the
+order of first use in the shipped pipelines, the seconds [s] that one takes to compile with what it
+calls, its module, its name and its types (`text_of`). The child begins with the second half, the
+dearest first; each process finds in the cache what the other has made, and waits for what the other
+is making (`kernel_cache.share`). Whatever goes wrong there only means that this process compiles
+it. Later runs load the kernels in a thread while they point the telescope.
 """
 
 from __future__ import annotations
@@ -32,15 +34,18 @@ from .compiled import cache_folder
 GROUP = "zonda.kernels"
 KIND = "compiled"
 COMPILING = (100_000, 20, 100)
-"""Thresholds of garbage collection while kernels are compiled: by Python's own it takes 7 % of the time."""
+"""Thresholds of garbage collection while kernels are compiled: by Python's own it takes 7 % of the
+time.
+"""
 
 
 class Helper:
-    """The second process of a first run, the thread of a later one; nothing where there is one processor only.
+    """The second process of a first run, the thread of a later one; nothing where there is one
+    processor only.
 
-    `prepare` starts the process at once, before this one has imported anything heavy; `begin`, when the operators are imported,
-    tells it their modules, whose kernels it compiles, or starts the thread. `close` it in any case; after `succeeded` there is no
-    first run any more.
+    `prepare` starts the process at once, before this one has imported anything heavy; `begin`, when
+    the operators are imported, tells it their modules, whose kernels it compiles, or starts the
+    thread. `close` it in any case; after `succeeded` there is no first run any more.
     """
 
     def __init__(self) -> None:
@@ -70,12 +75,16 @@ class Helper:
                 )
 
     def begin(self) -> None:
-        """Let the process compile, or the thread load, the kernels of the modules that are imported now."""
+        """Let the process compile, or the thread load, the kernels of the modules that are imported
+        now.
+        """
         modules = list(sys.modules)
         if self._first:
             gc.set_threshold(*COMPILING)
         elif not self._alone:
-            self._thread = Thread(target=compile_listed, args=(modules, False, self._enough), daemon=True)
+            self._thread = Thread(
+                target=compile_listed, args=(modules, False, self._enough), daemon=True
+            )
             self._thread.start()
         if self._process is not None and self._process.stdin is not None:
             from .jit import share
@@ -104,8 +113,12 @@ class Helper:
 
 
 def serve() -> None:
-    """The child's side: it ends when there is nothing left to compile, or when the parent has hung up."""
-    from ..numerics import random  # the second with numba, whose compiler is made ready while the parent reads its file
+    """The child's side: it ends when there is nothing left to compile, or when the parent has hung
+    up.
+    """
+    from ..numerics import (
+        random,
+    )  # the second with numba, whose compiler is made ready while the parent reads its file
     from .jit import share
 
     random.fill_normals.targetctx.refresh()
@@ -124,22 +137,27 @@ def serve() -> None:
 
 
 def compile_listed(modules: list[str], as_child: bool = True, enough: Event | None = None) -> int:
-    """Compile or load the listed kernels of these modules until ``enough``; returns how many there were."""
-    from ..numerics import random  # noqa: F401  it says where kernels are kept, before any is defined
+    """Compile or load the listed kernels of these modules until ``enough``; returns how many there
+    were.
+    """
 
     rows = [row for row in listed() if row[1] in modules]
     done = 0
     for _, module, name, *types in for_child(rows) if as_child else rows:
         if enough is not None and enough.is_set():
             break
-        with suppress(Exception):  # a list of another version: what it lacks is compiled when it is used
+        with suppress(
+            Exception
+        ):  # a list of another version: what it lacks is compiled when it is used
             getattr(import_module(module), name).compile(tuple(map(type_of, types)))
             done += 1
     return done
 
 
 def listed() -> list[list[str]]:
-    """Rows (seconds, module, name, types) of all lists, in the order of first use; a list that cannot be read is left out."""
+    """Rows (seconds, module, name, types) of all lists, in the order of first use; a list that
+    cannot be read is left out.
+    """
     rows = []
     for found in discover(GROUP):
         with suppress(*RAISED):
@@ -148,16 +166,16 @@ def listed() -> list[list[str]]:
 
 
 def for_child(rows: list[list[str]]) -> list[list[str]]:
-    """Rows that begin with seconds in the child's order: what ends in the second half of the time, the dearest first; then the
-    others from the end."""
+    """Rows that begin with seconds in the child's order: what ends in the second half of the time,
+    the dearest first; then the others from the end."""
     ends = list(accumulate(float(row[0]) for row in rows))
     first = bisect_right(ends, ends[-1] / 2) if ends else 0
     return sorted(rows[first:], key=lambda row: -float(row[0])) + rows[:first][::-1]
 
 
 def text_of(kind: Any) -> str | None:
-    """A numba type as the list has it: ``f8``, ``f4:2C`` (dimensions, layout, ``r``: read only), ``f4:2C*3`` (a tuple of three);
-    None: not one for the list."""
+    """A numba type as the list has it: ``f8``, ``f4:2C`` (dimensions, layout, ``r``: read only),
+    ``f4:2C*3`` (a tuple of three); None: not one for the list."""
     from numba import types
     from numba.np.numpy_support import as_dtype
 
@@ -185,4 +203,8 @@ def type_of(text: str) -> Any:
     if found is None:
         raise ValueError(f"no type {text!r}")
     scalar = from_dtype(np.dtype(found[1]))
-    return types.Array(scalar, int(found[2]), found[3], readonly=bool(found[4])) if found[2] else scalar
+    return (
+        types.Array(scalar, int(found[2]), found[3], readonly=bool(found[4]))
+        if found[2]
+        else scalar
+    )

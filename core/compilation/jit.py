@@ -1,7 +1,9 @@
-"""numba for modules with kernels: what is imported from here keeps its compiled code in zonda's own files (`kernel_cache`).
+"""numba for modules with kernels: what is imported from here keeps its compiled code in zonda's own
+files (`kernel_cache`).
 
-`kernel_cache` leans on the inside of numba's cache, which has no public interface for other files (`NUMBA_CACHE_LOCATOR_CLASSES`
-chooses folders alone). Where a future numba has another inside, kernels are kept as numba keeps those of others, and it is said.
+`kernel_cache` leans on the inside of numba's cache, which has no public interface for other files
+(`NUMBA_CACHE_LOCATOR_CLASSES` chooses folders alone). Where a future numba has another inside,
+kernels are kept as numba keeps those of others, and it is said.
 """
 
 from __future__ import annotations

@@ -1,12 +1,15 @@
-"""Where zonda's compiled kernels are kept: one file for each kernel, types of arguments and processor; see `install`.
+"""Where zonda's compiled kernels are kept: one file for each kernel, types of arguments and
+processor; see `install`.
 
-numba's own cache keeps an index beside numbered files. Two first runs at once may give one number to two kernels, so that the
-next run loads the wrong machine code; a truncated file ends the run with a traceback; and a kernel stays as it was compiled
-when a function of another module that it calls has changed. Here a file's name is a hash of all that its content depends on,
-its content is checked by a hash, which knows the name too, and it is written under another name first. What others may have
-written is not run (`core.storage.own_files`). So files are written by any number of runs at
-once, damaged ones are compiled again, and nothing stale is ever loaded. Processes that share the work (`share`) compile no
-kernel twice: each locks the name of what it compiles, and who wants the same waits for it.
+numba's own cache keeps an index beside numbered files. Two first runs at once may give one number
+to two kernels, so that the next run loads the wrong machine code; a truncated file ends the run
+with a traceback; and a kernel stays as it was compiled when a function of another module that it
+calls has changed. Here a file's name is a hash of all that its content depends on, its content is
+checked by a hash, which knows the name too, and it is written under another name first. What others
+may have written is not run (`core.storage.own_files`). So files are written by any number of runs
+at once, damaged ones are compiled again, and nothing stale is ever loaded. Processes that share the
+work (`share`) compile no kernel twice: each locks the name of what it compiles, and who wants the
+same waits for it.
 """
 
 from __future__ import annotations
@@ -50,7 +53,9 @@ class Taken(Exception):
 
 
 class _Claims:
-    """What this process compiles, if it shares the work: open, locked files by the path of the kernel."""
+    """What this process compiles, if it shares the work: open, locked files by the path of the
+    kernel.
+    """
 
     def __init__(self) -> None:
         self.shared = self.polite = False
@@ -59,7 +64,8 @@ class _Claims:
     def take(self, path: Path) -> None:
         """Claim a kernel, when the process that has it has done with it. Raises `Taken`.
 
-        No two wait for each other: a process holds a kernel and those that call it, and waits for one that these call.
+        No two wait for each other: a process holds a kernel and those that call it, and waits for
+        one that these call.
         """
         try:
             import fcntl
@@ -97,7 +103,8 @@ _CLAIMS = _Claims()
 
 
 def share(polite: bool = False) -> None:
-    """From now on compile nothing that another process that shares compiles at the same time: wait for it.
+    """From now on compile nothing that another process that shares compiles at the same time: wait
+    for it.
 
     ``polite``: raise `Taken` instead where no other kernel needs it.
     """
@@ -105,7 +112,8 @@ def share(polite: bool = False) -> None:
 
 
 def install() -> None:
-    """Let zonda's kernels be kept as described here; those of other packages stay with numba. Call it before any is defined.
+    """Let zonda's kernels be kept as described here; those of other packages stay with numba. Call
+    it before any is defined.
 
     Raises AttributeError where numba's inside has changed.
     """
@@ -124,7 +132,9 @@ def _cache_of(function: Any) -> Any:
 
 
 class _TriedOnce:
-    """Finds the folder of a kernel as numba does, but tries only once whether a file can be made there."""
+    """Finds the folder of a kernel as numba does, but tries only once whether a file can be made
+    there.
+    """
 
     tried: ClassVar[set[str]] = set()
 
@@ -142,7 +152,8 @@ class _Reduced(caching.CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes: ClassVar[
         list[Any]
     ] = [  # a numba without them, or told others by NUMBA_CACHE_LOCATOR_CLASSES, tries each time
-        type(found.__name__, (_TriedOnce, found), {}) for found in getattr(caching.CompileResultCacheImpl, "_locator_classes", ())
+        type(found.__name__, (_TriedOnce, found), {})
+        for found in getattr(caching.CompileResultCacheImpl, "_locator_classes", ())
     ]
 
 
@@ -156,11 +167,13 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
         self._cache_file = KernelFiles(self._cache_path, self._impl.filename_base, function)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled kernel, or None where it must be compiled; a damaged file is removed with a warning.
+        """The compiled kernel, or None where it must be compiled; a damaged file is removed with a
+        warning.
 
-        numba's own first makes its compiler ready (``target_context.refresh()``), half a second of imports. Kept code needs of
-        that only the addresses of the functions that count references: those of numba's other helpers are known from the
-        beginning, but for ``hash`` and ``parallel=True``, which no kernel here uses.
+        numba's own first makes its compiler ready (``target_context.refresh()``), half a second of
+        imports. Kept code needs of that only the addresses of the functions that count references:
+        those of numba's other helpers are known from the beginning, but for ``hash`` and
+        ``parallel=True``, which no kernel here uses.
         """
         found = self._load(sig, target_context)
         path = self._cache_file.asked
@@ -185,7 +198,11 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
             return None
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        found = self._cache_file.load(self._index_key(sig, target_context.codegen())) if self._enabled else None
+        found = (
+            self._cache_file.load(self._index_key(sig, target_context.codegen()))
+            if self._enabled
+            else None
+        )
         if found is None:
             return None
         reduced, bitcode = found
@@ -196,15 +213,26 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]
         return made
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
-        """Types and processor; numba's own also has the function's code, which `meaning` knows, and what it closes over."""
-        return super()._index_key(sig, codegen) if self._py_func.__closure__ else (sig, _processor(codegen))
+        """Types and processor; numba's own also has the function's code, which `meaning` knows, and
+        what it closes over.
+        """
+        return (
+            super()._index_key(sig, codegen)
+            if self._py_func.__closure__
+            else (sig, _processor(codegen))
+        )
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep a compiled kernel; where the disk is full or read-only it is compiled again next time."""
+        """Keep a compiled kernel; where the disk is full or read-only it is compiled again next
+        time.
+        """
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            warnings.warn(f"compiled code cannot be kept for the next run: {error.strerror or error}", stacklevel=2)
+            warnings.warn(
+                f"compiled code cannot be kept for the next run: {error.strerror or error}",
+                stacklevel=2,
+            )
         except CHANGED as error:
             left_to_numba(error)
         finally:
@@ -220,19 +248,29 @@ def _processor(codegen: Any) -> Any:
 def _without_bitcode(reduced: Any) -> Any:
     """(``reduced``, bitcode) of a compiled kernel that numba has reduced to ``reduced``.
 
-    Its library is machine code, and LLVM's bitcode of the kernel and all that it calls, with which other kernels that call it are
-    compiled. numba reads both when it loads a kernel, to know the names in it: more than half of the time. In its place comes
-    bitcode of the names alone, of functions that do nothing, and the true one beside it. A numba whose inside has changed: as it
+    Its library is machine code, and LLVM's bitcode of the kernel and all that it calls, with which
+    other kernels that call it are compiled. numba reads both when it loads a kernel, to know the
+    names in it: more than half of the time. In its place comes bitcode of the names alone, of
+    functions that do nothing, and the true one beside it. A numba whose inside has changed: as it
     is, and None.
     """
-    known = hasattr(codegen.CPUCodeLibrary, "_get_module_for_linking") and hasattr(codegen.CPUCodeLibrary, "_unserialize")
+    known = hasattr(codegen.CPUCodeLibrary, "_get_module_for_linking") and hasattr(
+        codegen.CPUCodeLibrary, "_unserialize"
+    )
     with suppress(AttributeError, TypeError, ValueError, RuntimeError):
         (name, kind, (machine, bitcode)), description, *others = reduced
         if known and kind == "object":
-            names = [getattr(description, f"llvm_{what}_name") for what in ("func", "cpython_wrapper", "cfunc_wrapper")]
+            names = [
+                getattr(description, f"llvm_{what}_name")
+                for what in ("func", "cpython_wrapper", "cfunc_wrapper")
+            ]
             defined = [function for function in names if function.encode() in machine]
             text = "".join(f'define void @"{function}"() {{ ret void }}\n' for function in defined)
-            return ((name, kind, (machine, ll.parse_assembly(text).as_bitcode())), description, *others), bitcode
+            return (
+                (name, kind, (machine, ll.parse_assembly(text).as_bitcode())),
+                description,
+                *others,
+            ), bitcode
     return reduced, None
 
 
@@ -299,16 +337,20 @@ class KernelFiles:
 
 
 def _checksum(path: Path, body: Any) -> bytes:
-    """Of a file's name and content: a whole file of another kernel, put in this one's place, is damaged too."""
+    """Of a file's name and content: a whole file of another kernel, put in this one's place, is
+    damaged too.
+    """
     found = hashlib.blake2b(path.name.encode() + b"\0", digest_size=_DIGEST)
     found.update(body)
     return found.digest()
 
 
 class _Reader(pickle.Unpickler):
-    """Reads kept code without importing those of numba's modules that it was made of, e.g. `numba.np.linalg` and with it scipy.
+    """Reads kept code without importing those of numba's modules that it was made of, e.g.
+    `numba.np.linalg` and with it scipy.
 
-    They are the globals of its environment, which only object mode looks into; what it raises is among its constants.
+    They are the globals of its environment, which only object mode looks into; what it raises is
+    among its constants.
     """
 
     def find_class(self, module: str, name: str) -> Any:
@@ -317,7 +359,11 @@ class _Reader(pickle.Unpickler):
 
 
 def _environment(module: str, constants: Any, name: str) -> Any:
-    if module in sys.modules or not module.startswith("numba.") or environment.lookup_environment(name) is not None:
+    if (
+        module in sys.modules
+        or not module.startswith("numba.")
+        or environment.lookup_environment(name) is not None
+    ):
         return environment._rebuild_env(module, constants, name)
     made = environment.Environment({"__name__": module})
     made.consts[:] = constants
@@ -327,8 +373,9 @@ def _environment(module: str, constants: Any, name: str) -> Any:
 
 
 def meaning(function: Any) -> bytes:
-    """Hash of all that machine code made of ``function`` depends on, but for types and processor: the code and the constants of
-    it, of the kernels that it calls and of what makes its intrinsics; their options; the versions of what compiles them."""
+    """Hash of all that machine code made of ``function`` depends on, but for types and processor:
+    the code and the constants of it, of the kernels that it calls and of what makes its intrinsics;
+    their options; the versions of what compiles them."""
     digest = hashlib.blake2b(digest_size=16)
     digest.update(_text((FORMAT, numba.__version__, llvmlite.__version__, np.__version__)).encode())
     _add(digest, function, set())
@@ -341,11 +388,19 @@ def _add(digest: Any, function: Any, seen: set[Any]) -> None:
     seen.add(function)
     code = function.__code__
     kernel = function.__globals__.get(function.__name__)
-    options = getattr(kernel, "targetoptions", {}) if getattr(kernel, "py_func", None) is function else {}
-    digest.update(_text((function.__module__, function.__qualname__, code, function.__defaults__, options)).encode())
+    options = (
+        getattr(kernel, "targetoptions", {}) if getattr(kernel, "py_func", None) is function else {}
+    )
+    digest.update(
+        _text(
+            (function.__module__, function.__qualname__, code, function.__defaults__, options)
+        ).encode()
+    )
     for name in sorted(_names(code) & function.__globals__.keys()):
         value = function.__globals__[name]
-        value = getattr(value, "py_func", getattr(value, "_defn", value))  # of a kernel, of an intrinsic
+        value = getattr(
+            value, "py_func", getattr(value, "_defn", value)
+        )  # of a kernel, of an intrinsic
         if isinstance(value, FunctionType):
             _add(digest, value, seen)
         elif isinstance(value, np.ndarray):

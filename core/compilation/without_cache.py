@@ -17,7 +17,8 @@ def left_to_numba(error: BaseException) -> None:
     if not _told:
         _told.append(str(error))
         warnings.warn(
-            f"zonda cannot keep compiled code itself with numba {numba.__version__} ({error}): numba's own cache is "
-            "used, or kernels are compiled in every run; do not begin several first runs at once",
+            f"zonda cannot keep compiled code itself with numba {numba.__version__} ({error}):"
+            " numba's own cache is used, or kernels are compiled in every run; do not begin"
+            " several first runs at once",
             stacklevel=3,
         )

@@ -29,16 +29,26 @@ _WORDS: dict[Any, str] = {
 
 def choices(field: FieldInfo) -> tuple[Any, ...]:
     """The values of a Literal that a parameter takes; empty where it takes others."""
-    return tuple(dict.fromkeys(v for t in types_in(field.annotation) if get_origin(t) is Literal for v in get_args(t)))
+    return tuple(
+        dict.fromkeys(
+            v for t in types_in(field.annotation) if get_origin(t) is Literal for v in get_args(t)
+        )
+    )
 
 
 def kind(field: FieldInfo) -> str:
-    """What a parameter takes: a kind of quantity with an example, its choices, or a type in words."""
+    """What a parameter takes: a kind of quantity with an example, its choices, or a type in
+    words.
+    """
     kinds = members(field)
     unit = unit_of(field)
     words = [f"{unit.kind.noun} such as '{unit.example}'"] if unit and float in kinds else []
     chosen = [repr(value) for value in choices(field)]
-    words += [f"{', '.join(chosen[:-1])} or {chosen[-1]}" if len(chosen) > 1 else chosen[0]] if chosen else []
+    words += (
+        [f"{', '.join(chosen[:-1])} or {chosen[-1]}" if len(chosen) > 1 else chosen[0]]
+        if chosen
+        else []
+    )
     for member in kinds:
         if get_origin(member) in (list, tuple):
             words.append("a list")
@@ -55,7 +65,10 @@ def kind(field: FieldInfo) -> str:
 
 def unit_of(field: FieldInfo) -> Unit | None:
     """The unit that a parameter is annotated with."""
-    everything = [*field.metadata, *(m for t in types_in(field.annotation) for m in getattr(t, "__metadata__", ()))]
+    everything = [
+        *field.metadata,
+        *(m for t in types_in(field.annotation) for m in getattr(t, "__metadata__", ())),
+    ]
     return next((m for m in everything if isinstance(m, Unit)), None)
 
 
@@ -73,7 +86,11 @@ def signature(cls: type[BaseModel]) -> inspect.Signature:
     """Parameters with their defaults as a user would write them."""
     empty = inspect.Parameter.empty
     made = [
-        inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=empty if field.is_required() else _value(field))
+        inspect.Parameter(
+            key,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=empty if field.is_required() else _value(field),
+        )
         for key, field in ((field.alias or name, field) for name, field in cls.model_fields.items())
     ]
     return inspect.Signature(made)
@@ -86,7 +103,9 @@ def _value(field: FieldInfo) -> Any:
 def members(field: FieldInfo) -> tuple[Any, ...]:
     """The types of which a parameter takes one, without what they are annotated with."""
     annotation = field.annotation
-    members = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    members = (
+        get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    )
     return tuple(get_args(m)[0] if get_origin(m) is Annotated else m for m in members)
 
 

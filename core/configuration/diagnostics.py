@@ -45,7 +45,9 @@ class Diagnostic:
 
     def render(self, colour: bool = False) -> str:
         """Several lines of text, the last with a line feed."""
-        red, blue, bold, off = ("\033[31;1m", "\033[34;1m", "\033[1m", "\033[0m") if colour else ("",) * 4
+        red, blue, bold, off = (
+            ("\033[31;1m", "\033[34;1m", "\033[1m", "\033[0m") if colour else ("",) * 4
+        )
         lines = self.span.source.text.splitlines() or [""]
         row = min(self.span.line, len(lines) - 1)
         line = lines[row]
@@ -62,7 +64,10 @@ class Diagnostic:
             f"{gutter}{blue}-->{off} {self.place}",
             f"{gutter} {blue}|{off}",
             f"{blue}{row + 1} |{off} {shown.translate(_CONTROL)}",
-            f"{gutter} {blue}|{off} {indent}{red}{caret}{' ' + self.label if self.label else ''}{off}",
+            (
+                f"{gutter} {blue}|{off}"
+                f" {indent}{red}{caret}{' ' + self.label if self.label else ''}{off}"
+            ),
         ]
         if self.help:
             parts += [f"{gutter} {blue}={off} {text}" for text in self.help.splitlines()]
@@ -85,7 +90,10 @@ class ConfigurationError(ZondaError):
     """
 
     def __init__(self, diagnostics: Iterable[Diagnostic], place: str) -> None:
-        found = sorted(dict.fromkeys(diagnostics), key=lambda d: (d.span.source.name != place, d.span.line, d.span.column))
+        found = sorted(
+            dict.fromkeys(diagnostics),
+            key=lambda d: (d.span.source.name != place, d.span.line, d.span.column),
+        )
         count = f"{len(found)} mistake{'s' if len(found) != 1 else ''}"
         super().__init__(f"{count} in {place}", place="")
         self.diagnostics, self.place = found, place

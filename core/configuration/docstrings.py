@@ -1,4 +1,6 @@
-"""Docstrings of classes of parameters and of their fields, read from the source when somebody asks."""
+"""Docstrings of classes of parameters and of their fields, read from the source when somebody
+asks.
+"""
 
 from __future__ import annotations
 
@@ -29,14 +31,24 @@ def remember_place(cls: type) -> None:
 
 def own_doc(cls: type) -> str:
     """The docstring as it stands in the class."""
-    return inspect.cleandoc(next((own for c in cls.__mro__ if (own := c.__dict__.get("__doc__")) and isinstance(own, str)), ""))
+    return inspect.cleandoc(
+        next(
+            (
+                own
+                for c in cls.__mro__
+                if (own := c.__dict__.get("__doc__")) and isinstance(own, str)
+            ),
+            "",
+        )
+    )
 
 
 def described(model: type[BaseModel]) -> dict[str, FieldInfo]:
     """The fields of ``model``, with their docstrings as descriptions.
 
-    These are read from the source when somebody asks, not when the class is made (pydantic's ``use_attribute_docstrings``):
-    that takes a third of a second for the classes of a run, which asks for none.
+    These are read from the source when somebody asks, not when the class is made (pydantic's
+    ``use_attribute_docstrings``): that takes a third of a second for the classes of a run, which
+    asks for none.
     """
     for name, field in model.model_fields.items():
         if field.description is None:
@@ -46,7 +58,9 @@ def described(model: type[BaseModel]) -> dict[str, FieldInfo]:
 
 
 def source_is_known(model: type) -> bool:
-    """Whether the source of the class and of its bases can be read; not that of what was typed at the prompt of `python`."""
+    """Whether the source of the class and of its bases can be read; not that of what was typed at
+    the prompt of `python`.
+    """
     places = [_places[cls] for cls in model.__mro__ if cls in _places]
     return all(linecache.getlines(file, module) for file, _, module in places)
 
@@ -65,13 +79,22 @@ def _of_class(lines: list[str], name: str) -> dict[str, str]:
     """As `_docstrings`, from lines that begin with the class statement or its decorators."""
     try:
         statement = ast.parse(textwrap.dedent("".join(inspect.getblock(lines)))).body[0]
-    except (SyntaxError, IndexError, ValueError, tokenize.TokenError):  # the file has changed meanwhile
+    except (
+        SyntaxError,
+        IndexError,
+        ValueError,
+        tokenize.TokenError,
+    ):  # the file has changed meanwhile
         return {}
     if not isinstance(statement, ast.ClassDef) or statement.name != name:
         return {}
     found = {}
     for one, after in pairwise([*statement.body, ast.Pass()]):
         if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
-            text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else None
+            text = (
+                after.value.value
+                if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+                else None
+            )
             found[one.target.id] = inspect.cleandoc(text) if isinstance(text, str) else ""
     return found

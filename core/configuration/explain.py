@@ -88,15 +88,24 @@ def explain(
 
 
 def _together(found: list[Diagnostic]) -> list[Diagnostic]:
-    """More than two parameters that are missing at one place as one mistake; none that another name was meant for."""
+    """More than two parameters that are missing at one place as one mistake; none that another name
+    was meant for.
+    """
     found = without_meant(found)
     for span in dict.fromkeys(d.span for d in found):
         lacking = [d for d in found if d.span == span and " needs '" in d.message]
         if len(lacking) > 2:
             names = ", ".join(_missing(d) for d in lacking)
             texts = "\n".join(f"{_missing(d)[1:-1]}: {d.help}" for d in lacking)
-            one = Diagnostic(f"{lacking[0].message.split(' needs ')[0]} needs {names}", span, "these are missing", texts)
-            found = [one if d is lacking[0] else d for d in found if d is lacking[0] or d not in lacking]
+            one = Diagnostic(
+                f"{lacking[0].message.split(' needs ')[0]} needs {names}",
+                span,
+                "these are missing",
+                texts,
+            )
+            found = [
+                one if d is lacking[0] else d for d in found if d is lacking[0] or d not in lacking
+            ]
     return found
 
 
@@ -104,7 +113,11 @@ def without_meant(found: list[Diagnostic]) -> list[Diagnostic]:
     """Without what is missing as its name is written wrong: the wrong name says so."""
     meant = {d.label for d in found if d.message.startswith("unknown ")}
     lacking = [re.search(r" needs '(\w+)'", d.message) for d in found]
-    return [d for d, match in zip(found, lacking, strict=True) if not (match and f"did you mean '{match[1]}'?" in meant)]
+    return [
+        d
+        for d, match in zip(found, lacking, strict=True)
+        if not (match and f"did you mean '{match[1]}'?" in meant)
+    ]
 
 
 def _missing(diagnostic: Diagnostic) -> str:
@@ -125,7 +138,11 @@ class _Validated:
     def diagnostic(self, e: Any) -> Diagnostic:
         """One of pydantic's errors."""
         path, loc = self.at, []
-        place = e["loc"][:-1] if e["type"] == "missing" else (*e["loc"], *e.get("ctx", {}).get("at", ()))
+        place = (
+            e["loc"][:-1]
+            if e["type"] == "missing"
+            else (*e["loc"], *e.get("ctx", {}).get("at", ()))
+        )
         for part in place:  # leaves out tags of unions
             if (*path, part) in self.document.marks:
                 path = (*path, part)
@@ -143,20 +160,30 @@ class _Validated:
     def unknown(self, key: Any, loc: list[Any], span: Span) -> Diagnostic:
         owner, _ = _field(self.model, loc[:-1])
         fields = (owner or self.model).model_fields
-        options = list(self.keys if self.keys and len(loc) == 1 else (field.alias or name for name, field in fields.items()))
+        options = list(
+            self.keys
+            if self.keys and len(loc) == 1
+            else (field.alias or name for name, field in fields.items())
+        )
         meant = SYNONYMS.get(str(key).lower(), "")
         inner = getattr(owner or self.model, "KEYS_BELONG_IN", "") if "." in str(key) else ""
         known = f"write {inner}: {{{key}: [...]}}" if inner else "not a known key"
         hint = f"did you mean '{meant}'?" if meant in options else nearest(key, options, known)
         inside = self.name(loc[:-1])
         message = f"unknown {'parameter' if self.python else 'key'} '{key}' for {inside}"
-        return Diagnostic(message, span, glued(key, options) or hint, f"{inside} takes: {', '.join(options)}")
+        return Diagnostic(
+            message, span, glued(key, options) or hint, f"{inside} takes: {', '.join(options)}"
+        )
 
     def missing(self, name: str, loc: list[Any], span: Span) -> Diagnostic:
         _, field = _field(self.model, [*loc, name])
         unit = unit_of(field) if field else None
         if self.python and not loc:
-            label = f"add {name}={unit.example!r}" if unit and unit.unit else f"add {name}={unit.example if unit else '...'}"
+            label = (
+                f"add {name}={unit.example!r}"
+                if unit and unit.unit
+                else f"add {name}={unit.example if unit else '...'}"
+            )
         else:
             label = f"add '{name}: {unit.example}'" if unit else f"add '{name}:'"
         return Diagnostic(f"{self.name(loc)} needs '{name}'", span, label, _description(field))
@@ -164,14 +191,18 @@ class _Validated:
     def value(self, e: Any, path: Path, loc: list[Any]) -> Diagnostic:
         _, field = _field(self.model, loc)
         context, span = e.get("ctx", {}), self.document.marks[path].value
-        if isinstance(inner := context.get("error"), ConfigurationError) and inner.diagnostics:  # a call within
+        if (
+            isinstance(inner := context.get("error"), ConfigurationError) and inner.diagnostics
+        ):  # a call within
             first = inner.diagnostics[0]
             return Diagnostic(f"{self.name(loc)}: {first.message}", span, first.label, first.help)
         if caret := context.get("caret"):
             quoted = self.python and isinstance(e["input"], str)
             span = span.inner(caret[0] + 1, caret[1]) if quoted else span.part(*caret)
         message, label = self.message(e, unit_of(field) if field else None, path)
-        message = message[:1].lower() + message[1:] if re.match(r"[A-Z][a-z]+\b", message) else message
+        message = (
+            message[:1].lower() + message[1:] if re.match(r"[A-Z][a-z]+\b", message) else message
+        )
         text = "\n".join(filter(None, (context.get("help"), _description(field))))
         return Diagnostic(f"{self.name(loc)}: {message}", span, label, text)
 
@@ -182,17 +213,37 @@ class _Validated:
             return _limit(e, unit, self.document, path), ""
         if kind == "literal_error":
             expected = context.get("expected", "")
-            return f"must be {expected}, got {given}", nearest(e["input"], re.findall(r"'([^']*)'", expected))
+            return f"must be {expected}, got {given}", nearest(
+                e["input"], re.findall(r"'([^']*)'", expected)
+            )
         if kind == "too_short":
-            return f"needs at least {context['min_length']} of them, got {context['actual_length']}", ""
+            return (
+                f"needs at least {context['min_length']} of them, got {context['actual_length']}",
+                "",
+            )
         if kind == "string_pattern_mismatch":
-            within = ", '.', '+', '-' and spaces within" if " " in context.get("pattern", "") else ""
-            return f"{given} has a character that is not allowed here", f"use letters, digits and '_'{within}"
+            within = (
+                ", '.', '+', '-' and spaces within" if " " in context.get("pattern", "") else ""
+            )
+            return (
+                f"{given} has a character that is not allowed here",
+                f"use letters, digits and '_'{within}",
+            )
         wanted = _WANTED.get(kind.split("_")[0])
-        if wanted and kind.endswith(("_parsing", "_type", "_from_float")) and e["msg"].startswith("Input"):
+        if (
+            wanted
+            and kind.endswith(("_parsing", "_type", "_from_float"))
+            and e["msg"].startswith("Input")
+        ):
             single = kind == "list_type" and isinstance(e["input"], str | int | float)
             label = f"write [{given if self.python else e['input']}]" if single else ""
-            return f"expected {_IN_PYTHON.get(wanted, wanted) if self.python else wanted}, got {given}", label
+            return (
+                (
+                    f"expected {_IN_PYTHON.get(wanted, wanted) if self.python else wanted}, got"
+                    f" {given}"
+                ),
+                label,
+            )
         return str(context.get("error") or e["msg"]), context.get("label") or ""
 
 
@@ -209,7 +260,10 @@ def _limit(e: Any, unit: Unit | None, document: Document, path: Path) -> str:
     try:
         for part in path:
             value = value[part]
-    except (TypeError, LookupError):  # a key that is there twice: its places are of one, its value of the other
+    except (
+        TypeError,
+        LookupError,
+    ):  # a key that is there twice: its places are of one, its value of the other
         value = e["input"]
     limit = e["ctx"][key]
     shown = f"{limit}"
@@ -218,14 +272,23 @@ def _limit(e: Any, unit: Unit | None, document: Document, path: Path) -> str:
     return f"must be {words} {shown}, got {value}"
 
 
-def _field(model: type[BaseModel], loc: Iterable[Any]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
+def _field(
+    model: type[BaseModel], loc: Iterable[Any]
+) -> tuple[type[BaseModel] | None, FieldInfo | None]:
     """The model and the field at ``loc``: what a value there is checked against."""
     owner: type[BaseModel] | None = model
     field: FieldInfo | None = None
     for part in loc:
         if owner is not None and part in owner.model_fields:
             field = described(owner)[part]
-            owner = next((t for t in types_in(field.annotation) if isinstance(t, type) and issubclass(t, BaseModel)), None)
+            owner = next(
+                (
+                    t
+                    for t in types_in(field.annotation)
+                    if isinstance(t, type) and issubclass(t, BaseModel)
+                ),
+                None,
+            )
     return owner, field
 
 

@@ -34,10 +34,17 @@ def find(value: Any, info: ValidationInfo) -> Path:
         if candidate.exists():
             message = f"'{value}' is not a file" + (" but a folder" if candidate.is_dir() else "")
             inside = _names(Path(escape(str(path)), "*"), folders) if candidate.is_dir() else ""
-            raise mistake(message, help=f"it is {candidate}" + (f"; name a file in it: {inside}" if inside else ""))
+            raise mistake(
+                message,
+                help=f"it is {candidate}" + (f"; name a file in it: {inside}" if inside else ""),
+            )
     found = _names(path, folders)
     if found or {"*", "?"} & set(str(value)):
-        stands_for = f"write the names that it stands for: {found}" if found else "write the names of files; it stands for none"
+        stands_for = (
+            f"write the names that it stands for: {found}"
+            if found
+            else "write the names of files; it stands for none"
+        )
         raise mistake(f"'{value}' is a pattern, not the path of a file", help=stands_for)
     where = " and ".join(str(p.parent) for p in tried)
     beside = ((path.name, path.parent.iterdir()) for path in tried if path.parent.is_dir())
@@ -46,9 +53,13 @@ def find(value: Any, info: ValidationInfo) -> Path:
 
 
 def _names(pattern: Path, folders: list[Path]) -> str:
-    """The first files that match in one of the folders, and how many more there are; empty: none."""
+    """The first files that match in one of the folders, and how many more there are; empty:
+    none.
+    """
     for folder in folders:
-        names = sorted(name for name in glob(str(pattern), root_dir=folder) if (folder / name).is_file())
+        names = sorted(
+            name for name in glob(str(pattern), root_dir=folder) if (folder / name).is_file()
+        )
         if names:
             more = [f"and {len(names) - MOST_NAMED} more"] if len(names) > MOST_NAMED else []
             return ", ".join([*names[:MOST_NAMED], *more])
@@ -75,9 +86,13 @@ class InMemory(Protocol):
     """A step that may hold arrays in place of a file that a pipeline file names."""
 
     def in_files(self, path: Path) -> Self:
-        """The step with its arrays in a FITS file at ``path``, to the same bits; itself where it holds none."""
+        """The step with its arrays in a FITS file at ``path``, to the same bits; itself where it
+        holds none.
+        """
         ...
 
 
 InputPath = Annotated[Path, BeforeValidator(find)]
-"""A file to read. A relative path is looked for beside the pipeline file, then in the working directory; it becomes absolute."""
+"""A file to read. A relative path is looked for beside the pipeline file, then in the working
+directory; it becomes absolute.
+"""

@@ -40,16 +40,23 @@ class Header(Parameters):
     requires: list[str] = Field(default_factory=list)
     """Packages and versions this file needs, as pip writes them, e.g. zonda-toltec>=1.2."""
     runs: dict[str, Signal] = Field(default_factory=dict)
-    """Further signals, e.g. noiseless: {only: [sky]} or source_free: {without: [sky]}: what a subset of the components makes."""
+    """Further signals, e.g. noiseless: {only: [sky]} or source_free: {without: [sky]}: what a
+    subset of the components makes.
+    """
     only: list[str] = Field(default_factory=list)
-    """Components that the complete signal is narrowed to (`--only`), at the levels of the whole scene; where absent, all."""
+    """Components that the complete signal is narrowed to (`--only`), at the levels of the whole
+    scene; where absent, all.
+    """
     precision: Literal["float32", "float64"] = "float32"
     """Type of the time streams."""
     accuracy: Accuracy | None = None
-    """Error that the result may have from its approximations, e.g. 1 %, or {target: 1 %, metric: peak}: `zonda run` then takes
-    the cheapest setting of the knobs that a stored Pareto front of `zonda accuracy` shows to meet it, else the tightest."""
+    """Error that the result may have from its approximations, e.g. 1 %, or {target: 1 %, metric:
+    peak}: `zonda run` then takes the cheapest setting of the knobs that a stored Pareto front of
+    `zonda accuracy` shows to meet it, else the tightest."""
     budget: Annotated[Fraction, Field(ge=0, le=1)] | Limits = quantity("10 %")
-    """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g. {map_rms: 3 uK}."""
+    """Errors that the plan may add: a share of the noise (0: simulate everything in full), or e.g.
+    {map_rms: 3 uK}.
+    """
     campaign: Any = None
     """None; a file with a campaign has the header of its `Section`."""
     sweep: Any = None
@@ -66,5 +73,16 @@ class Header(Parameters):
 
 
 SCENE_KEYS = tuple(Scene.model_fields)
-KEYS = ["version", "name", "description", "requires", "seed", "site", "instrument", "time", "target", "weather"]
+KEYS = [
+    "version",
+    "name",
+    "description",
+    "requires",
+    "seed",
+    "site",
+    "instrument",
+    "time",
+    "target",
+    "weather",
+]
 KEYS += [key for key in (*SCENE_KEYS, *Header.model_fields) if key not in KEYS] + ["operators"]

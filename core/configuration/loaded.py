@@ -44,7 +44,8 @@ class PipelineFile:
     header
         Name, description, further signals, precision, folder for products.
     parameters
-        The scene's parameters as the file gives them: names of site and instrument, or their definitions.
+        The scene's parameters as the file gives them: names of site and instrument, or their
+        definitions.
     steps
         The operators, in order.
     place
@@ -93,9 +94,14 @@ class PipelineFile:
         )
 
     def look(
-        self, *, saved: bool = True, scene: Scene | None = None, say: Callable[[str], None] | None = None
+        self,
+        *,
+        saved: bool = True,
+        scene: Scene | None = None,
+        say: Callable[[str], None] | None = None,
     ) -> list[list[str]]:
-        """As `first_look`; raises `ConfigurationError` with all mistakes of the steps, each at its place in the file.
+        """As `first_look`; raises `ConfigurationError` with all mistakes of the steps, each at its
+        place in the file.
 
         ``say`` is told each step before it is looked at.
         """
@@ -114,11 +120,13 @@ class PipelineFile:
         """The file with every default filled in, which loads again to the same thing.
 
         Paths of files in ``folder`` are written from there on: it may move.
-        Site and instrument stay names where they were names, and a variant stays one; what they stand for is written under
-        ``x-resolved``.
+        Site and instrument stay names where they were names, and a variant stays one; what they
+        stand for is written under ``x-resolved``.
         """
         header = self.header.model_dump(mode="json")
-        header["runs"] = {name: run.model_dump(mode="json", exclude_none=True) for name, run in self.runs.items()}
+        header["runs"] = {
+            name: run.model_dump(mode="json", exclude_none=True) for name, run in self.runs.items()
+        }
         del header["sweep"]  # it is a campaign now
         if self.header.campaign is None:
             del header["campaign"]
@@ -127,12 +135,18 @@ class PipelineFile:
         scene = self._scene.model_dump(mode="json")
         for kind in ("site", "instrument"):  # each as its own class, with all its fields
             scene[kind] = getattr(self._scene, kind).model_dump(mode="json")
-        given = {kind: self.parameters.get(kind) for kind in ("site", "instrument")}  # None: recorded data bring it
+        given = {
+            kind: self.parameters.get(kind) for kind in ("site", "instrument")
+        }  # None: recorded data bring it
         named = {
-            kind: scene[kind] for kind, value in given.items() if value is None or isinstance(value, str) or is_variant(value)
+            kind: scene[kind]
+            for kind, value in given.items()
+            if value is None or isinstance(value, str) or is_variant(value)
         }
         values = header | scene | {kind: given[kind] for kind in named}
-        values = {key: value for key, value in values.items() if key not in given or value is not None}
+        values = {
+            key: value for key, value in values.items() if key not in given or value is not None
+        }
         if is_variant(given["instrument"]):
             values["instrument"] = written(self.parameters["instrument"], self._scene.instrument)
         tree = {key: values[key] for key in KEYS if key in values}
@@ -152,7 +166,11 @@ def refusal(document: Document, step: Step, err: ZondaError) -> Diagnostic:
     at = document.mark(step.at)
     for name in type(step.operator).model_fields:
         value = getattr(step.operator, name)
-        if isinstance(value, os.PathLike) and str(value) in f"{err.place} {err.message}" and (*step.at, name) in document.marks:
+        if (
+            isinstance(value, os.PathLike)
+            and str(value) in f"{err.place} {err.message}"
+            and (*step.at, name) in document.marks
+        ):
             return refused(err, document.mark((*step.at, name)).value)
     return refused(err, at.start)
 
@@ -169,12 +187,17 @@ def _from_there(value: Any, folder: str) -> Any:
 def _filled(operator: Operator) -> dict[str, Any]:
     """All parameters of an operator, but for those that do not apply beside the others.
 
-    Left out are parameters that are absent (None) by default and in fact, and defaults that the operator refuses when they
-    are written down (e.g. the ordering of HEALPix pixels for a map that is not HEALPix).
+    Left out are parameters that are absent (None) by default and in fact, and defaults that the
+    operator refuses when they are written down (e.g. the ordering of HEALPix pixels for a map that
+    is not HEALPix).
     """
     model, fields = type(operator), type(operator).model_fields
     values = operator.model_dump(mode="json")
-    values = {k: v for k, v in values.items() if v is not None or (k in fields and fields[k].get_default() is not None)}
+    values = {
+        k: v
+        for k, v in values.items()
+        if v is not None or (k in fields and fields[k].get_default() is not None)
+    }
     if _accepts(model, values):
         return values
     kept = set(operator.model_fields_set)

@@ -15,7 +15,9 @@ MAXIMUM_BYTES = 10_000_000
 
 def shipped() -> dict[str, Path]:
     """The shipped pipelines by name."""
-    return {path.stem: path for path in sorted(Path(zonda.pipelines.__file__).parent.glob("*.yaml"))}
+    return {
+        path.stem: path for path in sorted(Path(zonda.pipelines.__file__).parent.glob("*.yaml"))
+    }
 
 
 def folders() -> dict[str, Path]:
@@ -26,9 +28,15 @@ def folders() -> dict[str, Path]:
 
 
 def locate(path_or_name: str | Path) -> Path:
-    """The file that a path, or a shipped pipeline's name, stands for. Raises InputError where there is none."""
+    """The file that a path, or a shipped pipeline's name, stands for. Raises InputError where there
+    is none.
+    """
     if not isinstance(path_or_name, str | Path):
-        raise InputError("is not a path", place=f"{path_or_name!r:.60}", cure=f"give the path of a YAML file; {SHIPPED}")
+        raise InputError(
+            "is not a path",
+            place=f"{path_or_name!r:.60}",
+            cure=f"give the path of a YAML file; {SHIPPED}",
+        )
     path, name = Path(path_or_name), str(path_or_name)
     with suppress(RuntimeError):  # nobody of that name: take ~ as it stands
         path = path.expanduser()
@@ -40,14 +48,23 @@ def locate(path_or_name: str | Path) -> Path:
                 return file
     if path.is_dir():
         inside = sorted(p.name for p in path.glob("*.y*ml"))
-        cure = f"name a file in it, e.g. {path / inside[0]}" if inside else "give the path of a YAML file"
+        cure = (
+            f"name a file in it, e.g. {path / inside[0]}"
+            if inside
+            else "give the path of a YAML file"
+        )
         raise InputError("is a folder, not a pipeline file", place=name, cure=cure)
     if not path.exists():
-        beside = [str(path.parent / p.name) for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
+        beside = (
+            [str(path.parent / p.name) for p in path.parent.glob("*.y*ml")]
+            if path.parent.is_dir()
+            else []
+        )
         from .diagnostics import nearest
 
         cure = (
-            nearest(name, [*shipped(), *folders(), *beside]) or f"give the path of a YAML file or one of: {', '.join(shipped())}"
+            nearest(name, [*shipped(), *folders(), *beside])
+            or f"give the path of a YAML file or one of: {', '.join(shipped())}"
         )
         raise InputError("no such pipeline file or shipped pipeline", place=name, cure=cure)
     return path
@@ -59,9 +76,13 @@ def read(path: Path) -> str:
         with path.open("rb") as file:
             content = file.read(MAXIMUM_BYTES + 1)
     except OSError as err:
-        raise InputError(f"cannot be read: {err.strerror}", place=str(path), cure="check its permissions") from None
+        raise InputError(
+            f"cannot be read: {err.strerror}", place=str(path), cure="check its permissions"
+        ) from None
     if len(content) > MAXIMUM_BYTES:
-        raise InputError("is too large for a pipeline file", place=str(path), cure="give the path of a YAML file")
+        raise InputError(
+            "is too large for a pipeline file", place=str(path), cure="give the path of a YAML file"
+        )
     _check_kind(path, content)
     try:
         return content.decode("utf-8-sig")
@@ -69,14 +90,20 @@ def read(path: Path) -> str:
         line = content.count(b"\n", 0, err.start) + 1
         column = err.start - (content.rfind(b"\n", 0, err.start) + 1) + 1
         message = f"is not UTF-8 text (byte 0x{content[err.start]:02x})"
-        raise InputError(message, place=f"{path}:{line}:{column}", cure="save it as UTF-8") from None
+        raise InputError(
+            message, place=f"{path}:{line}:{column}", cure="save it as UTF-8"
+        ) from None
 
 
 SHIPPED = "`zonda pipelines` lists those that have names"
 _DATA = "give the path of a YAML file; `zonda pipelines` lists examples"
 _KINDS = (
     (b"SIMPLE  =", "a FITS file", "to observe it, name it in a pipeline: <sky>"),
-    (b"\x89HDF\r\n", "an HDF5 file", "to observe with its pointing, name it in a pipeline: <boresight>"),
+    (
+        b"\x89HDF\r\n",
+        "an HDF5 file",
+        "to observe with its pointing, name it in a pipeline: <boresight>",
+    ),
     (b"\x93NUMPY", "a NumPy array", _DATA),
     (b"CDF\x01", "a NetCDF file", "a reanalysis is named in a pipeline: weather: {file: <name>}"),
     (b"CDF\x02", "a NetCDF file", "a reanalysis is named in a pipeline: weather: {file: <name>}"),
@@ -93,7 +120,9 @@ _KINDS = (
     (b"<html", "a web page", "download the file itself, not the page that shows it"),
     (b"<?xml", "an XML file", _DATA),
 )
-"""How files begin that are no pipeline files, what they are, and what to do with them; ``<sky>``: the step that reads it."""
+"""How files begin that are no pipeline files, what they are, and what to do with them; ``<sky>``:
+the step that reads it.
+"""
 
 
 def _check_kind(path: Path, content: bytes) -> None:
@@ -104,11 +133,19 @@ def _check_kind(path: Path, content: bytes) -> None:
             for what in ("sky", "boresight"):
                 if f"<{what}>" in cure:
                     cure = cure.replace(f"<{what}>", _reader(what))
-            raise InputError(f"is {kind}, not a pipeline file", place=str(path), cure=cure.replace("<name>", path.name))
+            raise InputError(
+                f"is {kind}, not a pipeline file",
+                place=str(path),
+                cure=cure.replace("<name>", path.name),
+            )
     if b"\0" in content:
         raise InputError("is a binary file, not a pipeline file", place=str(path), cure=_DATA)
     if path.suffix == ".py":
-        raise InputError("is a Python script, not a pipeline file", place=str(path), cure=f"run it: python {path}")
+        raise InputError(
+            "is a Python script, not a pipeline file",
+            place=str(path),
+            cure=f"run it: python {path}",
+        )
 
 
 def _reader(what: str) -> str:
@@ -116,4 +153,7 @@ def _reader(what: str) -> str:
     from ..registry import makers, operators
 
     names = [name for name in makers(what) if "file" in operators.get(name).model_fields]
-    return " or ".join(f"- {name}: {{file: <name>}}" for name in names) or f"a step that provides {what}"
+    return (
+        " or ".join(f"- {name}: {{file: <name>}}" for name in names)
+        or f"a step that provides {what}"
+    )

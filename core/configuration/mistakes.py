@@ -28,7 +28,9 @@ class Mistakes:
         Where relative paths in the document are looked for first.
     """
 
-    def __init__(self, document: Document, folder: str | Path | None, found: list[Diagnostic]) -> None:
+    def __init__(
+        self, document: Document, folder: str | Path | None, found: list[Diagnostic]
+    ) -> None:
         self.document, self.found = document, found
         self.context = {"folder": folder}
 
@@ -36,8 +38,12 @@ class Mistakes:
         """Note a mistake."""
         self.found.append(Diagnostic(message, span, label, help))
 
-    def validate(self, model: type[P], value: Any, at: Place, who: str, keys: Iterable[str] = ()) -> P | None:
-        """What ``value`` at ``at`` describes; None where it is mistaken. ``who`` and ``keys`` as `explain` takes them."""
+    def validate(
+        self, model: type[P], value: Any, at: Place, who: str, keys: Iterable[str] = ()
+    ) -> P | None:
+        """What ``value`` at ``at`` describes; None where it is mistaken. ``who`` and ``keys`` as
+        `explain` takes them.
+        """
         try:
             return model.model_validate(value, context=self.context)
         except ValidationError as err:

@@ -7,7 +7,14 @@ import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, PydanticUserError, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    PydanticUserError,
+    ValidationError,
+)
 
 from ..errors import ZondaError
 from ..notebook import html_table
@@ -24,7 +31,8 @@ def quantity(default: str, **limits: Any) -> Any:
 
 
 def named(names: Any, value: Any) -> Any:
-    """What a registered name stands for (``names``: a `core.registry.Registry`); what is no text is returned as it is.
+    """What a registered name stands for (``names``: a `core.registry.Registry`); what is no text is
+    returned as it is.
 
     Raises PydanticCustomError, which is shown at the value's place.
     """
@@ -41,12 +49,15 @@ if TYPE_CHECKING:
 else:
 
     class _Shown(type(BaseModel)):
-        """How classes of parameters look to `help()` and to tab completion: their parameters, without pydantic's own names.
+        """How classes of parameters look to `help()` and to tab completion: their parameters,
+        without pydantic's own names.
 
         All is worked out when somebody asks.
         """
 
-        def __new__(mcls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **more: Any) -> Any:
+        def __new__(
+            mcls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **more: Any
+        ) -> Any:
             """Raises ZondaError for what is neither a parameter nor a constant."""
             try:
                 return super().__new__(mcls, name, bases, namespace, **more)
@@ -80,7 +91,11 @@ else:
             return tuple(c for c in order if c is not BaseModel) if shown else order
 
         def __dir__(cls) -> list[str]:
-            return [name for name in sorted(super().__dir__()) if name not in _PYDANTICS and not name.startswith("__")]
+            return [
+                name
+                for name in sorted(super().__dir__())
+                if name not in _PYDANTICS and not name.startswith("__")
+            ]
 
 
 _PYDANTICS = {name for name in dir(BaseModel) if name not in dir(object)} | {
@@ -92,9 +107,13 @@ _PYDANTICS = {name for name in dir(BaseModel) if name not in dir(object)} | {
 
 
 class Parameters(BaseModel, metaclass=_Shown):
-    """A frozen, validated parameter set. Attribute docstrings become schema descriptions and error messages."""
+    """A frozen, validated parameter set. Attribute docstrings become schema descriptions and error
+    messages.
+    """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False
+    )
 
     if not TYPE_CHECKING:  # a type checker sees the fields
 
@@ -112,7 +131,9 @@ class Parameters(BaseModel, metaclass=_Shown):
 
                 raise mistakes_of(err, type(self), given) from None
 
-        __init__.__pydantic_base_init__ = True  # what is validated as a field is not made by it: contexts and places are kept
+        __init__.__pydantic_base_init__ = (
+            True  # what is validated as a field is not made by it: contexts and places are kept
+        )
 
         def __setattr__(self, name: str, value: Any) -> None:
             try:
@@ -124,7 +145,8 @@ class Parameters(BaseModel, metaclass=_Shown):
 
     def __repr__(self) -> str:
         """The call that makes an equal one: what was given, in units that people use."""
-        return f"{type(self).__name__}({', '.join(f'{name}={text}' for name, text in self._arguments().items())})"
+        given = ", ".join(f"{name}={text}" for name, text in self._arguments().items())
+        return f"{type(self).__name__}({given})"
 
     __str__ = __repr__
 
@@ -132,17 +154,30 @@ class Parameters(BaseModel, metaclass=_Shown):
         given = self._arguments()
         dumped = self.model_dump(mode="json")
         rest = [
-            (name, dumped[name]) for name in type(self).model_fields if name not in given and dumped.get(name) not in (None, "")
+            (name, dumped[name])
+            for name in type(self).model_fields
+            if name not in given and dumped.get(name) not in (None, "")
         ]
-        return html_table(type(self).__name__, [*given.items(), *((name, f"{value} (default)") for name, value in rest)])
+        return html_table(
+            type(self).__name__,
+            [*given.items(), *((name, f"{value} (default)") for name, value in rest)],
+        )
 
     def __dir__(self) -> list[str]:
-        return [name for name in sorted(super().__dir__()) if name not in _PYDANTICS and not name.startswith("__pydantic")]
+        return [
+            name
+            for name in sorted(super().__dir__())
+            if name not in _PYDANTICS and not name.startswith("__pydantic")
+        ]
 
     def _arguments(self) -> dict[str, str]:
         """What was given, by name, as Python text."""
         dumped = self.model_dump(mode="json", include=self.model_fields_set)
-        keys = {name: field.alias or name for name, field in type(self).model_fields.items() if name in self.model_fields_set}
+        keys = {
+            name: field.alias or name
+            for name, field in type(self).model_fields.items()
+            if name in self.model_fields_set
+        }
         return {key: _written(getattr(self, name), dumped.get(key)) for name, key in keys.items()}
 
     def _as_argument(self) -> str:
@@ -154,7 +189,9 @@ class Parameters(BaseModel, metaclass=_Shown):
         remember_place(cls)
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        cls, schema: Any, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         made = handler(schema)
         resolved = handler.resolve_ref_schema(made)
         properties = resolved.get("properties", {})
@@ -167,7 +204,9 @@ class Parameters(BaseModel, metaclass=_Shown):
 
 
 def named_or_written(component: Any, names: Any) -> str:
-    """The name under which ``component`` is registered in ``names``, quoted; where it is not, the call that makes it."""
+    """The name under which ``component`` is registered in ``names``, quoted; where it is not, the
+    call that makes it.
+    """
     with suppress(ZondaError):
         if component.name in names and names.create(component.name) == component:
             return repr(component.name)

@@ -1,4 +1,6 @@
-"""Pipeline files: from YAML text to a scene and checked operators, with every mistake reported at its place."""
+"""Pipeline files: from YAML text to a scene and checked operators, with every mistake reported at
+its place.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,10 @@ from .steps import noun, read_steps
 from .target import WithMap
 from .yaml_places import Document, Source, Span
 
-EXAMPLE = "write at least: site, instrument, time, and operators (a list of steps); `zonda pipelines` lists examples"
+EXAMPLE = (
+    "write at least: site, instrument, time, and operators (a list of steps); `zonda pipelines`"
+    " lists examples"
+)
 
 MOST_STEPS = 1000
 """Longer pipelines are refused before they are looked at."""
@@ -71,7 +76,13 @@ def load(path_or_name: str | Path, overrides: Iterable[str] = ()) -> PipelineFil
     return parse(read(path), name=str(path), folder=path.parent, overrides=overrides)
 
 
-def parse(text: str, *, name: str = "<text>", folder: str | Path | None = None, overrides: Iterable[str] = ()) -> PipelineFile:
+def parse(
+    text: str,
+    *,
+    name: str = "<text>",
+    folder: str | Path | None = None,
+    overrides: Iterable[str] = (),
+) -> PipelineFile:
     """As `load`, from text; relative paths in it are looked for in ``folder`` first."""
     source = Source(name, text)
     document = yaml_places.load(source, longest={"operators": MOST_STEPS})
@@ -91,34 +102,54 @@ def parse(text: str, *, name: str = "<text>", folder: str | Path | None = None, 
 class _Check(Mistakes):
     """Turns a document into a `PipelineFile`, gathering mistakes on the way."""
 
-    def __init__(self, document: Document, name: str, folder: str | Path | None, found: list[Diagnostic]) -> None:
+    def __init__(
+        self, document: Document, name: str, folder: str | Path | None, found: list[Diagnostic]
+    ) -> None:
         super().__init__(document, folder, found)
         self.name, self.band_unknown = name, False
-        self.recorded_at: tuple[str, int] = ("operators", 0)  # the step that brings its own site and instrument
+        self.recorded_at: tuple[str, int] = (
+            "operators",
+            0,
+        )  # the step that brings its own site and instrument
         self.tree: dict[Any, Any] = document.value
 
     def run(self) -> PipelineFile:
         for key in ("sweep", "campaign"):
             if self.tree.get(key) is not None:
                 self.found += registry.sections.get(key).rewrite(self.document)
-        kind: type[Header] = Header if self.tree.get("campaign") is None else registry.sections.get("campaign").header
-        head = {k: v for k, v in self.tree.items() if k not in (*SCENE_KEYS, "operators") and not str(k).startswith("x-")}
+        kind: type[Header] = (
+            Header
+            if self.tree.get("campaign") is None
+            else registry.sections.get("campaign").header
+        )
+        head = {
+            k: v
+            for k, v in self.tree.items()
+            if k not in (*SCENE_KEYS, "operators") and not str(k).startswith("x-")
+        }
         header = self.validate(kind, head, (), "the pipeline", KEYS)
         self.sizes()
         self.requirements()
         steps = read_steps(self)
-        number = next((i for i, s in enumerate(steps) if s is not None and isinstance(s.operator, WithScene)), None)
+        number = next(
+            (i for i, s in enumerate(steps) if s is not None and isinstance(s.operator, WithScene)),
+            None,
+        )
         recorded = None if number is None else steps[number]
         self.recorded_at = "operators", number or 0
         before = len(self.found)
         scene = self.scene(None if recorded is None else recorded.operator)
         if self.recorded_lost(steps):
-            self.found[before:] = [m for m in self.found[before:] if not m.message.startswith("the pipeline needs '")]
+            self.found[before:] = [
+                m for m in self.found[before:] if not m.message.startswith("the pipeline needs '")
+            ]
         if header is not None:
             self.runs(header, steps)
         if header is not None and header.campaign is not None:
             section = registry.sections.get("campaign")
-            self.found = section.mistakes(self.document, header.campaign, self.found, self.without_campaign)
+            self.found = section.mistakes(
+                self.document, header.campaign, self.found, self.without_campaign
+            )
         if scene is not None and not self.found and self.target_of_map:
             scene = self.targeted(scene, [s.operator for s in steps if s is not None])
         if self.found:
@@ -129,7 +160,9 @@ class _Check(Mistakes):
         assert scene is not None
         stem = re.sub(r"[^\w.+-]", "_", Path(self.name).stem).lstrip("_.+-") or "pipeline"
         name = header.name or stem
-        header = header.model_copy(update={"name": name, "outputs": header.outputs or Path("out") / name})
+        header = header.model_copy(
+            update={"name": name, "outputs": header.outputs or Path("out") / name}
+        )
         own = OWN if recorded is not None else frozenset[str]()
         parameters = {k: self.tree[k] for k in SCENE_KEYS if k in self.tree and k not in own}
         made = tuple(s for s in steps if s is not None)
@@ -137,28 +170,51 @@ class _Check(Mistakes):
 
     def recorded_lost(self, steps: list[Step | None]) -> bool:
         """Whether a step that brings its own site, instrument and time could not be made."""
-        written = [item for item, step in zip(self.tree["operators"], steps, strict=True) if step is None] if steps else []
-        names = {next(iter(item), None) if isinstance(item, dict) else item for item in written if isinstance(item, dict | str)}
-        return bool(names) and not names.isdisjoint(registry.operators_that(lambda step: issubclass(step, WithScene)))
+        written = (
+            [item for item, step in zip(self.tree["operators"], steps, strict=True) if step is None]
+            if steps
+            else []
+        )
+        names = {
+            next(iter(item), None) if isinstance(item, dict) else item
+            for item in written
+            if isinstance(item, dict | str)
+        }
+        return bool(names) and not names.isdisjoint(
+            registry.operators_that(lambda step: issubclass(step, WithScene))
+        )
 
     def look(self, steps: list[Step | None], scene: Scene) -> None:
-        """Add what the steps that could be made would refuse: targets that are not up, files that are wrong."""
-        with warnings.catch_warnings(), suppress(Exception):  # the mistakes that are known come first
+        """Add what the steps that could be made would refuse: targets that are not up, files that
+        are wrong.
+        """
+        with (
+            warnings.catch_warnings(),
+            suppress(Exception),
+        ):  # the mistakes that are known come first
             warnings.simplefilter("ignore")
-            for number, err in looks([None if step is None else step.operator for step in steps], scene)[1]:
+            for number, err in looks(
+                [None if step is None else step.operator for step in steps], scene
+            )[1]:
                 step = steps[number]
                 if step is not None:
                     self.found.append(refusal(self.document, step, err))
 
     def sizes(self) -> None:
-        """Raise `ConfigurationError` for more steps (of an alias; those written are counted before) or entries than allowed."""
+        """Raise `ConfigurationError` for more steps (of an alias; those written are counted before)
+        or entries than allowed.
+        """
         items, campaign = self.tree.get("operators"), self.tree.get("campaign")
         many = isinstance(items, list) and len(items) > MOST_STEPS
         if many:
             at = self.document.mark(("operators",)).start
-            self.wrong(f"a pipeline of {len(items or [])} steps", at, "", f"write at most {MOST_STEPS}")
+            self.wrong(
+                f"a pipeline of {len(items or [])} steps", at, "", f"write at most {MOST_STEPS}"
+            )
         if isinstance(campaign, dict) and not many:
-            many = registry.sections.get("campaign").too_large(campaign)  # the header's own check has said so
+            many = registry.sections.get("campaign").too_large(
+                campaign
+            )  # the header's own check has said so
         if many:
             raise ConfigurationError(without_meant(self.found), self.name)
 
@@ -174,7 +230,9 @@ class _Check(Mistakes):
         if with_map is None:
             have = " or ".join(registry.operators_that(lambda step: issubclass(step, WithMap)))
             cure = f"add {have}, or give a position" if have else "give a position"
-            self.wrong("target: map takes the centre of an input map, and no step has one", at, "", cure)
+            self.wrong(
+                "target: map takes the centre of an input map, and no step has one", at, "", cure
+            )
             return scene
         try:
             return scene.model_copy(update={"target": with_map.map_centre()})
@@ -207,30 +265,59 @@ class _Check(Mistakes):
                 requirement = Requirement(text)
                 have = __version__ if requirement.name == "zonda" else version(requirement.name)
             except InvalidRequirement:
-                self.wrong(f"'{text}' is not a requirement", at, "write it as pip does, e.g. zonda-toltec>=1.2")
+                self.wrong(
+                    f"'{text}' is not a requirement",
+                    at,
+                    "write it as pip does, e.g. zonda-toltec>=1.2",
+                )
             except PackageNotFoundError:
-                self.wrong(f"this pipeline needs the package {requirement.name}", at, "not installed", f"pip install '{text}'")
+                self.wrong(
+                    f"this pipeline needs the package {requirement.name}",
+                    at,
+                    "not installed",
+                    f"pip install '{text}'",
+                )
             else:
                 if not requirement.specifier.contains(have, prereleases=True):
-                    self.wrong(f"this pipeline needs {text}", at, f"{have} is installed", f"pip install '{text}'")
+                    self.wrong(
+                        f"this pipeline needs {text}",
+                        at,
+                        f"{have} is installed",
+                        f"pip install '{text}'",
+                    )
 
     def scene(self, recorded: Any = None) -> Scene | None:
         """The scene; names are looked up one by one, so that each is reported at its own place.
 
-        ``recorded``: a step that brings its own site and instrument, which stand above those of the file.
+        ``recorded``: a step that brings its own site and instrument, which stand above those of the
+        file.
         """
-        given = {key: self.tree[key] for key in SCENE_KEYS if key in self.tree and not (key == "target" and self.target_of_map)}
+        given = {
+            key: self.tree[key]
+            for key in SCENE_KEYS
+            if key in self.tree and not (key == "target" and self.target_of_map)
+        }
         lost = set()
         for kind, names in (("site", registry.sites), ("instrument", registry.instruments)):
             if kind in given and not self.named(given, kind, names, (kind,)):
                 lost.add(kind)
         if isinstance(given.get("instrument"), dict):
             given["instrument"] = dict(given["instrument"])
-            if not self.named(given["instrument"], LIKE, registry.instruments, ("instrument", LIKE)):
+            if not self.named(
+                given["instrument"], LIKE, registry.instruments, ("instrument", LIKE)
+            ):
                 lost.add("instrument")
-            own = LIKE in given["instrument"] or given["instrument"].get("bands")  # which say more of an unknown band
-            if not own and not self.named(given["instrument"], "band", registry.bands, ("instrument", "band")):
-                given["instrument"]["band"] = {"name": "", "low": "1 Hz", "high": "2 Hz"}  # goes on to find the other mistakes
+            own = LIKE in given["instrument"] or given["instrument"].get(
+                "bands"
+            )  # which say more of an unknown band
+            if not own and not self.named(
+                given["instrument"], "band", registry.bands, ("instrument", "band")
+            ):
+                given["instrument"]["band"] = {
+                    "name": "",
+                    "low": "1 Hz",
+                    "high": "2 Hz",
+                }  # goes on to find the other mistakes
                 self.band_unknown = True
         if given.get("weather") is not None:
             given["weather"] = self.weather(given["weather"])
@@ -245,8 +332,14 @@ class _Check(Mistakes):
         return scene
 
     def recorded(self, step: Any, given: dict[str, Any]) -> Scene | None:
-        """The scene with the instrument and the site that a step brings; its time, where none is given."""
-        told = self.validate(Scene, {**UNKNOWN, **given}, (), "the pipeline", KEYS) if "instrument" in given else None
+        """The scene with the instrument and the site that a step brings; its time, where none is
+        given.
+        """
+        told = (
+            self.validate(Scene, {**UNKNOWN, **given}, (), "the pipeline", KEYS)
+            if "instrument" in given
+            else None
+        )
         if told is None and "instrument" in given:
             return None
         try:
@@ -261,7 +354,9 @@ class _Check(Mistakes):
         for key in sorted(OWN & given.keys()):
             if getattr(scene, key).name != above[key].name:
                 text = f"{step.label}: {key} is that of the recorded data, {above[key].name}"
-                warnings.warn(f"{text}; {getattr(scene, key).name} of this file is not used", stacklevel=2)
+                warnings.warn(
+                    f"{text}; {getattr(scene, key).name} of this file is not used", stacklevel=2
+                )
         return scene.model_copy(update=above)
 
     def weather(self, value: Any) -> WeatherSource | None:

@@ -23,7 +23,9 @@ _MODE: JsonSchemaMode = "validation"
 
 
 def json_schema() -> dict[str, Any]:
-    """Schema (draft 2020-12) of pipeline files: one property per installed operator; broken plugins are left out."""
+    """Schema (draft 2020-12) of pipeline files: one property per installed operator; broken plugins
+    are left out.
+    """
     classes: dict[str, type[Operator]] = {}
     for found in registry.operators.candidates():
         twice = sum(other.name == found.name for other in registry.operators.candidates()) > 1
@@ -35,25 +37,48 @@ def json_schema() -> dict[str, Any]:
         classes[found.qualified if twice else found.name] = operator
     weather = _weather()
     top: type[BaseModel] = registry.sections.get("campaign").header
-    wanted: list[type[BaseModel]] = [top, Scene, *dict.fromkeys([*classes.values(), *weather.values()])]
+    wanted: list[type[BaseModel]] = [
+        top,
+        Scene,
+        *dict.fromkeys([*classes.values(), *weather.values()]),
+    ]
     models = [(model, _MODE) for model in wanted]
     references, definitions = models_json_schema(models, ref_template="#/$defs/{model}")
     defs = definitions.get("$defs", {})
-    header, scene = (defs.pop(references[model, _MODE]["$ref"].rpartition("/")[2]) for model in (top, Scene))
+    header, scene = (
+        defs.pop(references[model, _MODE]["$ref"].rpartition("/")[2]) for model in (top, Scene)
+    )
     properties = header["properties"] | scene["properties"]
     for kind, names in (("site", registry.sites), ("instrument", registry.instruments)):
         properties[kind] = _name_or(properties[kind], names)
-    sources = [{"type": "string", "enum": list(weather)}, *(references[model, _MODE] for model in weather.values())]
-    properties["weather"] = {"anyOf": [*sources, {"type": "null"}], "description": properties["weather"]["description"]}
+    sources = [
+        {"type": "string", "enum": list(weather)},
+        *(references[model, _MODE] for model in weather.values()),
+    ]
+    properties["weather"] = {
+        "anyOf": [*sources, {"type": "null"}],
+        "description": properties["weather"]["description"],
+    }
     for definition in defs.values():
         if definition.get("title") == "Instrument":
-            definition["properties"]["band"] = _name_or(definition["properties"]["band"], registry.bands)
+            definition["properties"]["band"] = _name_or(
+                definition["properties"]["band"], registry.bands
+            )
             several = definition["properties"]["bands"]
             several["items"] = _name_or(several["items"], registry.bands)
-            definition["required"] = [key for key in definition["required"] if key not in ("band", "field_of_view", *PER_BAND)]
+            definition["required"] = [
+                key
+                for key in definition["required"]
+                if key not in ("band", "field_of_view", *PER_BAND)
+            ]
             properties["instrument"]["anyOf"].append(_variant(definition))
     steps = _step(classes, references)
-    properties["operators"] = {"type": "array", "minItems": 1, "description": "Steps, in order.", "items": steps}
+    properties["operators"] = {
+        "type": "array",
+        "minItems": 1,
+        "description": "Steps, in order.",
+        "items": steps,
+    }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "zonda pipeline",
@@ -76,18 +101,40 @@ def _weather() -> dict[str, type[BaseModel]]:
 
 
 def _variant(instrument: dict[str, Any]) -> dict[str, Any]:
-    """A registered instrument with some of its fields changed; what a telescope takes is left to `zonda check`."""
-    name = {"type": "string", "examples": list(registry.instruments), "description": "Registered instrument that is varied."}
-    fields = instrument["properties"] | {"telescope": {"type": "object", "description": "What differs of the telescope."}}
-    return {"type": "object", "properties": {LIKE: name} | fields, "required": [LIKE], "additionalProperties": False}
+    """A registered instrument with some of its fields changed; what a telescope takes is left to
+    `zonda check`.
+    """
+    name = {
+        "type": "string",
+        "examples": list(registry.instruments),
+        "description": "Registered instrument that is varied.",
+    }
+    fields = instrument["properties"] | {
+        "telescope": {"type": "object", "description": "What differs of the telescope."}
+    }
+    return {
+        "type": "object",
+        "properties": {LIKE: name} | fields,
+        "required": [LIKE],
+        "additionalProperties": False,
+    }
 
 
 def _step(classes: dict[str, type[Operator]], references: Any) -> dict[str, Any]:
     properties = {
-        name: {"anyOf": [references[model, _MODE], {"type": "null"}], "description": own_doc(model).split("\n")[0]}
+        name: {
+            "anyOf": [references[model, _MODE], {"type": "null"}],
+            "description": own_doc(model).split("\n")[0],
+        }
         for name, model in classes.items()
     }
-    whole = {"type": "object", "properties": properties, "minProperties": 1, "maxProperties": 1, "additionalProperties": False}
+    whole = {
+        "type": "object",
+        "properties": properties,
+        "minProperties": 1,
+        "maxProperties": 1,
+        "additionalProperties": False,
+    }
     return {"anyOf": [whole, {"enum": list(classes)}]}
 
 

@@ -1,4 +1,6 @@
-"""A key of pipeline files whose meaning lives above configuration: entry-point group ``zonda.sections``, by the key."""
+"""A key of pipeline files whose meaning lives above configuration: entry-point group
+``zonda.sections``, by the key.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ class Section:
 
     @staticmethod
     def too_large(value: Any) -> bool:
-        """Whether the mapping, as it was written, is larger than allowed: nothing else is checked then."""
+        """Whether the mapping, as it was written, is larger than allowed: nothing else is checked
+        then.
+        """
         return False
 
     @staticmethod
@@ -29,9 +33,13 @@ class Section:
 
     @staticmethod
     def mistakes(
-        document: Document, value: Any, known: list[Diagnostic], check: Callable[[Document], list[Diagnostic]]
+        document: Document,
+        value: Any,
+        known: list[Diagnostic],
+        check: Callable[[Document], list[Diagnostic]],
     ) -> list[Diagnostic]:
-        """All mistakes of a document: ``known`` ones, perhaps reworded, and those in the section's ``value``.
+        """All mistakes of a document: ``known`` ones, perhaps reworded, and those in the section's
+        ``value``.
 
         ``check`` lists the mistakes of a document without the section.
         """

@@ -20,11 +20,24 @@ def read_steps(mistakes: Mistakes) -> list[Step | None]:
     items = mistakes.document.value.get("operators")
     if not isinstance(items, list) or not items:
         there = ("operators",) in mistakes.document.marks
-        span = mistakes.document.mark(("operators",)).start if there else Span(mistakes.document.mark(()).value.source)
+        span = (
+            mistakes.document.mark(("operators",)).start
+            if there
+            else Span(mistakes.document.mark(()).value.source)
+        )
         empty = items is None or items == []
-        have = "'operators' is empty: it must be a list of steps" if empty else "'operators' must be a list of steps"
+        have = (
+            "'operators' is empty: it must be a list of steps"
+            if empty
+            else "'operators' must be a list of steps"
+        )
         message = have if there else "the pipeline needs 'operators', a list of steps"
-        mistakes.wrong(message, span, "" if there else "add 'operators:'", "write one '- Name: {parameter: value}' per step")
+        mistakes.wrong(
+            message,
+            span,
+            "" if there else "add 'operators:'",
+            "write one '- Name: {parameter: value}' per step",
+        )
         return []
     steps: list[Step | None] = []
     standing: list[tuple[int, Operator]] = []  # what takes part in the check of the order
@@ -41,13 +54,19 @@ def read_steps(mistakes: Mistakes) -> list[Step | None]:
         if i < unknown:  # an unknown step may provide anything
             mark = mistakes.document.mark(("operators", i))
             name = next(iter(items[i])) if isinstance(items[i], dict) else None
-            span = mistakes.document.mark(("operators", i, name)).start if name is not None else mark.value
+            span = (
+                mistakes.document.mark(("operators", i, name)).start
+                if name is not None
+                else mark.value
+            )
             mistakes.wrong(problem.message, span, problem.label, problem.cure)
     return steps
 
 
 def _step(mistakes: Mistakes, item: Any, at: Path) -> tuple[Step | None, Operator | None]:
-    """A step, and what stands for it in the check of the order: both None where the operator is not known."""
+    """A step, and what stands for it in the check of the order: both None where the operator is not
+    known.
+    """
     name: Any
     parameters: Any
     if isinstance(item, str):  # - BinMap
@@ -58,10 +77,17 @@ def _step(mistakes: Mistakes, item: Any, at: Path) -> tuple[Step | None, Operato
         span = mistakes.document.mark(inner).start
         parameters = {} if parameters is None else parameters
     else:
-        message, span, label = "each step is one operator: '- Name: {...}'", mistakes.document.mark(at).value, ""
+        message, span, label = (
+            "each step is one operator: '- Name: {...}'",
+            mistakes.document.mark(at).value,
+            "",
+        )
         if isinstance(item, dict) and item:
             second = list(item)[1]
-            span, label = mistakes.document.mark((*at, second)).start, "indent this under the operator"
+            span, label = (
+                mistakes.document.mark((*at, second)).start,
+                "indent this under the operator",
+            )
             message += f"; '{second}' may be indented too little"
         mistakes.wrong(message, span, label)
         return None, None
@@ -71,16 +97,26 @@ def _step(mistakes: Mistakes, item: Any, at: Path) -> tuple[Step | None, Operato
     except ZondaError as err:
         first = re.split(r"[\s{:]", name)[0]
         if first != name and first in registry.operators:
-            missing = "a space is missing behind the colon" if name[len(first)] == ":" else "a colon is missing"
-            mistakes.wrong(f"cannot read the step '{name}'", span, missing, f"write '- {first}: {{...}}'")
+            missing = (
+                "a space is missing behind the colon"
+                if name[len(first)] == ":"
+                else "a colon is missing"
+            )
+            mistakes.wrong(
+                f"cannot read the step '{name}'", span, missing, f"write '- {first}: {{...}}'"
+            )
         else:
             mistakes.refused(err, span)
         return None, None
     if not isinstance(parameters, dict):
         message = f"{name} takes a mapping of parameters, not {noun(parameters)}"
         known = list(operator.model_fields)
-        label = (isinstance(parameters, str) and glued(parameters, known)) or f"write '- {name}: {{...}}'"
-        mistakes.wrong(message, mistakes.document.mark(inner).value, label, f"{name} takes: {', '.join(known)}")
+        label = (
+            isinstance(parameters, str) and glued(parameters, known)
+        ) or f"write '- {name}: {{...}}'"
+        mistakes.wrong(
+            message, mistakes.document.mark(inner).value, label, f"{name} takes: {', '.join(known)}"
+        )
         return None, operator.model_construct()
     made = mistakes.validate(operator, parameters, inner, name)
     if made is None:
@@ -90,4 +126,6 @@ def _step(mistakes: Mistakes, item: Any, at: Path) -> tuple[Step | None, Operato
 
 def noun(value: Any) -> str:
     """What kind of YAML value this is, in words."""
-    return "a list" if isinstance(value, list) else "text" if isinstance(value, str) else "one value"
+    return (
+        "a list" if isinstance(value, list) else "text" if isinstance(value, str) else "one value"
+    )

@@ -1,4 +1,5 @@
-"""Where the telescope looks: a position in ICRS, Galactic or horizontal coordinates, written as text.
+"""Where the telescope looks: a position in ICRS, Galactic or horizontal coordinates, written as
+text.
 
 >>> Target.parse("05h00m00s +20d00m00s").icrs()    # doctest: +ELLIPSIS
 (1.3089..., 0.3490...)
@@ -25,18 +26,25 @@ _EXAMPLES = [
     "galactic 120.5 deg -30 deg",
     "az 180 deg el 60 deg",
 ]
-_KEYS: dict[Frame, tuple[str, str]] = {"icrs": ("ra", "dec"), "galactic": ("l", "b"), "horizontal": ("az", "el")}
+_KEYS: dict[Frame, tuple[str, str]] = {
+    "icrs": ("ra", "dec"),
+    "galactic": ("l", "b"),
+    "horizontal": ("az", "el"),
+}
 
 _GALACTIC_TO_ICRS = (
     (-0.05487565771259218, +0.49410943719272665, -0.8676661375596585),
     (-0.8734370519556162, -0.4448297212232957, -0.19807633727300056),
     (-0.4838350736167156, +0.7469821839866677, +0.45598381368730206),
 )
-"""IAU 1958 Galactic axes (columns) in ICRS, as astropy realizes them (pole 192.8595 deg +27.1283 deg in FK5 J2000)."""
+"""IAU 1958 Galactic axes (columns) in ICRS, as astropy realizes them (pole 192.8595 deg +27.1283
+deg in FK5 J2000).
+"""
 
 # one angle: sexagesimal (5h, 05h00m00s, +20d00m00s, 13:47:30.6) or a number with a unit (75 deg)
 _ANGLE = (
-    r"[-+]?\d+\s*(?:h|d|°|:)\s*\d+(?:\.\d*)?\s*(?:m|'|′|:)?\s*(?:\d+(?:\.\d*)?\s*(?:s|\"|″)?)?(?![\w.])"
+    r"[-+]?\d+\s*(?:h|d|°|:)\s*\d+(?:\.\d*)?\s*(?:m|'|′|:)?"
+    r"\s*(?:\d+(?:\.\d*)?\s*(?:s|\"|″)?)?(?![\w.])"
     r"|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\s*[A-Za-z°]*"
 )
 _PAIR = re.compile(
@@ -47,10 +55,13 @@ _PAIR = re.compile(
 )
 _SEXAGESIMAL = re.compile(
     r"(?P<sign>[-+]?)(?P<whole>\d+)\s*(?P<mark>h|d|°|:)\s*"
-    r"(?P<minutes>\d+(?:\.\d*)?)\s*(?P<mark2>m|'|′|:)?\s*(?:(?P<seconds>\d+(?:\.\d*)?)\s*(?:s|\"|″)?)?",
+    r"(?P<minutes>\d+(?:\.\d*)?)\s*(?P<mark2>m|'|′|:)?"
+    r"\s*(?:(?P<seconds>\d+(?:\.\d*)?)\s*(?:s|\"|″)?)?",
     re.IGNORECASE,
 )
-_SPACED = re.compile(r"(\d{1,2}) +(\d{1,2}) +(\d{1,2}(?:\.\d*)?)[ ,]+([-+]?\d{1,2}) +(\d{1,2}) +(\d{1,2}(?:\.\d*)?)")
+_SPACED = re.compile(
+    r"(\d{1,2}) +(\d{1,2}) +(\d{1,2}(?:\.\d*)?)[ ,]+([-+]?\d{1,2}) +(\d{1,2}) +(\d{1,2}(?:\.\d*)?)"
+)
 """05 00 00 +20 00 00, as catalogues write it."""
 _EQUINOX = re.compile(r"\(?\b(?:J2000(?:\.0)?|FK5|B1950(?:\.0)?|FK4)\)?", re.IGNORECASE)
 _DECIMAL = re.compile(r"(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>.*)")
@@ -82,12 +93,14 @@ class Target(TextValue):
 
     @classmethod
     def parse(cls, value: Any) -> Target:
-        """From text, a mapping {ra, dec}, {l, b} or {az, el} of angles with units, a pair of angles (ICRS), SkyCoord or Target.
+        """From text, a mapping {ra, dec}, {l, b} or {az, el} of angles with units, a pair of angles
+        (ICRS), SkyCoord or Target.
 
         A SkyCoord in AltAz is a horizontal target: of its time and place nothing is used.
 
-        Text: two angles, sexagesimal (h for hours; colons or spaces mean hours for a right ascension and degrees elsewhere) or
-        with a unit; the frame's name or the coordinates' names may stand before them; ICRS where neither does."""
+        Text: two angles, sexagesimal (h for hours; colons or spaces mean hours for a right
+        ascension and degrees elsewhere) or with a unit; the frame's name or the coordinates' names
+        may stand before them; ICRS where neither does."""
         if isinstance(value, Target):
             return value
         if isinstance(value, str):
@@ -96,9 +109,13 @@ class Target(TextValue):
             return cls._from_mapping(value)
         if isinstance(value, list | tuple) and len(value) == 2:
             return cls._of("icrs", *value)
-        if getattr(getattr(value, "frame", None), "name", "") == "altaz" and getattr(value, "isscalar", False):
+        if getattr(getattr(value, "frame", None), "name", "") == "altaz" and getattr(
+            value, "isscalar", False
+        ):
             return cls("horizontal", float(value.az.rad) % (2 * math.pi), float(value.alt.rad))
-        if hasattr(getattr(value, "icrs", None), "ra") and getattr(value, "isscalar", False):  # a SkyCoord
+        if hasattr(getattr(value, "icrs", None), "ra") and getattr(
+            value, "isscalar", False
+        ):  # a SkyCoord
             return cls("icrs", float(value.icrs.ra.rad) % (2 * math.pi), float(value.icrs.dec.rad))
         raise mistake(f"expected a position such as '{_EXAMPLES[0]}', got {value!r}")
 
@@ -110,24 +127,39 @@ class Target(TextValue):
             return cls._of("icrs", f"{h}:{m}:{s}", ":".join(dec))
         match = _PAIR.fullmatch(plain)
         if match is None and text.strip().lower() == "map":
-            raise mistake("'map', the centre of the input map, is for the target at the top level of a pipeline file")
-        if match is None and (_SEXAGESIMAL.fullmatch(plain) or (_DECIMAL.fullmatch(plain) and plain[-1:].isalpha())):
-            wanted = f"a position needs two, a right ascension and a declination, such as '{_EXAMPLES[0]}'"
+            raise mistake(
+                "'map', the centre of the input map, is for the target at the top level of a"
+                " pipeline file"
+            )
+        if match is None and (
+            _SEXAGESIMAL.fullmatch(plain) or (_DECIMAL.fullmatch(plain) and plain[-1:].isalpha())
+        ):
+            wanted = (
+                "a position needs two, a right ascension and a declination, such as"
+                f" '{_EXAMPLES[0]}'"
+            )
             raise mistake(f"{text!r} is one angle; {wanted}", "one angle is missing")
         if match is None and (equinox := _EQUINOX.search(plain)):
             word = equinox[0].strip()
             label = f"leave '{word}' out" + ("" if "2000" in word else "; precess it")
-            raise mistake(f"positions are ICRS (FK5 J2000 to 0.1 arcsec); '{word}' is not read", label)
+            raise mistake(
+                f"positions are ICRS (FK5 J2000 to 0.1 arcsec); '{word}' is not read", label
+            )
         if match is None:
             cure = f"write two angles such as '{_EXAMPLES[0]}' (names of objects are not looked up)"
-            raise mistake(f"cannot read {text!r} as a position; {cure}", f"e.g. {' | '.join(_EXAMPLES)}")
+            raise mistake(
+                f"cannot read {text!r} as a position; {cure}", f"e.g. {' | '.join(_EXAMPLES)}"
+            )
         keys = tuple((match[k] or "").lower() for k in ("key1", "key2"))
         named = match["frame"].lower() if match["frame"] else None
         frame: Frame = next((f for f in _KEYS if f == named), "icrs")
         if any(keys):
             by_key = [f for f, pair in _KEYS.items() if pair == keys]
             if not by_key or (named and named != by_key[0]):
-                raise mistake(f"the coordinate names in {text!r} do not belong together; use ra dec, l b, or az el")
+                raise mistake(
+                    f"the coordinate names in {text!r} do not belong together; use ra dec, l b, or"
+                    " az el"
+                )
             frame = by_key[0]
         return cls._of(frame, match["first"], match["second"])
 
@@ -137,7 +169,9 @@ class Target(TextValue):
             if set(value) == set(pair):
                 return cls._of(frame, value[pair[0]], value[pair[1]])
         given = ", ".join(map(str, value)) or "none"
-        raise mistake(f"a position needs exactly the keys ra and dec, l and b, or az and el, not {given}")
+        raise mistake(
+            f"a position needs exactly the keys ra and dec, l and b, or az and el, not {given}"
+        )
 
     @classmethod
     def _of(cls, frame: Frame, first: Any, second: Any) -> Target:
@@ -149,14 +183,22 @@ class Target(TextValue):
         return cls(frame, longitude, latitude)
 
     def icrs(self) -> tuple[float, float]:
-        """(ra, dec) rad. Raises ValueError for a horizontal target, which has none without a time and a site."""
+        """(ra, dec) rad. Raises ValueError for a horizontal target, which has none without a time
+        and a site.
+        """
         if self.frame == "horizontal":
             raise ValueError("a horizontal target has no fixed ICRS position")
         if self.frame == "icrs":
             return self.longitude, self.latitude
         c = math.cos(self.latitude)
-        galactic = (c * math.cos(self.longitude), c * math.sin(self.longitude), math.sin(self.latitude))
-        x, y, z = (sum(m * g for m, g in zip(row, galactic, strict=True)) for row in _GALACTIC_TO_ICRS)
+        galactic = (
+            c * math.cos(self.longitude),
+            c * math.sin(self.longitude),
+            math.sin(self.latitude),
+        )
+        x, y, z = (
+            sum(m * g for m, g in zip(row, galactic, strict=True)) for row in _GALACTIC_TO_ICRS
+        )
         return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
 
     def __str__(self) -> str:
@@ -170,7 +212,9 @@ class Target(TextValue):
         return f"Target.parse({str(self)!r})"
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        cls, schema: Any, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         pairs = [
             {
                 "type": "object",
@@ -194,7 +238,9 @@ class WithMap(Protocol):
 
 
 def _radians(value: Any, name: str, *, hours: bool, wrap: bool = False) -> float:
-    """One angle in rad; ``hours``: colons count hours; ``wrap``: reduced to [0, 2 pi), exactly where it is in degrees."""
+    """One angle in rad; ``hours``: colons count hours; ``wrap``: reduced to [0, 2 pi), exactly
+    where it is in degrees.
+    """
     number, unit = _read(value, name, hours=hours)
     if unit == "rad":
         return number % (2 * math.pi) if wrap else number
@@ -215,13 +261,18 @@ def _read(value: Any, name: str, *, hours: bool) -> tuple[float, Literal["rad", 
         raise mistake(f"cannot read {given}; write an angle such as '75 deg'")
     number, unit = float(match["number"]), match["unit"].strip().lower()
     if not unit:
-        raise mistake(f"{given} has no unit; write an angle such as '{text} deg'", f"add a unit, e.g. {text} deg")
+        raise mistake(
+            f"{given} has no unit; write an angle such as '{text} deg'",
+            f"add a unit, e.g. {text} deg",
+        )
     if not math.isfinite(number):
         raise mistake(f"{name} must be finite, got {value!r}")
     if unit in ("rad", "radian", "radians"):
         return number, "rad"
     if unit not in _DEGREES:
-        raise mistake(f"unknown unit '{unit}' in {given}; use deg, hourangle, arcmin, arcsec or rad")
+        raise mistake(
+            f"unknown unit '{unit}' in {given}; use deg, hourangle, arcmin, arcsec or rad"
+        )
     return number * _DEGREES[unit], "deg"
 
 
@@ -240,7 +291,9 @@ def _sexagesimal(match: re.Match[str], name: str, *, hours: bool) -> float:
 
 
 def _text(angle: float, *, wrap: bool = False) -> str:
-    """The shortest text in degrees that parses back to ``angle``; in radians where no number of degrees does."""
+    """The shortest text in degrees that parses back to ``angle``; in radians where no number of
+    degrees does.
+    """
     degrees = math.degrees(angle)
     for digits in range(1, 18):
         text = f"{degrees:.{digits}g}"

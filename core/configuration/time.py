@@ -1,4 +1,6 @@
-"""Exact instants: integer nanoseconds since 1970-01-01T00:00 UTC, written and read as ISO 8601 text."""
+"""Exact instants: integer nanoseconds since 1970-01-01T00:00 UTC, written and read as ISO 8601
+text.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ _FARTHEST_ZONE = 14 * 60
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _ISO = re.compile(
     r"(?P<date>\d{4}-\d{2}-\d{2})"
-    r"(?:[Tt ]\s*(?P<hour>\d{2}):(?P<minute>\d{2})(?::(?P<second>\d{2})(?:[.,](?P<fraction>\d+))?)?)?"
+    r"(?:[Tt"
+    r" ]\s*(?P<hour>\d{2}):(?P<minute>\d{2})(?::(?P<second>\d{2})(?:[.,](?P<fraction>\d+))?)?)?"
     r"\s*(?P<zone>[Zz]|UTC|(?P<sign>[-+])(?P<zone_hour>\d{2}):?(?P<zone_minute>\d{2})?)?"
 )
 
@@ -27,18 +30,24 @@ _ISO = re.compile(
 class Instant(TextValue):
     """An instant of UTC, exact to the nanosecond. Ordered and hashable.
 
-    POSIX time: every day has 86400 seconds, so differences across a leap second (the last one ended 2016) are one second
-    short, and the leap second itself (23:59:60) has no name.
+    POSIX time: every day has 86400 seconds, so differences across a leap second (the last one ended
+    2016) are one second short, and the leap second itself (23:59:60) has no name.
     """
 
-    json_schema: ClassVar[dict[str, Any]] = {"type": "string", "pattern": r"^\d{4}-\d{2}-\d{2}", "examples": _EXAMPLES}
+    json_schema: ClassVar[dict[str, Any]] = {
+        "type": "string",
+        "pattern": r"^\d{4}-\d{2}-\d{2}",
+        "examples": _EXAMPLES,
+    }
 
     nanoseconds: int
     """Nanoseconds since 1970-01-01T00:00:00 UTC."""
 
     @classmethod
     def parse(cls, value: Any) -> Instant:
-        """From ISO 8601 text (UTC unless it carries Z or an offset), a datetime (naive: UTC), an astropy Time or an Instant."""
+        """From ISO 8601 text (UTC unless it carries Z or an offset), a datetime (naive: UTC), an
+        astropy Time or an Instant.
+        """
         if isinstance(value, Instant):
             return value
         if isinstance(value, datetime):
@@ -59,25 +68,39 @@ class Instant(TextValue):
     def _from_text(cls, text: str) -> Instant:
         match = _ISO.fullmatch(text.strip())
         if match is None:
-            message = f"cannot read {text!r} as a time; write ISO 8601 text such as '{_EXAMPLES[0]}'"
+            message = (
+                f"cannot read {text!r} as a time; write ISO 8601 text such as '{_EXAMPLES[0]}'"
+            )
             raise mistake(message, "expected YYYY-MM-DDThh:mm[:ss][Z or an offset such as -05:00]")
         part = match.groupdict()
         seconds = int(part["second"] or 0)
         if seconds == 60:
-            raise mistake(f"{text!r} is a leap second, which POSIX time cannot name", "add one second")
+            raise mistake(
+                f"{text!r} is a leap second, which POSIX time cannot name", "add one second"
+            )
         fraction = part["fraction"] or ""
         if len(fraction.rstrip("0")) > 9:
-            raise mistake(f"{text!r} has more than nine decimals of a second", "times are exact to 1 ns")
+            raise mistake(
+                f"{text!r} has more than nine decimals of a second", "times are exact to 1 ns"
+            )
         try:
             zone: timezone = UTC
             if part["sign"]:
                 minutes = int(part["zone_hour"]) * 60 + int(part["zone_minute"] or 0)
                 if minutes > _FARTHEST_ZONE or int(part["zone_minute"] or 0) >= 60:
                     zone_text = part["zone"]
-                    raise ValueError(f"no time zone is {zone_text} from UTC; offsets go from -14:00 to +14:00, e.g. -05:00")
+                    raise ValueError(
+                        f"no time zone is {zone_text} from UTC; offsets go from -14:00 to +14:00,"
+                        " e.g. -05:00"
+                    )
                 zone = timezone(timedelta(minutes=-minutes if part["sign"] == "-" else minutes))
             day = datetime.fromisoformat(part["date"])
-            local = day.replace(hour=int(part["hour"] or 0), minute=int(part["minute"] or 0), second=seconds, tzinfo=zone)
+            local = day.replace(
+                hour=int(part["hour"] or 0),
+                minute=int(part["minute"] or 0),
+                second=seconds,
+                tzinfo=zone,
+            )
             if not 2 <= local.year <= 9998:  # a scan, or another time zone, may end in another year
                 raise ValueError("the year is not between 2 and 9998")
         except ValueError as err:
@@ -108,7 +131,9 @@ class Instant(TextValue):
         return (self.nanoseconds - other.nanoseconds) / SECOND
 
     def shifted(self, seconds: float) -> Instant:
-        """The instant ``seconds`` later; the shift is rounded to the nearest nanosecond, the sum is exact."""
+        """The instant ``seconds`` later; the shift is rounded to the nearest nanosecond, the sum is
+        exact.
+        """
         whole = int(seconds)
         return Instant(self.nanoseconds + whole * SECOND + round((seconds - whole) * SECOND))
 

@@ -5,8 +5,9 @@
 >>> Scan(radius="2 arcmin").radius      # doctest: +ELLIPSIS
 0.00058...
 
-Texts, astropy quantities and, for pure numbers, plain numbers are accepted; a number without a unit is an error. The
-common units are read here; what they do not cover is left to astropy, which takes half a second to import.
+Texts, astropy quantities and, for pure numbers, plain numbers are accepted; a number without a unit
+is an error. The common units are read here; what they do not cover is left to astropy, which takes
+half a second to import.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from .values import mistake
 
 
 class Kind(NamedTuple):
-    """One kind of quantity: how messages call it, examples, the units in which values are written back, and the largest value
-    (SI) that is computed with."""
+    """One kind of quantity: how messages call it, examples, the units in which values are written
+    back, and the largest value (SI) that is computed with."""
 
     noun: str
     examples: tuple[str, ...]
@@ -36,25 +37,50 @@ class Kind(NamedTuple):
 
 
 LEAST = 1e-30
-"""Smallest value (SI) besides zero that is computed with: squares and products of a few such values, and of `Kind.most`, are
-still numbers."""
+"""Smallest value (SI) besides zero that is computed with: squares and products of a few such
+values, and of `Kind.most`, are still numbers."""
 
 KINDS = {
-    "rad": Kind("an angle", ("4 arcmin", "11 arcsec", "0.5 deg"), ("deg", "arcmin", "arcsec", "rad"), 1e6),
-    "rad / s": Kind("an angular speed", ("51 arcsec/s", "0.5 deg/s"), ("deg/s", "arcmin/s", "arcsec/s", "rad/s"), 1e6),
-    "rad / s2": Kind("an angular acceleration", ("0.05 deg/s2",), ("deg/s2", "arcmin/s2", "arcsec/s2", "rad/s2"), 1e6),
-    "rad / s3": Kind("an angular jerk", ("0.2 deg/s3",), ("deg/s3", "arcmin/s3", "arcsec/s3", "rad/s3"), 1e6),
+    "rad": Kind(
+        "an angle", ("4 arcmin", "11 arcsec", "0.5 deg"), ("deg", "arcmin", "arcsec", "rad"), 1e6
+    ),
+    "rad / s": Kind(
+        "an angular speed",
+        ("51 arcsec/s", "0.5 deg/s"),
+        ("deg/s", "arcmin/s", "arcsec/s", "rad/s"),
+        1e6,
+    ),
+    "rad / s2": Kind(
+        "an angular acceleration",
+        ("0.05 deg/s2",),
+        ("deg/s2", "arcmin/s2", "arcsec/s2", "rad/s2"),
+        1e6,
+    ),
+    "rad / s3": Kind(
+        "an angular jerk", ("0.2 deg/s3",), ("deg/s3", "arcmin/s3", "arcsec/s3", "rad/s3"), 1e6
+    ),
     "s": Kind("a time", ("20 min", "600 s"), ("s", "min", "h", "ms"), 1e15),
     "Hz": Kind("a frequency", ("90 GHz", "100 Hz"), ("Hz", "mHz", "GHz"), 1e18),
     "m": Kind("a length", ("1.8 mm", "1 km"), ("m", "mm", "km"), 1e20),
     "m / s": Kind("a speed", ("10 m/s", "36 km/h"), ("m/s",), 1e15),
     "K": Kind("a temperature", ("150 mK", "270 K"), ("K", "mK", "uK"), 1e15),
-    "K s(1/2)": Kind("a noise level", ("1.7 mK s(1/2)", "400 uK s(1/2)"), ("mK s(1/2)", "uK s(1/2)", "K s(1/2)"), 1e15),
+    "K s(1/2)": Kind(
+        "a noise level",
+        ("1.7 mK s(1/2)", "400 uK s(1/2)"),
+        ("mK s(1/2)", "uK s(1/2)", "K s(1/2)"),
+        1e15,
+    ),
     "": Kind("a pure number", ("0.3", "30 %"), ("",)),
 }
 """By SI unit."""
 
-PURE, ANGLE, TIME, LENGTH, TEMPERATURE = (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
+PURE, ANGLE, TIME, LENGTH, TEMPERATURE = (
+    (0, 0, 0, 0),
+    (1, 0, 0, 0),
+    (0, 1, 0, 0),
+    (0, 0, 1, 0),
+    (0, 0, 0, 1),
+)
 FREQUENCY = (0, -1, 0, 0)
 DIMENSIONS: dict[tuple[float, ...], str] = {
     PURE: "a pure number",
@@ -92,14 +118,17 @@ _NAMED: list[tuple[str, float, tuple[int, ...]]] = [
 ]
 _PREFIXED = {"rad": ANGLE, "s": TIME, "Hz": FREQUENCY, "m": LENGTH, "K": TEMPERATURE}
 UNITS = {name: (factor, powers) for names, factor, powers in _NAMED for name in names.split()} | {
-    prefix + base: (factor, powers) for base, powers in _PREFIXED.items() for prefix, factor in PREFIXES.items()
+    prefix + base: (factor, powers)
+    for base, powers in _PREFIXED.items()
+    for prefix, factor in PREFIXES.items()
 }
 """Factor to SI and powers of (rad, s, m, K) of the units known without astropy."""
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$", re.DOTALL)
 _FACTOR = re.compile(
     r"(?:sqrt\((?P<root>[^\W\d_]+)\)|(?P<name>[^\W\d_]+|%|°)"
-    r"(?:(?:\^|\*\*)?(?:(?P<power>-?\d(?:\.\d{1,9})?)(?!\d)|\((?P<top>-?\d)(?:/(?P<bottom>[1-9]))?\)))?)(?:\s*[*. ]\s*|$)"
+    r"(?:(?:\^|\*\*)?(?:(?P<power>-?\d(?:\.\d{1,9})?)(?!\d)"
+    r"|\((?P<top>-?\d)(?:/(?P<bottom>[1-9]))?\)))?)(?:\s*[*. ]\s*|$)"
 )
 # powers of one digit: no unit here overflows by them
 
@@ -113,11 +142,16 @@ class Measure(NamedTuple):
 
 @lru_cache(maxsize=512)
 def read_unit(text: str) -> Measure | None:
-    """A product of powers of the units above with at most one ``/ factor`` behind it, e.g. ``mK s(1/2)``, ``deg / s2``.
+    """A product of powers of the units above with at most one ``/ factor`` behind it, e.g. ``mK
+    s(1/2)``, ``deg / s2``.
 
     None where the text is anything else: astropy may know it.
     """
-    upper, slash, lower = text.strip().partition("/") if not re.search(r"\(-?\d+/\d+\)", text) else (text.strip(), "", "")
+    upper, slash, lower = (
+        text.strip().partition("/")
+        if not re.search(r"\(-?\d+/\d+\)", text)
+        else (text.strip(), "", "")
+    )
     factor, powers = 1.0, [0.0] * 4
     for part, sign in ((upper.strip(), 1), (lower.strip(), -1)):
         factors = list(_factors(part))
@@ -133,7 +167,9 @@ def read_unit(text: str) -> Measure | None:
 
 
 def _factors(text: str) -> Iterator[tuple[tuple[float, tuple[int, ...]], float] | None]:
-    """((factor, powers of the base units), exponent) of each factor of a product; None where one is not known."""
+    """((factor, powers of the base units), exponent) of each factor of a product; None where one is
+    not known.
+    """
     at = 0
     while at < len(text):
         match = _FACTOR.match(text, at)
@@ -141,15 +177,21 @@ def _factors(text: str) -> Iterator[tuple[tuple[float, tuple[int, ...]], float] 
         if not match or name not in UNITS:
             yield None
             return
-        exponent = 0.5 if match["root"] else float(match["power"] or match["top"] or 1) / int(match["bottom"] or 1)
+        exponent = (
+            0.5
+            if match["root"]
+            else float(match["power"] or match["top"] or 1) / int(match["bottom"] or 1)
+        )
         yield UNITS[name], exponent
         at = match.end()
 
 
 class Unit:
-    """Annotation: read a quantity and convert it to ``unit``, an SI unit of `KINDS` or any that astropy knows.
+    """Annotation: read a quantity and convert it to ``unit``, an SI unit of `KINDS` or any that
+    astropy knows.
 
-    ``examples`` are what messages give, where those of the kind would mislead (elevations are degrees).
+    ``examples`` are what messages give, where those of the kind would mislead (elevations are
+    degrees).
     """
 
     def __init__(self, unit: str, *examples: str) -> None:
@@ -170,7 +212,11 @@ class Unit:
         if isinstance(value, str):
             number, unit, caret = self._split(value)
             result = number * self._factor(value, unit, caret) if unit else number
-        elif isinstance(value, bool) or value is None or not (isinstance(value, Real) or hasattr(value, "to_value")):
+        elif (
+            isinstance(value, bool)
+            or value is None
+            or not (isinstance(value, Real) or hasattr(value, "to_value"))
+        ):
             raise mistake(f"expected {self.kind.noun} such as '{self.example}', got {value!r:.60}")
         elif isinstance(value, Real):
             if self.unit:
@@ -182,24 +228,38 @@ class Unit:
             raise mistake(f"expected a finite number, got {value}")
         if result and not LEAST <= abs(result) <= self.kind.most:
             beyond = f"more than {self.kind.most:g}" if abs(result) > 1 else f"less than {LEAST:g}"
-            raise mistake(f"{value} is {beyond} {self.unit}".rstrip() + ", beyond what can be computed with")
+            raise mistake(
+                f"{value} is {beyond} {self.unit}".rstrip() + ", beyond what can be computed with"
+            )
         return result
 
     def write(self, value: float) -> str:
         """The shortest text that reads back to the same bits, in a unit people use."""
-        texts = [_shortest(value, name, Measure(1.0, ()) if name == "" else read_unit(name)) for name in self.kind.display]
-        return min((t for t in texts if t), key=lambda t: len(t.split(" ")[0]), default=f"{value!r} {self.unit}".strip())
+        texts = [
+            _shortest(value, name, Measure(1.0, ()) if name == "" else read_unit(name))
+            for name in self.kind.display
+        ]
+        return min(
+            (t for t in texts if t),
+            key=lambda t: len(t.split(" ")[0]),
+            default=f"{value!r} {self.unit}".strip(),
+        )
 
     def write_in_unit_of(self, value: float, like: str) -> str:
         """``value`` (SI) in the unit that the text ``like`` uses, for messages about limits."""
         match = _NUMBER.match(like)
         measure = read_unit(match[2]) if match and match[2] else None
-        return f"{value / measure.factor:.6g} {match[2]}" if match and measure else self.write(value)
+        return (
+            f"{value / measure.factor:.6g} {match[2]}" if match and measure else self.write(value)
+        )
 
     def _split(self, text: str) -> tuple[float, str, tuple[int, int]]:
         match = _NUMBER.match(text)
         if not match:
-            message = f"cannot read {text!r:.60} as {self.kind.noun}; write a number and a unit such as '{self.example}'"
+            message = (
+                f"cannot read {text!r:.60} as {self.kind.noun}; write a number and a unit such as"
+                f" '{self.example}'"
+            )
             raise mistake(message if self.unit else message.replace(" and a unit", ""))
         if not match[2] and self.unit:
             raise self._without_unit(match[1])
@@ -207,7 +267,10 @@ class Unit:
 
     def _factor(self, text: str, unit: str, caret: tuple[int, int]) -> float:
         if self.unit == "K s(1/2)" and "Hz" in unit:
-            message = f"'{unit}' may mean two things that differ by sqrt(2); write {self.kind.noun} in K s(1/2)"
+            message = (
+                f"'{unit}' may mean two things that differ by sqrt(2); write {self.kind.noun} in K"
+                " s(1/2)"
+            )
             raise mistake(message, "divide a NET per root hertz by sqrt(2)", caret=caret)
         measure, own = read_unit(unit), read_unit(self.unit)
         if measure is None or own is None:
@@ -224,11 +287,23 @@ class Unit:
             if isinstance(parsed, u.StructuredUnit):  # "m, s"
                 raise ValueError("several units")
             parsed.decompose()
-        except (ValueError, TypeError, OverflowError) as err:  # the last: km400, by an astropy before 7
+        except (
+            ValueError,
+            TypeError,
+            OverflowError,
+        ) as err:  # the last: km400, by an astropy before 7
             hint = re.search(r"Did you mean ([^?]*)\?", str(err))
-            otherwise = f"did you mean {hint[1]}?" if hint else f"expected {self.kind.noun}, e.g. '{self.example}'"
+            otherwise = (
+                f"did you mean {hint[1]}?"
+                if hint
+                else f"expected {self.kind.noun}, e.g. '{self.example}'"
+            )
             own = read_unit(self.unit)
-            label = nearest(unit, (name for name, (_, powers) in UNITS.items() if own and powers == own.powers), otherwise)
+            label = nearest(
+                unit,
+                (name for name, (_, powers) in UNITS.items() if own and powers == own.powers),
+                otherwise,
+            )
             raise mistake(f"unknown unit '{unit}' in {text!r:.60}", label, caret=caret) from None
         try:
             return float(parsed.to(u.Unit(self.unit)))
@@ -245,23 +320,40 @@ class Unit:
         try:
             return float(value.to_value(u.Unit(self.unit)))
         except u.UnitConversionError:
-            raise self._wrong_kind(str(value.unit), str(value.unit.physical_type).split("/")[0], None) from None
+            raise self._wrong_kind(
+                str(value.unit), str(value.unit.physical_type).split("/")[0], None
+            ) from None
 
     def _without_unit(self, number: str) -> PydanticCustomError:
         message = f"{number} has no unit; write {self.kind.noun} such as '{self.example}'"
         return mistake(message, f"add a unit, e.g. {number} {self.example.split(' ', 1)[1]}")
 
-    def _wrong_kind(self, unit: str, got: str, caret: tuple[int, int] | None) -> PydanticCustomError:
-        message = f"expected {self.kind.noun} such as '{self.example}', but '{unit}' is a unit of {got}"
+    def _wrong_kind(
+        self, unit: str, got: str, caret: tuple[int, int] | None
+    ) -> PydanticCustomError:
+        message = (
+            f"expected {self.kind.noun} such as '{self.example}', but '{unit}' is a unit of {got}"
+        )
         return mistake(message, f"not {self.kind.noun}", caret=caret)
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
         write = (lambda v: v) if self.unit == "" else self.write
         written = core_schema.plain_serializer_function_ser_schema(write, when_used="json")
-        return core_schema.no_info_before_validator_function(self.parse, handler(source), serialization=written)
+        return core_schema.no_info_before_validator_function(
+            self.parse, handler(source), serialization=written
+        )
 
-    def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        text = {"type": "string", "pattern": r"^\s*[-+]?[0-9.]+([eE][-+]?[0-9]+)?" + (r"\s*\S.*$" if self.unit else r"\s*\S*$")}
+    def __get_pydantic_json_schema__(
+        self, schema: Any, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        text = {
+            "type": "string",
+            "pattern": (
+                r"^\s*[-+]?[0-9.]+([eE][-+]?[0-9]+)?" + (r"\s*\S.*$" if self.unit else r"\s*\S*$")
+            ),
+        }
         options = [text] if self.unit else [{"type": "number"}, text]
         return {"anyOf": options, "examples": list(self.kind.examples), "x-unit": self.unit}
 

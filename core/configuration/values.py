@@ -22,30 +22,47 @@ class TextValue:
         raise NotImplementedError
 
     @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+    def __get_pydantic_core_schema__(
+        cls, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
         return core_schema.no_info_plain_validator_function(
-            cls.parse, serialization=core_schema.plain_serializer_function_ser_schema(str, when_used="json")
+            cls.parse,
+            serialization=core_schema.plain_serializer_function_ser_schema(str, when_used="json"),
         )
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        cls, schema: Any, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         return cls.json_schema
 
 
 def mistake(
-    message: str, label: str = "", help: str = "", caret: tuple[int, int] | None = None, at: tuple[str | int, ...] = ()
+    message: str,
+    label: str = "",
+    help: str = "",
+    caret: tuple[int, int] | None = None,
+    at: tuple[str | int, ...] = (),
 ) -> PydanticCustomError:
     """What a validator raises: shown at the value's place.
 
-    ``caret``: (offset, length) of what is wrong in a text. ``at``: keys and indices that lead to it within a mapping or list.
+    ``caret``: (offset, length) of what is wrong in a text. ``at``: keys and indices that lead to it
+    within a mapping or list.
     """
     context = {"message": message, "label": label, "help": help, "caret": caret, "at": at}
     return PydanticCustomError("mistake", "{message}", context)
 
 
 def refusal(err: ZondaError, at: tuple[str | int, ...] = ()) -> PydanticCustomError:
-    """What a validator raises where ``err`` says what is wrong with its value, or with what is ``at`` a place within it."""
+    """What a validator raises where ``err`` says what is wrong with its value, or with what is
+    ``at`` a place within it.
+    """
     if isinstance(err, ConfigurationError) and err.diagnostics:
         first = err.diagnostics[0]
         return mistake(first.message, first.label, first.help, at=at)
-    return mistake(f"{err.place}: {err.message}" if err.place else err.message, getattr(err, "label", ""), err.cure, at=at)
+    return mistake(
+        f"{err.place}: {err.message}" if err.place else err.message,
+        getattr(err, "label", ""),
+        err.cure,
+        at=at,
+    )

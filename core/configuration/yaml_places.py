@@ -1,7 +1,8 @@
 """YAML with places, and without the traps of YAML 1.1.
 
-Stock PyYAML reads ``-11:45:09`` as an integer of base 60, ``1e3`` as text, ``on`` as true and keeps the last of two equal
-keys. Here scalars follow the YAML 1.2 core schema, equal keys are errors, and every value knows where it stands.
+Stock PyYAML reads ``-11:45:09`` as an integer of base 60, ``1e3`` as text, ``on`` as true and keeps
+the last of two equal keys. Here scalars follow the YAML 1.2 core schema, equal keys are errors, and
+every value knows where it stands.
 """
 
 from __future__ import annotations
@@ -21,9 +22,12 @@ Path = tuple[Any, ...]
 MAXIMUM_VALUES = 100_000
 """More values than this (nested aliases and merges multiply) are refused."""
 MAXIMUM_DEPTH = 64
-"""Lists and mappings nested deeper are refused: what reads them recurses, libyaml's C code without a net."""
+"""Lists and mappings nested deeper are refused: what reads them recurses, libyaml's C code without
+a net.
+"""
 MAXIMUM_DIGITS = 64
-"""Integers of more digits are refused: nothing here is as large, and Python would not write them."""
+"""Integers of more digits are refused: nothing here is as large, and Python would not write them.
+"""
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,9 @@ class Span:
     end_column: int = 1
 
     def part(self, offset: int, length: int) -> Span:
-        """``length`` characters from ``offset`` on, where the span lies on one line and is not quoted."""
+        """``length`` characters from ``offset`` on, where the span lies on one line and is not
+        quoted.
+        """
         rows = self.source.text.splitlines()
         first = rows[self.line][self.column : self.column + 1] if self.line < len(rows) else ""
         if self.line != self.end_line or first in ("'", '"'):
@@ -54,7 +60,9 @@ class Span:
 
     def inner(self, offset: int, length: int) -> Span:
         """``length`` characters from ``offset`` on, on the first line."""
-        return Span(self.source, self.line, self.column + offset, self.line, self.column + offset + length)
+        return Span(
+            self.source, self.line, self.column + offset, self.line, self.column + offset + length
+        )
 
 
 @dataclass(frozen=True)
@@ -81,7 +89,9 @@ class Fault:
 
 @dataclass
 class Document:
-    """Plain dictionaries, lists and scalars; a `Mark` for every path in them; and what is wrong with the text."""
+    """Plain dictionaries, lists and scalars; a `Mark` for every path in them; and what is wrong
+    with the text.
+    """
 
     value: Any
     marks: dict[Path, Mark]
@@ -130,7 +140,10 @@ class _Dumper(yaml.SafeDumper):
         super().increase_indent(flow, False)
 
 
-_FLOAT = r"^[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$|^[-+]?\.(?:inf|Inf|INF)$|^\.(?:nan|NaN|NAN)$"
+_FLOAT = (
+    r"^[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$"
+    r"|^[-+]?\.(?:inf|Inf|INF)$|^\.(?:nan|NaN|NAN)$"
+)
 for _class in (_Loader, _Dumper):
     for _tag, _pattern, _first in [
         ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
@@ -139,7 +152,9 @@ for _class in (_Loader, _Dumper):
         ("int", r"^(?:[-+]?[0-9]+|0x[0-9a-fA-F]+|0o[0-7]+)$", "-+0123456789"),
         ("float", _FLOAT, "-+0123456789."),
     ]:
-        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first))
+        _class.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first)
+        )
 
 
 def _integer(loader: Any, node: Any) -> int:
@@ -152,11 +167,19 @@ def _integer(loader: Any, node: Any) -> int:
 _Loader.add_constructor("tag:yaml.org,2002:int", _integer)
 
 
-def load(source: Source, *, column: int = 0, text: str | None = None, longest: Mapping[str, int] | None = None) -> Document:
-    """Read a YAML document from ``text`` (default: all of the source), whose first line begins at ``column``.
+def load(
+    source: Source,
+    *,
+    column: int = 0,
+    text: str | None = None,
+    longest: Mapping[str, int] | None = None,
+) -> Document:
+    """Read a YAML document from ``text`` (default: all of the source), whose first line begins at
+    ``column``.
 
-    ``longest``: items that the list under a key of the top level may have; of a longer one nothing is built.
-    Never raises for bad text: what is wrong is in `Document.faults`, and what could be read in its value.
+    ``longest``: items that the list under a key of the top level may have; of a longer one nothing
+    is built. Never raises for bad text: what is wrong is in `Document.faults`, and what could be
+    read in its value.
     """
     reader = _Reader(source, column, source.text if text is None else text)
     try:
@@ -178,7 +201,14 @@ def load(source: Source, *, column: int = 0, text: str | None = None, longest: M
 
 def dump(value: Any) -> str:
     """YAML text that `load` reads back to the same value."""
-    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10_000, default_flow_style=False)
+    return yaml.dump(
+        value,
+        Dumper=_Dumper,
+        sort_keys=False,
+        allow_unicode=True,
+        width=10_000,
+        default_flow_style=False,
+    )
 
 
 class _TooMany(yaml.YAMLError):
@@ -194,10 +224,15 @@ class _TooLong(yaml.YAMLError):
 
 
 def _too_deep(mark: Any) -> yaml.MarkedYAMLError:
-    return yaml.MarkedYAMLError(problem=f"nested deeper than {MAXIMUM_DEPTH} levels", problem_mark=mark)
+    return yaml.MarkedYAMLError(
+        problem=f"nested deeper than {MAXIMUM_DEPTH} levels", problem_mark=mark
+    )
 
 
-_PLAIN = frozenset(f"tag:yaml.org,2002:{tag}" for tag in ("str", "int", "float", "bool", "null", "merge", "seq", "map"))
+_PLAIN = frozenset(
+    f"tag:yaml.org,2002:{tag}"
+    for tag in ("str", "int", "float", "bool", "null", "merge", "seq", "map")
+)
 _MERGE = "tag:yaml.org,2002:merge"
 _OPENING = (yaml.SequenceStartEvent, yaml.MappingStartEvent)
 _CLOSING = (yaml.SequenceEndEvent, yaml.MappingEndEvent)
@@ -212,7 +247,9 @@ class _Reader:
         self.merged = 0
 
     def survey(self, text: str, longest: Mapping[str, int]) -> None:
-        """Count values and depth event by event, without recursion, before anything is built. Raises yaml.YAMLError."""
+        """Count values and depth event by event, without recursion, before anything is built.
+        Raises yaml.YAMLError.
+        """
         depth = members = items = 0
         key, limit = None, math.inf  # of the top level
         for values, event in enumerate(yaml.parse(text, Loader=_Loader)):
@@ -223,7 +260,14 @@ class _Reader:
                     key = event
                 else:
                     listed = isinstance(event, yaml.SequenceStartEvent)
-                    items, limit = 0, longest.get(getattr(key, "value", None) or "", math.inf) if listed else math.inf
+                    items, limit = (
+                        0,
+                        (
+                            longest.get(getattr(key, "value", None) or "", math.inf)
+                            if listed
+                            else math.inf
+                        ),
+                    )
             elif depth == 2 and not closes:
                 items += 1
                 if items > limit:
@@ -235,7 +279,10 @@ class _Reader:
                 raise _TooMany(f"more than {MAXIMUM_VALUES} values")
 
     def document(self, value: Any) -> Document:
-        self.marks.setdefault((), Mark(Span(self.source, 0, self.column, 0, max(self.column + 1, len(self.source.text)))))
+        self.marks.setdefault(
+            (),
+            Mark(Span(self.source, 0, self.column, 0, max(self.column + 1, len(self.source.text)))),
+        )
         return Document(value, self.marks, self.faults)
 
     def span(self, node: Any) -> Span:
@@ -260,14 +307,18 @@ class _Reader:
             found = causes(err, self.text)
             for cause in found:
                 shift = self.column if cause.line == 0 else 0
-                span = Span(self.source, cause.line, cause.column + shift, cause.line, cause.end + shift)
+                span = Span(
+                    self.source, cause.line, cause.column + shift, cause.line, cause.end + shift
+                )
                 self.faults.append(Fault(cause.message, span, cause.label))
             if found:
                 return
             message = f"not valid YAML: {err.problem or err.context}"
             row = rows[line]
             label = "indent with spaces, not tabs" if "\t" in row[: column + 1] else ""
-            self.faults.append(Fault(message, Span(self.source, line, column, line, column + 1), label))
+            self.faults.append(
+                Fault(message, Span(self.source, line, column, line, column + 1), label)
+            )
         else:
             at = getattr(err, "position", 0)
             line = self.source.text.count("\n", 0, at)
@@ -275,7 +326,9 @@ class _Reader:
             reason = f"not valid YAML: {getattr(err, 'reason', err)}"
             self.faults.append(Fault(reason, Span(self.source, line, column, line, column + 1)))
 
-    def build(self, loader: Any, node: Any, path: Path, key: Span | None, above: tuple[int, ...]) -> Any:
+    def build(
+        self, loader: Any, node: Any, path: Path, key: Span | None, above: tuple[int, ...]
+    ) -> Any:
         span = self.span(node)
         if id(node) in above:
             self.faults.append(Fault("an alias may not stand inside what it names", span))
@@ -288,10 +341,17 @@ class _Reader:
         above = (*above, id(node))
         if node.tag not in _PLAIN:
             tag = node.tag.replace("tag:yaml.org,2002:", "!!")
-            self.faults.append(Fault(f"the tag {tag:.60} is not known", span, "leave it away: nothing here needs one"))
+            self.faults.append(
+                Fault(
+                    f"the tag {tag:.60} is not known", span, "leave it away: nothing here needs one"
+                )
+            )
             return None
         if isinstance(node, yaml.SequenceNode):
-            return [self.build(loader, item, (*path, i), None, above) for i, item in enumerate(node.value)]
+            return [
+                self.build(loader, item, (*path, i), None, above)
+                for i, item in enumerate(node.value)
+            ]
         if isinstance(node, yaml.MappingNode):
             return self.mapping(loader, node, path, above)
         return self.scalar(loader, node)
@@ -302,7 +362,13 @@ class _Reader:
             if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
                 if key.value in first:
                     line = first[key.value].start_mark.line + 1
-                    self.faults.append(Fault(f"duplicate key '{key.value}'", self.span(key), f"first given on line {line}"))
+                    self.faults.append(
+                        Fault(
+                            f"duplicate key '{key.value}'",
+                            self.span(key),
+                            f"first given on line {line}",
+                        )
+                    )
                 first.setdefault(key.value, key)
         result: dict[Any, Any] = {}
         for key, value in self.flattened(node):
@@ -314,7 +380,8 @@ class _Reader:
         return result
 
     def flattened(self, node: Any) -> list[tuple[Any, Any]]:
-        """Keys and values of a mapping, those merged by ``<<`` first; each key once where it is merged, nearer ones win.
+        """Keys and values of a mapping, those merged by ``<<`` first; each key once where it is
+        merged, nearer ones win.
 
         PyYAML's own repeats merged keys: eight lines of them fill the memory.
         """
@@ -331,7 +398,10 @@ class _Reader:
                 if not isinstance(part, yaml.MappingNode):
                     self.faults.append(Fault("only mappings can be merged", self.span(part)))
                     continue
-                merged |= {k.value if isinstance(k, yaml.ScalarNode) else id(k): (k, v) for k, v in self.flattened(part)}
+                merged |= {
+                    k.value if isinstance(k, yaml.ScalarNode) else id(k): (k, v)
+                    for k, v in self.flattened(part)
+                }
         self.merged += len(merged)
         if self.merged > MAXIMUM_VALUES:
             raise _TooMany(f"more than {MAXIMUM_VALUES} values")
@@ -341,7 +411,10 @@ class _Reader:
     def scalar(self, loader: Any, node: Any) -> Any:
         try:
             return loader.construct_object(node, deep=True)
-        except (ValueError, LookupError) as err:  # e.g. an integer of more digits than Python reads, !!bool maybe
+        except (
+            ValueError,
+            LookupError,
+        ) as err:  # e.g. an integer of more digits than Python reads, !!bool maybe
             self.faults.append(Fault(f"cannot be read: {err}", self.span(node)))
         except yaml.MarkedYAMLError as err:  # a lone <<, a text that is said to be a list
             self.fault(err)

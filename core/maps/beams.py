@@ -1,12 +1,15 @@
 """The beam of a map to which detectors of different beams contribute.
 
-A point source of flux density S is seen by a detector of Gaussian beam O_d with the peak S / O_d, and the map's peak is the
-mean of these by the weights W_d that the detectors have in it. The beam of the map is the Gaussian of the solid angle O with
+A point source of flux density S is seen by a detector of Gaussian beam O_d with the peak S / O_d,
+and the map's peak is the mean of these by the weights W_d that the detectors have in it. The beam
+of the map is the Gaussian of the solid angle O with
 
-    1 / O = sum W_d / O_d / sum W_d,   that is   FWHM^-2 = sum W_d FWHM_d^-2 / sum W_d:                           (1)
+    1 / O = sum W_d / O_d / sum W_d,
+    that is   FWHM^-2 = sum W_d FWHM_d^-2 / sum W_d:                           (1)
 
-peak times O is S, as is the integral over the map (which is S for any beams). No single Gaussian has the shape of a sum of
-several: what lies between, such as a fit of the width, is as near as the beams are to each other.
+peak times O is S, as is the integral over the map (which is S for any beams). No single Gaussian
+has the shape of a sum of several: what lies between, such as a fit of the width, is as near as the
+beams are to each other.
 """
 
 from __future__ import annotations
@@ -32,19 +35,29 @@ WIDER = 3.0
 
 
 def check_width(fwhm: float, across: float, place: str, cure: str) -> None:
-    """Raise InputError for a beam [rad] that is `WIDER` than the map, ``across`` [rad]: BMAJ in arcsec or radians."""
+    """Raise InputError for a beam [rad] that is `WIDER` than the map, ``across`` [rad]: BMAJ in
+    arcsec or radians.
+    """
     if fwhm > WIDER * across:
-        text = f"the beam of the map is {size_text(fwhm)} wide, and the whole map {size_text(across)}"
+        text = (
+            f"the beam of the map is {size_text(fwhm)} wide, and the whole map {size_text(across)}"
+        )
         raise InputError(text, place=place, cure=cure)
 
 
 def size_text(angle: float) -> str:
     """rad in the units of headers: ``20 deg``, ``18 arcsec``."""
-    return f"{math.degrees(angle):.4g} deg" if angle >= math.radians(0.1) else f"{angle / ARCSEC:.4g} arcsec"
+    return (
+        f"{math.degrees(angle):.4g} deg"
+        if angle >= math.radians(0.1)
+        else f"{angle / ARCSEC:.4g} arcsec"
+    )
 
 
 def effective_fwhm(weights: Mapping[float, float]) -> float:
-    """Equation (1) [rad] of weights by FWHM; of one FWHM that itself; 0 where one of them is not known (0) or there is none."""
+    """Equation (1) [rad] of weights by FWHM; of one FWHM that itself; 0 where one of them is not
+    known (0) or there is none.
+    """
     used = sorted((fwhm, weight) for fwhm, weight in weights.items() if weight > 0)
     if not used or not used[0][0] > 0:
         return 0.0
@@ -55,8 +68,8 @@ def effective_fwhm(weights: Mapping[float, float]) -> float:
 
 
 def expected_fwhm(fwhm: Floats, net: Floats) -> float:
-    """Equation (1) [rad] of detectors (n_det,) that see the same of a map, with the weights of their ``net``; equal ones where
-    one is 0."""
+    """Equation (1) [rad] of detectors (n_det,) that see the same of a map, with the weights of
+    their ``net``; equal ones where one is 0."""
     weight = net**-2.0 if (net > 0).all() else np.ones(len(net))
     return effective_fwhm(dict(_by_width(fwhm, weight)))
 
@@ -69,12 +82,16 @@ def _by_width(fwhm: Floats, weight: Floats) -> list[tuple[float, float]]:
 
 @dataclass
 class Beams:
-    """Weights in a map by the detectors' FWHM [rad], in whole numbers of `UNIT` times a sample of weight 1."""
+    """Weights in a map by the detectors' FWHM [rad], in whole numbers of `UNIT` times a sample of
+    weight 1.
+    """
 
     weights: dict[float, int] = field(default_factory=dict)
 
     def add(self, fwhm: Floats, weight: Floats, samples: int) -> None:
-        """Detectors of ``fwhm`` (n_det,) whose samples weigh ``weight`` (n_det,), with about ``samples`` each."""
+        """Detectors of ``fwhm`` (n_det,) whose samples weigh ``weight`` (n_det,), with about
+        ``samples`` each.
+        """
         for width, total in _by_width(fwhm, weight):
             share = round(total * UNIT) * samples
             if share > 0:

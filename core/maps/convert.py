@@ -26,12 +26,20 @@ def converted(product: Map, unit: str, spectral_index: float) -> Map:
     except InputError as err:
         cure = f"use {KNOWN_UNITS}, with a prefix where you like: mK_RJ"
         raise InputError(err.message, place="map.to", cure=cure) from None
-    factor = _kelvin_per(product, product.unit, spectral_index) / _kelvin_per(product, name, spectral_index)
+    factor = _kelvin_per(product, product.unit, spectral_index) / _kelvin_per(
+        product, name, spectral_index
+    )
     known = {plane: getattr(product, plane) for plane in ("signal", "noise", "half_difference")}
-    weights = product.weights / factor**2 if product.weighting == "inverse_variance" else product.weights
-    planes: dict[str, Any] = {plane: None if values is None else values * factor for plane, values in known.items()}
+    weights = (
+        product.weights / factor**2 if product.weighting == "inverse_variance" else product.weights
+    )
+    planes: dict[str, Any] = {
+        plane: None if values is None else values * factor for plane, values in known.items()
+    }
     if product.polarization is not None:
-        planes["polarization"] = product.polarization.scaled(factor, product.weighting == "inverse_variance")
+        planes["polarization"] = product.polarization.scaled(
+            factor, product.weighting == "inverse_variance"
+        )
     return replace(product, unit=name, weights=weights, **planes)
 
 
@@ -45,19 +53,31 @@ def _kelvin_per(product: MapArrays, unit: str, spectral_index: float) -> float |
         raise InputError(f"the band of the map is not known: no {unit}", place="map", cure=cure)
     beam = math.pi / (4 * math.log(2)) * product.resolution**2 if plain == "Jy/beam" else None
     index = spectral_index if plain in SURFACE_BRIGHTNESS_UNITS else 0.0
-    return to_kelvin_rj(plain, product.band, 1.0, index, beam) * prefix / (product.areas() if plain == "Jy/pixel" else 1.0)
+    return (
+        to_kelvin_rj(plain, product.band, 1.0, index, beam)
+        * prefix
+        / (product.areas() if plain == "Jy/pixel" else 1.0)
+    )
 
 
 def smoothing_width(given: Any, beam: float) -> float:
     """FWHM [rad] as text or quantity; None: the ``beam``. Raises InputError for what is none."""
     if given is None:
         if not beam > 0:
-            raise InputError("the beam of the map is not known", place="map", cure="write map.smooth('9 arcsec')")
+            raise InputError(
+                "the beam of the map is not known", place="map", cure="write map.smooth('9 arcsec')"
+            )
         return beam
     try:
         width = Unit("rad").parse(given)
     except PydanticCustomError as err:
-        raise InputError(err.message(), place="map.smooth", cure="write map.smooth('9 arcsec')") from None
+        raise InputError(
+            err.message(), place="map.smooth", cure="write map.smooth('9 arcsec')"
+        ) from None
     if not width > 0:
-        raise InputError(f"{given} cannot be the width of a smoothing", place="map.smooth", cure="write map.smooth('9 arcsec')")
+        raise InputError(
+            f"{given} cannot be the width of a smoothing",
+            place="map.smooth",
+            cure="write map.smooth('9 arcsec')",
+        )
     return width

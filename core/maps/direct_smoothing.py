@@ -10,7 +10,9 @@ from ..compilation.jit import nb
 from ..types import Floats
 
 STEPS = 8192
-"""Of the table of the Gaussian: linear interpolation is right to (12.5 power / STEPS)^2 / 8, some 1e-6."""
+"""Of the table of the Gaussian: linear interpolation is right to (12.5 power / STEPS)^2 / 8, some
+1e-6.
+"""
 DEEPEST = 12.5
 """r^2 / 2 sigma^2 at which kernels end: 5 sigma."""
 
@@ -21,11 +23,14 @@ def table(power: float) -> Floats:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def smooth_directly(values, d, areas, reach, whole, sigma, power, gaussian, first, stop):  # type: ignore[no-untyped-def]
-    """sum_q K_pq^power values_q (ny, nx) for pixels from (row, column) ``first`` to before ``stop``; others are 0.
+def smooth_directly(  # type: ignore[no-untyped-def]
+    values, d, areas, reach, whole, sigma, power, gaussian, first, stop
+):
+    """sum_q K_pq^power values_q (ny, nx) for pixels from (row, column) ``first`` to before
+    ``stop``; others are 0.
 
-    ``d`` (ny, nx, 3) directions, NaN off the sky; ``areas`` (ny, nx) [sr]; ``reach`` (2, ny, nx) columns and rows to look at on
-    either side; ``whole``: the last column is beside the first one.
+    ``d`` (ny, nx, 3) directions, NaN off the sky; ``areas`` (ny, nx) [sr]; ``reach`` (2, ny, nx)
+    columns and rows to look at on either side; ``whole``: the last column is beside the first one.
     """
     ny, nx = values.shape
     out = np.zeros((ny, nx))
@@ -49,6 +54,8 @@ def smooth_directly(values, d, areas, reach, whole, sigma, power, gaussian, firs
                     at = chord * (1.0 + chord / 12.0) / (2 * sigma * sigma) * (STEPS / DEEPEST)
                     if at < STEPS:
                         n = int(at)
-                        found += (gaussian[n] + (at - n) * (gaussian[n + 1] - gaussian[n])) * values[j, i]
+                        found += (
+                            gaussian[n] + (at - n) * (gaussian[n + 1] - gaussian[n])
+                        ) * values[j, i]
             out[y, x] = found * scale**power
     return out

@@ -1,14 +1,18 @@
-"""Grids of map pixels on the sphere: solid angles, steps on the sky, distances, duplicates, and smoothing.
+"""Grids of map pixels on the sphere: solid angles, steps on the sky, distances, duplicates, and
+smoothing.
 
-A pixel's size is not a constant: solid angles and steps are those of each pixel, in every projection that astropy
-reads. With d(x, y) the direction (a unit vector) of the 0-based pixel coordinates (x, y),
+A pixel's size is not a constant: solid angles and steps are those of each pixel, in every
+projection that astropy reads. With d(x, y) the direction (a unit vector) of the 0-based pixel
+coordinates (x, y),
 
-    step along x = |d_x|,  along y = |d_y|,   solid angle = |d_x cross d_y|,   metric g_ij = d_i . d_j,           (1)
+    step along x = |d_x|,   along y = |d_y|,   solid angle = |d_x cross d_y|,
+    metric g_ij = d_i . d_j,   (1)
 
-derivatives over the middle half of the pixel; of gnomonic (TAN) and plate carree (CAR) images in closed form. A Gaussian of FWHM
-sqrt(8 ln 2) sigma on the sky, r the angle between two directions, is the kernel
+derivatives over the middle half of the pixel; of gnomonic (TAN) and plate carree (CAR) images in
+closed form. A Gaussian of FWHM sqrt(8 ln 2) sigma on the sky, r the angle between two directions,
+is the kernel
 
-    K_pq = W_p / (2 pi sigma^2) exp(-r_pq^2 / 2 sigma^2),   W_p the solid angle of pixel p,                        (2)
+    K_pq = W_p / (2 pi sigma^2) exp(-r_pq^2 / 2 sigma^2),   W_p the solid angle of pixel p,   (2)
 
 cut at 5 sigma: over pixels much smaller than the kernel it sums to 1.
 """
@@ -33,20 +37,28 @@ from ..numerics.transforms import convolved, convolved_rows, gaussian_taps
 from ..types import AnyFloats, Floats
 
 Smoother = Callable[..., Floats]
-"""f(values, power=1.0): values, shape of the grid, convolved with the power-th power of equation (2). Nothing lies outside."""
+"""f(values, power=1.0): values, shape of the grid, convolved with the power-th power of equation
+(2). Nothing lies outside.
+"""
 
 EVEN = 2e-3
 """Relative differences of steps across an image below which one kernel serves all pixels."""
 GENTLE = 5e-3
-"""sigma tan(latitude) of a CAR image up to which each row has its own kernel: the kernel's width varies by half of it within."""
+"""sigma tan(latitude) of a CAR image up to which each row has its own kernel: the kernel's width
+varies by half of it within.
+"""
 CUT = 5.0
 """Standard deviations at which kernels end."""
 STEEP = 0.15
-"""sigma tan(latitude) up to which the mean of two kernels for each row serves CAR images, to some 0.5 %."""
+"""sigma tan(latitude) up to which the mean of two kernels for each row serves CAR images, to some
+0.5 %.
+"""
 SMALL = 1 << 20
 """Pixels of a grid whose solid angles and distances are kept."""
 MOST_PAIRS = 3e6
-"""Pairs of HEALPix pixels under a kernel up to which each is looked at: harmonics of a whole sphere take as long."""
+"""Pairs of HEALPix pixels under a kernel up to which each is looked at: harmonics of a whole sphere
+take as long.
+"""
 LARGEST_NSIDE = 2048
 """Of HEALPix maps that are smoothed by harmonics: beyond, a whole sphere takes gigabytes."""
 DIRECT = 1e9
@@ -55,14 +67,17 @@ MOST_DIRECT = 3e11
 """Pairs beyond which that is not done."""
 TILE = 64
 SKEW = 1e-2
-"""Skewness of pixels below which the kernel is that of pixels at right angles: right to half of it, of the kernel's peak."""
+"""Skewness of pixels below which the kernel is that of pixels at right angles: right to half of it,
+of the kernel's peak.
+"""
 CYLINDERS = ("CAR", "CEA", "MER", "CYP")
 ROWS = 256
 """Of an image that are worked on at a time."""
 
 
 class MapGrid:
-    """Positions and sizes of a map's pixels on the sky: an image (`image_grid`) or a list of HEALPix pixels (`healpix_grid`).
+    """Positions and sizes of a map's pixels on the sky: an image (`image_grid`) or a list of
+    HEALPix pixels (`healpix_grid`).
 
     Attributes
     ----------
@@ -74,22 +89,30 @@ class MapGrid:
 
     @property
     def turn(self) -> Floats:
-        """(3, 3) from ICRS directions to those of the grid's frame. InputError for frames that are no rotation of it (FK4)."""
+        """(3, 3) from ICRS directions to those of the grid's frame. InputError for frames that are
+        no rotation of it (FK4).
+        """
         raise NotImplementedError
 
     @property
     def areas(self) -> Floats:
-        """Solid angles [sr], an array that broadcasts to `shape`; NaN for pixels that are not on the sky."""
+        """Solid angles [sr], an array that broadcasts to `shape`; NaN for pixels that are not on
+        the sky.
+        """
         raise NotImplementedError
 
     @property
     def once(self) -> NDArray[np.bool_]:
-        """Pixels that are on the sky and repeat no other one (as columns of CAR beyond 360 deg do); broadcasts to `shape`."""
+        """Pixels that are on the sky and repeat no other one (as columns of CAR beyond 360 deg do);
+        broadcasts to `shape`.
+        """
         raise NotImplementedError
 
     @property
     def sides(self) -> tuple[float, float]:
-        """Steps (y, x) on the sky [rad] of the middle pixel: what spectra and profiles of a small map need."""
+        """Steps (y, x) on the sky [rad] of the middle pixel: what spectra and profiles of a small
+        map need.
+        """
         raise NotImplementedError
 
     def directions(self) -> Floats:
@@ -97,7 +120,9 @@ class MapGrid:
         raise NotImplementedError
 
     def pixels_at(self, directions: Floats) -> NDArray[np.int64]:
-        """Flat places (...) of the pixels that hold directions (..., 3) of the grid's frame, -1 where there is none."""
+        """Flat places (...) of the pixels that hold directions (..., 3) of the grid's frame, -1
+        where there is none.
+        """
         raise NotImplementedError
 
     def smoother(self, fwhm: float) -> Smoother:
@@ -110,7 +135,9 @@ class MapGrid:
         return math.sqrt(math.prod(self.sides))
 
     def distance(self, centre: tuple[float, float]) -> Floats:
-        """Angles [rad] of the pixels from ``centre`` (longitude, latitude) [rad] in the grid's frame, of `shape`."""
+        """Angles [rad] of the pixels from ``centre`` (longitude, latitude) [rad] in the grid's
+        frame, of `shape`.
+        """
         return separation(*angles(self.directions()), centre)
 
     def solid_angle(self, where: NDArray[np.bool_]) -> float:
@@ -119,13 +146,20 @@ class MapGrid:
         return float(np.broadcast_to(areas, self.shape)[where].sum())
 
     def smoothed(
-        self, values: Floats, fwhm: float, weights: Floats | None = None, noise: Floats | None = None
+        self,
+        values: Floats,
+        fwhm: float,
+        weights: Floats | None = None,
+        noise: Floats | None = None,
     ) -> tuple[Floats, Floats | None]:
-        """(values, noise) of the mean under a Gaussian; NaN where ``values`` are, which count in no other pixel.
+        """(values, noise) of the mean under a Gaussian; NaN where ``values`` are, which count in no
+        other pixel.
 
-            m'_p = sum_q K_pq w_q m_q / sum_q K_pq w_q,    n'_p = [sum_q (K_pq w_q n_q)^2]^(1/2) / sum_q K_pq w_q          (3)
+            m'_p = sum_q K_pq w_q m_q / sum_q K_pq w_q,
+            n'_p = [sum_q (K_pq w_q n_q)^2]^(1/2) / sum_q K_pq w_q          (3)
 
-        ``weights``: default the solid angles, so that values are points of a brightness; noise is of pixels that are independent.
+        ``weights``: default the solid angles, so that values are points of a brightness; noise is
+        of pixels that are independent.
         """
         convolve = self.smoother(fwhm)
         own = np.broadcast_to(np.nan_to_num(np.where(self.once, self.areas, 0.0)), self.shape)
@@ -139,7 +173,9 @@ class MapGrid:
                 return found, None
             quiet = known & np.isfinite(noise)
             variance = convolve((weight * np.where(quiet, noise, 0.0)) ** 2, 2.0)
-            return found, np.where(quiet & (variance >= 0), np.sqrt(np.maximum(variance, 0.0)) / total, np.nan)
+            return found, np.where(
+                quiet & (variance >= 0), np.sqrt(np.maximum(variance, 0.0)) / total, np.nan
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +187,8 @@ class ImagePixels(MapGrid):
     wcs
         A `TangentWcs` or an `astropy.wcs.WCS` of two celestial axes.
     nominal
-        Steps (y, x) [rad] where the header's degrees, which are rounded, are not to be taken; None: those.
+        Steps (y, x) [rad] where the header's degrees, which are rounded, are not to be taken; None:
+        those.
     """
 
     wcs: Any
@@ -164,7 +201,9 @@ class ImagePixels(MapGrid):
 
     @cached_property
     def matrix(self) -> Floats:
-        """(2, 2) of the WCS: intermediate world coordinates (first axis, second axis) [rad] per pixel (x, y)."""
+        """(2, 2) of the WCS: intermediate world coordinates (first axis, second axis) [rad] per
+        pixel (x, y).
+        """
         found = np.radians(np.asarray(self.wcs.pixel_scale_matrix, np.float64))
         if self.nominal is not None:
             found = found / np.sqrt((found**2).sum(axis=0)) * self.nominal[::-1]
@@ -172,15 +211,24 @@ class ImagePixels(MapGrid):
 
     @cached_property
     def kind(self) -> str:
-        """Three letters of the projection; empty where distortions or parameters make more of it."""
+        """Three letters of the projection; empty where distortions or parameters make more of
+        it.
+        """
         names = {str(name)[-3:] for name in self.wcs.wcs.ctype}
         plain = len(names) == 1 and not self.wcs.has_distortion and not len(self.wcs.wcs.get_pv())
         return names.pop() if plain else ""
 
     @cached_property
     def cylinder(self) -> bool:
-        """True if rows are parallels of a cylindrical projection (of its own sphere, which may lie askew)."""
-        return self.kind in CYLINDERS and self.wcs.wcs.lng == 0 and not self.matrix[0, 1] and not self.matrix[1, 0]
+        """True if rows are parallels of a cylindrical projection (of its own sphere, which may lie
+        askew).
+        """
+        return (
+            self.kind in CYLINDERS
+            and self.wcs.wcs.lng == 0
+            and not self.matrix[0, 1]
+            and not self.matrix[1, 0]
+        )
 
     @property
     def around(self) -> int:
@@ -195,13 +243,17 @@ class ImagePixels(MapGrid):
 
     @property
     def _unbounded(self) -> Any:
-        """The WCS; that of a cylinder takes columns beyond a turn (astropy before 7 forgets that when parameters are read)."""
+        """The WCS; that of a cylinder takes columns beyond a turn (astropy before 7 forgets that
+        when parameters are read).
+        """
         if str(self.wcs.wcs.ctype[0])[-3:] in CYLINDERS:
             self.wcs.wcs.bounds_check(False, False)
         return self.wcs
 
     def at(self, x: Any, y: Any) -> Floats:
-        """(..., 3) unit vectors, in the grid's frame, of 0-based pixel coordinates; NaN where they are not on the sky."""
+        """(..., 3) unit vectors, in the grid's frame, of 0-based pixel coordinates; NaN where they
+        are not on the sky.
+        """
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
         if self.kind == "TAN":
             rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(central(self.wcs)).T
@@ -220,11 +272,16 @@ class ImagePixels(MapGrid):
         h = 0.25
         across = (self.at(np.asarray(x) + h, y) - self.at(np.asarray(x) - h, y)) / (2 * h)
         along = (self.at(x, np.asarray(y) + h) - self.at(x, np.asarray(y) - h)) / (2 * h)
-        return tuple(np.asarray((a * b).sum(axis=-1)) for a, b in ((across, across), (across, along), (along, along)))  # type: ignore[return-value]
+        return tuple(
+            np.asarray((a * b).sum(axis=-1))
+            for a, b in ((across, across), (across, along), (along, along))
+        )  # type: ignore[return-value]
 
     @cached_property
     def middle(self) -> tuple[float, float, float]:
-        """Metric g_xx, g_xy, g_yy of the middle of the image; of the reference point where that is not on the sky."""
+        """Metric g_xx, g_xy, g_yy of the middle of the image; of the reference point where that is
+        not on the sky.
+        """
         ny, nx = self.shape
         found = self.metric((nx - 1) / 2, (ny - 1) / 2)
         if not np.isfinite(found).all():
@@ -257,16 +314,32 @@ class ImagePixels(MapGrid):
         ny, nx = self.shape
         flat = abs(float(np.linalg.det(self.matrix)))
         if self.kind == "TAN":  # r^2 on the plane: 1 + r^2 = 1 / cos^2
-            x, y = (np.arange(n) + 1.0 - float(c) for n, c in zip((nx, ny), self.wcs.wcs.crpix[:2], strict=True))
+            x, y = (
+                np.arange(n) + 1.0 - float(c)
+                for n, c in zip((nx, ny), self.wcs.wcs.crpix[:2], strict=True)
+            )
             g = self.matrix.T @ self.matrix
-            secant = g[0, 0] * x**2 + (2 * g[0, 1] * x) * y[:, None] + (g[1, 1] * y**2)[:, None] + 1.0
+            secant = (
+                g[0, 0] * x**2 + (2 * g[0, 1] * x) * y[:, None] + (g[1, 1] * y**2)[:, None] + 1.0
+            )
             return np.asarray(flat / (secant * np.sqrt(secant)))
         if self.kind == "CAR" and self.cylinder:
             step = abs(float(self.matrix[1, 1]))
-            edges = np.clip(self.latitudes[:, None] + [[-step / 2, step / 2]], -math.pi / 2, math.pi / 2)
-            found = abs(float(self.matrix[0, 0])) * 2 * np.sin(np.diff(edges) / 2) * np.cos(edges.mean(axis=1, keepdims=True))
-            return np.where(abs(self.latitudes[:, None]) <= math.pi / 2 * (1 + 1e-12), found, np.nan)
-        columns = np.arange(1 if self.cylinder else nx) + (float(self.wcs.wcs.crpix[0]) - 1.0 if self.cylinder else 0.0)
+            edges = np.clip(
+                self.latitudes[:, None] + [[-step / 2, step / 2]], -math.pi / 2, math.pi / 2
+            )
+            found = (
+                abs(float(self.matrix[0, 0]))
+                * 2
+                * np.sin(np.diff(edges) / 2)
+                * np.cos(edges.mean(axis=1, keepdims=True))
+            )
+            return np.where(
+                abs(self.latitudes[:, None]) <= math.pi / 2 * (1 + 1e-12), found, np.nan
+            )
+        columns = np.arange(1 if self.cylinder else nx) + (
+            float(self.wcs.wcs.crpix[0]) - 1.0 if self.cylinder else 0.0
+        )
         found = np.empty((ny, len(columns)))
         for first in range(0, ny, ROWS):
             rows = np.arange(first, min(first + ROWS, ny), dtype=np.float64)
@@ -307,7 +380,8 @@ class ImagePixels(MapGrid):
         return found
 
     def coordinates(self, directions: Floats) -> tuple[Floats, Floats]:
-        """0-based pixel coordinates (x, y) of directions (..., 3) of the grid's frame; NaN where the projection has none.
+        """0-based pixel coordinates (x, y) of directions (..., 3) of the grid's frame; NaN where
+        the projection has none.
 
         Of a cylindrical image from -1/2 to a full turn beyond; others may lie outside the image.
         """
@@ -318,7 +392,9 @@ class ImagePixels(MapGrid):
                 return np.where(c > 0, a / c, np.nan), np.where(c > 0, b / c, np.nan)
         lon, lat = np.degrees(angles(directions))
         known = np.isfinite(lon) & np.isfinite(lat)
-        pair = [np.where(known, lon % 360.0, 0.0), np.where(known, lat, 0.0)][:: -1 if self.wcs.wcs.lng == 1 else 1]
+        pair = [np.where(known, lon % 360.0, 0.0), np.where(known, lat, 0.0)][
+            :: -1 if self.wcs.wcs.lng == 1 else 1
+        ]
         if self.wcs.has_distortion:
             x, y = self._unbounded.all_world2pix(*pair, 0, quiet=True)
         else:
@@ -334,40 +410,62 @@ class ImagePixels(MapGrid):
         ny, nx = self.shape
         with np.errstate(invalid="ignore"):
             inside = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
-        column, row = (np.rint(np.where(inside, v, 0.0)).astype(np.int64).clip(0, n - 1) for v, n in ((x, nx), (y, ny)))
+        column, row = (
+            np.rint(np.where(inside, v, 0.0)).astype(np.int64).clip(0, n - 1)
+            for v, n in ((x, nx), (y, ny))
+        )
         return np.where(inside, row * nx + column, -1)
 
     def window(self, rows: slice, columns: slice) -> ImagePixels:
         """The grid of a part of the image."""
-        (y0, y1, _), (x0, x1, _) = (s.indices(n) for s, n in zip((rows, columns), self.shape, strict=True))
+        (y0, y1, _), (x0, x1, _) = (
+            s.indices(n) for s, n in zip((rows, columns), self.shape, strict=True)
+        )
         shape = max(y1 - y0, 0), max(x1 - x0, 0)
         if isinstance(self.wcs, tangent.TangentWcs):
             x, y = self.wcs.crpix
-            world: Any = tangent.TangentWcs(self.wcs.frame, self.wcs.crval, (x - x0, y - y0), self.wcs.cdelt)
+            world: Any = tangent.TangentWcs(
+                self.wcs.frame, self.wcs.crval, (x - x0, y - y0), self.wcs.cdelt
+            )
         else:
             world = self.wcs.slice((slice(y0, None), slice(x0, None)))
         return ImagePixels(world, shape, self.nominal)
 
-    # ------------------------------------------------------------------------------------------------------ smoothing
+    # ----------------------------------------------------------------------------------------------
+    # smoothing
 
     def smoother(self, fwhm: float) -> Smoother:
         sigma = fwhm / FWHM_PER_SIGMA
-        if self.kind == "CAR" and self.cylinder and sigma * np.tan(abs(self.latitudes)).max(initial=0.0) < GENTLE:
+        if (
+            self.kind == "CAR"
+            and self.cylinder
+            and sigma * np.tan(abs(self.latitudes)).max(initial=0.0) < GENTLE
+        ):
             return self._by_rows(sigma)
         steps = self._even()
         if steps is None:
             reach = self.reach(CUT * sigma)
             by_latitudes = self.kind == "CAR" and self.cylinder  # right to 0.2 %, and much faster
-            if 4.0 * math.prod(self.shape) * math.prod(reach) < (DIRECT / 100 if by_latitudes else DIRECT):
+            if 4.0 * math.prod(self.shape) * math.prod(reach) < (
+                DIRECT / 100 if by_latitudes else DIRECT
+            ):
                 return self._directly(sigma)
             if by_latitudes:
                 return self._by_latitudes(sigma)
-            return self._directly(sigma) if 0 < self.around <= self.shape[1] else self._by_tiles(sigma, reach)
+            return (
+                self._directly(sigma)
+                if 0 < self.around <= self.shape[1]
+                else self._by_tiles(sigma, reach)
+            )
         along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
-        return lambda values, power=1.0: np.asarray(convolved(values, along_y**power, along_x**power))
+        return lambda values, power=1.0: np.asarray(
+            convolved(values, along_y**power, along_x**power)
+        )
 
     def _by_tiles(self, sigma: float, reach: tuple[int, int]) -> Smoother:
-        """Smoother of a large image: tile by tile, each so small that one kernel serves it where that can be."""
+        """Smoother of a large image: tile by tile, each so small that one kernel serves it where
+        that can be.
+        """
         ny, nx = self.shape
         more = tuple(math.ceil(1.2 * n) + 2 for n in reach)
         tiles = self._tiles(slice(0, ny), slice(0, nx))
@@ -376,7 +474,10 @@ class ImagePixels(MapGrid):
             out = np.empty((ny, nx))
             for y, x in tiles:
                 low = max(y.start - more[0], 0), max(x.start - more[1], 0)
-                around = slice(low[0], min(y.stop + more[0], ny)), slice(low[1], min(x.stop + more[1], nx))
+                around = (
+                    slice(low[0], min(y.stop + more[0], ny)),
+                    slice(low[1], min(x.stop + more[1], nx)),
+                )
                 steps, part = self.window(y, x)._even(), np.asarray(values[around], np.float64)
                 if steps is None:
                     own = [slice(s.start - n, s.stop - n) for s, n in zip((y, x), low, strict=True)]
@@ -384,13 +485,17 @@ class ImagePixels(MapGrid):
                 else:
                     along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
                     whole = np.asarray(convolved(part, along_y**power, along_x**power), np.float64)
-                out[y, x] = whole[y.start - low[0] : y.stop - low[0], x.start - low[1] : x.stop - low[1]]
+                out[y, x] = whole[
+                    y.start - low[0] : y.stop - low[0], x.start - low[1] : x.stop - low[1]
+                ]
             return out
 
         return found
 
     def _tiles(self, y: slice, x: slice) -> list[tuple[slice, slice]]:
-        """Halves of halves of the image, until each is even or of no more than `TILE` pixels a side."""
+        """Halves of halves of the image, until each is even or of no more than `TILE` pixels a
+        side.
+        """
         rows, columns = y.stop - y.start, x.stop - x.start
         if max(rows, columns) <= TILE or self.window(y, x).even:
             return [(y, x)]
@@ -401,12 +506,17 @@ class ImagePixels(MapGrid):
         return self._tiles(y, slice(x.start, middle)) + self._tiles(y, slice(middle, x.stop))
 
     def _by_rows(self, sigma: float, both: bool = False) -> Smoother:
-        """Smoother of a CAR image: along each row with its own width, then along the columns; right to sigma tan(latitude) / 2.
+        """Smoother of a CAR image: along each row with its own width, then along the columns; right
+        to sigma tan(latitude) / 2.
 
-        ``both``: the mean of that, of the height that equation (2) has, and of columns first, rows then. The widths go with
-        cos(latitude) of the pixel that is seen, and of the one that sees it; so has r^2 the mean of both: right to the square.
+        ``both``: the mean of that, of the height that equation (2) has, and of columns first, rows
+        then. The widths go with cos(latitude) of the pixel that is seen, and of the one that sees
+        it; so has r^2 the mean of both: right to the square.
         """
-        side, taps = abs(float(self.matrix[0, 0])), gaussian_taps(sigma / abs(float(self.matrix[1, 1])))
+        side, taps = (
+            abs(float(self.matrix[0, 0])),
+            gaussian_taps(sigma / abs(float(self.matrix[1, 1]))),
+        )
         cosines = np.cos(self.latitudes)
         if both:  # rows nearer to a pole are left to `_directly`
             cosines = np.maximum(cosines, sigma / 2 / STEEP)
@@ -419,7 +529,10 @@ class ImagePixels(MapGrid):
                 return convolved_rows(values, taps**power, along)
             height = cosines[:, None] ** power
             seen = height * convolved_rows(values / height, taps**power, along)
-            return (seen + convolved_rows(convolved_rows(values, taps**power, [one] * len(rows)), one, along)) / 2
+            return (
+                seen
+                + convolved_rows(convolved_rows(values, taps**power, [one] * len(rows)), one, along)
+            ) / 2
 
         if not 0 < around <= nx:
             return lambda values, power=1.0: convolve(np.asarray(values, np.float64), power)
@@ -427,21 +540,35 @@ class ImagePixels(MapGrid):
         columns = np.arange(-reach, around + reach) % around
 
         def found(values: AnyFloats, power: float = 1.0) -> Floats:
-            return convolve(np.asarray(values, np.float64)[:, columns], power)[:, reach + np.arange(nx) % around]
+            return convolve(np.asarray(values, np.float64)[:, columns], power)[
+                :, reach + np.arange(nx) % around
+            ]
 
         return found
 
     def _by_latitudes(self, sigma: float) -> Smoother:
-        """Smoother of a large CAR image: by rows, but near the poles pixel by pixel. InputError where that would take hours."""
+        """Smoother of a large CAR image: by rows, but near the poles pixel by pixel. InputError
+        where that would take hours.
+        """
         ny, nx = self.shape
         with np.errstate(divide="ignore", invalid="ignore"):
             steep = ~(sigma * np.tan(abs(self.latitudes)) < STEEP)
-        rows, halo = self._by_rows(sigma, both=True), math.ceil(1.1 * CUT * sigma / abs(float(self.matrix[1, 1]))) + 2
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], steep.view(np.int8), [0]]))).reshape(-1, 2)
+        rows, halo = (
+            self._by_rows(sigma, both=True),
+            math.ceil(1.1 * CUT * sigma / abs(float(self.matrix[1, 1]))) + 2,
+        )
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], steep.view(np.int8), [0]]))).reshape(
+            -1, 2
+        )
         if (pairs := float(steep.sum()) * nx * nx * 2 * halo) > MOST_DIRECT:
-            text = f"a CAR map of {nx} x {ny} pixels that holds a pole, smoothed by {angle_text(sigma * FWHM_PER_SIGMA)}"
+            text = (
+                f"a CAR map of {nx} x {ny} pixels that holds a pole, smoothed by"
+                f" {angle_text(sigma * FWHM_PER_SIGMA)}"
+            )
             cure = "smooth it less, cut the pole off, or make a HEALPix map (nside)"
-            raise InputError(f"{text}, would take {pairs / 1e12:.2g} hours", place="smoothing", cure=cure)
+            raise InputError(
+                f"{text}, would take {pairs / 1e12:.2g} hours", place="smoothing", cure=cure
+            )
 
         def found(values: AnyFloats, power: float = 1.0) -> Floats:
             out = rows(values, power)
@@ -466,36 +593,50 @@ class ImagePixels(MapGrid):
     @cached_property
     def _somewhere(self) -> tuple[Floats, Floats, Floats]:
         """The metric at some pixels all over the image, its corners among them."""
-        y, x = np.meshgrid(*(np.unique(np.linspace(0, n - 1, min(n, 33))) for n in self.shape), indexing="ij")
+        y, x = np.meshgrid(
+            *(np.unique(np.linspace(0, n - 1, min(n, 33))) for n in self.shape), indexing="ij"
+        )
         return self.metric(x, y)
 
     @property
     def even(self) -> bool:
-        """True if all pixels have the same steps along its axes, to `EVEN`: one kernel serves all."""
+        """True if all pixels have the same steps along its axes, to `EVEN`: one kernel serves
+        all.
+        """
         return self._even() is not None
 
     def _even(self) -> tuple[float, float] | None:
-        """Steps (y, x) that hold for all pixels to `EVEN`, whose axes are at right angles; None: they differ."""
+        """Steps (y, x) that hold for all pixels to `EVEN`, whose axes are at right angles; None:
+        they differ.
+        """
         if 0 < self.around <= self.shape[1]:
             return None
         xx, xy, yy = self._somewhere
         reference = tuple(float(v) for v in np.sqrt((self.matrix**2).sum(axis=0))[::-1])
         for dy, dx in (reference, self.sides):
             with np.errstate(invalid="ignore"):
-                same = (abs(np.sqrt(xx) / dx - 1) < EVEN) & (abs(np.sqrt(yy) / dy - 1) < EVEN) & (abs(xy) < SKEW / 2 * dx * dy)
+                same = (
+                    (abs(np.sqrt(xx) / dx - 1) < EVEN)
+                    & (abs(np.sqrt(yy) / dy - 1) < EVEN)
+                    & (abs(xy) < SKEW / 2 * dx * dy)
+                )
             if same.all():
                 return dy, dy if abs(dx / dy - 1) < 1e-9 else dx
         return None
 
     def _directly(self, sigma: float, within: tuple[slice, slice] | None = None) -> Smoother:
-        """Equation (2) as it stands: each pixel with its own kernel. ``within``: only for these rows and columns."""
+        """Equation (2) as it stands: each pixel with its own kernel. ``within``: only for these
+        rows and columns.
+        """
         from .direct_smoothing import smooth_directly, table
 
         ny, nx = self.shape
         whole = 0 < self.around <= nx
         columns = self.around if whole else nx
         directions = np.ascontiguousarray(self.directions()[:, :columns])
-        areas = np.ascontiguousarray(np.nan_to_num(np.broadcast_to(self.areas, self.shape)[:, :columns]))
+        areas = np.ascontiguousarray(
+            np.nan_to_num(np.broadcast_to(self.areas, self.shape)[:, :columns])
+        )
         farthest = columns // 2 if whole else columns
         down, across = within or (slice(0, ny), slice(0, columns))
         begin, end = (down.start, across.start), (down.stop, min(across.stop, columns))
@@ -508,13 +649,19 @@ class ImagePixels(MapGrid):
                 if self.cylinder:  # meridians meet: a circle about the pole has all columns
                     side = abs(float(self.matrix[0, 0]))
                     share = math.sin(min(CUT * sigma, math.pi / 2)) / (np.sqrt(xx) / side)
-                    wide[0] = np.where(share < 1, np.arcsin(np.minimum(share, 1.0)) / side + 1, np.inf)
+                    wide[0] = np.where(
+                        share < 1, np.arcsin(np.minimum(share, 1.0)) / side + 1, np.inf
+                    )
             wide = np.where(np.isnan(wide), 0.0, wide)
-            reach[:, first : first + ROWS] = np.minimum(wide, np.array([farthest, ny])[:, None, None])
+            reach[:, first : first + ROWS] = np.minimum(
+                wide, np.array([farthest, ny])[:, None, None]
+            )
 
         def found(values: AnyFloats, power: float = 1.0) -> Floats:
             own = np.ascontiguousarray(values[:, :columns], np.float64)
-            out = smooth_directly(own, directions, areas, reach, whole, sigma, power, table(power), begin, end)
+            out = smooth_directly(
+                own, directions, areas, reach, whole, sigma, power, table(power), begin, end
+            )
             return np.asarray(out[:, np.arange(nx) % columns] if nx > columns else out, np.float64)
 
         return found
@@ -564,14 +711,19 @@ class HealpixPixels(MapGrid):
     def pixels_at(self, directions: Floats) -> NDArray[np.int64]:
         import healpy
 
-        wanted = np.asarray(healpy.vec2pix(self.nside, *np.moveaxis(directions, -1, 0), nest=self.nest))
+        wanted = np.asarray(
+            healpy.vec2pix(self.nside, *np.moveaxis(directions, -1, 0), nest=self.nest)
+        )
         pixels = self.pixels if len(self.pixels) else np.array([-1])
         place = np.clip(np.searchsorted(pixels, wanted), 0, len(pixels) - 1)
         return np.where(pixels[place] == wanted, place, -1)
 
     def smoother(self, fwhm: float) -> Smoother:
         sigma = fwhm / FWHM_PER_SIGMA / self.sides[0]
-        if len(self.pixels) * math.pi * (CUT * sigma) ** 2 < MOST_PAIRS or self.nside > LARGEST_NSIDE:
+        if (
+            len(self.pixels) * math.pi * (CUT * sigma) ** 2 < MOST_PAIRS
+            or self.nside > LARGEST_NSIDE
+        ):
             return self._directly(fwhm / FWHM_PER_SIGMA)
 
         def found(values: AnyFloats, power: float = 1.0) -> Floats:
@@ -590,7 +742,9 @@ class HealpixPixels(MapGrid):
         return found
 
     def _directly(self, sigma: float) -> Smoother:
-        """Equation (2) as it stands: of few pixels, or of a part of a sphere that is too fine for harmonics of the whole."""
+        """Equation (2) as it stands: of few pixels, or of a part of a sphere that is too fine for
+        harmonics of the whole.
+        """
         from scipy.spatial import cKDTree
 
         directions = self.directions()
@@ -604,7 +758,9 @@ class HealpixPixels(MapGrid):
                 near = part.sparse_distance_matrix(tree, CUT * sigma, output_type="ndarray")
                 chord = near["v"] ** 2
                 kernel = np.exp(-power * chord * (1 + chord / 12) / (2 * sigma**2))
-                out[first : first + rows] = np.bincount(near["i"], kernel * values[near["j"]], part.n)
+                out[first : first + rows] = np.bincount(
+                    near["i"], kernel * values[near["j"]], part.n
+                )
             return np.asarray(out * scale**power, np.float64)
 
         return found
@@ -613,10 +769,13 @@ class HealpixPixels(MapGrid):
 def image_grid(header: Any, shape: tuple[int, int], nominal: float | None = None) -> ImagePixels:
     """The grid of an image by its FITS header (any mapping that astropy's `WCS` takes).
 
-    ``nominal``: side of a pixel at the reference point [rad], where it is known better than by the header's degrees.
+    ``nominal``: side of a pixel at the reference point [rad], where it is known better than by the
+    header's degrees.
     """
     known = ((key, header[key]) for key in header if key not in ("", "COMMENT", "HISTORY"))
-    cards = tuple((key, value) for key, value in known if isinstance(value, bool | int | float | str))
+    cards = tuple(
+        (key, value) for key, value in known if isinstance(value, bool | int | float | str)
+    )
     return _image(tangent.plain(header) or cards, (int(shape[0]), int(shape[1])), nominal)
 
 
@@ -629,12 +788,16 @@ def wcs_grid(wcs: Any, shape: tuple[int, int]) -> ImagePixels:
     return ImagePixels(wcs, (int(shape[0]), int(shape[1])))
 
 
-def healpix_grid(nside: int, nest: bool, pixels: NDArray[np.int64], frame: str = "icrs") -> HealpixPixels:
+def healpix_grid(
+    nside: int, nest: bool, pixels: NDArray[np.int64], frame: str = "icrs"
+) -> HealpixPixels:
     """The grid of some HEALPix pixels (sorted)."""
     return HealpixPixels(nside, nest, pixels, frame)
 
 
-@lru_cache(maxsize=4)  # the maps of all signals of a run share one, with its solid angles and distances
+@lru_cache(
+    maxsize=4
+)  # the maps of all signals of a run share one, with its solid angles and distances
 def _image(world: Any, shape: tuple[int, int], nominal: float | None) -> ImagePixels:
     if not isinstance(world, tangent.TangentWcs):
         from astropy.wcs import WCS

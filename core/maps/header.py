@@ -1,4 +1,6 @@
-"""Cards of FITS headers from elsewhere, checked for their type where they are read, for maps, masks and comparisons alike."""
+"""Cards of FITS headers from elsewhere, checked for their type where they are read, for maps, masks
+and comparisons alike.
+"""
 
 from __future__ import annotations
 
@@ -13,36 +15,50 @@ from ..errors import InputError
 from ..types import AnyFloats
 
 FRAMES = ("ICRS", "FK5", "FK4", "FK4-NO-E")
-"""Values of RADESYS that are read (FITS 4.0, table 24, without GAPPT: apparent places, which depend on an instant)."""
+"""Values of RADESYS that are read (FITS 4.0, table 24, without GAPPT: apparent places, which depend
+on an instant).
+"""
 _SAME = {
     **dict.fromkeys(("J2000", "J2000.0", "FK5J2000", "EQUATORIALJ2000"), ("FK5", 2000.0)),
     **dict.fromkeys(("B1950", "B1950.0", "FK4B1950"), ("FK4", 1950.0)),
     **dict.fromkeys(("ICRF", "ICRF2", "ICRF3", "GCRS"), ("ICRS", None)),
 }  # fmt: skip
 """What CASA, AIPS and others write: RADESYS and equinox."""
-_NUMBERS = re.compile(r"(CRPIX|CRVAL|CDELT|CROTA)[12]|(CD|PC)[12]_[12]|LONPOLE|LATPOLE|PV[12]_\d+|EQUINOX|EPOCH")
+_NUMBERS = re.compile(
+    r"(CRPIX|CRVAL|CDELT|CROTA)[12]|(CD|PC)[12]_[12]|LONPOLE|LATPOLE|PV[12]_\d+|EQUINOX|EPOCH"
+)
 """Cards of world coordinates that are numbers: astropy takes a default for one that is none."""
 _IN_DEGREES = {"rad": math.degrees(1.0), "arcmin": 1 / 60, "arcsec": 1 / 3600, "mas": 1 / 3.6e6}
 _EQUATORIAL = ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH")
 
 
 def number(header: Any, key: str, place: str, cure: str = "") -> float | None:
-    """The finite number of a card; None where there is no such card, or it has no value. Raises InputError for anything else."""
+    """The finite number of a card; None where there is no such card, or it has no value. Raises
+    InputError for anything else.
+    """
     value = header.get(key)
     if value is None or _is_blank(value):
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{key} = {value!r} is no number", place=place, cure=cure or f"write {key} as a number, or remove it")
+        raise InputError(
+            f"{key} = {value!r} is no number",
+            place=place,
+            cure=cure or f"write {key} as a number, or remove it",
+        )
     return float(value)
 
 
 def text(header: Any, key: str, place: str, cure: str = "") -> str:
-    """The text of a card, empty where there is none. Raises InputError for a number or a logical value."""
+    """The text of a card, empty where there is none. Raises InputError for a number or a logical
+    value.
+    """
     value = header.get(key)
     if value is None or _is_blank(value):
         return ""
     if not isinstance(value, str):
-        raise InputError(f"{key} = {value!r} is no text", place=place, cure=cure or f"write {key} in quotes")
+        raise InputError(
+            f"{key} = {value!r} is no text", place=place, cure=cure or f"write {key} in quotes"
+        )
     return value.strip()
 
 
@@ -51,7 +67,8 @@ UNSEEN = -1.6375e30
 
 
 def marked_bad(values: AnyFloats, header: Any, place: str) -> NDArray[np.bool_]:
-    """True for values that a map's file marks as not observed: `UNSEEN`, and that of the card BAD_DATA. NaN is not among them.
+    """True for values that a map's file marks as not observed: `UNSEEN`, and that of the card
+    BAD_DATA. NaN is not among them.
 
     Raises InputError where BAD_DATA is no number.
     """
@@ -68,14 +85,16 @@ def _is_blank(value: Any) -> bool:
 
 
 def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
-    """A copy of an image's header whose RADESYS is one of `FRAMES`, or absent, and a note where another one was read as that.
+    """A copy of an image's header whose RADESYS is one of `FRAMES`, or absent, and a note where
+    another one was read as that.
 
     Of Galactic axes what belongs to equatorial ones is removed: astropy would take ICRS.
 
     Raises
     ------
     InputError
-        RADESYS is none that is known, or no text; cards of the world coordinates are no numbers, units no texts.
+        RADESYS is none that is known, or no text; cards of the world coordinates are no numbers,
+        units no texts.
     """
     made = header.copy()
     for key in list(made):
@@ -87,7 +106,9 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
         key, unit = f"CRVAL{axis}", text(made, f"CUNIT{axis}", place) or "deg"
         if abs(number(made, key, place) or 0.0) * _IN_DEGREES.get(unit.lower(), 1.0) > 720.0:
             cure = f"correct {key}, or the unit CUNIT{axis}"
-            raise InputError(f"{key} = {made[key]:g} {unit} is no longitude or latitude", place=place, cure=cure)
+            raise InputError(
+                f"{key} = {made[key]:g} {unit} is no longitude or latitude", place=place, cure=cure
+            )
     kinds = {str(header.get(f"CTYPE{axis}", "")).strip().upper()[:4] for axis in "12"}
     if kinds == {"GLON", "GLAT"}:
         for key in _EQUATORIAL:
@@ -103,13 +124,22 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
         del made[key]
     if not written or written in FRAMES:
         return made, ""
-    plain = written.upper().replace(" ", "").replace("(", "").replace(")", "").replace("_", "").replace("/", "")
+    plain = (
+        written.upper()
+        .replace(" ", "")
+        .replace("(", "")
+        .replace(")", "")
+        .replace("_", "")
+        .replace("/", "")
+    )
     frame, equinox = _SAME.get(plain, (written.upper(), None))
     if frame not in FRAMES:
         raise InputError(
             f"{key} = '{written}' is no frame of coordinates that is read",
             place=place,
-            cure=f"set {key} to {', '.join(FRAMES[:-1])} or {FRAMES[-1]}, or convert the map to ICRS",
+            cure=(
+                f"set {key} to {', '.join(FRAMES[:-1])} or {FRAMES[-1]}, or convert the map to ICRS"
+            ),
         )
     made[key] = frame
     stated = number(made, "EQUINOX", place)

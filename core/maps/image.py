@@ -31,12 +31,13 @@ class Image:
     values
         (ny, nx) float64, NaN where nothing is known; row 0 is the FITS file's first row.
     header
-        FITS keywords with a two-dimensional celestial WCS; a dict that `astropy.io.fits.Header` takes.
+        FITS keywords with a two-dimensional celestial WCS; a dict that `astropy.io.fits.Header`
+        takes.
     unit
         Unit of ``values``, e.g. ``K_RJ``.
     polarization, axis
-        (2, ny, nx) Q and U beside them, COSMO, from the meridians through the ICRS direction ``axis`` (3,); `stokes` turns them
-        to those of the image's frame. None: there are none.
+        (2, ny, nx) Q and U beside them, COSMO, from the meridians through the ICRS direction
+        ``axis`` (3,); `stokes` turns them to those of the image's frame. None: there are none.
     """
 
     values: Floats
@@ -53,14 +54,22 @@ class Image:
         Raises InputError for an image without Q and U, and for other names.
         """
         if self.polarization is None or self.axis is None:
-            raise InputError("the image has no Q and U", place="image.stokes", cure="give a map of I, Q and U")
+            raise InputError(
+                "the image has no Q and U", place="image.stokes", cure="give a map of I, Q and U"
+            )
         if which not in ("I", "Q", "U"):
-            raise InputError(f"{which!r} is none of I, Q and U", place="image.stokes", cure="write image.stokes('Q')")
+            raise InputError(
+                f"{which!r} is none of I, Q and U",
+                place="image.stokes",
+                cure="write image.stokes('Q')",
+            )
         plain = replace(self, polarization=None, axis=None)
         if which == "I":
             return plain
         to = wcs_frame_rotation(self.wcs)[2] if pole is None else pole
-        return replace(plain, values=_turned(self.polarization, (self.axis, to), self, "QU".index(which)))
+        return replace(
+            plain, values=_turned(self.polarization, (self.axis, to), self, "QU".index(which))
+        )
 
     @property
     def fwhm(self) -> float:
@@ -75,14 +84,18 @@ class Image:
         return WCS(self.header, naxis=2)
 
     def plot(self, ax: Any = None, *, title: str = "", limit: float | None = None) -> Any:
-        """Draw it; the matplotlib Axes. ``limit``: where the colours end; default: what 99.5 % of the pixels stay below."""
+        """Draw it; the matplotlib Axes. ``limit``: where the colours end; default: what 99.5 % of
+        the pixels stay below.
+        """
         from .picture import Shown, draw
 
         return draw(Shown(self.values, self.wcs, self.unit, title), ax, limit)
 
 
 def _turned(q_and_u: Floats, poles: tuple[Floats, Floats], image: Image, number: int) -> Floats:
-    """Q or U (ny, nx), which stand to meridians through the first of the ``poles``, from those through the second."""
+    """Q or U (ny, nx), which stand to meridians through the first of the ``poles``, from those
+    through the second.
+    """
     to_sky, (axis, pole) = np.linalg.inv(pixel_matrix(image.wcs)), poles
     found: Floats = np.empty_like(image.values, np.float64)
     for start in range(0, len(found), ROWS):

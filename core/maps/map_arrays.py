@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 @dataclass
 class MapArrays:
-    """A map in the TAN or CAR projection, arrays (ny, nx), or in HEALPix, arrays (n_pixel,) for the pixels ``pixels``.
+    """A map in the TAN or CAR projection, arrays (ny, nx), or in HEALPix, arrays (n_pixel,) for the
+    pixels ``pixels``.
 
     Attributes
     ----------
@@ -35,22 +36,25 @@ class MapArrays:
     weights
         Sum of the samples' weights: K^-2 (inverse variance), or a plain count (uniform).
     noise
-        Standard deviation of ``signal`` (after smoothing, where it is smoothed), `unit`; NaN where unknown.
+        Standard deviation of ``signal`` (after smoothing, where it is smoothed), `unit`; NaN where
+        unknown.
     half_difference
-        Noise map from the difference of two halves of the samples (``difference``: which, ``even - odd scans``),
-        (m_1 - m_2) sqrt(w_1 w_2) / (w_1 + w_2): its variance is that of ``signal`` where both have a value; NaN elsewhere.
+        Noise map from the difference of two halves of the samples (``difference``: which, ``even -
+        odd scans``), (m_1 - m_2) sqrt(w_1 w_2) / (w_1 + w_2): its variance is that of ``signal``
+        where both have a value; NaN elsewhere.
     header
         Keywords of the WCS (images), else None; a dict that `astropy.io.fits.Header` takes.
     centre
         (lon, lat) [rad] of the map's centre in ``frame``.
     pixel
-        Nominal side of a pixel [rad]: of TAN at the tangent point, of CAR in latitude (and in longitude on the equator); for
-        HEALPix the square root of its area. What a pixel covers on the sky is in `grid`.
+        Nominal side of a pixel [rad]: of TAN at the tangent point, of CAR in latitude (and in
+        longitude on the equator); for HEALPix the square root of its area. What a pixel covers on
+        the sky is in `grid`.
     nside, nest, pixels
         HEALPix parameters and sorted pixel numbers, else 0, False, None.
     fwhm
-        FWHM of the beam [rad]; of detectors with several beams that of the map, `core.maps.beams`; 0: not known.
-        ``smoothed_by``: FWHM of the Gaussian applied to the map, 0 for none.
+        FWHM of the beam [rad]; of detectors with several beams that of the map, `core.maps.beams`;
+        0: not known. ``smoothed_by``: FWHM of the Gaussian applied to the map, 0 for none.
     scans
         Names of the observations in it.
     sample_rate
@@ -80,10 +84,13 @@ class MapArrays:
     """``hits``: nothing else was made, ``signal`` and ``noise`` are NaN."""
     difference: str = "even - odd scans"
     polarization: Polarization | None = None
-    """Q and U; ``signal`` and the others are of I then, and ``weights`` 0 where I, Q and U are not determined."""
+    """Q and U; ``signal`` and the others are of I then, and ``weights`` 0 where I, Q and U are not
+    determined.
+    """
     directions: Floats | None = None
-    """(2, ...) mean cosine and sine of twice the angle, from east to north, in which detectors moved through each pixel; NaN
-    where none did. None: not kept (`BinMap: {crosslinking: true}`)."""
+    """(2, ...) mean cosine and sine of twice the angle, from east to north, in which detectors
+    moved through each pixel; NaN where none did. None: not kept (`BinMap: {crosslinking:
+    true}`)."""
     scan_hits: ScanHits | None = None
     """Hits of each scan (`BinMap: {scan_hits: true}`)."""
     band: Band | None = None
@@ -97,21 +104,27 @@ class MapArrays:
         from astropy.wcs import WCS
 
         if self.header is None:
-            raise InputError("a HEALPix map has no WCS", place="map", cure="use nside, pixels and healpy")
+            raise InputError(
+                "a HEALPix map has no WCS", place="map", cure="use nside, pixels and healpy"
+            )
         return WCS(self.header)
 
     @property
     def crosslinking(self) -> Floats | None:
-        """How one-sided the scan directions in each pixel are: 0 where they cross evenly, 1 where all are along one line.
+        """How one-sided the scan directions in each pixel are: 0 where they cross evenly, 1 where
+        all are along one line.
 
-        The modulus of the mean of exp(2 i psi), psi the direction of motion, as of ACT's maps (Aiola et al. 2020, `xlink`) and
-        TOAST's `CrossLinking`. NaN where no detector moved; None where it was not kept.
+        The modulus of the mean of exp(2 i psi), psi the direction of motion, as of ACT's maps
+        (Aiola et al. 2020, `xlink`) and TOAST's `CrossLinking`. NaN where no detector moved; None
+        where it was not kept.
         """
         return None if self.directions is None else np.hypot(*self.directions)
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Where the map has a value: where there are samples and, of a polarized map, enough of their angles."""
+        """Where the map has a value: where there are samples and, of a polarized map, enough of
+        their angles.
+        """
         hit = self.hits > 0
         return hit if self.contents == "hits" else hit & np.isfinite(self.signal)
 
@@ -121,9 +134,15 @@ class MapArrays:
         return np.where(self.known, self.hits, 0)
 
     def hits_of(self, scan: str | int) -> NDArray[np.int32]:
-        """Hits of one scan, by name or number, shape of ``signal``. Raises InputError where they were not kept."""
+        """Hits of one scan, by name or number, shape of ``signal``. Raises InputError where they
+        were not kept.
+        """
         if self.scan_hits is None:
-            raise InputError("the hits of each scan were not kept", place="map", cure="set scan_hits: true of the map maker")
+            raise InputError(
+                "the hits of each scan were not kept",
+                place="map",
+                cure="set scan_hits: true of the map maker",
+            )
         return self.scan_hits.plane(scan, self.signal.shape)
 
     @property
@@ -144,7 +163,9 @@ class MapArrays:
     @property
     def latitudes(self) -> Floats:
         """(ny,) latitudes of the rows of a CAR map [rad]."""
-        return image_grid(self.header, (self.signal.shape[0], self.signal.shape[1]), self.pixel).latitudes
+        return image_grid(
+            self.header, (self.signal.shape[0], self.signal.shape[1]), self.pixel
+        ).latitudes
 
     @property
     def sides(self) -> tuple[float, float]:
@@ -152,9 +173,11 @@ class MapArrays:
         return self.grid.sides if self.projection == "CAR" else (self.pixel, self.pixel)
 
     def areas(self) -> Floats | float:
-        """Solid angles of the pixels [sr]: one number (HEALPix), of rows (ny, 1) (CAR), or of all pixels (TAN).
+        """Solid angles of the pixels [sr]: one number (HEALPix), of rows (ny, 1) (CAR), or of all
+        pixels (TAN).
 
-        TAN: side^2 cos^3(distance from the tangent point),   CAR: 2 side sin(side / 2) cos(latitude)
+        TAN: side^2 cos^3(distance from the tangent point),   CAR: 2 side sin(side / 2)
+        cos(latitude)
         """
         return self.pixel**2 if self.header is None else self.grid.areas
 
@@ -168,16 +191,21 @@ class MapArrays:
         return self.grid.distance(self.centre)
 
     def seconds_per_beam(self) -> Floats | float | None:
-        """What one sample in a pixel adds to the integration time of all detectors per beam [s]: times ``hits``, that time.
+        """What one sample in a pixel adds to the integration time of all detectors per beam [s]:
+        times ``hits``, that time.
 
             1 / sample rate x beam area / pixel area,   beam area = pi FWHM^2 / (4 ln 2)
 
-        The beam is the telescope's, not what smoothing made of it. One number where pixels are equal to 0.1 %, else an array,
-        shape of ``signal``; None where the rate or the beam is not known.
+        The beam is the telescope's, not what smoothing made of it. One number where pixels are
+        equal to 0.1 %, else an array, shape of ``signal``; None where the rate or the beam is not
+        known.
         """
         if not (self.sample_rate > 0 and self.fwhm > 0):
             return None
-        beam, areas = math.pi / math.log(16) * self.fwhm**2 / self.sample_rate, np.asarray(self.areas())
+        beam, areas = (
+            math.pi / math.log(16) * self.fwhm**2 / self.sample_rate,
+            np.asarray(self.areas()),
+        )
         if areas.max() < 1.001 * areas.min():
             return beam / (float(areas.mean()) if self.projection == "CAR" else self.pixel**2)
         return np.asarray(np.broadcast_to(beam / areas, self.signal.shape), np.float64)

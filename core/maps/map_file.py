@@ -1,4 +1,6 @@
-"""Map files: FITS images with world coordinates or partial HEALPix tables, and where they come from."""
+"""Map files: FITS images with world coordinates or partial HEALPix tables, and where they come
+from.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,8 @@ class Provenance:
     cards
         For the first header: who made it, with what; the resolved YAML as HISTORY.
     tables
-        The resolved YAML (a row per line), the plan and the tally: binary tables of text, as they stand at a file's end.
+        The resolved YAML (a row per line), the plan and the tally: binary tables of text, as they
+        stand at a file's end.
     """
 
     cards: Cards
@@ -65,7 +68,12 @@ class Provenance:
         """What is known of a map apart from its run."""
         from zonda import __version__
 
-        cards = Cards([("ORIGIN", "zonda", "simulated, not observed"), ("CREATOR", f"zonda {__version__}", "software")])
+        cards = Cards(
+            [
+                ("ORIGIN", "zonda", "simulated, not observed"),
+                ("CREATOR", f"zonda {__version__}", "software"),
+            ]
+        )
         return cls(cards.add(Cards([("NSCANS", len(product.scans), "scans")])), b"")
 
     @classmethod
@@ -85,7 +93,8 @@ class MapFile:
     product
         Whose pixels, frame and beam these are.
     planes
-        ``signal``, ``hits`` ...: (ny, nx) each on a WCS grid, (n_pix,) on HEALPix; NaN where nothing is known.
+        ``signal``, ``hits`` ...: (ny, nx) each on a WCS grid, (n_pix,) on HEALPix; NaN where
+        nothing is known.
     cards
         More of the header of the first image, or of the table.
     noise
@@ -99,16 +108,31 @@ class MapFile:
     noise: Mapping[str, tuple[float | None, str]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, name: str, product: MapArrays, noise: Mapping[str, tuple[float | None, str]] | None = None) -> MapFile:
+    def of(
+        cls,
+        name: str,
+        product: MapArrays,
+        noise: Mapping[str, tuple[float | None, str]] | None = None,
+    ) -> MapFile:
         """With the planes that a product has."""
         found: dict[str, Any]
         if product.polarization is not None:
             found = file_planes(product)
         else:
-            found = {plane: getattr(product, plane) for plane in (PLANES if product.contents == "all" else ("hits",))}
+            found = {
+                plane: getattr(product, plane)
+                for plane in (PLANES if product.contents == "all" else ("hits",))
+            }
         if product.directions is not None:
-            found = found | dict(zip(CROSSING, (product.crosslinking, *product.directions), strict=True))
-        return cls(name, product, {plane: values for plane, values in found.items() if values is not None}, noise=noise or {})
+            found = found | dict(
+                zip(CROSSING, (product.crosslinking, *product.directions), strict=True)
+            )
+        return cls(
+            name,
+            product,
+            {plane: values for plane, values in found.items() if values is not None},
+            noise=noise or {},
+        )
 
     def unit(self, plane: str) -> str:
         """FITS unit; none for counts."""
@@ -125,8 +149,16 @@ class MapFile:
         """The resolution of the map."""
         product = self.product
         degrees = float(np.degrees(product.resolution))
-        what = "[deg] FWHM: beam, smoothing in quadrature" if product.smoothed_by else "[deg] FWHM of the beam"
-        cards = Cards([("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")] if degrees else ())
+        what = (
+            "[deg] FWHM: beam, smoothing in quadrature"
+            if product.smoothed_by
+            else "[deg] FWHM of the beam"
+        )
+        cards = Cards(
+            [("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")]
+            if degrees
+            else ()
+        )
         narrow, wide = (float(np.degrees(fwhm)) for fwhm in product.beams)
         if degrees and narrow < wide:
             cards["BEAMLOW"] = narrow, "[deg] narrowest FWHM of the beams in BMAJ"
@@ -142,23 +174,35 @@ class MapFile:
     @property
     def halves(self) -> Cards:
         """What `half_difference` is the difference of."""
-        return Cards([("JACKKNIF", ascii_text(self.product.difference), "halves that were subtracted")])
+        return Cards(
+            [("JACKKNIF", ascii_text(self.product.difference), "halves that were subtracted")]
+        )
 
     def noise_cards(self, plane: str = "") -> Cards:
-        """What stands behind the noise, for the header of a ``plane`` of it; of a table, for all its columns together."""
+        """What stands behind the noise, for the header of a ``plane`` of it; of a table, for all
+        its columns together.
+        """
         cards = Cards()
         for key, (factor, words) in self.noise.items():
-            if plane and plane not in {"I": ("noise", "cov_ii"), "Q": ("cov_qq",), "U": ("cov_uu",)}[key]:
+            if (
+                plane
+                and plane not in {"I": ("noise", "cov_ii"), "Q": ("cov_qq",), "U": ("cov_uu",)}[key]
+            ):
                 continue
             if factor is not None:
-                cards["NOISEFAC" if plane else f"NOISFAC{key}"] = factor, "measured noise / this white noise"
+                cards["NOISEFAC" if plane else f"NOISFAC{key}"] = (
+                    factor,
+                    "measured noise / this white noise",
+                )
             if plane or key == "I":
                 cards["NOISEOF"] = ascii_text(words), "what the noise was measured in"
         return cards
 
     def first(self, about: Provenance) -> Cards:
         """Cards of the first header: the name, where it comes from, and its own cards."""
-        own = Cards([("PRODUCT", ascii_text(self.name), "product of the pipeline")]).add(about.cards)
+        own = Cards([("PRODUCT", ascii_text(self.name), "product of the pipeline")]).add(
+            about.cards
+        )
         if (band := self.product.band) is not None:
             own["RESTFRQ"] = float(f"{band.centre:.12g}"), "[Hz] centre of the band"
             own["BAND"] = ascii_text(band.name), "name of the band"
@@ -178,7 +222,9 @@ class MapFile:
         return path
 
     def _scan_tables(self) -> Iterator[bytes]:
-        """Hits of each scan: its number, pixel (HEALPix, or y nx + x) and samples, a row each; and the names of the scans."""
+        """Hits of each scan: its number, pixel (HEALPix, or y nx + x) and samples, a row each; and
+        the names of the scans.
+        """
         if (found := self.product.scan_hits) is not None and "hits" in self.planes:
             columns: dict[str, NDArray[Any]] = {**found.table}
             if self.product.pixels is not None:
@@ -189,7 +235,11 @@ class MapFile:
     def _images(self, about: Provenance) -> Iterator[bytes]:
         world = (tangent.plain(self.product.header) or self.product.wcs).to_header(relax=True)
         for k, (name, plane) in enumerate(self.planes.items()):
-            header = Cards((key, world[key], world.comments[key]) for key in world if key not in ("", "COMMENT", "HISTORY"))
+            header = Cards(
+                (key, world[key], world.comments[key])
+                for key in world
+                if key not in ("", "COMMENT", "HISTORY")
+            )
             header["EXTNAME"] = name.upper(), "extension name"
             if unit := self.unit(name):
                 header["BUNIT"] = unit, _MEANING[name]
@@ -199,13 +249,17 @@ class MapFile:
                 header.add(self.beam)
             if name.startswith("half_difference"):
                 header.add(self.halves)
-            header.add(self.noise_cards(name) if name == "noise" or name.startswith("cov_") else Cards()).add(self.convention)
+            header.add(
+                self.noise_cards(name) if name == "noise" or name.startswith("cov_") else Cards()
+            ).add(self.convention)
             if k == 0:
                 header.add(self.first(about)).add(self.cards)
             yield from image_pieces(header, plane, extension=k > 0, dtype=_type(name, plane))
 
     def _write_table(self, path: Path, about: Provenance) -> None:
-        """A partial map, pixel numbers explicit; the cards are those of Gorski et al. (2005) that healpy reads."""
+        """A partial map, pixel numbers explicit; the cards are those of Gorski et al. (2005) that
+        healpy reads.
+        """
         from astropy.io import fits
 
         product = self.product
@@ -213,7 +267,9 @@ class MapFile:
         for name, plane in self.planes.items():
             values: NDArray[Any] = np.asarray(plane, _type(name, plane))
             code = "D" if values.dtype.kind == "f" else "K" if values.dtype.itemsize == 8 else "J"
-            columns.append(fits.Column(name.upper(), code, unit=self.unit(name) or None, array=values))
+            columns.append(
+                fits.Column(name.upper(), code, unit=self.unit(name) or None, array=values)
+            )
         table = fits.BinTableHDU.from_columns(columns, name="MAP")
         made = Cards(
             [
@@ -227,7 +283,9 @@ class MapFile:
         )
         if scale := scale_of(product.unit)[1]:
             made["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
-        made.add(self.beam).add(self.halves if "half_difference" in self.planes else Cards()).add(self.convention)
+        made.add(self.beam).add(self.halves if "half_difference" in self.planes else Cards()).add(
+            self.convention
+        )
         made.add(self.noise_cards()).add(self.first(about)).add(self.cards)
         hdus = [fits.PrimaryHDU(), table]
         for hdu, more in zip(hdus, (self.first(about), made), strict=True):
@@ -242,12 +300,17 @@ def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
     """`MapProduct.write`."""
     path = Path(path).expanduser()
     if path.exists() and not overwrite:
-        raise OutputError("exists already", place=str(path), cure="choose another name, or write overwrite=True")
+        raise OutputError(
+            "exists already", place=str(path), cure="choose another name, or write overwrite=True"
+        )
     noise = {}
     for key, plane in zip("IQU", planes_of(product, "map").values(), strict=False):
         half = plane.half_difference
         if np.isfinite(plane.noise).any():
-            noise[key] = stated(plane.noise, None if half is None else (half, f"half the difference, {plane.difference}"))
+            noise[key] = stated(
+                plane.noise,
+                None if half is None else (half, f"half the difference, {plane.difference}"),
+            )
     return MapFile.of("map", product, noise).write(path, Provenance.of_a_map(product))
 
 
@@ -266,15 +329,27 @@ def _origin(data: Data) -> Cards:
     cards = Cards(
         [
             ("ORIGIN", "zonda", "simulated, not observed"),
-            ("CREATOR", f"zonda {provenance.get('versions', {}).get('zonda', zonda.__version__)}", "software"),
+            (
+                "CREATOR",
+                f"zonda {provenance.get('versions', {}).get('zonda', zonda.__version__)}",
+                "software",
+            ),
             ("PIPELINE", ascii_text(str(provenance.get("name", ""))), "pipeline"),
             ("SEED", int(scene.seed), "root of all random numbers"),
-            ("DATE-OBS", str(min((o.start for o in data.scans), default=scene.time)), "start of the first scan, UTC"),
+            (
+                "DATE-OBS",
+                str(min((o.start for o in data.scans), default=scene.time)),
+                "start of the first scan, UTC",
+            ),
             ("NSCANS", len(data.scans), "scans"),
         ]
     )
     names = (scene.instrument.telescope.name, scene.instrument.name, scene.site.name)
-    found = zip(*(o.origin for o in data.scans), strict=True) if data.scans else ((name,) for name in names)
+    found = (
+        zip(*(o.origin for o in data.scans), strict=True)
+        if data.scans
+        else ((name,) for name in names)
+    )
     for key, every in zip(("TELESCOP", "INSTRUME", "SITE"), found, strict=True):
         cards[key], more = _names(every)
         cards.history += [f"{key}: {name}" for name in more]
@@ -312,19 +387,43 @@ def _tables(data: Data) -> Iterable[bytes]:
 def _text_table(name: str, columns: dict[str, list[str]]) -> bytes:
     plain = {title: [ascii_text(t) for t in texts] for title, texts in columns.items()}
     widths = {title: max([1, *map(len, texts)]) for title, texts in plain.items()}
-    return _table(name, {title: np.array([t.encode("ascii") for t in plain[title]], f"S{widths[title]}") for title in plain})
+    return _table(
+        name,
+        {
+            title: np.array([t.encode("ascii") for t in plain[title]], f"S{widths[title]}")
+            for title in plain
+        },
+    )
 
 
 def _table(name: str, columns: Mapping[str, NDArray[Any]]) -> bytes:
-    """Columns of texts (``S``), int32 or int64: FITS 4.0, section 7.3; see `core.storage.fits_image` for why not astropy."""
-    plain = {title: values.astype(values.dtype.newbyteorder(">")) for title, values in columns.items()}
-    rows = np.rec.fromarrays(list(plain.values()), dtype=[(title, values.dtype) for title, values in plain.items()])
+    """Columns of texts (``S``), int32 or int64: FITS 4.0, section 7.3; see
+    `core.storage.fits_image` for why not astropy.
+    """
+    plain = {
+        title: values.astype(values.dtype.newbyteorder(">")) for title, values in columns.items()
+    }
+    rows = np.rec.fromarrays(
+        list(plain.values()), dtype=[(title, values.dtype) for title, values in plain.items()]
+    )
     cards = Cards([("XTENSION", "BINTABLE", "binary table extension"), ("BITPIX", 8), ("NAXIS", 2)])
-    sizes = {"NAXIS1": rows.dtype.itemsize, "NAXIS2": len(rows), "PCOUNT": 0, "GCOUNT": 1, "TFIELDS": len(plain)}
+    sizes = {
+        "NAXIS1": rows.dtype.itemsize,
+        "NAXIS2": len(rows),
+        "PCOUNT": 0,
+        "GCOUNT": 1,
+        "TFIELDS": len(plain),
+    }
     for key, size in sizes.items():
         cards[key] = size
     for k, (title, values) in enumerate(plain.items(), 1):
-        form = f"{values.dtype.itemsize}A" if values.dtype.kind == "S" else "J" if values.dtype.itemsize == 4 else "K"
+        form = (
+            f"{values.dtype.itemsize}A"
+            if values.dtype.kind == "S"
+            else "J"
+            if values.dtype.itemsize == 4
+            else "K"
+        )
         cards[f"TTYPE{k}"], cards[f"TFORM{k}"] = title, form
     cards["EXTNAME"] = name
     body = rows.tobytes()

@@ -26,38 +26,46 @@ class MapProduct(MapArrays):
     """`MapArrays`, and what is done with them."""
 
     def to(self, unit: str, *, spectral_index: float = 0.0) -> MapProduct:
-        """The map in another unit: K_RJ, K_CMB, Jy/beam, Jy/pixel, MJy/sr or y, with a prefix (``uK_CMB``, ``mJy/beam``).
+        """The map in another unit: K_RJ, K_CMB, Jy/beam, Jy/pixel, MJy/sr or y, with a prefix
+        (``uK_CMB``, ``mJy/beam``).
 
-        ``uK`` alone is on the map's own temperature scale. Equation (1) of `core.numerics.radiation` averages over the band of
-        the run; ``spectral_index`` is that of the flux density within the band. A beam is a Gaussian of `resolution`. Weights
-        that are an inverse variance are divided by the square of the factor. Raises InputError for a unit that is not known, and
-        where the map has no band or beam.
+        ``uK`` alone is on the map's own temperature scale. Equation (1) of
+        `core.numerics.radiation` averages over the band of the run; ``spectral_index`` is that of
+        the flux density within the band. A beam is a Gaussian of `resolution`. Weights that are an
+        inverse variance are divided by the square of the factor. Raises InputError for a unit that
+        is not known, and where the map has no band or beam.
         """
         from .convert import converted
 
         return converted(self, unit, spectral_index)
 
     def smooth(self, fwhm: Any = None) -> MapProduct:
-        """`smoothed` with a Gaussian of ``fwhm``: ``"9 arcsec"``, an astropy quantity; None: the telescope's beam."""
+        """`smoothed` with a Gaussian of ``fwhm``: ``"9 arcsec"``, an astropy quantity; None: the
+        telescope's beam.
+        """
         from .convert import smoothing_width
 
         return self.smoothed(smoothing_width(fwhm, self.fwhm))
 
     def stokes(self, which: str) -> MapProduct:
-        """I, Q or U of a polarized map as a map of its own, or P = sqrt(Q^2 + U^2) (which noise makes larger on the average).
+        """I, Q or U of a polarized map as a map of its own, or P = sqrt(Q^2 + U^2) (which noise
+        makes larger on the average).
 
-        Its weights are 1 over the diagonal of A^-1. Raises InputError for a map without Q and U, and for other names.
+        Its weights are 1 over the diagonal of A^-1. Raises InputError for a map without Q and U,
+        and for other names.
         """
         from .stokes import stokes_plane
 
         return stokes_plane(self, which)
 
-    def plot(self, ax: Any = None, *, plane: str = "signal", title: str = "", limit: float | None = None) -> Any:
+    def plot(
+        self, ax: Any = None, *, plane: str = "signal", title: str = "", limit: float | None = None
+    ) -> Any:
         """Draw a plane; the matplotlib Axes.
 
-        Planes are ``signal``, ``noise``, ``hits``, ``weights``, ``half_difference``, ``crosslinking``; of a polarized map also
-        ``Q``, ``U``, ``P``.
-        Raises InputError for a plane that the map has not.
+        Planes are ``signal``, ``noise``, ``hits``, ``weights``, ``half_difference``,
+        ``crosslinking``; of a polarized map also ``Q``, ``U``, ``P``. Raises InputError for a plane
+        that the map has not.
 
         Parameters
         ----------
@@ -71,9 +79,11 @@ class MapProduct(MapArrays):
         return draw_map(self, ax, plane, title, limit)
 
     def write(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write it as `SaveMap` does (FITS image, or HEALPix table), without the log of the run; the path.
+        """Write it as `SaveMap` does (FITS image, or HEALPix table), without the log of the run;
+        the path.
 
-        Raises `OutputError` where the file is there already (unless ``overwrite``), or cannot be written.
+        Raises `OutputError` where the file is there already (unless ``overwrite``), or cannot be
+        written.
         """
         from .map_file import write_map
 
@@ -84,20 +94,36 @@ class MapProduct(MapArrays):
         """Of the circle in which `rms` is taken, rad: `central.central_diameter`."""
         return central_diameter(self.fwhm, self.pixel) / 2
 
-    def rms(self, radius: float | None = None, of: Literal["signal", "half_difference"] = "signal") -> float:
-        """Weighted root mean square, sqrt(sum w m^2 / sum w), within ``radius`` [rad] of the centre (`central_radius`).
+    def rms(
+        self, radius: float | None = None, of: Literal["signal", "half_difference"] = "signal"
+    ) -> float:
+        """Weighted root mean square, sqrt(sum w m^2 / sum w), within ``radius`` [rad] of the centre
+        (`central_radius`).
 
         NaN where no pixel there has a value.
         """
         values = getattr(self, of)
         if values is None:
-            raise InputError("the map has no half-difference", place="map", cure="set half_difference and make two scans")
-        return _rms(values, self.weights, self.distance() <= (self.central_radius if radius is None else radius))
+            raise InputError(
+                "the map has no half-difference",
+                place="map",
+                cure="set half_difference and make two scans",
+            )
+        return _rms(
+            values,
+            self.weights,
+            self.distance() <= (self.central_radius if radius is None else radius),
+        )
 
     def smoothed_rms(
-        self, fwhm: float, radius: float | None = None, of: Literal["signal", "half_difference"] = "signal"
+        self,
+        fwhm: float,
+        radius: float | None = None,
+        of: Literal["signal", "half_difference"] = "signal",
     ) -> float:
-        """``smoothed(fwhm).rms(radius, of)``; of an image, only what the circle sees is smoothed."""
+        """``smoothed(fwhm).rms(radius, of)``; of an image, only what the circle sees is
+        smoothed.
+        """
         radius = self.central_radius if radius is None else radius
         if self.polarization is not None:
             return self.stokes("I").smoothed_rms(fwhm, radius, of)
@@ -105,24 +131,36 @@ class MapProduct(MapArrays):
             return self.smoothed(fwhm).rms(radius, of)
         near = self.distance() <= radius
         reach = self.grid.reach(CUT * fwhm / FWHM_PER_SIGMA)  # type: ignore[union-attr]
-        window = tuple(_around(np.flatnonzero(near.any(axis=axis)), more) for axis, more in zip((1, 0), reach, strict=True))
+        window = tuple(
+            _around(np.flatnonzero(near.any(axis=axis)), more)
+            for axis, more in zip((1, 0), reach, strict=True)
+        )
         names = ("signal", "hits", "weights", "noise", "half_difference")
-        planes: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[window] for n in names}
-        cut = replace(self, header=_cut(self.header, window[0].start or 0, window[1].start or 0), **planes)
+        planes: dict[str, Any] = {
+            n: None if getattr(self, n) is None else getattr(self, n)[window] for n in names
+        }
+        cut = replace(
+            self, header=_cut(self.header, window[0].start or 0, window[1].start or 0), **planes
+        )
         return _rms(getattr(cut.smoothed(fwhm), of), cut.weights, near[window])
 
     def smoothed(self, fwhm: float) -> MapProduct:
-        """The map convolved with a Gaussian of ``fwhm`` [rad], weighted: sum_q K w m / sum_q K w over pixels with a value.
+        """The map convolved with a Gaussian of ``fwhm`` [rad], weighted: sum_q K w m / sum_q K w
+        over pixels with a value.
 
-        Empty pixels neither contribute nor are filled. Noise: pixels are independent before, so its variance becomes
-        sum K^2 w^2 n^2 / (sum K w)^2. Hits and weights stay those of the pixel itself. I, Q and U are smoothed one by one.
-        Raises InputError for a map in Jy/beam, whose beam it would change.
+        Empty pixels neither contribute nor are filled. Noise: pixels are independent before, so its
+        variance becomes sum K^2 w^2 n^2 / (sum K w)^2. Hits and weights stay those of the pixel
+        itself. I, Q and U are smoothed one by one. Raises InputError for a map in Jy/beam, whose
+        beam it would change.
         """
         if self.unit.endswith("/beam"):
             message = (
-                f"a map in {self.unit} is per beam of {math.degrees(self.resolution) * 3600:.3g} arcsec, which smoothing widens"
+                f"a map in {self.unit} is per beam of {math.degrees(self.resolution) * 3600:.3g}"
+                " arcsec, which smoothing widens"
             )
-            raise InputError(message, place="map", cure="smooth it before: map.smooth(...).to('Jy/beam')")
+            raise InputError(
+                message, place="map", cure="smooth it before: map.smooth(...).to('Jy/beam')"
+            )
         if self.polarization is not None:
             from .stokes import smoothed_polarization
 
@@ -142,7 +180,9 @@ class MapProduct(MapArrays):
         quiet = known & np.isfinite(self.noise)
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = convolve((weights * np.where(quiet, self.noise, 0.0)) ** 2, 2.0) / total**2
-        with np.errstate(invalid="ignore"):  # where the transform's rounding is all there is, the noise is not known
+        with np.errstate(
+            invalid="ignore"
+        ):  # where the transform's rounding is all there is, the noise is not known
             noise = np.where(quiet & (variance >= 0), np.sqrt(variance), np.nan)
         half = self.half_difference
         if half is not None:
@@ -157,7 +197,9 @@ class MapProduct(MapArrays):
 
     @property
     def healpix_full(self) -> Floats:
-        """The whole-sphere signal (12 nside^2,), healpy's UNSEEN where there is none (HEALPix maps)."""
+        """The whole-sphere signal (12 nside^2,), healpy's UNSEEN where there is none (HEALPix
+        maps).
+        """
         import healpy
 
         if self.pixels is None:
@@ -173,7 +215,10 @@ class MapProduct(MapArrays):
             if self.header is None
             else f"{self.hits.shape[1]} x {self.hits.shape[0]}"
         )
-        return f"<MapProduct {size}, {int(self.hits.sum())} samples of {len(self.scans)} scans, {self.unit}>"
+        return (
+            f"<MapProduct {size}, {int(self.hits.sum())} samples of {len(self.scans)} scans,"
+            f" {self.unit}>"
+        )
 
     def _repr_html_(self) -> str:
         hit = self.hits > 0
@@ -181,28 +226,51 @@ class MapProduct(MapArrays):
             ("size", repr(self)),
             ("pixel", sides_text(*self.sides)),
             ("pixels hit", int(hit.sum())),
-            ("smoothed by", f"{math.degrees(self.smoothed_by) * 3600:.3g} arcsec" if self.smoothed_by else "nothing"),
+            (
+                "smoothed by",
+                (
+                    f"{math.degrees(self.smoothed_by) * 3600:.3g} arcsec"
+                    if self.smoothed_by
+                    else "nothing"
+                ),
+            ),
             ("resolution (FWHM)", f"{math.degrees(self.resolution) * 3600:.3g} arcsec"),
-            (f"rms within {angle_text(self.central_radius)} of the centre", f"{self.rms():.3g} {self.unit}"),
+            (
+                f"rms within {angle_text(self.central_radius)} of the centre",
+                f"{self.rms():.3g} {self.unit}",
+            ),
         ]
         if self.half_difference is not None:
-            rows.append(("half-difference rms there", f"{self.rms(of='half_difference'):.3g} {self.unit}"))
+            rows.append(
+                ("half-difference rms there", f"{self.rms(of='half_difference'):.3g} {self.unit}")
+            )
         return html_table("Map", rows)
 
 
 def _rms(values: Floats, weights: Floats, where: NDArray[np.bool_]) -> float:
     use = where & np.isfinite(values)
     w = weights[use]
-    return float(np.sqrt((w * values[use] ** 2).sum() / w.sum())) if use.any() and w.sum() > 0 else math.nan
+    return (
+        float(np.sqrt((w * values[use] ** 2).sum() / w.sum()))
+        if use.any() and w.sum() > 0
+        else math.nan
+    )
 
 
 def _cut(header: Any, rows: int, columns: int) -> Any:
     """The header of an image without its first rows and columns."""
     found = header.copy()
-    found["CRPIX1"], found["CRPIX2"] = float(header["CRPIX1"]) - columns, float(header["CRPIX2"]) - rows
+    found["CRPIX1"], found["CRPIX2"] = (
+        float(header["CRPIX1"]) - columns,
+        float(header["CRPIX2"]) - rows,
+    )
     return found
 
 
 def _around(places: NDArray[np.int64], reach: int) -> slice:
     """From ``reach`` before the first to ``reach`` behind the last."""
-    return slice(max(0, int(places[0]) - reach), int(places[-1]) + reach + 1) if places.size else slice(0)
+    return (
+        slice(max(0, int(places[0]) - reach), int(places[-1]) + reach + 1)
+        if places.size
+        else slice(0)
+    )

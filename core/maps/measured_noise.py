@@ -7,17 +7,22 @@ import numpy as np
 from ..types import Floats
 
 LEAST = 0.1
-"""Share of the 99th percentile of the weight (1 / noise^2) that a pixel needs for its noise to be measured."""
+"""Share of the 99th percentile of the weight (1 / noise^2) that a pixel needs for its noise to be
+measured.
+"""
 ELSEWHERE = "that of the complete map, none in this one"
-"""Said of the noise of a signal without noise (`Signal.is_quiet`): it is that of the complete map."""
+"""Said of the noise of a signal without noise (`Signal.is_quiet`): it is that of the complete map.
+"""
 WHITE = "white noise only"
-"""Said of noise that is the standard error of independent pixels, where no map of the noise alone is known."""
+"""Said of noise that is the standard error of independent pixels, where no map of the noise alone
+is known.
+"""
 
 
 def noise_factor(noise: Floats, alone: Floats) -> float | None:
-    """The rms of ``alone`` / ``noise`` over pixels with at least `LEAST` of the usual weight: what white
-    noise is to be multiplied by, so that noise that is correlated between pixels (1/f noise, the atmosphere)
-    counts in full. None where it cannot be measured."""
+    """The rms of ``alone`` / ``noise`` over pixels with at least `LEAST` of the usual weight: what
+    white noise is to be multiplied by, so that noise that is correlated between pixels (1/f noise,
+    the atmosphere) counts in full. None where it cannot be measured."""
     with np.errstate(invalid="ignore", divide="ignore"):
         weight, ratio = noise**-2.0, alone / noise
     known = np.isfinite(ratio) & np.isfinite(weight)
@@ -29,6 +34,8 @@ def noise_factor(noise: Floats, alone: Floats) -> float | None:
 
 
 def stated(noise: Floats, alone: tuple[Floats, str] | None) -> tuple[float | None, str]:
-    """`noise_factor`, and what it was measured in; None and `WHITE` where it is not known. ``alone``: the map and its name."""
+    """`noise_factor`, and what it was measured in; None and `WHITE` where it is not known.
+    ``alone``: the map and its name.
+    """
     factor = None if alone is None else noise_factor(noise, alone[0])
     return (None, WHITE) if alone is None or factor is None else (factor, alone[1])

@@ -17,11 +17,14 @@ from .measured_noise import ELSEWHERE, stated
 from .stokes import planes_of
 
 Noise = Literal["half_difference", "source_free"]
-"""What holds noise alone: half the difference of two halves of the samples, the map of the signal without the sky."""
+"""What holds noise alone: half the difference of two halves of the samples, the map of the signal
+without the sky.
+"""
 
 
 def maps_of(products: Mapping[str, Any], *, split: bool = True) -> dict[str, MapProduct]:
-    """Every map among ``data.products``, by name, of ``signal`` first; not of signals that a step has for itself (_NAME).
+    """Every map among ``data.products``, by name, of ``signal`` first; not of signals that a step
+    has for itself (_NAME).
 
     ``split``: I, Q and U of a polarized map are maps of their own (`stokes.planes_of`).
     """
@@ -29,15 +32,18 @@ def maps_of(products: Mapping[str, Any], *, split: bool = True) -> dict[str, Map
     names = sorted(found, key=lambda n: ("/" in n, n))
     if not split:
         return {name: products[name] for name in names}
-    return {shown: plane for name in names for shown, plane in planes_of(products[name], name).items()}
+    return {
+        shown: plane for name in names for shown, plane in planes_of(products[name], name).items()
+    }
 
 
 @dataclass(frozen=True)
 class NoiseFigure:
     """How noisy a map is near its centre.
 
-    ``of``: ``half_difference`` or ``source_free``; ``rms``: in K, NaN where there is no pixel; ``smoothed``: the same after
-    smoothing with the beam (NaN where the map cannot be or is already smoothed); ``diameter`` [rad] of the circle.
+    ``of``: ``half_difference`` or ``source_free``; ``rms``: in K, NaN where there is no pixel;
+    ``smoothed``: the same after smoothing with the beam (NaN where the map cannot be or is already
+    smoothed); ``diameter`` [rad] of the circle.
     """
 
     product: str
@@ -58,7 +64,9 @@ def noise_figures(maps: Mapping[str, MapProduct], given: float | None = None) ->
             diameter = central_diameter(product.fwhm, product.pixel, given)
             rms = product.rms(diameter / 2, of=plane)
             again = product.header is not None and product.fwhm > 0 and not product.smoothed_by
-            smoothed = product.smoothed_rms(product.fwhm, diameter / 2, of=plane) if again else math.nan
+            smoothed = (
+                product.smoothed_rms(product.fwhm, diameter / 2, of=plane) if again else math.nan
+            )
             found.append(NoiseFigure(name, of, rms, smoothed, diameter))
     return found
 
@@ -68,38 +76,49 @@ FREE = "the map of all but the sky"
 
 
 def noise_alone(
-    maps: Mapping[str, MapProduct], name: str, wanted: Sequence[Noise] = ("source_free", "half_difference")
+    maps: Mapping[str, MapProduct],
+    name: str,
+    wanted: Sequence[Noise] = ("source_free", "half_difference"),
 ) -> tuple[Floats, str] | None:
-    """A map of the noise alone of the map ``name``, and what it is in words: all but the sky, else half the difference of two
-    halves of
-    the samples (``wanted``: which, in this order). None where there is none."""
+    """A map of the noise alone of the map ``name``, and what it is in words: all but the sky, else
+    half the difference of two halves of the samples (``wanted``: which, in this order). None where
+    there is none."""
     sources = noise_sources(maps, name)
     for of in wanted:
         if of in sources:
             product, plane = sources[of]
             values = np.where(product.known, getattr(product, plane), np.nan)
-            return values, FREE if of == "source_free" else f"half the difference, {product.difference}"
+            return (
+                values,
+                FREE if of == "source_free" else f"half the difference, {product.difference}",
+            )
     return None
 
 
 def noise_stated(
     maps: Mapping[str, MapProduct], name: str, runs: Mapping[str, Any] | None = None
 ) -> dict[str, tuple[float | None, str]]:
-    """What is known of the noise of I, and of Q and U where they are there, of a map among ``maps`` (`maps_of`).
+    """What is known of the noise of I, and of Q and U where they are there, of a map among ``maps``
+    (`maps_of`).
 
-    The factor on its white noise, and what it was measured in; None and `WHITE` where there is no map of the noise
-    alone, and `ELSEWHERE` of a map without noise. Nothing where no noise is known. ``runs``: as of `is_quiet`.
+    The factor on its white noise, and what it was measured in; None and `WHITE` where there is no
+    map of the noise alone, and `ELSEWHERE` of a map without noise. Nothing where no noise is known.
+    ``runs``: as of `is_quiet`.
     """
     found: dict[str, tuple[float | None, str]] = {}
     for key, own in (("I", name), ("Q", f"{name}_Q"), ("U", f"{name}_U")):
         if own in maps and np.isfinite(maps[own].noise).any():
             quiet = is_quiet(runs or {}, name)
-            found[key] = (None, ELSEWHERE) if quiet else stated(maps[own].noise, noise_alone(maps, own))
+            found[key] = (
+                (None, ELSEWHERE) if quiet else stated(maps[own].noise, noise_alone(maps, own))
+            )
     return found
 
 
 def is_quiet(runs: Mapping[str, Any], name: str) -> bool:
-    """Whether the map ``name`` is of a signal without noise. ``runs``: the signals of a run, as its provenance has them."""
+    """Whether the map ``name`` is of a signal without noise. ``runs``: the signals of a run, as its
+    provenance has them.
+    """
     signal, _, rest = name.partition("/")
     return bool(rest) and signal in runs and Signal(**runs[signal]).is_quiet
 
@@ -107,7 +126,9 @@ def is_quiet(runs: Mapping[str, Any], name: str) -> bool:
 def noise_sources(
     maps: Mapping[str, MapProduct], name: str
 ) -> dict[Noise, tuple[MapProduct, Literal["signal", "half_difference"]]]:
-    """For a map of ``signal``: which product's which plane holds noise alone; nothing for maps of other signals."""
+    """For a map of ``signal``: which product's which plane holds noise alone; nothing for maps of
+    other signals.
+    """
     found: dict[Noise, tuple[MapProduct, Literal["signal", "half_difference"]]] = {}
     if "/" in name:
         return found

@@ -13,12 +13,15 @@ from ..types import AnyFloats, Floats
 from .map_arrays import MapArrays
 
 
-def on_plane(product: MapArrays, planes: Mapping[str, AnyFloats], size: int = 400) -> tuple[dict[str, AnyFloats], Any]:
-    """``planes`` of a map on a grid of at most ``size`` x ``size`` points of a plane about its centre; its astropy WCS.
+def on_plane(
+    product: MapArrays, planes: Mapping[str, AnyFloats], size: int = 400
+) -> tuple[dict[str, AnyFloats], Any]:
+    """``planes`` of a map on a grid of at most ``size`` x ``size`` points of a plane about its
+    centre; its astropy WCS.
 
-    The plane is the tangent plane, or for maps of more than 60 deg the equal-area one (ZEA); the grid reaches as far as the
-    pixels with hits (of a HEALPix map, its pixels). Each point takes the value of the pixel it lies in; elsewhere ``hits`` are
-    0, other planes NaN.
+    The plane is the tangent plane, or for maps of more than 60 deg the equal-area one (ZEA); the
+    grid reaches as far as the pixels with hits (of a HEALPix map, its pixels). Each point takes the
+    value of the pixel it lies in; elsewhere ``hits`` are 0, other planes NaN.
     """
     wcs, (nx, ny) = _plane(product, size)
     x, y = np.meshgrid(np.arange(nx), np.arange(ny))
@@ -35,7 +38,9 @@ def on_plane(product: MapArrays, planes: Mapping[str, AnyFloats], size: int = 40
 
 
 def _positions(product: MapArrays) -> Floats:
-    """(2, n) longitudes and latitudes [deg] of the pixels of a list; of an image those with hits, all where none has."""
+    """(2, n) longitudes and latitudes [deg] of the pixels of a list; of an image those with hits,
+    all where none has.
+    """
     if product.pixels is not None:
         import healpy as hp
 

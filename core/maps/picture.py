@@ -16,18 +16,26 @@ from .map_arrays import MapArrays
 from .stokes import stokes_plane
 
 PLANES = ("signal", "noise", "hits", "weights", "half_difference", "crosslinking")
-UNITS = {"hits": "samples per pixel", "weights": "weight", "crosslinking": "0: evenly crossed, 1: one direction"}
+UNITS = {
+    "hits": "samples per pixel",
+    "weights": "weight",
+    "crosslinking": "0: evenly crossed, 1: one direction",
+}
 """What the colours of planes that are no brightness mean."""
 SHOWN = 99.5
 """Per cent of the pixels that the colours cover by default."""
 FAR = 0.1
-"""A map whose lowest brightness is more than this share of its highest is far from zero (one with the mean emission in it)."""
+"""A map whose lowest brightness is more than this share of its highest is far from zero (one with
+the mean emission in it).
+"""
 PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n"))
 
 
 @dataclass
 class Shown:
-    """What a picture shows: ``values`` (ny, nx), NaN grey, in ``unit``; ``fwhm`` [rad] of a beam, 0: none."""
+    """What a picture shows: ``values`` (ny, nx), NaN grey, in ``unit``; ``fwhm`` [rad] of a beam,
+    0: none.
+    """
 
     values: AnyFloats
     wcs: Any
@@ -62,7 +70,9 @@ def draw_map(product: MapArrays, ax: Any, plane: str, title: str, limit: float |
 
 
 def draw(shown: Shown, ax: Any, limit: float | None) -> Any:
-    """A picture with a colour bar, in ``ax`` or a new figure; its Axes. ``limit``: where the colours end."""
+    """A picture with a colour bar, in ``ax`` or a new figure; its Axes. ``limit``: where the
+    colours end.
+    """
     import matplotlib as mpl
     from matplotlib import pyplot as plt
 
@@ -72,13 +82,26 @@ def draw(shown: Shown, ax: Any, limit: float | None) -> Any:
     low, top, around_zero = _range(values[np.isfinite(values)], limit, shown.around_zero)
     size, letter = 1.0, ""
     if unit in ("K_RJ", "K_CMB"):
-        size, letter = next(((s, p) for s, p in PREFIXES if max(abs(low), abs(top)) >= s), PREFIXES[-1])
+        size, letter = next(
+            ((s, p) for s, p in PREFIXES if max(abs(low), abs(top)) >= s), PREFIXES[-1]
+        )
     colours = mpl.colormaps["RdBu_r" if around_zero else "viridis"].with_extremes(bad="0.85")
-    picture = ax.imshow(values / size, origin="lower", cmap=colours, vmin=low / size, vmax=top / size, interpolation="nearest")
+    picture = ax.imshow(
+        values / size,
+        origin="lower",
+        cmap=colours,
+        vmin=low / size,
+        vmax=top / size,
+        interpolation="nearest",
+    )
     ax.figure.colorbar(picture, ax=ax, label=letter + unit)
     if hasattr(ax, "coords"):
         for axis, name in zip(ax.coords, wcs.wcs.ctype, strict=True):
-            axis.set_axislabel({"RA--": "right ascension", "DEC-": "declination", "GLON": "l", "GLAT": "b"}.get(name[:4], name))
+            axis.set_axislabel(
+                {"RA--": "right ascension", "DEC-": "declination", "GLON": "l", "GLAT": "b"}.get(
+                    name[:4], name
+                )
+            )
     if shown.fwhm > 0:
         _beam(ax, shown)
     ax.set_title(shown.title)
@@ -86,7 +109,9 @@ def draw(shown: Shown, ax: Any, limit: float | None) -> Any:
 
 
 def _range(known: AnyFloats, limit: float | None, around_zero: bool) -> tuple[float, float, bool]:
-    """(lowest, highest) brightness of the colours; whether they lie about zero: not those of a map that is far from it."""
+    """(lowest, highest) brightness of the colours; whether they lie about zero: not those of a map
+    that is far from it.
+    """
     if not known.size:
         return -(limit or 1.0), limit or 1.0, around_zero
     low, top = (float(v) for v in np.percentile(known, [(100 - SHOWN) / 2, (100 + SHOWN) / 2]))
@@ -98,7 +123,9 @@ def _range(known: AnyFloats, limit: float | None, around_zero: bool) -> tuple[fl
 
 
 def _beam(ax: Any, shown: Shown) -> None:
-    """The beam in the lower left corner: a circle on the sky there, in the picture's pixels an ellipse."""
+    """The beam in the lower left corner: a circle on the sky there, in the picture's pixels an
+    ellipse.
+    """
     from matplotlib.patches import Ellipse
 
     grid = wcs_grid(shown.wcs, (shown.values.shape[0], shown.values.shape[1]))

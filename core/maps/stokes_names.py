@@ -1,4 +1,6 @@
-"""How files name Stokes parameters: columns, extensions, and planes along an axis STOKES; and what else columns hold."""
+"""How files name Stokes parameters: columns, extensions, and planes along an axis STOKES; and what
+else columns hold.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +16,23 @@ _NAMES = {1: "I", 2: "Q", 3: "U", 4: "V"}
 _POLARIZED = re.compile(r"(STOKES[ _-]?)?[QUV]([ _-].*)?", re.IGNORECASE)
 """Names of columns and extensions: Q_POLARISATION (healpy), Q_STOKES (Planck), STOKES_Q, Q."""
 _INTENSITY = re.compile(
-    r"(STOKES[ _-]?)?[IT]|[IT][ _-]?STOKES|I[ _-]POL[A-Z]*|TEMP(ERATURE)?|INTENSITY|SIGNAL|BRIGHTNESS|T[ _-]?B", re.IGNORECASE
+    r"(STOKES[ _-]?)?[IT]|[IT][ _-]?STOKES|I["
+    r" _-]POL[A-Z]*|TEMP(ERATURE)?|INTENSITY|SIGNAL|BRIGHTNESS|T[ _-]?B",
+    re.IGNORECASE,
 )
-"""Names of columns of a brightness: I_STOKES (Planck), TEMPERATURE (healpy), SIGNAL (zonda, HEALPix's own tools)."""
+"""Names of columns of a brightness: I_STOKES (Planck), TEMPERATURE (healpy), SIGNAL (zonda,
+HEALPix's own tools).
+"""
 _PIXEL = re.compile(
-    r"(I?PIX(EL|ELS|NUM|NO|ID)?|PIXEL?[ _-]?(INDEX|NUMBER|NUM|ID)|INDEX|HPX[ _-]?(PIXEL|INDEX|ID)|HEALPIX|HPIX)", re.IGNORECASE
+    r"(I?PIX(EL|ELS|NUM|NO|ID)?|PIXEL?[ _-]?(INDEX|NUMBER|NUM|ID)|INDEX|HPX["
+    r" _-]?(PIXEL|INDEX|ID)|HEALPIX|HPIX)",
+    re.IGNORECASE,
 )
 _OTHER = re.compile(
-    r"(.*[ _-])?(N?[ _-]?HITS?|N[ _-]?OBS(ERVATIONS)?|N[ _-]?SAMP(LES)?|COUNTS?|WEIGHTS?|WGTS?|COV(ARIANCE|ERAGE)?|"
-    r"STD(DEV)?|STDEV|SIGMA|RMS|ERR(ORS?)?|VAR(IANCE)?|NOISE|[TPIQU]?MASK|R?COND(ITION)?|EXPOSURE|TIME|FLAGS?|RA|DEC|GLON|GLAT|LON|LAT)"
+    r"(.*[ _-])?(N?[ _-]?HITS?|N[ _-]?OBS(ERVATIONS)?|N["
+    r" _-]?SAMP(LES)?|COUNTS?|WEIGHTS?|WGTS?|COV(ARIANCE|ERAGE)?|"
+    r"STD(DEV)?|STDEV|SIGMA|RMS|ERR(ORS?)?|VAR(IANCE)?|NOISE|[TPIQU]?MASK|R?COND(ITION)?"
+    r"|EXPOSURE|TIME|FLAGS?|RA|DEC|GLON|GLAT|LON|LAT)"
     r"([ _-].*|\d+)?|[IQUV][IQUV]",
     re.IGNORECASE,
 )
@@ -35,12 +45,15 @@ def is_polarized(name: str) -> bool:
 
 
 def pixel_column(names: Sequence[str]) -> int | None:
-    """Which column of a HEALPix table numbers its pixels; None where none does, so that row k is pixel k."""
+    """Which column of a HEALPix table numbers its pixels; None where none does, so that row k is
+    pixel k.
+    """
     return next((k for k, name in enumerate(names) if _PIXEL.fullmatch(name.strip())), None)
 
 
 def intensity_column(names: Sequence[str], wanted: int | str | None, place: str) -> int:
-    """Which column of a HEALPix table is read as I: the one that is ``wanted``, that of a known name, or the only possible one.
+    """Which column of a HEALPix table is read as I: the one that is ``wanted``, that of a known
+    name, or the only possible one.
 
     Parameters
     ----------
@@ -55,18 +68,35 @@ def intensity_column(names: Sequence[str], wanted: int | str | None, place: str)
     there = ", ".join(names)
     pixel = pixel_column(names)
     if wanted is not None:
-        same = [k for k, n in enumerate(names, 1) if str(wanted).strip().upper() in (n.strip().upper(), str(k))]
+        same = [
+            k
+            for k, n in enumerate(names, 1)
+            if str(wanted).strip().upper() in (n.strip().upper(), str(k))
+        ]
         if not same or same[0] - 1 == pixel:
-            raise InputError(f"there is no map in a column {wanted}", place=place, cure=f"set column to one of: {there}")
+            raise InputError(
+                f"there is no map in a column {wanted}",
+                place=place,
+                cure=f"set column to one of: {there}",
+            )
         return same[0] - 1
-    may_be = [k for k, name in enumerate(names) if k != pixel and not is_polarized(name) and not _OTHER.fullmatch(name.strip())]
+    may_be = [
+        k
+        for k, name in enumerate(names)
+        if k != pixel and not is_polarized(name) and not _OTHER.fullmatch(name.strip())
+    ]
     known = [k for k in may_be if _INTENSITY.fullmatch(names[k].strip())]
-    known = known or [k for k in may_be if re.match(r"I[ _-]|STOKES[ _-]?I", names[k].strip(), re.IGNORECASE)]
+    known = known or [
+        k for k in may_be if re.match(r"I[ _-]|STOKES[ _-]?I", names[k].strip(), re.IGNORECASE)
+    ]
     if not may_be:
         raise InputError(
             f"none of its columns is an intensity: {there}",
             place=place,
-            cure="write a column I_STOKES, or set the operator's parameter column to the one that is the map",
+            cure=(
+                "write a column I_STOKES, or set the operator's parameter column to the one that is"
+                " the map"
+            ),
         )
     if not known and len(may_be) > 1:
         which = ", ".join(names[k] for k in may_be)
@@ -76,7 +106,9 @@ def intensity_column(names: Sequence[str], wanted: int | str | None, place: str)
 
 
 def columns_of_q_and_u(names: Sequence[str]) -> list[int] | None:
-    """Which of the columns or extensions of these names hold Q and U; None where they are not both there."""
+    """Which of the columns or extensions of these names hold Q and U; None where they are not both
+    there.
+    """
     letters = [_letter(name) for name in names]
     return [letters.index("Q"), letters.index("U")] if {"Q", "U"} <= set(letters) else None
 
@@ -87,7 +119,8 @@ def along_axis(header: Any, axis: int, length: int, place: str = "") -> list[str
     Raises
     ------
     InputError
-        Its cards are no numbers, or not all there; they give no whole numbers, or one for several planes.
+        Its cards are no numbers, or not all there; they give no whole numbers, or one for several
+        planes.
     """
     cure = f"correct CRVAL{axis}, CDELT{axis} and CRPIX{axis}: 1, 1, 1 for I, Q, U"
     given = [number(header, f"{key}{axis}", place, cure) for key in ("CRVAL", "CDELT", "CRPIX")]
@@ -95,9 +128,14 @@ def along_axis(header: Any, axis: int, length: int, place: str = "") -> list[str
         raise InputError(f"of CRVAL{axis} and CRPIX{axis} one is missing", place=place, cure=cure)
     first, step, pixel = (1.0 if value is None else value for value in given)
     values = [first + (n + 1 - pixel) * step for n in range(length)]
-    if any(abs(value - round(value)) > 1e-3 for value in values) or len({round(value) for value in values}) < length:
+    if (
+        any(abs(value - round(value)) > 1e-3 for value in values)
+        or len({round(value) for value in values}) < length
+    ):
         told = ", ".join(f"{value:g}" for value in values[:4])
-        raise InputError(f"the planes of its axis STOKES have the values {told}", place=place, cure=cure)
+        raise InputError(
+            f"the planes of its axis STOKES have the values {told}", place=place, cure=cure
+        )
     return [_NAMES.get(round(value), "a correlation") for value in values]
 
 

@@ -1,1 +1,3 @@
-"""Arithmetic that operators share: random numbers, tiles, smooth fields, projections, transforms, brightness."""
+"""Arithmetic that operators share: random numbers, tiles, smooth fields, projections, transforms,
+brightness.
+"""

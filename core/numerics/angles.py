@@ -19,5 +19,7 @@ def angle_text(value: float, digits: int = 3) -> str:
 
 
 def sides_text(y: float, x: float) -> str:
-    """Size of a pixel of these sides [rad]: ``2″`` where they are equal to a per cent, else across and up, ``1″ x 2″``."""
+    """Size of a pixel of these sides [rad]: ``2″`` where they are equal to a per cent, else across
+    and up, ``1″ x 2″``.
+    """
     return angle_text(y) if abs(x / y - 1) < 0.01 else f"{angle_text(x)} x {angle_text(y)}"

@@ -1,8 +1,9 @@
 """Where targets, the Sun, the Moon and planets stand above the horizon of a site.
 
-Directions are ERFA's, without refraction: aberration, precession-nutation (IAU 2006/2000A), Earth rotation, polar motion. Planets
-are those of Simon et al. 1994 (plan94), the Moon that of Meeus 1998 (moon98), as in astropy's built-in ephemeris: nothing is
-downloaded. Topocentric: the Moon's parallax is in. Light is not bent by the Sun (below 2 arcsec).
+Directions are ERFA's, without refraction: aberration, precession-nutation (IAU 2006/2000A), Earth
+rotation, polar motion. Planets are those of Simon et al. 1994 (plan94), the Moon that of Meeus 1998
+(moon98), as in astropy's built-in ephemeris: nothing is downloaded. Topocentric: the Moon's
+parallax is in. Light is not bent by the Sun (below 2 arcsec).
 """
 
 from __future__ import annotations
@@ -22,7 +23,15 @@ if TYPE_CHECKING:
     from ..configuration.target import Target
     from ..site import Site
 
-PLANETS = {"mercury": 1, "venus": 2, "mars": 4, "jupiter": 5, "saturn": 6, "uranus": 7, "neptune": 8}
+PLANETS = {
+    "mercury": 1,
+    "venus": 2,
+    "mars": 4,
+    "jupiter": 5,
+    "saturn": 6,
+    "uranus": 7,
+    "neptune": 8,
+}
 """Planets, with their numbers in ERFA's plan94."""
 BODIES = ("sun", "moon", *PLANETS)
 LIGHT = 173.14463267424
@@ -50,7 +59,9 @@ class Track:
 
     @property
     def elevation(self) -> Floats:
-        return np.asarray(np.arctan2(self.direction[:, 2], np.hypot(self.direction[:, 0], self.direction[:, 1])))
+        return np.asarray(
+            np.arctan2(self.direction[:, 2], np.hypot(self.direction[:, 0], self.direction[:, 1]))
+        )
 
     def distance(self, other: Track) -> Floats:
         """(n,) angle to another track, rad."""
@@ -63,7 +74,9 @@ def tracks(site: Site, times: Floats, *what: Target | str) -> list[Track]:
     import erfa
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", erfa.ErfaWarning)  # "dubious year": leap seconds to come are unknown
+        warnings.simplefilter(
+            "ignore", erfa.ErfaWarning
+        )  # "dubious year": leap seconds to come are unknown
         jd, days = np.full(len(times), 2440587.5), times / DAY
         earth = orientation(jd - 2400000.5 + days)
         place = (site.longitude, site.latitude, site.altitude, earth.x, earth.y)
@@ -79,10 +92,18 @@ def _track(one: Target | str, star: Any, when: Any, n: int) -> Track:
         c = math.cos(one.latitude)
         fixed = [c * math.cos(one.longitude), c * math.sin(one.longitude), math.sin(one.latitude)]
         return Track(np.tile(fixed, (n, 1)))
-    natural = _of_body(one, star, when) if isinstance(one, str) else np.tile(unit_vectors(*one.icrs()), (n, 1))
+    natural = (
+        _of_body(one, star, when)
+        if isinstance(one, str)
+        else np.tile(unit_vectors(*one.icrs()), (n, 1))
+    )
     distance = np.ascontiguousarray(star["em"])
-    seen = erfa.ab(natural, np.ascontiguousarray(star["v"]), distance, np.ascontiguousarray(star["bm1"]))
-    azimuth, zenith, *_ = erfa.atioq(*erfa.c2s(erfa.rxp(np.ascontiguousarray(star["bpn"]), seen)), star)
+    seen = erfa.ab(
+        natural, np.ascontiguousarray(star["v"]), distance, np.ascontiguousarray(star["bm1"])
+    )
+    azimuth, zenith, *_ = erfa.atioq(
+        *erfa.c2s(erfa.rxp(np.ascontiguousarray(star["bpn"]), seen)), star
+    )
     sine = np.sin(zenith)
     return Track(np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=1))
 
@@ -95,7 +116,9 @@ def _of_body(name: str, star: Any, when: Any) -> Floats:
     if name == "moon":
         _, earth = erfa.epv00(*when)
         vector = erfa.moon98(*when)["p"] - (star["eb"] - earth["p"])
-        vector -= np.linalg.norm(vector, axis=1)[:, None] * star["v"]  # it moves with the Earth while its light is on the way
+        vector -= (
+            np.linalg.norm(vector, axis=1)[:, None] * star["v"]
+        )  # it moves with the Earth while its light is on the way
     elif name == "sun":
         vector = -from_sun
     else:

@@ -1,22 +1,25 @@
-"""From ICRS to the horizon and back for a whole scan: exact at coarse time nodes, interpolated between them.
+"""From ICRS to the horizon and back for a whole scan: exact at coarse time nodes, interpolated
+between them.
 
 An ICRS direction p becomes the horizontal direction h at time t by
 
-    h(t) = M(t) a(d(p, e(t)), v(t))                                                                          (1)
+    h(t) = M(t) a(d(p, e(t)), v(t))                                                              (1)
 
-with d the light deflection by the Sun in direction e, a the aberration for the observer's velocity v, and M a rotation:
-precession-nutation, Earth rotation, polar motion and the site's vertical. There is no refraction (astropy's AltAz with
-pressure 0). d, a and M are ERFA's (IAU 2006/2000A): at the nodes (1) is astropy's full transformation. Between nodes M is
+with d the light deflection by the Sun in direction e, a the aberration for the observer's velocity
+v, and M a rotation: precession-nutation, Earth rotation, polar motion and the site's vertical.
+There is no refraction (astropy's AltAz with pressure 0). d, a and M are ERFA's (IAU 2006/2000A): at
+the nodes (1) is astropy's full transformation. Between nodes M is
 
-    M(t) = C R_z(-(theta_0 + lambda + omega t)) B(t)                                                         (2)
+    M(t) = C R_z(-(theta_0 + lambda + omega t)) B(t)                                             (2)
 
-where all the speed is in the sidereal rotation omega t; what is left, B (a quaternion), v and e, varies over hours and is
-interpolated by the cubics through the four nearest nodes. The error is measured halfway between the nodes, which are doubled
-until it is met.
+where all the speed is in the sidereal rotation omega t; what is left, B (a quaternion), v and e,
+varies over hours and is interpolated by the cubics through the four nearest nodes. The error is
+measured halfway between the nodes, which are doubled until it is met.
 
-Horizontal vectors have the axes north, west, up: longitude is minus the azimuth, as in TOAST, so that both frames are
-right-handed and M is a rotation. Aberration also scales the field by up to 1e-4 (13 mas at 2 arcmin), which a boresight
-rotation cannot hold; its rotation of the field is kept.
+Horizontal vectors have the axes north, west, up: longitude is minus the azimuth, as in TOAST, so
+that both frames are right-handed and M is a rotation. Aberration also scales the field by up to
+1e-4 (13 mas at 2 arcmin), which a boresight rotation cannot hold; its rotation of the field is
+kept.
 """
 
 from __future__ import annotations
@@ -66,7 +69,8 @@ class Boresight(NamedTuple):
     azel: Floats
     """(n, 4) quaternions; psi is 0: eta points to the zenith."""
     radec: Floats
-    """(n, 4) quaternions: the same focal plane carried to ICRS, so psi is the parallactic rotation."""
+    """(n, 4) quaternions: the same focal plane carried to ICRS, so psi is the parallactic rotation.
+    """
 
 
 class CelestialTransform:
@@ -95,7 +99,9 @@ class CelestialTransform:
         False where no bundled table reaches the date.
     """
 
-    def __init__(self, site: Site, start: Instant, duration: float, tolerance: float = 1e-9) -> None:
+    def __init__(
+        self, site: Site, start: Instant, duration: float, tolerance: float = 1e-9
+    ) -> None:
         self.site, self.start, self.duration = site, start, duration
         self.source, self.orientation_known = "", True
         self._theta0 = self._rotation_angle()
@@ -116,7 +122,9 @@ class CelestialTransform:
         )
 
     def horizontal(self, icrs: Floats, seconds: Floats) -> Floats:
-        """Directions (n, 3) north, west, up of ICRS unit vectors (n, 3) or (3,) at ``seconds`` (n,)."""
+        """Directions (n, 3) north, west, up of ICRS unit vectors (n, 3) or (3,) at ``seconds``
+        (n,).
+        """
         out = np.empty((len(seconds), 3))
         for part in chunks(len(seconds)):
             now = self._interpolated(seconds[part])
@@ -130,7 +138,9 @@ class CelestialTransform:
         for part in chunks(len(seconds)):
             now = self._interpolated(seconds[part])
             turn = conjugate(self._rotation(now, seconds[part]))
-            out[part] = _natural(rotate(turn, horizontal if horizontal.ndim == 1 else horizontal[part]), now)
+            out[part] = _natural(
+                rotate(turn, horizontal if horizontal.ndim == 1 else horizontal[part]), now
+            )
         return out
 
     def boresight(self, horizontal: Floats, seconds: Floats) -> Boresight:
@@ -170,38 +180,63 @@ class CelestialTransform:
         import erfa
 
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", erfa.ErfaWarning)  # "dubious year": leap seconds to come are unknown
+            warnings.simplefilter(
+                "ignore", erfa.ErfaWarning
+            )  # "dubious year": leap seconds to come are unknown
             utc1, utc2 = self._utc(seconds)
             earth = orientation(utc1 - 2400000.5 + utc2)
             self.source, self.orientation_known = earth.source, earth.known
             site = self.site
-            # no refraction: pressure, temperature, humidity 0; the wavelength [um] then has no effect
+            # no refraction: pressure, temperature, humidity 0; the wavelength [um] then has no
+            # effect
             star, _ = erfa.apco13(
-                utc1, utc2, earth.ut1_utc, site.longitude, site.latitude, site.altitude, earth.x, earth.y, 0.0, 0.0, 0.0, 1.0
+                utc1,
+                utc2,
+                earth.ut1_utc,
+                site.longitude,
+                site.latitude,
+                site.altitude,
+                earth.x,
+                earth.y,
+                0.0,
+                0.0,
+                0.0,
+                1.0,
             )
         # columns of the rotation from CIRS to the horizon, from its three axes
-        azimuth, zenith, *_ = erfa.atioq(np.array([[0.0], [np.pi / 2], [0.0]]), np.array([[0.0], [0.0], [np.pi / 2]]), star)
+        azimuth, zenith, *_ = erfa.atioq(
+            np.array([[0.0], [np.pi / 2], [0.0]]), np.array([[0.0], [0.0], [np.pi / 2]]), star
+        )
         sine = np.sin(zenith)
-        axes = np.array([sine * np.cos(azimuth), -sine * np.sin(azimuth), np.cos(zenith)])  # (component, axis, node)
+        axes = np.array(
+            [sine * np.cos(azimuth), -sine * np.sin(azimuth), np.cos(zenith)]
+        )  # (component, axis, node)
         whole = np.einsum("can,nab->ncb", axes, star["bpn"])
         rigid = self._spin(seconds)
         slow = np.einsum("nki,nkj->nij", rotation_matrices(rigid), whole)
         return _Nodes(_near_identity(slow), star["v"], np.column_stack([star["eh"], star["em"]]))
 
     def _utc(self, seconds: Floats) -> tuple[Floats, Floats]:
-        """Two-part UTC Julian dates. Seconds are SI seconds: counted in TAI, so leap seconds are right."""
+        """Two-part UTC Julian dates. Seconds are SI seconds: counted in TAI, so leap seconds are
+        right.
+        """
         import erfa
 
         days, rest = divmod(self.start.nanoseconds, 86_400_000_000_000)
         year, month, day, _ = erfa.jd2cal(2440587.5, days)
         minutes, rest = divmod(rest, 60_000_000_000)
-        # by calendar: a day that ends in a leap second has 86401 s, and ERFA counts its fractions of those
-        tai1, tai2 = erfa.utctai(*erfa.dtf2d("UTC", year, month, day, minutes // 60, minutes % 60, rest / 1e9))
+        # by calendar: a day that ends in a leap second has 86401 s, and ERFA counts its fractions
+        # of those
+        tai1, tai2 = erfa.utctai(
+            *erfa.dtf2d("UTC", year, month, day, minutes // 60, minutes % 60, rest / 1e9)
+        )
         utc1, utc2 = erfa.taiutc(np.full(len(seconds), tai1), tai2 + seconds / 86400.0)
         return utc1, utc2
 
     def _rotation_angle(self) -> float:
-        """theta_0 of equation (2), Earth rotation angle at the start; B absorbs what is left of UT1-UTC."""
+        """theta_0 of equation (2), Earth rotation angle at the start; B absorbs what is left of
+        UT1-UTC.
+        """
         import erfa
 
         with warnings.catch_warnings():
@@ -209,7 +244,9 @@ class CelestialTransform:
             return float(erfa.era00(*self._utc(np.zeros(1)))[0])
 
     def _spin(self, seconds: Floats) -> Floats:
-        """C R_z of equation (2), quaternions (n, 4); C turns (meridian, east, pole) axes into (north, west, up)."""
+        """C R_z of equation (2), quaternions (n, 4); C turns (meridian, east, pole) axes into
+        (north, west, up).
+        """
         half = -(self._theta0 + self.site.longitude + SIDEREAL_RATE * seconds) / 2
         tilt = np.pi / 4 - self.site.latitude / 2
         a, b, sine, cosine = np.sin(tilt), np.cos(tilt), np.sin(half), np.cos(half)
@@ -222,7 +259,11 @@ class CelestialTransform:
         edges = np.flatnonzero(np.diff(interval, prepend=-1, append=-1))
         for first, last in pairwise(edges.tolist()):
             k = interval[first]
-            part, s, (c0, c1, c2, c3) = at[:, first:last], where[first:last] - k, self._cubics[k].T[:, :, None]
+            part, s, (c0, c1, c2, c3) = (
+                at[:, first:last],
+                where[first:last] - k,
+                self._cubics[k].T[:, :, None],
+            )
             np.multiply(c3, s, out=part)
             for c in (c2, c1):
                 part += c
@@ -238,14 +279,20 @@ class CelestialTransform:
     @staticmethod
     def _difference(exact: _Nodes, other: _Nodes) -> float:
         """Bound on the angle [rad] between directions transformed with the one and the other."""
-        turn = 2 * np.linalg.norm(multiply(exact.rotation, conjugate(other.rotation))[:, :3], axis=1)
+        turn = 2 * np.linalg.norm(
+            multiply(exact.rotation, conjugate(other.rotation))[:, :3], axis=1
+        )
         velocity = np.linalg.norm(exact.velocity - other.velocity, axis=1)
-        sun = 1e-5 * np.abs(exact.sun - other.sun).sum(axis=1)  # deflection is below 1e-5 rad everywhere
+        sun = 1e-5 * np.abs(exact.sun - other.sun).sum(
+            axis=1
+        )  # deflection is below 1e-5 rad everywhere
         return float((turn + velocity + sun).max())
 
 
 def _carried(turn: Floats, observed: Floats, natural: Floats, azel: Floats) -> Floats:
-    """ICRS quaternions (n, 4): ``turn`` from the horizon to the observed direction, then along a great circle to the natural."""
+    """ICRS quaternions (n, 4): ``turn`` from the horizon to the observed direction, then along a
+    great circle to the natural.
+    """
     return multiply(shortest_rotation(observed, natural), multiply(turn, azel))
 
 
@@ -261,7 +308,9 @@ def _observed(icrs: Floats, now: _Nodes) -> Floats:
 
 
 def _natural(observed: Floats, now: _Nodes) -> Floats:
-    """Inverse of `_observed`, a fixed point: errors shrink by 1e-4 per step, from those of one bend for all directions."""
+    """Inverse of `_observed`, a fixed point: errors shrink by 1e-4 per step, from those of one bend
+    for all directions.
+    """
     middle, then = observed.mean(axis=0, keepdims=True), _Nodes(*(part[:1] for part in now))
     middle = middle / (np.linalg.norm(middle) or 1.0)
     natural = observed - (_observed(middle, then) - middle)
@@ -278,12 +327,16 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def _cubics(nodes: Floats) -> Floats:
-    """Coefficients (m, k, 4) of the cubics through four neighbours of n = m + 3 equidistant nodes (n, k).
+    """Coefficients (m, k, 4) of the cubics through four neighbours of n = m + 3 equidistant nodes
+    (n, k).
 
-    v(s) = c_0 + c_1 s + c_2 s^2 + c_3 s^3 between the second of the four, at s = 0, and the third, at s = 1.
+    v(s) = c_0 + c_1 s + c_2 s^2 + c_3 s^3 between the second of the four, at s = 0, and the third,
+    at s = 1.
     """
     a, b, c, d = (nodes[k : k + len(nodes) - 3] for k in range(4))
-    return np.stack([b, c - a / 3 - b / 2 - d / 6, (a + c) / 2 - b, (d - a) / 6 + (b - c) / 2], axis=2)
+    return np.stack(
+        [b, c - a / 3 - b / 2 - d / 6, (a + c) / 2 - b, (d - a) / 6 + (b - c) / 2], axis=2
+    )
 
 
 def _near_identity(matrix: Floats) -> Floats:

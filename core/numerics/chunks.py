@@ -1,6 +1,8 @@
-"""Long scans are worked on in chunks: fresh memory for what is used for a moment takes longer than the sums.
+"""Long scans are worked on in chunks: fresh memory for what is used for a moment takes longer than
+the sums.
 
-What is only used for a moment then stays in the cache, and in memory that was touched before; what lasts goes into one array.
+What is only used for a moment then stays in the cache, and in memory that was touched before; what
+lasts goes into one array.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ def chunks(n: int, size: int = CHUNK) -> list[slice]:
 def empty(shape: tuple[int, int], dtype: Any = np.float64) -> NDArray[Any]:
     """An array of zeros, in pages of ordinary size.
 
-    numpy asks for large pages, which on a virtual machine may cost five times more to touch first: 3 ms for each 2 MB.
+    numpy asks for large pages, which on a virtual machine may cost five times more to touch first:
+    3 ms for each 2 MB.
     """
     size = shape[0] * shape[1] * np.dtype(dtype).itemsize
     if size >= LARGE and hasattr(mmap, "MAP_ANONYMOUS"):

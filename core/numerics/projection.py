@@ -1,12 +1,14 @@
 """From the focal plane to the pixels of a tangent-plane image: one 3 x 3 matrix per time sample.
 
-A gnomonic projection of the focal plane and a gnomonic (TAN) image are both central projections of the sphere, so the
-map from one to the other is a homography (Hartley & Zisserman 2004, section 2.3):
+A gnomonic projection of the focal plane and a gnomonic (TAN) image are both central projections of
+the sphere, so the map from one to the other is a homography (Hartley & Zisserman 2004, section
+2.3):
 
-    x = (h0 xi + h1 eta + h2) / w,   y = (h3 xi + h4 eta + h5) / w,   w = h6 xi + h7 eta + h8            (1)
+    x = (h0 xi + h1 eta + h2) / w,   y = (h3 xi + h4 eta + h5) / w,
+    w = h6 xi + h7 eta + h8            (1)
 
-exact, without trigonometry. ``w`` is the cosine to the image centre times the length of (xi, eta, 1): where w <= 0 the
-direction lies in the opposite hemisphere and has no pixel.
+exact, without trigonometry. ``w`` is the cosine to the image centre times the length of (xi, eta,
+1): where w <= 0 the direction lies in the opposite hemisphere and has no pixel.
 """
 
 from __future__ import annotations
@@ -25,11 +27,15 @@ GALACTIC = (
     (0.4941094371927268, -0.4448297212232952, 0.7469821839866676),
     (-0.8676661375596576, -0.19807633727300053, 0.4559838136873016),
 )
-"""The rotation from ICRS to Galactic coordinates as astropy makes it, which takes half a second to import."""
+"""The rotation from ICRS to Galactic coordinates as astropy makes it, which takes half a second to
+import.
+"""
 
 
 class Wcs(Protocol):
-    """What is asked of world coordinates: those of `astropy.wcs.WCS` and of `core.numerics.tangent.TangentWcs`."""
+    """What is asked of world coordinates: those of `astropy.wcs.WCS` and of
+    `core.numerics.tangent.TangentWcs`.
+    """
 
     @property
     def naxis(self) -> int:
@@ -49,7 +55,9 @@ class Wcs(Protocol):
 
 
 def rotation_matrices(quaternions: Floats) -> Floats:
-    """Rotation matrices (n, 3, 3) of quaternions (n, 4) in the order x, y, z, w; they need not be normalized."""
+    """Rotation matrices (n, 3, 3) of quaternions (n, 4) in the order x, y, z, w; they need not be
+    normalized.
+    """
     return np.moveaxis(_rotations(quaternions), 2, 0)
 
 
@@ -58,18 +66,36 @@ def _rotations(quaternions: Floats) -> Floats:
     found = np.empty((3, 3, len(quaternions)))
     for s in chunks(len(quaternions)):
         x, y, z, w = _normalized(quaternions[s])
-        found[0, 0, s], found[0, 1, s], found[0, 2, s] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
-        found[1, 0, s], found[1, 1, s], found[1, 2, s] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
-        found[2, 0, s], found[2, 1, s], found[2, 2, s] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+        found[0, 0, s], found[0, 1, s], found[0, 2, s] = (
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - z * w),
+            2 * (x * z + y * w),
+        )
+        found[1, 0, s], found[1, 1, s], found[1, 2, s] = (
+            2 * (x * y + z * w),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - x * w),
+        )
+        found[2, 0, s], found[2, 1, s], found[2, 2, s] = (
+            2 * (x * z - y * w),
+            2 * (y * z + x * w),
+            1 - 2 * (x * x + y * y),
+        )
     return found
 
 
 def boresights(quaternions: Floats) -> Floats:
-    """Unit vectors (3, n) that boresight quaternions (n, 4) look at: the last column of `rotation_matrices`."""
+    """Unit vectors (3, n) that boresight quaternions (n, 4) look at: the last column of
+    `rotation_matrices`.
+    """
     found = empty((3, len(quaternions)))
     for s in chunks(len(quaternions)):
         x, y, z, w = _normalized(quaternions[s])
-        found[0, s], found[1, s], found[2, s] = 2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)
+        found[0, s], found[1, s], found[2, s] = (
+            2 * (x * z + y * w),
+            2 * (y * z - x * w),
+            1 - 2 * (x * x + y * y),
+        )
     return found
 
 
@@ -80,7 +106,9 @@ def _normalized(quaternions: Floats) -> Floats:
 
 
 def frame_rotation(frame: str) -> Floats:
-    """Matrix (3, 3) that turns an ICRS direction into one in ``frame`` (``icrs``, ``fk5``, ``galactic`` or astropy's name)."""
+    """Matrix (3, 3) that turns an ICRS direction into one in ``frame`` (``icrs``, ``fk5``,
+    ``galactic`` or astropy's name).
+    """
     if frame == "icrs":
         return np.eye(3)
     if frame == "galactic":
@@ -88,7 +116,9 @@ def frame_rotation(frame: str) -> Floats:
     from astropy.coordinates.baseframe import frame_transform_graph
 
     if frame_transform_graph.lookup_name(frame) is None:
-        raise InputError(f"unknown celestial frame {frame!r}", place="frame", cure="use icrs or galactic")
+        raise InputError(
+            f"unknown celestial frame {frame!r}", place="frame", cure="use icrs or galactic"
+        )
     return _rotation_into(frame, frame, "frame")
 
 
@@ -101,7 +131,9 @@ def wcs_frame_rotation(wcs: Wcs) -> Floats:
     try:
         frame = wcs_to_celestial_frame(wcs)
     except ValueError:
-        raise InputError("the WCS has no celestial frame", place="WCS", cure="set CTYPE1, CTYPE2 and RADESYS") from None
+        raise InputError(
+            "the WCS has no celestial frame", place="WCS", cure="set CTYPE1, CTYPE2 and RADESYS"
+        ) from None
     if frame.name == "icrs":
         return np.eye(3)
     return _rotation_into(frame, f"the WCS's frame {frame.name}", "WCS")
@@ -110,18 +142,24 @@ def wcs_frame_rotation(wcs: Wcs) -> Floats:
 def _rotation_into(frame: Any, called: str, place: str) -> Floats:
     from astropy.coordinates import SkyCoord
 
-    axes = SkyCoord(x=[1, 0, 0], y=[0, 1, 0], z=[0, 0, 1], representation_type="cartesian", frame="icrs").transform_to(frame)
+    axes = SkyCoord(
+        x=[1, 0, 0], y=[0, 1, 0], z=[0, 0, 1], representation_type="cartesian", frame="icrs"
+    ).transform_to(frame)
     matrix: Floats = np.array(axes.cartesian.xyz.value, dtype=np.float64)
     if not np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=1e-12):
-        raise InputError(f"{called} is not a rotation of ICRS", place=place, cure="use icrs or galactic")
+        raise InputError(
+            f"{called} is not a rotation of ICRS", place=place, cure="use icrs or galactic"
+        )
     return matrix
 
 
 def pixel_matrix(wcs: Wcs) -> Floats:
-    """Matrix P (3, 3): an ICRS direction d has the 0-based pixel (x, y) = ((P d)_0, (P d)_1) / (P d)_2.
+    """Matrix P (3, 3): an ICRS direction d has the 0-based pixel (x, y) = ((P d)_0, (P d)_1) / (P
+    d)_2.
 
-    ``wcs`` is a two-dimensional celestial TAN WCS; CRPIX, CDELT (signs too), PC/CD, LONPOLE, the order of the axes and
-    the frame are honoured (Calabretta & Greisen 2002). Raises InputError for other projections and for distortions.
+    ``wcs`` is a two-dimensional celestial TAN WCS; CRPIX, CDELT (signs too), PC/CD, LONPOLE, the
+    order of the axes and the frame are honoured (Calabretta & Greisen 2002). Raises InputError for
+    other projections and for distortions.
     """
     lng, lat = wcs.wcs.lng, wcs.wcs.lat
     kinds = [str(c) for c in wcs.wcs.ctype]
@@ -129,7 +167,11 @@ def pixel_matrix(wcs: Wcs) -> Floats:
         cure = "set CTYPE1 and CTYPE2, e.g. RA---TAN and DEC--TAN"
         raise InputError(f"needs two celestial axes, has {kinds}", place="WCS", cure=cure)
     if not all(k.endswith("-TAN") for k in kinds) or wcs.has_distortion:
-        raise InputError(f"projection {kinds} is not a plain TAN", place="WCS", cure="reproject to TAN without distortion")
+        raise InputError(
+            f"projection {kinds} is not a plain TAN",
+            place="WCS",
+            cure="reproject to TAN without distortion",
+        )
     wcs.wcs.set()
     return central(wcs) @ wcs_frame_rotation(wcs)
 
@@ -138,18 +180,29 @@ LOOKED_AT = 256, 37
 """Instants of a scan and detectors that `share_outside` takes, at most."""
 
 
-def share_outside(scans: Iterable[tuple[Floats, Floats, Floats]], matrix: Floats, shape: tuple[int, int]) -> float:
-    """About what share of all samples lies beyond an image (ny, nx) whose `pixel_matrix` is ``matrix``.
+def share_outside(
+    scans: Iterable[tuple[Floats, Floats, Floats]], matrix: Floats, shape: tuple[int, int]
+) -> float:
+    """About what share of all samples lies beyond an image (ny, nx) whose `pixel_matrix` is
+    ``matrix``.
 
-    ``scans``: boresight quaternions (n, 4), ICRS, and offsets of the detectors (n_det,), (n_det,) of each; some of them are used.
+    ``scans``: boresight quaternions (n, 4), ICRS, and offsets of the detectors (n_det,), (n_det,)
+    of each; some of them are used.
     """
     ny, nx = shape
     beyond = looked = 0
     for quaternions, xi, eta in scans:
-        at, of = (slice(None, None, -(-n // most)) for n, most in zip((len(quaternions), len(xi)), LOOKED_AT, strict=True))
+        at, of = (
+            slice(None, None, -(-n // most))
+            for n, most in zip((len(quaternions), len(xi)), LOOKED_AT, strict=True)
+        )
         x, y, depth = np.moveaxis(directions(quaternions[at], xi[of], eta[of]) @ matrix.T, -1, 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            inside = (depth > 0) & (abs(x / depth - (nx - 1) / 2) <= nx / 2) & (abs(y / depth - (ny - 1) / 2) <= ny / 2)
+            inside = (
+                (depth > 0)
+                & (abs(x / depth - (nx - 1) / 2) <= nx / 2)
+                & (abs(y / depth - (ny - 1) / 2) <= ny / 2)
+            )
         beyond, looked = beyond + int(np.count_nonzero(~inside)), looked + inside.size
     return beyond / looked if looked else 0.0
 
@@ -171,20 +224,22 @@ def central(wcs: Wcs) -> Floats:
 
 
 def homographies(quaternions: Floats, wcs: Wcs) -> Floats:
-    """Equation (1): coefficients h (n, 9) float64 for boresight quaternions (n, 4) in ICRS and a TAN image.
+    """Equation (1): coefficients h (n, 9) float64 for boresight quaternions (n, 4) in ICRS and a
+    TAN image.
 
-    A detector at focal-plane offsets (xi, eta) looks at R(q) (-eta, -xi, 1) (TOAST's boresight frame). Pixels are
-    0-based, with integer coordinates at pixel centres. Error: some 1e-13 of the distance to the image centre in pixels.
-    Each coefficient lies in one piece (Fortran's order).
+    A detector at focal-plane offsets (xi, eta) looks at R(q) (-eta, -xi, 1) (TOAST's boresight
+    frame). Pixels are 0-based, with integer coordinates at pixel centres. Error: some 1e-13 of the
+    distance to the image centre in pixels. Each coefficient lies in one piece (Fortran's order).
     """
     return ray_coefficients(quaternions, pixel_matrix(wcs))
 
 
 def ray_coefficients(quaternions: Floats, matrix: Floats) -> Floats:
-    """Coefficients h (n, 9): ``matrix`` (3, 3) times the direction of a detector, times the length of (xi, eta, 1).
+    """Coefficients h (n, 9): ``matrix`` (3, 3) times the direction of a detector, times the length
+    of (xi, eta, 1).
 
-    Its components are h0 xi + h1 eta + h2, h3 xi + h4 eta + h5, h6 xi + h7 eta + h8. Each coefficient lies in one piece
-    (Fortran's order).
+    Its components are h0 xi + h1 eta + h2, h3 xi + h4 eta + h5, h6 xi + h7 eta + h8. Each
+    coefficient lies in one piece (Fortran's order).
     """
     h = empty((9, len(quaternions)))
     for s in chunks(len(quaternions)):
@@ -197,7 +252,9 @@ def ray_coefficients(quaternions: Floats, matrix: Floats) -> Floats:
 
 
 def directions(quaternions: Floats, xi: Floats, eta: Floats) -> Floats:
-    """Unit vectors (n_det, n, 3) that detectors at offsets (n_det,) look at, for boresight quaternions (n, 4)."""
+    """Unit vectors (n_det, n, 3) that detectors at offsets (n_det,) look at, for boresight
+    quaternions (n, 4).
+    """
     rays = np.stack([-np.asarray(eta), -np.asarray(xi), np.ones(len(xi))], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     turned: Floats = np.einsum("nij,dj->dni", rotation_matrices(quaternions), rays)

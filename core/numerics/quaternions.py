@@ -1,4 +1,6 @@
-"""Quaternions (n, 4) in the order x, y, z, w, of unit length. Of many, each component is contiguous (Fortran's order)."""
+"""Quaternions (n, 4) in the order x, y, z, w, of unit length. Of many, each component is contiguous
+(Fortran's order).
+"""
 
 from __future__ import annotations
 
@@ -43,13 +45,23 @@ def rotate(a: Floats, vector: Floats) -> Floats:
     qx, qy, qz, w = a.T
     vx, vy, vz = vector.T
     tx, ty, tz = 2 * (qy * vz - qz * vy), 2 * (qz * vx - qx * vz), 2 * (qx * vy - qy * vx)
-    return np.stack([vx + w * tx + qy * tz - qz * ty, vy + w * ty + qz * tx - qx * tz, vz + w * tz + qx * ty - qy * tx]).T
+    return np.stack(
+        [
+            vx + w * tx + qy * tz - qz * ty,
+            vy + w * ty + qz * tx - qx * tz,
+            vz + w * tz + qx * ty - qy * tx,
+        ]
+    ).T
 
 
 def shortest_rotation(a: Floats, b: Floats) -> Floats:
-    """Quaternions (n, 4) that turn unit vectors a into b along great circles; a and b are not opposite."""
+    """Quaternions (n, 4) that turn unit vectors a into b along great circles; a and b are not
+    opposite.
+    """
     (ax, ay, az), (bx, by, bz) = a.T, b.T
-    half = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx, 1 + (ax * bx + ay * by + az * bz)])
+    half = np.stack(
+        [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx, 1 + (ax * bx + ay * by + az * bz)]
+    )
     turned: Floats = (half / np.sqrt((half * half).sum(axis=0))).T
     return turned
 
@@ -63,9 +75,11 @@ def from_angles(longitude: Any, latitude: Any) -> Floats:
 
 
 def detector_quaternions(xi: Any, eta: Any, angle: Any) -> Floats:
-    """Rotations (n, 4) that take the boresight frame's Z axis to (-eta, -xi, 1) and its X axis to the polarization angle.
+    """Rotations (n, 4) that take the boresight frame's Z axis to (-eta, -xi, 1) and its X axis to
+    the polarization angle.
 
-    q = Rz(phi) Ry(theta) Rz(angle - phi), theta = atan |(xi, eta)|, phi = atan2(-xi, -eta); see `core.focalplane.Focalplane`.
+    q = Rz(phi) Ry(theta) Rz(angle - phi), theta = atan |(xi, eta)|, phi = atan2(-xi, -eta); see
+    `core.focalplane.Focalplane`.
     """
     half, phi = np.arctan(np.hypot(xi, eta)) / 2, np.arctan2(-np.asarray(xi), -np.asarray(eta))
     roll = np.asarray(angle) / 2
@@ -74,13 +88,15 @@ def detector_quaternions(xi: Any, eta: Any, angle: Any) -> Floats:
 
 
 class Upright:
-    """`from_angles` of unit vectors (n, 3), chunk by chunk: (n, 4), neighbours with neighbouring signs.
+    """`from_angles` of unit vectors (n, 3), chunk by chunk: (n, 4), neighbours with neighbouring
+    signs.
 
     By half angles: with z = cos(b) and r = sin(b) for the distance b from the pole,
 
-        cos(b / 2) = sqrt((1 + z) / 2),   sin(b / 2) = r / (2 cos(b / 2)),                                   (3)
+        cos(b / 2) = sqrt((1 + z) / 2),   sin(b / 2) = r / (2 cos(b / 2)),   (3)
 
-    and so for the longitude counted from the very first direction's, in chunks in which that stays below `_FAR`.
+    and so for the longitude counted from the very first direction's, in chunks in which that stays
+    below `_FAR`.
     """
 
     def __init__(self) -> None:

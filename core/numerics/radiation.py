@@ -1,10 +1,13 @@
-"""Brightness: Planck's law in Rayleigh-Jeans kelvin, and the conversion of astronomical units to it over a passband.
+"""Brightness: Planck's law in Rayleigh-Jeans kelvin, and the conversion of astronomical units to it
+over a passband.
 
-A detector that sees one mode per polarization receives k T_RJ(nu) dnu, so the brightness of a band is
+A detector that sees one mode per polarization receives k T_RJ(nu) dnu, so the brightness of a band
+is
 
-    T_RJ = integral t(nu) T_RJ(nu) dnu / integral t(nu) dnu                                                      (1)
+    T_RJ = integral t(nu) T_RJ(nu) dnu / integral t(nu) dnu                                      (1)
 
-with t the transmission per unit of Rayleigh-Jeans temperature. Sky maps and the atmosphere are averaged with the same t.
+with t the transmission per unit of Rayleigh-Jeans temperature. Sky maps and the atmosphere are
+averaged with the same t.
 """
 
 from __future__ import annotations
@@ -30,7 +33,9 @@ BOLTZMANN = 1.380649e-23
 T_CMB = 2.72548
 """K (Fixsen 2009, ApJ 707, 916)."""
 LEAST_TRANSMISSION = 1e-6
-"""Band transmission below which samples are not calibrated: they are flagged as opaque, and say nothing of the noise."""
+"""Band transmission below which samples are not calibrated: they are flagged as opaque, and say
+nothing of the noise.
+"""
 
 SURFACE_BRIGHTNESS_UNITS = ("Jy/pixel", "Jy/beam", "MJy/sr")
 """Units of specific intensity: their conversion needs the source's spectral index."""
@@ -39,7 +44,9 @@ UNITS = ("K_RJ", "K_CMB", *SURFACE_BRIGHTNESS_UNITS, "y")
 
 
 def rayleigh_jeans(frequency: ArrayLike, temperature: ArrayLike) -> Floats:
-    """Rayleigh-Jeans brightness of a black body, J = (h nu / k) / (exp(h nu / k T) - 1). Hz, K -> K; shapes broadcast."""
+    """Rayleigh-Jeans brightness of a black body, J = (h nu / k) / (exp(h nu / k T) - 1). Hz, K ->
+    K; shapes broadcast.
+    """
     nu, temperature = np.asarray(frequency, np.float64), np.asarray(temperature, np.float64)
     x = PLANCK * nu / (BOLTZMANN * temperature)
     with np.errstate(over="ignore"):
@@ -47,30 +54,38 @@ def rayleigh_jeans(frequency: ArrayLike, temperature: ArrayLike) -> Floats:
 
 
 def cmb_slope(frequency: ArrayLike) -> Floats:
-    """dT_RJ / dT_CMB = x^2 e^x / (e^x - 1)^2 at 2.72548 K, with x = h nu / k T. Hz -> K_RJ per K_CMB."""
+    """dT_RJ / dT_CMB = x^2 e^x / (e^x - 1)^2 at 2.72548 K, with x = h nu / k T. Hz -> K_RJ per
+    K_CMB.
+    """
     half = PLANCK * np.asarray(frequency, np.float64) / (2 * BOLTZMANN * T_CMB)
     with np.errstate(over="ignore"):
         return np.asarray((half / np.sinh(half)) ** 2)
 
 
 def thermal_sz(frequency: ArrayLike) -> Floats:
-    """Non-relativistic thermal Sunyaev-Zel'dovich effect, T_CMB (x coth(x/2) - 4) dT_RJ/dT_CMB. Hz -> K_RJ per Compton-y.
+    """Non-relativistic thermal Sunyaev-Zel'dovich effect, T_CMB (x coth(x/2) - 4) dT_RJ/dT_CMB. Hz
+    -> K_RJ per Compton-y.
 
-    Sunyaev & Zel'dovich (1972); negative below 217.5 GHz. Relativistic terms (-3 % for gas of 10 keV) are left out.
+    Sunyaev & Zel'dovich (1972); negative below 217.5 GHz. Relativistic terms (-3 % for gas of 10
+    keV) are left out.
     """
     x = PLANCK * np.asarray(frequency, np.float64) / (BOLTZMANN * T_CMB)
     return np.asarray(T_CMB * (x / np.tanh(x / 2) - 4) * cmb_slope(frequency))
 
 
 def intensity_to_kelvin(frequency: ArrayLike) -> Floats:
-    """Rayleigh-Jeans kelvin per unit of specific intensity, c^2 / (2 k nu^2). Hz -> K / (W m^-2 Hz^-1 sr^-1)."""
+    """Rayleigh-Jeans kelvin per unit of specific intensity, c^2 / (2 k nu^2). Hz -> K / (W m^-2
+    Hz^-1 sr^-1).
+    """
     return np.asarray(SPEED_OF_LIGHT**2 / (2 * BOLTZMANN * np.asarray(frequency, np.float64) ** 2))
 
 
 def band_average(band: Band, function: Callable[[Floats], Floats]) -> float:
-    """Equation (1) of ``function`` (Hz array -> array): Gauss-Legendre between the band's tabulated points.
+    """Equation (1) of ``function`` (Hz array -> array): Gauss-Legendre between the band's tabulated
+    points.
 
-    Intervals wider than 1 % of their frequency are divided, so that smooth spectra are integrated to 1e-12.
+    Intervals wider than 1 % of their frequency are divided, so that smooth spectra are integrated
+    to 1e-12.
     """
     nu, transmission = band.frequency, band.transmission
     pieces = np.maximum(np.ceil(np.diff(nu) / (0.01 * nu[:-1])), 1).astype(int)
@@ -95,25 +110,29 @@ def to_kelvin_rj(
     Parameters
     ----------
     unit
-        ``K_RJ`` (already the band's brightness: factor 1), ``K_CMB`` (spectrum of CMB anisotropy), ``y`` (Compton-y,
-        thermal SZ spectrum), ``Jy/pixel``, ``Jy/beam`` or ``MJy/sr`` (a power law, below).
+        ``K_RJ`` (already the band's brightness: factor 1), ``K_CMB`` (spectrum of CMB anisotropy),
+        ``y`` (Compton-y, thermal SZ spectrum), ``Jy/pixel``, ``Jy/beam`` or ``MJy/sr`` (a power
+        law, below).
     band
         The passband.
     pixel_solid_angle
         sr; for ``Jy/pixel``.
     spectral_index
-        alpha of S(nu) = S0 (nu / nu0)^alpha for ``Jy/pixel``, ``Jy/beam`` and ``MJy/sr``, where the map holds S0, the
-        value at the band centre nu0 (`Band.centre`). 0 is a flat spectrum.
+        alpha of S(nu) = S0 (nu / nu0)^alpha for ``Jy/pixel``, ``Jy/beam`` and ``MJy/sr``, where the
+        map holds S0, the value at the band centre nu0 (`Band.centre`). 0 is a flat spectrum.
     beam_solid_angle
         sr; for ``Jy/beam``.
 
     Raises
     ------
     InputError
-        Unknown unit; a solid angle is missing or not positive; a spectral index with a unit that has its own spectrum.
+        Unknown unit; a solid angle is missing or not positive; a spectral index with a unit that
+        has its own spectrum.
     """
     if unit not in UNITS:
-        raise InputError(f"unknown unit '{unit}' of a sky map", cure=f"give one of {', '.join(UNITS)}")
+        raise InputError(
+            f"unknown unit '{unit}' of a sky map", cure=f"give one of {', '.join(UNITS)}"
+        )
     if unit in SURFACE_BRIGHTNESS_UNITS:
         centre = band.centre
 
@@ -123,8 +142,12 @@ def to_kelvin_rj(
         return band_average(band, power_law) * _intensity(unit, pixel_solid_angle, beam_solid_angle)
     if spectral_index != 0.0:
         raise InputError(
-            f"a map in {unit} has its own spectrum, a spectral index of {spectral_index:g} does not apply",
-            cure=f"remove the spectral index; it serves maps in {', '.join(SURFACE_BRIGHTNESS_UNITS)}",
+            f"a map in {unit} has its own spectrum, a spectral index of {spectral_index:g} does not"
+            " apply",
+            cure=(
+                "remove the spectral index; it serves maps in"
+                f" {', '.join(SURFACE_BRIGHTNESS_UNITS)}"
+            ),
         )
     if unit == "K_CMB":
         return band_average(band, cmb_slope)
@@ -135,7 +158,9 @@ def _intensity(unit: str, pixel_solid_angle: float | None, beam_solid_angle: flo
     """One of ``unit`` in W m^-2 Hz^-1 sr^-1."""
     if unit == "MJy/sr":
         return 1e-20
-    name, solid_angle = ("pixel", pixel_solid_angle) if unit == "Jy/pixel" else ("beam", beam_solid_angle)
+    name, solid_angle = (
+        ("pixel", pixel_solid_angle) if unit == "Jy/pixel" else ("beam", beam_solid_angle)
+    )
     if solid_angle is None or not (math.isfinite(solid_angle) and solid_angle > 0):
         given = "none is given" if solid_angle is None else f"{solid_angle:g} sr is given"
         message = f"a map in {unit} needs the solid angle of its {name}, but {given}"

@@ -1,22 +1,27 @@
-"""Counter-based random numbers: every number has an absolute address and can be made alone, in any order, in any thread.
+"""Counter-based random numbers: every number has an absolute address and can be made alone, in any
+order, in any thread.
 
-Philox4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3") maps a 64-bit key and a 128-bit counter
-to 128 random bits. Normal deviates follow by Box-Muller in float32: 24 significant bits, largest magnitude 6.66.
+Philox4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3") maps a 64-bit key
+and a 128-bit counter to 128 random bits. Normal deviates follow by Box-Muller in float32: 24
+significant bits, largest magnitude 6.66.
 
-The unit of work is a tile of `TILE` = 1024 numbers = 256 consecutive counters x 4 words, always made whole, so the bits of
-a number never depend on where a request begins or ends.
+The unit of work is a tile of `TILE` = 1024 numbers = 256 consecutive counters x 4 words, always
+made whole, so the bits of a number never depend on where a request begins or ends.
 
 The counter words (c0, least significant, to c3) of block b = 0 .. 255 of a tile:
 
-=============  ===============================  ====================  ==========================================
-kind           c0, c1                           c2                    c3
-=============  ===============================  ====================  ==========================================
-normals        256 tile + b, 64 bits            stream                0
-uniforms       256 tile + b, 64 bits            stream                2^30
-lattice        b + 2^8 J, low 64 bits           I, low 32 bits        I >> 32 (27 bits), J >> 56 (3 bits), 2^31
-=============  ===============================  ====================  ==========================================
+=============  ===============================  ====================
+========================================== kind           c0, c1                           c2
+c3
+=============  ===============================  ====================
+========================================== normals        256 tile + b, 64 bits            stream
+0 uniforms       256 tile + b, 64 bits            stream                2^30 lattice        b + 2^8
+J, low 64 bits           I, low 32 bits        I >> 32 (27 bits), J >> 56 (3 bits), 2^31
+=============  ===============================  ====================
+==========================================
 
-with (I, J) = (i >> 5, j >> 5) the lattice tile of 32 x 32 points: kinds, streams and tiles never share a counter.
+with (I, J) = (i >> 5, j >> 5) the lattice tile of 32 x 32 points: kinds, streams and tiles never
+share a counter.
 """
 
 from __future__ import annotations
@@ -45,8 +50,8 @@ _STREAMS = 1 << 32
 def stream_key(seed: int, *names: str | int) -> NDArray[np.uint32]:
     """Key (2,) uint32 of the random stream that belongs to ``seed`` and ``names``.
 
-    BLAKE2b over the type, length and content of each part, so no two different lists are encoded alike
-    (``"ab", "c"`` and ``"a", "bc"``; ``1`` and ``"1"``).
+    BLAKE2b over the type, length and content of each part, so no two different lists are encoded
+    alike (``"ab", "c"`` and ``"a", "bc"``; ``1`` and ``"1"``).
     """
     digest = hashlib.blake2b(digest_size=8)
     for part in (int(seed), *names):
@@ -61,12 +66,17 @@ def stream_key(seed: int, *names: str | int) -> NDArray[np.uint32]:
 
 
 def normals(
-    key: NDArray[np.uint32], start: int, stop: int, stream: int = 0, out: NDArray[np.floating[Any]] | None = None
+    key: NDArray[np.uint32],
+    start: int,
+    stop: int,
+    stream: int = 0,
+    out: NDArray[np.floating[Any]] | None = None,
 ) -> NDArray[Any]:
-    """Standard normal deviates ``start`` .. ``stop - 1`` of stream ``stream`` (0 .. 2^32 - 1) under ``key``.
+    """Standard normal deviates ``start`` .. ``stop - 1`` of stream ``stream`` (0 .. 2^32 - 1) under
+    ``key``.
 
-    Indices are absolute and may be negative. Shape (stop - start,), float32, or ``out`` filled (float32 or float64, same
-    values).
+    Indices are absolute and may be negative. Shape (stop - start,), float32, or ``out`` filled
+    (float32 or float64, same values).
     """
     out = _target(start, stop, stream, out, np.float32)
     fill_normals(key, stream, start, out)
@@ -74,16 +84,25 @@ def normals(
 
 
 def uniforms(
-    key: NDArray[np.uint32], start: int, stop: int, stream: int = 0, out: NDArray[np.floating[Any]] | None = None
+    key: NDArray[np.uint32],
+    start: int,
+    stop: int,
+    stream: int = 0,
+    out: NDArray[np.floating[Any]] | None = None,
 ) -> NDArray[Any]:
-    """Uniform deviates in the open interval (0, 1), 32 bits each; arguments as in `normals`. Shape (stop - start,), float64."""
+    """Uniform deviates in the open interval (0, 1), 32 bits each; arguments as in `normals`. Shape
+    (stop - start,), float64.
+    """
     out = _target(start, stop, stream, out, np.float64)
     fill_uniforms(key, stream, start, out)
     return out
 
 
-def lattice_normals(key: NDArray[np.uint32], i0: int, i1: int, j0: int, j1: int) -> NDArray[np.float32]:
-    """Standard normal deviates at the points (i0 .. i1 - 1, j0 .. j1 - 1) of an unbounded integer lattice.
+def lattice_normals(
+    key: NDArray[np.uint32], i0: int, i1: int, j0: int, j1: int
+) -> NDArray[np.float32]:
+    """Standard normal deviates at the points (i0 .. i1 - 1, j0 .. j1 - 1) of an unbounded integer
+    lattice.
 
     Any int64 indices. Shape (i1 - i0, j1 - j0), float32.
     """
@@ -94,7 +113,9 @@ def lattice_normals(key: NDArray[np.uint32], i0: int, i1: int, j0: int, j1: int)
     return out
 
 
-def _target(start: int, stop: int, stream: int, out: NDArray[Any] | None, dtype: type) -> NDArray[Any]:
+def _target(
+    start: int, stop: int, stream: int, out: NDArray[Any] | None, dtype: type
+) -> NDArray[Any]:
     if stop < start:
         raise ValueError(f"reversed range {start}:{stop}")
     if not 0 <= stream < _STREAMS:
@@ -106,12 +127,15 @@ def _target(start: int, stop: int, stream: int, out: NDArray[Any] | None, dtype:
     return out
 
 
-# ---------------------------------------------------------------------------------------------- kernels (callable from numba)
+# ----------------------------------------------------------------------------------------------
+# kernels (callable from numba)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def fill_normals(key, stream, start, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` (n,) float32 or float64 with normal deviates ``start`` .. of ``stream`` under ``key`` (2,) uint32."""
+    """Fill ``out`` (n,) float32 or float64 with normal deviates ``start`` .. of ``stream`` under
+    ``key`` (2,) uint32.
+    """
     words, bits, tile = normal_scratch()
     first = int64(start)
     stop = first + int64(out.size)
@@ -127,14 +151,22 @@ def fill_normals(key, stream, start, out):  # type: ignore[no-untyped-def]
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def normal_scratch():  # type: ignore[no-untyped-def]
     """(words, bits, tile) for `normal_tile`."""
-    return np.empty((4, _BLOCKS), np.uint32), np.empty(_BLOCKS, np.int32), np.empty(TILE, np.float32)
+    return (
+        np.empty((4, _BLOCKS), np.uint32),
+        np.empty(_BLOCKS, np.int32),
+        np.empty(TILE, np.float32),
+    )
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def normal_tile(key, stream, number, words, bits, tile):  # type: ignore[no-untyped-def]
-    """Fill ``tile`` (`TILE`,) float32 with normal deviates `TILE` number .. of ``stream`` under ``key``."""
+    """Fill ``tile`` (`TILE`,) float32 with normal deviates `TILE` number .. of ``stream`` under
+    ``key``.
+    """
     counter = uint64(number) << uint64(8)
-    philox(key, counter & uint64(0xFFFFFFFF), counter >> uint64(32), uint64(stream), uint64(0), words)
+    philox(
+        key, counter & uint64(0xFFFFFFFF), counter >> uint64(32), uint64(stream), uint64(0), words
+    )
     box_muller(words[0], words[1], bits, tile[0:256], tile[256:512])
     box_muller(words[2], words[3], bits, tile[512:768], tile[768:1024])
 
@@ -148,7 +180,14 @@ def fill_uniforms(key, stream, start, out):  # type: ignore[no-untyped-def]
     flat = words.reshape(TILE)
     for number in range(first >> int64(10), (stop + int64(TILE - 1)) >> int64(10)):
         counter = uint64(number) << uint64(8)
-        philox(key, counter & uint64(0xFFFFFFFF), counter >> uint64(32), uint64(stream), uint64(_UNIFORMS), words)
+        philox(
+            key,
+            counter & uint64(0xFFFFFFFF),
+            counter >> uint64(32),
+            uint64(stream),
+            uint64(_UNIFORMS),
+            words,
+        )
         origin = number << int64(10)
         low, high = max(first, origin), min(stop, origin + int64(TILE))
         for k in range(low, high):
@@ -157,7 +196,9 @@ def fill_uniforms(key, stream, start, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def fill_lattice_normals(key, i0, j0, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` (n_i, n_j) with the normal deviates of the lattice points from (i0, j0) under ``key`` (2,) uint32."""
+    """Fill ``out`` (n_i, n_j) with the normal deviates of the lattice points from (i0, j0) under
+    ``key`` (2,) uint32.
+    """
     words = np.empty((4, _BLOCKS), np.uint32)
     tile = np.empty(TILE, np.float32)
     bits = np.empty(_BLOCKS, np.int32)
@@ -166,16 +207,37 @@ def fill_lattice_normals(key, i0, j0, out):  # type: ignore[no-untyped-def]
     i1, j1 = i0 + int64(out.shape[0]), j0 + int64(out.shape[1])
     for row in range(i0 >> int64(5), ((i1 - int64(1)) >> int64(5)) + int64(1)):
         for column in range(j0 >> int64(5), ((j1 - int64(1)) >> int64(5)) + int64(1)):
-            a, b = uint64(row) & uint64(0x7FFFFFFFFFFFFFF), uint64(column) & uint64(0x7FFFFFFFFFFFFFF)
+            a, b = (
+                uint64(row) & uint64(0x7FFFFFFFFFFFFFF),
+                uint64(column) & uint64(0x7FFFFFFFFFFFFFF),
+            )
             low = b << uint64(8)
-            c3 = (a >> uint64(32)) | ((b >> uint64(56)) << uint64(27)) | (uint64(_LATTICE) & uint64(0xC0000000))
-            philox(key, low & uint64(0xFFFFFFFF), (low >> uint64(32)) & uint64(0xFFFFFFFF), a & uint64(0xFFFFFFFF), c3, words)
+            c3 = (
+                (a >> uint64(32))
+                | ((b >> uint64(56)) << uint64(27))
+                | (uint64(_LATTICE) & uint64(0xC0000000))
+            )
+            philox(
+                key,
+                low & uint64(0xFFFFFFFF),
+                (low >> uint64(32)) & uint64(0xFFFFFFFF),
+                a & uint64(0xFFFFFFFF),
+                c3,
+                words,
+            )
             box_muller(words[0], words[1], bits, tile[0:256], tile[256:512])
             box_muller(words[2], words[3], bits, tile[512:768], tile[768:1024])
             top, left = row * side, column * side
-            # Offsets from the tile's corner: the corner of the last tile plus 32 could overflow int64.
-            i_low, i_high = max(i0 - top, int64(0)), min(i1 - int64(1) - top, side - int64(1)) + int64(1)
-            j_low, j_high = max(j0 - left, int64(0)), min(j1 - int64(1) - left, side - int64(1)) + int64(1)
+            # Offsets from the tile's corner: the corner of the last tile plus 32 could overflow
+            # int64.
+            i_low, i_high = (
+                max(i0 - top, int64(0)),
+                min(i1 - int64(1) - top, side - int64(1)) + int64(1),
+            )
+            j_low, j_high = (
+                max(j0 - left, int64(0)),
+                min(j1 - int64(1) - left, side - int64(1)) + int64(1),
+            )
             for i in range(i_low, i_high):
                 source = tile[i * side + j_low : i * side + j_high]
                 target = out[top - i0 + i, left - j0 + j_low : left - j0 + j_high]
@@ -185,10 +247,12 @@ def fill_lattice_normals(key, i0, j0, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def philox(key, c0, c1, c2, c3, words):  # type: ignore[no-untyped-def]
-    """Philox4x32-10 of the counters (c0 + b, c1, c2, c3), b = 0 .. n - 1 (no carry): words (4, n) uint32.
+    """Philox4x32-10 of the counters (c0 + b, c1, c2, c3), b = 0 .. n - 1 (no carry): words (4, n)
+    uint32.
 
-    Each 32-bit word is held in the low half of a uint64, which the compiler turns into vector multiplications; the high half is
-    masked where they are made, so that the masks become part of them.
+    Each 32-bit word is held in the low half of a uint64, which the compiler turns into vector
+    multiplications; the high half is masked where they are made, so that the masks become part of
+    them.
     """
     low, half = uint64(0xFFFFFFFF), uint64(32)
     m0, m1 = uint64(0xD2511F53), uint64(0xCD9E8D57)
@@ -206,12 +270,16 @@ def philox(key, c0, c1, c2, c3, words):  # type: ignore[no-untyped-def]
         out0[b], out1[b], out2[b], out3[b] = uint32(x0), uint32(x1), uint32(x2), uint32(x3)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def box_muller(a, b, bits, one, two):  # type: ignore[no-untyped-def]
-    """Two arrays of normal deviates ``one, two`` (n,) float32 from two of random words ``a, b`` (n,) uint32.
+    """Two arrays of normal deviates ``one, two`` (n,) float32 from two of random words ``a, b``
+    (n,) uint32.
 
-    Radius sqrt(-2 ln u), u = (a/2 + 1/2) / 2^31, with the single-precision polynomials of Cephes for the logarithm and
-    for sine and cosine on a quarter turn; the top two bits of ``b`` choose the quadrant. ``bits``: (n,) int32, overwritten.
+    Radius sqrt(-2 ln u), u = (a/2 + 1/2) / 2^31, with the single-precision polynomials of Cephes
+    for the logarithm and for sine and cosine on a quarter turn; the top two bits of ``b`` choose
+    the quadrant. ``bits``: (n,) int32, overwritten.
     """
     value = bits.view(np.float32)
     for i in range(uint64(a.size)):
@@ -240,8 +308,13 @@ def box_muller(a, b, bits, one, two):  # type: ignore[no-untyped-def]
         turn = b[i]
         angle = float32(int32(turn << uint32(2))) * float32(3.657347e-10)
         z = angle * angle
-        sine = ((float32(-1.9515295891e-4) * z + float32(8.3321608736e-3)) * z + float32(-1.6666654611e-1)) * z * angle + angle
-        cosine = (float32(2.443315711809948e-5) * z + float32(-1.388731625493765e-3)) * z + float32(4.166664568298827e-2)
+        sine = (
+            (float32(-1.9515295891e-4) * z + float32(8.3321608736e-3)) * z
+            + float32(-1.6666654611e-1)
+        ) * z * angle + angle
+        cosine = (float32(2.443315711809948e-5) * z + float32(-1.388731625493765e-3)) * z + float32(
+            4.166664568298827e-2
+        )
         cosine = cosine * z * z - float32(0.5) * z + float32(1)
         quadrant = int32(turn >> uint32(30))
         odd = (quadrant & int32(1)) != 0

@@ -1,11 +1,14 @@
-"""Fields that vary slowly over the focal plane and in time, kept at nodes and evaluated where they are wanted.
+"""Fields that vary slowly over the focal plane and in time, kept at nodes and evaluated where they
+are wanted.
 
 A field is stored as cubic B-spline coefficients in time at ``n_node`` focal-plane nodes:
 
-    f(d, t) = sum_n weights[d, n] * sum_j coefficients[n, m + j] * B_j(r / step),   t = m * step + r,  j = 0..3     (1)
+    f(d, t) = sum_n weights[d, n] * sum_j coefficients[n, m + j] * B_j(r / step),
+    t = m * step + r,   j = 0..3     (1)
 
-with B_j the four cubic B-spline weights. Both the mean emission of the atmosphere (float64: microkelvin under tens of
-kelvin) and its turbulent part (float32) are such fields; see ``docs/atmosphere.md``.
+with B_j the four cubic B-spline weights. Both the mean emission of the atmosphere (float64:
+microkelvin under tens of kelvin) and its turbulent part (float32) are such fields; see
+``docs/atmosphere.md``.
 """
 
 from __future__ import annotations
@@ -30,16 +33,20 @@ LINES_KEPT = 1 << 18
 """Coefficients of all detectors up to which they are worked out once, not for every block."""
 
 SPLINE_MARGIN = 12
-"""Values on either side that `spline_coefficients` uses up: its filter is cut where it has fallen to 1.4e-7."""
+"""Values on either side that `spline_coefficients` uses up: its filter is cut where it has fallen
+to 1.4e-7.
+"""
 
 REACH = 28
 """Values on either side beyond which the filter is below rounding: 0.27^28 = 1e-16."""
 
 
 def spline_coefficients(values: AnyFloats, dtype: type = np.float64) -> AnyFloats:
-    """Cubic B-spline coefficients of rows of values (n, m + 2 `SPLINE_MARGIN`): (n, m), each from its neighbours alone.
+    """Cubic B-spline coefficients of rows of values (n, m + 2 `SPLINE_MARGIN`): (n, m), each from
+    its neighbours alone.
 
-    A finite filter, normalized to unit sum, so that a coefficient has the same bits wherever the rows begin.
+    A finite filter, normalized to unit sum, so that a coefficient has the same bits wherever the
+    rows begin.
     """
     out: AnyFloats = np.empty((values.shape[0], values.shape[1] - 2 * SPLINE_MARGIN), dtype)
     _prefilter(np.ascontiguousarray(values, np.float64), _inverse_taps(SPLINE_MARGIN), out)
@@ -47,9 +54,13 @@ def spline_coefficients(values: AnyFloats, dtype: type = np.float64) -> AnyFloat
 
 
 def interpolating(values: AnyFloats) -> NDArray[np.float64]:
-    """Cubic B-spline coefficients (n, m) of rows of values (n, m), mirrored about their first and their last: exact."""
+    """Cubic B-spline coefficients (n, m) of rows of values (n, m), mirrored about their first and
+    their last: exact.
+    """
     out = np.empty(values.shape)
-    rows = np.pad(np.ascontiguousarray(values, np.float64), ((0, 0), (REACH, REACH)), mode="reflect")
+    rows = np.pad(
+        np.ascontiguousarray(values, np.float64), ((0, 0), (REACH, REACH)), mode="reflect"
+    )
     _prefilter(rows, _inverse_taps(REACH), out)
     return out
 
@@ -62,9 +73,13 @@ def _inverse_taps(reach: int) -> NDArray[np.float64]:
 
 
 def spline_basis(u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The four cubic B-splines that reach a point of a cell, at ``u`` (n,), 0 to 1 of the way through it: (4, n)."""
+    """The four cubic B-splines that reach a point of a cell, at ``u`` (n,), 0 to 1 of the way
+    through it: (4, n).
+    """
     v = 1.0 - u
-    return np.array([v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6])
+    return np.array(
+        [v * v * v / 6, 2 / 3 - u * u * (2 - u) / 2, 2 / 3 - v * v * (2 - v) / 2, u * u * u / 6]
+    )
 
 
 @lru_cache(maxsize=32)
@@ -90,11 +105,14 @@ class SmoothField:
     Attributes
     ----------
     weights
-        (n_det, n_node): interpolation from nodes to detectors (any per-detector gain is absorbed here).
+        (n_det, n_node): interpolation from nodes to detectors (any per-detector gain is absorbed
+        here).
     coefficients
-        (n_node, ceil(n_samples / step) + 3): B-spline coefficients in time; index k stands at sample (k - 1) * step.
+        (n_node, ceil(n_samples / step) + 3): B-spline coefficients in time; index k stands at
+        sample (k - 1) * step.
     step
-        Samples between coefficients; a power of two, so that blocks never cut an interval (see `core.run.execution`).
+        Samples between coefficients; a power of two, so that blocks never cut an interval (see
+        `core.run.execution`).
     n_samples
         Samples covered.
     """
@@ -108,17 +126,25 @@ class SmoothField:
 
     @classmethod
     def from_values(
-        cls, weights: AnyFloats, values: AnyFloats, step: int, n_samples: int, dtype: type = np.float64
+        cls,
+        weights: AnyFloats,
+        values: AnyFloats,
+        step: int,
+        n_samples: int,
+        dtype: type = np.float64,
     ) -> SmoothField:
-        """From node values with a margin: ``values`` (n_node, n_coarse + 2 * margin) sampled every ``step`` samples.
+        """From node values with a margin: ``values`` (n_node, n_coarse + 2 * margin) sampled every
+        ``step`` samples.
 
-        The margin (equal on both sides, inferred from the width) is used by the spline prefilter and then dropped;
-        12 coefficients make the edge effect of the mirror boundary < 2e-7.
+        The margin (equal on both sides, inferred from the width) is used by the spline prefilter
+        and then dropped; 12 coefficients make the edge effect of the mirror boundary < 2e-7.
         """
         wanted = -(-n_samples // step) + 3
         margin, odd = divmod(values.shape[1] - wanted, 2)
         if margin < 0 or odd:
-            raise ValueError(f"values must have {wanted} + 2 * margin columns, got {values.shape[1]}")
+            raise ValueError(
+                f"values must have {wanted} + 2 * margin columns, got {values.shape[1]}"
+            )
         kept = np.ascontiguousarray(interpolating(values)[:, margin : margin + wanted])
         return cls(np.ascontiguousarray(weights, dtype), kept.astype(dtype), step, n_samples)
 
@@ -126,21 +152,37 @@ class SmoothField:
     def constant(cls, per_detector: AnyFloats, n_samples: int, step: int = 2048) -> SmoothField:
         """A field that does not vary in time: ``per_detector`` (n_det,)."""
         ones = np.ones((1, -(-n_samples // step) + 3))
-        return cls(np.ascontiguousarray(np.asarray(per_detector, np.float64)[:, None]), ones, step, n_samples)
+        return cls(
+            np.ascontiguousarray(np.asarray(per_detector, np.float64)[:, None]),
+            ones,
+            step,
+            n_samples,
+        )
 
     def scaled(self, per_detector: AnyFloats) -> SmoothField:
         """The field times a per-detector factor (n_det,)."""
-        return SmoothField(self.weights * np.asarray(per_detector)[:, None], self.coefficients, self.step, self.n_samples)
+        return SmoothField(
+            self.weights * np.asarray(per_detector)[:, None],
+            self.coefficients,
+            self.step,
+            self.n_samples,
+        )
 
     def plus(self, other: SmoothField) -> SmoothField:
-        """The sum of two fields over the same detectors and samples, at the shorter of their steps."""
+        """The sum of two fields over the same detectors and samples, at the shorter of their
+        steps.
+        """
         step = min(self.step, other.step)
         parts = [part.refined(step) for part in (self, other)]
         weights = np.hstack([np.asarray(part.weights, np.float64) for part in parts])
-        return SmoothField(weights, np.vstack([part.coefficients for part in parts]), step, self.n_samples)
+        return SmoothField(
+            weights, np.vstack([part.coefficients for part in parts]), step, self.n_samples
+        )
 
     def refined(self, step: int) -> SmoothField:
-        """The same field at a shorter ``step``, by halving: b_2k = (c_k + c_k+1) / 2, b_2k-1 = (c_k-1 + 6 c_k + c_k+1) / 8."""
+        """The same field at a shorter ``step``, by halving: b_2k = (c_k + c_k+1) / 2, b_2k-1 =
+        (c_k-1 + 6 c_k + c_k+1) / 8.
+        """
         now, c = self.step, np.asarray(self.coefficients, np.float64)
         while now > step:
             now //= 2
@@ -155,7 +197,8 @@ class SmoothField:
         return np.asarray(self.weights @ self.coefficients.mean(1), np.float64)
 
     def evaluate(self, detectors: slice, samples: slice, out: AnyFloats | None = None) -> AnyFloats:
-        """f at the detectors and samples of a block: (n_det_block, n_samp_block), of ``out``'s dtype or float64.
+        """f at the detectors and samples of a block: (n_det_block, n_samp_block), of ``out``'s
+        dtype or float64.
 
         Bits depend on the absolute detector and sample only. ``out`` is overwritten.
         """
@@ -165,7 +208,9 @@ class SmoothField:
         return out
 
     def series(self, detectors: slice, samples: slice, dtype: np.dtype[Any]) -> Series:
-        """What a kernel needs to evaluate f at the detectors and samples of a block, to the same bits as `evaluate`."""
+        """What a kernel needs to evaluate f at the detectors and samples of a block, to the same
+        bits as `evaluate`.
+        """
         start, stop = samples.start, samples.stop
         if not 0 <= start <= stop <= self.n_samples:
             raise ValueError(f"samples {start}:{stop} outside 0:{self.n_samples}")
@@ -199,14 +244,16 @@ class FieldSums:
         if len(fields) == 1:
             return fields[0]
         key = tuple(map(id, fields))
-        if key not in self._made:  # the fields are held with their sum, so that none of another scan takes their place
+        if (
+            key not in self._made
+        ):  # the fields are held with their sum, so that none of another scan takes their place
             self._made.setdefault(key, (fields, reduce(SmoothField.plus, fields)))
         return self._made[key][1]
 
 
 def product(rows: AnyFloats, matrix: AnyFloats) -> NDArray[np.float64]:
-    """Rows (n, m) times a small matrix (m, k), (n, k): not by BLAS, whose bits in one row depend on how many there are and
-    where it stands among them."""
+    """Rows (n, m) times a small matrix (m, k), (n, k): not by BLAS, whose bits in one row depend on
+    how many there are and where it stands among them."""
     out = np.empty((len(rows), matrix.shape[1]))
     _lines(np.ascontiguousarray(rows, np.float64), np.ascontiguousarray(matrix, np.float64), 0, out)
     return out
@@ -214,7 +261,8 @@ def product(rows: AnyFloats, matrix: AnyFloats) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class DetectorField:
-    """Equation (1) where every detector is its own node: no weights, and no focal-plane interpolation to pay for.
+    """Equation (1) where every detector is its own node: no weights, and no focal-plane
+    interpolation to pay for.
 
     Attributes
     ----------
@@ -285,14 +333,21 @@ def _evaluate(lines, first, inside, start, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def series_into(line, first, inside, start, into):  # type: ignore[no-untyped-def]
-    """One detector of a `Series` at the samples start .. start + into.size - 1 (absolute). For use in kernels."""
+    """One detector of a `Series` at the samples start .. start + into.size - 1 (absolute). For use
+    in kernels.
+    """
     step, size = nb.uint64(inside.size), nb.uint64(into.size)
     one, two, six = inside.dtype.type(1), inside.dtype.type(2), inside.dtype.type(6)
     m, done = nb.uint64(start) // step, nb.uint64(0)
     k, r = m - nb.uint64(first), nb.uint64(start) - m * step
     while done < size:
         n = min(step - r, size - done)
-        c0, c1, c2, c3 = line[k], line[k + nb.uint64(1)], line[k + nb.uint64(2)], line[k + nb.uint64(3)]
+        c0, c1, c2, c3 = (
+            line[k],
+            line[k + nb.uint64(1)],
+            line[k + nb.uint64(2)],
+            line[k + nb.uint64(3)],
+        )
         p0, p1 = (c0 + (two + two) * c1 + c2) / six, (c2 - c0) / two
         p2, p3 = (c0 - two * c1 + c2) / two, (c3 - c0 + (two + one) * (c1 - c2)) / six
         for t in range(n):

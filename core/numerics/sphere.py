@@ -1,4 +1,6 @@
-"""Directions on the sphere: unit vectors of longitudes and latitudes, and back. All angles in rad."""
+"""Directions on the sphere: unit vectors of longitudes and latitudes, and back. All angles in
+rad.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ from ..types import Floats
 
 
 def unit_vectors(longitude: Any, latitude: Any) -> Floats:
-    """(..., 3) directions of spherical coordinates; the longitude of a horizontal one is minus its azimuth."""
+    """(..., 3) directions of spherical coordinates; the longitude of a horizontal one is minus its
+    azimuth.
+    """
     c = np.cos(latitude)
     axes = np.broadcast_arrays(c * np.cos(longitude), c * np.sin(longitude), np.sin(latitude))
     vectors: Floats = np.stack(axes, axis=-1)
@@ -26,7 +30,11 @@ def angles(vectors: Floats) -> tuple[Floats, Floats]:
 def local_axes(longitude: float, latitude: float) -> Floats:
     """(3, 3) rows: the direction at a point, east and north there."""
     east = [-np.sin(longitude), np.cos(longitude), 0.0]
-    north = [-np.sin(latitude) * np.cos(longitude), -np.sin(latitude) * np.sin(longitude), np.cos(latitude)]
+    north = [
+        -np.sin(latitude) * np.cos(longitude),
+        -np.sin(latitude) * np.sin(longitude),
+        np.cos(latitude),
+    ]
     return np.array([unit_vectors(longitude, latitude), east, north])
 
 
@@ -38,5 +46,8 @@ def angle_between(a: Floats, b: Floats) -> Floats:
 def separation(longitude: Floats, latitude: Floats, centre: tuple[float, float]) -> Floats:
     """Angles of directions from ``centre`` (longitude, latitude), accurate for small ones."""
     lon, lat = centre
-    half = np.sin((latitude - lat) / 2) ** 2 + np.cos(latitude) * np.cos(lat) * np.sin((longitude - lon) / 2) ** 2
+    half = (
+        np.sin((latitude - lat) / 2) ** 2
+        + np.cos(latitude) * np.cos(lat) * np.sin((longitude - lon) / 2) ** 2
+    )
     return np.asarray(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1))))

@@ -1,7 +1,9 @@
-"""World coordinates of a plain tangent-plane (TAN) image, without `astropy.wcs`, which takes 0.4 s to import.
+"""World coordinates of a plain tangent-plane (TAN) image, without `astropy.wcs`, which takes 0.4 s
+to import.
 
-No rotation, no distortion, in ICRS or Galactic coordinates: what zonda makes, and most of what it reads. `TangentWcs` answers to
-the names of `astropy.wcs.WCS` that zonda asks for; any other name is answered by astropy.
+No rotation, no distortion, in ICRS or Galactic coordinates: what zonda makes, and most of what it
+reads. `TangentWcs` answers to the names of `astropy.wcs.WCS` that zonda asks for; any other name is
+answered by astropy.
 """
 
 from __future__ import annotations
@@ -18,9 +20,14 @@ from ..types import Floats
 from .projection import central
 
 AXES = {"icrs": ("RA---TAN", "DEC--TAN"), "galactic": ("GLON-TAN", "GLAT-TAN")}
-_WORDS = {"icrs": ("Right ascension", "Declination"), "galactic": ("Galactic longitude", "Galactic latitude")}
+_WORDS = {
+    "icrs": ("Right ascension", "Declination"),
+    "galactic": ("Galactic longitude", "Galactic latitude"),
+}
 
-_MORE = re.compile(r"CD\d|PC\d|PV|PS|CROTA|[AB]P?_|C[PQ]DIS|D[PQ]\d|D2IM|DVERR|RADECSYS|EPOCH|EQUINOX|VELANGL")
+_MORE = re.compile(
+    r"CD\d|PC\d|PV|PS|CROTA|[AB]P?_|C[PQ]DIS|D[PQ]\d|D2IM|DVERR|RADECSYS|EPOCH|EQUINOX|VELANGL"
+)
 """Keys that may make of a header more than a `TangentWcs`."""
 
 
@@ -33,8 +40,8 @@ class TangentWcs:
     frame
         ``icrs`` or ``galactic``.
     crval, crpix, cdelt
-        As in a FITS header: (longitude, latitude) [deg] of the tangent point, less than 90 deg from the equator; its pixel
-        (x, y), counted from 1; degrees per pixel along x and y.
+        As in a FITS header: (longitude, latitude) [deg] of the tangent point, less than 90 deg from
+        the equator; its pixel (x, y), counted from 1; degrees per pixel along x and y.
     """
 
     frame: str
@@ -72,9 +79,15 @@ class TangentWcs:
         return []
 
     def wcs_pix2world(self, *arguments: Any) -> Any:
-        """(x, y, origin) to two arrays, or (pixels (n, 2), origin) to (n, 2): longitudes in [0, 360) and latitudes [deg]."""
+        """(x, y, origin) to two arrays, or (pixels (n, 2), origin) to (n, 2): longitudes in [0,
+        360) and latitudes [deg].
+        """
         *pixels, origin = arguments
-        pair = np.asarray(pixels[0], np.float64).T if len(pixels) == 1 else np.broadcast_arrays(*pixels)
+        pair = (
+            np.asarray(pixels[0], np.float64).T
+            if len(pixels) == 1
+            else np.broadcast_arrays(*pixels)
+        )
         x, y = (np.asarray(axis, np.float64) - origin for axis in pair)
         a, b, c = np.tensordot(np.linalg.inv(central(self)), np.stack([x, y, np.ones_like(x)]), 1)
         world = np.degrees(np.arctan2(b, a)) % 360.0, np.degrees(np.arctan2(c, np.hypot(a, b)))
@@ -114,20 +127,33 @@ class TangentWcs:
 
 
 def plain(header: Any) -> TangentWcs | None:
-    """What a FITS header says, or None where that is more than a `TangentWcs` holds, or not valid."""
-    frame = next((f for f, axes in AXES.items() if axes == (header.get("CTYPE1"), header.get("CTYPE2"))), None)
+    """What a FITS header says, or None where that is more than a `TangentWcs` holds, or not
+    valid.
+    """
+    frame = next(
+        (f for f, axes in AXES.items() if axes == (header.get("CTYPE1"), header.get("CTYPE2"))),
+        None,
+    )
     if frame is None or any(_MORE.match(key) for key in header):
         return None
     system = header.get("RADESYS", "ICRS" if frame == "icrs" else "")
     if system != ("ICRS" if frame == "icrs" else "") or header.get("LONPOLE", 180.0) != 180.0:
         return None
-    if any(header.get(f"CUNIT{k}", "deg") != "deg" for k in (1, 2)) or header.get("WCSAXES", 2) != 2:
+    if (
+        any(header.get(f"CUNIT{k}", "deg") != "deg" for k in (1, 2))
+        or header.get("WCSAXES", 2) != 2
+    ):
         return None
-    crval, crpix, cdelt = ([header.get(f"{key}{k}") for k in (1, 2)] for key in ("CRVAL", "CRPIX", "CDELT"))
+    crval, crpix, cdelt = (
+        [header.get(f"{key}{k}") for k in (1, 2)] for key in ("CRVAL", "CRPIX", "CDELT")
+    )
     if not all(type(v) in (int, float) and math.isfinite(v) for v in (*crval, *crpix, *cdelt)):
         return None
     if not all(cdelt) or not abs(crval[1]) < 90.0:
         return None
     return TangentWcs(
-        frame, (float(crval[0]), float(crval[1])), (float(crpix[0]), float(crpix[1])), (float(cdelt[0]), float(cdelt[1]))
+        frame,
+        (float(crval[0]), float(crval[1])),
+        (float(crpix[0]), float(crpix[1])),
+        (float(cdelt[0]), float(cdelt[1])),
     )

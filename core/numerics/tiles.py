@@ -1,4 +1,6 @@
-"""The absolute tiles in which work is cut, so that no result depends on block size, threads or order."""
+"""The absolute tiles in which work is cut, so that no result depends on block size, threads or
+order.
+"""
 
 from __future__ import annotations
 

@@ -1,16 +1,19 @@
 """`zonda plan --audit`: do the omitted effects stay within their bounds?
 
-A slice of the scan, short enough for its cost, is simulated in full, and once more for each effect that the plan drops or
-coarsens, with the same random numbers, through the same filters. The bounds are those that the operators state for the slice. An
-actual error violates its bound where it exceeds it by more than two of its own standard errors, which follow from its scatter
-between parts of the slice.
+A slice of the scan, short enough for its cost, is simulated in full, and once more for each effect
+that the plan drops or coarsens, with the same random numbers, through the same filters. The bounds
+are those that the operators state for the slice. An actual error violates its bound where it
+exceeds it by more than two of its own standard errors, which follow from its scatter between parts
+of the slice.
 
-Of a map of I, Q and U each plane S is compared. A bound is one of I, the mean of the H samples of a pixel. For samples of
-weight a with errors e_i, whose correlations add up to c at most,
+Of a map of I, Q and U each plane S is compared. A bound is one of I, the mean of the H samples of a
+pixel. For samples of weight a with errors e_i, whose correlations add up to c at most,
 
-    |sum g_i e_i|^2 <= c sum g_i^2 e^2 = (c / H) e^2 / s,   s = w_S / (a H),   g = a (A^-1)_S r,   w_S = 1 / (A^-1)_SS     (1)
+    |sum g_i e_i|^2 <= c sum g_i^2 e^2 = (c / H) e^2 / s,   s = w_S / (a H),
+    g = a (A^-1)_S r,   w_S = 1 / (A^-1)_SS                                   (1)
 
-(`operators.maps.stokes_sums`), so that it holds for the error of S times s^(1/2), which is what is reported.
+(`operators.maps.stokes_sums`), so that it holds for the error of S times s^(1/2), which is what is
+reported.
 """
 
 from __future__ import annotations
@@ -48,17 +51,20 @@ SHORTEST = 8.0
 """Shortest slice before detectors are left out, s."""
 
 COST = 20.0
-"""CPU seconds [reference machine] that an audit may take, all its runs: the slice is chosen by it."""
+"""CPU seconds [reference machine] that an audit may take, all its runs: the slice is chosen by it.
+"""
 
 HEADLINE, ROUGH = 0.15, 0.4
-"""Relative error that the stated noise of a pixel may have: where every sample was counted, in pixels that lie otherwise than the
-map's; and where hits were counted on coarse cells, of some of the samples."""
+"""Relative error that the stated noise of a pixel may have: where every sample was counted, in
+pixels that lie otherwise than the map's; and where hits were counted on coarse cells, of some of
+the samples."""
 
 GIVEN = "sky_given"
 """Name of the signal of the sky that no filter changes."""
 
 ROUNDING = 1e-6
-"""Of the stream's rms: differences below are float32 arithmetic in another order, not the effect."""
+"""Of the stream's rms: differences below are float32 arithmetic in another order, not the effect.
+"""
 
 
 @dataclass(frozen=True)
@@ -70,10 +76,11 @@ class Extent:
 
 
 def extent(made: Plan, runs: int) -> Extent:
-    """The longest slice for which that many runs, each beside one of the sky alone, take no more than `COST`.
+    """The longest slice for which that many runs, each beside one of the sky alone, take no more
+    than `COST`.
 
-    Set-up (reading, convolving, laying out) is counted once for each run; what remains buys samples. A slice is not made shorter
-    than `SHORTEST` for it: detectors are left out instead.
+    Set-up (reading, convolving, laying out) is counted once for each run; what remains buys
+    samples. A slice is not made shorter than `SHORTEST` for it: detectors are left out instead.
     """
     o, estimates = made.context.first, made.costs
     fixed = sum(c.fixed + c.once for c in estimates.values())
@@ -88,8 +95,9 @@ def extent(made: Plan, runs: int) -> Extent:
 class Checked:
     """One effect in one metric: its bound, what the error was, the standard error of that.
 
-    ``exercised``: whether the coarser form changed anything that could show the error; where it did not, nothing is said of the
-    bound. ``within``: the bound is no bound but a prediction, which the actual value meets within this share of it.
+    ``exercised``: whether the coarser form changed anything that could show the error; where it did
+    not, nothing is said of the bound. ``within``: the bound is no bound but a prediction, which the
+    actual value meets within this share of it.
     """
 
     effect: str
@@ -135,19 +143,30 @@ class Audit:
             table.append((r.effect, r.what, r.metric, bound, actual, error, r.verdict))
         widths = [max(len(row[k]) for row in table) for k in range(6)]
         lines = [f"audit of {self.slice}"]
-        lines += ["  ".join([*(c.ljust(w) for c, w in zip(r, widths, strict=False)), r[6]]).rstrip() for r in table]
+        lines += [
+            "  ".join([*(c.ljust(w) for c, w in zip(r, widths, strict=False)), r[6]]).rstrip()
+            for r in table
+        ]
         count = sum(r.violated for r in self.rows)
         if not self.rows:
             return f"{lines[0]}: nothing was coarsened, and no output depends on what was dropped"
         if all(r.within is not None for r in self.rows):
             lines.append("nothing was coarsened, and no output depends on what was dropped")
         idle = sum(not r.exercised for r in self.rows)
-        lines.append(f"{len(self.rows)} bounds, {count} violated" + (f", {idle} not exercised" if idle else ""))
+        lines.append(
+            f"{len(self.rows)} bounds, {count} violated"
+            + (f", {idle} not exercised" if idle else "")
+        )
         return "\n".join(lines)
 
     def json(self) -> str:
         """The rows as JSON."""
-        return json.dumps({"slice": self.slice, "rows": [{**dataclasses.asdict(r), "violated": r.violated} for r in self.rows]})
+        return json.dumps(
+            {
+                "slice": self.slice,
+                "rows": [{**dataclasses.asdict(r), "violated": r.violated} for r in self.rows],
+            }
+        )
 
 
 @dataclass(frozen=True)
@@ -168,22 +187,34 @@ class AuditOfBands:
 
     def json(self) -> str:
         """The rows of each band as JSON."""
-        return json.dumps({"bands": {name: json.loads(found.json()) for name, found in self.bands.items()}})
+        return json.dumps(
+            {"bands": {name: json.loads(found.json()) for name, found in self.bands.items()}}
+        )
 
 
-def audit_of_bands(file: PipelineFile, made: PlanOfBands, *, threads: int | None = None) -> AuditOfBands:
-    """`audit` of each band, in a camera that has no other: what the plan of that band decides. A run for all bands takes of
-    that what they have in common."""
-    return AuditOfBands({
-        name: audit(one, made.plans[name], threads=threads) for name, one in files_of_bands(file).items()
-    })  # fmt: skip
+def audit_of_bands(
+    file: PipelineFile, made: PlanOfBands, *, threads: int | None = None
+) -> AuditOfBands:
+    """`audit` of each band, in a camera that has no other: what the plan of that band decides. A
+    run for all bands takes of that what they have in common."""
+    return AuditOfBands(
+        {
+            name: audit(one, made.plans[name], threads=threads)
+            for name, one in files_of_bands(file).items()
+        }
+    )
 
 
 def audit(
-    file: PipelineFile, made: Plan, *, threads: int | None = None, seconds: float | None = None, observations: int = 1
+    file: PipelineFile,
+    made: Plan,
+    *,
+    threads: int | None = None,
+    seconds: float | None = None,
+    observations: int = 1,
 ) -> Audit:
-    """Compare every decision of ``made`` with the full simulation of a slice of ``file``, chosen by cost (`extent`) where no
-    ``seconds`` are given."""
+    """Compare every decision of ``made`` with the full simulation of a slice of ``file``, chosen by
+    cost (`extent`) where no ``seconds`` are given."""
     chosen = [d for d in made.decided if d.chosen > 0]
     size = extent(made, len(chosen) + 2) if seconds is None else Extent(seconds)
     seconds = size.seconds
@@ -191,14 +222,21 @@ def audit(
         file = dataclasses.replace(made, decided=()).apply(file)
     part = sliced(file, seconds, observations, size.every)
     whole = Structure(tuple(o.label for o in part.pipeline().operators), tuple(part.runs), ())
-    dropped = [d.operator for d in chosen if d.effect.name == NAME and d.operator in whole.operators]
+    dropped = [
+        d.operator for d in chosen if d.effect.name == NAME and d.operator in whole.operators
+    ]
     whole_plan = plan_band(part, Wishes(prune_all=False, drop=dropped))
     words = f"the first {seconds:.3g} s of {observations} scan{'s' if observations > 1 else ''}"
     if size.every > 1:
         words += f", every {size.every}th detector"
     if made.context.joined:
-        words += f", this band alone: with the others, which {made.context.joined} joins, the bounds need not hold"
-    fewer = tuple(label for label in whole.operators if label in made.structure.operators or label == "Slice")
+        words += (
+            f", this band alone: with the others, which {made.context.joined} joins, the bounds"
+            " need not hold"
+        )
+    fewer = tuple(
+        label for label in whole.operators if label in made.structure.operators or label == "Slice"
+    )
     rows = _noise(dataclasses.replace(whole_plan, structure=whole).apply(part), whole_plan, threads)
     if not chosen and fewer == whole.operators:
         return Audit(tuple(rows), words)
@@ -220,16 +258,22 @@ def audit(
         result = _run(decided(*same), threads)
         bound: dict[str, float] = {}
         for d in same:
-            sky = d.choice.bound.get("peak", 0.0)  # what is bounded for the sky alone is in the stream and the map too
+            sky = d.choice.bound.get(
+                "peak", 0.0
+            )  # what is bounded for the sky alone is in the stream and the map too
             bound = add(bound, {"tod": sky, "map_rms": sky, **d.choice.bound})
-        rows += _compare("all together", Choice("coarse", "", bound=bound), reference, result, whole_plan.context)
+        rows += _compare(
+            "all together", Choice("coarse", "", bound=bound), reference, result, whole_plan.context
+        )
     return Audit(tuple(rows), words)
 
 
 def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]:
-    """The white noise of a map pixel of the slice: as the plan states it, and as it is where the hits are those of the deep part.
+    """The white noise of a map pixel of the slice: as the plan states it, and as it is where the
+    hits are those of the deep part.
 
-    It is what the map of white noise and atmosphere has more than that of the atmosphere alone, through which it is calibrated.
+    It is what the map of white noise and atmosphere has more than that of the atmosphere alone,
+    through which it is calibrated.
     """
     provided = [made_by(s.operator) for s in part.steps]
     if not made.noise[1] or not any("white" in p for p in provided):
@@ -243,28 +287,54 @@ def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]
     except PipelineError as err:
         if "too large for the map's fixed-point sums" not in err.message:
             raise
-        return []  # an opaque atmosphere, calibrated and not filtered: the map's samples have no noise to compare
-    maps: dict[str, Any] = {run: v for run in runs for k, v in products.items() if k.startswith(f"{run}/") and hasattr(v, "hits")}
+        # an opaque atmosphere, calibrated and not filtered: the map's samples have no noise to
+        # compare
+        return []
+    maps: dict[str, Any] = {
+        run: v
+        for run in runs
+        for k, v in products.items()
+        if k.startswith(f"{run}/") and hasattr(v, "hits")
+    }
     several = sum("map" in p for p in provided) > 1
     if (
         maps.keys() != runs.keys() or several or getattr(maps["white"], "smoothed_by", 0.0) > 0
     ):  # the plan's pixel is none of these maps'
         return []
     first = maps["white"]
-    noise, hits = np.ravel(first.signal - (maps["air"].signal if air else 0.0)), np.ravel(first.hits)
+    noise, hits = (
+        np.ravel(first.signal - (maps["air"].signal if air else 0.0)),
+        np.ravel(first.hits),
+    )
     seen = (hits > 0) & np.isfinite(noise)
     if np.count_nonzero(seen) < 2 * PARTS:
         return []
     deep = float(np.quantile(hits[seen], DEEP))
     squares = [float(p.mean()) for p in np.array_split(noise[seen] ** 2 * hits[seen] / deep, PARTS)]
     within = HEADLINE if made.context.coverage and made.context.coverage.exact else ROUGH
-    return [Checked("white noise", "of the plan", "map_rms", made.noise[1], _rms(squares), _rms_error(squares), within=within)]
+    return [
+        Checked(
+            "white noise",
+            "of the plan",
+            "map_rms",
+            made.noise[1],
+            _rms(squares),
+            _rms_error(squares),
+            within=within,
+        )
+    ]
 
 
 def _on_slice(d: Decided, stated: dict[str, Decided]) -> Decided | None:
-    """The same choice with the bound that holds for the slice; None where the slice has no such choice."""
+    """The same choice with the bound that holds for the slice; None where the slice has no such
+    choice.
+    """
     mine = stated.get(d.name)
-    numbers = [] if mine is None else [k for k, c in enumerate(mine.effect.choices) if c.what == d.choice.what]
+    numbers = (
+        []
+        if mine is None
+        else [k for k, c in enumerate(mine.effect.choices) if c.what == d.choice.what]
+    )
     return dataclasses.replace(mine, chosen=numbers[0]) if mine is not None and numbers else None
 
 
@@ -285,9 +355,14 @@ def _run(file: PipelineFile, threads: int | None) -> _Result:
     maps = [k for k, v in data.products.items() if hasattr(v, "hits") and hasattr(v, "signal")]
     main = next((data.products[k] for k in maps if "/" not in k), None)
     runs = ("sky_alone", GIVEN, "sky_with_own_modes")
-    sky, given, own = (next((data.products[k] for k in maps if k.startswith(f"{run}/")), None) for run in runs)
+    sky, given, own = (
+        next((data.products[k] for k in maps if k.startswith(f"{run}/")), None) for run in runs
+    )
     kept = [o for o in data.observations if "signal" in o.detdata]
-    signal = [np.asarray(o.detdata["signal"][o.good_detectors][:, o.good_samples], np.float64) for o in kept]
+    signal = [
+        np.asarray(o.detdata["signal"][o.good_detectors][:, o.good_samples], np.float64)
+        for o in kept
+    ]
     return _Result(signal, main, sky, given, own)
 
 
@@ -299,15 +374,28 @@ def _with_sky_given(file: PipelineFile) -> PipelineFile:
     return dataclasses.replace(file, header=file.header.model_copy(update={"runs": runs}))
 
 
-def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: Context) -> list[Checked]:
+def _compare(
+    name: str, choice: Choice, full: _Result, other: _Result, context: Context
+) -> list[Checked]:
     rows = []
 
     def add(metric: str, actual: float, error: float, rounding: float, plane: str = "") -> None:
         if metric in choice.bound and math.isfinite(actual):
             bound = choice.bound[metric]
-            # where nothing may change, that nothing did is what is asked for, if there was something
+            # where nothing may change, that nothing did is what is asked for, if there was
+            # something
             exercised = actual > 0 or (bound == 0 and rounding > 0)
-            rows.append(Checked(name, choice.what, f"{metric} {plane}".strip(), bound + rounding, actual, error, exercised))
+            rows.append(
+                Checked(
+                    name,
+                    choice.what,
+                    f"{metric} {plane}".strip(),
+                    bound + rounding,
+                    actual,
+                    error,
+                    exercised,
+                )
+            )
 
     scale = ROUNDING * _rms([float((s * s).mean()) for s in full.signal if s.size])
     if [a.shape for a in full.signal] == [b.shape for b in other.signal]:
@@ -327,9 +415,17 @@ def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: 
                 scaled = difference[deep] ** 2 * hits[deep] / context.coverage.hits
                 squares = [float(p.mean()) for p in np.array_split(scaled, PARTS) if p.size]
                 add("map_rms", _rms(squares), _rms_error(squares), scale, plane)
-    skies = [(one, two) for one, two in ((full.sky, other.sky), (full.own, other.own)) if one is not None and two is not None]
+    skies = [
+        (one, two)
+        for one, two in ((full.sky, other.sky), (full.own, other.own))
+        if one is not None and two is not None
+    ]
     if skies:
-        strongest = float(np.nanmax(np.abs((skies[0][0] if full.given is None else full.given).signal), initial=0.0))
+        strongest = float(
+            np.nanmax(
+                np.abs((skies[0][0] if full.given is None else full.given).signal), initial=0.0
+            )
+        )
         largest: dict[str, float] = {}
         for one, two in skies:
             for plane, share, a, b in _planes(one, two):
@@ -343,14 +439,17 @@ def _compare(name: str, choice: Choice, full: _Result, other: _Result, context: 
 
 
 def _planes(full: Any, other: Any) -> list[tuple[str, Any, Any, Any]]:
-    """Of each plane of two maps its name (of I none), s^(1/2) of equation (1), and the maps of it."""
+    """Of each plane of two maps its name (of I none), s^(1/2) of equation (1), and the maps of
+    it.
+    """
     if getattr(full, "polarization", None) is None:
         return [("", 1.0, full, other)]
     with np.errstate(invalid="ignore", divide="ignore"):
         most = float(np.nanmax(full.weights / full.hits, initial=0.0))  # a, or a little less
         both = [(plane, full.stokes(plane), other.stokes(plane)) for plane in "IQU"]
         return [
-            (plane.strip("I"), np.sqrt(one.weights / (most * np.maximum(full.hits, 1))), one, two) for plane, one, two in both
+            (plane.strip("I"), np.sqrt(one.weights / (most * np.maximum(full.hits, 1))), one, two)
+            for plane, one, two in both
         ]
 
 
@@ -359,7 +458,9 @@ def _rms(squares: Sequence[float]) -> float:
 
 
 def _rms_error(squares: Sequence[float]) -> float:
-    """Standard error of the rms from its scatter between the parts: sigma(s^2) / (2 rms sqrt(n))."""
+    """Standard error of the rms from its scatter between the parts: sigma(s^2) / (2 rms
+    sqrt(n)).
+    """
     rms = _rms(squares)
     if len(squares) < 2 or rms == 0:
         return 0.0

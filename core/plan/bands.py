@@ -1,6 +1,8 @@
-"""Plans of cameras with several bands: each band is planned like a camera that has no other, and one pipeline is run for all.
+"""Plans of cameras with several bands: each band is planned like a camera that has no other, and
+one pipeline is run for all.
 
-What a band's map needs is simulated for all of them; what is coarser is so where every band's plan says so.
+What a band's map needs is simulated for all of them; what is coarser is so where every band's plan
+says so.
 """
 
 from __future__ import annotations
@@ -31,11 +33,16 @@ class PlanOfBands:
         return combined({name: made.summary for name, made in self.plans.items()})
 
     def apply(self, file: PipelineFile) -> PipelineFile:
-        """The pipeline that is run: an ordinary one, with parameters changed and operators omitted."""
+        """The pipeline that is run: an ordinary one, with parameters changed and operators
+        omitted.
+        """
         return self.summary.apply(file)
 
     def __str__(self) -> str:
-        return "\n\n".join(f"band {name}: {made}" for name, made in self.plans.items()) + f"\n\nall bands: {self.summary}"
+        return (
+            "\n\n".join(f"band {name}: {made}" for name, made in self.plans.items())
+            + f"\n\nall bands: {self.summary}"
+        )
 
 
 def plan(
@@ -48,20 +55,24 @@ def plan(
     memory: int | None = None,
     measure: bool = False,
 ) -> Plan | PlanOfBands:
-    """Plan a pipeline file: decide as on a reference machine (one thread, memory for all), predict for this one.
+    """Plan a pipeline file: decide as on a reference machine (one thread, memory for all), predict
+    for this one.
 
     Parameters
     ----------
     keep
-        Effects or operators that stay as the pipeline asks for them (``poles``, ``PinkNoise.poles``, ``PinkNoise``).
+        Effects or operators that stay as the pipeline asks for them (``poles``,
+        ``PinkNoise.poles``, ``PinkNoise``).
     drop
         Effects or operators to leave out, whatever that costs; their bounds are stated.
     prune_all
         False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
     threads, memory
-        Of the run that is predicted [memory in bytes]; decisions do not depend on them. None: those of this machine.
+        Of the run that is predicted [memory in bytes]; decisions do not depend on them. None: those
+        of this machine.
     measure
-        Run a slice of a few seconds to find the cost of operators that do not state it; decisions do not depend on it.
+        Run a slice of a few seconds to find the cost of operators that do not state it; decisions
+        do not depend on it.
 
     Returns
     -------
@@ -88,7 +99,9 @@ def as_dict(made: Plan | PlanOfBands) -> dict[str, Any]:
 
 
 def files_of_bands(file: PipelineFile) -> dict[str, PipelineFile]:
-    """By name of the band, the file with a camera that has this band alone; empty where the camera has one band."""
+    """By name of the band, the file with a camera that has this band alone; empty where the camera
+    has one band.
+    """
     scene = file.scene()
     return {
         name: dataclasses.replace(file, _scene=scene.model_copy(update={"instrument": camera}))
@@ -97,7 +110,9 @@ def files_of_bands(file: PipelineFile) -> dict[str, PipelineFile]:
 
 
 def combined(summaries: Mapping[str, PlanSummary]) -> PlanSummary:
-    """One summary for all bands: all operators and signals that one of them needs, settings that all of them have."""
+    """One summary for all bands: all operators and signals that one of them needs, settings that
+    all of them have.
+    """
     every = list(summaries.values())
     first = every[0]
     order = max((s.operators for s in every), key=len)
@@ -105,7 +120,11 @@ def combined(summaries: Mapping[str, PlanSummary]) -> PlanSummary:
     runs = dict.fromkeys(run for s in every for run in s.runs)
     settings: dict[str, dict[str, Any]] = {}
     for label, own in first.settings.items():
-        common = {key: value for key, value in own.items() if all(s.settings.get(label, {}).get(key) == value for s in every)}
+        common = {
+            key: value
+            for key, value in own.items()
+            if all(s.settings.get(label, {}).get(key) == value for s in every)
+        }
         if common:
             settings[label] = common
     short = [(f"{name}: {row[0]}", *row[1:]) for name, s in summaries.items() for row in s.short]
@@ -123,7 +142,9 @@ def _added(predictions: list[Prediction]) -> Prediction:
     return dataclasses.replace(
         predictions[0],
         seconds=seconds,
-        bytes=max(max(p.bytes - p.products, BASE) for p in predictions) + products + max(p.shared for p in predictions),
+        bytes=max(max(p.bytes - p.products, BASE) for p in predictions)
+        + products
+        + max(p.shared for p in predictions),
         products=products,
         unknown=tuple(dict.fromkeys(label for p in predictions for label in p.unknown)),
         startup=max(p.startup for p in predictions),

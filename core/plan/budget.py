@@ -35,7 +35,10 @@ class Limits(Parameters):
     @model_validator(mode="after")
     def _something(self) -> Limits:
         if not self.model_fields_set:
-            raise ValueError("state at least one of map_rms, peak, transfer, tod, psd; or a share of the noise, e.g. 10 %")
+            raise ValueError(
+                "state at least one of map_rms, peak, transfer, tod, psd; or a share of the noise,"
+                " e.g. 10 %"
+            )
         return self
 
 
@@ -47,9 +50,22 @@ def limits(budget: Any, map_noise: float, sample_noise: float) -> dict[str, floa
     ZondaError
         For a share that is not a number from 0 to 1.
     """
-    given = {metric: v for metric, v in budget if v is not None} if isinstance(budget, Limits) else {}
+    given = (
+        {metric: v for metric, v in budget if v is not None} if isinstance(budget, Limits) else {}
+    )
     share = SHARE if isinstance(budget, Limits) else float(budget)
     if not 0 <= share <= 1:
-        raise ZondaError(f"the budget is a share of the noise from 0 to 1, got {share:g}", place="budget", cure="write e.g. 10 %")
+        raise ZondaError(
+            f"the budget is a share of the noise from 0 to 1, got {share:g}",
+            place="budget",
+            cure="write e.g. 10 %",
+        )
     in_map, transfer = given.get("map_rms", share * map_noise), TRANSFER * min(1.0, share / SHARE)
-    return {"map_rms": in_map, "peak": in_map, "transfer": transfer, "tod": share * sample_noise, "psd": share, **given}
+    return {
+        "map_rms": in_map,
+        "peak": in_map,
+        "transfer": transfer,
+        "tod": share * sample_noise,
+        "psd": share,
+        **given,
+    }

@@ -9,16 +9,38 @@ from ..cli import complete
 
 @click.command()
 @click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
-@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, as for `zonda run`.")
-@click.option("--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full.")
-@click.option("--drop", multiple=True, metavar="NAME", help="Leave this effect or operator out, whatever that costs.")
-@click.option("--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone.")
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change one value, as for `zonda run`.",
+)
+@click.option(
+    "--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full."
+)
+@click.option(
+    "--drop",
+    multiple=True,
+    metavar="NAME",
+    help="Leave this effect or operator out, whatever that costs.",
+)
+@click.option(
+    "--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone."
+)
 @click.option("--no-prune", is_flag=True, help="Leave nothing out.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option(
-    "--audit", is_flag=True, help="Rerun a short slice with everything on and compare; exit status 1 where a bound fails."
+    "--audit",
+    is_flag=True,
+    help="Rerun a short slice with everything on and compare; exit status 1 where a bound fails.",
 )
-@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads of the run that is planned.  [default: all]")
+@click.option(
+    "--threads",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Threads of the run that is planned.  [default: all]",
+)
 def plan(
     pipeline: str,
     settings: tuple[str, ...],
@@ -30,11 +52,12 @@ def plan(
     audit: bool,
     threads: int | None,
 ) -> None:
-    """Show what of a scene is worth simulating, what it costs, and what leaving out the rest may cost.
+    """Show what of a scene is worth simulating, what it costs, and what leaving out the rest may
+    cost.
 
-    Each effect has a bound on the error that its coarser form adds to the products, with its formula. They are dropped or
-    coarsened, the cheapest first, while the bounds add up to no more than the budget: a tenth of the noise, or the file's
-    `budget:`.
+    Each effect has a bound on the error that its coarser form adds to the products, with its
+    formula. They are dropped or coarsened, the cheapest first, while the bounds add up to no more
+    than the budget: a tenth of the noise, or the file's `budget:`.
     """
     from ..compilation.compiled import ensure_cache, one_blas_thread
 
@@ -64,7 +87,11 @@ def plan(
     from .audit import audit as compare
     from .audit import audit_of_bands
 
-    found = audit_of_bands(file, made, threads=threads) if isinstance(made, PlanOfBands) else compare(file, made, threads=threads)
+    found = (
+        audit_of_bands(file, made, threads=threads)
+        if isinstance(made, PlanOfBands)
+        else compare(file, made, threads=threads)
+    )
     click.echo(found.json() if as_json else str(found))
     if found.violated:
         raise click.exceptions.Exit(1)

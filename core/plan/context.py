@@ -1,4 +1,6 @@
-"""What bounds depend on: the scan, the noise of the products, and the filters on the way to them."""
+"""What bounds depend on: the scan, the noise of the products, and the filters on the way to
+them.
+"""
 
 from __future__ import annotations
 
@@ -60,8 +62,8 @@ class Depth:
     sample
         rms of one sample of the calibrated stream over detectors and scans, K.
     weighed
-        sqrt(hits) times the noise of a map pixel, K, where all detectors and scans share in every pixel alike: with weights w,
-        sqrt(N sum w^2 sigma^2) / sum w over the N samples.
+        sqrt(hits) times the noise of a map pixel, K, where all detectors and scans share in every
+        pixel alike: with weights w, sqrt(N sum w^2 sigma^2) / sum w over the N samples.
     """
 
     sample: float
@@ -81,7 +83,8 @@ class Work:
     components
         Names of all streams that become part of a signal.
     times
-        How often each operator does its work, by label: once for components, and for each signal that it forms, filters or maps.
+        How often each operator does its work, by label: once for components, and for each signal
+        that it forms, filters or maps.
     """
 
     steps: tuple[Operator, ...] = ()
@@ -122,7 +125,9 @@ class Context:
     depth: Depth = Depth(0.0, 0.0)
     """The white noise that the run will have."""
     readers: frozenset[str] = frozenset()
-    """Labels of the operators that make a product of the time streams themselves (`Planning.reads_streams`)."""
+    """Labels of the operators that make a product of the time streams themselves
+    (`Planning.reads_streams`).
+    """
     kept_streams: frozenset[str] = frozenset()
     """Streams that some operator saves, measures or draws besides ``signal``."""
     band: str = ""
@@ -135,34 +140,40 @@ class Context:
 
     @cached_property
     def lowest(self) -> Observation:
-        """The observation at the lowest elevation: there the atmosphere is thickest, and what depends on it largest."""
+        """The observation at the lowest elevation: there the atmosphere is thickest, and what
+        depends on it largest.
+        """
         return min(self.observations, key=lambda o: float(o.elevation.min()))
 
     @property
     def noise(self) -> float:
-        """White noise of one sample of the calibrated stream, the quietest detector's, K: (sum of squares)^(1/2) over the
-        operators. See `depth` for that of all of them."""
+        """White noise of one sample of the calibrated stream, the quietest detector's, K: (sum of
+        squares)^(1/2) over the operators. See `depth` for that of all of them."""
         return math.sqrt(sum(t.noise**2 for t in self.traits.values()))
 
     @property
     def fluctuation(self) -> float:
         """Largest rms of one sample's fluctuation, all components, K."""
-        return math.sqrt(sum(t.rms**2 + t.loudest**2 + (t.peak or 0.0) ** 2 for t in self.traits.values()))
+        return math.sqrt(
+            sum(t.rms**2 + t.loudest**2 + (t.peak or 0.0) ** 2 for t in self.traits.values())
+        )
 
     @cached_property
     def mean_emission(self) -> float:
         """Largest mean emission in the calibrated stream, K; 0: there is none."""
-        return max((float(_calibrated_mean(o).max(initial=0.0)) for o in self.observations), default=0.0)
+        return max(
+            (float(_calibrated_mean(o).max(initial=0.0)) for o in self.observations), default=0.0
+        )
 
     @cached_property
     def passed(self) -> float:
-        """Largest rms of one sample's fluctuation behind the high-pass filter, K: `LEAKS` of what a brick wall on whole scans
-        leaves of it, for scans that do not repeat."""
+        """Largest rms of one sample's fluctuation behind the high-pass filter, K: `LEAKS` of what a
+        brick wall on whole scans leaves of it, for scans that do not repeat."""
         return self.weighted(lambda f: 1.0, self.cut, math.inf) * (LEAKS if self.cut > 0 else 1.0)
 
     def weighted(self, weight: Callable[[float], float], low: float, high: float) -> float:
-        """sqrt(int S w^2 df) over a range of frequencies [Hz], K; S of all components, w <= 1 rising or falling (its larger end
-        of each step of the grid counts)."""
+        """sqrt(int S w^2 df) over a range of frequencies [Hz], K; S of all components, w <= 1
+        rising or falling (its larger end of each step of the grid counts)."""
         if low <= 0 and high == math.inf:
             return self.fluctuation
         top = min(high, 0.5 * self.first.sample_rate)
@@ -173,10 +184,14 @@ class Context:
         for t in self.traits.values():
             parts = np.array([t.faster(float(f)) if t.faster else t.rms for f in grid]) ** 2
             noise = t.loudest**2 * np.maximum(1 - 2 * grid / self.first.sample_rate, 0.0)
-            above = parts + noise + (t.peak or 0.0) ** 2 * (1 if high == math.inf else 1 - grid / top)
+            above = (
+                parts + noise + (t.peak or 0.0) ** 2 * (1 if high == math.inf else 1 - grid / top)
+            )
             w = np.array([weight(float(f)) ** 2 for f in grid])
             last = above[-1] * w[-1] if high == math.inf else 0.0
-            total += float(np.maximum(above[:-1] - above[1:], 0.0) @ np.maximum(w[:-1], w[1:])) + last
+            total += (
+                float(np.maximum(above[:-1] - above[1:], 0.0) @ np.maximum(w[:-1], w[1:])) + last
+            )
         return math.sqrt(total)
 
     @property
@@ -191,8 +206,9 @@ class Context:
 
     @property
     def joined(self) -> str:
-        """Labels of the steps that measure the detectors of all bands together, where there are several. Bounds are those of one
-        band: what it alone has in common is not removed, and what of another band goes into it is not counted."""
+        """Labels of the steps that measure the detectors of all bands together, where there are
+        several. Bounds are those of one band: what it alone has in common is not removed, and what
+        of another band goes into it is not counted."""
         return " and ".join(o.label for o in self.operators if self.band and joins(o))
 
     @property
@@ -202,14 +218,18 @@ class Context:
 
     @property
     def turns(self) -> bool:
-        """Whether a filter removes modes that it finds in the data, which turn where a part of the data is left out; or one
-        without a planning class may."""
+        """Whether a filter removes modes that it finds in the data, which turn where a part of the
+        data is left out; or one without a planning class may."""
         return any(t.turns for t in self.traits.values())
 
     @cached_property
     def before_filters(self) -> bool:
-        """Whether a stream is saved, measured or drawn above a filter: what the filters remove is then in it."""
-        filtering = {label for label, t in self.traits.items() if t.removes_common or t.response is not None}
+        """Whether a stream is saved, measured or drawn above a filter: what the filters remove is
+        then in it.
+        """
+        filtering = {
+            label for label, t in self.traits.items() if t.removes_common or t.response is not None
+        }
         filters = [k for k, o in enumerate(self.operators) if o.label in filtering]
         readers = [k for k, o in enumerate(self.operators) if o.label in self.readers]
         return bool(filters and readers) and min(readers) < max(filters)
@@ -238,9 +258,10 @@ class Context:
     def in_map(self, tod: float, correlated: float, common: bool) -> float:
         """Map rms of an error of rms ``tod`` in the stream, K.
 
-        The mean of H samples whose errors have correlation rho has the variance tod^2 sum_ij rho_ij / H^2 <= tod^2 c / H, c
-        the number of samples that err together: those of one passage through the pixel, and those that fall in it within the
-        correlation time. ``correlated``: integral of |rho| over time, s. ``common``: all detectors err alike.
+        The mean of H samples whose errors have correlation rho has the variance tod^2 sum_ij rho_ij
+        / H^2 <= tod^2 c / H, c the number of samples that err together: those of one passage
+        through the pixel, and those that fall in it within the correlation time. ``correlated``:
+        integral of |rho| over time, s. ``common``: all detectors err alike.
         """
         if self.coverage is None:
             return 0.0
@@ -261,21 +282,32 @@ class Context:
         return {"tod": tod, "map_rms": self.in_map(tod, correlated, common)}
 
     def other_modes(self, label: str = "") -> dict[str, float]:
-        """Bound on what changes beside a part E of the data, where that is left out and other modes are removed for it; of what
-        all other steps but ``label`` make, B, and all of the sky.
+        """Bound on what changes beside a part E of the data, where that is left out and other modes
+        are removed for it; of what all other steps but ``label`` make, B, and all of the sky.
 
-        With P, P' the projectors on the modes of E + B and of B, Q on the detectors' mean, |.| the rms,
+        With P, P' the projectors on the modes of E + B and of B, Q on the detectors' mean, |.| the
+        rms,
 
-            |(1 - P) (E + B) - (1 - P') B| <= |(1 - Q) (E + B)| + |(1 - Q) B| <= |(1 - Q) E| + 2 |B|,
+            |(1 - P) (E + B) - (1 - P') B|
+                <= |(1 - Q) (E + B)| + |(1 - Q) B| <= |(1 - Q) E| + 2 |B|,
 
         because nothing of the modes' rank leaves less than they do.
         """
-        others = replace(self, traits={k: t for k, t in self.traits.items() if k != label or t.removes_common or t.response})
-        return {**self.bound(2 * others.passed, self.first.duration, common=True), **self.sky_error(1.0), "psd": 0.0}
+        others = replace(
+            self,
+            traits={
+                k: t for k, t in self.traits.items() if k != label or t.removes_common or t.response
+            },
+        )
+        return {
+            **self.bound(2 * others.passed, self.first.duration, common=True),
+            **self.sky_error(1.0),
+            "psd": 0.0,
+        }
 
     def behind_modes(self, bound: Mapping[str, float]) -> dict[str, float]:
-        """The bound on an error of a part of the data, behind all filters: where one finds its modes in the data, with
-        `other_modes`."""
+        """The bound on an error of a part of the data, behind all filters: where one finds its
+        modes in the data, with `other_modes`."""
         return add(bound, self.other_modes()) if self.turns else dict(bound)
 
     def affords(self, bound: Mapping[str, float]) -> bool:
@@ -295,13 +327,18 @@ def _calibrated_mean(o: Observation) -> NDArray[np.float64]:
     share = o.focalplane.illumination_efficiency / o.focalplane.main_beam_efficiency
     passed: NDArray[Any] = np.ones(1)
     if transmission is not None:
-        passed = np.maximum(-_largest(transmission.weights, -transmission.coefficients), LEAST_TRANSMISSION)
-    return np.asarray(share * _largest(emission.weights, emission.coefficients) / passed, np.float64)
+        passed = np.maximum(
+            -_largest(transmission.weights, -transmission.coefficients), LEAST_TRANSMISSION
+        )
+    return np.asarray(
+        share * _largest(emission.weights, emission.coefficients) / passed, np.float64
+    )
 
 
 def _largest(weights: NDArray[Any], coefficients: NDArray[Any]) -> NDArray[Any]:
-    """(n_det,) largest value of a smooth field over the scan: at the node where the detectors' mean is largest, and at `INSTANTS`
-    others at most; all nodes of all detectors would take gigabytes."""
+    """(n_det,) largest value of a smooth field over the scan: at the node where the detectors' mean
+    is largest, and at `INSTANTS` others at most; all nodes of all detectors would take
+    gigabytes."""
     nodes = coefficients.shape[1]
     evenly = np.linspace(0, nodes - 1, min(INSTANTS, nodes)).astype(int)
     at = np.r_[evenly, np.argmax(weights.mean(axis=0) @ coefficients)]

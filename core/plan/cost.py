@@ -1,8 +1,9 @@
 """CPU time and memory before they are spent.
 
-An operator states its cost on a reference machine as seconds = a + b N_t + c N_det N_t (`estimate.Cost`). What this machine
-needs follows from three kernels that are run for a fraction of a second and compared with their times there: random numbers,
-streams through memory, and the interpreter with small arrays.
+An operator states its cost on a reference machine as seconds = a + b N_t + c N_det N_t
+(`estimate.Cost`). What this machine needs follows from three kernels that are run for a fraction of
+a second and compared with their times there: random numbers, streams through memory, and the
+interpreter with small arrays.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ from .planning import planning_of
 from .summary import Prediction
 
 REFERENCE = {"random": 1.7e-3, "stream": 1.0e-3, "python": 3.2e-3}
-"""Seconds of the kernels on the reference machine: one core of a Sapphire Rapids server at 2.x GHz with AVX-512."""
+"""Seconds of the kernels on the reference machine: one core of a Sapphire Rapids server at 2.x GHz
+with AVX-512.
+"""
 
 STARTUP = Cost(once=0.9, kernel="python")
 """Imports and compiled code from the cache; planning is measured."""
@@ -43,7 +46,9 @@ LASTS = 30 * 86400.0
 
 @cache
 def calibrate() -> Mapping[str, float]:
-    """Time of each kernel relative to the reference machine: measured once, then remembered for `LASTS` seconds."""
+    """Time of each kernel relative to the reference machine: measured once, then remembered for
+    `LASTS` seconds.
+    """
     from ..versions import versions
 
     key = {"processor": user_cache.processor(), "versions": versions()}
@@ -85,7 +90,10 @@ def measure_speed(budget: float = 0.3) -> dict[str, float]:
     best = dict.fromkeys(kernels, np.inf)
     until = time.process_time() + budget
     while time.process_time() < until:
-        for name, kernel in kernels.items():  # in turn, so that a busy moment does not spoil one of them
+        for (
+            name,
+            kernel,
+        ) in kernels.items():  # in turn, so that a busy moment does not spoil one of them
             start = time.process_time()
             kernel()
             best[name] = min(best[name], time.process_time() - start)
@@ -93,10 +101,15 @@ def measure_speed(budget: float = 0.3) -> dict[str, float]:
 
 
 def predict(
-    context: Context, costs: Mapping[str, Cost | None], item: int, threads: int, memory: int, portable: bool = False
+    context: Context,
+    costs: Mapping[str, Cost | None],
+    item: int,
+    threads: int,
+    memory: int,
+    portable: bool = False,
 ) -> Prediction:
-    """CPU time and memory of the pipeline, all signals. Streams that memory has no room for may be made again
-    (`core.run.schedule`).
+    """CPU time and memory of the pipeline, all signals. Streams that memory has no room for may be
+    made again (`core.run.schedule`).
 
     Parameters
     ----------
@@ -114,7 +127,9 @@ def predict(
     during = [o for o in context.operators if not isinstance(o, Output)]
     held = POINTED * context.times + sum(planning_of(o).memory(longest) for o in during)
     after = sum(planning_of(o).memory(longest) for o in context.operators if isinstance(o, Output))
-    settings = Settings(threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32)
+    settings = Settings(
+        threads, max(int(memory - BASE - held), 1), np.float64 if item == 8 else np.float32
+    )
     work = context.work
     chain = Chain(work.steps, work.signals, work.components)
     products = sum(planning_of(o).memory(longest) for o in during if makes_products(o))
@@ -128,16 +143,22 @@ def predict(
     for label, cost in costs.items():
         if cost is not None:
             each = sum(cost.seconds(o.n_samples, o.n_detectors) for o in context.observations)
-            again = found.again.get(label, 0) * (each - cost.fixed * len(context.observations))  # prepared once, made again
+            again = found.again.get(label, 0) * (
+                each - cost.fixed * len(context.observations)
+            )  # prepared once, made again
             # decisions, which are portable, are those of the band alone
             own = 1.0 if in_step is None or portable else 1 - cost.shared * (1 - 1 / bands)
-            seconds[label] = factors[cost.kernel] * (work.times.get(label, 1.0) * (own * each + again) + cost.once)
+            seconds[label] = factors[cost.kernel] * (
+                work.times.get(label, 1.0) * (own * each + again) + cost.once
+            )
     unknown = tuple(label for label, cost in costs.items() if cost is None)
     startup = factors[STARTUP.kernel] * STARTUP.once
     if in_step is not None:
         products = held + found.bytes
     if any(map(joins, work.steps)):
-        products = held + found.bytes + item * longest.n_samples * longest.n_detectors  # its part of the stream of all bands
+        products = (
+            held + found.bytes + item * longest.n_samples * longest.n_detectors
+        )  # its part of the stream of all bands
     shared = room_for(longest.n_detectors, longest.n_samples)
     size = BASE + max(held + found.bytes, after)
     return Prediction(seconds, size, unknown, startup, work.times, factors, products, shared)

@@ -1,4 +1,6 @@
-"""What is decided about each effect: the largest saving for the share of the budget that it takes, first."""
+"""What is decided about each effect: the largest saving for the share of the budget that it takes,
+first.
+"""
 
 from __future__ import annotations
 
@@ -79,16 +81,24 @@ def decide(
     predicted
         On the reference machine: decisions must not depend on this one.
     kept, forced
-        Names of effects that stay as the pipeline asks for them, and of those that take their coarsest form.
+        Names of effects that stay as the pipeline asks for them, and of those that take their
+        coarsest form.
     prune_all
         False: nothing is coarsened but what is forced.
     joined
         Steps for which the bounds do not hold (`Context.joined`): likewise.
     """
     chosen = {d.name: len(d.effect.choices) - 1 if d.name in forced else 0 for d in effects}
-    left = {m: allowed[m] - sum(d.bound(chosen[d.name], m) for d in effects if d.name in forced) for m in allowed}
+    left = {
+        m: allowed[m] - sum(d.bound(chosen[d.name], m) for d in effects if d.name in forced)
+        for m in allowed
+    }
     worth = LEAST_SAVING * predicted.total
-    free = [d for d in effects if prune_all and not joined and d.name not in kept and d.name not in forced]
+    free = [
+        d
+        for d in effects
+        if prune_all and not joined and d.name not in kept and d.name not in forced
+    ]
     while True:
         steps: list[tuple[float, Decided, int]] = []
         for d in free:
@@ -97,7 +107,9 @@ def decide(
                 saved = d.saving(k, predicted) - d.saving(now, predicted)
                 more = {m: d.bound(k, m) - d.bound(now, m) for m in left}
                 if saved >= worth and all(extra <= left[m] for m, extra in more.items()):
-                    share = max((extra / allowed[m] for m, extra in more.items() if extra > 0), default=0.0)
+                    share = max(
+                        (extra / allowed[m] for m, extra in more.items() if extra > 0), default=0.0
+                    )
                     steps.append((saved / max(share, 1e-9), d, k))
         if not steps:
             break
@@ -108,7 +120,11 @@ def decide(
     coarser_forms = "" if prune_all else "--no-prune"
     found = []
     for d in effects:
-        reason = _within(d, left) if not d.simulated else stated.get(d.name) or ("within the budget" if chosen[d.name] else "")
+        reason = (
+            _within(d, left)
+            if not d.simulated
+            else stated.get(d.name) or ("within the budget" if chosen[d.name] else "")
+        )
         if joined and len(d.effect.choices) > 1:
             reason = reason or f"{joined} joins the bands"
         reason = reason or coarser_forms or _why_in_full(d, predicted, worth)
@@ -118,7 +134,11 @@ def decide(
 
 def _within(d: Decided, left: Mapping[str, float]) -> str:
     over = [m for m, v in d.choice.bound.items() if v > left.get(m, math.inf)]
-    return f"may exceed what is left of the budget for {' and '.join(over)}" if over else "within the budget"
+    return (
+        f"may exceed what is left of the budget for {' and '.join(over)}"
+        if over
+        else "within the budget"
+    )
 
 
 def _why_in_full(d: Decided, predicted: Prediction, worth: float) -> str:
@@ -136,9 +156,18 @@ def named(names: Sequence[str], effects: Sequence[Decided], labels: Sequence[str
     for name in names:
         mine = {d.name for d in effects if name in (d.name, d.effect.name, d.operator)}
         if not mine and name not in labels:
-            options = [*dict.fromkeys([*(d.effect.name for d in effects), *(d.name for d in effects), *labels])]
-            cure = nearest(name, options) or f"choose from: {', '.join(dict.fromkeys(d.effect.name for d in effects))}"
-            raise ZondaError(f"the plan has no effect or operator {name!r}", place="zonda plan", cure=cure)
+            options = [
+                *dict.fromkeys(
+                    [*(d.effect.name for d in effects), *(d.name for d in effects), *labels]
+                )
+            ]
+            cure = (
+                nearest(name, options)
+                or f"choose from: {', '.join(dict.fromkeys(d.effect.name for d in effects))}"
+            )
+            raise ZondaError(
+                f"the plan has no effect or operator {name!r}", place="zonda plan", cure=cure
+            )
         found |= mine
     return found
 
@@ -150,4 +179,8 @@ def check_droppable(drop: Sequence[str], effects: Sequence[Decided], labels: Seq
         mine = [d for d in effects if name in (d.name, d.effect.name)]
         if mine and name not in labels and all(len(d.effect.choices) == 1 for d in mine):
             what = "has no coarser form" if mine[0].simulated else "is not simulated"
-            raise ZondaError(f"{name!r} cannot be dropped: it {what}", place="zonda plan", cure="remove this --drop")
+            raise ZondaError(
+                f"{name!r} cannot be dropped: it {what}",
+                place="zonda plan",
+                cure="remove this --drop",
+            )

@@ -1,4 +1,6 @@
-"""Estimates of an operator for the planner: the size of its effects, the errors of coarser forms, their costs."""
+"""Estimates of an operator for the planner: the size of its effects, the errors of coarser forms,
+their costs.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,8 @@ class Choice:
     formula
         Where the bound comes from.
     seconds
-        CPU time that it saves against the effect as the pipeline asks for it [reference s, see `cost`].
+        CPU time that it saves against the effect as the pipeline asks for it [reference s, see
+        `cost`].
     """
 
     decision: Decision
@@ -62,9 +65,11 @@ class Effect:
     name
         Unique in its operator: ``poles``, ``layer 9``.
     choices
-        The first is what the pipeline asks for; the others are coarser, each less accurate than the one before.
+        The first is what the pipeline asks for; the others are coarser, each less accurate than the
+        one before.
     size, formula
-        Upper bound of what the effect contributes (what leaving it out would cost), and where it comes from.
+        Upper bound of what the effect contributes (what leaving it out would cost), and where it
+        comes from.
     """
 
     name: str
@@ -103,8 +108,9 @@ class Cost:
 
 @dataclass(frozen=True)
 class Estimate:
-    """An operator's effects and its cost; ``cost`` None: unknown, the planner says so. ``without``: what leaving the whole
-    operator out would cost, where that is not what its effects contribute."""
+    """An operator's effects and its cost; ``cost`` None: unknown, the planner says so. ``without``:
+    what leaving the whole operator out would cost, where that is not what its effects
+    contribute."""
 
     effects: tuple[Effect, ...] = ()
     cost: Cost | None = None
@@ -118,7 +124,8 @@ class Traits:
     Attributes
     ----------
     noise
-        Adds this much white noise: rms of one sample of the calibrated stream, K; of the quietest detector.
+        Adds this much white noise: rms of one sample of the calibrated stream, K; of the quietest
+        detector.
     each
         (n_det,) The same of each detector; None: they are alike.
     rms
@@ -171,4 +178,6 @@ def full(what: str, **more: Any) -> Choice:
 
 def not_simulated(name: str, what: str, bound: Bound, formula: str) -> Effect:
     """An effect that nature has and zonda leaves out, with a bound on what that costs."""
-    return Effect(name, (Choice("not simulated", what, bound=bound, formula=formula),), bound, formula)
+    return Effect(
+        name, (Choice("not simulated", what, bound=bound, formula=formula),), bound, formula
+    )

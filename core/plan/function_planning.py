@@ -14,7 +14,9 @@ class FunctionPlanning(Planning[FunctionOperator]):
     smaller = "make the scan shorter, or couple less: couples='all' holds a whole scan in float64"
 
     def memory(self, observation: Observation) -> int:
-        """With ``couples="all"`` the scan in float64, what the function makes of it, and that of each signal."""
+        """With ``couples="all"`` the scan in float64, what the function makes of it, and that of
+        each signal.
+        """
         if self.operator.couples != "all":
             return 0
         return 8 * (2 + len(observation.signals)) * observation.n_detectors * observation.n_samples

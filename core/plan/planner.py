@@ -1,4 +1,6 @@
-"""`zonda plan`: the effects of a scene, their costs, and which are omitted or coarsened within an error budget."""
+"""`zonda plan`: the effects of a scene, their costs, and which are omitted or coarsened within an
+error budget.
+"""
 
 from __future__ import annotations
 
@@ -30,11 +32,14 @@ from .summary import Prediction
 from .whole import everything_of, without
 
 LARGEST_RATIO = 1e5
-"""Of a stream's rms to its noise up to which float32 is thought of where the pipeline asks for float64."""
+"""Of a stream's rms to its noise up to which float32 is thought of where the pipeline asks for
+float64.
+"""
 
 AMPLE = 1 << 60
-"""Memory of the machine for which decisions are made: it holds all streams. They must not depend on the real one, its speed,
-threads, memory and disk: the same file and seed give the same bits, and all parts of a campaign's map are made alike."""
+"""Memory of the machine for which decisions are made: it holds all streams. They must not depend on
+the real one, its speed, threads, memory and disk: the same file and seed give the same bits, and
+all parts of a campaign's map are made alike."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,9 @@ class Wishes:
 
 
 def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") -> Plan:
-    """Plan a pipeline file for a camera's only band, or for one ``band`` of several. Errors are those of `zonda.plan`."""
+    """Plan a pipeline file for a camera's only band, or for one ``band`` of several. Errors are
+    those of `zonda.plan`.
+    """
     wishes = wishes or Wishes()
     keep, drop, prune_all = wishes.keep, wishes.drop, wishes.prune_all
     _check_arguments(file, keep, drop)
@@ -60,7 +67,11 @@ def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") 
         scene.instrument.check_one_band("zonda plan")
     labels = [o.label for o in pipeline.operators]
     everything = Structure.of_all(pipeline)
-    structure = prune(pipeline, [k.partition(".")[0] if k not in labels else k for k in keep]) if prune_all else everything
+    structure = (
+        prune(pipeline, [k.partition(".")[0] if k not in labels else k for k in keep])
+        if prune_all
+        else everything
+    )
     context = look(pipeline, scene, structure, band)
     budget = limits(file.header.budget, context.map_noise, context.depth.sample)
     context.limits = allowed = {m: v for m, v in budget.items() if m in context.metrics}
@@ -74,7 +85,11 @@ def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") 
         allowed,
         predict(context, costs, item, 1, AMPLE, portable=True),
         kept=named(keep, effects, labels),
-        forced={d.name for d in effects if d.operator in whole or {d.name, d.effect.name, d.operator} & {*drop}},
+        forced={
+            d.name
+            for d in effects
+            if d.operator in whole or {d.name, d.effect.name, d.operator} & {*drop}
+        },
         prune_all=prune_all,
         joined=context.joined,
     )
@@ -86,16 +101,26 @@ def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") 
     single = any(d.operator == "pipeline" and d.chosen for d in decided)
     if whole or single:  # what is left out holds nothing
         rest = {o.label: costs[o.label] for o in left.operators}
-        prediction = dataclasses.replace(prediction, bytes=predict(left, rest, 4 if single else item, *machine).bytes)
+        prediction = dataclasses.replace(
+            prediction, bytes=predict(left, rest, 4 if single else item, *machine).bytes
+        )
     pruned = (structure.operators, structure.runs) != (everything.operators, everything.runs)
-    unpruned = predict(*_everything_on(pipeline, everything, context, estimates), item, *machine) if pruned else now
+    unpruned = (
+        predict(*_everything_on(pipeline, everything, context, estimates), item, *machine)
+        if pruned
+        else now
+    )
     planning = time.process_time() - begin
-    prediction, unpruned = (dataclasses.replace(p, startup=p.startup + planning) for p in (prediction, unpruned))
+    prediction, unpruned = (
+        dataclasses.replace(p, startup=p.startup + planning) for p in (prediction, unpruned)
+    )
     return Plan(
         structure,
         tuple(decided),
         limits=allowed,
-        spent={m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen > 0) for m in allowed},
+        spent={
+            m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen > 0) for m in allowed
+        },
         noise=(left.depth.sample, left.map_noise, left.coverage.hits if left.coverage else 0.0),
         prediction=prediction,
         unpruned=unpruned,
@@ -107,17 +132,27 @@ def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") 
 def _check_arguments(file: Any, keep: Any, drop: Any) -> None:
     if not isinstance(file, PipelineFile):
         cure = "write zonda.plan(zonda.load(path_or_name))"
-        raise ZondaError(f"a plan is made of a pipeline file, not of {file!r:.60}", place="zonda plan", cure=cure)
+        raise ZondaError(
+            f"a plan is made of a pipeline file, not of {file!r:.60}", place="zonda plan", cure=cure
+        )
     for what, names in (("keep", keep), ("drop", drop)):
         if isinstance(names, str):
             cure = f"write {what}=[{names!r}]"
-            raise ZondaError(f"{what} is a list of names, not the text {names!r}", place="zonda plan", cure=cure)
+            raise ZondaError(
+                f"{what} is a list of names, not the text {names!r}", place="zonda plan", cure=cure
+            )
 
 
 def _effects(
-    file: PipelineFile, structure: Structure, context: Context, estimates: Mapping[str, Estimate], drop: Sequence[str]
+    file: PipelineFile,
+    structure: Structure,
+    context: Context,
+    estimates: Mapping[str, Estimate],
+    drop: Sequence[str],
 ) -> tuple[list[Decided], Context]:
-    """All effects, those of an operator that is dropped altogether as one; and the context without such operators."""
+    """All effects, those of an operator that is dropped altogether as one; and the context without
+    such operators.
+    """
     pipeline = file.pipeline()
     effects = [Decided(label, e) for label, estimate in estimates.items() for e in estimate.effects]
     effects += [Decided("pipeline", e) for e in _of_pipeline(pipeline, context)]
@@ -127,7 +162,9 @@ def _effects(
         return effects, context
     left = without(file, structure, whole, context.band)
     effects = [d for d in effects if d.operator not in whole]
-    return effects + [Decided(label, everything_of(label, estimates, context, left)) for label in whole], left
+    return effects + [
+        Decided(label, everything_of(label, estimates, context, left)) for label in whole
+    ], left
 
 
 def _with_savings(now: Prediction, decided: Iterable[Decided]) -> Prediction:
@@ -144,7 +181,9 @@ def _everything_on(
     pipeline: Pipeline, everything: Structure, context: Context, estimates: Mapping[str, Estimate]
 ) -> tuple[Context, dict[str, Cost | None]]:
     """The context and the costs of the complete pipeline."""
-    whole = dataclasses.replace(context, operators=list(pipeline.operators), work=work(pipeline, everything))
+    whole = dataclasses.replace(
+        context, operators=list(pipeline.operators), work=work(pipeline, everything)
+    )
     costs: dict[str, Cost | None] = {}
     for operator in pipeline.operators:
         known = estimates.get(operator.label)
@@ -158,7 +197,9 @@ def _everything_on(
 
 
 def _of_pipeline(pipeline: Pipeline, context: Context) -> list[Effect]:
-    """Precision of the streams. Rounding is independent from sample to sample: 2^-24 / sqrt(3) of their rms."""
+    """Precision of the streams. Rounding is independent from sample to sample: 2^-24 / sqrt(3) of
+    their rms.
+    """
     rms = context.fluctuation * 2.0**-24 / math.sqrt(3.0)
     formula = "2^-24 / sqrt(3) x rms of the stream, independent between samples"
     bound = context.bound(rms)
@@ -167,8 +208,12 @@ def _of_pipeline(pipeline: Pipeline, context: Context) -> list[Effect]:
     if pipeline.precision == "float32":
         return [Effect("precision", (full("float32"),), bound, formula)]
     carries_mean = context.cut == 0 and any("atmosphere" in made_by(o) for o in context.operators)
-    if carries_mean or context.fluctuation > LARGEST_RATIO * context.noise:  # the filters refuse float32 there
+    if (
+        carries_mean or context.fluctuation > LARGEST_RATIO * context.noise
+    ):  # the filters refuse float32 there
         return [Effect("precision", (full("float64"),), bound, formula)]
     seconds = 4e-9 * context.samples
-    single = Choice("coarse", "float32", {"precision": "float32"}, bound=bound, formula=formula, seconds=seconds)
+    single = Choice(
+        "coarse", "float32", {"precision": "float32"}, bound=bound, formula=formula, seconds=seconds
+    )
     return [Effect("precision", (full("float64"), single), bound, formula)]

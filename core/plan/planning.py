@@ -18,25 +18,28 @@ O = TypeVar("O", bound=Operator)  # noqa: E741
 
 
 class Planning(Generic[O]):
-    """The planning of an operator. Its name in the registry (``zonda.planning``) is that of the operator's class.
+    """The planning of an operator. Its name in the registry (``zonda.planning``) is that of the
+    operator's class.
 
     An operator without one is never coarsened, and the planner says that its cost is not counted.
 
     Attributes
     ----------
     of
-        The class of the operator, or ``module:class`` where it need not be imported for the planning of others; classes derived
-        from it inherit its planning.
+        The class of the operator, or ``module:class`` where it need not be imported for the
+        planning of others; classes derived from it inherit its planning.
     cost
         What it costs, where that is the same for every scene.
     knobs
         The parameters that trade accuracy for time, each with its ladder of values (`core.knobs`).
     reads_streams
-        It makes a product of the time streams themselves (spectra, files), in which errors of a sample count.
+        It makes a product of the time streams themselves (spectra, files), in which errors of a
+        sample count.
     holds
         Its `memory`, where that is the same for every observation.
     smaller
-        What lessens its `memory`, in a few words (``choose a larger pixel``), for a run that does not fit.
+        What lessens its `memory`, in a few words (``choose a larger pixel``), for a run that does
+        not fit.
     """
 
     of: ClassVar[type[Operator] | str]
@@ -52,8 +55,9 @@ class Planning(Generic[O]):
     def traits(self, observation: Observation) -> Traits:
         """What other operators' bounds need to know of this one (noise, pixels, filters).
 
-        Called after `Operator.configure`, before anything is prepared; ``observation`` has its pointing. A filter of which
-        nothing is stated, and that couples all samples or is not linear, may find what it removes in the data.
+        Called after `Operator.configure`, before anything is prepared; ``observation`` has its
+        pointing. A filter of which nothing is stated, and that couples all samples or is not
+        linear, may find what it removes in the data.
         """
         own = self.operator
         return Traits(turns=filters(own) and (own.couples == "all" or not own.linear))
@@ -63,27 +67,38 @@ class Planning(Generic[O]):
         return Estimate((), self.cost)
 
     def coarser(self, parameter: str) -> list[Any]:
-        """The rungs of a knob that are coarser than the operator's own value, the finest of them first."""
-        return next(knob for knob in self.knobs if knob.parameter == parameter).coarser(self.operator)
+        """The rungs of a knob that are coarser than the operator's own value, the finest of them
+        first.
+        """
+        return next(knob for knob in self.knobs if knob.parameter == parameter).coarser(
+            self.operator
+        )
 
     def memory(self, observation: Observation) -> int:
-        """Bytes that the step will hold for one observation, besides streams and blocks: tables, accumulators, products.
+        """Bytes that the step will hold for one observation, besides streams and blocks: tables,
+        accumulators, products.
 
-        An upper bound, asked after `Operator.observe` and before `Operator.prepare`: a run that would not fit is refused before
-        it starts.
+        An upper bound, asked after `Operator.observe` and before `Operator.prepare`: a run that
+        would not fit is refused before it starts.
         """
         return self.holds
 
     def sweeps(self, observation: Observation) -> int:
-        """How often `Operator.measure` goes through its stream with `Stream.sweep`; 0: it wants ``stream.array``."""
+        """How often `Operator.measure` goes through its stream with `Stream.sweep`; 0: it wants
+        ``stream.array``.
+        """
         return 0
 
     def in_time_order(self, observation: Observation) -> bool:
-        """Whether `Operator.exec` is much cheaper when it sees all detectors at one time before it goes on to the next."""
+        """Whether `Operator.exec` is much cheaper when it sees all detectors at one time before it
+        goes on to the next.
+        """
         return False
 
     def shares_blocks(self, observation: Observation) -> bool:
-        """Whether bands that look through the same pixels save time where each block is worked on with one after the other."""
+        """Whether bands that look through the same pixels save time where each block is worked on
+        with one after the other.
+        """
         return False
 
 

@@ -26,8 +26,8 @@ SECONDS = 60.0
 
 
 class Slice(Operator):
-    """Keep the first samples of the first observations, and every so many detectors: random numbers are addressed, not drawn in
-    order, so that all runs over a slice see the same."""
+    """Keep the first samples of the first observations, and every so many detectors: random numbers
+    are addressed, not drawn in order, so that all runs over a slice see the same."""
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     observations: int = Field(1, ge=1)
@@ -39,7 +39,9 @@ class Slice(Operator):
 
     def observe(self, data: Data) -> None:
         """Cut every scan to the slice."""
-        data.observations[:] = [_cut(o, self.seconds, self.every) for o in data.observations[: self.observations]]
+        data.observations[:] = [
+            _cut(o, self.seconds, self.every) for o in data.observations[: self.observations]
+        ]
 
 
 def _cut(o: Observation, seconds: float, every: int) -> Observation:
@@ -51,44 +53,58 @@ def _cut(o: Observation, seconds: float, every: int) -> Observation:
     outer = [int(f(v)) for v in (plane.xi, plane.eta) for f in (np.argmin, np.argmax)]
     kept = np.unique(np.r_[np.arange(0, len(plane), every), outer])
     chosen = {f.name: _taken(getattr(plane, f.name), kept) for f in dataclasses.fields(plane)}
-    return dataclasses.replace(o, focalplane=Focalplane(**chosen), detector_flags=o.detector_flags[kept])
+    return dataclasses.replace(
+        o, focalplane=Focalplane(**chosen), detector_flags=o.detector_flags[kept]
+    )
 
 
 def _taken(values: Any, index: NDArray[np.intp]) -> Any:
     return values[index] if isinstance(values, np.ndarray) else [values[k] for k in index]
 
 
-def sliced(file: PipelineFile, seconds: float = SECONDS, observations: int = 1, every: int = 1) -> PipelineFile:
-    """The same pipeline over a slice, without what writes or draws, with a run of the sky as it is in the
-    complete map, and one of the sky with modes of its own where the pipeline has such a signal."""
+def sliced(
+    file: PipelineFile, seconds: float = SECONDS, observations: int = 1, every: int = 1
+) -> PipelineFile:
+    """The same pipeline over a slice, without what writes or draws, with a run of the sky as it is
+    in the complete map, and one of the sky with modes of its own where the pipeline has such a
+    signal."""
     steps: list[Step] = []
     for step in file.steps:
         o = step.operator
         if isinstance(o, Output) or planning_of(o).reads_streams:
             continue
         if "boresight" not in o.provides and steps and "boresight" in steps[-1].operator.provides:
-            steps.append(Step("Slice", Slice(seconds=seconds, observations=observations, every=every)))
+            steps.append(
+                Step("Slice", Slice(seconds=seconds, observations=observations, every=every))
+            )
         steps.append(step)
     made = frozenset[str]().union(*(made_by(s.operator) for s in steps))
     sky = "sky" in made and made & {"atmosphere", "white", "pink"}
     runs = {"sky_alone": Signal(only=["sky"], modes="full")} if sky else {}
     if sky and _has_own_modes(file):
         runs["sky_with_own_modes"] = Signal(only=["sky"])
-    return dataclasses.replace(file, steps=tuple(steps), header=file.header.model_copy(update={"runs": runs}))
+    return dataclasses.replace(
+        file, steps=tuple(steps), header=file.header.model_copy(update={"runs": runs})
+    )
 
 
 def _has_own_modes(file: PipelineFile) -> bool:
     """Whether a signal of the sky is filtered by itself, not as a part of the complete one."""
     signals = file.pipeline().signals
     return any(
-        signal.filtered and not signal.model and signals.makers(name) and signals.all[name].components <= {"sky"}
+        signal.filtered
+        and not signal.model
+        and signals.makers(name)
+        and signals.all[name].components <= {"sky"}
         for name, signal in signals.all.items()
         if name
     )
 
 
 def measured(file: PipelineFile, labels: Sequence[str], seconds: float = 5.0) -> dict[str, Cost]:
-    """Cost of operators that state none, from a slice that is run twice (the first run compiles). What writes is not run."""
+    """Cost of operators that state none, from a slice that is run twice (the first run compiles).
+    What writes is not run.
+    """
     part = sliced(file, seconds)
     part = dataclasses.replace(part, header=part.header.model_copy(update={"runs": {}}))
     for _ in range(2):

@@ -1,9 +1,11 @@
-"""Structural pruning: from the requested outputs back to the operators and signals that they depend on.
+"""Structural pruning: from the requested outputs back to the operators and signals that they depend
+on.
 
-An operator takes part if it is an output itself, if it changes a stream or a field that a later operator reads, or if what it
-does cannot be known. One that makes nothing but products (`mapmaker.makes_products`) takes part only where a later step reads
-them. A signal is left out where nothing that is made of it is read; the complete one too, where another that keeps fewer of the
-components can take its place, and no signal takes its singular modes.
+An operator takes part if it is an output itself, if it changes a stream or a field that a later
+operator reads, or if what it does cannot be known. One that makes nothing but products
+(`mapmaker.makes_products`) takes part only where a later step reads them. A signal is left out
+where nothing that is made of it is read; the complete one too, where another that keeps fewer of
+the components can take its place, and no signal takes its singular modes.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from .context import Work
 
 @dataclass(frozen=True)
 class Row:
-    """What is omitted, and why: an operator of a signal (empty: the complete one), or (``operator`` empty) a signal."""
+    """What is omitted, and why: an operator of a signal (empty: the complete one), or (``operator``
+    empty) a signal.
+    """
 
     run: str
     operator: str
@@ -56,21 +60,31 @@ class Structure:
     @classmethod
     def of_all(cls, pipeline: Pipeline) -> Structure:
         """The structure of a pipeline from which nothing is omitted."""
-        return cls(tuple(o.label for o in pipeline.operators), tuple(pipeline.runs), derived=remainders(pipeline, pipeline.runs))
+        return cls(
+            tuple(o.label for o in pipeline.operators),
+            tuple(pipeline.runs),
+            derived=remainders(pipeline, pipeline.runs),
+        )
 
 
 def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
-    """What the pipeline's outputs depend on. ``keep``: labels of operators that stay whatever depends on them."""
+    """What the pipeline's outputs depend on. ``keep``: labels of operators that stay whatever
+    depends on them.
+    """
     rows: list[Row] = []
     in_memory = not any(map(is_output, pipeline.operators))
     every = set().union(*(o.provides for o in pipeline.operators))
     needed: dict[str, dict[str, str]] = {}  # by signal: label -> reason
     for name in [*pipeline.runs, ""]:  # the complete signal last: the others may need its modes
         steps = steps_of(pipeline, name)
-        wanted = every if in_memory else _wanted(pipeline, name)  # where nothing is written, the products are the output
+        wanted = (
+            every if in_memory else _wanted(pipeline, name)
+        )  # where nothing is written, the products are the output
         pinned = dict.fromkeys(keep, "asked for with --keep")
         for other in [n for n in needed if not name and _takes_modes(pipeline, n)]:
-            pinned |= {o.label: f"signal {other} takes its modes" for o in steps if o.couples == "all"}
+            pinned |= {
+                o.label: f"signal {other} takes its modes" for o in steps if o.couples == "all"
+            }
         compared = _is_compared(pipeline, name)
         found, left_out = _walk(steps, wanted | {MAIN} if compared else wanted, pinned)
         if name and not compared and (reason := _useless(steps, found, wanted)):
@@ -81,22 +95,42 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     instead = _in_place_of_complete(pipeline, needed, {*keep}) if not in_memory else ""
     if instead:
         rows = [r for r in rows if r.run not in ("", instead)]
-        words = "the sky alone" if pipeline.runs[instead].only == ["sky"] else f"signal {instead.strip('_')}"
+        words = (
+            "the sky alone"
+            if pipeline.runs[instead].only == ["sky"]
+            else f"signal {instead.strip('_')}"
+        )
         reason = f"no step reads what a run of everything makes: {words} takes its place"
-        rows += [Row("", o.label, reason) for o in pipeline.signals.steps if o.label not in needed[instead]]
+        rows += [
+            Row("", o.label, reason)
+            for o in pipeline.signals.steps
+            if o.label not in needed[instead]
+        ]
         needed[""] = needed.pop(instead)
-    acting = {o.label for o in pipeline.operators if isinstance(o, Output) or "boresight" in o.provides}.union(*needed.values())
+    acting = {
+        o.label for o in pipeline.operators if isinstance(o, Output) or "boresight" in o.provides
+    }.union(*needed.values())
     named = {part for name in needed if name for part in pipeline.runs[name].without or ()}
-    acting |= {o.label for o in pipeline.operators if made_by(o) & named}  # a signal is not without what is not there
+    acting |= {
+        o.label for o in pipeline.operators if made_by(o) & named
+    }  # a signal is not without what is not there
     rows = [r for r in rows if not r.operator or (r.operator in acting) == bool(r.run)]
     rows.sort(key=lambda r: ["", *pipeline.runs].index(r.run))
     runs = tuple(name for name in pipeline.runs if name in needed)
     derived = {} if instead else remainders(pipeline, runs)
-    return Structure(tuple(o.label for o in pipeline.operators if o.label in acting), runs, tuple(rows), instead, derived)
+    return Structure(
+        tuple(o.label for o in pipeline.operators if o.label in acting),
+        runs,
+        tuple(rows),
+        instead,
+        derived,
+    )
 
 
 def _wanted(pipeline: Pipeline, name: str) -> set[str]:
-    """Products and components of a signal that outputs read. Those that ask for certain signals read of these alone."""
+    """Products and components of a signal that outputs read. Those that ask for certain signals
+    read of these alone.
+    """
     found: set[str] = set()
     for o in pipeline.operators:
         if isinstance(o, Output) and o.reads(name):
@@ -109,9 +143,11 @@ def _is_compared(pipeline: Pipeline, name: str) -> bool:
     return bool(name) and any(stream_of(name) in o.optional for o in pipeline.operators)
 
 
-def _in_place_of_complete(pipeline: Pipeline, needed: Mapping[str, Mapping[str, str]], keep: set[str]) -> str:
-    """A signal whose components hold those of all other needed ones, where nothing reads what the complete one makes; else
-    empty."""
+def _in_place_of_complete(
+    pipeline: Pipeline, needed: Mapping[str, Mapping[str, str]], keep: set[str]
+) -> str:
+    """A signal whose components hold those of all other needed ones, where nothing reads what the
+    complete one makes; else empty."""
     signals, wanted = pipeline.signals, _wanted(pipeline, "")
     steps = [o for o in signals.steps if o.label in needed[""]]
     if any(_makes_something(o, wanted) or o.label in keep for o in steps) or any(
@@ -121,17 +157,26 @@ def _in_place_of_complete(pipeline: Pipeline, needed: Mapping[str, Mapping[str, 
     others = [name for name in needed if name and pipeline.runs[name].only is not None]
     for name in others:
         made = signals.makers(name)
-        if signals.all[name].filtered and len(others) == len(needed) - 1 and all(signals.makers(n) <= made for n in others):
+        if (
+            signals.all[name].filtered
+            and len(others) == len(needed) - 1
+            and all(signals.makers(n) <= made for n in others)
+        ):
             return name
     return ""
 
 
 def _takes_modes(pipeline: Pipeline, name: str) -> bool:
-    """Whether a signal is treated as a part of the complete one, by a filter or by the atmosphere's transmission."""
+    """Whether a signal is treated as a part of the complete one, by a filter or by the atmosphere's
+    transmission.
+    """
     signal = pipeline.signals.all[name]
     return signal.model and (
         TRANSMISSION in signal.components
-        or any(filters(o) and o.couples == "all" and o.label not in signal.own for o in pipeline.operators)
+        or any(
+            filters(o) and o.couples == "all" and o.label not in signal.own
+            for o in pipeline.operators
+        )
     )
 
 
@@ -146,9 +191,13 @@ def _useless(steps: Sequence[Operator], found: Mapping[str, str], wanted: set[st
     return ""
 
 
-def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:
+def _walk(
+    steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]
+) -> tuple[dict[str, str], dict[str, str]]:
     """(needed, omitted) by label with reasons, going back through one signal's steps."""
-    read = {name: "an output" for name in wanted if is_stream(name)}  # stream or field -> who reads it
+    read = {
+        name: "an output" for name in wanted if is_stream(name)
+    }  # stream or field -> who reads it
     needed: dict[str, str] = {}
     left_out: dict[str, str] = {}
     for operator in reversed(steps):
@@ -158,7 +207,11 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) 
             reason = keep[operator.label]
         elif readers:
             reason = f"read by {', '.join(readers)}"
-        elif made and all(map(is_stream, made)) and (MAIN not in made or type(operator).finalize is Operator.finalize):
+        elif (
+            made
+            and all(map(is_stream, made))
+            and (MAIN not in made or type(operator).finalize is Operator.finalize)
+        ):
             left_out[operator.label] = f"no step that is needed reads {' or '.join(sorted(made))}"
             continue
         elif changes_observations(operator):
@@ -175,7 +228,11 @@ def _walk(steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]) 
                 others = [o for o in steps[: list(steps).index(operator)] if name in o.provides]
                 if not others:
                     read.pop(name, None)
-        for name in operator.requires | operator.optional | (_components_before(operator, steps) if forms(operator) else set()):
+        for name in (
+            operator.requires
+            | operator.optional
+            | (_components_before(operator, steps) if forms(operator) else set())
+        ):
             read.setdefault(name, operator.label)
     return needed, left_out
 
@@ -218,22 +275,38 @@ def steps_of(pipeline: Pipeline, name: str) -> list[Operator]:
 def remainders(pipeline: Pipeline, names: Iterable[str]) -> dict[str, str]:
     """The remainders among these signals: those that are not formed but follow from others."""
     kept = {*names}
-    return {name: remainder(parts) for name, parts in pipeline.signals.remainders.items() if {name, *parts} <= kept}
+    return {
+        name: remainder(parts)
+        for name, parts in pipeline.signals.remainders.items()
+        if {name, *parts} <= kept
+    }
 
 
 FORM, FILTER, MAP = 0.3, 0.7, 0.4
-"""What a further signal takes of the time of the first in steps that form, filter and map it. Measured with the MUSTANG-2 job:
-0.30; 0.88 (high-pass) and 0.53 (common mode); 0.40."""
+"""What a further signal takes of the time of the first in steps that form, filter and map it.
+Measured with the MUSTANG-2 job: 0.30; 0.88 (high-pass) and 0.53 (common mode); 0.40."""
 
 
 def work(pipeline: Pipeline, structure: Structure) -> Work:
     """What the operators that take part do with each observation."""
-    signals = tuple(pipeline.signals.all[name] for name in ["", *structure.runs] if name not in structure.derived)
+    signals = tuple(
+        pipeline.signals.all[name]
+        for name in ["", *structure.runs]
+        if name not in structure.derived
+    )
     acting = [o for o in pipeline.operators if o.label in structure.operators]
     steps = tuple(acting_steps(acting))
     others, filtered = len(signals) - 1, sum(s.filtered for s in signals) - 1
     times = dict.fromkeys(structure.operators, 1.0)
     for o in steps:
-        more = FORM * others if forms(o) else FILTER * filtered if filters(o) else MAP * others if isinstance(o, MapMaker) else 0
+        more = (
+            FORM * others
+            if forms(o)
+            else FILTER * filtered
+            if filters(o)
+            else MAP * others
+            if isinstance(o, MapMaker)
+            else 0
+        )
         times[o.label] = 1.0 + more
     return Work(steps, signals, pipeline.signals.components, times)

@@ -1,4 +1,6 @@
-"""What a run takes from a plan. A run whose plan is remembered imports this module, not the planner."""
+"""What a run takes from a plan. A run whose plan is remembered imports this module, not the
+planner.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,8 @@ class Prediction:
     """How often each operator does its work, by label (`context.Work`)."""
     factors: Mapping[str, float] = field(default_factory=dict)
     products: float = 0.0
-    """Bytes that are held while another band of the camera acts: what steps add up over all scans, and all where bands are in
-    step."""
+    """Bytes that are held while another band of the camera acts: what steps add up over all scans,
+    and all where bands are in step."""
     shared: float = 0.0
     """Bytes that may be kept for another band of the camera, not part of ``bytes``."""
 
@@ -62,15 +64,26 @@ class PlanSummary:
         return steps + [f"signal {name}" for name in file.runs if name not in self.runs]
 
     def apply(self, file: PipelineFile) -> PipelineFile:
-        """The pipeline that is run: an ordinary one, with parameters changed and operators omitted."""
+        """The pipeline that is run: an ordinary one, with parameters changed and operators
+        omitted.
+        """
         steps, kept = [], []
-        for label, step in zip((o.label for o in file.pipeline().operators), file.steps, strict=True):
+        for label, step in zip(
+            (o.label for o in file.pipeline().operators), file.steps, strict=True
+        ):
             if label in self.operators:
                 update = self.settings.get(label, {})
-                steps.append(Step(step.key, step.operator.model_copy(update=dict(update)) if update else step.operator))
+                steps.append(
+                    Step(
+                        step.key,
+                        step.operator.model_copy(update=dict(update)) if update else step.operator,
+                    )
+                )
                 kept.append(label)
         runs = {name: run for name, run in file.runs.items() if name in self.runs}
-        header = file.header.model_copy(update={"runs": runs, "budget": 0.0, **self.settings.get("pipeline", {})})
+        header = file.header.model_copy(
+            update={"runs": runs, "budget": 0.0, **self.settings.get("pipeline", {})}
+        )
         return dataclasses.replace(file, header=header, steps=tuple(same_labels(steps, kept)))
 
     def __str__(self) -> str:
@@ -82,9 +95,13 @@ class PlanSummary:
 
 
 def same_labels(steps: list[Step], wanted: list[str]) -> list[Step]:
-    """The steps, named where need be: each keeps its label, which its random numbers depend on, though a namesake is left out."""
+    """The steps, named where need be: each keeps its label, which its random numbers depend on,
+    though a namesake is left out.
+    """
     named = []
     for step, label, new in zip(steps, wanted, labels(s.operator for s in steps), strict=True):
         same = new == label
-        named.append(step if same else Step(step.key, step.operator.model_copy(update={"name": label})))
+        named.append(
+            step if same else Step(step.key, step.operator.model_copy(update={"name": label}))
+        )
     return named

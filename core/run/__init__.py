@@ -1,1 +1,3 @@
-"""Carries a pipeline's runs out: which operators take part, over which observations, in which blocks, within what memory."""
+"""Carries a pipeline's runs out: which operators take part, over which observations, in which
+blocks, within what memory.
+"""

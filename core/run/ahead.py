@@ -1,7 +1,8 @@
 """Prepares the next observation on a thread of its own while one is executed.
 
-`Operator.prepare` is mostly Python on one thread; the blocks of the observation before it keep the others busy meanwhile. Nothing
-depends on it: an observation's preparation reads and writes what belongs to that observation.
+`Operator.prepare` is mostly Python on one thread; the blocks of the observation before it keep the
+others busy meanwhile. Nothing depends on it: an observation's preparation reads and writes what
+belongs to that observation.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
-"""A camera of several bands: the telescope is pointed once, and each band observes the scans as a camera that has no other.
+"""A camera of several bands: the telescope is pointed once, and each band observes the scans as a
+camera that has no other.
 
-Every band has the bits that it has alone. What bands share is keyed without them: pointing, and the turbulence above the
-telescope. What belongs to detectors is keyed by instrument and band (`Observation.detector_key`).
+Every band has the bits that it has alone. What bands share is keyed without them: pointing, and the
+turbulence above the telescope. What belongs to detectors is keyed by instrument and band
+(`Observation.detector_key`).
 """
 
 from __future__ import annotations
@@ -24,15 +26,21 @@ from ..tally import Tally
 
 
 def data_of_bands(data: Data) -> dict[str, Data]:
-    """By name of the band, the data of a run with that band alone; empty where the camera has one band."""
+    """By name of the band, the data of a run with that band alone; empty where the camera has one
+    band.
+    """
     instrument = data.scene.instrument
     return {
         name: Data(
-            data.scene.model_copy(update={"instrument": camera}), provenance=dict(data.provenance), output=data.output,
-            threads=data.threads, laid_out=data.laid_out, band=name,
+            data.scene.model_copy(update={"instrument": camera}),
+            provenance=dict(data.provenance),
+            output=data.output,
+            threads=data.threads,
+            laid_out=data.laid_out,
+            band=name,
         )
         for name, camera in (instrument.cameras.items() if instrument.bands else ())
-    }  # fmt: skip
+    }
 
 
 def points(operator: Operator) -> bool:
@@ -41,10 +49,12 @@ def points(operator: Operator) -> bool:
 
 
 def of_one_band(operator: Operator) -> bool:
-    """Whether a step acts on each band's data: all but those that only point, which is done once for all bands.
+    """Whether a step acts on each band's data: all but those that only point, which is done once
+    for all bands.
 
-    A step that points and reads streams too observes the scans of all bands first, and then each band's data (`Data.band`); so
-    does one that reads recorded pointing, whose flags differ from band to band.
+    A step that points and reads streams too observes the scans of all bands first, and then each
+    band's data (`Data.band`); so does one that reads recorded pointing, whose flags differ from
+    band to band.
     """
     return operator.provides != {"boresight"} or isinstance(operator, WithScene)
 
@@ -54,21 +64,31 @@ def use_recorded(data: Data, operators: Sequence[Operator]) -> None:
     for operator in operators:
         if isinstance(operator, WithScene):
             given, own = data.scene, operator.own_scene(data.scene.instrument)
-            data.scene = given.model_copy(update={what: own[what] for what in ("site", "instrument")})
+            data.scene = given.model_copy(
+                update={what: own[what] for what in ("site", "instrument")}
+            )
             for what in ("instrument", "site"):
                 one, other = own[what].name, getattr(given, what).name
-                text = f"{one}, the file's" + ("" if one == other else f"; the scene's {other} is not used")
+                text = f"{one}, the file's" + (
+                    "" if one == other else f"; the scene's {other} is not used"
+                )
                 data.tally.state(operator.label, what, text)
 
 
 def distribute(data: Data, bands: Sequence[Data]) -> None:
     """Give each band its detectors of all scans, and what is laid out for it."""
     shared = [
-        SharedScan(room_for(scan.n_detectors // len(bands), scan.n_samples), _alike(scan.focalplane, len(bands)))
+        SharedScan(
+            room_for(scan.n_detectors // len(bands), scan.n_samples),
+            _alike(scan.focalplane, len(bands)),
+        )
         for scan in data.observations
     ]
     for number, own in enumerate(bands):
-        own.observations = [_of_band(scan, number, own, part) for scan, part in zip(data.observations, shared, strict=True)]
+        own.observations = [
+            _of_band(scan, number, own, part)
+            for scan, part in zip(data.observations, shared, strict=True)
+        ]
         own.layouts = _of(data.layouts, own.band)
     data.pointed = data.observations
 
@@ -76,27 +96,38 @@ def distribute(data: Data, bands: Sequence[Data]) -> None:
 def _alike(plane: Focalplane, bands: int) -> int:
     """Number of bands whose detectors look through the same pixels; 1 where not all do."""
     first, *others = (plane.band == number for number in range(bands))
-    same = all(np.array_equal(of[first], of[other]) for other in others for of in (plane.xi, plane.eta))
+    same = all(
+        np.array_equal(of[first], of[other]) for other in others for of in (plane.xi, plane.eta)
+    )
     return bands if same else 1
 
 
 def hand_over(data: Data, bands: Sequence[Data]) -> None:
-    """Give each band its scans, layouts and partial products of combined data (`gather`); nothing where there is one band."""
+    """Give each band its scans, layouts and partial products of combined data (`gather`); nothing
+    where there is one band.
+    """
     if bands[0] is data:
         return
     for own in bands:
-        own.observations = [scan for scan in data.observations if scan.instrument == own.scene.instrument]
+        own.observations = [
+            scan for scan in data.observations if scan.instrument == own.scene.instrument
+        ]
         own.partial, own.layouts = _of(data.partial, own.band), _of(data.layouts, own.band)
     data.partial, data.layouts = {}, {}
 
 
 def _of(whole: Mapping[str, Any], band: str) -> dict[str, Any]:
     """What belongs to a band of what `gather` put together by label."""
-    return {key.removesuffix(_key(band)): value for key, value in whole.items() if key.endswith(_key(band))}
+    return {
+        key.removesuffix(_key(band)): value
+        for key, value in whole.items()
+        if key.endswith(_key(band))
+    }
 
 
 def gather(data: Data, bands: Sequence[Data]) -> None:
-    """Put together what the bands made: products and entries of the log bear the band's name; nothing where there is one band.
+    """Put together what the bands made: products and entries of the log bear the band's name;
+    nothing where there is one band.
 
     What pointing counted in the scans is added once, not for each band.
     """
@@ -116,7 +147,9 @@ def gather(data: Data, bands: Sequence[Data]) -> None:
             key = product_name(stream_of(signal) if signal else MAIN, own.named(plain))
             if key in data.products:
                 cure = "rename the band, or give the step another product name"
-                raise PipelineError(f"two steps make the product {key!r}", place=f"band {band}", cure=cure)
+                raise PipelineError(
+                    f"two steps make the product {key!r}", place=f"band {band}", cure=cure
+                )
             data.products[key] = product
         data.partial |= {label + _key(band): part for label, part in own.partial.items()}
         data.layouts |= {label + _key(band): layout for label, layout in own.layouts.items()}
@@ -135,11 +168,27 @@ def _of_band(scan: Observation, number: int, own: Data, shared: SharedScan) -> O
         raise InputError(
             f"the focal plane has no detector of the band {band}",
             place=f"instrument {own.scene.instrument.name}",
-            cure="a class that lays out detectors of several bands joins them with Focalplane.of_bands",
+            cure=(
+                "a class that lays out detectors of several bands joins them with"
+                " Focalplane.of_bands"
+            ),
         )
     return replace(
-        scan, name=f"{scan.name}-{band}", instrument=own.scene.instrument, focalplane=plane, flags=scan.flags.copy(),
-        detector_flags=scan.detector_flags[scan.focalplane.band == number], intervals=dict(scan.intervals), smooth={}, detdata={},
-        noise_levels={}, closed_forms={}, windows={}, quoted_net=None, expected_load=None, load_spectra=None, tally=Tally(),
+        scan,
+        name=f"{scan.name}-{band}",
+        instrument=own.scene.instrument,
+        focalplane=plane,
+        flags=scan.flags.copy(),
+        detector_flags=scan.detector_flags[scan.focalplane.band == number],
+        intervals=dict(scan.intervals),
+        smooth={},
+        detdata={},
+        noise_levels={},
+        closed_forms={},
+        windows={},
+        quoted_net=None,
+        expected_load=None,
+        load_spectra=None,
+        tally=Tally(),
         shared=shared,
-    )  # fmt: skip
+    )

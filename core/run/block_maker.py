@@ -1,7 +1,9 @@
-"""Makes the blocks of one observation: a segment's steps, carried out on a rectangle of detectors x samples.
+"""Makes the blocks of one observation: a segment's steps, carried out on a rectangle of detectors x
+samples.
 
-A step acts on a block in one of four ways: it forms every signal of its components; it filters each signal, as if that were the
-only one; it maps all of them (`core.mapmaker`); or it makes or reads components, and of the signals sees the complete one.
+A step acts on a block in one of four ways: it forms every signal of its components; it filters each
+signal, as if that were the only one; it maps all of them (`core.mapmaker`); or it makes or reads
+components, and of the signals sees the complete one.
 """
 
 from __future__ import annotations
@@ -74,14 +76,21 @@ class BlockMaker:
         self._schedule = schedule
         self._labels = {id(step): step.label for step in chain.steps}  # the property is slow
         acting = [o for o in chain.steps if type(o).exec is not Operator.exec]
-        self._declared = {o.label: names_of(o, self._observation.signals) for o in acting if not knows_means(o)}
+        self._declared = {
+            o.label: names_of(o, self._observation.signals) for o in acting if not knows_means(o)
+        }
         self._due: dict[str, frozenset[str]] = {}
         """By label: streams that a step must have made, for a later one requires them."""
         required = frozenset[str]()
         for step in reversed(chain.steps):
             self._due[step.label] = frozenset(n for n in step.provides & required if is_stream(n))
             required |= step.requires if step in acting else frozenset()
-        self._measures = {o.label: (o.label, name) for o in acting if o.couples == "all" for name in o.requires - {"boresight"}}
+        self._measures = {
+            o.label: (o.label, name)
+            for o in acting
+            if o.couples == "all"
+            for name in o.requires - {"boresight"}
+        }
         # an unfiltered signal may be finite where a filter has spoilt the others
         self._masks_maps = not all(signal.filtered for signal in chain.signals)
         self._local = threading.local()
@@ -108,7 +117,8 @@ class BlockMaker:
     ) -> Block:
         """A block with the segment's steps, and those of the stages before it, carried out.
 
-        ``signals``: those that are of use in it; None: all that are not made again where they are mapped.
+        ``signals``: those that are of use in it; None: all that are not made again where they are
+        mapped.
         """
         segment, again = stage.segment, again or stage.swept
         outermost = signals is None
@@ -120,14 +130,20 @@ class BlockMaker:
         first, rest = segment.split()
         # whole scans, and what is only taken in pieces, are worked on where they are kept
         in_place = bool(made) and not segment.halo and (not rest or reach == slice(0, n_samples))
-        passed_on = set(stage.wanted).union(*(self._chain.expanded(o.requires | o.optional) for o in rest))
+        passed_on = set(stage.wanted).union(
+            *(self._chain.expanded(o.requires | o.optional) for o in rest)
+        )
         if again:
             of_use = self._of_use(signals)
             first, rest = ([o for o in part if id(o) in of_use] for part in (first, rest))
         else:
-            first, rest = ([o for o in part if not o.provides or self._is_read(o)] for part in (first, rest))
+            first, rest = (
+                [o for o in part if not o.provides or self._is_read(o)] for part in (first, rest)
+            )
         window = Window(detectors, samples, reach)
-        block = self._block(stage, window, made if in_place else {}, again, not first or bool(rest), signals)
+        block = self._block(
+            stage, window, made if in_place else {}, again, not first or bool(rest), signals
+        )
         if self._apart and any(isinstance(o, MapMaker) for o in segment.operators):
             self._add_unfiltered(block)
         if first:
@@ -135,7 +151,10 @@ class BlockMaker:
         self._exec(rest[:1], block, signals)
         if reach != samples:
             block = trimmed(block, samples)
-        last = next((k for k, o in enumerate(rest) if all(isinstance(step, MapMaker) for step in rest[k:])), len(rest))
+        last = next(
+            (k for k, o in enumerate(rest) if all(isinstance(step, MapMaker) for step in rest[k:])),
+            len(rest),
+        )
         self._exec(rest[1 : max(last, 1)], block, signals)
         block.stays = outermost  # of one that is made for another, the next may take the place
         self._exec(rest[max(last, 1) :], block, signals)
@@ -151,10 +170,14 @@ class BlockMaker:
         """Whether a step must act: one of its streams is read later, or it makes products."""
         provides = step.provides - {"boresight"}
         streams = [n for n in provides if is_stream(n)]
-        return not provides or len(streams) < len(provides) or any(n in self._streams for n in streams)
+        return (
+            not provides or len(streams) < len(provides) or any(n in self._streams for n in streams)
+        )
 
     def _of_use(self, signals: Sequence[Formed]) -> set[int]:
-        """The steps, by identity, that change the streams of a block that is made again, of which only ``signals`` are of use."""
+        """The steps, by identity, that change the streams of a block that is made again, of which
+        only ``signals`` are of use.
+        """
         few = len(signals) < len(self._chain.signals)
         steps = self._chain.needed_for(signals, filtered=True) if few else self._chain.steps
         return {id(step) for step in steps if step.provides & self._streams}
@@ -174,7 +197,11 @@ class BlockMaker:
             else:
                 if self._masks_maps and isinstance(step, MapMaker):
                     share_mask(block, block.signals)
-                self._act(step, block, self._measured.get(self._measures.get(label, ("", "")), self._states[label]))
+                self._act(
+                    step,
+                    block,
+                    self._measured.get(self._measures.get(label, ("", "")), self._states[label]),
+                )
             now = time.thread_time()
             self._timer.add(label, "exec", now - start)
             start = now
@@ -191,7 +218,12 @@ class BlockMaker:
         here = [s for s in self._chain.signals if s.stream in block.detdata and s.filtered]
         for signal in here:
             found = (label, signal.stream)
-            self._on_one(step, block, signal, self._measured[found] if found in self._measured else self._states[label])
+            self._on_one(
+                step,
+                block,
+                signal,
+                self._measured[found] if found in self._measured else self._states[label],
+            )
         if len(here) > 1 and not step.linear:
             share_mask(block, [s.stream for s in here])
 
@@ -201,7 +233,9 @@ class BlockMaker:
             block.components = signal.components
             self._act(step, block, state)
             return
-        seen = block.alone(signal.stream, signal.components, self._chain.components - signal.components)
+        seen = block.alone(
+            signal.stream, signal.components, self._chain.components - signal.components
+        )
         self._act(step, seen, state)
         block.take(signal.stream, seen)
 
@@ -212,8 +246,15 @@ class BlockMaker:
         def work(block: Block) -> None:
             before = dict(block.detdata)
             if (lost := step.exec(block, state)) is not None:  # type: ignore[func-returns-value]
-                text = f"exec returned {type(lost).__name__}, which nobody takes: a step changes block.detdata in place"
-                raise PipelineError(text, place=label, cure='write block.detdata["signal"][...] = ..., and return nothing')
+                text = (
+                    f"exec returned {type(lost).__name__}, which nobody takes: a step changes"
+                    " block.detdata in place"
+                )
+                raise PipelineError(
+                    text,
+                    place=label,
+                    cure='write block.detdata["signal"][...] = ..., and return nothing',
+                )
             check_left(step, block, before, self._due[label])
 
         fields = {}
@@ -235,9 +276,11 @@ class BlockMaker:
         copied: bool,
         signals: Sequence[Formed],
     ) -> Block:
-        """A block with its sources in it: where they are kept (as ``made`` says), copies, or made again.
+        """A block with its sources in it: where they are kept (as ``made`` says), copies, or made
+        again.
 
-        With margins never in place: others read them too. Not ``copied``: steps work on copies of parts of it alone.
+        With margins never in place: others read them too. Not ``copied``: steps work on copies of
+        parts of it alone.
         """
         source, observation = stage.source, self._observation
         detectors, samples, reach = window.detectors, window.samples, window.reach
@@ -245,7 +288,9 @@ class BlockMaker:
             observation = copy.copy(observation)
             observation.tally = Tally()
         buffers = self._local.__dict__.setdefault("blocks", {}).setdefault(stage.place, {})
-        block = Block(observation, detectors, reach, dtype=self._dtype, buffers=buffers, again=again)
+        block = Block(
+            observation, detectors, reach, dtype=self._dtype, buffers=buffers, again=again
+        )
         block.places = {name: stream.array[detectors, reach] for name, stream in made.items()}
         for name, stream in source.streams.items():
             if made or not copied:
@@ -272,22 +317,36 @@ class BlockMaker:
         return block
 
     def _add_unfiltered(self, block: Block) -> None:
-        """Put the signals that pass no filter into a block of a map maker, made again from their components."""
+        """Put the signals that pass no filter into a block of a map maker, made again from their
+        components.
+        """
         signals = [s for s in self._chain.signals if s.stream in self._apart]
-        stage = Stage.without_filters(self._chain.needed_for(signals, filtered=False), frozenset(self._apart))
+        stage = Stage.without_filters(
+            self._chain.needed_for(signals, filtered=False), frozenset(self._apart)
+        )
         found = self.make(stage, block.detectors, block.samples, {}, again=True, signals=signals)
         for name in self._apart:
             block.detdata[name] = found.detdata[name]
             if name in found.means:
                 block.means[name] = found.means[name]
 
-    def _in_pieces(self, steps: list[Operator], block: Block, passed_on: set[str], signals: Sequence[Formed]) -> None:
-        """Let steps that couple nothing work on copies of parts of a block; put the streams ``passed_on`` into it."""
+    def _in_pieces(
+        self, steps: list[Operator], block: Block, passed_on: set[str], signals: Sequence[Formed]
+    ) -> None:
+        """Let steps that couple nothing work on copies of parts of a block; put the streams
+        ``passed_on`` into it.
+        """
         given, means, made = block.detdata, block.means, dict[str, AnyFloats]()
         buffers = self._local.__dict__.setdefault("pieces", {})
         for detectors, samples in pieces(block.detectors, block.samples):
             piece = Block(
-                block.observation, detectors, samples, means=dict(means), dtype=block.dtype, buffers=buffers, again=block.again
+                block.observation,
+                detectors,
+                samples,
+                means=dict(means),
+                dtype=block.dtype,
+                buffers=buffers,
+                again=block.again,
             )
             where = within(block.detectors, detectors), within(block.samples, samples)
             for name, stream in given.items():
@@ -296,14 +355,20 @@ class BlockMaker:
             self._exec(steps, piece, signals)
             for name in passed_on & piece.detdata.keys():
                 if name not in made:
-                    made[name] = block.places[name] if name in block.places else block.buffer(name, block.shape)
+                    made[name] = (
+                        block.places[name]
+                        if name in block.places
+                        else block.buffer(name, block.shape)
+                    )
                 made[name][where] = piece.detdata[name]
             block.means = piece.means  # the same fields in every piece
         block.detdata = {**given, **made}
 
 
 def share_mask(block: Block, streams: Sequence[str]) -> None:
-    """Make samples NaN in all signals that are not finite in one: their maps have the same hits, and remainders hold."""
+    """Make samples NaN in all signals that are not finite in one: their maps have the same hits,
+    and remainders hold.
+    """
     arrays = tuple(block.detdata[name] for name in streams)
     for d in range(block.shape[0]):
         if not all(_finite(array[d]) for array in arrays):
@@ -312,7 +377,13 @@ def share_mask(block: Block, streams: Sequence[str]) -> None:
                 array[d, bad] = np.nan
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
+@nb.njit(
+    nogil=True,
+    cache=True,
+    boundscheck=False,
+    error_model="numpy",
+    fastmath={"contract", "nsz", "reassoc"},
+)
 def _finite(row):  # type: ignore[no-untyped-def]
     """Whether all samples of a row are finite."""
     total = zero = row.dtype.type(0)
@@ -321,8 +392,11 @@ def _finite(row):  # type: ignore[no-untyped-def]
     return total == 0
 
 
-def check_left(step: Operator, block: Block, before: Mapping[str, AnyFloats], due: frozenset[str]) -> None:
-    """Refuse what `Operator.exec` must not leave: a stream that is missing, or is no array of the block's shape and type.
+def check_left(
+    step: Operator, block: Block, before: Mapping[str, AnyFloats], due: frozenset[str]
+) -> None:
+    """Refuse what `Operator.exec` must not leave: a stream that is missing, or is no array of the
+    block's shape and type.
 
     Parameters
     ----------
@@ -357,7 +431,12 @@ def check_left(step: Operator, block: Block, before: Mapping[str, AnyFloats], du
     if gone:
         name = min(gone)
         raise PluginError(
-            f"exec left no stream {name!r}, which {'it provides' if name in step.provides else 'others read'}",
+            f"exec left no stream {name!r}, which"
+            f" {'it provides' if name in step.provides else 'others read'}",
             place=whose(step),
-            cure=f"make it with block.new({name!r}), or leave it out of provides" if name in due else "leave it in block.detdata",
+            cure=(
+                f"make it with block.new({name!r}), or leave it out of provides"
+                if name in due
+                else "leave it in block.detdata"
+            ),
         )

@@ -12,14 +12,17 @@ from ..numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from ..operator import Operator
 
 PIECE = 4 * TILE_SAMPLES
-"""Samples that operators without coupling see at once: 0.5 MB per float32 stream, and little time lost between calls."""
+"""Samples that operators without coupling see at once: 0.5 MB per float32 stream, and little time
+lost between calls.
+"""
 
 
 @dataclass
 class Segment:
     """Operators that see the same blocks. ``span``: what a block must hold whole (sample: nothing).
 
-    ``in_time_order``: blocks hold all detectors and come in order of time (`Operator.in_time_order`).
+    ``in_time_order``: blocks hold all detectors and come in order of time
+    (`Operator.in_time_order`).
     """
 
     operators: list[Operator]
@@ -28,7 +31,9 @@ class Segment:
     in_time_order: bool = False
 
     def split(self) -> tuple[list[Operator], list[Operator]]:
-        """The first operators, which take a block in pieces, and those from the first coupled one on."""
+        """The first operators, which take a block in pieces, and those from the first coupled one
+        on.
+        """
         if self.halo:
             return [], self.operators
         coupled = [o.couples in ("detectors", "time") for o in self.operators]
@@ -36,17 +41,27 @@ class Segment:
         return self.operators[:cut], self.operators[cut:]
 
 
-def cut(operators: Sequence[Operator], observation: Observation, ordered: Collection[str] = ()) -> list[Segment]:
-    """Cut a chain into segments. ``ordered``: labels of the operators that want their blocks in order of time."""
+def cut(
+    operators: Sequence[Operator], observation: Observation, ordered: Collection[str] = ()
+) -> list[Segment]:
+    """Cut a chain into segments. ``ordered``: labels of the operators that want their blocks in
+    order of time.
+    """
     segments = [Segment([])]
     for operator in operators:
         last = segments[-1]
-        couples, halo, in_order = operator.couples, operator.halo(observation), operator.label in ordered
+        couples, halo, in_order = (
+            operator.couples,
+            operator.halo(observation),
+            operator.label in ordered,
+        )
         if (in_order and last.span == "time") or (last.in_time_order and couples == "time"):
             segments.append(Segment([operator], couples, in_time_order=in_order))
         elif couples == "all":
             segments.append(Segment([operator]))
-        elif halo > 0 and last.span != "time":  # whole scans need no halo; otherwise read the stream with margins
+        elif (
+            halo > 0 and last.span != "time"
+        ):  # whole scans need no halo; otherwise read the stream with margins
             segments.append(Segment([operator], halo=halo))
         elif couples in ("sample", last.span):
             last.operators.append(operator)
@@ -60,7 +75,9 @@ def cut(operators: Sequence[Operator], observation: Observation, ordered: Collec
 
 
 def whole_span(span: str, before: str) -> str:
-    """What blocks hold whole where a segment of ``span`` reads streams that are made with the span ``before``."""
+    """What blocks hold whole where a segment of ``span`` reads streams that are made with the span
+    ``before``.
+    """
     return before if span == "sample" else span
 
 
@@ -73,13 +90,18 @@ def least_block(span: str, shape: tuple[int, int]) -> tuple[int, int]:
 
 
 def block_share(budget: int, whole: int, part: int) -> int:
-    """Samples that a block may hold where ``whole`` arrays of its size and ``part`` of a piece's must fit in ``budget`` items."""
+    """Samples that a block may hold where ``whole`` arrays of its size and ``part`` of a piece's
+    must fit in ``budget`` items.
+    """
     pieces_take = part * TILE_DETECTORS * PIECE
     return max(budget // max(whole + part, 1), (budget - pieces_take) // max(whole, 1))
 
 
-def blocks(span: str, in_time_order: bool, shape: tuple[int, int], share: int) -> Iterator[tuple[slice, slice]]:
-    """Blocks of at most ``share`` samples (or the least) that cover the observation, detectors first.
+def blocks(
+    span: str, in_time_order: bool, shape: tuple[int, int], share: int
+) -> Iterator[tuple[slice, slice]]:
+    """Blocks of at most ``share`` samples (or the least) that cover the observation, detectors
+    first.
 
     ``in_time_order``: times first, where the span allows.
     """
@@ -90,9 +112,16 @@ def blocks(span: str, in_time_order: bool, shape: tuple[int, int], share: int) -
         rows = min(n_det, max(1, share // columns // TILE_DETECTORS) * TILE_DETECTORS)
         for start in range(0, n_samp, columns):
             for first in range(0, n_det, rows):
-                yield slice(first, min(first + rows, n_det)), slice(start, min(start + columns, n_samp))
+                yield (
+                    slice(first, min(first + rows, n_det)),
+                    slice(start, min(start + columns, n_samp)),
+                )
         return
-    columns = n_samp if span == "time" else min(n_samp, max(1, share // rows // TILE_SAMPLES) * TILE_SAMPLES)
+    columns = (
+        n_samp
+        if span == "time"
+        else min(n_samp, max(1, share // rows // TILE_SAMPLES) * TILE_SAMPLES)
+    )
     for first in range(0, n_det, rows):
         for start in range(0, n_samp, columns):
             yield slice(first, min(first + rows, n_det)), slice(start, min(start + columns, n_samp))
@@ -102,7 +131,10 @@ def pieces(detectors: slice, samples: slice) -> Iterator[tuple[slice, slice]]:
     """The pieces of a block, in order of time."""
     for start in range(samples.start, samples.stop, PIECE):
         for first in range(detectors.start, detectors.stop, TILE_DETECTORS):
-            yield slice(first, min(first + TILE_DETECTORS, detectors.stop)), slice(start, min(start + PIECE, samples.stop))
+            yield (
+                slice(first, min(first + TILE_DETECTORS, detectors.stop)),
+                slice(start, min(start + PIECE, samples.stop)),
+            )
 
 
 def within(whole: slice, part: slice) -> slice:
@@ -113,5 +145,7 @@ def within(whole: slice, part: slice) -> slice:
 def trimmed(block: Block, samples: slice) -> Block:
     """The block without its margins."""
     inside = within(block.samples, samples)
-    detdata = {name: np.ascontiguousarray(array[:, inside]) for name, array in block.detdata.items()}
+    detdata = {
+        name: np.ascontiguousarray(array[:, inside]) for name, array in block.detdata.items()
+    }
     return Block(block.observation, block.detectors, samples, detdata, block.means, block.dtype)

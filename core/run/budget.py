@@ -1,4 +1,6 @@
-"""What a process may hold, divided among operators, streams and blocks, and scans prepared ahead."""
+"""What a process may hold, divided among operators, streams and blocks, and scans prepared
+ahead.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,11 @@ def longest_of(observations: Sequence[Observation]) -> Observation:
     return max(observations, key=lambda o: o.n_detectors * o.n_samples)
 
 
-def divided(chain: Chain, observation: Observation, settings: Settings, place: str, fresh: bool = True) -> Settings:
-    """The settings with the memory of streams and blocks, and with fewer threads where the blocks of all do not fit.
+def divided(
+    chain: Chain, observation: Observation, settings: Settings, place: str, fresh: bool = True
+) -> Settings:
+    """The settings with the memory of streams and blocks, and with fewer threads where the blocks
+    of all do not fit.
 
     Results depend on neither.
 
@@ -41,13 +46,14 @@ def divided(chain: Chain, observation: Observation, settings: Settings, place: s
     place
         The pipeline's name, for errors.
     fresh
-        False in a worker, which still holds what tasks before this one have left: that is no part of the forecast.
+        False in a worker, which still holds what tasks before this one have left: that is no part
+        of the forecast.
 
     Raises
     ------
     PipelineError
-        Where the least that a run needs is more than its budget, or more than the machine has: what needs it, and what would
-        make it fit.
+        Where the least that a run needs is more than its budget, or more than the machine has: what
+        needs it, and what would make it fit.
     """
     budget = settings.asked or resident_memory() + available_memory() // 2
     parts = {"zonda and its libraries": max(resident_memory(), BASE) if fresh else BASE}
@@ -57,7 +63,10 @@ def divided(chain: Chain, observation: Observation, settings: Settings, place: s
     left = replace(settings, memory=max(budget - fixed, 1))
     found = schedule(chain, observation, left)
     if fixed + found.least > budget and left.threads > 1:
-        left = replace(left, threads=max(1, min(left.threads - 1, (budget - fixed) * left.threads // found.least)))
+        left = replace(
+            left,
+            threads=max(1, min(left.threads - 1, (budget - fixed) * left.threads // found.least)),
+        )
         found = schedule(chain, observation, left)
     if fixed + found.least > budget:
         _refuse(chain, parts, found.least, budget, left.threads, place)
@@ -71,8 +80,14 @@ def products_of(chain: Chain, observation: Observation) -> int:
 
 
 def held_of(chain: Chain, observation: Observation, in_step: bool = False) -> int:
-    """Bytes that a band holds while another acts: `products_of`; ``in_step`` with that one, whatever its steps hold."""
-    return sum(planning_of(o).memory(observation) for o in chain.steps) if in_step else products_of(chain, observation)
+    """Bytes that a band holds while another acts: `products_of`; ``in_step`` with that one,
+    whatever its steps hold.
+    """
+    return (
+        sum(planning_of(o).memory(observation) for o in chain.steps)
+        if in_step
+        else products_of(chain, observation)
+    )
 
 
 def shared_bytes(observation: Observation) -> int:
@@ -81,7 +96,9 @@ def shared_bytes(observation: Observation) -> int:
 
 
 def with_scan_ahead(chain: Chain, observation: Observation, settings: Settings) -> Settings | None:
-    """The settings without what a scan holds that is prepared while another is executed; None where there is no room for it."""
+    """The settings without what a scan holds that is prepared while another is executed; None where
+    there is no room for it.
+    """
     size = sum(planning_of(o).memory(observation) for o in chain.steps if not makes_products(o))
     if not spares(chain, observation, settings, size):
         return None
@@ -89,11 +106,13 @@ def with_scan_ahead(chain: Chain, observation: Observation, settings: Settings) 
     return replace(settings, memory=settings.memory - size, ceiling=ceiling)
 
 
-def share_in_step(chain: Chain, observation: Observation, settings: Settings, bands: int, beside: int) -> Settings | None:
+def share_in_step(
+    chain: Chain, observation: Observation, settings: Settings, bands: int, beside: int
+) -> Settings | None:
     """The settings of one of several ``bands`` that work on a scan at the same time (`in_step`).
 
-    None where no step saves time so, or less would be kept in memory than where it works alone. ``beside``: bytes that the steps
-    of the others hold.
+    None where no step saves time so, or less would be kept in memory than where it works alone.
+    ``beside``: bytes that the steps of the others hold.
     """
     if not any(planning_of(o).shares_blocks(observation) for o in chain.steps):
         return None
@@ -104,15 +123,29 @@ def share_in_step(chain: Chain, observation: Observation, settings: Settings, ba
 
 
 def check_kept_memory(size: int, free: int, place: str) -> None:
-    """Refuse to keep streams of ``size`` bytes where less memory is ``free``. Raises PipelineError."""
+    """Refuse to keep streams of ``size`` bytes where less memory is ``free``. Raises
+    PipelineError.
+    """
     if size > free:
-        raise PipelineError(f"the kept streams would take {_size(size)}, {_size(free)} are free", place=place, cure=FEWER)
+        raise PipelineError(
+            f"the kept streams would take {_size(size)}, {_size(free)} are free",
+            place=place,
+            cure=FEWER,
+        )
 
 
 def least_memory(chain: Chain, observation: Observation, settings: Settings) -> int:
-    """Bytes with which a process runs these steps over an observation on one thread, libraries included."""
-    held = sum(planning_of(o).memory(observation) for o in chain.steps) + settings.others + shared_bytes(observation)
-    return _with_margin(BASE + held + schedule(chain, observation, replace(settings, threads=1)).least)
+    """Bytes with which a process runs these steps over an observation on one thread, libraries
+    included.
+    """
+    held = (
+        sum(planning_of(o).memory(observation) for o in chain.steps)
+        + settings.others
+        + shared_bytes(observation)
+    )
+    return _with_margin(
+        BASE + held + schedule(chain, observation, replace(settings, threads=1)).least
+    )
 
 
 def _with_margin(size: int) -> int:
@@ -120,18 +153,26 @@ def _with_margin(size: int) -> int:
     return -(-size * 21 // 20_000_000) * 1_000_000
 
 
-def _refuse(chain: Chain, parts: Mapping[str, int], blocks: int, budget: int, threads: int, place: str) -> None:
+def _refuse(
+    chain: Chain, parts: Mapping[str, int], blocks: int, budget: int, threads: int, place: str
+) -> None:
     need, free = sum(parts.values()) + blocks, available_memory() + resident_memory()
-    rows = sorted([*parts.items(), (f"blocks on {threads} thread{'s' if threads > 1 else ''}", blocks)], key=lambda row: -row[1])
+    rows = sorted(
+        [*parts.items(), (f"blocks on {threads} thread{'s' if threads > 1 else ''}", blocks)],
+        key=lambda row: -row[1],
+    )
     largest = ", ".join(f"{who} {_size(size)}" for who, size in rows[:4] if size > 0.01 * need)
     cures = [f"use --memory {_with_margin(need) // 1_000_000}MB"] if need * 1.05 <= free else []
     smaller = {KEPT: FEWER} | {o.label: planning_of(o).smaller for o in chain.steps}
-    cures += [f"{label}: {how}" for label, how in smaller.items() if how and parts[label] > 0.1 * need]
+    cures += [
+        f"{label}: {how}" for label, how in smaller.items() if how and parts[label] > 0.1 * need
+    ]
     if blocks > 0.1 * need and parts["zonda and its libraries"] < budget:
         cures.append("split the scan into shorter ones")
     beyond = f", more than this machine has ({_size(free)})" if need > free else ""
     raise PipelineError(
-        f"the run would hold {_size(need)}{beyond}: {largest}; its memory budget is {_size(budget)}",
+        f"the run would hold {_size(need)}{beyond}: {largest}; its memory budget is"
+        f" {_size(budget)}",
         place=place,
         cure="; or ".join(cures or ["use a machine with more memory"]),
     )

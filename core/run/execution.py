@@ -1,11 +1,13 @@
-"""Runs a chain of operators over one observation, in blocks of detectors x samples inside a memory budget.
+"""Runs a chain of operators over one observation, in blocks of detectors x samples inside a memory
+budget.
 
-The chain is cut into segments where the coupling changes (see `Operator.couples`). A segment works through the observation
-in blocks; operators that couple nothing work through a block in pieces of `TILE_DETECTORS` x `PIECE` samples, each of which
-passes through all of them while it is hot in the cache. All signals are in the same block. Between segments the streams that
-later operators need are kept in memory, spilled to a temporary file, or made again when they are read, as the `schedule` says.
-Blocks and pieces begin at multiples of `TILE_DETECTORS` and `TILE_SAMPLES`, so that no result depends on the budget or on the
-number of threads.
+The chain is cut into segments where the coupling changes (see `Operator.couples`). A segment works
+through the observation in blocks; operators that couple nothing work through a block in pieces of
+`TILE_DETECTORS` x `PIECE` samples, each of which passes through all of them while it is hot in the
+cache. All signals are in the same block. Between segments the streams that later operators need are
+kept in memory, spilled to a temporary file, or made again when they are read, as the `schedule`
+says. Blocks and pieces begin at multiples of `TILE_DETECTORS` and `TILE_SAMPLES`, so that no result
+depends on the budget or on the number of threads.
 """
 
 from __future__ import annotations
@@ -53,7 +55,8 @@ class Execution:
     Parameters
     ----------
     before, after
-        Called before and after each stage of a step, with ``operator``, ``observation``, ``stage`` (and ``seconds``).
+        Called before and after each stage of a step, with ``operator``, ``observation``, ``stage``
+        (and ``seconds``).
     """
 
     def __init__(
@@ -65,7 +68,12 @@ class Execution:
         before: Callable[..., None] = lambda **what: None,
         after: Callable[..., None] = lambda **what: None,
     ) -> None:
-        self.chain, self.observation, self.settings, self.timer = chain, observation, settings, timer
+        self.chain, self.observation, self.settings, self.timer = (
+            chain,
+            observation,
+            settings,
+            timer,
+        )
         self._before, self._after = before, after
         self.states: dict[str, Any] = {}
         self.measured: Measured = {}
@@ -76,8 +84,11 @@ class Execution:
         self._stop = threading.Event()
         self._in_step = False
 
-    def run(self, data: Data, ahead: Ahead | None = None, following: Execution | None = None) -> None:
-        """Configure, prepare, execute and collect; on any failure operators discard what they began.
+    def run(
+        self, data: Data, ahead: Ahead | None = None, following: Execution | None = None
+    ) -> None:
+        """Configure, prepare, execute and collect; on any failure operators discard what they
+        began.
 
         ``following``: what ``ahead`` may prepare meanwhile.
         """
@@ -89,11 +100,21 @@ class Execution:
                 raise error.__cause__ from None
             raise
 
-    def turns(self, data: Data, ahead: Ahead | None = None, following: Execution | None = None, in_step: bool = False) -> Turns:
-        """As `run`; ``in_step`` with other bands it yields its blocks, and where it waits for these (`core.run.in_step`)."""
+    def turns(
+        self,
+        data: Data,
+        ahead: Ahead | None = None,
+        following: Execution | None = None,
+        in_step: bool = False,
+    ) -> Turns:
+        """As `run`; ``in_step`` with other bands it yields its blocks, and where it waits for these
+        (`core.run.in_step`).
+        """
         self._in_step = in_step
         self._ahead = ahead or self._ahead
-        self._store = Store(self.settings.memory, self.settings.dtype, self.settings.spare, self.ledger)
+        self._store = Store(
+            self.settings.memory, self.settings.dtype, self.settings.spare, self.ledger
+        )
         try:
             if self.beforehand is not None:
                 self.beforehand.result()
@@ -118,7 +139,9 @@ class Execution:
                     field.forget()
 
     def prepare(self) -> None:
-        """Configure and prepare all steps; perhaps while another observation is executed (`ahead`)."""
+        """Configure and prepare all steps; perhaps while another observation is executed
+        (`ahead`).
+        """
         for operator in self.chain.steps:
             operator.configure(self.observation)
         for operator in self.chain.steps:
@@ -151,21 +174,31 @@ class Execution:
     def _plan(self) -> None:
         """Make the schedule with the memory that there is now: what operators hold is known."""
         self.settings = self._within_ceiling()
-        self._store = Store(self.settings.memory, self.settings.dtype, self.settings.spare, self.ledger)
+        self._store = Store(
+            self.settings.memory, self.settings.dtype, self.settings.spare, self.ledger
+        )
         self.schedule = Schedule(self.chain, self.observation, self.settings)
         stopped = self._stop.is_set
-        self._blocks = BlockMaker(self.schedule, self.states, self.measured, self.timer, self.ledger, stopped)
+        self._blocks = BlockMaker(
+            self.schedule, self.states, self.measured, self.timer, self.ledger, stopped
+        )
         self.schedule.make(self._cost)
 
     def _within_ceiling(self) -> Settings:
         settings = self.settings
         if settings.ceiling is None:
             return settings
-        room = max((settings.ceiling - (resident_memory() - sum(a.nbytes for a in settings.spare))) // settings.bands, 1)
+        room = max(
+            (settings.ceiling - (resident_memory() - sum(a.nbytes for a in settings.spare)))
+            // settings.bands,
+            1,
+        )
         threads = settings.threads
         if room >= settings.memory:
             return settings
-        if room < settings.least:  # the operators took a little more than they said: work on fewer blocks at once
+        if (
+            room < settings.least
+        ):  # the operators took a little more than they said: work on fewer blocks at once
             threads = max(1, threads * room // settings.least)
             room = max(room, settings.least * threads // settings.threads)
         return replace(settings, memory=room, threads=threads)
@@ -193,21 +226,28 @@ class Execution:
             for operator in planned.segment.operators:
                 self._before(operator=operator, observation=self.observation, stage="exec")
             begun += planned.segment.operators
-            source = yield from self._carry_out(planned, Stage(planned.segment, source, planned.wanted))
+            source = yield from self._carry_out(
+                planned, Stage(planned.segment, source, planned.wanted)
+            )
             if source.stage is None:  # else they are not through yet
                 for operator in begun:
                     used = self.timer.seconds.get((operator.label, "exec"), 0.0)
-                    self._after(operator=operator, observation=self.observation, stage="exec", seconds=used)
+                    self._after(
+                        operator=operator, observation=self.observation, stage="exec", seconds=used
+                    )
                 begun.clear()
         for name in self.chain.keep:
             if name not in source.streams:
                 raise PipelineError(
-                    f"stream {name!r} was asked to be kept, but no operator makes it", cure="keep a stream that a step provides"
+                    f"stream {name!r} was asked to be kept, but no operator makes it",
+                    cure="keep a stream that a step provides",
                 )
             self.observation.detdata[name] = self._whole(source.streams[name])
 
     def _whole(self, stream: Stream) -> AnyFloats:
-        """All of a stream with its mean, float64; a few detectors at a time, so that nothing of its size is made besides."""
+        """All of a stream with its mean, float64; a few detectors at a time, so that nothing of its
+        size is made besides.
+        """
         whole = empty(self.schedule.shape, np.float64)
         for first in range(0, len(whole), TILE_DETECTORS):
             rows = slice(first, min(first + TILE_DETECTORS, len(whole)))
@@ -225,7 +265,9 @@ class Execution:
         found = self._probe(stage)
         names = frozenset(stage.wanted & found.detdata.keys())
         for name in sorted(names):
-            self.observation.tally.state("Execution", f"stream {name} made again when it is read", planned.why)
+            self.observation.tally.state(
+                "Execution", f"stream {name} made again when it is read", planned.why
+            )
         return Source({}, stage, names, dict(found.means))
 
     def _pass(self, planned: Planned, stage: Stage) -> Generator[Sweep | Waiting, Any, Source]:
@@ -239,7 +281,9 @@ class Execution:
             array = self._store.allocate(name, self.schedule.shape, planned.how == "kept")
             made[name] = Stream(name, observation, array, {}, settings.threads)
             if isinstance(array, np.memmap):
-                observation.tally.state("Execution", f"stream {name} spilled to disk", f"{array.nbytes / 1e9:.2f} GB")
+                observation.tally.state(
+                    "Execution", f"stream {name} spilled to disk", f"{array.nbytes / 1e9:.2f} GB"
+                )
         seen: set[str] = set()
         means: dict[str, SmoothField] = {}
 
@@ -255,47 +299,76 @@ class Execution:
                 forget_pages(stream.array)
 
         what = ", ".join(o.label for o in stage.segment.operators)
-        todo = Sweep(work, self.schedule.blocks(planned), observation.name, what, name_of_all(observation), self._stop.set)
+        todo = Sweep(
+            work,
+            self.schedule.blocks(planned),
+            observation.name,
+            what,
+            name_of_all(observation),
+            self._stop.set,
+        )
         if self._in_step:
             yield todo
         else:
             sweep(todo, settings)
         stage.has_been_swept()
         self._blocks.release()
-        kept = {name: Stream(name, observation, s.array, means, settings.threads) for name, s in made.items() if name in seen}
+        kept = {
+            name: Stream(name, observation, s.array, means, settings.threads)
+            for name, s in made.items()
+            if name in seen
+        }
         held = {id(s.array) for s in kept.values()}
-        self._store.release([s.array for s in [*source.streams.values(), *made.values()] if id(s.array) not in held])
+        self._store.release(
+            [s.array for s in [*source.streams.values(), *made.values()] if id(s.array) not in held]
+        )
         return Source.of(kept, means)
 
     # ---- steps that measure whole streams
 
     def _measure(self, operator: Operator, source: Source) -> Turns:
-        """Let a filter measure each signal, the complete one first; let another step measure the one stream that it requires."""
+        """Let a filter measure each signal, the complete one first; let another step measure the
+        one stream that it requires.
+        """
         names = sorted(operator.requires & source.names)
         if len(names) != 1:
             raise PipelineError(
-                f"{operator.label} measures a whole stream, but {len(names)} reach it", cure="it must require exactly one"
+                f"{operator.label} measures a whole stream, but {len(names)} reach it",
+                cure="it must require exactly one",
             )
         self._before(operator=operator, observation=self.observation, stage="measure")
         used = 0.0
         one = self.chain.signals[0] if names == [MAIN] else Formed(names[0], frozenset())
-        signals = [s for s in self.chain.signals if s.filtered and s.stream in source.names] if filters(operator) else [one]
+        signals = (
+            [s for s in self.chain.signals if s.filtered and s.stream in source.names]
+            if filters(operator)
+            else [one]
+        )
         for signal in signals:
             lent: list[AnyFloats] = []
-            stream, takes = self._stream(operator, source, signal, lent), signal.takes_model(operator.label)
+            stream, takes = (
+                self._stream(operator, source, signal, lent),
+                signal.takes_model(operator.label),
+            )
             if self._in_step and joins(operator):
                 found, seconds = yield Waiting(operator, stream, takes)
                 used += seconds
             else:
                 start = self._without_blocks()
-                found = operator.measure(stream, self.measured.get((operator.label, MAIN)) if takes else None)
+                found = operator.measure(
+                    stream, self.measured.get((operator.label, MAIN)) if takes else None
+                )
                 used += self._without_blocks() - start
             self.measured[operator.label, signal.stream] = found
             self._store.drop(lent)
         self._tell(operator, "measure", used)
 
-    def _stream(self, operator: Operator, source: Source, signal: Formed, lent: list[AnyFloats]) -> Stream:
-        """A stream for a step that measures: under the name that it knows, with its own mean alone."""
+    def _stream(
+        self, operator: Operator, source: Source, signal: Formed, lent: list[AnyFloats]
+    ) -> Stream:
+        """A stream for a step that measures: under the name that it knows, with its own mean
+        alone.
+        """
         held, name = signal.stream, MAIN if is_signal(signal.stream) else signal.stream
         observation, threads, means = self.observation, self.settings.threads, dict(source.means)
         if name == MAIN:
@@ -303,16 +376,29 @@ class Execution:
         if held != name:  # what is found out of it is not the scene's
             observation = copy.copy(observation)
             observation.tally = Tally()
-            observation.flags, observation.detector_flags = observation.flags.copy(), observation.detector_flags.copy()
+            observation.flags, observation.detector_flags = (
+                observation.flags.copy(),
+                observation.detector_flags.copy(),
+            )
         if source.stage is not None:
-            sweeper = partial(self._sweep, source.stage, signal, f"{operator.label} measures {name}")
-            stream: Stream = StreamMadeAgain(name, observation, means, threads, self.settings.dtype, sweeper)
+            sweeper = partial(
+                self._sweep, source.stage, signal, f"{operator.label} measures {name}"
+            )
+            stream: Stream = StreamMadeAgain(
+                name, observation, means, threads, self.settings.dtype, sweeper
+            )
         else:
             room = max(self.settings.memory - self._store.held, 0)
             stream = Stream(name, observation, source.streams[held].array, means, threads, room)
-        if not knows_means(operator) and (fields := means_of(observation, means, frozenset({name}))):
+        if not knows_means(operator) and (
+            fields := means_of(observation, means, frozenset({name}))
+        ):
             stream = WholeStream(stream, fields[name], partial(self._lend, name, lent))
-        stream.signal, stream.components, stream.state = held, signal.components, self.states[operator.label]
+        stream.signal, stream.components, stream.state = (
+            held,
+            signal.components,
+            self.states[operator.label],
+        )
         return stream
 
     def _lend(self, name: str, lent: list[AnyFloats], shape: tuple[int, int]) -> AnyFloats:
@@ -321,14 +407,22 @@ class Execution:
         return lent[-1]
 
     def _without_blocks(self) -> float:
-        """CPU seconds of this process, without those of blocks (a stream made again is made of them) and of the scan ahead."""
+        """CPU seconds of this process, without those of blocks (a stream made again is made of
+        them) and of the scan ahead.
+        """
         return time.process_time() - self.timer.of_stage("exec") - self._ahead.seconds()
 
     def _sweep(
-        self, stage: Stage, signal: Formed, what: str, work: Callable[[slice, slice, AnyFloats], Any]
+        self,
+        stage: Stage,
+        signal: Formed,
+        what: str,
+        work: Callable[[slice, slice, AnyFloats], Any],
     ) -> Iterator[tuple[slice, slice, Any]]:
         """`Stream.sweep` of a stream that ``stage`` makes."""
-        signals: Sequence[Formed] | None = [signal] if stage.swept and signal in self.chain.signals else None
+        signals: Sequence[Formed] | None = (
+            [signal] if stage.swept and signal in self.chain.signals else None
+        )
 
         def one(detectors: slice, samples: slice) -> tuple[slice, slice, Any]:
             block = self._blocks.make(stage, detectors, samples, {}, again=False, signals=signals)

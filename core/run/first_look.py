@@ -1,4 +1,6 @@
-"""What can be found out about a pipeline before any work: `zonda check` prints it, and every run begins with it."""
+"""What can be found out about a pipeline before any work: `zonda check` prints it, and every run
+begins with it.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,10 @@ def warn_of_nothing_saved(pipeline: Pipeline) -> None:
     """Warn where no step writes anything."""
     if not writes(pipeline.operators):
         text = f"{pipeline.name}: no step writes a product, so what is computed is lost"
-        warnings.warn(f"{text}; add a step that saves or shows it (`zonda plugins` lists the operators)", stacklevel=3)
+        warnings.warn(
+            f"{text}; add a step that saves or shows it (`zonda plugins` lists the operators)",
+            stacklevel=3,
+        )
 
 
 def looks(
@@ -66,8 +71,16 @@ def looks(
 
 
 def writes(operators: Iterable[Operator]) -> bool:
-    """Whether any step may leave a file: one that is neither pointing nor a stream, nor keeps its products in memory."""
+    """Whether any step may leave a file: one that is neither pointing nor a stream, nor keeps its
+    products in memory.
+    """
     return any(
-        may_write(o) or (o.provides and not (makes_products(o) or "boresight" in o.provides or all(map(is_stream, o.provides))))
+        may_write(o)
+        or (
+            o.provides
+            and not (
+                makes_products(o) or "boresight" in o.provides or all(map(is_stream, o.provides))
+            )
+        )
         for o in operators
     )

@@ -1,8 +1,9 @@
-"""Bands in step: each block of a scan is worked on with one band after the other, so that what they share is found once.
+"""Bands in step: each block of a scan is worked on with one band after the other, so that what they
+share is found once.
 
-Where a step measures the detectors of all bands together, bands wait for each other. Such a band does not have the bits that it
-has alone; any other has. Bands that share nothing, or for whose streams the memory has no room, follow each other scan by scan
-(`in_turn`).
+Where a step measures the detectors of all bands together, bands wait for each other. Such a band
+does not have the bits that it has alone; any other has. Bands that share nothing, or for whose
+streams the memory has no room, follow each other scan by scan (`in_turn`).
 """
 
 from __future__ import annotations
@@ -44,13 +45,16 @@ class JoinsBands(Protocol):
     joins_bands: bool
 
     def of_rows(self, measured: Any, rows: slice) -> Any:
-        """Of what ``measure`` returned for the detectors of all bands, what ``exec`` needs for some of them."""
+        """Of what ``measure`` returned for the detectors of all bands, what ``exec`` needs for some
+        of them.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """A band that waits until a step has measured the streams of all; it takes what was found, and the CPU seconds of its part.
+    """A band that waits until a step has measured the streams of all; it takes what was found, and
+    the CPU seconds of its part.
 
     Attributes
     ----------
@@ -74,7 +78,8 @@ class Sweep:
     work
         Called with the detectors and the samples of each of ``blocks``, on several threads.
     scan, what
-        Names of the scan and of the steps, for the progress; ``together``: that of the scan with all bands.
+        Names of the scan and of the steps, for the progress; ``together``: that of the scan with
+        all bands.
     stop
         Called where a block fails: the others are of no use any more.
     """
@@ -98,7 +103,12 @@ def joins(operator: Operator) -> bool:
 
 def sweep(one: Sweep, settings: Settings) -> None:
     """Work on every block, on ``settings.threads`` threads; the first error stops all."""
-    blocks, progress, total, what = one.blocks, settings.progress, len(one.blocks), f"{one.scan}: {one.what}"
+    blocks, progress, total, what = (
+        one.blocks,
+        settings.progress,
+        len(one.blocks),
+        f"{one.scan}: {one.what}",
+    )
     if settings.threads == 1 or total == 1:
         for done, block in enumerate(blocks, 1):
             one.work(*block)
@@ -117,7 +127,9 @@ def sweep(one: Sweep, settings: Settings) -> None:
             raise
 
 
-def run_in_step(bands: Sequence[Turns], settings: Settings, timer: Timer, shared: SharedScan | None) -> None:
+def run_in_step(
+    bands: Sequence[Turns], settings: Settings, timer: Timer, shared: SharedScan | None
+) -> None:
     """Execute one scan with all bands.
 
     Parameters
@@ -125,7 +137,8 @@ def run_in_step(bands: Sequence[Turns], settings: Settings, timer: Timer, shared
     settings
         ``memory``: bytes for streams of all bands together, where a step measures these.
     shared
-        What blocks are worked on with one band after the other; None: each band works on all of its blocks at a time.
+        What blocks are worked on with one band after the other; None: each band works on all of its
+        blocks at a time.
     """
     store = Store(settings.memory, settings.dtype, [], Ledger())
     models: dict[str, Any] = {}
@@ -139,7 +152,9 @@ def run_in_step(bands: Sequence[Turns], settings: Settings, timer: Timer, shared
                 ready = list(sweeps)
             else:
                 ready = [k for k, one in enumerate(asked) if one is not None]
-                start = time.process_time() - timer.of_stage("exec")  # a stream made again is made of blocks
+                start = time.process_time() - timer.of_stage(
+                    "exec"
+                )  # a stream made again is made of blocks
                 parts = _measure([one for one in asked if isinstance(one, Waiting)], models, store)
                 used = (time.process_time() - timer.of_stage("exec") - start) / len(parts)
                 answers = [(part, used) for part in parts]
@@ -162,8 +177,12 @@ def _resume(band: Turns, answer: Any) -> Waiting | Sweep | None:
         return None
 
 
-def _sweep(sweeps: Sequence[Sweep], settings: Settings, timer: Timer, shared: SharedScan | None) -> None:
-    """Work on the blocks of several bands: on each with all of them where their blocks are the same."""
+def _sweep(
+    sweeps: Sequence[Sweep], settings: Settings, timer: Timer, shared: SharedScan | None
+) -> None:
+    """Work on the blocks of several bands: on each with all of them where their blocks are the
+    same.
+    """
     first = sweeps[0]
     if shared is None or any(one.blocks != first.blocks for one in sweeps):
         for one in sweeps:
@@ -187,7 +206,9 @@ def _sweep(sweeps: Sequence[Sweep], settings: Settings, timer: Timer, shared: Sh
 
 
 def _measure(waiting: Sequence[Waiting], models: dict[str, Any], store: Store) -> list[Any]:
-    """What each band needs of what the step measured for all; ``models``: by label, what it measured in the complete signal."""
+    """What each band needs of what the step measured for all; ``models``: by label, what it
+    measured in the complete signal.
+    """
     step, streams = waiting[0].operator, [w.stream for w in waiting]
     assert isinstance(step, JoinsBands)
     stream = _joined(streams, store)
@@ -213,14 +234,22 @@ def _rows(streams: Sequence[Stream]) -> list[slice]:
 
 
 def _joined(streams: Sequence[Stream], store: Store) -> Stream:
-    """A copy of all streams, one band after the other. In float64 it has the mean emission, which float32 cannot carry."""
+    """A copy of all streams, one band after the other. In float64 it has the mean emission, which
+    float32 cannot carry.
+    """
     first, rows = streams[0], _rows(streams)
     array = store.allocate(first.name, (rows[-1].stop, first.shape[1]), dtype=first.dtype)
     carries = first.dtype == np.float64
     for stream, at in zip(streams, rows, strict=True):
         mean = stream.means.get(stream.name) if carries else None
 
-        def copy(detectors: slice, samples: slice, part: AnyFloats, start: int = at.start, mean: Any = mean) -> None:
+        def copy(
+            detectors: slice,
+            samples: slice,
+            part: AnyFloats,
+            start: int = at.start,
+            mean: Any = mean,
+        ) -> None:
             to = array[start + detectors.start : start + detectors.stop, samples]
             to[...] = part if mean is None else part + mean.evaluate(detectors, samples)
 
@@ -239,11 +268,17 @@ def name_of_all(scan: Observation) -> str:
 
 
 def _all_detectors(scans: Sequence[Observation]) -> Observation:
-    """A scan with the detectors of all bands. A sample that one band flags is flagged: the bands have no common mode there."""
+    """A scan with the detectors of all bands. A sample that one band flags is flagged: the bands
+    have no common mode there.
+    """
     first = scans[0]
     return replace(
-        first, name=f"{name_of_all(first)}, all bands",
+        first,
+        name=f"{name_of_all(first)}, all bands",
         focalplane=Focalplane.of_bands({str(k): scan.focalplane for k, scan in enumerate(scans)}),
         flags=np.bitwise_or.reduce([scan.flags for scan in scans]),
-        detector_flags=np.concatenate([scan.detector_flags for scan in scans]), smooth={}, detdata={}, tally=Tally(),
-    )  # fmt: skip
+        detector_flags=np.concatenate([scan.detector_flags for scan in scans]),
+        smooth={},
+        detdata={},
+        tally=Tally(),
+    )

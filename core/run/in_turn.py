@@ -1,6 +1,8 @@
-"""Executes all scans of a run, each with all bands of the camera; what these share of a scan is released after the last.
+"""Executes all scans of a run, each with all bands of the camera; what these share of a scan is
+released after the last.
 
-Bands that share pixels, or that a filter measures together, are in step (`in_step`); others follow each other.
+Bands that share pixels, or that a filter measures together, are in step (`in_step`); others follow
+each other.
 """
 
 from __future__ import annotations
@@ -23,14 +25,18 @@ from .settings import Settings, Timer
 
 @dataclass(frozen=True)
 class Band:
-    """What observes with one band, or with a camera that has one: the steps, the data, and who is told when a scan is done."""
+    """What observes with one band, or with a camera that has one: the steps, the data, and who is
+    told when a scan is done.
+    """
 
     chain: Chain
     data: Data
     watch: Callable[[Data, Progress], None]
 
     def held(self, in_step: bool) -> int:
-        """Bytes that it holds while another band acts: what is added up over all scans; ``in_step``: all that its steps hold."""
+        """Bytes that it holds while another band acts: what is added up over all scans;
+        ``in_step``: all that its steps hold.
+        """
         return held_of(self.chain, longest_of(self.data.observations), in_step)
 
 
@@ -54,17 +60,25 @@ class Budget:
 
 
 def execute(bands: Sequence[Band], settings: Settings, timer: Timer, budget: Budget) -> None:
-    """Run all observations in order, each with all bands; the next one is prepared while one is executed."""
+    """Run all observations in order, each with all bands; the next one is prepared while one is
+    executed.
+    """
     hooks = manager().hook.zonda_before_operator, manager().hook.zonda_after_operator
-    heard = any(hook.get_hookimpls() for hook in hooks)  # who listens hears of one observation after the other
+    heard = any(
+        hook.get_hookimpls() for hook in hooks
+    )  # who listens hears of one observation after the other
     several = sum(len(band.data.observations) for band in bands) > 1
     joined = len(bands) > 1 and any(map(joins, bands[0].chain.steps))
     ahead = Ahead(settings.threads > 1 and several and not joined and not heard)
     every = [o for band in bands for o in band.data.observations]
-    settings = replace(settings, kept=8 * len(bands[0].chain.keep) * sum(o.n_detectors * o.n_samples for o in every))
+    settings = replace(
+        settings,
+        kept=8 * len(bands[0].chain.keep) * sum(o.n_detectors * o.n_samples for o in every),
+    )
     held = [band.held(joined) for band in bands]
     alone = [
-        _divided(band, replace(settings, others=sum(held) - mine), ahead, budget) for band, mine in zip(bands, held, strict=True)
+        _divided(band, replace(settings, others=sum(held) - mine), ahead, budget)
+        for band, mine in zip(bands, held, strict=True)
     ]
     shares = _joined_shares(alone) if joined else None if heard else _shares(bands, alone, ahead.on)
     executions = [
@@ -78,7 +92,14 @@ def execute(bands: Sequence[Band], settings: Settings, timer: Timer, budget: Bud
         else:
             memory, threads = alone[0].memory, min(own.threads for own in shares)
             blocks = _alike(bands) and sum(own.memory for own in shares) <= memory
-            _run_in_step(scans, bands, ahead, replace(alone[0], memory=memory // 2, threads=threads), timer, blocks)
+            _run_in_step(
+                scans,
+                bands,
+                ahead,
+                replace(alone[0], memory=memory // 2, threads=threads),
+                timer,
+                blocks,
+            )
     finally:
         ahead.close()
 
@@ -92,12 +113,20 @@ def _run_in_turn(scans: Sequence[Sequence[Execution]], bands: Sequence[Band], ah
 
 
 def _run_in_step(
-    scans: Sequence[Sequence[Execution]], bands: Sequence[Band], ahead: Ahead, settings: Settings, timer: Timer, blocks: bool
+    scans: Sequence[Sequence[Execution]],
+    bands: Sequence[Band],
+    ahead: Ahead,
+    settings: Settings,
+    timer: Timer,
+    blocks: bool,
 ) -> None:
     """Run all observations in order, each with all bands in step; ``blocks``: block by block."""
     datas = [band.data for band in bands]
     for scan, following in zip(scans, [*scans[1:], [None] * len(bands)], strict=True):
-        turns = [one.turns(data, ahead, then, in_step=True) for one, data, then in zip(scan, datas, following, strict=True)]
+        turns = [
+            one.turns(data, ahead, then, in_step=True)
+            for one, data, then in zip(scan, datas, following, strict=True)
+        ]
         run_in_step(turns, settings, timer, scan[0].observation.shared if blocks else None)
         for execution, band in zip(scan, bands, strict=True):
             _done(execution, band, band is bands[-1])
@@ -106,16 +135,27 @@ def _run_in_step(
 def _joined_shares(alone: Sequence[Settings]) -> list[Settings]:
     """The settings of bands whose streams are held side by side, and once more together."""
     n = len(alone)
-    return [replace(own, memory=max(own.memory // (2 * n), min(own.least, own.memory)), bands=n, spare=[]) for own in alone]
+    return [
+        replace(
+            own, memory=max(own.memory // (2 * n), min(own.least, own.memory)), bands=n, spare=[]
+        )
+        for own in alone
+    ]
 
 
 def _shares(bands: Sequence[Band], alone: Sequence[Settings], ahead: bool) -> list[Settings] | None:
-    """The settings of bands in step; None where they follow each other: they share no pixels, gain nothing or would keep less."""
+    """The settings of bands in step; None where they follow each other: they share no pixels, gain
+    nothing or would keep less.
+    """
     if len(bands) == 1 or not _alike(bands):
         return None
-    beside = [(2 if ahead else 1) * (band.held(in_step=True) - band.held(in_step=False)) for band in bands]
+    beside = [
+        (2 if ahead else 1) * (band.held(in_step=True) - band.held(in_step=False)) for band in bands
+    ]
     found = [
-        share_in_step(band.chain, longest_of(band.data.observations), own, len(bands), sum(beside) - mine)
+        share_in_step(
+            band.chain, longest_of(band.data.observations), own, len(bands), sum(beside) - mine
+        )
         for band, own, mine in zip(bands, alone, beside, strict=True)
     ]
     shares = [one for one in found if one is not None]
@@ -124,7 +164,9 @@ def _shares(bands: Sequence[Band], alone: Sequence[Settings], ahead: bool) -> li
 
 def _alike(bands: Sequence[Band]) -> bool:
     """Whether the detectors of all bands look through the same pixels."""
-    return all(o.shared is not None and o.shared.bands == len(bands) for o in bands[0].data.observations)
+    return all(
+        o.shared is not None and o.shared.bands == len(bands) for o in bands[0].data.observations
+    )
 
 
 def _done(execution: Execution, band: Band, last: bool) -> None:
@@ -150,7 +192,10 @@ def _divided(band: Band, settings: Settings, ahead: Ahead, budget: Budget) -> Se
         less = with_scan_ahead(chain, longest, settings)
         ahead.on, settings = less is not None, less or settings
     if settings.threads < data.threads and budget.fresh:
-        text = f"{settings.threads} of {data.threads} threads work: more do not fit in the memory budget"
+        text = (
+            f"{settings.threads} of {data.threads} threads work: more do not fit in the memory"
+            " budget"
+        )
         warnings.warn(f"{budget.place}: {text}", stacklevel=4)
     data.threads = settings.threads
     return settings

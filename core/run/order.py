@@ -33,13 +33,21 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
         if index == sky_is_signal:
             have.add("signal")
         name = type(operator).__name__
-        later = {what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides}
-        made = {what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides - o.requires}
+        later = {
+            what: type(o).__name__ for o in reversed(operators[index + 1 :]) for what in o.provides
+        }
+        made = {
+            what: type(o).__name__
+            for o in reversed(operators[index + 1 :])
+            for what in o.provides - o.requires
+        }
         for what in sorted(operator.requires - have):
             if what in made:
                 problems.append(
                     OrderProblem(
-                        index, f"{name} needs {what}, which {made[what]} provides only later", f"move it below {made[what]}"
+                        index,
+                        f"{name} needs {what}, which {made[what]} provides only later",
+                        f"move it below {made[what]}",
                     )
                 )
             else:
@@ -50,7 +58,9 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                 elif not found and not cure and have:
                     cure = f"what there is: {', '.join(sorted(have))}"
                 message = f"{name} needs {what}, which no step provides"
-                problems.append(OrderProblem(index, message, f"add a step that provides {what} above", cure))
+                problems.append(
+                    OrderProblem(index, message, f"add a step that provides {what} above", cure)
+                )
         adds_up = forms(operator) and (operator.requires | operator.optional) - {"boresight"}
         components = {what for what in later if isinstance(what, Component)} if adds_up else set()
         late: dict[str, list[str]] = {}
@@ -69,12 +79,23 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                 )
             )
         read = next((type(o).__name__ for o in operators[:index] if isinstance(o, WithScene)), None)
-        if read and "boresight" in operator.provides - operator.requires and not isinstance(operator, WithScene):
-            message = f"{name} would add scans to those that {read} has read, with nothing recorded in them"
-            problems.append(OrderProblem(index, message, f"leave {name} out: {read} brings the pointing"))
+        if (
+            read
+            and "boresight" in operator.provides - operator.requires
+            and not isinstance(operator, WithScene)
+        ):
+            message = (
+                f"{name} would add scans to those that {read} has read, with nothing recorded in"
+                " them"
+            )
+            problems.append(
+                OrderProblem(index, message, f"leave {name} out: {read} brings the pointing")
+            )
         if not changes_components(operator):
             have |= operator.provides
     if operators and not any("boresight" in o.provides | o.requires for o in operators):
         cure = f"{' or '.join(makers('boresight'))} would"
-        problems.append(OrderProblem(0, "no step points the telescope", "begin with a pointing step", cure))
+        problems.append(
+            OrderProblem(0, "no step points the telescope", "begin with a pointing step", cure)
+        )
     return problems

@@ -1,7 +1,8 @@
-"""The schedule of one observation: its segments, what becomes of the streams between them, and the blocks that are cut.
+"""The schedule of one observation: its segments, what becomes of the streams between them, and the
+blocks that are cut.
 
-It is made once for an observation, without running or allocating anything, and then followed; the forecast of a run is the
-schedule that would be followed with its budget.
+It is made once for an observation, without running or allocating anything, and then followed; the
+forecast of a run is the schedule that would be followed with its budget.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ SCRATCH_STREAMS = 2
 """Block-sized arrays assumed for operators' own scratch when the budget is divided."""
 
 AMPLE = 3.0
-"""Times the streams of all signals: with so much memory unfiltered ones are held across the filters, not made again."""
+"""Times the streams of all signals: with so much memory unfiltered ones are held across the
+filters, not made again.
+"""
 
 AMPLE_BLOCK = 128 << 20
 """Bytes of a block's arrays on one thread beyond which larger ones gain nothing."""
@@ -59,25 +62,39 @@ class Chain:
 
     def expanded(self, names: Collection[str]) -> frozenset[str]:
         """Names of streams, with those of all signals in place of ``signal``."""
-        return frozenset(names) | {s.stream for s in self.signals} if MAIN in names else frozenset(names)
+        return (
+            frozenset(names) | {s.stream for s in self.signals}
+            if MAIN in names
+            else frozenset(names)
+        )
 
     @property
     def read(self) -> frozenset[str]:
-        """Names of the streams that are needed: what `Operator.exec` or `Operator.measure` reads, and what is kept."""
+        """Names of the streams that are needed: what `Operator.exec` or `Operator.measure` reads,
+        and what is kept.
+        """
         names = frozenset(self.keep)
         for step in self.steps:
             if type(step).exec is not Operator.exec or type(step).measure is not Operator.measure:
-                names |= self.of(step, self.signals) if forms(step) else step.requires | step.optional
+                names |= (
+                    self.of(step, self.signals) if forms(step) else step.requires | step.optional
+                )
         return self.expanded(names - {"boresight"})
 
     def of(self, step: Operator, signals: Collection[Formed]) -> frozenset[str]:
         """Names of the streams that a step which forms signals reads for these."""
         unknown = not self.components
         parts = frozenset[str]().union(*(s.components for s in signals))
-        return frozenset(n for n in step.requires | step.optional | parts if unknown or n in parts or n not in self.components)
+        return frozenset(
+            n
+            for n in step.requires | step.optional | parts
+            if unknown or n in parts or n not in self.components
+        )
 
     def needed_for(self, signals: Collection[Formed], *, filtered: bool) -> list[Operator]:
-        """The steps that form signals, those that filter them if so wanted, and those that make what these read."""
+        """The steps that form signals, those that filter them if so wanted, and those that make
+        what these read.
+        """
         found: list[Operator] = []
         names = frozenset[str]()
         for step in reversed(self.steps):
@@ -130,13 +147,15 @@ class Schedule:
     planned
         The segments in order.
     made_again
-        Signals that are passed to map makers as they were formed, made again from their components where they are mapped.
+        Signals that are passed to map makers as they were formed, made again from their components
+        where they are mapped.
     bytes, least
         Bytes that streams and blocks take at once; the least budget that would do.
     elsewhere
         Streams that are kept nowhere or on disk, in words.
     again
-        How many times more the operators, by label, act whose streams are made again when they are read.
+        How many times more the operators, by label, act whose streams are made again when they are
+        read.
     """
 
     chain: Chain
@@ -150,7 +169,10 @@ class Schedule:
     again: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.streams, self.means = self.chain.read, self.chain.expanded(may_have_means(self.chain.steps))
+        self.streams, self.means = (
+            self.chain.read,
+            self.chain.expanded(may_have_means(self.chain.steps)),
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -176,10 +198,14 @@ class Schedule:
         if rows * columns > share:
             settings, need = self.settings, self._least_blocks(stage)
             raise PipelineError(
-                f"one block of {rows} detectors needs {need / settings.threads / 1e6:.1f} MB on each of {settings.threads} "
-                f"threads, the memory budget has {(settings.memory - held) / 1e6:.1f} MB for all of them",
+                f"one block of {rows} detectors needs {need / settings.threads / 1e6:.1f} MB on"
+                f" each of {settings.threads} threads, the memory budget has"
+                f" {(settings.memory - held) / 1e6:.1f} MB for all of them",
                 place=self.observation.name,
-                cure=f"raise --memory to {self._ceiling_for(need + held)}, use fewer --threads, or make the scan shorter",
+                cure=(
+                    f"raise --memory to {self._ceiling_for(need + held)}, use fewer --threads, or"
+                    " make the scan shorter"
+                ),
             )
         return list(blocks(stage.span, stage.in_time_order, self.shape, share))
 
@@ -195,45 +221,74 @@ class Schedule:
         source, held, elsewhere, again = Source(), 0, list[str](), dict[str, int]()
         for number, segment in enumerate(segments):
             later = segments[number + 1 :]
-            wanted = frozenset(self.chain.keep).union(*(o.requires | o.optional for s in later for o in s.operators))
+            wanted = frozenset(self.chain.keep).union(
+                *(o.requires | o.optional for s in later for o in s.operators)
+            )
             made = source.names.union(*(self.chain.expanded(o.provides) for o in segment.operators))
-            stage = Stage(segment, source, made & self.chain.expanded(wanted) & self.streams - apart)
-            new = stage.wanted if segment.halo else stage.wanted - (frozenset() if source.stage else source.names)
+            stage = Stage(
+                segment, source, made & self.chain.expanded(wanted) & self.streams - apart
+            )
+            new = (
+                stage.wanted
+                if segment.halo
+                else stage.wanted - (frozenset() if source.stage else source.names)
+            )
             size, how, why = len(new) * self.stream_size, "kept", ""
             planned = Planned(stage)
             if later and new and not self._keeps(stage, size, held, later):
                 how, why = self._where(planned, sorted(new), size, held, later, cost)
-                elsewhere += [f"{name} {'spilled to disk' if how == 'spilled' else 'made again'}" for name in sorted(new)]
+                elsewhere += [
+                    f"{name} {'spilled to disk' if how == 'spilled' else 'made again'}"
+                    for name in sorted(new)
+                ]
             planned.how, planned.why = how, why  # type: ignore[assignment]
             self.planned.append(planned)
             if how == "again":
                 times = self._readings(later)
-                again.update({o.label: max(times, again.get(o.label, 0)) for o in segment.operators if not makes_products(o)})
+                again.update(
+                    {
+                        o.label: max(times, again.get(o.label, 0))
+                        for o in segment.operators
+                        if not makes_products(o)
+                    }
+                )
                 source = Source({}, stage, stage.wanted)
                 continue
             size = 0 if how == "spilled" else size
             planned.held = held + (size if later else 0)
             smallest = self._least_blocks(stage)
             largest = max(self._largest_blocks(stage, planned.held), smallest)
-            self.bytes, self.least = max(self.bytes, held + size + largest), max(self.least, smallest)
+            self.bytes, self.least = (
+                max(self.bytes, held + size + largest),
+                max(self.least, smallest),
+            )
             held = planned.held
             source = Source(names=stage.wanted)
         self.elsewhere, self.again = tuple(elsewhere), again
 
     def _made_again(self, segments: Sequence[Segment]) -> tuple[Formed, ...]:
-        """Unfiltered signals, where streams are held on the way to the maps and memory is not ample for all of them, and blocks
-        need neither a span nor neighbours."""
-        unfiltered = tuple(s for s in self.chain.signals if not s.filtered and s.stream not in self.chain.keep)
-        if not unfiltered or AMPLE * len(self.chain.signals) * self.stream_size <= self.settings.memory:
+        """Unfiltered signals, where streams are held on the way to the maps and memory is not ample
+        for all of them, and blocks need neither a span nor neighbours."""
+        unfiltered = tuple(
+            s for s in self.chain.signals if not s.filtered and s.stream not in self.chain.keep
+        )
+        if (
+            not unfiltered
+            or AMPLE * len(self.chain.signals) * self.stream_size <= self.settings.memory
+        ):
             return ()
         before = [k for k, s in enumerate(segments) if any(forms(o) for o in s.operators)]
-        mapped = [k for k, s in enumerate(segments) if any(isinstance(o, MapMaker) for o in s.operators)]
+        mapped = [
+            k for k, s in enumerate(segments) if any(isinstance(o, MapMaker) for o in s.operators)
+        ]
         needed = self.chain.needed_for(unfiltered, filtered=False)
         bound = any(o.couples != "sample" or o.halo(self.observation) for o in needed)
         return unfiltered if before and mapped and min(mapped) > before[0] and not bound else ()
 
     def _keeps(self, stage: Stage, size: int, held: int, later: list[Segment]) -> bool:
-        """Whether ``size`` bytes of streams beside those held stay in memory: in half of it, and leave room for blocks."""
+        """Whether ``size`` bytes of streams beside those held stay in memory: in half of it, and
+        leave room for blocks.
+        """
         following = Stage(later[0], Source(names=stage.wanted), frozenset())
         least = max(self._least_blocks(stage), self._least_blocks(following))
         return held + size <= min(self.settings.memory // 2, self.settings.memory - least)
@@ -264,14 +319,19 @@ class Schedule:
             f"the stream{'s' if len(new) > 1 else ''} {', '.join(new)}",
             size,
             spill_seconds=2 * size / rate,
-            again=(self._readings(later), self.shape[0] * self.shape[1] * sample_cost / self.settings.threads),
+            again=(
+                self._readings(later),
+                self.shape[0] * self.shape[1] * sample_cost / self.settings.threads,
+            ),
             hindrance=hindrance,
             prefer="spilled" if slow else self.settings.prefer,
             refusal=(self.observation.name, self._ceiling_for(2 * (held + size))),
         )
 
     def _readings(self, later: Sequence[Segment]) -> int:
-        """How often, beyond once, the segments to come read what is passed on to the first of them."""
+        """How often, beyond once, the segments to come read what is passed on to the first of
+        them.
+        """
         heads = [s.operators[0] for s in later]
         swept = sum(planning_of(o).sweeps(self.observation) for o in heads if o.couples == "all")
         swept *= sum(s.filtered for s in self.chain.signals)
@@ -285,32 +345,54 @@ class Schedule:
         return self._bytes(stage, rows * columns, min(rows, TILE_DETECTORS) * min(columns, PIECE))
 
     def _largest_blocks(self, stage: Stage, held: int) -> int:
-        """Bytes of the blocks that would be cut beside ``held`` bytes of streams, on all threads."""
+        """Bytes of the blocks that would be cut beside ``held`` bytes of streams, on all
+        threads.
+        """
         share = max(self._share(stage, held), 1)
         first = next(iter(blocks(stage.span, stage.in_time_order, self.shape, share)))
         rows, columns = (s.stop - s.start for s in first)
         return self._bytes(stage, rows * columns, min(rows, TILE_DETECTORS) * min(columns, PIECE))
 
     def _share(self, stage: Stage, held: int) -> int:
-        """Samples that a block may hold beside ``held`` bytes of streams: within half of the budget, or all that is left."""
+        """Samples that a block may hold beside ``held`` bytes of streams: within half of the
+        budget, or all that is left.
+        """
         settings, (whole, part) = self.settings, self._streams_in_block(stage)
         rows, columns = least_block(stage.span, self.shape)
         each = settings.threads * np.dtype(settings.dtype).itemsize
-        share = block_share(min(settings.memory // 2, settings.threads * AMPLE_BLOCK) // each, whole, part)
-        return share if share >= rows * columns else block_share((settings.memory - held) // each, whole, part)
+        share = block_share(
+            min(settings.memory // 2, settings.threads * AMPLE_BLOCK) // each, whole, part
+        )
+        return (
+            share
+            if share >= rows * columns
+            else block_share((settings.memory - held) // each, whole, part)
+        )
 
     def _bytes(self, stage: Stage, block: int, piece: int) -> int:
         whole, part = self._streams_in_block(stage)
-        return self.settings.threads * np.dtype(self.settings.dtype).itemsize * (whole * block + part * piece)
+        return (
+            self.settings.threads
+            * np.dtype(self.settings.dtype).itemsize
+            * (whole * block + part * piece)
+        )
 
     def _streams_in_block(self, stage: Stage | None) -> tuple[int, int]:
-        """Numbers of block-sized and of piece-sized arrays that a stage and those before it hold."""
+        """Numbers of block-sized and of piece-sized arrays that a stage and those before it
+        hold.
+        """
         if stage is None:
             return 0, 0
         first, rest = stage.segment.split()
         expanded = self.chain.expanded
-        names = set(stage.source.names | stage.wanted).union(*(expanded(o.requires | o.optional | o.provides) for o in rest))
-        every = names.union(*(expanded(o.requires | o.optional | o.provides) for o in first)) if first else set()
+        names = set(stage.source.names | stage.wanted).union(
+            *(expanded(o.requires | o.optional | o.provides) for o in rest)
+        )
+        every = (
+            names.union(*(expanded(o.requires | o.optional | o.provides) for o in first))
+            if first
+            else set()
+        )
         before = self._streams_in_block(stage.source.stage)
         whole, part = len(names & self.streams), len(every & self.streams)
         scratch = SCRATCH_STREAMS if rest else 0
@@ -319,10 +401,19 @@ class Schedule:
         return before[0] + whole + self._copies(rest), max(before[1], part + self._copies(first))
 
     def _copies(self, operators: Sequence[Operator]) -> int:
-        """Arrays of the run's precision that whole streams and one mean take, float64, where a step does not know of means."""
+        """Arrays of the run's precision that whole streams and one mean take, float64, where a step
+        does not know of means.
+        """
         each = 8 // np.dtype(self.settings.dtype).itemsize
-        paying = [o for o in operators if (o.requires | o.optional) & self.means and not knows_means(o)]
-        return each * (1 + max(len(names_of(o, self.observation.signals) & self.streams) for o in paying)) if paying else 0
+        paying = [
+            o for o in operators if (o.requires | o.optional) & self.means and not knows_means(o)
+        ]
+        return (
+            each
+            * (1 + max(len(names_of(o, self.observation.signals) & self.streams) for o in paying))
+            if paying
+            else 0
+        )
 
     def _ceiling_for(self, need: int) -> str:
         """``--memory`` with which streams and blocks may take ``need`` bytes."""
@@ -332,11 +423,15 @@ class Schedule:
 
 
 def schedule(
-    chain: Chain, observation: Observation, settings: Settings, cost: Callable[[Planned], float] | None = None
+    chain: Chain,
+    observation: Observation,
+    settings: Settings,
+    cost: Callable[[Planned], float] | None = None,
 ) -> Schedule:
     """The schedule of an observation.
 
-    ``cost``: measures what a sample of a segment costs (CPU s); None: nothing is tried, neither operators nor the disk.
+    ``cost``: measures what a sample of a segment costs (CPU s); None: nothing is tried, neither
+    operators nor the disk.
 
     Raises
     ------

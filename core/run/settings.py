@@ -12,7 +12,9 @@ import numpy as np
 from ..types import AnyFloats
 
 Held = Literal["kept", "spilled", "again"]
-"""Streams between two segments: in memory, in a temporary file, or nowhere, to be made again block by block."""
+"""Streams between two segments: in memory, in a temporary file, or nowhere, to be made again block
+by block.
+"""
 
 
 @dataclass(frozen=True)
@@ -30,11 +32,13 @@ class Settings:
     dtype
         Type of the streams.
     asked
-        Bytes that were asked for (``--memory``), of which ``memory`` is what is left for streams and blocks.
+        Bytes that were asked for (``--memory``), of which ``memory`` is what is left for streams
+        and blocks.
     least
         Bytes of the smallest blocks on all ``threads``.
     prefer
-        What is done with streams that do not fit in memory where there is a choice; None: what is quicker.
+        What is done with streams that do not fit in memory where there is a choice; None: what is
+        quicker.
     progress
         Progress callback.
     spare
@@ -42,9 +46,11 @@ class Settings:
     kept
         Bytes of the streams of all scans that the user wants to have at the end.
     others
-        Bytes of the products of the other bands of a camera, which grow scan by scan beside those of this one.
+        Bytes of the products of the other bands of a camera, which grow scan by scan beside those
+        of this one.
     bands
-        Bands that hold streams and blocks at a time (`core.run.in_step`): ``memory`` is the part of one of them.
+        Bands that hold streams and blocks at a time (`core.run.in_step`): ``memory`` is the part of
+        one of them.
     """
 
     threads: int = 1

@@ -1,12 +1,13 @@
 """Which signals a pipeline makes, of which components, and which of them follow from others.
 
-With the complete data's modes and the same transmission of the atmosphere (``modes: full``) a pipeline of linear steps is a
-linear map L of the components. For a signal of the components C and others of P_1, P_2 ..., which together are all the rest,
+With the complete data's modes and the same transmission of the atmosphere (``modes: full``) a
+pipeline of linear steps is a linear map L of the components. For a signal of the components C and
+others of P_1, P_2 ..., which together are all the rest,
 
-    L(C) = L(all) - L(P_1) - L(P_2) - ...                                                                        (1)
+    L(C) = L(all) - L(P_1) - L(P_2) - ...                                                        (1)
 
-Such a *remainder* is neither formed nor filtered: its sums in the pixels of a map are those of the complete signal minus those of
-the others, exactly.
+Such a *remainder* is neither formed nor filtered: its sums in the pixels of a map are those of the
+complete signal minus those of the others, exactly.
 """
 
 from __future__ import annotations
@@ -20,7 +21,18 @@ from ..mapmaker import MapMaker, acts, changes_components, filters, forms, with_
 from ..observation import Observation
 from ..operator import Operator
 from ..output import Output
-from ..signal import BUILT_IN, MAIN, TRANSMISSION, Component, Formed, Signal, can_be_named, is_signal, needed_name, stream_of
+from ..signal import (
+    BUILT_IN,
+    MAIN,
+    TRANSMISSION,
+    Component,
+    Formed,
+    Signal,
+    can_be_named,
+    is_signal,
+    needed_name,
+    stream_of,
+)
 
 MOST_PARTS = 4
 """Signals that may be taken from the complete one: each adds its rounding."""
@@ -52,18 +64,31 @@ class Signals:
     formed
         Those that are made of their components, the complete one first.
     remainders
-        By name of the others: the names of the signals that are taken from the complete one, equation (1).
+        By name of the others: the names of the signals that are taken from the complete one,
+        equation (1).
     not_linear
-        Label of the first filter that is not linear; empty: all are. From there on signals with ``modes: full`` have modes of
-        their own, and there are no remainders.
+        Label of the first filter that is not linear; empty: all are. From there on signals with
+        ``modes: full`` have modes of their own, and there are no remainders.
     """
 
-    def __init__(self, operators: Sequence[Operator], runs: Mapping[str, Signal], only: Sequence[str], place: str) -> None:
+    def __init__(
+        self,
+        operators: Sequence[Operator],
+        runs: Mapping[str, Signal],
+        only: Sequence[str],
+        place: str,
+    ) -> None:
         self.operators, self.runs, self._place = list(operators), dict(runs), place
         self._generators = _generators(operators)
         former = next((o for o in operators if forms(o)), None)
-        self._inputs = frozenset[str]() if former is None else (former.requires | former.optional) - {"boresight"}
-        self.components = frozenset[Component]().union(*(self.components_of(o) for o in self._generators))
+        self._inputs = (
+            frozenset[str]()
+            if former is None
+            else (former.requires | former.optional) - {"boresight"}
+        )
+        self.components = frozenset[Component]().union(
+            *(self.components_of(o) for o in self._generators)
+        )
         self._only = Signal(only=list(only)) if only else None
         for name, signal in self.runs.items():
             if not can_be_named(name):
@@ -78,7 +103,9 @@ class Signals:
         self.not_linear = next((o.label for o in changing if not o.linear), "")
         labels = [o.label for o in changing]
         self._own = frozenset(labels[labels.index(self.not_linear) :] if self.not_linear else ())
-        self.all = {name: self._formed(name, signal) for name, signal in [("", None), *self.runs.items()]}
+        self.all = {
+            name: self._formed(name, signal) for name, signal in [("", None), *self.runs.items()]
+        }
         self.remainders = {} if self.not_linear else self._remainders()
         self.formed = tuple(f for name, f in self.all.items() if name not in self.remainders)
 
@@ -95,11 +122,14 @@ class Signals:
         return frozenset(o.label for o in self._generators if self._keeps(signal, o))
 
     def components_of(self, operator: Operator) -> frozenset[Component]:
-        """The components that a step makes: those of `core.signal`, and what the step that forms the signal reads."""
+        """The components that a step makes: those of `core.signal`, and what the step that forms
+        the signal reads.
+        """
         known = {*BUILT_IN, *(c for c in operator.provides if isinstance(c, Component))}
         made = operator.provides & (known | self._inputs)
         named = {c: c for c in known}
-        return frozenset(named.get(name) or Component(name) for name in made)  # type: ignore[call-overload]
+        found = (named.get(name) or Component(name) for name in made)  # type: ignore[call-overload]
+        return frozenset(found)
 
     def check_kept(self, streams: Sequence[str]) -> None:
         """Refuse to keep a stream that no step makes, or a signal that has none."""
@@ -111,13 +141,25 @@ class Signals:
             if not is_signal(stream):
                 have = sorted({*made, *self.components})
                 cure = nearest(stream, have) or f"there are: {', '.join(have)}"
-                raise PipelineError(f"the stream {stream!r} cannot be kept: no step makes it", place=self._place, cure=cure)
+                raise PipelineError(
+                    f"the stream {stream!r} cannot be kept: no step makes it",
+                    place=self._place,
+                    cure=cure,
+                )
             parts = self.remainders.get(stream.partition("/")[2], ())
-            what, cure = "there is no such signal", nearest(stream, made) or f"choose from: {', '.join(made)}"
+            what, cure = (
+                "there is no such signal",
+                nearest(stream, made) or f"choose from: {', '.join(made)}",
+            )
             if parts:
                 what = f"it is {remainder(parts)}, in the maps alone"
-                cure = f"keep {' and '.join([MAIN, *(stream_of(part) for part in parts)])}, and subtract"
-            raise PipelineError(f"the stream {stream!r} cannot be kept: {what}", place=self._place, cure=cure)
+                cure = (
+                    f"keep {' and '.join([MAIN, *(stream_of(part) for part in parts)])}, and"
+                    " subtract"
+                )
+            raise PipelineError(
+                f"the stream {stream!r} cannot be kept: {what}", place=self._place, cure=cure
+            )
 
     # ---- what a signal is
 
@@ -132,7 +174,13 @@ class Signals:
         if signal is not None and model and TRANSMISSION not in (signal.without or ()):
             components |= {c for c in self.components if c == TRANSMISSION}
         filtered = signal is None or signal.filters == "all"
-        return Formed(stream_of(name), components, model and len(kept) < len(self._generators), filtered, self._own)
+        return Formed(
+            stream_of(name),
+            components,
+            model and len(kept) < len(self._generators),
+            filtered,
+            self._own,
+        )
 
     def _is_left(self, signal: Signal) -> bool:
         """Whether a signal is another than the narrowed complete one, and not empty."""
@@ -143,18 +191,30 @@ class Signals:
     def _check_components(self, signal: Signal, who: str) -> None:
         for what in [*(signal.only or ()), *(signal.without or ())]:
             if what not in self.components:
-                cure = nearest(what, sorted(self.components)) or f"choose from: {', '.join(sorted(self.components))}"
-                raise PipelineError(f"{who} {what!r}, which no step provides", place=self._place, cure=cure)
+                cure = (
+                    nearest(what, sorted(self.components))
+                    or f"choose from: {', '.join(sorted(self.components))}"
+                )
+                raise PipelineError(
+                    f"{who} {what!r}, which no step provides", place=self._place, cure=cure
+                )
 
     def _add_needed(self, given: Mapping[str, Signal]) -> None:
-        """Find for each output the signals that it reads; add those that are not there. ``given``: those of the pipeline."""
+        """Find for each output the signals that it reads; add those that are not there. ``given``:
+        those of the pipeline.
+        """
         for operator in self.operators:
             if not isinstance(operator, Output):
                 continue
             for name in {*operator.named_signals()} - {"", *given}:
-                cure = nearest(name, sorted(given)) or f"add it to runs, e.g. `runs: {{{name}: {{without: [sky]}}}}`"
+                cure = (
+                    nearest(name, sorted(given))
+                    or f"add it to runs, e.g. `runs: {{{name}: {{without: [sky]}}}}`"
+                )
                 raise PipelineError(
-                    f"{operator.label} reads the signal {name!r}, which is not among runs", place=self._place, cure=cure
+                    f"{operator.label} reads the signal {name!r}, which is not among runs",
+                    place=self._place,
+                    cure=cure,
                 )
             names = []
             for wanted in operator.signals():
@@ -171,7 +231,9 @@ class Signals:
             operator._shown = tuple(names)
 
     def _kind(self, signal: Signal | None) -> tuple[frozenset[str], bool, bool]:
-        """What distinguishes signals: steps of components, filters, whether modes and transmission are the complete data's."""
+        """What distinguishes signals: steps of components, filters, whether modes and transmission
+        are the complete data's.
+        """
         kept = frozenset(o.label for o in self._generators if self._keeps(signal, o))
         changing = [o for o in self.operators if filters(o)]
         filtered = signal is None or signal.filters == "all" or not changing
@@ -183,7 +245,9 @@ class Signals:
 
     def _remainders(self) -> dict[str, tuple[str, ...]]:
         makers = [o for o in self.operators if isinstance(o, MapMaker)]
-        if not all(o.linear for o in makers) or not all(o.linear for o in self.operators if forms(o)):
+        if not all(o.linear for o in makers) or not all(
+            o.linear for o in self.operators if forms(o)
+        ):
             return {}
         every = self.makers("")
         made = {name: self.makers(name) for name in self.runs if self._fits(name)}
@@ -193,9 +257,16 @@ class Signals:
             if name in taken:
                 continue
             rest = every - made[name]
-            others = [other for other in made if other != name and other not in found and made[other] <= rest]
+            others = [
+                other
+                for other in made
+                if other != name and other not in found and made[other] <= rest
+            ]
             for parts in (p for n in range(1, MOST_PARTS + 1) for p in combinations(others, n)):
-                if sum(len(made[p]) for p in parts) == len(rest) and frozenset().union(*(made[p] for p in parts)) == rest:
+                if (
+                    sum(len(made[p]) for p in parts) == len(rest)
+                    and frozenset().union(*(made[p] for p in parts)) == rest
+                ):
                     found[name] = parts
                     taken.update(parts)
                     break
@@ -207,21 +278,36 @@ class Signals:
         names_it = TRANSMISSION in [*(signal.only or ()), *(signal.without or ())]
         narrowed = self._only is not None
         whole = kept == self.makers("")
-        return signal.modes == "full" and signal.filters == "all" and not names_it and bool(kept) and not whole and not narrowed
+        return (
+            signal.modes == "full"
+            and signal.filters == "all"
+            and not names_it
+            and bool(kept)
+            and not whole
+            and not narrowed
+        )
 
 
 def acting_steps(operators: Sequence[Operator]) -> list[Operator]:
-    """The operators that act on observations, and a `CalibratedSignal` where none of them forms a signal."""
+    """The operators that act on observations, and a `CalibratedSignal` where none of them forms a
+    signal.
+    """
     return with_calibrated_signal([o for o in operators if acts(o)])
 
 
-def note_signals(observations: Iterable[Observation], components: Iterable[str], formed: Iterable[Formed]) -> None:
+def note_signals(
+    observations: Iterable[Observation], components: Iterable[str], formed: Iterable[Formed]
+) -> None:
     """Note in observations which components there are and which signals are formed."""
     formed = list(formed)
     names, streams = frozenset(components), tuple(sorted(signal.stream for signal in formed))
     unfiltered = frozenset(signal.stream for signal in formed if not signal.filtered)
     for observation in observations:
-        observation.components, observation.signals, observation.unfiltered = names, streams, unfiltered
+        observation.components, observation.signals, observation.unfiltered = (
+            names,
+            streams,
+            unfiltered,
+        )
 
 
 def _generators(operators: Sequence[Operator]) -> list[Operator]:

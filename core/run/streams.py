@@ -1,15 +1,19 @@
-"""Where the streams between two segments stay: in memory, in a temporary file, or nowhere, to be made again block by block.
+"""Where the streams between two segments stay: in memory, in a temporary file, or nowhere, to be
+made again block by block.
 
-Making again needs no room and no disk: operators depend on absolute detectors and samples only, random numbers are counted, so
-the segments before can run once more for any block that a later segment or an `Operator.measure` reads. It costs their time
-once more for each reading. What is done follows from sizes, free disk and that cost:
+Making again needs no room and no disk: operators depend on absolute detectors and samples only,
+random numbers are counted, so the segments before can run once more for any block that a later
+segment or an `Operator.measure` reads. It costs their time once more for each reading. What is done
+follows from sizes, free disk and that cost:
 
-    kept      while all streams of an observation that are held at once take at most half of the budget, and leave
+    kept      while all streams of an observation that are held at once take at most half of the
+    budget, and leave
               room for blocks;
-    spilled   where the disk has room and 2 N b / D <= k N c / threads;                                      (1)
+    spilled   where the disk has room and 2 N b / D <= k N c / threads;   (1)
     again     otherwise,
 
-N samples of b bytes, D [B/s] the disk's rate, k the number of readings beyond the first, c [CPU s] what a sample costs.
+N samples of b bytes, D [B/s] the disk's rate, k the number of readings beyond the first, c [CPU s]
+what a sample costs.
 """
 
 from __future__ import annotations
@@ -38,7 +42,9 @@ DISK_RATE = 4e8
 """Bytes per second to and from the temporary folder where it is not measured."""
 
 WORTH_MEASURING = 1 << 30
-"""Bytes from which the disk's rate and the cost of a sample are measured before anything is decided."""
+"""Bytes from which the disk's rate and the cost of a sample are measured before anything is
+decided.
+"""
 
 SAMPLE_COST = 25e-9
 """CPU seconds to make a sample, where it is not measured."""
@@ -111,7 +117,9 @@ class Stage:
     @property
     def in_time_order(self) -> bool:
         """Whether it is much cheaper in order of time."""
-        return self.segment.in_time_order or bool(self.source.stage and self.source.stage.in_time_order)
+        return self.segment.in_time_order or bool(
+            self.source.stage and self.source.stage.in_time_order
+        )
 
     def has_been_swept(self) -> None:
         """Every sample was worked on."""
@@ -122,7 +130,9 @@ class Stage:
 
 @dataclass
 class Source:
-    """What a segment reads: streams that are held, or a stage that makes them; the mean emission that belongs to them."""
+    """What a segment reads: streams that are held, or a stage that makes them; the mean emission
+    that belongs to them.
+    """
 
     streams: dict[str, Stream] = field(default_factory=dict)
     stage: Stage | None = None
@@ -141,7 +151,9 @@ class Source:
 
 
 class StreamMadeAgain(Stream):
-    """A stream that is held nowhere: `sweep` makes it. ``sweeper`` is given what `sweep` is given."""
+    """A stream that is held nowhere: `sweep` makes it. ``sweeper`` is given what `sweep` is
+    given.
+    """
 
     def __init__(
         self,
@@ -150,7 +162,9 @@ class StreamMadeAgain(Stream):
         means: dict[str, SmoothField],
         threads: int,
         dtype: type[np.floating[Any]],
-        sweeper: Callable[[Callable[[slice, slice, AnyFloats], Any]], Iterator[tuple[slice, slice, Any]]],
+        sweeper: Callable[
+            [Callable[[slice, slice, AnyFloats], Any]], Iterator[tuple[slice, slice, Any]]
+        ],
     ) -> None:
         self.name, self.observation, self.means, self.threads = name, observation, means, threads
         self._dtype, self._sweeper = np.dtype(dtype), sweeper
@@ -174,16 +188,27 @@ class StreamMadeAgain(Stream):
         """Type of its values."""
         return self._dtype
 
-    def sweep(self, work: Callable[[slice, slice, AnyFloats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+    def sweep(
+        self, work: Callable[[slice, slice, AnyFloats], Any]
+    ) -> Iterator[tuple[slice, slice, Any]]:
         """See `Stream.sweep`."""
         return self._sweeper(work)
 
 
 class Store:
-    """Arrays for whole streams: in memory up to half of the budget, or in a temporary folder, removed at the end."""
+    """Arrays for whole streams: in memory up to half of the budget, or in a temporary folder,
+    removed at the end.
+    """
 
-    def __init__(self, memory: int, dtype: type[np.floating[Any]], spare: list[AnyFloats], ledger: Ledger) -> None:
-        self._room, self._dtype, self._spare, self._ledger = memory // 2, np.dtype(dtype), spare, ledger
+    def __init__(
+        self, memory: int, dtype: type[np.floating[Any]], spare: list[AnyFloats], ledger: Ledger
+    ) -> None:
+        self._room, self._dtype, self._spare, self._ledger = (
+            memory // 2,
+            np.dtype(dtype),
+            spare,
+            ledger,
+        )
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._live: dict[int, AnyFloats] = {}
 
@@ -200,8 +225,11 @@ class Store:
         """Whether ``size`` more bytes stay within the streams' share of the budget."""
         return self._in_use + size <= self._room
 
-    def allocate(self, name: str, shape: tuple[int, int], in_memory: bool = True, dtype: Any = None) -> AnyFloats:
-        """An array of anything; a memory map of a file where it does not fit or is not wanted in memory.
+    def allocate(
+        self, name: str, shape: tuple[int, int], in_memory: bool = True, dtype: Any = None
+    ) -> AnyFloats:
+        """An array of anything; a memory map of a file where it does not fit or is not wanted in
+        memory.
 
         ``dtype``: where it is not that of the streams.
         """
@@ -220,10 +248,14 @@ class Store:
         return array
 
     def release(self, arrays: list[AnyFloats]) -> None:
-        """Keep memory that is no longer used for the next stream: touching fresh memory costs as much as the physics."""
+        """Keep memory that is no longer used for the next stream: touching fresh memory costs as
+        much as the physics.
+        """
         for array in {id(a): a for a in arrays}.values():
             self._live.pop(id(array), None)
-            if not isinstance(array, np.memmap) and self.fits(array.nbytes + sum(a.nbytes for a in self._spare)):
+            if not isinstance(array, np.memmap) and self.fits(
+                array.nbytes + sum(a.nbytes for a in self._spare)
+            ):
                 self._spare.append(array)
         self._note()
 
@@ -268,7 +300,9 @@ class Store:
 
 
 def _reserve(handle: int, size: int) -> None:
-    """Give a file its size, and blocks on the disk: where the disk fills up later, writing to a mapping kills the process."""
+    """Give a file its size, and blocks on the disk: where the disk fills up later, writing to a
+    mapping kills the process.
+    """
     if size and hasattr(os, "posix_fallocate"):
         os.posix_fallocate(handle, 0, size)
     else:
@@ -278,8 +312,8 @@ def _reserve(handle: int, size: int) -> None:
 def columns(array: AnyFloats, samples: slice) -> AnyFloats:
     """(n_det, n) samples of all detectors as an array of its own.
 
-    A spilled stream's are read from its file: around each page that is touched in a mapping the system maps up to 64 kB, which is
-    most of a stream whose rows are that short.
+    A spilled stream's are read from its file: around each page that is touched in a mapping the
+    system maps up to 64 kB, which is most of a stream whose rows are that short.
     """
     if not isinstance(array, np.memmap):
         return np.array(array[:, samples], order="C")
@@ -287,12 +321,17 @@ def columns(array: AnyFloats, samples: slice) -> AnyFloats:
     whole, size = found.data.cast("B"), found.strides[0]
     with open(str(array.filename), "rb", buffering=0) as file:
         for row in range(array.shape[0]):
-            place, left = row * array.strides[0] + samples.start * array.itemsize, whole[row * size : (row + 1) * size]
+            place, left = (
+                row * array.strides[0] + samples.start * array.itemsize,
+                whole[row * size : (row + 1) * size],
+            )
             while left:
                 read = _read_at(file, left, place)
                 if not read:
                     cure = "do not change files in the temporary folder while zonda runs"
-                    raise OutputError("the temporary file was truncated", place=str(array.filename), cure=cure)
+                    raise OutputError(
+                        "the temporary file was truncated", place=str(array.filename), cure=cure
+                    )
                 place, left = place + read, left[read:]
     return found
 
@@ -356,15 +395,22 @@ def choose(
     if hindrance and size > disk:
         place, ceiling = refusal
         raise PipelineError(
-            f"{what} takes {size / 1e9:.3g} GB, which fit neither in memory nor on the disk ({disk / 1e9:.3g} GB free in "
-            f"{tempfile.gettempdir()}), and cannot be made again when it is read: {hindrance}",
+            f"{what} takes {size / 1e9:.3g} GB, which fit neither in memory nor on the disk"
+            f" ({disk / 1e9:.3g} GB free in {tempfile.gettempdir()}), and cannot be made again when"
+            f" it is read: {hindrance}",
             place=place,
-            cure=f"use --memory {ceiling}, or point TMPDIR to a larger disk, or split into shorter scans",
+            cure=(
+                f"use --memory {ceiling}, or point TMPDIR to a larger disk, or split into shorter"
+                " scans"
+            ),
         )
     if size > disk:
         return "again", f"{size / 1e9:.3g} GB; the disk has room for {disk / 1e9:.3g} GB"
     if hindrance:
         return "spilled", f"{size / 1e9:.2f} GB: {hindrance}"
     readings, each = again
-    costs = f"{size / 1e9:.3g} GB: about {spill_seconds:.2g} s by disk, {readings * each:.2g} s to make {readings} times more"
+    costs = (
+        f"{size / 1e9:.3g} GB: about {spill_seconds:.2g} s by disk, {readings * each:.2g} s to make"
+        f" {readings} times more"
+    )
     return (prefer or ("spilled" if spill_seconds <= readings * each else "again")), costs

@@ -1,13 +1,14 @@
 """Whole streams for steps that do not know of means (`Operator.knows_means`).
 
-Beside a stream x may stand a mean M, tens of kelvin (`Block.means`, ``observation.smooth["atmosphere"]``). A step f that does not
-say that it knows of means is given all of the stream, in float64; the same mean is subtracted from what it makes of it, which is
-then rounded once to the precision of the run:
+Beside a stream x may stand a mean M, tens of kelvin (`Block.means`,
+``observation.smooth["atmosphere"]``). A step f that does not say that it knows of means is given
+all of the stream, in float64; the same mean is subtracted from what it makes of it, which is then
+rounded once to the precision of the run:
 
-    y = round(f(x + M) - M)                                                                                      (1)
+    y = round(f(x + M) - M)                                                                      (1)
 
-In float32, x + M itself would lose microkelvins. M has the same bits in every block, so that y does not depend on the blocks.
-What the step only reads is not written back.
+In float32, x + M itself would lose microkelvins. M has the same bits in every block, so that y does
+not depend on the blocks. What the step only reads is not written back.
 """
 
 from __future__ import annotations
@@ -26,14 +27,20 @@ from ..signal import MAIN
 from ..types import AnyFloats
 
 EMISSION = "atmosphere"
-"""The stream whose mean is in ``observation.smooth``, where calibration and noise models find it, too."""
+"""The stream whose mean is in ``observation.smooth``, where calibration and noise models find it,
+too.
+"""
 
 
 def knows_means(operator: Operator) -> bool:
-    """Whether it handles means itself. A class that overrides `exec` or `measure` of one that does must say so anew."""
+    """Whether it handles means itself. A class that overrides `exec` or `measure` of one that does
+    must say so anew.
+    """
     order = type(operator).__mro__
     says = next(n for n, c in enumerate(order) if "knows_means" in vars(c))
-    does = next((n for n, c in enumerate(order) if {"exec", "measure"} & vars(c).keys()), len(order))
+    does = next(
+        (n for n, c in enumerate(order) if {"exec", "measure"} & vars(c).keys()), len(order)
+    )
     return bool(operator.knows_means) and says <= does
 
 
@@ -44,12 +51,18 @@ def names_of(operator: Operator, signals: Sequence[str]) -> frozenset[str]:
 
 
 def may_have_means(operators: Sequence[Operator]) -> frozenset[str]:
-    """Streams beside which a mean may stand, known before anything runs: steps that know of means put it there."""
+    """Streams beside which a mean may stand, known before anything runs: steps that know of means
+    put it there.
+    """
     return frozenset({EMISSION}).union(*(o.provides for o in operators if knows_means(o)))
 
 
-def means_of(observation: Observation, means: Mapping[str, SmoothField], names: frozenset[str]) -> dict[str, SmoothField]:
-    """The means of those of the streams ``names`` that have one; ``means``: `Block.means` or `Stream.means`."""
+def means_of(
+    observation: Observation, means: Mapping[str, SmoothField], names: frozenset[str]
+) -> dict[str, SmoothField]:
+    """The means of those of the streams ``names`` that have one; ``means``: `Block.means` or
+    `Stream.means`.
+    """
     found = {name: field for name, field in means.items() if name in names}
     if EMISSION in names and EMISSION in observation.smooth:
         found.setdefault(EMISSION, observation.smooth[EMISSION])
@@ -76,9 +89,15 @@ def exec_whole(
     """
     means = {name: field for name, field in block.means.items() if name not in fields}
     whole = Block(
-        block.observation, block.detectors, block.samples, means=means, dtype=np.float64, buffers=buffers, again=block.again,
+        block.observation,
+        block.detectors,
+        block.samples,
+        means=means,
+        dtype=np.float64,
+        buffers=buffers,
+        again=block.again,
         components=block.components,
-    )  # fmt: skip
+    )
     names = names_of(operator, block.signals)
     for name, stream in block.detdata.items():
         whole.detdata[name] = stream
@@ -97,7 +116,9 @@ def exec_whole(
         elif name in fields and name not in whole.means:
             mean = whole.buffer("(mean)", block.shape)
             fields[name].evaluate(block.detectors, block.samples, out=mean)
-            np.subtract(whole.detdata[name], mean, out=block.new(name, zero=False), casting="same_kind")
+            np.subtract(
+                whole.detdata[name], mean, out=block.new(name, zero=False), casting="same_kind"
+            )
         else:
             block.new(name, zero=False)[...] = whole.detdata[name]
     for name in means.keys() - whole.means.keys():
@@ -116,14 +137,23 @@ class WholeStream(Stream):
         Gives an array of a shape for all of it, where somebody wants it as one.
     """
 
-    def __init__(self, stream: Stream, field: SmoothField, allocate: Callable[[tuple[int, ...]], AnyFloats]) -> None:
-        self.name, self.observation, self.threads, self.room = stream.name, stream.observation, stream.threads, stream.room
+    def __init__(
+        self, stream: Stream, field: SmoothField, allocate: Callable[[tuple[int, ...]], AnyFloats]
+    ) -> None:
+        self.name, self.observation, self.threads, self.room = (
+            stream.name,
+            stream.observation,
+            stream.threads,
+            stream.room,
+        )
         self.means = {name: other for name, other in stream.means.items() if name != stream.name}
         self._stream, self._field, self._allocate = stream, field, allocate
 
     @cached_property
     def array(self) -> AnyFloats:  # type: ignore[override]
-        """(n_det, n_samp) float64; where the stream is made again when it is read, as there: refused."""
+        """(n_det, n_samp) float64; where the stream is made again when it is read, as there:
+        refused.
+        """
         whole = self._allocate(self._stream.array.shape)
         for detectors, samples, part in self.sweep(lambda detectors, samples, part: part):
             whole[detectors, samples] = part
@@ -139,7 +169,9 @@ class WholeStream(Stream):
         """float64."""
         return np.dtype(np.float64)
 
-    def sweep(self, work: Callable[[slice, slice, AnyFloats], Any]) -> Iterator[tuple[slice, slice, Any]]:
+    def sweep(
+        self, work: Callable[[slice, slice, AnyFloats], Any]
+    ) -> Iterator[tuple[slice, slice, Any]]:
         """See `Stream.sweep`."""
 
         def of_whole(detectors: slice, samples: slice, part: AnyFloats) -> Any:

@@ -1,4 +1,6 @@
-"""Small tables as text: ECSV (Astropy enhancement proposal 6), a CSV file with units, descriptions and provenance on top."""
+"""Small tables as text: ECSV (Astropy enhancement proposal 6), a CSV file with units, descriptions
+and provenance on top.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ LARGEST = 1 << 28
 
 @dataclass(frozen=True)
 class Column:
-    """Name, values (n,) (numbers, or all of them texts), FITS unit (empty: none) and description."""
+    """Name, values (n,) (numbers, or all of them texts), FITS unit (empty: none) and
+    description.
+    """
 
     name: str
     values: Any
@@ -37,7 +41,10 @@ def write_ecsv(path: str | Path, columns: Sequence[Column], meta: Mapping[str, A
     for c in columns:
         unit = f"unit: {c.unit}, " if c.unit else ""
         kind = "string" if any(isinstance(v, str) for v in c.values) else "float64"
-        head.append(f"- {{name: {c.name}, {unit}datatype: {kind}, description: {json.dumps(c.description)}}}")
+        head.append(
+            f"- {{name: {c.name}, {unit}datatype: {kind}, description:"
+            f" {json.dumps(c.description)}}}"
+        )
     head.append("meta: !!omap")
     head += [f"- {{{json.dumps(key)}: {json.dumps(value)}}}" for key, value in meta.items()]
     head.append("schema: astropy-2.0")
@@ -85,7 +92,8 @@ class Table:
     def numbers(self, name: str, unit: str = "") -> NDArray[np.float64]:
         """A column of finite numbers, in ``unit``; where that is empty, the column has none.
 
-        Raises `TableError` for a column without a unit, of another kind, and for every row that is not a finite number.
+        Raises `TableError` for a column without a unit, of another kind, and for every row that is
+        not a finite number.
         """
         texts, mistakes = self.texts(name), Mistakes(self.place)
         factor = 1.0
@@ -99,7 +107,9 @@ class Table:
         return values * factor
 
     def values(self, name: str) -> NDArray[np.float64]:
-        """A column as numbers, in the unit in which it is written; NaN where it has another text."""
+        """A column as numbers, in the unit in which it is written; NaN where it has another
+        text.
+        """
         return np.array([_number(text) for text in self.texts(name)])
 
     def _factor(self, name: str, written: str, unit: str) -> float:
@@ -110,15 +120,24 @@ class Table:
         named = KINDS[unit].display if unit in KINDS else (unit,)
         accepted = f"{', '.join(named[:-1])} or {named[-1]}" if len(named) > 1 else unit
         if not written:
-            cure = f"give it in {accepted}: in ECSV 'unit: {named[0]}', in CSV a heading such as {name} [{named[0]}]"
+            cure = (
+                f"give it in {accepted}: in ECSV 'unit: {named[0]}', in CSV a heading such as"
+                f" {name} [{named[0]}]"
+            )
             raise TableError(self.place, [(self.lines[-1], f"{name} has no unit", cure)])
         from astropy import units
 
         try:
             return float(units.Unit(written).to(units.Unit(unit)))
         except (ValueError, units.UnitConversionError):
-            cure = f"give it in {accepted}, or another unit of its kind" if unit else "leave the unit out"
-            raise TableError(self.place, [(self.lines[-1], f"{name} has the unit {written!r}", cure)]) from None
+            cure = (
+                f"give it in {accepted}, or another unit of its kind"
+                if unit
+                else "leave the unit out"
+            )
+            raise TableError(
+                self.place, [(self.lines[-1], f"{name} has the unit {written!r}", cure)]
+            ) from None
 
 
 def _number(text: str) -> float:
@@ -130,14 +149,22 @@ def _number(text: str) -> float:
 
 
 def read_table(path: Path) -> Table:
-    """Read ECSV, or CSV whose first line names the columns, with units in brackets: ``ra [deg], dec [deg]``.
+    """Read ECSV, or CSV whose first line names the columns, with units in brackets: ``ra [deg], dec
+    [deg]``.
 
-    Raises InputError for another kind of file, rows of unequal length, columns of one name, or a table without rows.
+    Raises InputError for another kind of file, rows of unequal length, columns of one name, or a
+    table without rows.
     """
     place = str(path)
-    with reading(place, "a table", "give ECSV, or CSV whose first line names the columns, with their units in brackets"):
+    with reading(
+        place,
+        "a table",
+        "give ECSV, or CSV whose first line names the columns, with their units in brackets",
+    ):
         if path.stat().st_size > LARGEST:
-            raise InputError(f"is larger than {LARGEST >> 20} MB", place=place, cure="give a small table")
+            raise InputError(
+                f"is larger than {LARGEST >> 20} MB", place=place, cure="give a small table"
+            )
         text = path.read_text(encoding="utf-8-sig")
     names, units, rows, lines = _ecsv(text, place) if text.startswith("# %ECSV") else _csv(text)
     mistakes = Mistakes(place)
@@ -160,19 +187,39 @@ Written = tuple[list[str], list[str], Cells, list[int]]
 
 
 def _csv(text: str) -> Written:
-    """CSV. The heading is the first line that is no comment; where that has numbers, a comment above with as many fields."""
+    """CSV. The heading is the first line that is no comment; where that has numbers, a comment
+    above with as many fields.
+    """
     written = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    numbers, rows = _cells([(number, line) for number, line in written if not line.startswith("#")], ",")
+    numbers, rows = _cells(
+        [(number, line) for number, line in written if not line.startswith("#")], ","
+    )
     if rows and any(math.isfinite(_number(cell)) for cell in rows[0]):
-        above = [(number, line.lstrip("# ")) for number, line in written if line.startswith("#") and number < numbers[0]]
-        fitting = [(number, row) for number, row in zip(*_cells(above, ","), strict=True) if len(row) == len(rows[0])]
+        above = [
+            (number, line.lstrip("# "))
+            for number, line in written
+            if line.startswith("#") and number < numbers[0]
+        ]
+        fitting = [
+            (number, row)
+            for number, row in zip(*_cells(above, ","), strict=True)
+            if len(row) == len(rows[0])
+        ]
         with_units = [(number, row) for number, row in fitting if any("[" in cell for cell in row)]
         if fitting:
             number, heading = (with_units or fitting)[-1]
             numbers, rows = [number, *numbers], [heading, *rows]
     named = [word.partition("[") for word in (rows[0] if rows else [])]
-    names, units = [name.strip() for name, _, _ in named], [unit.strip("] ") for _, _, unit in named]
-    return names, units, [[cell.strip() for cell in row] for row in rows[1:]], [*numbers[1:], *(numbers[:1] or [1])]
+    names, units = (
+        [name.strip() for name, _, _ in named],
+        [unit.strip("] ") for _, _, unit in named],
+    )
+    return (
+        names,
+        units,
+        [[cell.strip() for cell in row] for row in rows[1:]],
+        [*numbers[1:], *(numbers[:1] or [1])],
+    )
 
 
 def _cells(lines: Sequence[tuple[int, str]], comma: str) -> tuple[list[int], Cells]:
@@ -190,8 +237,14 @@ def _ecsv(text: str, place: str) -> Written:
         lines = text.splitlines()
         head = [line[2:] for line in lines if line.startswith("# ")]
         document = yaml.safe_load(_without_meta(head[1:]))
-        described = {str(column["name"]): str(column.get("unit", "")) for column in document["datatype"]}
-        body = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+        described = {
+            str(column["name"]): str(column.get("unit", "")) for column in document["datatype"]
+        }
+        body = [
+            (number, line)
+            for number, line in enumerate(lines, 1)
+            if line.strip() and not line.startswith("#")
+        ]
         numbers, rows = _cells(body, str(document.get("delimiter", " ")))
         names = rows[0]
         units = [described[name] for name in names]

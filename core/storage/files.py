@@ -1,4 +1,6 @@
-"""Reading and writing files: a product is there whole or not at all, and a failure says what to do about it."""
+"""Reading and writing files: a product is there whole or not at all, and a failure says what to do
+about it.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +18,23 @@ from ..errors import InputError, OutputError, ZondaError
 _CURES = {
     errno.ENOSPC: ("no space left on the disk", "free some space or choose another output folder"),
     errno.EDQUOT: ("the disk quota is used up", "free some space or choose another output folder"),
-    errno.EFBIG: ("the file grew beyond what this file system allows", "choose another output folder or write fewer streams"),
+    errno.EFBIG: (
+        "the file grew beyond what this file system allows",
+        "choose another output folder or write fewer streams",
+    ),
     errno.EACCES: ("permission denied", "choose an output folder that you may write to"),
     errno.EPERM: ("permission denied", "choose an output folder that you may write to"),
     errno.EROFS: ("the file system is read-only", "choose another output folder"),
     errno.EISDIR: ("there is a folder of that name", "remove it or choose another output folder"),
-    errno.ENOTDIR: ("a part of the path is a file, not a folder", "remove that file or choose another output folder"),
+    errno.ENOTDIR: (
+        "a part of the path is a file, not a folder",
+        "remove that file or choose another output folder",
+    ),
     errno.EEXIST: ("there is a file of that name", "remove it or choose another output folder"),
-    errno.ENOENT: ("the folder does not exist", "it may have been removed during the run: make it again or choose another one"),
+    errno.ENOENT: (
+        "the folder does not exist",
+        "it may have been removed during the run: make it again or choose another one",
+    ),
     errno.ENAMETOOLONG: ("the name is too long", "choose a shorter name"),
 }
 
@@ -33,7 +44,8 @@ MOST_AT_ONCE = 4
 
 
 def output_error(error: OSError, path: str | os.PathLike[str]) -> OutputError:
-    """The `OutputError` that tells the user what an operating-system error on ``path`` means and how to mend it.
+    """The `OutputError` that tells the user what an operating-system error on ``path`` means and
+    how to mend it.
 
     HDF5 reports a full disk without an error number: its message text is read instead.
     """
@@ -42,7 +54,10 @@ def output_error(error: OSError, path: str | os.PathLike[str]) -> OutputError:
         number = int(match.group(1))
     if number is None and "no space left" in str(error).lower():
         number = errno.ENOSPC
-    fallback = (str(error).splitlines()[0] if str(error) else type(error).__name__, "choose another output folder")
+    fallback = (
+        str(error).splitlines()[0] if str(error) else type(error).__name__,
+        "choose another output folder",
+    )
     cause, cure = _CURES.get(number or 0, fallback)
     return OutputError(f"cannot be written: {cause}", place=str(path), cure=cure)
 
@@ -60,7 +75,8 @@ def writing(path: str | os.PathLike[str]) -> Iterator[None]:
 def reading(place: str, kind: str, cure: str) -> Iterator[None]:
     """Raise an `InputError` for whatever reading a file of foreign bytes raises in the body.
 
-    Libraries meet corrupt bytes with nearly every exception there is, so all are caught: keep only the reading in the body.
+    Libraries meet corrupt bytes with nearly every exception there is, so all are caught: keep only
+    the reading in the body.
 
     Parameters
     ----------
@@ -76,21 +92,33 @@ def reading(place: str, kind: str, cure: str) -> Iterator[None]:
     except ZondaError:
         raise
     except FileNotFoundError as error:
-        raise InputError("there is no such file", place=place, cure=_whereabouts(error.filename)) from error
+        raise InputError(
+            "there is no such file", place=place, cure=_whereabouts(error.filename)
+        ) from error
     except IsADirectoryError as error:
-        raise InputError("is a folder, not a file", place=place, cure="give the file's path") from error
+        raise InputError(
+            "is a folder, not a file", place=place, cure="give the file's path"
+        ) from error
     except PermissionError as error:
         raise InputError("permission denied", place=place, cure="make the file readable") from error
     except KeyError as error:
-        raise InputError(f"is incomplete or corrupt: {error.args[0] if error.args else ''}", place=place, cure=cure) from error
+        raise InputError(
+            f"is incomplete or corrupt: {error.args[0] if error.args else ''}",
+            place=place,
+            cure=cure,
+        ) from error
     except MemoryError as error:
         raise InputError("needs more memory than there is", place=place, cure=cure) from error
     except Exception as error:
-        raise InputError(f"cannot be read as {kind}: {first_line(error)}", place=place, cure=cure) from error
+        raise InputError(
+            f"cannot be read as {kind}: {first_line(error)}", place=place, cure=cure
+        ) from error
 
 
 def _whereabouts(path: str | bytes | int | None) -> str:
-    """What to do about a path where nothing is: a name in its folder that is near, or the folder that is missing."""
+    """What to do about a path where nothing is: a name in its folder that is near, or the folder
+    that is missing.
+    """
     otherwise = "check the path; if it was there before, it has been moved or removed"
     if not isinstance(path, (str, bytes)):
         return otherwise
@@ -106,25 +134,36 @@ def _whereabouts(path: str | bytes | int | None) -> str:
 
 @contextlib.contextmanager
 def own_data(path: Path) -> Iterator[Any]:
-    """A numpy archive that comes with zonda. Raises `InputError` where it is missing or damaged (its checksums are tested)."""
+    """A numpy archive that comes with zonda. Raises `InputError` where it is missing or damaged
+    (its checksums are tested).
+    """
     import numpy as np
 
     cure = "the installation is damaged: pip install --force-reinstall zonda"
     try:
-        with reading(f"data file {path}", "a numpy archive", cure), np.load(path, allow_pickle=False) as archive:
+        with (
+            reading(f"data file {path}", "a numpy archive", cure),
+            np.load(path, allow_pickle=False) as archive,
+        ):
             yield archive
     except InputError as error:
         raise InputError(error.message, place=error.place, cure=cure) from error
 
 
 def first_line(error: Exception) -> str:
-    """The line of an error's text that says why: wcslib begins with the line of its own source code."""
-    lines = [line for line in str(error).splitlines() if line.strip() and not line.startswith("ERROR ")]
+    """The line of an error's text that says why: wcslib begins with the line of its own source
+    code.
+    """
+    lines = [
+        line for line in str(error).splitlines() if line.strip() and not line.startswith("ERROR ")
+    ]
     return (lines or [type(error).__name__])[0].strip().rstrip(".")[:300]
 
 
 def check_memory(size: int, what: str, place: str) -> None:
-    """Refuse to read ``what`` of ``size`` bytes where that is more than the machine has free (`InputError`)."""
+    """Refuse to read ``what`` of ``size`` bytes where that is more than the machine has free
+    (`InputError`).
+    """
     from ..machine import available_memory
 
     free = available_memory()
@@ -132,18 +171,26 @@ def check_memory(size: int, what: str, place: str) -> None:
         raise InputError(
             f"{what} needs {size / 1e9:.3g} GB of memory, {free / 1e9:.3g} GB are free",
             place=place,
-            cure="if the file should be smaller it is corrupt: copy it again; else give a smaller one or a larger machine",
+            cure=(
+                "if the file should be smaller it is corrupt: copy it again; else give a smaller"
+                " one or a larger machine"
+            ),
         )
 
 
 def temporary_sibling(path: str | os.PathLike[str]) -> Path:
-    """A hidden name beside ``path``, with its suffix (writers choose the format by it), that no other run uses."""
+    """A hidden name beside ``path``, with its suffix (writers choose the format by it), that no
+    other run uses.
+    """
     path = Path(path)
-    return path.with_name(f".{path.stem[:100]}.{os.getpid()}-{secrets.token_hex(4)}.part{path.suffix}")
+    return path.with_name(
+        f".{path.stem[:100]}.{os.getpid()}-{secrets.token_hex(4)}.part{path.suffix}"
+    )
 
 
 def put(path: Path, content: bytes) -> None:
-    """Write a file for later runs, whole or not at all, readable by all and written by this user alone; raises OSError.
+    """Write a file for later runs, whole or not at all, readable by all and written by this user
+    alone; raises OSError.
 
     Unlike a product it need not outlive a crash of the machine: nothing waits for the disk.
     """
@@ -151,7 +198,9 @@ def put(path: Path, content: bytes) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(content)
-        temporary.chmod(0o644)  # whatever the umask: compiled code that others may write to is not read
+        temporary.chmod(
+            0o644
+        )  # whatever the umask: compiled code that others may write to is not read
         os.replace(temporary, path)
     except BaseException:
         discard(temporary)
@@ -159,7 +208,9 @@ def put(path: Path, content: bytes) -> None:
 
 
 def publish(temporary: Path, path: str | os.PathLike[str]) -> None:
-    """Move a finished temporary file to its name in one step. Raises `OutputError`; the temporary file is gone either way."""
+    """Move a finished temporary file to its name in one step. Raises `OutputError`; the temporary
+    file is gone either way.
+    """
     try:
         with writing(path):
             _synchronize(temporary)
@@ -177,12 +228,14 @@ def discard(temporary: Path) -> None:
 
 @contextlib.contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary sibling of ``path`` to write to: renamed to ``path`` on success, removed on any failure or Ctrl-C.
+    """A temporary sibling of ``path`` to write to: renamed to ``path`` on success, removed on any
+    failure or Ctrl-C.
 
     Raises
     ------
     OutputError
-        For every operating-system error in the body (disk full, not writable, a folder in the way), with place and cure.
+        For every operating-system error in the body (disk full, not writable, a folder in the way),
+        with place and cure.
     """
     path = Path(path)
     temporary = temporary_sibling(path)
@@ -206,25 +259,35 @@ def write_text(path: str | os.PathLike[str], text: str) -> Path:
 
 
 def product_path(folder: str | os.PathLike[str], name: str, suffix: str = "") -> Path:
-    """Path of a product called ``name`` in ``folder``: it never leaves the folder and is a legal file name everywhere.
+    """Path of a product called ``name`` in ``folder``: it never leaves the folder and is a legal
+    file name everywhere.
 
-    Slashes become underscores, other unusual characters dashes; ``../../etc/passwd`` becomes ``etc_passwd``.
+    Slashes become underscores, other unusual characters dashes; ``../../etc/passwd`` becomes
+    ``etc_passwd``.
     """
     stem = re.sub(r"[^\w.+=@-]+", "-", name.replace("\\", "/").replace("/", "_")).strip("._- ")
     if not stem:
-        raise OutputError(f"{name!r} cannot name a file", place=str(folder), cure="use letters, digits, '-' and '_'")
+        raise OutputError(
+            f"{name!r} cannot name a file",
+            place=str(folder),
+            cure="use letters, digits, '-' and '_'",
+        )
     return Path(folder) / f"{stem[:180]}{suffix}"
 
 
 def make_folder(path: str | os.PathLike[str]) -> Path:
-    """Make a folder and those above it; its path. Raises OSError, and `OutputError` where the file system takes no new ones."""
+    """Make a folder and those above it; its path. Raises OSError, and `OutputError` where the file
+    system takes no new ones.
+    """
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except FileNotFoundError as error:
         above = next(parent for parent in folder.absolute().parents if parent.is_dir())
         cure = "choose another output folder"
-        raise OutputError(f"cannot be made: {above} takes no new folders", place=str(folder), cure=cure) from error
+        raise OutputError(
+            f"cannot be made: {above} takes no new folders", place=str(folder), cure=cure
+        ) from error
     return folder
 
 
@@ -237,7 +300,9 @@ def check_output_folder(path: str | os.PathLike[str]) -> Path:
         Not creatable, not writable, a file in its place, or no space for even a small file.
     """
     folder = Path(path)
-    probe = temporary_sibling(folder / "probe")  # where a kill leaves one, a campaign finds it by this name
+    probe = temporary_sibling(
+        folder / "probe"
+    )  # where a kill leaves one, a campaign finds it by this name
     try:
         with writing(folder):
             make_folder(folder)

@@ -20,14 +20,20 @@ COMPRESSED = (".gz", ".bz2", ".xz", ".z", ".zip")
 """Suffixes of files whose length says nothing about what is in them."""
 
 FIELDS_MAX = 999
-"""Axes of an array, and columns of a table, that FITS 4.0 allows (4.4.1, 7.3.1); astropy loops over what is claimed."""
+"""Axes of an array, and columns of a table, that FITS 4.0 allows (4.4.1, 7.3.1); astropy loops over
+what is claimed.
+"""
 HEADER_MAX = 10_000_000
 """Bytes of one header: 125 000 cards."""
 
 
 @contextlib.contextmanager
-def opened(path: str | os.PathLike[str], place: str, cure: str, kind: str = "FITS") -> Iterator[Any]:
-    """An `astropy.io.fits.HDUList` to read from; whatever goes wrong in the body is an `InputError` about ``place``."""
+def opened(
+    path: str | os.PathLike[str], place: str, cure: str, kind: str = "FITS"
+) -> Iterator[Any]:
+    """An `astropy.io.fits.HDUList` to read from; whatever goes wrong in the body is an `InputError`
+    about ``place``.
+    """
     with reading(place, kind, cure):
         from astropy.io import fits
         from astropy.utils.exceptions import AstropyWarning
@@ -40,8 +46,8 @@ def opened(path: str | os.PathLike[str], place: str, cure: str, kind: str = "FIT
 
 
 def check_size(path: str | os.PathLike[str], hdu: Any, place: str, *, whole: bool = True) -> None:
-    """Before data are read: OSError where the file ends before them, `InputError` where, read ``whole``, they need more memory
-    than is free."""
+    """Before data are read: OSError where the file ends before them, `InputError` where, read
+    ``whole``, they need more memory than is free."""
     size = _data_bytes(hdu.header)
     tiled = hdu.header.get("ZIMAGE") or type(hdu).__name__ == "CompImageHDU"
     if tiled and size > packed.UNPACKED_MAX:
@@ -53,14 +59,17 @@ def check_size(path: str | os.PathLike[str], hdu: Any, place: str, *, whole: boo
         return
     needed, found = info["datLoc"] + size, os.path.getsize(path)
     if found < needed:
-        raise OSError(f"the file is truncated: {found} bytes, its header promises at least {needed}")
+        raise OSError(
+            f"the file is truncated: {found} bytes, its header promises at least {needed}"
+        )
 
 
 def _survey(path: str | os.PathLike[str], place: str) -> Any:
-    """What astropy may open: the path, or what was in an xz file or a zip archive (astropy would unpack it to a temporary file).
+    """What astropy may open: the path, or what was in an xz file or a zip archive (astropy would
+    unpack it to a temporary file).
 
-    Refused are headers that would keep a reader busy without end, and compressed files whose headers lead beyond
-    `packed.UNPACKED_MAX` (`InputError`); what else is wrong is left to astropy.
+    Refused are headers that would keep a reader busy without end, and compressed files whose
+    headers lead beyond `packed.UNPACKED_MAX` (`InputError`); what else is wrong is left to astropy.
     """
     content, compressed = packed.stream(path, place)
     with content as file:
@@ -90,20 +99,35 @@ def _next_header(file: IO[bytes], place: str) -> int:
                 key, value = match[1], int(match[2][:20])
                 found.setdefault(key, value)
                 if key in (b"NAXIS", b"TFIELDS") and value > FIELDS_MAX:
-                    message = f"{key.decode()} = {value}, more than the {FIELDS_MAX} that FITS allows"
-                    raise InputError(message, place=place, cure="the file is corrupt: copy or make it again")
+                    message = (
+                        f"{key.decode()} = {value}, more than the {FIELDS_MAX} that FITS allows"
+                    )
+                    raise InputError(
+                        message, place=place, cure="the file is corrupt: copy or make it again"
+                    )
             if _END.match(card):
-                size = math.prod(found.get(b"NAXIS%d" % k, 0) for k in range(1, found.get(b"NAXIS", 0) + 1))
+                size = math.prod(
+                    found.get(b"NAXIS%d" % k, 0) for k in range(1, found.get(b"NAXIS", 0) + 1)
+                )
                 size = size if found.get(b"NAXIS", 0) > 0 else 0
-                size = abs(found.get(b"BITPIX", 8)) // 8 * found.get(b"GCOUNT", 1) * (size + found.get(b"PCOUNT", 0))
+                size = (
+                    abs(found.get(b"BITPIX", 8))
+                    // 8
+                    * found.get(b"GCOUNT", 1)
+                    * (size + found.get(b"PCOUNT", 0))
+                )
                 if size < 0:  # astropy would go back in the file and never come to its end
                     message = "a header claims data of a negative length (NAXISn, PCOUNT, GCOUNT)"
-                    raise InputError(message, place=place, cure="the file is corrupt: copy or make it again")
+                    raise InputError(
+                        message, place=place, cure="the file is corrupt: copy or make it again"
+                    )
                 return 2880 + size if size < 2**62 else 0
         if len(block) < 2880:
             return 0
     raise InputError(
-        f"a header is longer than {HEADER_MAX / 1e6:g} MB", place=place, cure="the file is corrupt: copy or make it again"
+        f"a header is longer than {HEADER_MAX / 1e6:g} MB",
+        place=place,
+        cure="the file is corrupt: copy or make it again",
     )
 
 

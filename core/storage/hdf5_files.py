@@ -1,4 +1,6 @@
-"""HDF5 files from elsewhere: opened for reading, whole in themselves, and no larger in memory than what they can hold."""
+"""HDF5 files from elsewhere: opened for reading, whole in themselves, and no larger in memory than
+what they can hold.
+"""
 
 from __future__ import annotations
 
@@ -23,16 +25,20 @@ PATIENCE = 60.0
 
 @contextlib.contextmanager
 def opened(path: str | os.PathLike[str], place: str, kind: str, cure: str) -> Iterator[Any]:
-    """An `h5py.File` to read from; whatever goes wrong in the body is an `InputError` about ``place``.
+    """An `h5py.File` to read from; whatever goes wrong in the body is an `InputError` about
+    ``place``.
 
-    External links, data kept in other files and virtual data sets are refused: a file must not make zonda open others.
+    External links, data kept in other files and virtual data sets are refused: a file must not make
+    zonda open others.
     """
     with reading(place, kind, cure), checked(path, place, cure) as file:
         yield file
 
 
 def checked(path: str | os.PathLike[str], place: str, cure: str) -> Any:
-    """As `opened`, for as long as the caller keeps the `h5py.File` open; errors are those of h5py, but for files that harm."""
+    """As `opened`, for as long as the caller keeps the `h5py.File` open; errors are those of h5py,
+    but for files that harm.
+    """
     import h5py
 
     survey(path, place, cure)
@@ -46,28 +52,41 @@ def checked(path: str | os.PathLike[str], place: str, cure: str) -> Any:
 
 
 def survey(path: str | os.PathLike[str], place: str, cure: str) -> None:
-    """Let a process of its own look at the file first (`hdf5_survey`). `InputError` where that hangs, crashes or fails."""
+    """Let a process of its own look at the file first (`hdf5_survey`). `InputError` where that
+    hangs, crashes or fails.
+    """
     with open(path, "rb"):  # not there, not readable: OSError says so
         pass
-    command = children.command("zonda.core.storage.hdf5_survey", "main", os.path.abspath(os.fspath(path)))
+    command = children.command(
+        "zonda.core.storage.hdf5_survey", "main", os.path.abspath(os.fspath(path))
+    )
     try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=PATIENCE)
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=PATIENCE
+        )
     except subprocess.TimeoutExpired:
-        raise InputError("is corrupt: the HDF5 library does not come to an end with it", place=place, cure=cure) from None
+        raise InputError(
+            "is corrupt: the HDF5 library does not come to an end with it", place=place, cure=cure
+        ) from None
     if done.returncode < 0:
-        raise InputError(f"is corrupt: the HDF5 library crashes on it (signal {-done.returncode})", place=place, cure=cure)
+        raise InputError(
+            f"is corrupt: the HDF5 library crashes on it (signal {-done.returncode})",
+            place=place,
+            cure=cure,
+        )
     if done.returncode:
         said = (done.stderr.decode(errors="replace").strip().splitlines() or ["nothing"])[-1]
         raise InputError(
-            f"cannot be checked: the process that opens it first ended with status {done.returncode} and said {said!r}",
+            "cannot be checked: the process that opens it first ended with status"
+            f" {done.returncode} and said {said!r}",
             place=place,
             cure=f"does `{sys.executable} -c 'import h5py'` work? If so, {cure}",
         )
 
 
 def check_size(dataset: Any, place: str, *, whole: bool = True) -> None:
-    """Refuse a data set that claims more than its file can hold before it is read, or, read ``whole``, than memory is free
-    (`InputError`)."""
+    """Refuse a data set that claims more than its file can hold before it is read, or, read
+    ``whole``, than memory is free (`InputError`)."""
     size = int(dataset.size or 0) * int(dataset.dtype.itemsize)
     if size > COMPRESSION_MAX * os.path.getsize(dataset.file.filename):
         raise InputError(
@@ -81,7 +100,9 @@ def check_size(dataset: Any, place: str, *, whole: bool = True) -> None:
 
 
 def _check_chunks(dataset: Any, place: str) -> None:
-    """Refuse chunks that unpack to more than they hold: libhdf5 unpacks whatever is stored, before it looks at the size."""
+    """Refuse chunks that unpack to more than they hold: libhdf5 unpacks whatever is stored, before
+    it looks at the size.
+    """
     import h5py
 
     plist = dataset.id.get_create_plist()
@@ -92,18 +113,24 @@ def _check_chunks(dataset: Any, place: str) -> None:
     if filters.count(h5py.h5z.FILTER_DEFLATE) > 1:
         raise InputError(f"{dataset.name} is deflated twice over", place=place, cure=harm)
     size = math.prod(dataset.chunks) * int(dataset.dtype.itemsize)
-    most = size + size // 16 + 4096  # what cannot be compressed grows: deflate by less than 0.1 %, others by less than 1/16
+    most = (
+        size + size // 16 + 4096
+    )  # what cannot be compressed grows: deflate by less than 0.1 %, others by less than 1/16
 
     def larger(chunk: Any) -> int | None:
         return int(chunk.size) if chunk.size > most else None
 
     if found := dataset.id.chunk_iter(larger):
-        message = f"a chunk of {dataset.name} is stored in {found} bytes, more than the {size} that it holds unpacked"
+        message = (
+            f"a chunk of {dataset.name} is stored in {found} bytes, more than the {size} that it"
+            " holds unpacked"
+        )
         raise InputError(message, place=place, cure=harm)
 
 
 class Disk:
-    """A file for h5py to write to. libhdf5 crashes when it closes a file that it could not write: it is never told of a failure.
+    """A file for h5py to write to. libhdf5 crashes when it closes a file that it could not write:
+    it is never told of a failure.
 
     Raises OSError at the next `check` or `close`; whatever is written after a failure is dropped.
     """
@@ -195,4 +222,6 @@ def _refuse_other_files(file: Any, place: str) -> None:
 
 
 def _leaves(message: str, place: str) -> InputError:
-    return InputError(message, place=place, cure="give a file that holds everything itself, e.g. made by h5repack")
+    return InputError(
+        message, place=place, cure="give a file that holds everything itself, e.g. made by h5repack"
+    )

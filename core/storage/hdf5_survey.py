@@ -1,9 +1,10 @@
 """A first look at an HDF5 file in a process of its own, which calls `main`.
 
-On some corrupt files libhdf5 itself never returns, or takes the process with it (damaged global heaps, B-trees that lead back to
-themselves). Here that costs nothing but this process. It touches what a reader touches: every object, attribute and small data
-set. Python's own errors about the file are left to the reader, who tells them better; whatever else goes wrong ends the process
-with another status than 0.
+On some corrupt files libhdf5 itself never returns, or takes the process with it (damaged global
+heaps, B-trees that lead back to themselves). Here that costs nothing but this process. It touches
+what a reader touches: every object, attribute and small data set. Python's own errors about the
+file are left to the reader, who tells them better; whatever else goes wrong ends the process with
+another status than 0.
 """
 
 from __future__ import annotations
@@ -34,7 +35,12 @@ def main(path: str) -> int:
             for key in list(item.attrs):
                 with contextlib.suppress(Exception):
                     item.attrs[key]
-            if isinstance(item, h5py.Dataset) and item.size and not item.external and not item.is_virtual:
+            if (
+                isinstance(item, h5py.Dataset)
+                and item.size
+                and not item.external
+                and not item.is_virtual
+            ):
                 item[()] if item.size * item.dtype.itemsize <= SMALL else item[(0,) * item.ndim]
 
     with contextlib.suppress(Exception), h5py.File(path, "r") as file:

@@ -1,9 +1,10 @@
 """One run at a time in an output folder, and locks that outlive nobody.
 
-A lock is a file that names its holder: host, boot, process and when that process began, in ticks since the boot; the time of day,
-which may jump, plays no part. A holder of this host that is gone has left its lock behind, and the lock is taken over. Of another
-host nothing is known: there the file's own lock (``flock``), which file servers pass on, decides, and where that is not to be
-had the user.
+A lock is a file that names its holder: host, boot, process and when that process began, in ticks
+since the boot; the time of day, which may jump, plays no part. A holder of this host that is gone
+has left its lock behind, and the lock is taken over. Of another host nothing is known: there the
+file's own lock (``flock``), which file servers pass on, decides, and where that is not to be had
+the user.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ def lock(folder: str | os.PathLike[str], part: str = "") -> Iterator[None]:
     Parameters
     ----------
     part
-        Name of a share of the work (a job of an array): parts of other names may run beside it, a whole run may not.
+        Name of a share of the work (a job of an array): parts of other names may run beside it, a
+        whole run may not.
 
     Raises
     ------
@@ -74,7 +76,9 @@ def _take(path: Path) -> int:
 
 
 def _living(path: Path) -> dict[str, Any] | None:
-    """The holder of another lock, where there is one and it is not known to be gone. What one that is gone left is removed."""
+    """The holder of another lock, where there is one and it is not known to be gone. What one that
+    is gone left is removed.
+    """
     try:
         handle = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:
@@ -94,7 +98,9 @@ def _living(path: Path) -> dict[str, Any] | None:
 
 
 def _flock(handle: int) -> bool | None:
-    """Lock an open file: True; False where another process holds it; None where this file system cannot say."""
+    """Lock an open file: True; False where another process holds it; None where this file system
+    cannot say.
+    """
     try:
         import fcntl
     except ImportError:  # not POSIX
@@ -107,7 +113,12 @@ def _flock(handle: int) -> bool | None:
 
 
 def _myself() -> dict[str, Any]:
-    return {"host": socket.gethostname(), "boot": _boot(), "pid": os.getpid(), "began": _began(os.getpid())}
+    return {
+        "host": socket.gethostname(),
+        "boot": _boot(),
+        "pid": os.getpid(),
+        "began": _began(os.getpid()),
+    }
 
 
 def _lives(holder: dict[str, Any], locked: bool | None) -> bool:
@@ -121,7 +132,9 @@ def _lives(holder: dict[str, Any], locked: bool | None) -> bool:
 
 
 def _began(pid: int) -> str | None:
-    """When a process began, in ticks since the boot (Linux); None: there is none. Elsewhere just whether there is one."""
+    """When a process began, in ticks since the boot (Linux); None: there is none. Elsewhere just
+    whether there is one.
+    """
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
     except (OSError, IndexError):
@@ -155,5 +168,7 @@ def _held(path: Path, holder: dict[str, Any] | None) -> OutputError:
     return OutputError(
         f"{who} is writing to this folder",
         place=str(path.parent),
-        cure=f"wait for it or choose another output folder; if it is gone for certain, remove {path}",
+        cure=(
+            f"wait for it or choose another output folder; if it is gone for certain, remove {path}"
+        ),
     )

@@ -18,7 +18,12 @@ UNPACKED_MAX = 4_000_000_000
 TEXT_MAX = 16_000_000
 """Bytes of a table of numbers as text, unpacked."""
 
-_PACKED = {b"\x1f\x8b\x08": "gzip", b"BZh": "bz2", b"\xfd7z": "lzma", b"\x1f\x9d\x90": "uncompresspy"}
+_PACKED = {
+    b"\x1f\x8b\x08": "gzip",
+    b"BZh": "bz2",
+    b"\xfd7z": "lzma",
+    b"\x1f\x9d\x90": "uncompresspy",
+}
 _BY_NAME = {".gz": "gzip", ".bz2": "bz2", ".xz": "lzma", ".lzma": "lzma"}
 PIECE = 1 << 20
 
@@ -26,16 +31,22 @@ PIECE = 1 << 20
 def too_large(size: int, most: int, place: str, *, least: bool) -> InputError:
     """That something unpacks to ``size`` bytes or, ``least``, to no less."""
     return InputError(
-        f"unpacks to {'at least ' if least else ''}{size / 1e9:.4g} GB; reading stops at {most / 1e9:.4g} GB",
+        f"unpacks to {'at least ' if least else ''}{size / 1e9:.4g} GB; reading stops at"
+        f" {most / 1e9:.4g} GB",
         place=place,
-        cure="where that is its true size, unpack it before; else it is corrupt or made to harm: make it again",
+        cure=(
+            "where that is its true size, unpack it before; else it is corrupt or made to harm:"
+            " make it again"
+        ),
     )
 
 
 def stream(path: str | os.PathLike[str], place: str) -> tuple[IO[bytes], bool]:
-    """The file's content, unpacked while it is read, and whether it was compressed. The caller closes it.
+    """The file's content, unpacked while it is read, and whether it was compressed. The caller
+    closes it.
 
-    The one file in a zip archive is unpacked into memory (`InputError` where it is larger than `UNPACKED_MAX`).
+    The one file in a zip archive is unpacked into memory (`InputError` where it is larger than
+    `UNPACKED_MAX`).
     """
     with open(path, "rb") as raw:
         magic = raw.read(4)
@@ -44,7 +55,11 @@ def stream(path: str | os.PathLike[str], place: str) -> tuple[IO[bytes], bool]:
     unpack = next((m for start, m in _PACKED.items() if magic.startswith(start)), "")
     if unpack == "uncompresspy":
         if find_spec(unpack) is None:
-            raise InputError("compress (.Z) needs the package uncompresspy", place=place, cure="unpack it: uncompress FILE")
+            raise InputError(
+                "compress (.Z) needs the package uncompresspy",
+                place=place,
+                cure="unpack it: uncompress FILE",
+            )
         file: Any = import_module(unpack).LZWFile(path)
         return file, True
     file = import_module(unpack).open(path, "rb") if unpack else open(path, "rb")  # noqa: SIM115
@@ -52,7 +67,8 @@ def stream(path: str | os.PathLike[str], place: str) -> tuple[IO[bytes], bool]:
 
 
 def text(path: Path, place: str) -> str:
-    """A table's text; compressed where its suffix is one of gzip, bzip2 or xz. `InputError` where it is longer than `TEXT_MAX`.
+    """A table's text; compressed where its suffix is one of gzip, bzip2 or xz. `InputError` where
+    it is longer than `TEXT_MAX`.
 
     Other failures are OSError or ValueError.
     """
@@ -69,7 +85,8 @@ def text(path: Path, place: str) -> str:
         raise ValueError(f"it cannot be unpacked ({error})") from error
     if len(content) > TEXT_MAX:
         raise InputError(
-            f"{'unpacks to' if unpack else 'has'} more than {TEXT_MAX / 1e6:g} MB, where reading stops",
+            f"{'unpacks to' if unpack else 'has'} more than {TEXT_MAX / 1e6:g} MB, where reading"
+            " stops",
             place=place,
             cure="give a table of numbers; a coarser one where it is that long",
         )

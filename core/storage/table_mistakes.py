@@ -24,13 +24,17 @@ class TableError(InputError):
 
     def __init__(self, place: str, mistakes: Sequence[tuple[int, str, str]]) -> None:
         self.mistakes = sorted(mistakes, key=lambda mistake: mistake[0])
-        told = [(f"line {line}: {text}" if line else text, cure) for line, text, cure in self.mistakes]
+        told = [
+            (f"line {line}: {text}" if line else text, cure) for line, text, cure in self.mistakes
+        ]
         if len(told) == 1:
             (message, cure), *_ = told
         else:
             message = f"{len(told)} mistakes"
             lines = [f"{text}; {cure}" if cure else text for text, cure in told[:MOST_TOLD]]
-            cure = "\n".join([*lines, *([f"and {len(told) - MOST_TOLD} more"] if len(told) > MOST_TOLD else [])])
+            cure = "\n".join(
+                [*lines, *([f"and {len(told) - MOST_TOLD} more"] if len(told) > MOST_TOLD else [])]
+            )
         super().__init__(message, place=place, cure=cure)
 
 

@@ -1,4 +1,5 @@
-"""What a run may know from earlier ones: small JSON files in the user's cache folder, worth nothing if they are lost.
+"""What a run may know from earlier ones: small JSON files in the user's cache folder, worth nothing
+if they are lost.
 
 ``$ZONDA_CACHE_DIR``, else ``zonda`` in the system's cache folder of the user. Where nothing can be
 written, nothing is remembered.
@@ -18,7 +19,13 @@ from typing import Any
 
 from .files import put
 
-RESTRAINTS = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE", "GLIBC_TUNABLES")
+RESTRAINTS = (
+    "NUMBA_CPU_NAME",
+    "NUMBA_CPU_FEATURES",
+    "NPY_DISABLE_CPU_FEATURES",
+    "OPENBLAS_CORETYPE",
+    "GLIBC_TUNABLES",
+)
 """Variables with which other instructions are chosen than the processor's own."""
 
 MOST = 64
@@ -37,32 +44,46 @@ def folder() -> Path:
 
 
 def recall(kind: str, key: Any) -> Any:
-    """What was remembered under ``key`` (JSON values), or None; a damaged or foreign file counts as none."""
+    """What was remembered under ``key`` (JSON values), or None; a damaged or foreign file counts as
+    none.
+    """
     text = _text(key)
     with suppress(OSError, ValueError, RecursionError):  # no home, no file, no JSON
         entry = json.loads(_path(kind, text).read_text(encoding="utf-8"))
-        if isinstance(entry, dict) and entry.get("key") == text and entry.get("check") == _hash(text + _text(entry.get("value"))):
+        if (
+            isinstance(entry, dict)
+            and entry.get("key") == text
+            and entry.get("check") == _hash(text + _text(entry.get("value")))
+        ):
             return entry["value"]
     return None
 
 
 def remember(kind: str, key: Any, value: Any) -> None:
-    """Keep ``value`` (JSON values) under ``key``, whole or not at all; a value that JSON would change is not kept."""
+    """Keep ``value`` (JSON values) under ``key``, whole or not at all; a value that JSON would
+    change is not kept.
+    """
     text = _text(key)
     with suppress(OSError, ValueError, TypeError, RuntimeError):
-        body = json.dumps({"key": text, "value": value, "check": _hash(text + json.dumps(value, sort_keys=True))})
+        body = json.dumps(
+            {"key": text, "value": value, "check": _hash(text + json.dumps(value, sort_keys=True))}
+        )
         if json.loads(body)["value"] != value:
             return
         path = _path(kind, text)
         put(path, body.encode())
-        for old in sorted(path.parent.glob(f"{kind}-*.json"), key=lambda p: p.stat().st_mtime)[:-MOST]:
+        for old in sorted(path.parent.glob(f"{kind}-*.json"), key=lambda p: p.stat().st_mtime)[
+            :-MOST
+        ]:
             old.unlink(missing_ok=True)
 
 
 @cache
 def processor() -> str:
     """This machine's processor, as the system calls it, and what the environment forbids it."""
-    return " ".join([_name(), *(f"{name}={os.environ[name]}" for name in RESTRAINTS if os.environ.get(name))])
+    return " ".join(
+        [_name(), *(f"{name}={os.environ[name]}" for name in RESTRAINTS if os.environ.get(name))]
+    )
 
 
 def _name() -> str:

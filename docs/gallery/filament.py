@@ -9,8 +9,23 @@ south = south - 0.35 * np.sin(2.5 * east)  # it is bent
 slope = -0.35 * 2.5 * np.cos(2.5 * east)
 brightness = 3.0 * np.exp(-((south / 0.09) ** 2)) + 0.6 * np.exp(-((south / 0.3) ** 2))  # MJy/sr
 across = np.arctan(slope)  # the normal of the filament, from south to east
-planes = [brightness, 0.15 * brightness * np.cos(2 * across), 0.15 * brightness * np.sin(2 * across)]
-header = fits.Header({"BUNIT": "MJy/sr", "CTYPE3": "STOKES", "CRVAL3": 1, "CRPIX3": 1, "CDELT3": 1, "POLCCONV": "COSMO"})
-header.update(CTYPE1="RA---TAN", CTYPE2="DEC--TAN", CRVAL1=75.0, CRVAL2=-30.0, CDELT1=-pixel, CDELT2=pixel)
+planes = [
+    brightness,
+    0.15 * brightness * np.cos(2 * across),
+    0.15 * brightness * np.sin(2 * across),
+]
+header = fits.Header(
+    {
+        "BUNIT": "MJy/sr",
+        "CTYPE3": "STOKES",
+        "CRVAL3": 1,
+        "CRPIX3": 1,
+        "CDELT3": 1,
+        "POLCCONV": "COSMO",
+    }
+)
+header.update(
+    CTYPE1="RA---TAN", CTYPE2="DEC--TAN", CRVAL1=75.0, CRVAL2=-30.0, CDELT1=-pixel, CDELT2=pixel
+)
 header.update(CRPIX1=(side + 1) / 2, CRPIX2=(side + 1) / 2)
 fits.writeto("filament.fits", np.array(planes, np.float32), header, overwrite=True)

@@ -2,15 +2,18 @@
 
 Of a layer's field g and a pixel that H samples see, at times t_h along rays x_h, the map holds
 
-    m = 1/H sum_h [g(x_h) - <g(x_d, t_h)>_d],    <m^2> = int dk P(k) |1/H sum_h [e^(i k x_h) - <e^(i k x_d)>_d]|^2      (1)
+    m = 1/H sum_h [g(x_h) - <g(x_d, t_h)>_d],
+    <m^2> = int dk P(k) |1/H sum_h [e^(i k x_h) - <e^(i k x_d)>_d]|^2      (1)
 
-the detectors' mean taken off where it is removed. The integral is a sum over random wave vectors of the mixture
-sum_j w_j exp(-r^2 / 4 e_j) (normal, of variance 1 / 2 e_j on each axis; components that differ over the field are drawn more
-often), the sum over h one over random instants at which the pixel is in the field; what these instants scatter more than the H
-samples do is taken off. Positions move with the wind: this is the ensemble's variance, exact but for the draws, whose standard
-error is added twice. One scan is looked at, and no high-pass filter. Such a filter removes most of what drifts slowly by, but not
-all: a scan has ends, and the singular mode that is subtracted turns a little with what it is made of. Counting only the waves
-that a ray sees above the cut made bounds that did not hold (docs/plan.md).
+the detectors' mean taken off where it is removed. The integral is a sum over random wave vectors of
+the mixture sum_j w_j exp(-r^2 / 4 e_j) (normal, of variance 1 / 2 e_j on each axis; components that
+differ over the field are drawn more often), the sum over h one over random instants at which the
+pixel is in the field; what these instants scatter more than the H samples do is taken off.
+Positions move with the wind: this is the ensemble's variance, exact but for the draws, whose
+standard error is added twice. One scan is looked at, and no high-pass filter. Such a filter removes
+most of what drifts slowly by, but not all: a scan has ends, and the singular mode that is
+subtracted turns a little with what it is made of. Counting only the waves that a ray sees above the
+cut made bounds that did not hold (docs/plan.md).
 """
 
 from __future__ import annotations
@@ -32,8 +35,11 @@ from .turbulence.nodes import Layer
 INSTANTS, CANDIDATES, HITS, WAVES = 4000, 48, 160, 160
 
 
-def shares(context: Context, layers: list[Layer], components: list[tuple[Floats, Floats]], plane: ScanPlane) -> list[float]:
-    """For each layer, the rms in a pixel over that in a sample (with the detectors' mean removed where it is), at most 1.
+def shares(
+    context: Context, layers: list[Layer], components: list[tuple[Floats, Floats]], plane: ScanPlane
+) -> list[float]:
+    """For each layer, the rms in a pixel over that in a sample (with the detectors' mean removed
+    where it is), at most 1.
 
     ``components``: (e, w) of each layer. ``plane``: of the first scan.
     """
@@ -42,7 +48,8 @@ def shares(context: Context, layers: list[Layer], components: list[tuple[Floats,
         return [1.0] * len(layers)
     rng = np.random.default_rng(1)
     seen = _seen(context, rng)
-    # Where the field's footprint is within the beam's in every layer four points stand for the detectors' mean.
+    # Where the field's footprint is within the beam's in every layer four points stand for the
+    # detectors' mean.
     smooth = all(layer.distance * o.focalplane.radius <= layer.sigma for layer in layers)
     points = _nodes(context, 2 if smooth else 4) if context.removes_common else None
     found: list[float] = []
@@ -53,14 +60,24 @@ def shares(context: Context, layers: list[Layer], components: list[tuple[Floats,
         j = rng.choice(len(e), WAVES, p=chance)
         k = rng.standard_normal((WAVES, 2)) / np.sqrt(2 * e[j])[:, None]
         weight = w[j] / chance[j] / WAVES
-        worst = max([0.0, *(_in_pixel(_waves(o, layer, plane, pixel, k, points), weight, pixel.hits) for pixel in seen)])
+        worst = max(
+            [
+                0.0,
+                *(
+                    _in_pixel(_waves(o, layer, plane, pixel, k, points), weight, pixel.hits)
+                    for pixel in seen
+                ),
+            ]
+        )
         found.append(math.sqrt(min(worst, 1.0)))
     return found
 
 
 @dataclass(frozen=True)
 class _Pixel:
-    """Sample numbers at which a pixel is in the field, where in it (xi, eta), and the number of its samples in all."""
+    """Sample numbers at which a pixel is in the field, where in it (xi, eta), and the number of its
+    samples in all.
+    """
 
     at: NDArray[np.intp]
     xi: Floats
@@ -69,14 +86,30 @@ class _Pixel:
 
 
 def _waves(
-    o: Observation, layer: Layer, plane: ScanPlane, pixel: _Pixel, k: Floats, points: tuple[Floats, Floats] | None
+    o: Observation,
+    layer: Layer,
+    plane: ScanPlane,
+    pixel: _Pixel,
+    k: Floats,
+    points: tuple[Floats, Floats] | None,
 ) -> NDArray[np.complex128]:
-    """Plane waves k of a layer in a pixel (n_wave, n_instant), less their mean over points of the focal plane."""
-    seconds, frame, drift = o.seconds[pixel.at], axes(o.boresight_azel[pixel.at]), plane.drift @ layer.wind
+    """Plane waves k of a layer in a pixel (n_wave, n_instant), less their mean over points of the
+    focal plane.
+    """
+    seconds, frame, drift = (
+        o.seconds[pixel.at],
+        axes(o.boresight_azel[pixel.at]),
+        plane.drift @ layer.wind,
+    )
     own = frame[:, :, 2] - pixel.eta[:, None] * frame[:, :, 0] - pixel.xi[:, None] * frame[:, :, 1]
-    wave = np.exp(1j * (k @ (layer.height * plane.unroll(crossing(own.T)) - drift[:, None] * seconds)))
+    wave = np.exp(
+        1j * (k @ (layer.height * plane.unroll(crossing(own.T)) - drift[:, None] * seconds))
+    )
     if points is not None:
-        everywhere = layer.height * plane.unroll(crossing(rays(frame, *points))) - drift[:, None, None] * seconds
+        everywhere = (
+            layer.height * plane.unroll(crossing(rays(frame, *points)))
+            - drift[:, None, None] * seconds
+        )
         wave -= np.exp(1j * np.tensordot(k, everywhere, 1)).mean(axis=1)
     return np.asarray(wave, np.complex128)
 
@@ -102,7 +135,9 @@ def _nodes(context: Context, n: int) -> tuple[Floats, Floats]:
 
 
 def _seen(context: Context, rng: np.random.Generator) -> list[_Pixel]:
-    """For some pixels: instants of the first scan at which they are in the field, where in it, and the pixel's samples then."""
+    """For some pixels: instants of the first scan at which they are in the field, where in it, and
+    the pixel's samples then.
+    """
     o, plane = context.first, context.first.focalplane
     at = np.sort(rng.integers(0, o.n_samples, INSTANTS))
     turn = rotation_matrices(o.boresight_radec[at])
@@ -117,9 +152,13 @@ def _seen(context: Context, rng: np.random.Generator) -> list[_Pixel]:
     inside = (np.hypot(x - middle[0], y - middle[1]) <= radius) & (found[:, :, 2] > 0)
     count = inside.sum(axis=1)
     assert context.coverage is not None
-    density = o.n_detectors * context.coverage.pixel**2 / (math.pi * radius**2)  # detectors in a pixel
+    density = (
+        o.n_detectors * context.coverage.pixel**2 / (math.pi * radius**2)
+    )  # detectors in a pixel
     chosen = []
-    for number in np.argsort(count)[[CANDIDATES // 2, 3 * CANDIDATES // 4]]:  # of those that samples fall in
+    for number in np.argsort(count)[
+        [CANDIDATES // 2, 3 * CANDIDATES // 4]
+    ]:  # of those that samples fall in
         index = np.flatnonzero(inside[number])
         if len(index) > HITS:
             index = np.sort(rng.choice(index, HITS, replace=False))

@@ -1,4 +1,6 @@
-"""How the PWV along a line of sight fluctuates about its mean: normally, or log-normally where it fluctuates strongly."""
+"""How the PWV along a line of sight fluctuates about its mean: normally, or log-normally where it
+fluctuates strongly.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from zonda.core.types import Floats
 from zonda.core.weather import PWV_MAX
 
 LOG_NORMAL_FROM = 0.15
-"""PWV rms from which y is exp(s g - s^2 var(g) / 2) - 1, so that the PWV stays positive (below, 1 + y < 0 takes 6.7 sigma)."""
+"""PWV rms from which y is exp(s g - s^2 var(g) / 2) - 1, so that the PWV stays positive (below, 1 +
+y < 0 takes 6.7 sigma).
+"""
 
 CERTAIN = 5.0
 """Sigma up to which the PWV must lie inside the table: what is beyond is clipped, and counted."""
@@ -23,7 +27,11 @@ LARGEST_DEVIATION = 8
 
 def largest_pwv(pwv: float, rms: float) -> float:
     """The PWV [m] up to which a band is tabulated, for a mean and a relative rms."""
-    rise = math.exp(7 * _log_width(rms, 1.0)) if rms >= LOG_NORMAL_FROM else 1 + LARGEST_DEVIATION * rms
+    rise = (
+        math.exp(7 * _log_width(rms, 1.0))
+        if rms >= LOG_NORMAL_FROM
+        else 1 + LARGEST_DEVIATION * rms
+    )
     return min(pwv * max(rise, 1.05), PWV_MAX)
 
 
@@ -87,8 +95,8 @@ class Fluctuation:
         fits = (PWV_MAX / pwv - 1) / CERTAIN
         fits = fits if fits < LOG_NORMAL_FROM else math.sqrt(math.expm1(width**2))
         raise InputError(
-            f"a PWV of {pwv * 1e3:.3g} mm with a rms of {self.rms:.3g} of it reaches {most * 1e3:.3g} mm at {CERTAIN:g} "
-            f"sigma; the limit is {PWV_MAX * 1e3:.0f} mm",
+            f"a PWV of {pwv * 1e3:.3g} mm with a rms of {self.rms:.3g} of it reaches"
+            f" {most * 1e3:.3g} mm at {CERTAIN:g} sigma; the limit is {PWV_MAX * 1e3:.0f} mm",
             place=place,
             cure=f"lower pwv_rms to {fits:.1%} or less, or the PWV",
         )

@@ -1,4 +1,6 @@
-"""Turbulence drawn for one observation, the band's response to it, and what the report says of both."""
+"""Turbulence drawn for one observation, the band's response to it, and what the report says of
+both.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,12 @@ PLANES = {
 
 def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     """The fluctuations of an observation, stated in its log."""
-    parameters, observation, chosen, law = model.parameters, model.observation, model.resolution(), model.fluctuation
+    parameters, observation, chosen, law = (
+        model.parameters,
+        model.observation,
+        model.resolution(),
+        model.fluctuation,
+    )
     law.check(model.pwv, label)
     turbulence = _layers_of(model, label)
     path = turbulence.paths[chosen.step]
@@ -37,7 +44,9 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     top = model.band.pwv_max / model.pwv - 1
     sines, terms = (path.low, path.high), model.terms((path.low, path.high))
     names = streams(parameters.outputs)
-    response = Response(model.band, model.pwv, law.limits(top), sines, vapour_height, per_vapour, names, terms)
+    response = Response(
+        model.band, model.pwv, law.limits(top), sines, vapour_height, per_vapour, names, terms
+    )
     if terms is not None:
         turbulence.weights = terms.weights
 
@@ -55,7 +64,9 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     for what, text in _statements(model, path):
         observation.tally.state(label, what, text)
     if "path_delay" in parameters.outputs:
-        observation.tally.state(label, "wet path delay", f"{per_vapour:.3f} times the PWV (non-dispersive)")
+        observation.tally.state(
+            label, "wet path delay", f"{per_vapour:.3f} times the PWV (non-dispersive)"
+        )
     arguments = chosen.nodes, turbulence, pwv, response, chosen.step, observation.n_samples
     if chosen.nodes.shape:
         return AtNodes.make(*arguments)
@@ -72,7 +83,8 @@ def height_of_vapour(model: AtmosphereModel) -> float:
 
 
 def _layers_of(model: AtmosphereModel, label: str) -> DriftingLayers:
-    """The layers; bands of one camera make the tiles of lattices that they look through together once for all.
+    """The layers; bands of one camera make the tiles of lattices that they look through together
+    once for all.
 
     A band takes what was made for it, so that tiles are released with the last that needs them.
     """
@@ -93,16 +105,27 @@ def _of_bands(models: Sequence[AtmosphereModel], label: str) -> dict[str, Drifti
         whole = len(model.turbulence) - len(set(model.parameters.omit))
         named = ((models[k].observation.instrument.band.name, n) for k, n in sorted(others.items()))
         parts = ", ".join(f"{name} ({n} of {whole} layers)" for name, n in named)
-        text = f"lattices made once with those of {parts}" if parts else "lattices of its own: other beams or directions"
+        text = (
+            f"lattices made once with those of {parts}"
+            if parts
+            else "lattices of its own: other beams or directions"
+        )
         model.observation.tally.state(label, "turbulence beside other bands", text)
     return {model.observation.name: one for model, one in zip(models, layers, strict=True)}
 
 
-def drifting_layers(model: AtmosphereModel, points: tuple[Floats, Floats] | None = None) -> DriftingLayers:
-    """The layers that are simulated, over the whole scan, to be looked at from focal-plane ``points``, by default the nodes."""
+def drifting_layers(
+    model: AtmosphereModel, points: tuple[Floats, Floats] | None = None
+) -> DriftingLayers:
+    """The layers that are simulated, over the whole scan, to be looked at from focal-plane
+    ``points``, by default the nodes.
+    """
     chosen = model.resolution()
     parts = zip(model.turbulence, model.layers, chosen.steps, strict=True)
-    every = [Drifting(field, layer.height, layer.amplitude, layer.wind, step) for field, layer, step in parts]
+    every = [
+        Drifting(field, layer.height, layer.amplitude, layer.wind, step)
+        for field, layer, step in parts
+    ]
     drifting = [one for number, one in enumerate(every) if number not in model.parameters.omit]
     first, count = times(slice(0, model.observation.n_samples), chosen.step)
     kind = np.float64 if chosen.nodes.shape else np.float32
@@ -126,11 +149,15 @@ def streams(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def in_time_order(model: AtmosphereModel) -> bool:
-    """Whether blocks should come in order of time: detectors are evaluated one by one, and share the turbulence of the moment."""
+    """Whether blocks should come in order of time: detectors are evaluated one by one, and share
+    the turbulence of the moment.
+    """
     o, chosen = model.observation, model.resolution()
     if chosen.nodes.shape:
         return False
-    return not keeps_all(o.n_detectors, o.n_samples, chosen.step, len(streams(model.parameters.outputs)))
+    return not keeps_all(
+        o.n_detectors, o.n_samples, chosen.step, len(streams(model.parameters.outputs))
+    )
 
 
 def bytes_of_units(model: AtmosphereModel) -> int:
@@ -138,7 +165,9 @@ def bytes_of_units(model: AtmosphereModel) -> int:
     o, chosen = model.observation, model.resolution()
     if chosen.nodes.shape:
         return 0
-    every = units_bytes(o.n_detectors, o.n_samples, chosen.step, len(streams(model.parameters.outputs)))
+    every = units_bytes(
+        o.n_detectors, o.n_samples, chosen.step, len(streams(model.parameters.outputs))
+    )
     return min(every, BYTES_KEPT) if in_time_order(model) else every
 
 
@@ -155,7 +184,10 @@ def _statements(model: AtmosphereModel, path: LinesOfSight) -> Iterator[tuple[st
 def _of_the_pwv(model: AtmosphereModel) -> Iterator[tuple[str, str]]:
     law = model.fluctuation
     before, after = law.before_and_after()
-    yield "mean PWV", f"{model.pwv * 1e3:.3f} mm" + ("" if model.parameters.pwv else " (of the weather)")
+    yield (
+        "mean PWV",
+        f"{model.pwv * 1e3:.3f} mm" + ("" if model.parameters.pwv else " (of the weather)"),
+    )
     yield "PWV rms", f"{before:.3%} of the mean before the beam, {after:.3%} after it"
     yield "distribution of the PWV", "log-normal" if law.log_normal else "normal"
     each = (
@@ -164,14 +196,24 @@ def _of_the_pwv(model: AtmosphereModel) -> Iterator[tuple[str, str]]:
     )
     yield "PWV rms after the beam, per layer", ", ".join(each)
     if model.parameters.pwv_rms_at == "zenith":
-        text = f"{law.rms / model.parameters.pwv_rms:.3f} of that at the zenith, at {math.degrees(model.elevation):.1f} deg"
+        text = (
+            f"{law.rms / model.parameters.pwv_rms:.3f} of that at the zenith, at"
+            f" {math.degrees(model.elevation):.1f} deg"
+        )
         yield (
             "PWV rms by elevation",
-            text + (", one value for the scan" if model.strength(np.ones(1)) is None else ", and by sample"),
+            text
+            + (
+                ", one value for the scan"
+                if model.strength(np.ones(1)) is None
+                else ", and by sample"
+            ),
         )
     if model.parameters.layer_response == "layer":
         for name in NAMES:
-            each = (f"{h:.0f} m: {k:.3f}" for h, k in zip(model.heights, model.kappa[name], strict=True))
+            each = (
+                f"{h:.0f} m: {k:.3f}" for h, k in zip(model.heights, model.kappa[name], strict=True)
+            )
             yield f"{name} of a layer's water, over the column's", ", ".join(each)
     else:
         yield "emission and opacity of a layer's water", "as of the column, whatever its height"
@@ -185,27 +227,55 @@ def _of_the_beam(model: AtmosphereModel, path: LinesOfSight) -> Iterator[tuple[s
     diameter, wavelength = instrument.telescope.diameter, SPEED_OF_LIGHT / instrument.band.centre
     sines = math.sin(model.plane.elevation) / np.array([path.high, path.low])
     ends = [widened(diameter, wavelength, layers[-1].distance * k) for k in (*sines, 1.0)]
-    text = f"{ends[0] / ends[2]:.3f} to {ends[1] / ends[2]:.3f} of the one used, in the highest layer"
+    text = (
+        f"{ends[0] / ends[2]:.3f} to {ends[1] / ends[2]:.3f} of the one used, in the highest layer"
+    )
     yield "width of the beam over the elevations of field and scan", text
     if footprint != "gaussian":
         far = rayleigh_distance(diameter, wavelength)
         beyond = sum(layer.distance > far for layer in layers)
-        yield "footprint", f"{footprint}; {beyond} of {len(layers)} layers lie beyond {far:.0f} m, where beams lose their rim"
-    yield "turbulence covariance", f"within {fields[0].fidelity.error:.1%} of the variance ({model.parameters.fidelity})"
+        yield (
+            "footprint",
+            (
+                f"{footprint}; {beyond} of {len(layers)} layers lie beyond {far:.0f} m, where beams"
+                " lose their rim"
+            ),
+        )
+    yield (
+        "turbulence covariance",
+        f"within {fields[0].fidelity.error:.1%} of the variance ({model.parameters.fidelity})",
+    )
 
 
 def _of_the_resolution(model: AtmosphereModel) -> Iterator[tuple[str, str]]:
     chosen, plane = model.resolution(), model.plane
-    error = f"; expected rms error {chosen.focal_plane_error:.1e} of the fluctuation" if chosen.nodes.shape else ""
+    error = (
+        f"; expected rms error {chosen.focal_plane_error:.1e} of the fluctuation"
+        if chosen.nodes.shape
+        else ""
+    )
     yield "nodes", f"{chosen.nodes}{error}"
     several = len(set(chosen.steps)) > 1
-    steps = f"{min(chosen.steps)} to {max(chosen.steps)} samples, by layer" if several else f"{min(chosen.steps)} samples"
+    steps = (
+        f"{min(chosen.steps)} to {max(chosen.steps)} samples, by layer"
+        if several
+        else f"{min(chosen.steps)} samples"
+    )
     yield "step in time", f"{steps}; expected rms error {chosen.time_error:.1e} of the fluctuation"
     yield "nodes and step of the mean emission", f"{chosen.mean_nodes}; {chosen.mean_step} samples"
     both = "each, for nodes and for the step" if chosen.nodes.shape else "x sqrt(2) for the step"
     yield "error allowed", f"{chosen.tolerance:.1e} of the fluctuation {both}"
-    text = f"{chosen.differential:.1e} of the fluctuation is left after subtraction of the focal-plane mean"
+    text = (
+        f"{chosen.differential:.1e} of the fluctuation is left after subtraction of the focal-plane"
+        " mean"
+    )
     yield "differential signal", text
-    yield "plane of the turbulence", f"{PLANES[plane.kind]}; squared separations within {plane.bound:.1%}"
+    yield (
+        "plane of the turbulence",
+        f"{PLANES[plane.kind]}; squared separations within {plane.bound:.1%}",
+    )
     if plane.kind == "cone":
-        yield "wind on the unrolled cone", f"drifts within {plane.drift_bound:.1%} at the ends of the scan"
+        yield (
+            "wind on the unrolled cone",
+            f"drifts within {plane.drift_bound:.1%} at the ends of the scan",
+        )

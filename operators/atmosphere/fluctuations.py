@@ -1,9 +1,11 @@
-"""The fluctuations that a block is given: from nodes over the focal plane, or of each detector where no nodes pay.
+"""The fluctuations that a block is given: from nodes over the focal plane, or of each detector
+where no nodes pay.
 
-At nodes everything is drawn once, before the blocks: few nodes stand for all detectors. Where each detector is its own node
-its series are made on demand, a unit of detectors and samples at a time, so that a scan of any length needs
-little memory; a unit has the same bits whenever it is made. Where all units of a scan are kept they are made in order of time,
-those of bands in step together: tiles of the turbulence serve all detectors of that moment.
+At nodes everything is drawn once, before the blocks: few nodes stand for all detectors. Where each
+detector is its own node its series are made on demand, a unit of detectors and samples at a time,
+so that a scan of any length needs little memory; a unit has the same bits whenever it is made.
+Where all units of a scan are kept they are made in order of time, those of bands in step together:
+tiles of the turbulence serve all detectors of that moment.
 """
 
 from __future__ import annotations
@@ -19,7 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, SmoothField, spline_coefficients
+from zonda.core.numerics.smooth import (
+    PAD,
+    SPLINE_MARGIN,
+    DetectorField,
+    SmoothField,
+    spline_coefficients,
+)
 from zonda.core.types import AnyFloats, Floats
 
 from .response import Response
@@ -27,8 +35,8 @@ from .turbulence.nodes import Nodes
 from .turbulence.sampling import TIMES_AT_ONCE, DriftingLayers
 
 ToPwv = Callable[[Floats, Floats, Floats, slice], tuple[Floats, Floats]]
-"""(sum of the layers, their weighted sums, sine of the elevation, columns that belong to the scan) -> y, and the weighted sums as
-strong as y is there; it counts what it clips."""
+"""(sum of the layers, their weighted sums, sine of the elevation, columns that belong to the scan)
+-> y, and the weighted sums as strong as y is there; it counts what it clips."""
 
 UNIT_DETECTORS, UNIT_SAMPLES = 128, 16384
 """Size of a unit."""
@@ -40,15 +48,19 @@ AHEAD = 8
 """Units that a thread may work ahead."""
 
 BYTES_KEPT = 128 << 20
-"""Memory of the units that are kept: until the other detectors and operators have taken their part."""
+"""Memory of the units that are kept: until the other detectors and operators have taken their part.
+"""
 
 ALL_KEPT, SHARE_KEPT = 384 << 20, 0.3
-"""Memory up to which all units of a scan are kept, as long as it is at most this share of a stream's: a step behind this one that
-needs whole scans would else need a whole stream, or the units in another order than that of time."""
+"""Memory up to which all units of a scan are kept, as long as it is at most this share of a
+stream's: a step behind this one that needs whole scans would else need a whole stream, or the units
+in another order than that of time."""
 
 
 def times(samples: slice, step: int) -> tuple[int, int]:
-    """First time (in units of ``step``) and number of times whose values make the spline over these samples."""
+    """First time (in units of ``step``) and number of times whose values make the spline over these
+    samples.
+    """
     first = samples.start // step - PAD - SPLINE_MARGIN
     return first, -(-samples.stop // step) + 2 + SPLINE_MARGIN - first
 
@@ -61,7 +73,15 @@ class AtNodes:
     sums: tuple[int, float, float]
 
     @classmethod
-    def make(cls, nodes: Nodes, layers: DriftingLayers, to_pwv: ToPwv, response: Response, step: int, n_samples: int) -> AtNodes:
+    def make(
+        cls,
+        nodes: Nodes,
+        layers: DriftingLayers,
+        to_pwv: ToPwv,
+        response: Response,
+        step: int,
+        n_samples: int,
+    ) -> AtNodes:
         """Evaluate the layers at the nodes over the whole scan, a part of it at a time."""
         n_node, weights = len(nodes.xi), np.ascontiguousarray(nodes.weights)
         width = -(-n_samples // step) + 3
@@ -78,15 +98,26 @@ class AtNodes:
             for name, whole in coefficients.items():
                 made = spline_coefficients(response(name, y, sine, weighted))
                 whole[:, first : first + made.shape[1]] = made
-        fields = {name: SmoothField(weights, c, step, n_samples) for name, c in coefficients.items()}
-        return cls(fields, (sum(n for n, _, _ in sums), math.fsum(t for _, t, _ in sums), math.fsum(q for _, _, q in sums)))
+        fields = {
+            name: SmoothField(weights, c, step, n_samples) for name, c in coefficients.items()
+        }
+        return cls(
+            fields,
+            (
+                sum(n for n, _, _ in sums),
+                math.fsum(t for _, t, _ in sums),
+                math.fsum(q for _, _, q in sums),
+            ),
+        )
 
     def drawn(self) -> tuple[int, float, float]:
         """Number of values of the PWV, their sum, and that of their squares."""
         return self.sums
 
     def into(self, detectors: slice, samples: slice, out: dict[str, AnyFloats]) -> None:
-        """Overwrite the arrays ``out`` (n_det, n_samp), by name, with the fluctuations of a block."""
+        """Overwrite the arrays ``out`` (n_det, n_samp), by name, with the fluctuations of a
+        block.
+        """
         for name, array in out.items():
             self.fields[name].evaluate(detectors, samples, array)
 
@@ -95,9 +126,21 @@ class OfDetectors:
     """Each detector's own series, in float32, made on demand. Safe for threads."""
 
     def __init__(
-        self, nodes: Nodes, layers: DriftingLayers, to_pwv: ToPwv, response: Response, step: int, n_samples: int
+        self,
+        nodes: Nodes,
+        layers: DriftingLayers,
+        to_pwv: ToPwv,
+        response: Response,
+        step: int,
+        n_samples: int,
     ) -> None:
-        self._xi, self._eta, self._layers, self._to_pwv, self._response = nodes.xi, nodes.eta, layers, to_pwv, response
+        self._xi, self._eta, self._layers, self._to_pwv, self._response = (
+            nodes.xi,
+            nodes.eta,
+            layers,
+            to_pwv,
+            response,
+        )
         self.step, self._n_samples = step, n_samples
         self._units: OrderedDict[tuple[int, int], Future[dict[str, AnyFloats]]] = OrderedDict()
         self._sums: dict[tuple[int, int], tuple[int, float, float]] = {}
@@ -113,11 +156,15 @@ class OfDetectors:
         """The number that bands have in common whose detectors look along the same lines."""
 
     def join(self, bands: list[weakref.ref[OfDetectors]]) -> None:
-        """Let bands that are in step make units together; ``bands``: a list that all of them are given."""
+        """Let bands that are in step make units together; ``bands``: a list that all of them are
+        given.
+        """
         if self._keeps_all:
             others = [one for one in map(_held, bands) if one is not None]
             unlike = {one._alike for one in others if not one._looks_as(self)}
-            self._alike = next((one._alike for one in others if one._alike not in unlike), len(bands))
+            self._alike = next(
+                (one._alike for one in others if one._alike not in unlike), len(bands)
+            )
             self._beside = bands
             bands.append(weakref.ref(self))
 
@@ -128,17 +175,29 @@ class OfDetectors:
     def drawn(self) -> tuple[int, float, float]:
         """As `AtNodes.drawn`, of the units made so far."""
         parts = [self._sums[key] for key in sorted(self._sums)]
-        return sum(p[0] for p in parts), math.fsum(p[1] for p in parts), math.fsum(p[2] for p in parts)
+        return (
+            sum(p[0] for p in parts),
+            math.fsum(p[1] for p in parts),
+            math.fsum(p[2] for p in parts),
+        )
 
     def into(self, detectors: slice, samples: slice, out: dict[str, AnyFloats]) -> None:
         """As `AtNodes.into`."""
         for unit, of_detectors in _parts(detectors, UNIT_DETECTORS):
             for number, of_samples in _parts(samples, UNIT_SAMPLES):
                 coefficients = self._unit(unit, number)
-                rows = slice(of_detectors.start - unit * UNIT_DETECTORS, of_detectors.stop - unit * UNIT_DETECTORS)
-                at = slice(of_samples.start - number * UNIT_SAMPLES, of_samples.stop - number * UNIT_SAMPLES)
+                rows = slice(
+                    of_detectors.start - unit * UNIT_DETECTORS,
+                    of_detectors.stop - unit * UNIT_DETECTORS,
+                )
+                at = slice(
+                    of_samples.start - number * UNIT_SAMPLES,
+                    of_samples.stop - number * UNIT_SAMPLES,
+                )
                 where = (
-                    slice(of_detectors.start - detectors.start, of_detectors.stop - detectors.start),
+                    slice(
+                        of_detectors.start - detectors.start, of_detectors.stop - detectors.start
+                    ),
                     slice(of_samples.start - samples.start, of_samples.stop - samples.start),
                 )
                 for name, array in out.items():
@@ -150,7 +209,9 @@ class OfDetectors:
                         part[...] = field.evaluate(rows, at, np.empty(part.shape, part.dtype))
 
     def _unit(self, unit: int, number: int) -> dict[str, AnyFloats]:
-        """The coefficients of a unit. A thread that would wait for another to make it makes one that comes later instead."""
+        """The coefficients of a unit. A thread that would wait for another to make it makes one
+        that comes later instead.
+        """
         while True:
             with self._lock:
                 wanted = self._units.get((unit, number))
@@ -166,7 +227,9 @@ class OfDetectors:
                 return mine.result()
 
     def _to_make(self, unit: int, number: int) -> tuple[int, int] | None:
-        """The unit to begin with where one is wanted that is not made; None: all that may be of use have been begun."""
+        """The unit to begin with where one is wanted that is not made; None: all that may be of use
+        have been begun.
+        """
         if self._keeps_all:
             while self._begun < self._groups * self._times:
                 number, unit = divmod(self._begun, self._groups)
@@ -176,7 +239,10 @@ class OfDetectors:
             return None
         if (unit, number) not in self._units:
             return unit, number
-        return next((k for k in self._next(unit, number, min(AHEAD, self._most)) if k not in self._units), None)
+        return next(
+            (k for k in self._next(unit, number, min(AHEAD, self._most)) if k not in self._units),
+            None,
+        )
 
     def _begin(self, key: tuple[int, int]) -> Future[dict[str, AnyFloats]]:
         """Note that a unit is being made; the lock is held."""
@@ -187,13 +253,21 @@ class OfDetectors:
         return mine
 
     def _fill(self, key: tuple[int, int], mine: Future[dict[str, AnyFloats]]) -> None:
-        """Make a unit that has been begun, and that of bands beside this one, unless they have begun it."""
+        """Make a unit that has been begun, and that of bands beside this one, unless they have
+        begun it.
+        """
         todo = [(self, mine)]
-        todo += [(other, theirs) for other in map(_held, self._beside) if other and (theirs := other._also(key)) is not None]
+        todo += [
+            (other, theirs)
+            for other in map(_held, self._beside)
+            if other and (theirs := other._also(key)) is not None
+        ]
         try:
             for alike in sorted({band._alike for band, _ in todo}):
                 these = [one for one in todo if one[0]._alike == alike]
-                drawn, weighted, sine = these[0][0]._draw([band._layers for band, _ in these[1:]], *key)
+                drawn, weighted, sine = these[0][0]._draw(
+                    [band._layers for band, _ in these[1:]], *key
+                )
                 for (band, future), g, own in zip(these, drawn, weighted, strict=True):
                     future.set_result(band._make(key, g, own, sine))
         except BaseException as error:
@@ -211,19 +285,27 @@ class OfDetectors:
             return None if key in self._units else self._begin(key)
 
     def _next(self, unit: int, number: int, reach: int) -> Iterator[tuple[int, int]]:
-        """Units that will be needed soon: later ones of the same detectors, the same time of the next detectors."""
+        """Units that will be needed soon: later ones of the same detectors, the same time of the
+        next detectors.
+        """
         for k in range(number + 1, min(number + reach, self._times)):
             yield unit, k
         for k in range(unit + 1, min(unit + reach, self._groups)):
             yield k, number
 
-    def _draw(self, others: Sequence[DriftingLayers], unit: int, number: int) -> tuple[Floats, list[Floats], Floats]:
+    def _draw(
+        self, others: Sequence[DriftingLayers], unit: int, number: int
+    ) -> tuple[Floats, list[Floats], Floats]:
         """`DriftingLayers.sums` for the detectors and times of a unit."""
         rows = slice(unit * UNIT_DETECTORS, (unit + 1) * UNIT_DETECTORS)
         samples = slice(number * UNIT_SAMPLES, min((number + 1) * UNIT_SAMPLES, self._n_samples))
-        return self._layers.sums(others, self._xi[rows], self._eta[rows], *times(samples, self.step))
+        return self._layers.sums(
+            others, self._xi[rows], self._eta[rows], *times(samples, self.step)
+        )
 
-    def _make(self, key: tuple[int, int], g: Floats, weighted: Floats, sine: Floats) -> dict[str, AnyFloats]:
+    def _make(
+        self, key: tuple[int, int], g: Floats, weighted: Floats, sine: Floats
+    ) -> dict[str, AnyFloats]:
         own = _own(g.shape[1])
         with self._lock:  # what is made again is not counted again
             counted = own if key not in self._sums else slice(0, 0)
@@ -240,9 +322,13 @@ def units_fit(n_detectors: int, n_samples: int, step: int, streams: int) -> bool
 
 
 def keeps_all(n_detectors: int, n_samples: int, step: int, streams: int) -> bool:
-    """Whether all units of `OfDetectors` are kept, so that the order in which blocks are worked on does not matter."""
+    """Whether all units of `OfDetectors` are kept, so that the order in which blocks are worked on
+    does not matter.
+    """
     stream = 4 * n_detectors * n_samples
-    return units_bytes(n_detectors, n_samples, step, streams) <= max(BYTES_KEPT, min(ALL_KEPT, SHARE_KEPT * stream))
+    return units_bytes(n_detectors, n_samples, step, streams) <= max(
+        BYTES_KEPT, min(ALL_KEPT, SHARE_KEPT * stream)
+    )
 
 
 def units_bytes(n_detectors: int, n_samples: int, step: int, streams: int) -> int:
@@ -253,7 +339,12 @@ def units_bytes(n_detectors: int, n_samples: int, step: int, streams: int) -> in
 
 def _unit_size(n_detectors: int, step: int, streams: int) -> int:
     """Bytes."""
-    return 4 * min(UNIT_DETECTORS, n_detectors) * (UNIT_SAMPLES // min(step, UNIT_SAMPLES) + 3) * streams
+    return (
+        4
+        * min(UNIT_DETECTORS, n_detectors)
+        * (UNIT_SAMPLES // min(step, UNIT_SAMPLES) + 3)
+        * streams
+    )
 
 
 def _held(band: weakref.ref[OfDetectors]) -> OfDetectors | None:

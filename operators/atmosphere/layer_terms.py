@@ -1,13 +1,16 @@
-"""Layers whose water absorbs and emits as it does at its height, where the column's does as it does on average.
+"""Layers whose water absorbs and emits as it does at its height, where the column's does as it does
+on average.
 
-With f'_l(s) the derivative of the band's emission (or opacity) with respect to a relative change of the PWV that is made at the
-height of layer l, f'(0, s) that of the column, kappa_l = f'_l / f', what `response` gives for the column gains
+With f'_l(s) the derivative of the band's emission (or opacity) with respect to a relative change of
+the PWV that is made at the height of layer l, f'(0, s) that of the column, kappa_l = f'_l / f',
+what `response` gives for the column gains
 
-    f'(0, s) sum_l (kappa_l - 1) p a_l g_l = (1 / s) sum_j S^j sum_l c_jl p a_l g_l,      S in [-1, 1] over the scan      (1)
+    f'(0, s) sum_l (kappa_l - 1) p a_l g_l = (1 / s) sum_j S^j sum_l c_jl p a_l g_l,
+    S in [-1, 1] over the scan      (1)
 
-the first order of what each layer's water changes more than the column's. s (f'_l - f') is nearly constant where the air is
-clear; the c_jl are its polynomials in S, of the degree that the range of elevations needs. The quotient kappa_l is not formed:
-where a line is saturated f' vanishes.
+the first order of what each layer's water changes more than the column's. s (f'_l - f') is nearly
+constant where the air is clear; the c_jl are its polynomials in S, of the degree that the range of
+elevations needs. The quotient kappa_l is not formed: where a line is saturated f' vanishes.
 """
 
 from __future__ import annotations
@@ -39,7 +42,8 @@ class LayerTerms:
     Attributes
     ----------
     weights
-        (k, n_layer) c_jl times y / (a_l g_l): the weights of the sums over the layers' a_l g_l, those of the emission first.
+        (k, n_layer) c_jl times y / (a_l g_l): the weights of the sums over the layers' a_l g_l,
+        those of the emission first.
     degrees
         Highest power of S of each of `NAMES`.
     sines
@@ -51,9 +55,21 @@ class LayerTerms:
     sines: tuple[float, float]
 
     @classmethod
-    def of(cls, band: BandAtmosphere, pwv: float, heights: Floats, scale: float, sines: tuple[float, float]) -> LayerTerms:
-        """Compute the terms of layers at ``heights`` (n_layer,) above the site [m]; ``scale``: y / sum_l a_l g_l."""
-        low, high = max(sines[0], math.sin(ELEVATION_MIN) * (1 + 1e-12)), min(sines[1], math.sin(ELEVATION_MAX))
+    def of(
+        cls,
+        band: BandAtmosphere,
+        pwv: float,
+        heights: Floats,
+        scale: float,
+        sines: tuple[float, float],
+    ) -> LayerTerms:
+        """Compute the terms of layers at ``heights`` (n_layer,) above the site [m]; ``scale``: y /
+        sum_l a_l g_l.
+        """
+        low, high = (
+            max(sines[0], math.sin(ELEVATION_MIN) * (1 + 1e-12)),
+            min(sines[1], math.sin(ELEVATION_MAX)),
+        )
         looked_at = np.cos(np.linspace(0, math.pi, LOOKED_AT))
         points = [np.cos(np.pi * (np.arange(n + 1) + 0.5) / (n + 1)) for n in DEGREES]
         places = np.concatenate([looked_at, *points])
@@ -68,7 +84,9 @@ class LayerTerms:
                 matrix = np.linalg.inv(np.vander(known, degree + 1, increasing=True))
                 found = matrix @ excess[first : first + degree + 1]
                 first += degree + 1
-                error = np.abs(np.vander(looked_at, degree + 1, increasing=True) @ found - truth).max()
+                error = np.abs(
+                    np.vander(looked_at, degree + 1, increasing=True) @ found - truth
+                ).max()
                 if error <= ERROR * np.abs(own[:LOOKED_AT]).max():
                     break
             weights.append(scale * found)
@@ -76,7 +94,9 @@ class LayerTerms:
         return cls(np.concatenate(weights), tuple(degrees), (low, high))
 
     def add(self, name: str, sums: Floats, s: Floats, out: Floats) -> None:
-        """Add equation (1) to the response called ``name``; ``sums`` (k, n, m) over all layers, ``s`` and ``out`` (n, m)."""
+        """Add equation (1) to the response called ``name``; ``sums`` (k, n, m) over all layers,
+        ``s`` and ``out`` (n, m).
+        """
         if name not in NAMES:
             return
         which = NAMES.index(name)
@@ -92,7 +112,8 @@ class LayerTerms:
 
 
 def kappa(band: BandAtmosphere, pwv: float, elevation: float, heights: Floats) -> dict[str, Floats]:
-    """kappa of the emission and of the opacity, (n,) each, at ``heights`` above the site [m]. PWV in m, elevation in rad.
+    """kappa of the emission and of the opacity, (n,) each, at ``heights`` above the site [m]. PWV
+    in m, elevation in rad.
 
     Of the whole column, int kappa rho_v dh = PWV.
     """

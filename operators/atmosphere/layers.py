@@ -1,12 +1,15 @@
-"""`AtmosphereLayers`: turbulent layers of water vapour that drift over the telescope, their emission and their opacity.
+"""`AtmosphereLayers`: turbulent layers of water vapour that drift over the telescope, their
+emission and their opacity.
 
 The PWV along a line of sight is
 
-    PWV_los = airmass PWV (1 + y),    y = p sum_l a_l g_l,    sum_l a_l^2 = 1                                    (1)
+    PWV_los = airmass PWV (1 + y),   y = p sum_l a_l g_l,
+    sum_l a_l^2 = 1                                    (1)
 
-with g_l the unit-variance von Karman field of layer l (`turbulence`), seen through the near-field beam at the layer's
-distance, and p the ensemble rms. Emission and transmission of the band follow from radiative transfer at PWV (1 + y) and the
-elevation of the ray (`response`). All of it is smooth, so it is computed at nodes (`turbulence.nodes`) and interpolated.
+with g_l the unit-variance von Karman field of layer l (`turbulence`), seen through the near-field
+beam at the layer's distance, and p the ensemble rms. Emission and transmission of the band follow
+from radiative transfer at PWV (1 + y) and the elevation of the ray (`response`). All of it is
+smooth, so it is computed at nodes (`turbulence.nodes`) and interpolated.
 """
 
 from __future__ import annotations
@@ -34,19 +37,29 @@ from .weather.radiative_transfer import ELEVATION_MIN
 
 
 class _Provides:
-    """The streams of an `AtmosphereLayers`: those of every one, and its `outputs`; of the class: all that there may be."""
+    """The streams of an `AtmosphereLayers`: those of every one, and its `outputs`; of the class:
+    all that there may be.
+    """
 
     def __get__(self, operator: AtmosphereLayers | None, owner: type) -> frozenset[str]:
-        return frozenset({"atmosphere", "transmission", *(operator.outputs if operator else ("pwv", "opacity", "path_delay"))})
+        return frozenset(
+            {
+                "atmosphere",
+                "transmission",
+                *(operator.outputs if operator else ("pwv", "opacity", "path_delay")),
+            }
+        )
 
 
 class AtmosphereLayers(LayerParameters):
-    """Turbulent layers of water vapour seen through near-field beams: their emission and transmission in the band.
+    """Turbulent layers of water vapour seen through near-field beams: their emission and
+    transmission in the band.
 
-    Sets ``observation.smooth["atmosphere"]`` (mean emission, K_RJ) and ``["transmission"]`` (band-mean e^-tau), and adds the
-    fluctuation of the emission to the stream ``atmosphere`` and that of the transmission, relative, to ``transmission``.
-    With `outputs` it also makes streams of the fluctuation along each line of sight: ``pwv`` (m), ``opacity`` (of the band)
-    and ``path_delay`` (m of excess path, non-dispersive).
+    Sets ``observation.smooth["atmosphere"]`` (mean emission, K_RJ) and ``["transmission"]``
+    (band-mean e^-tau), and adds the fluctuation of the emission to the stream ``atmosphere`` and
+    that of the transmission, relative, to ``transmission``. With `outputs` it also makes streams of
+    the fluctuation along each line of sight: ``pwv`` (m), ``opacity`` (of the band) and
+    ``path_delay`` (m of excess path, non-dispersive).
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -60,31 +73,53 @@ class AtmosphereLayers(LayerParameters):
         return self._models.of(self, observation)
 
     def check(self, data: Data) -> list[str]:
-        """The weather and what the band sees of it. Raises InputError or PointingError where a run cannot be seen through it."""
-        models, lines = Models(data.scene.time, data.scene.weather, {}, self._models._bands), list[str]()
+        """The weather and what the band sees of it. Raises InputError or PointingError where a run
+        cannot be seen through it.
+        """
+        models, lines = (
+            Models(data.scene.time, data.scene.weather, {}, self._models._bands),
+            list[str](),
+        )
         for observation in data.observations:
             _check_pointing(observation)
         for alone in data.observations[0].of_each_band() if data.observations else ():
             model, band = models.of(self, alone), alone.instrument.band.name
-            _ = model.turbulence, model.ground  # what is wrong with layers is found as they are laid out
-            every = np.concatenate([o.elevation[[o.elevation.argmin(), o.elevation.argmax()]] for o in data.observations])
+            _ = (
+                model.turbulence,
+                model.ground,
+            )  # what is wrong with layers is found as they are laid out
+            every = np.concatenate(
+                [
+                    o.elevation[[o.elevation.argmin(), o.elevation.argmax()]]
+                    for o in data.observations
+                ]
+            )
             emission = np.asarray(model.band.emission(model.pwv, every))
             if not lines:
                 if text := doubt(f"{self.label}: PWV", model.pwv, PWV, "m"):
                     warnings.warn(text, stacklevel=2)
                 lines.append(f"PWV {1e3 * model.pwv:.3g} mm at zenith")
             through = float(np.mean(model.band.transmission(model.pwv, every)))
-            lines.append(f"{band}: emission {emission.min():.3g} to {emission.max():.3g} K_RJ, transmission {through:.3g}")
+            lines.append(
+                f"{band}: emission {emission.min():.3g} to {emission.max():.3g} K_RJ, transmission"
+                f" {through:.3g}"
+            )
         return lines
 
     def observe(self, data: Data) -> None:
-        """Note the start of the run and its scans, which share one drifting atmosphere; announce the load to map makers."""
-        self._models = self._models.of_run(data)  # one of its own: copies of this step may be at work in other threads
+        """Note the start of the run and its scans, which share one drifting atmosphere; announce
+        the load to map makers.
+        """
+        self._models = self._models.of_run(
+            data
+        )  # one of its own: copies of this step may be at work in other threads
         for observation in data.observations:
             ExpectedLoad(self._models, self, observation).announce()
 
     def configure(self, observation: Observation) -> None:
-        """Set the smooth means: noise levels that follow from the load need them before any step is prepared."""
+        """Set the smooth means: noise levels that follow from the load need them before any step is
+        prepared.
+        """
         _check_pointing(observation)
         model = self.model(observation)
         observation.weather = model.ground
@@ -102,13 +137,19 @@ class AtmosphereLayers(LayerParameters):
         return state
 
     def exec(self, block: Block, state: AtNodes | OfDetectors) -> None:
-        """Add the fluctuations to the block's ``atmosphere`` and ``transmission``, and to the `outputs`."""
+        """Add the fluctuations to the block's ``atmosphere`` and ``transmission``, and to the
+        `outputs`.
+        """
         names: dict[str, str] = {"emission": "atmosphere", "transmission": "transmission"}
         names.update((name, name) for name in self.outputs)
         made = {}
         for name, stream in names.items():
             there = stream in block.detdata
-            made[name] = block.buffer(f"{self.label} {name}", block.shape) if there else block.new(stream, zero=False)
+            made[name] = (
+                block.buffer(f"{self.label} {name}", block.shape)
+                if there
+                else block.new(stream, zero=False)
+            )
         state.into(block.detectors, block.samples, made)
         for name, stream in names.items():
             if block.detdata[stream] is not made[name]:
@@ -126,7 +167,8 @@ def _check_pointing(observation: Observation) -> None:
         if not np.isfinite(part).all():
             bad = np.flatnonzero(~np.isfinite(quaternions).all(axis=1))
             raise PointingError(
-                f"the boresight of sample {bad[0]} is not a number ({len(bad)} of {observation.n_samples} samples)",
+                f"the boresight of sample {bad[0]} is not a number ({len(bad)} of"
+                f" {observation.n_samples} samples)",
                 place=observation.name,
                 cure="repair the pointing, or remove these samples",
             )
@@ -136,8 +178,8 @@ def _check_pointing(observation: Observation) -> None:
     elevation = observation.elevation
     if 0 <= elevation.min() < ELEVATION_MIN:
         raise PointingError(
-            f"the boresight is {math.degrees(elevation.min()):.2f} deg above the horizon at sample {elevation.argmin()}; "
-            "the limits of the radiative transfer are 4.5 to 90 deg",
+            f"the boresight is {math.degrees(elevation.min()):.2f} deg above the horizon at sample"
+            f" {elevation.argmin()}; the limits of the radiative transfer are 4.5 to 90 deg",
             place=observation.name,
             cure="choose a target or a time with a higher elevation",
         )

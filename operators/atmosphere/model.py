@@ -1,4 +1,6 @@
-"""What an observation sees of the atmosphere before any of it is drawn: built once, for the run and for planning."""
+"""What an observation sees of the atmosphere before any of it is drawn: built once, for the run and
+for planning.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ EDGE_TAPER = 10.0
 """dB: power at the rim of a tapered aperture below that at its centre, where none is given."""
 
 ONE_VALUE = 0.01
-"""Relative change of the fluctuation's rms with elevation within a scan up to which one value serves the whole scan."""
+"""Relative change of the fluctuation's rms with elevation within a scan up to which one value
+serves the whole scan.
+"""
 
 AIRMASS_STEP = 0.05
 """Of ln(airmass), between which the load's integrals over the passband are interpolated."""
@@ -55,7 +59,8 @@ MODELS_KEPT = 2
 
 @dataclass(eq=False)
 class AtmosphereModel:
-    """The atmosphere above one observation: weather, the band's response to it, the layers as the telescope sees them.
+    """The atmosphere above one observation: weather, the band's response to it, the layers as the
+    telescope sees them.
 
     Attributes
     ----------
@@ -85,7 +90,11 @@ class AtmosphereModel:
     @cached_property
     def layers(self) -> list[Layer]:
         """The layers, the lowest first."""
-        p, telescope, band = self.parameters, self.observation.instrument.telescope, self.observation.instrument.band
+        p, telescope, band = (
+            self.parameters,
+            self.observation.instrument.telescope,
+            self.observation.instrument.band,
+        )
         heights = np.linspace(p.lowest, p.highest, p.layers)
         shares, winds = _shares(p, self.profile, heights), _winds(p, self.profile, heights)
         layers = []
@@ -94,14 +103,28 @@ class AtmosphereModel:
             aperture, sigma = None, beam_sigma(telescope, band, distance)
             if p.beam != "gaussian":
                 taper = 0.0 if p.beam == "top_hat" else p.edge_taper or EDGE_TAPER
-                aperture = Aperture(widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance), taper)
+                aperture = Aperture(
+                    widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance), taper
+                )
                 sigma = aperture.sigma
-            layers.append(Layer(share, height, distance, p.outer_scale, sigma, aperture, np.asarray(wind, np.float64)))
+            layers.append(
+                Layer(
+                    share,
+                    height,
+                    distance,
+                    p.outer_scale,
+                    sigma,
+                    aperture,
+                    np.asarray(wind, np.float64),
+                )
+            )
         return layers
 
     @cached_property
     def turbulence(self) -> list[Turbulence]:
-        """The layers' fields. Keyed by seed, operator and layer, not by observation: all scans see the same atmosphere."""
+        """The layers' fields. Keyed by seed, operator and layer, not by observation: all scans see
+        the same atmosphere.
+        """
         p = self.parameters
         return [
             Turbulence(
@@ -127,12 +150,16 @@ class AtmosphereModel:
         before = p.pwv_rms
         if p.pwv_rms_after_beam:
             before, _ = Fluctuation(p.pwv_rms, True, self._variance_at_zenith).before_and_after()
-        return Fluctuation(before * float(self.slab.share(math.sin(self.elevation))), False, variance)
+        return Fluctuation(
+            before * float(self.slab.share(math.sin(self.elevation))), False, variance
+        )
 
     def strength(self, sine: Floats) -> Floats | None:
-        """By which the fluctuation at sines of the elevation exceeds that at the mean elevation; None: nowhere.
+        """By which the fluctuation at sines of the elevation exceeds that at the mean elevation;
+        None: nowhere.
 
-        Where `pwv_rms` holds at the zenith, in scans whose elevation changes by so much that it varies by `ONE_VALUE`.
+        Where `pwv_rms` holds at the zenith, in scans whose elevation changes by so much that it
+        varies by `ONE_VALUE`.
         """
         if self._strength is None:
             return None
@@ -144,7 +171,9 @@ class AtmosphereModel:
         if self.parameters.pwv_rms_at == "scan":
             return None
         elevation, reach = self.observation.elevation, math.atan(self.observation.focalplane.radius)
-        ends = np.clip([float(elevation.min()), float(elevation.max())], ELEVATION_MIN, ELEVATION_MAX)
+        ends = np.clip(
+            [float(elevation.min()), float(elevation.max())], ELEVATION_MIN, ELEVATION_MAX
+        )
         mean = float(self.slab.share(math.sin(self.elevation)))
         if np.abs(self.slab.share(np.sin(ends)) / mean - 1).max() <= ONE_VALUE:
             return None
@@ -156,7 +185,9 @@ class AtmosphereModel:
     def slab(self) -> Slab:
         """The water between the lowest and the highest layer."""
         p = self.parameters
-        return Slab(self.profile if p.weights == "vapour" else None, p.lowest, p.highest, p.outer_scale)
+        return Slab(
+            self.profile if p.weights == "vapour" else None, p.lowest, p.highest, p.outer_scale
+        )
 
     @property
     def elevation(self) -> float:
@@ -164,15 +195,25 @@ class AtmosphereModel:
         return min(max(float(np.mean(self.observation.elevation)), ELEVATION_MIN), ELEVATION_MAX)
 
     def _variance(self, layers: Sequence[Layer]) -> float:
-        return sum(m.amplitude**2 * b.variance for m, b in zip(layers, self.turbulence, strict=True))
+        return sum(
+            m.amplitude**2 * b.variance for m, b in zip(layers, self.turbulence, strict=True)
+        )
 
     @cached_property
     def _variance_at_zenith(self) -> float:
         """Of the sum of the layers behind the beam, for a telescope that looks up."""
-        telescope, band, total = self.observation.instrument.telescope, self.observation.instrument.band, 0.0
+        telescope, band, total = (
+            self.observation.instrument.telescope,
+            self.observation.instrument.band,
+            0.0,
+        )
         for layer in self.layers:
             if layer.aperture is None:
-                one = float(beam_correlation(0.0, layer.outer_scale, beam_sigma(telescope, band, layer.height))[0])
+                one = float(
+                    beam_correlation(
+                        0.0, layer.outer_scale, beam_sigma(telescope, band, layer.height)
+                    )[0]
+                )
             else:
                 width = widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, layer.height)
                 one = Aperture(width, layer.aperture.taper).variance(layer.outer_scale)
@@ -181,7 +222,8 @@ class AtmosphereModel:
 
     @cached_property
     def kappa(self) -> dict[str, Floats]:
-        """``emission`` and ``opacity`` (n_layer,) of water at each layer's height over the column's, at the mean elevation.
+        """``emission`` and ``opacity`` (n_layer,) of water at each layer's height over the
+        column's, at the mean elevation.
 
         1 where layers respond as the column does."""
         if self.parameters.layer_response == "column":
@@ -195,18 +237,27 @@ class AtmosphereModel:
 
     @cached_property
     def emitting(self) -> list[Layer]:
-        """The layers, with their shares of the emission's fluctuation in place of those of the water's: kappa_l a_l."""
+        """The layers, with their shares of the emission's fluctuation in place of those of the
+        water's: kappa_l a_l.
+        """
         if self.parameters.layer_response == "column":
             return self.layers
         shares = np.abs(self.kappa["emission"])
-        return [replace(m, amplitude=m.amplitude * k) for m, k in zip(self.layers, shares.tolist(), strict=True)]
+        return [
+            replace(m, amplitude=m.amplitude * k)
+            for m, k in zip(self.layers, shares.tolist(), strict=True)
+        ]
 
     def terms(self, sines: tuple[float, float]) -> LayerTerms | None:
-        """What the layers that are simulated add to the column's response between two sines of the elevation."""
+        """What the layers that are simulated add to the column's response between two sines of the
+        elevation.
+        """
         if self.parameters.layer_response == "column":
             return None
         simulated = [k for k in range(len(self.layers)) if k not in self.parameters.omit]
-        return LayerTerms.of(self.band, self.pwv, self.heights[simulated], self.fluctuation.scale, sines)
+        return LayerTerms.of(
+            self.band, self.pwv, self.heights[simulated], self.fluctuation.scale, sines
+        )
 
     def resolution(self, tolerance: float | None = None) -> Resolution:
         """Nodes and steps in time, for the parameters' tolerance or another."""
@@ -215,28 +266,42 @@ class AtmosphereModel:
             emission = partial(self.band.emission, self.pwv)
             layers, rms = self.emitting, self.fluctuation.rms
             variance = self._variance(layers)
-            if not variance > 1e-12 * self.fluctuation.variance:  # of a saturated line only the air below is seen
+            if (
+                not variance > 1e-12 * self.fluctuation.variance
+            ):  # of a saturated line only the air below is seen
                 layers, variance = self.layers, self.fluctuation.variance
-            found = choose_resolution(self.observation, self.plane, layers, variance, tolerance, emission, rms)
+            found = choose_resolution(
+                self.observation, self.plane, layers, variance, tolerance, emission, rms
+            )
             self._resolutions[tolerance] = found
         return self._resolutions[tolerance]
 
     @property
     def ground(self) -> GroundWeather:
         """The weather at the telescope."""
-        return on_the_ground(self.profile, self.time, None if self.parameters.wind == "profile" else self.layers[0].wind)
+        return on_the_ground(
+            self.profile,
+            self.time,
+            None if self.parameters.wind == "profile" else self.layers[0].wind,
+        )
 
     def means(self) -> dict[str, SmoothField]:
         """Mean emission and transmission over the scan, at nodes of their own."""
         chosen, n = self.resolution(), self.observation.n_samples
         nodes, step = chosen.mean_nodes, chosen.mean_step
         index = times_with_margin(n, step)
-        elevation = np.arcsin(rays(axes_at(self.observation.boresight_azel, index, step), nodes.xi, nodes.eta)[2])
-        # The margin of the spline is an extrapolated path: it stays inside the limits of the radiative transfer.
+        elevation = np.arcsin(
+            rays(axes_at(self.observation.boresight_azel, index, step), nodes.xi, nodes.eta)[2]
+        )
+        # The margin of the spline is an extrapolated path: it stays inside the limits of the
+        # radiative transfer.
         inside = (index >= 0) & (index < n)
         elevation[:, ~inside] = np.clip(elevation[:, ~inside], ELEVATION_MIN, ELEVATION_MAX)
         values = {"atmosphere": self.band.emission, "transmission": self.band.transmission}
-        return {k: SmoothField.from_values(nodes.weights, f(self.pwv, elevation), step, n) for k, f in values.items()}
+        return {
+            k: SmoothField.from_values(nodes.weights, f(self.pwv, elevation), step, n)
+            for k, f in values.items()
+        }
 
 
 @dataclass
@@ -250,8 +315,12 @@ class Models:
     _made: list[tuple[str, AtmosphereModel]] = field(default_factory=list, compare=False)
 
     def of_run(self, data: Data) -> Models:
-        """Those of a run, which begins at one time in one weather, and whose scans follow each other through the same layers."""
-        planes = dict(zip((o.name for o in data.observations), scan_planes(data.observations), strict=True))
+        """Those of a run, which begins at one time in one weather, and whose scans follow each
+        other through the same layers.
+        """
+        planes = dict(
+            zip((o.name for o in data.observations), scan_planes(data.observations), strict=True)
+        )
         return Models(data.scene.time, data.scene.weather, planes, self._bands)
 
     def of(self, parameters: LayerParameters, observation: Observation) -> AtmosphereModel:
@@ -262,26 +331,50 @@ class Models:
                 return model
         plane = self._planes.get(observation.name) or scan_planes([observation])[0]
         profile, band = self.weather(parameters, observation)
-        # A planner changes parameters in copies of the operator; the model keeps those that it was built with.
-        made = AtmosphereModel(parameters.model_copy(), observation, plane, profile, band, self._time or observation.start)
+        # A planner changes parameters in copies of the operator; the model keeps those that it was
+        # built with.
+        made = AtmosphereModel(
+            parameters.model_copy(),
+            observation,
+            plane,
+            profile,
+            band,
+            self._time or observation.start,
+        )
         self._made = [*self._made[1 - MODELS_KEPT :], (key, made)]
         return made
 
-    def weather(self, parameters: LayerParameters, observation: Observation) -> tuple[Profile, BandAtmosphere]:
+    def weather(
+        self, parameters: LayerParameters, observation: Observation
+    ) -> tuple[Profile, BandAtmosphere]:
         """One weather for the run: the scene's at its start; and the band's response to it."""
         time, band = self._time or observation.start, observation.instrument.band
         vapour = parameters.pwv, parameters.pwv_rms, parameters.spectra
-        key = (repr(observation.site), time, repr(band), repr(self._weather), observation.seed, *vapour)
+        key = (
+            repr(observation.site),
+            time,
+            repr(band),
+            repr(self._weather),
+            observation.seed,
+            *vapour,
+        )
         if key not in self._bands:
-            profile = profile_of(self._weather, observation.site, time, observation.seed, parameters.pwv)
+            profile = profile_of(
+                self._weather, observation.site, time, observation.seed, parameters.pwv
+            )
             largest = largest_pwv(parameters.pwv or profile.pwv, parameters.pwv_rms)
-            self._bands[key] = profile, BandAtmosphere(band, profile, largest, absorption_of(parameters))
+            self._bands[key] = (
+                profile,
+                BandAtmosphere(band, profile, largest, absorption_of(parameters)),
+            )
         return self._bands[key]
 
 
 @dataclass(frozen=True)
 class ExpectedLoad:
-    """What an `AtmosphereLayers` announces to other steps of an observation: `expected_load` as a call, and its model."""
+    """What an `AtmosphereLayers` announces to other steps of an observation: `expected_load` as a
+    call, and its model.
+    """
 
     models: Models
     parameters: LayerParameters
@@ -297,10 +390,16 @@ class ExpectedLoad:
             self.observation.shared.announce(self.parameters.label, self.observation.name, self)
 
     def spectra(self) -> LoadSpectra:
-        """The atmosphere over the passband at elevations that the scan sees, before its model is built."""
+        """The atmosphere over the passband at elevations that the scan sees, before its model is
+        built.
+        """
         profile, band = self.models.weather(self.parameters, self.observation)
         elevation, reach = self.observation.elevation, math.atan(self.observation.focalplane.radius)
-        ends = np.clip([float(elevation.min()) - reach, float(elevation.max()) + reach], ELEVATION_MIN, ELEVATION_MAX)
+        ends = np.clip(
+            [float(elevation.min()) - reach, float(elevation.max()) + reach],
+            ELEVATION_MIN,
+            ELEVATION_MAX,
+        )
         low, high = np.log(np.sin(ends))
         number = 2 + math.ceil((high - low) / AIRMASS_STEP)
         elevations = np.arcsin(np.minimum(np.exp(np.linspace(low, high, number)), 1.0))
@@ -311,7 +410,9 @@ class ExpectedLoad:
         return self.models.of(self.parameters, self.observation)
 
 
-def expected_load(models: Models, parameters: LayerParameters, observation: Observation) -> tuple[float, float]:
+def expected_load(
+    models: Models, parameters: LayerParameters, observation: Observation
+) -> tuple[float, float]:
     """Mean emission [K_RJ] and transmission in the middle of a scan, before its model is built."""
     profile, band = models.weather(parameters, observation)
     elevation = min(max(float(np.median(observation.elevation)), ELEVATION_MIN), ELEVATION_MAX)
@@ -332,9 +433,11 @@ def absorption_of(parameters: LayerParameters) -> AbsorptionTable:
 
 
 def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
-    """Standard deviation [m] of the beam at a distance [m] along the line of sight: D sqrt(1 + (z/z_r)^2) / 2.3548.
+    """Standard deviation [m] of the beam at a distance [m] along the line of sight: D sqrt(1 +
+    (z/z_r)^2) / 2.3548.
 
-    From the paper's near-field FWHM(z) = D sqrt(z^-2 + z_r^-2) rad, z_r = pi (D/2)^2 / lambda at the band centre.
+    From the paper's near-field FWHM(z) = D sqrt(z^-2 + z_r^-2) rad, z_r = pi (D/2)^2 / lambda at
+    the band centre.
     """
     return widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance) / FWHM_PER_SIGMA
 
@@ -347,7 +450,9 @@ def _shares(parameters: LayerParameters, profile: Profile, heights: Floats) -> F
         share = np.asarray(profile.at(heights).vapour_density) * thickness
     if not share.sum() > 0:
         raise InputError(
-            "the atmosphere is dry at every layer", place=parameters.label, cure="set weights: equal, or lower the layers"
+            "the atmosphere is dry at every layer",
+            place=parameters.label,
+            cure="set weights: equal, or lower the layers",
         )
     return np.asarray(share / np.sqrt((share**2).sum()), np.float64)
 

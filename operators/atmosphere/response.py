@@ -1,13 +1,16 @@
-"""The band's response to a fluctuation of the PWV, as polynomials valid for one scan: fast, and smooth.
+"""The band's response to a fluctuation of the PWV, as polynomials valid for one scan: fast, and
+smooth.
 
 With y the relative fluctuation of the PWV and s the sine of the elevation,
 
-    f(y, s) = y sum_ij c_ij Y^i S^j,       Y, S in [-1, 1] over the ranges of y and s                               (1)
+    f(y, s) = y sum_ij c_ij Y^i S^j,
+    Y, S in [-1, 1] over the ranges of y and s                               (1)
 
-stands for the difference of the emission [K_RJ] and of the opacity from those at y = 0, fitted to `BandAtmosphere` at Chebyshev
-points; the relative transmission, which spans decades in opaque bands, is expm1 of minus the latter. The factor y makes it
-exact where nothing fluctuates. Where layers have a response of their own (`layer_terms`), its first order is added. Ranges too
-wide for polynomials of `_DEGREES` (strong log-normal fluctuations) are left to `BandAtmosphere` itself.
+stands for the difference of the emission [K_RJ] and of the opacity from those at y = 0, fitted to
+`BandAtmosphere` at Chebyshev points; the relative transmission, which spans decades in opaque
+bands, is expm1 of minus the latter. The factor y makes it exact where nothing fluctuates. Where
+layers have a response of their own (`layer_terms`), its first order is added. Ranges too wide for
+polynomials of `_DEGREES` (strong log-normal fluctuations) are left to `BandAtmosphere` itself.
 """
 
 from __future__ import annotations
@@ -38,11 +41,13 @@ _DEGREES = ((2, 2), (3, 3), (4, 4), (5, 6), (7, 8), (10, 12), (14, 16))
 
 
 def delay_per_vapour(temperature: Floats, weights: Floats) -> float:
-    """Excess path length per PWV, Pi = 1e-6 rho R_v (k_3 / T_m + k_2'), of vapour at temperatures [K] with weights (any unit).
+    """Excess path length per PWV, Pi = 1e-6 rho R_v (k_3 / T_m + k_2'), of vapour at temperatures
+    [K] with weights (any unit).
 
-    T_m = int rho_v dz / int (rho_v / T) dz, rho the density of water, R_v the gas constant of vapour (Bevis et al. 1994, J. Appl.
-    Meteor. 33, 379, after Thayer). Pi is 6.4 at T_m = 273 K and falls with temperature, 0.35 % per K. It holds for radio waves
-    far from water lines; dispersion in the submillimetre windows (some per cent, more beside 557 GHz) is not in it.
+    T_m = int rho_v dz / int (rho_v / T) dz, rho the density of water, R_v the gas constant of
+    vapour (Bevis et al. 1994, J. Appl. Meteor. 33, 379, after Thayer). Pi is 6.4 at T_m = 273 K and
+    falls with temperature, 0.35 % per K. It holds for radio waves far from water lines; dispersion
+    in the submillimetre windows (some per cent, more beside 557 GHz) is not in it.
     """
     mean = float(weights.sum() / (weights / temperature).sum())
     return 1e-6 * WATER_DENSITY * VAPOUR_GAS_CONSTANT * (K3 / mean + K2)
@@ -93,7 +98,9 @@ class Response:
         low, high = max(sines[0], bottom), min(sines[1], top)
         self._s = ((low + high) / 2, 2 / max(high - low, 1e-9))
 
-        def elevation(s: Floats) -> Floats:  # lines of sight beyond are refused: this cuts the widened range, and rounding
+        def elevation(
+            s: Floats,
+        ) -> Floats:  # lines of sight beyond are refused: this cuts the widened range, and rounding
             return np.asarray(np.arcsin(np.clip(s, bottom, top)), np.float64)
 
         def column(y: Floats, s: Floats) -> Floats:
@@ -113,7 +120,8 @@ class Response:
         self._coefficients = {name: self._fit(self._direct[name]) for name in needed}
 
     def __call__(self, name: str, y: Floats, s: Floats, weighted: Floats | None = None) -> Floats:
-        """The difference called ``name`` at fluctuations ``y`` and sines of the elevation ``s``, both (n, m).
+        """The difference called ``name`` at fluctuations ``y`` and sines of the elevation ``s``,
+        both (n, m).
 
         ``weighted``: (k, n, m) sums over the layers, with the weights of `LayerTerms`.
         """
@@ -146,13 +154,19 @@ class Response:
         for n_y, n_s in _DEGREES:
             looked_at = LOOKED_AT if max(n_y, n_s) <= 4 else 2 * LOOKED_AT
             if looked_at not in known:
-                known[looked_at] = over_y(*self._unscaled(*np.meshgrid(*_ends(looked_at), indexing="ij")))
+                known[looked_at] = over_y(
+                    *self._unscaled(*np.meshgrid(*_ends(looked_at), indexing="ij"))
+                )
             truth, (a, b) = known[looked_at], (_points(n) for n in (n_y, n_s))
             values = over_y(*self._unscaled(*np.meshgrid(a, b, indexing="ij")))
             series = np.einsum("iu,uv,jv->ij", _to_series(n_y), values, _to_series(n_s))
-            found = np.einsum("pi,ij,qj->pq", *(_vander(looked_at, 0, n_y), series, _vander(looked_at, 1, n_s)))
+            found = np.einsum(
+                "pi,ij,qj->pq", *(_vander(looked_at, 0, n_y), series, _vander(looked_at, 1, n_s))
+            )
             if abs(found - truth).max() <= ERROR * abs(truth).max():
-                return np.ascontiguousarray(np.einsum("ki,ij,lj->kl", _to_powers(n_y), series, _to_powers(n_s)))
+                return np.ascontiguousarray(
+                    np.einsum("ki,ij,lj->kl", _to_powers(n_y), series, _to_powers(n_s))
+                )
         return None
 
     def _unscaled(self, a: Floats, b: Floats) -> tuple[Floats, Floats]:
@@ -161,7 +175,9 @@ class Response:
 
 def airmass(elevation: Floats, height: float) -> Floats:
     """Airmass of a spherical shell at ``height`` [m]: equation (1) of `radiative_transfer`."""
-    return np.asarray(1 / np.sqrt(1 - (np.cos(elevation) / (1 + height / EARTH_RADIUS)) ** 2), np.float64)
+    return np.asarray(
+        1 / np.sqrt(1 - (np.cos(elevation) / (1 + height / EARTH_RADIUS)) ** 2), np.float64
+    )
 
 
 def _ends(number: int) -> tuple[Floats, Floats]:
@@ -176,7 +192,9 @@ def _points(n: int) -> Floats:
 @lru_cache
 def _to_series(n: int) -> Floats:
     """Matrix (n, n) from values at `_points` to Chebyshev coefficients."""
-    return np.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(_points(n), n - 1)), np.float64)
+    return np.asarray(
+        np.linalg.inv(np.polynomial.chebyshev.chebvander(_points(n), n - 1)), np.float64
+    )
 
 
 @lru_cache
@@ -196,10 +214,13 @@ def _to_powers(n: int) -> Floats:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _polynomials(y, s, coefficients, y0, y_scale, s0, s_scale, y_low, y_high, out):  # type: ignore[no-untyped-def]
+def _polynomials(  # type: ignore[no-untyped-def]
+    y, s, coefficients, y0, y_scale, s0, s_scale, y_low, y_high, out
+):
     """Equation (1); the number of values of ``y`` outside its range.
 
-    S outside its range belongs to the path beyond the ends of a scan, which only feeds the margin of a spline: held at its end.
+    S outside its range belongs to the path beyond the ends of a scan, which only feeds the margin
+    of a spline: held at its end.
     """
     m = nb.uint64(y.shape[1])
     n_y, n_s = coefficients.shape

@@ -35,7 +35,8 @@ class LayerScreen:
     spacing
         Between the values, m.
     track
-        (n, 2) across and along the wind, m, where the boresight passes through the layer during the scan; 0 at the moment.
+        (n, 2) across and along the wind, m, where the boresight passes through the layer during the
+        scan; 0 at the moment.
     fwhm, field
         Width of the beam there, and diameter of the field of view, m.
     """
@@ -63,7 +64,8 @@ class Screens:
     seconds
         (k,) of ``pwv``, s since the scan's start.
     pwv
-        (k, n, n) fluctuation of the PWV along the line of sight, m; rows eta, columns xi; NaN beyond the field.
+        (k, n, n) fluctuation of the PWV along the line of sight, m; rows eta, columns xi; NaN
+        beyond the field.
     side
         Of the field, rad.
     mean_pwv
@@ -91,9 +93,10 @@ def sketches(name: str, found: Screens) -> list[Sketch]:
     for ax, layer in zip(layers, found.layers, strict=True):
         _layer(ax, layer)
     text = (
-        f"PWV fluctuation (at zenith) in each simulated layer, {found.moment:.3g} s after the start of {found.observation}, in "
-        "the frame that drifts with the layer's wind (arrow). Line: where the boresight passes through the layer in the scan; "
-        "cross: at this moment; solid circle: the beam (FWHM); dotted: the field of view."
+        f"PWV fluctuation (at zenith) in each simulated layer, {found.moment:.3g} s after the start"
+        f" of {found.observation}, in the frame that drifts with the layer's wind (arrow). Line:"
+        " where the boresight passes through the layer in the scan; cross: at this moment; solid"
+        " circle: the beam (FWHM); dotted: the field of view."
     )
     strip = _grid(len(found.seconds))
     half = math.degrees(found.side) * 30
@@ -103,8 +106,9 @@ def sketches(name: str, found: Screens) -> list[Sketch]:
         ax.set_xlabel("xi [arcmin]", fontsize=9)
         ax.set_ylabel("eta [arcmin]", fontsize=9)
     caption = (
-        f"Fluctuation of the PWV along the line of sight [µm] over the field of view of {found.observation}, minus its mean over "
-        f"the field, which each title states. Mean PWV {found.mean_pwv * 1e3:.3g} mm."
+        "Fluctuation of the PWV along the line of sight [µm] over the field of view of"
+        f" {found.observation}, minus its mean over the field, which each title states. Mean PWV"
+        f" {found.mean_pwv * 1e3:.3g} mm."
     )
     return [
         Sketch(f"{name}_layers", "Turbulent layers", text, layers[0]),
@@ -124,7 +128,10 @@ def _grid(count: int) -> list[Any]:
     figure = Figure(figsize=(width, height), dpi=110)
     made = []
     for k in range(count):
-        x, y = (k % columns) * (SIDE + right) + left, height - (k // columns + 1) * (inner + bottom + top) + bottom
+        x, y = (
+            (k % columns) * (SIDE + right) + left,
+            height - (k // columns + 1) * (inner + bottom + top) + bottom,
+        )
         made.append(figure.add_axes((x / width, y / height, inner / width, inner / height)))
     return made
 
@@ -133,10 +140,14 @@ def _image(ax: Any, values: Any, half: float, title: str) -> None:
     """Values [m] in µm, with a colour bar of its own, zero in white."""
     shown = np.ma.masked_invalid(values * 1e6)
     top = float(np.abs(shown).max()) or 1.0
-    picture = ax.imshow(shown, origin="lower", extent=(-half, half, -half, half), cmap=COLOURS, vmin=-top, vmax=top)
+    picture = ax.imshow(
+        shown, origin="lower", extent=(-half, half, -half, half), cmap=COLOURS, vmin=-top, vmax=top
+    )
     box = ax.get_position()
     figure = ax.figure
-    bar = figure.add_axes((box.x1 + 0.06 / figure.get_figwidth(), box.y0, 0.07 / figure.get_figwidth(), box.height))
+    bar = figure.add_axes(
+        (box.x1 + 0.06 / figure.get_figwidth(), box.y0, 0.07 / figure.get_figwidth(), box.height)
+    )
     figure.colorbar(picture, cax=bar).set_label("change of the PWV [µm]", fontsize=9, labelpad=5)
     bar.tick_params(labelsize=8.5, pad=1)
     ax.tick_params(labelsize=8.5)
@@ -151,13 +162,29 @@ def _layer(ax: Any, layer: LayerScreen) -> None:
     half = n * layer.spacing / 2
     speed = math.hypot(*layer.wind)
     azimuth = math.degrees(math.atan2(*layer.wind)) % 360
-    _image(ax, layer.values, half, f"{layer.height:.0f} m, wind {speed:.3g} m/s towards {azimuth:.0f}°")
+    _image(
+        ax, layer.values, half, f"{layer.height:.0f} m, wind {speed:.3g} m/s towards {azimuth:.0f}°"
+    )
     ax.plot(*layer.track.T, color="black", linewidth=0.6)
     here = layer.track[np.abs(layer.track).sum(axis=1).argmin()]
     ax.plot(*here, "x", color="black", markersize=5)
     ax.add_patch(Circle(tuple(here), layer.fwhm / 2, fill=False, edgecolor="black", linewidth=1.0))
-    ax.add_patch(Circle(tuple(here), layer.field / 2, fill=False, edgecolor="black", linewidth=1.0, linestyle=":"))
-    ax.annotate("", (-0.86 * half, 0.9 * half), (-0.86 * half, 0.5 * half), arrowprops={"arrowstyle": "-|>", "linewidth": 1.4})
+    ax.add_patch(
+        Circle(
+            tuple(here),
+            layer.field / 2,
+            fill=False,
+            edgecolor="black",
+            linewidth=1.0,
+            linestyle=":",
+        )
+    )
+    ax.annotate(
+        "",
+        (-0.86 * half, 0.9 * half),
+        (-0.86 * half, 0.5 * half),
+        arrowprops={"arrowstyle": "-|>", "linewidth": 1.4},
+    )
     ax.set_xlim(-half, half)
     ax.set_ylim(-half, half)
     ax.set_xlabel("across the wind [m]", fontsize=9)

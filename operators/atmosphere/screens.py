@@ -1,9 +1,12 @@
-"""`AtmosphereScreens`: the turbulence that the detectors saw, as fields: each layer at a moment, and their sum over the field.
+"""`AtmosphereScreens`: the turbulence that the detectors saw, as fields: each layer at a moment,
+and their sum over the field.
 
-The realization is that of `AtmosphereLayers` (the same random streams), evaluated at other places: layer l on its lattice, in the
-frame that drifts with its wind, and the fluctuation of the PWV along lines of sight over the field of view,
+The realization is that of `AtmosphereLayers` (the same random streams), evaluated at other places:
+layer l on its lattice, in the frame that drifts with its wind, and the fluctuation of the PWV along
+lines of sight over the field of view,
 
-    dPWV = airmass PWV y,   y as in equation (1) of `layers`.                                                (1)
+    dPWV = airmass PWV y,
+    y as in equation (1) of `layers`.                                                (1)
 """
 
 from __future__ import annotations
@@ -42,13 +45,16 @@ NOTHING = "there is no atmosphere to show"
 
 
 class AtmosphereScreens(Output):
-    """Pictures and files of the simulated turbulence: each layer at a moment, and the PWV over the field as time goes on.
+    """Pictures and files of the simulated turbulence: each layer at a moment, and the PWV over the
+    field as time goes on.
 
-    They show the realization that the detectors saw. Each layer is shown in the frame that drifts with its wind, with the wind,
-    the beam, the field of view and the boresight's track through it. Makes the product ``screens`` (a `Screens`); where there is
-    an output folder, it is written there as ``screens.fits`` and ``screens.ecsv``. `Plots` and `Report` show it.
+    They show the realization that the detectors saw. Each layer is shown in the frame that drifts
+    with its wind, with the wind, the beam, the field of view and the boresight's track through it.
+    Makes the product ``screens`` (a `Screens`); where there is an output folder, it is written
+    there as ``screens.fits`` and ``screens.ecsv``. `Plots` and `Report` show it.
 
-    Raises `PipelineError` where there is no `AtmosphereLayers`, or no scan of that number. A campaign has none: its log says so.
+    Raises `PipelineError` where there is no `AtmosphereLayers`, or no scan of that number. A
+    campaign has none: its log says so.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -74,14 +80,22 @@ class AtmosphereScreens(Output):
         return []
 
     def watch(self, data: Data, done: Progress) -> None:
-        """Refuse a scan that is not there before any is simulated; a part of a campaign does not know how many there are."""
+        """Refuse a scan that is not there before any is simulated; a part of a campaign does not
+        know how many there are.
+        """
         if done == "pointing" and not data.laid_out:
             data.check_scan(self.observation, self.label)
 
     def finalize(self, data: Data) -> None:
-        """Evaluate the layers and write them; on the sum of a campaign's scans, which has no scan any more, say so instead."""
+        """Evaluate the layers and write them; on the sum of a campaign's scans, which has no scan
+        any more, say so instead.
+        """
         if data.laid_out:
-            data.tally.state(self.label, "not drawn", "the scans of a campaign are not here when it is combined; run one of them")
+            data.tally.state(
+                self.label,
+                "not drawn",
+                "the scans of a campaign are not here when it is combined; run one of them",
+            )
             return
         data.check_scan(self.observation, self.label)
         load = data.observations[self.observation].expected_load
@@ -95,15 +109,23 @@ class AtmosphereScreens(Output):
 
 
 def screens(model: AtmosphereModel, moment: float | None, moments: int, pixels: int) -> Screens:
-    """The layers of an observation at a ``moment`` [s] after its start, and the PWV over the field at ``moments``."""
+    """The layers of an observation at a ``moment`` [s] after its start, and the PWV over the field
+    at ``moments``.
+    """
     o = model.observation
     seconds = np.asarray(o.seconds_at(np.arange(o.n_samples, dtype=np.int64)), np.float64)
     seconds = seconds - seconds[0]
-    at = o.n_samples // 2 if moment is None else int(np.searchsorted(seconds, min(moment, float(seconds[-1]))))
+    at = (
+        o.n_samples // 2
+        if moment is None
+        else int(np.searchsorted(seconds, min(moment, float(seconds[-1]))))
+    )
     step = model.resolution().step
     samples = np.linspace(0, o.n_samples - 1, moments + 2)[1:-1].astype(np.int64) // step * step
     plane = o.focalplane
-    radius = max(float(np.hypot(plane.xi, plane.eta).max()), float(plane.fwhm.max()) / 2)  # of one detector its beam
+    radius = max(
+        float(np.hypot(plane.xi, plane.eta).max()), float(plane.fwhm.max()) / 2
+    )  # of one detector its beam
     line = np.linspace(-1, 1, pixels) * radius
     xi, eta = (grid.ravel() for grid in np.meshgrid(line, line))
     inside = np.hypot(xi, eta) <= radius * (1 + 1e-9)
@@ -111,11 +133,14 @@ def screens(model: AtmosphereModel, moment: float | None, moments: int, pixels: 
     pwv[:, inside] = pwv_at(model, xi[inside], eta[inside], samples).T
     layers = _layers(model, at)
     cube = pwv.reshape(moments, pixels, pixels)
-    return Screens(layers, float(seconds[at]), seconds[samples], cube, 2 * radius, model.pwv, o.name)
+    return Screens(
+        layers, float(seconds[at]), seconds[samples], cube, 2 * radius, model.pwv, o.name
+    )
 
 
 def pwv_at(model: AtmosphereModel, xi: Floats, eta: Floats, samples: NDArray[np.int64]) -> Floats:
-    """(n, k) fluctuation of the PWV [m] along lines of sight at focal-plane offsets (n,) and samples (k,), equation (1).
+    """(n, k) fluctuation of the PWV [m] along lines of sight at focal-plane offsets (n,) and
+    samples (k,), equation (1).
 
     Samples are rounded down to the times that `AtmosphereLayers` evaluates.
     """
@@ -125,7 +150,9 @@ def pwv_at(model: AtmosphereModel, xi: Floats, eta: Floats, samples: NDArray[np.
     for sample in samples:
         g, sine = layers(xi, eta, int(sample) // step, 1)
         strength = model.strength(sine)
-        y = np.clip(law(g if strength is None else g * strength), -1.0, model.band.pwv_max / model.pwv - 1)
+        y = np.clip(
+            law(g if strength is None else g * strength), -1.0, model.band.pwv_max / model.pwv - 1
+        )
         found.append((model.pwv * y * airmass(np.arcsin(sine), height))[:, 0])
     return np.stack(found, axis=1)
 
@@ -145,10 +172,14 @@ def _layers(model: AtmosphereModel, at: int) -> list[LayerScreen]:
         if number in omit:
             continue
         matrix, start, velocity = plane.affine(layer.height, layer.wind)
-        place = (matrix @ crossing + start[:, None] + velocity[:, None] * path.seconds[samples]).T  # across, along
+        place = (
+            matrix @ crossing + start[:, None] + velocity[:, None] * path.seconds[samples]
+        ).T  # across, along
         here, track = place[-1], place[:-1] - place[-1]
         fwhm, d = field.sigma * FWHM_PER_SIGMA, field.spacing
-        half = max(LEAST_BEAMS / 2 * fwhm, layer.distance * angle, float(np.abs(track).max()) * 1.05)
+        half = max(
+            LEAST_BEAMS / 2 * fwhm, layer.distance * angle, float(np.abs(track).max()) * 1.05
+        )
         cells = min(MOST_CELLS // 2, math.ceil(half / d))
         i, j = (round(float(v) / d) for v in here)
         values = field.region(i - cells, i + cells + 1, j - cells, j + cells + 1).astype(np.float64)
@@ -170,25 +201,44 @@ def _layers(model: AtmosphereModel, at: int) -> list[LayerScreen]:
 
 
 def write(found: Screens, stem: Path) -> list[Path]:
-    """``STEM.fits`` (PWV over the field, then each layer) and ``STEM.ecsv`` (the layers); their paths. Raises OutputError."""
+    """``STEM.fits`` (PWV over the field, then each layer) and ``STEM.ecsv`` (the layers); their
+    paths. Raises OutputError.
+    """
     images, table = stem.with_name(f"{stem.name}.fits"), stem.with_name(f"{stem.name}.ecsv")
     with atomic_path(images) as temporary, open(temporary, "wb") as file:
         step = math.degrees(found.side) / (found.pwv.shape[1] - 1)
         middle = (found.pwv.shape[1] + 1) / 2
         cards = Cards(
-            [("EXTNAME", "PWV", "fluctuation along the line of sight"), ("BUNIT", "m"), ("CTYPE1", "XI"), ("CTYPE2", "ETA")]
+            [
+                ("EXTNAME", "PWV", "fluctuation along the line of sight"),
+                ("BUNIT", "m"),
+                ("CTYPE1", "XI"),
+                ("CTYPE2", "ETA"),
+            ]
         )
-        cards = cards.add(Cards((f"CRPIX{k}", middle) for k in (1, 2))).add(Cards((f"CDELT{k}", step) for k in (1, 2)))
+        cards = cards.add(Cards((f"CRPIX{k}", middle) for k in (1, 2))).add(
+            Cards((f"CDELT{k}", step) for k in (1, 2))
+        )
         for k, second in enumerate(found.seconds):
             cards[f"TIME{k + 1}"] = float(second), "[s] since the start of the scan"
         for piece in image_pieces(cards, found.pwv, dtype=np.float64):
             file.write(piece)
         for k, layer in enumerate(found.layers):
             cards = Cards(
-                [("EXTNAME", f"LAYER{k}"), ("BUNIT", "m"), ("HEIGHT", layer.height, "[m]"), ("TIME", found.moment, "[s]")]
+                [
+                    ("EXTNAME", f"LAYER{k}"),
+                    ("BUNIT", "m"),
+                    ("HEIGHT", layer.height, "[m]"),
+                    ("TIME", found.moment, "[s]"),
+                ]
             )
-            for axis, (name, n) in enumerate(zip(("ACROSS", "ALONG"), layer.values.shape[::-1], strict=True), 1):
-                cards[f"CTYPE{axis}"], cards[f"CDELT{axis}"] = (name, "the wind"), (layer.spacing, "[m]")
+            for axis, (name, n) in enumerate(
+                zip(("ACROSS", "ALONG"), layer.values.shape[::-1], strict=True), 1
+            ):
+                cards[f"CTYPE{axis}"], cards[f"CDELT{axis}"] = (
+                    (name, "the wind"),
+                    (layer.spacing, "[m]"),
+                )
                 cards[f"CRPIX{axis}"] = (n + 1) / 2
             for piece in image_pieces(cards, layer.values, extension=True, dtype=np.float64):
                 file.write(piece)
@@ -200,7 +250,16 @@ def write(found: Screens, stem: Path) -> list[Path]:
         Column("wind_north", [r.wind[1] for r in rows], "m / s", "towards the north"),
         Column("beam", [r.fwhm for r in rows], "m", "FWHM of the beam in the layer"),
         Column("field", [r.field for r in rows], "m", "diameter of the field of view in the layer"),
-        Column("pwv_rms", [float(r.values.std()) for r in rows], "m", "of the fluctuation within the picture"),
+        Column(
+            "pwv_rms",
+            [float(r.values.std()) for r in rows],
+            "m",
+            "of the fluctuation within the picture",
+        ),
     ]
-    write_ecsv(table, columns, {"OBSERVATION": found.observation, "MOMENT": found.moment, "PWV": found.mean_pwv})
+    write_ecsv(
+        table,
+        columns,
+        {"OBSERVATION": found.observation, "MOMENT": found.moment, "PWV": found.mean_pwv},
+    )
     return [images, table]

@@ -1,9 +1,9 @@
 """Crosstalk between detectors.
 
-    y_d = x_d + sum_e C_de x_e,   C_dd = 0,                                                                (1)
+    y_d = x_d + sum_e C_de x_e,   C_dd = 0,   (1)
 
-at every instant, C_de the share of the signal of detector e that is read in detector d. The sum is formed in the order of the
-detectors.
+at every instant, C_de the share of the signal of detector e that is read in detector d. The sum is
+formed in the order of the detectors.
 """
 
 from __future__ import annotations
@@ -31,17 +31,20 @@ from zonda.core.storage.table_mistakes import Mistakes
 from zonda.core.types import Floats
 
 NEXT = 1.2
-"""Detectors up to this many of the smallest distance away are neighbours: six in a hexagon, four in a square."""
+"""Detectors up to this many of the smallest distance away are neighbours: six in a hexagon, four in
+a square.
+"""
 
 COLUMNS = ("detector", "source", "share")
 """Of a matrix in a file."""
 
 
 class Crosstalk(Operator):
-    """Add to the signal of each detector shares of the signals of others: y_d = x_d + sum_e C_de x_e.
+    """Add to the signal of each detector shares of the signals of others: y_d = x_d + sum_e C_de
+    x_e.
 
-    C is `level` for the nearest neighbours in the focal plane that are of the same band, or the table in `file`. A sample that
-    is not finite adds nothing to others.
+    C is `level` for the nearest neighbours in the focal plane that are of the same band, or the
+    table in `file`. A sample that is not finite adds nothing to others.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -52,7 +55,9 @@ class Crosstalk(Operator):
     level: Fraction = quantity("0.3 %", ge=-0.5, le=0.5)
     """Share of each nearest neighbour's signal."""
     file: InputPath | None = None
-    """Table (ECSV or CSV) of shares, with columns `detector` and `source` (names) and `share`; instead of `level`."""
+    """Table (ECSV or CSV) of shares, with columns `detector` and `source` (names) and `share`;
+    instead of `level`.
+    """
 
     @model_validator(mode="after")
     def _one_of_two(self) -> Crosstalk:
@@ -67,10 +72,16 @@ class Crosstalk(Operator):
         return []
 
     def prepare(self, observation: Observation) -> Shares:
-        """The shares by detector. Raises InputError for a file that does not suit the focal plane."""
+        """The shares by detector. Raises InputError for a file that does not suit the focal
+        plane.
+        """
         plane = observation.focalplane
-        found = neighbours(plane, self.level) if self.file is None else read_shares(self.file, plane)
-        observation.tally.state(self.label, "pairs of detectors with crosstalk", f"{len(found.source)}")
+        found = (
+            neighbours(plane, self.level) if self.file is None else read_shares(self.file, plane)
+        )
+        observation.tally.state(
+            self.label, "pairs of detectors with crosstalk", f"{len(found.source)}"
+        )
         return found
 
     def exec(self, block: Block, state: Shares) -> None:
@@ -98,7 +109,9 @@ class Shares:
     share: Floats
 
     @classmethod
-    def of(cls, n_det: int, detector: NDArray[np.int64], source: NDArray[np.int64], share: Floats) -> Shares:
+    def of(
+        cls, n_det: int, detector: NDArray[np.int64], source: NDArray[np.int64], share: Floats
+    ) -> Shares:
         """From entries in any order."""
         order = np.lexsort((source, detector))
         first = np.searchsorted(detector[order], np.arange(n_det + 1))
@@ -106,7 +119,9 @@ class Shares:
 
 
 def neighbours(plane: Focalplane, level: float) -> Shares:
-    """``level`` for each pair of nearest neighbours of one band; detectors in one place are none."""
+    """``level`` for each pair of nearest neighbours of one band; detectors in one place are
+    none.
+    """
     from scipy.spatial import cKDTree
 
     at, bands = np.stack([plane.xi, plane.eta], axis=1), np.asarray(plane.band)
@@ -119,7 +134,13 @@ def neighbours(plane: Focalplane, level: float) -> Shares:
             reach = NEXT * float(np.min(tree.query(places, k=[2])[0]))
             near = tree.sparse_distance_matrix(tree, reach, output_type="coo_matrix")
             held = [of_band[where.ravel() == k] for k in range(len(places))]
-            pairs += [(d, e) for i, j in zip(near.row, near.col, strict=True) if i != j for d in held[i] for e in held[j]]
+            pairs += [
+                (d, e)
+                for i, j in zip(near.row, near.col, strict=True)
+                if i != j
+                for d in held[i]
+                for e in held[j]
+            ]
     found = np.array(pairs, np.int64).reshape(-1, 2)
     return Shares.of(len(plane), found[:, 0], found[:, 1], np.full(len(found), level))
 
@@ -139,19 +160,27 @@ def read_shares(path: Path, plane: Focalplane) -> Shares:
         index.append(np.array([number.get(name, -1) for name in names], np.int64))
     detector, source = index
     for row in np.flatnonzero((detector == source) & (detector >= 0)).tolist():
-        mistakes.add(table.lines[row], "is a detector's share of itself", "remove it; gains are not crosstalk")
+        mistakes.add(
+            table.lines[row],
+            "is a detector's share of itself",
+            "remove it; gains are not crosstalk",
+        )
     share = np.zeros(len(table))
     with mistakes.noted():
         share = table.numbers(COLUMNS[2])
     mistakes.tell()
     if len(set(zip(detector.tolist(), source.tolist(), strict=True))) < len(share):
-        raise InputError("a pair of detectors is there twice", place=table.place, cure="remove one of the rows")
+        raise InputError(
+            "a pair of detectors is there twice", place=table.place, cure="remove one of the rows"
+        )
     return Shares.of(len(plane), detector, source, share)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _add_shares(given, first, source, share, out):  # type: ignore[no-untyped-def]
-    """Equation (1); the detectors' samples in turn, so that a sample has the same bits in every block."""
+    """Equation (1); the detectors' samples in turn, so that a sample has the same bits in every
+    block.
+    """
     for d in range(out.shape[0]):
         for k in range(first[d], first[d + 1]):
             row, factor = given[source[k]], out.dtype.type(share[k])

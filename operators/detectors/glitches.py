@@ -1,11 +1,12 @@
 """Glitches: short pulses in single detectors, such as cosmic rays make.
 
-    g(t) = sum_i A_i exp(-(t - t_i) / tau)   for t >= t_i,                                                 (1)
+    g(t) = sum_i A_i exp(-(t - t_i) / tau)   for t >= t_i,   (1)
 
-arrivals t_i of a Poisson process of rate lambda in each detector, amplitudes A_i exponentially distributed with mean A: shot
-noise of mean lambda A tau and variance lambda A^2 tau (Campbell 1909; Planck 2013 results X has such pulses and their rates). A
-sample is the value at its time; what arrives between two samples is seen from the next one on, decayed. After `REACH` tau a pulse
-is over.
+arrivals t_i of a Poisson process of rate lambda in each detector, amplitudes A_i exponentially
+distributed with mean A: shot noise of mean lambda A tau and variance lambda A^2 tau (Campbell 1909;
+Planck 2013 results X has such pulses and their rates). A sample is the value at its time; what
+arrives between two samples is seen from the next one on, decayed. After `REACH` tau a pulse is
+over.
 """
 
 from __future__ import annotations
@@ -34,10 +35,12 @@ REACH = 23
 
 
 class Glitches(Operator):
-    """Pulses A exp(-(t - t_i) / decay) at random times t_i in each detector: the component ``glitches`` at the detector.
+    """Pulses A exp(-(t - t_i) / decay) at random times t_i in each detector: the component
+    ``glitches`` at the detector.
 
-    Samples in which pulses exceed `flag_above` are lost, as if a glitch finder had found them: they become NaN, filters bridge
-    them in every signal, and no map uses them. The log counts pulses and samples.
+    Samples in which pulses exceed `flag_above` are lost, as if a glitch finder had found them: they
+    become NaN, filters bridge them in every signal, and no map uses them. The log counts pulses and
+    samples.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -68,7 +71,9 @@ class Glitches(Operator):
             of = slice(int(state.first[d]), int(state.first[d + 1]))
             if of.stop > of.start:
                 seconds = observation.seconds[block.samples]
-                lost += _add_pulses(state.time[of], state.amplitude[of], self.decay, seconds, threshold, row)
+                lost += _add_pulses(
+                    state.time[of], state.amplitude[of], self.decay, seconds, threshold, row
+                )
         if self.flag_above is not None:
             size = block.shape[0] * block.shape[1]
             observation.tally.count(self.label, "samples lost to glitches", lost, size)
@@ -108,14 +113,20 @@ def arrivals(step: Glitches, observation: Observation) -> Arrivals:
     return Arrivals(np.cumsum(count, dtype=np.int64), np.concatenate(times), np.concatenate(sizes))
 
 
-def _of_detector(step: Glitches, observation: Observation, detector: int, span: float) -> tuple[Floats, Floats]:
-    """(arrival times within ``span``, uniform deviates of the amplitudes): waiting times are exponential."""
+def _of_detector(
+    step: Glitches, observation: Observation, detector: int, span: float
+) -> tuple[Floats, Floats]:
+    """(arrival times within ``span``, uniform deviates of the amplitudes): waiting times are
+    exponential.
+    """
     if step.rate == 0:
         return np.zeros(0), np.zeros(0)
     key, mean = observation.detector_key(step.label), step.rate * span
     number = int(mean + 6 * math.sqrt(mean) + 16)
     while True:
-        u = uniforms(key, 0, 2 * number, stream=detector).reshape(-1, 2)  # pairs, so that more of them begin with the same
+        u = uniforms(key, 0, 2 * number, stream=detector).reshape(
+            -1, 2
+        )  # pairs, so that more of them begin with the same
         when = np.cumsum(-np.log(u[:, 0])) / step.rate
         if when[-1] > span:
             kept = int(np.searchsorted(when, span))
@@ -125,7 +136,8 @@ def _of_detector(step: Glitches, observation: Observation, detector: int, span: 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _add_pulses(times, amplitudes, decay, seconds, threshold, out):  # type: ignore[no-untyped-def]
-    """Add equation (1) at ``seconds`` (n,) to ``out`` (n,); NaN where it is above the threshold. Returns how many are.
+    """Add equation (1) at ``seconds`` (n,) to ``out`` (n,); NaN where it is above the threshold.
+    Returns how many are.
 
     Each sample is the sum over the pulses in their order, whatever the block.
     """

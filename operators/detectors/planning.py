@@ -34,11 +34,19 @@ class GainPlanning(Planning[GainDrift]):
         return 8 * observation.n_detectors * (observation.n_samples // step + 4)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size: all that is in the stream, the mean emission included, changes by the rms of the gains."""
+        """Its size: all that is in the stream, the mean emission included, changes by the rms of
+        the gains.
+        """
         rms, o = self.operator.rms, context.first
-        size = context.bound(rms * (context.fluctuation + context.mean_emission), o.duration) | context.sky_error(rms)
-        text = "rms of the gains x (rms of the stream + mean emission); of the sky, rms of the gains"
-        return Estimate((Effect("gain drift", (full("exact"),), size, text),), Cost(fixed=0.01, per_sample=2e-9))
+        size = context.bound(
+            rms * (context.fluctuation + context.mean_emission), o.duration
+        ) | context.sky_error(rms)
+        text = (
+            "rms of the gains x (rms of the stream + mean emission); of the sky, rms of the gains"
+        )
+        return Estimate(
+            (Effect("gain drift", (full("exact"),), size, text),), Cost(fixed=0.01, per_sample=2e-9)
+        )
 
 
 class TimeConstantPlanning(Planning[TimeConstant]):
@@ -54,7 +62,14 @@ class TimeConstantPlanning(Planning[TimeConstant]):
         frequency = min(0.71 * speed / float(o.focalplane.fwhm.min()), o.sample_rate / 2)
         loss = 1 - 1 / math.hypot(1, 2 * math.pi * frequency * tau)
         text = "1 - |1 / (1 + 2 pi i f tau)| at f = 0.71 v / FWHM"
-        effects = (Effect("time constant", (full("exact below 0.46 of the sample rate"),), context.sky_error(loss), text),)
+        effects = (
+            Effect(
+                "time constant",
+                (full("exact below 0.46 of the sample rate"),),
+                context.sky_error(loss),
+                text,
+            ),
+        )
         remembered = REMEMBERED * tau * o.sample_rate
         return Estimate(effects, Cost(fixed=0.001, per_sample=3e-8 * (1 + remembered / 2048)))
 
@@ -69,14 +84,24 @@ class CrosstalkPlanning(Planning[Crosstalk]):
         return 24 * len(self._shares(observation).source)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size: the signals of others, all alike. A table may give one detector more than the rest."""
+        """Its size: the signals of others, all alike. A table may give one detector more than the
+        rest.
+        """
         shares, o = self._shares(context.first), context.first
         rows = np.repeat(np.arange(o.n_detectors), np.diff(shares.first))
         largest = float(np.bincount(rows, np.abs(shares.share), o.n_detectors).max(initial=0.0))
-        size = context.bound(largest * (context.fluctuation + context.mean_emission), o.duration, common=True)
-        text = "largest sum of a detector's shares x (rms of the stream + mean emission); of the sky, that sum"
+        size = context.bound(
+            largest * (context.fluctuation + context.mean_emission), o.duration, common=True
+        )
+        text = (
+            "largest sum of a detector's shares x (rms of the stream + mean emission); of the sky,"
+            " that sum"
+        )
         effect = Effect("crosstalk", (full("exact"),), size | context.sky_error(largest), text)
-        return Estimate((effect,), Cost(fixed=0.01, per_sample=1e-9 + 0.3e-9 * len(rows) / max(o.n_detectors, 1)))
+        return Estimate(
+            (effect,),
+            Cost(fixed=0.01, per_sample=1e-9 + 0.3e-9 * len(rows) / max(o.n_detectors, 1)),
+        )
 
     def _shares(self, observation: Observation) -> Shares:
         step, plane = self.operator, observation.focalplane

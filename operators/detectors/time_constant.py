@@ -1,21 +1,23 @@
 """The time constants of the detectors: a first-order low-pass.
 
-A detector of time constant tau answers x(t) with y, tau y' = x - y, the response 1 / (1 + 2 pi i f tau) (Mather 1982). From
-sample to sample, 1/f_s apart,
+A detector of time constant tau answers x(t) with y, tau y' = x - y, the response 1 / (1 + 2 pi i f
+tau) (Mather 1982). From sample to sample, 1/f_s apart,
 
-    y_n = a y_(n-1) + r int_0^1 e^(-r v) x(n - v) dv,   a = e^-r,   r = 1 / (tau f_s),                                     (1)
+    y_n = a y_(n-1) + r int_0^1 e^(-r v) x(n - v) dv,   a = e^-r,   r = 1 / (tau f_s),   (1)
 
-v in samples. Of a signal without waves above f_s / 2, x(n - v) is the sum of its samples times sinc, here times Kaiser's window
-over `TAPS` samples on either side (Kaiser & Schafer 1980), so that the integral is one over samples too:
+v in samples. Of a signal without waves above f_s / 2, x(n - v) is the sum of its samples times
+sinc, here times Kaiser's window over `TAPS` samples on either side (Kaiser & Schafer 1980), so that
+the integral is one over samples too:
 
-    y_n = a y_(n-1) + sum_j w_j x_(n+j),   w_j = r int_0^1 e^(-r v) K(v + j) dv,                                           (2)
+    y_n = a y_(n-1) + sum_j w_j x_(n+j),   w_j = r int_0^1 e^(-r v) K(v + j) dv,   (2)
 
-K divided by its sum over j, so that a constant stays. The integral is a Gauss-Legendre sum over p = (1 - e^(-r v)) / (1 - a),
-exact for time constants from 0 to any. The response is that of the detector within 0.3 % up to 0.46 f_s. Before the scan x is
-taken to be what it is at its first sample, behind it what it is at its last.
+K divided by its sum over j, so that a constant stays. The integral is a Gauss-Legendre sum over p =
+(1 - e^(-r v)) / (1 - a), exact for time constants from 0 to any. The response is that of the
+detector within 0.3 % up to 0.46 f_s. Before the scan x is taken to be what it is at its first
+sample, behind it what it is at its last.
 
-The recursion begins anew `REACH` time constants before every tile of samples, so that no result depends on the blocks: what it
-forgets is e^-REACH of a change of x.
+The recursion begins anew `REACH` time constants before every tile of samples, so that no result
+depends on the blocks: what it forgets is e^-REACH of a change of x.
 """
 
 from __future__ import annotations
@@ -38,17 +40,17 @@ from zonda.core.types import Floats
 REACH = 23
 """Time constants after which a change counts no more: e^-23 = 1e-10."""
 TAPS, BETA, NODES = 24, 5.5, 48
-"""Samples on either side of an instant that tell the signal there, and the parameter of their window: 0.2 % up to 0.46 f_s. Nodes
-of the integral."""
+"""Samples on either side of an instant that tell the signal there, and the parameter of their
+window: 0.2 % up to 0.46 f_s. Nodes of the integral."""
 
 
 class TimeConstant(Operator):
-    """First-order low-pass of each detector, tau y' = x - y, with x what its samples say of a signal without waves above half of
-    the sample rate: within 0.5 % up to 0.46 of it.
+    """First-order low-pass of each detector, tau y' = x - y, with x what its samples say of a
+    signal without waves above half of the sample rate: within 0.5 % up to 0.46 of it.
 
-    It acts on all of the signal. Noise of the readout, which a real detector does not filter, is filtered too. A jump between two
-    samples, which holds waves of any frequency, rings for a few samples. Samples that are not finite stay as they are; the
-    filter sees a straight line there.
+    It acts on all of the signal. Noise of the readout, which a real detector does not filter, is
+    filtered too. A jump between two samples, which holds waves of any frequency, rings for a few
+    samples. Samples that are not finite stay as they are; the filter sees a straight line there.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -58,7 +60,9 @@ class TimeConstant(Operator):
     tau: Seconds = quantity("5 ms", ge=0, le=60)
     """Time constant."""
     scatter: Fraction = quantity("0 %", ge=0, le=1)
-    """Relative scatter of the time constants between detectors (log-normal with this median spread, the same in all scans)."""
+    """Relative scatter of the time constants between detectors (log-normal with this median spread,
+    the same in all scans).
+    """
 
     def constants(self, observation: Observation) -> Floats:
         """(n_det,) time constants, s."""
@@ -74,14 +78,22 @@ class TimeConstant(Operator):
         return reach + TAPS if reach else 0
 
     def prepare(self, observation: Observation) -> Floats:
-        """(n_det, 2 + 2 TAPS): a of equation (2), the samples that each remembers (0: it does nothing), and w."""
+        """(n_det, 2 + 2 TAPS): a of equation (2), the samples that each remembers (0: it does
+        nothing), and w.
+        """
         tau, rate = self.constants(observation), observation.sample_rate
         cut = 1 / (2 * np.pi * max(float(np.median(tau)), 1e-12))
         if cut < 1e9:
-            text = f"{1e3 * np.median(tau):.4g} ms (median); half power at {cut:.4g} Hz of {rate / 2:.4g} Hz"
+            text = (
+                f"{1e3 * np.median(tau):.4g} ms (median); half power at {cut:.4g} Hz of"
+                f" {rate / 2:.4g} Hz"
+            )
             observation.tally.state(self.label, "time constant", text)
         different, which = np.unique(tau, return_inverse=True)
-        made = [[math.exp(-1 / (t * rate)) if t else 0.0, _reach(t, rate), *weights(t * rate)] for t in different.tolist()]
+        made = [
+            [math.exp(-1 / (t * rate)) if t else 0.0, _reach(t, rate), *weights(t * rate)]
+            for t in different.tolist()
+        ]
         return np.array(made)[which]
 
     def exec(self, block: Block, state: Floats) -> None:
@@ -115,7 +127,9 @@ def _reach(tau: float, rate: float) -> int:
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _low_pass(given, start, factors, tile, out):  # type: ignore[no-untyped-def]
-    """Equation (2); ``given``, ``out`` (n_det, n) from sample ``start`` on, in tiles that are absolute."""
+    """Equation (2); ``given``, ``out`` (n_det, n) from sample ``start`` on, in tiles that are
+    absolute.
+    """
     n, taps = given.shape[1], (factors.shape[1] - 2) // 2
     for d in range(given.shape[0]):
         a, reach, w = factors[d, 0], int(factors[d, 1]), factors[d, 2:]
@@ -143,7 +157,9 @@ def _low_pass(given, start, factors, tile, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _around(row, low, high):  # type: ignore[no-untyped-def]
-    """Samples low .. high - 1 of a row in float64: straight lines where they are not finite, held beyond the last that are."""
+    """Samples low .. high - 1 of a row in float64: straight lines where they are not finite, held
+    beyond the last that are.
+    """
     x, before = np.zeros(high - low), -1
     for t in range(max(low, 0), min(high, row.size)):
         if np.isfinite(row[t]):

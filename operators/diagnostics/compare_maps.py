@@ -34,17 +34,19 @@ if TYPE_CHECKING:
 
 
 class CompareMaps(Output):
-    """How a map differs from a reference: difference, fidelity, signal-to-noise ratio, radial spectra and profiles.
+    """How a map differs from a reference: difference, fidelity, signal-to-noise ratio, radial
+    spectra and profiles.
 
-    Both are brought to one beam (the wider one) and one grid (that of the map with the smaller pixels), see
-    `comparison.planes`. Fidelity is \\|reference\\| / max(\\|difference\\|, `threshold` x rms of the difference), as for ALMA.
-    Of maps of I, Q and U each plane is compared, Q and U from the meridians of the map's frame (`comparison.stokes`):
-    ``comparison_Q`` and ``comparison_U`` stand beside ``comparison``, which is of I. Where one of the two has no Q and U, I alone
-    is compared.
+    Both are brought to one beam (the wider one) and one grid (that of the map with the smaller
+    pixels), see `comparison.planes`. Fidelity is \\|reference\\| / max(\\|difference\\|,
+    `threshold` x rms of the difference), as for ALMA. Of maps of I, Q and U each plane is compared,
+    Q and U from the meridians of the map's frame (`comparison.stokes`): ``comparison_Q`` and
+    ``comparison_U`` stand beside ``comparison``, which is of I. Where one of the two has no Q and
+    U, I alone is compared.
 
-    Makes the product ``comparison`` (a `Comparison`), or one under this step's own name where it has one; where there is an
-    output folder, it is written there as ``comparison.fits`` and as tables of spectra and profiles (ECSV). `Plots` and `Report`
-    show it.
+    Makes the product ``comparison`` (a `Comparison`), or one under this step's own name where it
+    has one; where there is an output folder, it is written there as ``comparison.fits`` and as
+    tables of spectra and profiles (ECSV). `Plots` and `Report` show it.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
@@ -54,29 +56,45 @@ class CompareMaps(Output):
     map: str = "map"
     """Which map, by its name among the products, e.g. noiseless/map."""
     reference: str = "input"
-    """What it is compared with, by its name among the products: the input of `SkyMap`, or another map."""
+    """What it is compared with, by its name among the products: the input of `SkyMap`, or another
+    map.
+    """
     file: InputPath | None = None
-    """FITS image or HEALPix map to compare with, instead of a product. A relative path starts at the pipeline file's folder."""
+    """FITS image or HEALPix map to compare with, instead of a product. A relative path starts at
+    the pipeline file's folder.
+    """
     hdu: int | str | None = None
-    """Which extension of the `file`, by name or number. Default: its first image or HEALPix table."""
+    """Which extension of the `file`, by name or number. Default: its first image or HEALPix table.
+    """
     plane: int | list[int] | None = None
-    """Plane of a cube in the `file`, counted from 1; of one with several axes of planes a list, in FITS's order."""
+    """Plane of a cube in the `file`, counted from 1; of one with several axes of planes a list, in
+    FITS's order.
+    """
     coordsys: str | None = None
-    """Coordinate system of a HEALPix `file` whose header has no COORDSYS: C (ICRS), G (galactic) or E (ecliptic)."""
+    """Coordinate system of a HEALPix `file` whose header has no COORDSYS: C (ICRS), G (galactic) or
+    E (ecliptic).
+    """
     beam: Angle | None = Field(None, gt=0)
-    """Common resolution (FWHM). Default: that of the map with the wider beam, once more smoothed with it if it was not yet."""
+    """Common resolution (FWHM). Default: that of the map with the wider beam, once more smoothed
+    with it if it was not yet.
+    """
     least_coverage: float = Field(0.1, ge=0, lt=1)
-    """Map pixels with fewer (beam-smoothed) samples than this share of their 99th percentile are left out."""
+    """Map pixels with fewer (beam-smoothed) samples than this share of their 99th percentile are
+    left out.
+    """
     threshold: float = Field(THRESHOLD, gt=0, le=100)
     """Least difference that the fidelity divides by, in units of the rms of the difference."""
     noise: Literal["measured", "half_difference", "map"] = "measured"
-    """Noise of the SNR: that of the map, brought to the rms, at the resolution of the comparison, of the map of all but the sky
-    (signal ``source_free``) or else of half the difference of the scans; of the latter alone; or as it is (`map`)."""
+    """Noise of the SNR: that of the map, brought to the rms, at the resolution of the comparison,
+    of the map of all but the sky (signal ``source_free``) or else of half the difference of the
+    scans; of the latter alone; or as it is (`map`)."""
     bins: int = Field(24, ge=2, le=500)
     """Number of rings of the spectra, of equal width in the logarithm of the scale."""
 
     def check(self, data: Data) -> list[str]:
-        """Read the `file`, and tell what it holds. Raises InputError where it cannot be read as a map."""
+        """Read the `file`, and tell what it holds. Raises InputError where it cannot be read as a
+        map.
+        """
         for name in (self.map, *([self.reference] if self.file is None else [])):
             check_map(data, name, self.label)
         if self.file is None:
@@ -92,22 +110,35 @@ class CompareMaps(Output):
         return [f"{self.file.name}: {', '.join(read.planes)} in {unit}", *read.notes]
 
     def finalize(self, data: Data) -> None:
-        """Raises PipelineError where a map is missing, InputError where the two cannot be compared."""
-        references, maps = _references(self, data), products_of(_product(data, self.map, self.label), self.map)
+        """Raises PipelineError where a map is missing, InputError where the two cannot be
+        compared.
+        """
+        references, maps = (
+            _references(self, data),
+            products_of(_product(data, self.map, self.label), self.map),
+        )
         both = [plane for plane in maps if plane in references]
         if len(both) < max(len(maps), len(references)):
             which = "reference" if len(references) == 1 else "map"
             data.tally.state(self.label, "Q and U", f"not compared: the {which} has none")
-        references = on_meridians_of(plane_of(maps["I"][1], self.map), {plane: references[plane] for plane in both})
+        references = on_meridians_of(
+            plane_of(maps["I"][1], self.map), {plane: references[plane] for plane in both}
+        )
         for plane in both:
             _compare(self, data, plane, references[plane], maps[plane])
 
 
-def _compare(step: CompareMaps, data: Data, which: str, reference: Plane, product: tuple[str, Any]) -> None:
-    """Compare one of I, Q and U with that of the reference. ``product``: the map's name, and the map."""
+def _compare(
+    step: CompareMaps, data: Data, which: str, reference: Plane, product: tuple[str, Any]
+) -> None:
+    """Compare one of I, Q and U with that of the reference. ``product``: the map's name, and the
+    map.
+    """
     name, found = product
     runs = data.provenance.get("runs", {})
-    plane = covered(_with_noise(step, data, which, plane_of(found, name)), found, step.least_coverage)
+    plane = covered(
+        _with_noise(step, data, which, plane_of(found, name)), found, step.least_coverage
+    )
     plane = replace(plane, quiet=is_quiet(runs, step.map))
     if step.file is None:
         reference = replace(reference, quiet=is_quiet(runs, step.reference))
@@ -125,18 +156,26 @@ def _compare(step: CompareMaps, data: Data, which: str, reference: Plane, produc
 
 
 def _with_noise(step: CompareMaps, data: Data, which: str, plane: Plane) -> Plane:
-    """With the noise of the complete map, also of a signal without noise, and what is known of the noise alone."""
+    """With the noise of the complete map, also of a signal without noise, and what is known of the
+    noise alone.
+    """
     complete = step.map.rpartition("/")[2]
     whole = data.products.get(complete)
     if step.noise == "map" or not isinstance(whole, MapProduct) or whole.contents != "all":
         return plane
     name = plane_key(complete, which) if whole.polarization is not None else complete
     maps = maps_of(data.products)
-    alone = noise_alone(maps, name) if step.noise == "measured" else noise_alone(maps, name, ["half_difference"])
+    alone = (
+        noise_alone(maps, name)
+        if step.noise == "measured"
+        else noise_alone(maps, name, ["half_difference"])
+    )
     noisy = plane_of(maps[name], name, alone)
     if noisy.values.shape != plane.values.shape:
         return plane
-    return replace(plane, noise=noisy.noise, blurred=noisy.blurred, alone=noisy.alone, alone_of=noisy.alone_of)
+    return replace(
+        plane, noise=noisy.noise, blurred=noisy.blurred, alone=noisy.alone, alone_of=noisy.alone_of
+    )
 
 
 def _references(step: CompareMaps, data: Data) -> dict[str, Plane]:
@@ -152,7 +191,13 @@ def _references(step: CompareMaps, data: Data) -> dict[str, Plane]:
 def _read(step: CompareMaps) -> ReadMap:
     """The file. Raises InputError as `read_planes`."""
     assert step.file is not None
-    plane = (step.plane,) if isinstance(step.plane, int) else None if step.plane is None else tuple(step.plane)
+    plane = (
+        (step.plane,)
+        if isinstance(step.plane, int)
+        else None
+        if step.plane is None
+        else tuple(step.plane)
+    )
     return read_planes(step.file, wanted=Wanted(step.hdu, plane, step.coordsys))
 
 
@@ -167,7 +212,9 @@ def _in_kelvin(plane: Plane, band: Band) -> Plane:
 
 
 def resolution(plane: Plane, reference: Plane, product: Any) -> float:
-    """FWHM [rad] of the map with the wider beam; sqrt(2) times that of a map which is not smoothed yet. 0: not known."""
+    """FWHM [rad] of the map with the wider beam; sqrt(2) times that of a map which is not smoothed
+    yet. 0: not known.
+    """
     own = plane.fwhm or 0.0
     if isinstance(product, MapProduct) and not product.smoothed_by:
         own *= math.sqrt(2)
@@ -179,7 +226,9 @@ def covered(plane: Plane, product: Any, least: float) -> Plane:
     if not isinstance(product, MapProduct):
         return plane
     if product.projection == "TAN":
-        return replace(plane, values=np.where(window_of(product, least=least) > 0, plane.values, np.nan))
+        return replace(
+            plane, values=np.where(window_of(product, least=least) > 0, plane.values, np.nan)
+        )
     areas, seen = np.broadcast_to(plane.grid.areas, product.hits.shape), product.known
     depth = product.known_hits / areas  # samples per solid angle, under the beam
     if product.fwhm > 0:
@@ -192,8 +241,14 @@ def _product(data: Data, name: str, place: str) -> Any:
     found = data.products.get(name)
     if isinstance(found, Image) or (isinstance(found, MapProduct) and found.contents == "all"):
         return found
-    known = [key for key, value in data.products.items() if isinstance(value, Image | MapProduct) and not key.startswith("_")]
-    raise PipelineError(f"there is no map {name!r}", place=place, cure=f"name one of these: {', '.join(known)}")
+    known = [
+        key
+        for key, value in data.products.items()
+        if isinstance(value, Image | MapProduct) and not key.startswith("_")
+    ]
+    raise PipelineError(
+        f"there is no map {name!r}", place=place, cure=f"name one of these: {', '.join(known)}"
+    )
 
 
 def _tell(label: str, of: str, data: Data, found: Comparison) -> None:
@@ -203,4 +258,6 @@ def _tell(label: str, of: str, data: Data, found: Comparison) -> None:
     data.tally.state(label, f"{of}rms of the difference", f"{f['rms difference']:.3e} {found.unit}")
     if f.get("chi2 values"):
         ratio, error = f["chi2"] / f["chi2 pixels"], math.sqrt(2 / f["chi2 values"])
-        data.tally.state(label, f"{of}chi2 of the difference / pixels", f"{ratio:.4g} +- {error:.2g}")
+        data.tally.state(
+            label, f"{of}chi2 of the difference / pixels", f"{ratio:.4g} +- {error:.2g}"
+        )

@@ -24,12 +24,16 @@ from .series import about, check_streams, key_of
 from .stream_statistics import Pair, StreamComparison, pair
 
 LEAST_SEGMENTS = 8
-"""A segment is at most this part of the scan: with a single one the coherence is 1 whatever the streams."""
+"""A segment is at most this part of the scan: with a single one the coherence is 1 whatever the
+streams.
+"""
 
 
 @dataclass
 class Pairs:
-    """Spectra of one scan by detector, and the segment's length in samples (0: the scan is too short)."""
+    """Spectra of one scan by detector, and the segment's length in samples (0: the scan is too
+    short).
+    """
 
     detectors: NDArray[np.int64]
     length: int
@@ -38,12 +42,15 @@ class Pairs:
 
 
 class CompareStreams(Operator):
-    """How a stream differs from another at this step: rms, correlation, gain, ratio of spectra and coherence.
+    """How a stream differs from another at this step: rms, correlation, gain, ratio of spectra and
+    coherence.
 
-    Both are referred to the calibrated sky as in `PowerSpectrum`, and freed of a straight line in each segment: what is slower
-    than a segment is not compared. `signal` holds the mean emission of the atmosphere, `atmosphere` is the fluctuation about it.
-    Makes the product ``stream_comparison`` (a `StreamComparison`), or one under this step's own name where it has one; where
-    there is an output folder, it is written there as tables (ECSV), by frequency and by detector. `Plots` and `Report` show it.
+    Both are referred to the calibrated sky as in `PowerSpectrum`, and freed of a straight line in
+    each segment: what is slower than a segment is not compared. `signal` holds the mean emission of
+    the atmosphere, `atmosphere` is the fluctuation about it. Makes the product
+    ``stream_comparison`` (a `StreamComparison`), or one under this step's own name where it has
+    one; where there is an output folder, it is written there as tables (ECSV), by frequency and by
+    detector. `Plots` and `Report` show it.
 
     Raises `PipelineError` where a stream is absent at this step.
     """
@@ -55,14 +62,16 @@ class CompareStreams(Operator):
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     stream: AnyStream = "signal"
-    """Which stream: `signal`, that of a signal of `runs` (`signal/noiseless`), a component, or another that a step above makes
-    (`pwv`)."""
+    """Which stream: `signal`, that of a signal of `runs` (`signal/noiseless`), a component, or
+    another that a step above makes (`pwv`)."""
     reference: AnyStream = "atmosphere"
     """What it is compared with."""
     detectors: int = Field(16, ge=1)
     """Number of detectors, chosen evenly among those not flagged."""
     segment: Seconds = quantity("16 s", gt=0)
-    """Length of Welch's segments, at most an eighth of the scan. Shortened to a number of samples that transforms quickly."""
+    """Length of Welch's segments, at most an eighth of the scan. Shortened to a number of samples
+    that transforms quickly.
+    """
 
     @model_validator(mode="after")
     def _two(self) -> Self:
@@ -106,12 +115,21 @@ def begin(step: CompareStreams, observation: Observation) -> Pairs:
     usable = np.flatnonzero(observation.good_detectors)
     count = min(usable.size, step.detectors)
     chosen = np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
-    length = min(observation.n_samples // LEAST_SEGMENTS, round(step.segment * observation.sample_rate))
+    length = min(
+        observation.n_samples // LEAST_SEGMENTS, round(step.segment * observation.sample_rate)
+    )
     if flagged := int(np.count_nonzero(~observation.good_samples)):
-        observation.tally.count(step.label, "flagged samples that the comparison includes", flagged, observation.n_samples)
+        observation.tally.count(
+            step.label,
+            "flagged samples that the comparison includes",
+            flagged,
+            observation.n_samples,
+        )
     if length < 4:
         return Pairs(usable[chosen], 0)
-    return Pairs(usable[chosen], next(n for n in range(length, 0, -1) if next_fast_len(n, real=True) == n))
+    return Pairs(
+        usable[chosen], next(n for n in range(length, 0, -1) if next_fast_len(n, real=True) == n)
+    )
 
 
 def add(step: CompareStreams, block: Block, state: Pairs, detector: int) -> None:
@@ -119,20 +137,30 @@ def add(step: CompareStreams, block: Block, state: Pairs, detector: int) -> None
     for name in step.streams:
         if name not in block.detdata:
             have = ", ".join(sorted(block.detdata))
-            raise PipelineError(f"there is no stream {name!r} at this step", place=step.label, cure=f"choose from: {have}")
+            raise PipelineError(
+                f"there is no stream {name!r} at this step",
+                place=step.label,
+                cure=f"choose from: {have}",
+            )
     factor = calibration(block, detector)
     with np.errstate(invalid="ignore", over="ignore"):
         x, y = (on_sky(block, detector, name, factor) for name in step.streams)
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
-        block.observation.tally.count(step.label, "detectors left out for samples that are not finite", 1)
+        block.observation.tally.count(
+            step.label, "detectors left out for samples that are not finite", 1
+        )
         return
     found = pair(x, y, block.observation.sample_rate, state.length)
     with state.lock:
         state.found[detector] = found
 
 
-def finished(step: CompareStreams, observation: Observation, state: Pairs) -> StreamComparison | None:
-    """The comparison of one scan, in the order of the detectors; None where there is none, which is counted."""
+def finished(
+    step: CompareStreams, observation: Observation, state: Pairs
+) -> StreamComparison | None:
+    """The comparison of one scan, in the order of the detectors; None where there is none, which is
+    counted.
+    """
     if not state.found:
         why = "without a detector to compare" if state.length else "too short to compare streams"
         observation.tally.count(step.label, f"scans {why}", 1)
@@ -141,16 +169,32 @@ def finished(step: CompareStreams, observation: Observation, state: Pairs) -> St
     welch = Welch(observation.n_samples, observation.sample_rate, state.length)
     names = [observation.focalplane.names[d] for d in every]
     what = (*step.streams, step.label, key_of(step, "stream_comparison"))
-    return StreamComparison.of_pairs([state.found[d] for d in every], welch.frequency, welch.independent, names, what)
+    return StreamComparison.of_pairs(
+        [state.found[d] for d in every], welch.frequency, welch.independent, names, what
+    )
 
 
 def tell(step: CompareStreams, data: Data, found: StreamComparison) -> None:
     """State the figures in the log, keep the product and write its tables."""
-    data.tally.count(step.label, "scans left out: other detectors or length", found.of_another_length)
+    data.tally.count(
+        step.label, "scans left out: other detectors or length", found.of_another_length
+    )
     for figure, text in found.lines():
         data.tally.state(step.label, figure, text)
     data.products[found.product] = found
     if data.output is not None:
-        made = about(data, STREAM=found.stream, REFERENCE=found.reference, SCANS=found.observations, SEGMENTS=found.segments)
-        write_ecsv(product_path(data.output, data.named(found.product), ".ecsv"), found.columns(), made)
-        write_ecsv(product_path(data.output, data.named(f"{found.product}_detectors"), ".ecsv"), found.detector_columns(), made)
+        made = about(
+            data,
+            STREAM=found.stream,
+            REFERENCE=found.reference,
+            SCANS=found.observations,
+            SEGMENTS=found.segments,
+        )
+        write_ecsv(
+            product_path(data.output, data.named(found.product), ".ecsv"), found.columns(), made
+        )
+        write_ecsv(
+            product_path(data.output, data.named(f"{found.product}_detectors"), ".ecsv"),
+            found.detector_columns(),
+            made,
+        )

@@ -1,16 +1,20 @@
 """Principal components of the detectors' streams, instantaneous and time-lagged.
 
-With x_d(t) the stream of detector d at the good samples t, and K delays of L samples, the rows of A are
+With x_d(t) the stream of detector d at the good samples t, and K delays of L samples, the rows of A
+are
 
-    A_(d,k)(t) = x_d(t + k L) - <x_d(t + k L)>,      k = 0 ... K                                               (1)
+    A_(d,k)(t) = x_d(t + k L) - <x_d(t + k L)>,
+    k = 0 ... K                                               (1)
 
-(multichannel singular spectrum analysis, Broomhead & King 1986; K = 0: the instantaneous components). With C = A A^T, its
-eigenvectors u_i and eigenvalues sigma_i^2,
+(multichannel singular spectrum analysis, Broomhead & King 1986; K = 0: the instantaneous
+components). With C = A A^T, its eigenvectors u_i and eigenvalues sigma_i^2,
 
-    share_i = sigma_i^2 / tr C,      v_i(t) = sum_(d,k) u_i(d,k) A_(d,k)(t).                                     (2)
+    share_i = sigma_i^2 / tr C,
+    v_i(t) = sum_(d,k) u_i(d,k) A_(d,k)(t).                                     (2)
 
-C is added up in float64 over tiles of fixed length, in order, of streams from which their first good sample is subtracted: the
-bits do not depend on blocks or memory, and microkelvins survive beside tens of kelvin.
+C is added up in float64 over tiles of fixed length, in order, of streams from which their first
+good sample is subtracted: the bits do not depend on blocks or memory, and microkelvins survive
+beside tens of kelvin.
 """
 
 from __future__ import annotations
@@ -33,7 +37,8 @@ class Components:
     Attributes
     ----------
     values
-        (n,) singular values sigma_i, largest first, divided by the root of the number of rows and samples of A.
+        (n,) singular values sigma_i, largest first, divided by the root of the number of rows and
+        samples of A.
     energy
         Their sum of squares over all i.
     vectors
@@ -52,11 +57,16 @@ class Components:
 
 
 class Lagged:
-    """The rows of A, equation (1), tile by tile: ``detectors`` of a stream, ``delays`` of ``lag`` samples."""
+    """The rows of A, equation (1), tile by tile: ``detectors`` of a stream, ``delays`` of ``lag``
+    samples.
+    """
 
     def __init__(self, stream: Stream, detectors: NDArray[np.int64], delays: int, lag: int) -> None:
         self.stream, self.detectors, self.delays, self.lag = stream, detectors, delays, lag
-        self.n_rows, self.n_samples = detectors.size * (delays + 1), max(0, stream.shape[1] - delays * lag)
+        self.n_rows, self.n_samples = (
+            detectors.size * (delays + 1),
+            max(0, stream.shape[1] - delays * lag),
+        )
         good = stream.observation.good_samples
         self.good = np.ones(self.n_samples, bool)
         for k in range(delays + 1):
@@ -67,15 +77,22 @@ class Lagged:
         self._start = np.nan_to_num(self._columns(slice(first, first + 1)), posinf=0.0, neginf=0.0)
 
     def tiles(self) -> Iterator[tuple[slice, Floats]]:
-        """(samples, rows (n_row, n)) with zeros at flagged samples; detectors that are not finite are found in `used`."""
+        """(samples, rows (n_row, n)) with zeros at flagged samples; detectors that are not finite
+        are found in `used`.
+        """
         for start in range(0, self.n_samples, TILE_SAMPLES):
             at = slice(start, min(start + TILE_SAMPLES, self.n_samples))
             x = self._columns(slice(at.start, at.stop + self.delays * self.lag))
-            x[:, ~self.stream.observation.good_samples[at.start : at.stop + self.delays * self.lag]] = 0.0
+            x[
+                :,
+                ~self.stream.observation.good_samples[at.start : at.stop + self.delays * self.lag],
+            ] = 0.0
             self.used &= np.isfinite(x).all(axis=1)
             x[~self.used] = 0.0
             width = at.stop - at.start
-            rows = np.concatenate([x[:, k * self.lag : k * self.lag + width] for k in range(self.delays + 1)])
+            rows = np.concatenate(
+                [x[:, k * self.lag : k * self.lag + width] for k in range(self.delays + 1)]
+            )
             rows[:, ~self.good[at]] = 0.0
             yield at, rows
 
@@ -90,8 +107,12 @@ class Lagged:
         return np.asarray(x - self._start)
 
 
-def components(lagged: Lagged, modes: int, *, center: bool = True, normalize: bool = False) -> Components:
-    """Equation (2). ``center``: subtract the rows' means; ``normalize``: divide rows by their rms, so that each counts alike."""
+def components(
+    lagged: Lagged, modes: int, *, center: bool = True, normalize: bool = False
+) -> Components:
+    """Equation (2). ``center``: subtract the rows' means; ``normalize``: divide rows by their rms,
+    so that each counts alike.
+    """
     c, total = np.zeros((lagged.n_rows, lagged.n_rows)), np.zeros(lagged.n_rows)
     for _, rows in lagged.tiles():
         c += rows @ rows.T

@@ -29,7 +29,10 @@ from .transfer_function import window_of
 USABLE = frozenset({"TAN", "HEALPix"})
 """Kinds of maps of which there is a spectrum."""
 SEVERAL_HEALPIX = "spectra of HEALPix maps are of one map at a time"
-NO_MAP, CURE = "there is no TAN or HEALPix map of the signal", "leave projection and contents of the map out"
+NO_MAP, CURE = (
+    "there is no TAN or HEALPix map of the signal",
+    "leave projection and contents of the map out",
+)
 
 HALVES = {"": "", "_E": " (E)", "_B": " (B)"}
 """How the spectra of the half-difference are called."""
@@ -61,24 +64,37 @@ class MapSpectra:
             Column("wavenumber", 1 / s.scale, "rad-1", "mean over the ring's modes"),
             *(Column(plain[n], p, "K2 sr", "power spectral density") for n, p in s.power.items()),
             *(
-                Column(f"{plain[n]}_white", p, "K2 sr", "of white noise with the map's standard errors")
+                Column(
+                    f"{plain[n]}_white", p, "K2 sr", "of white noise with the map's standard errors"
+                )
                 for n, p in s.white.items()
             ),
-            *(Column(n.replace("/", "_"), p, "K2 sr", "cross power spectral density") for n, p in s.cross.items()),
-            Column("modes", s.modes, "", "independent modes; relative standard error of the power: modes^-1/2"),
+            *(
+                Column(n.replace("/", "_"), p, "K2 sr", "cross power spectral density")
+                for n, p in s.cross.items()
+            ),
+            Column(
+                "modes",
+                s.modes,
+                "",
+                "independent modes; relative standard error of the power: modes^-1/2",
+            ),
         ]
 
 
 class MapSpectrum(Output):
-    """Radial power spectra of maps, with the level of white noise: what is left of 1/f noise at each angular scale.
+    """Radial power spectra of maps, with the level of white noise: what is left of 1/f noise at
+    each angular scale.
 
-    Of the map and of what holds noise alone (half the difference of two halves of the samples, the source-free map), or of the
-    `maps` that are named. Makes the product ``map_spectra`` (a `MapSpectra`), or one under this step's own name where it has
-    one; where there is an output folder, it is written there as a table (ECSV).
+    Of the map and of what holds noise alone (half the difference of two halves of the samples, the
+    source-free map), or of the `maps` that are named. Makes the product ``map_spectra`` (a
+    `MapSpectra`), or one under this step's own name where it has one; where there is an output
+    folder, it is written there as a table (ECSV).
 
-    Of maps of I, Q and U the spectra are those of I (``map``), E and B (``map_E``, ``map_B``), with the cross spectra ``map_TE``,
-    ``map_TB`` and ``map_EB``, in COSMO's convention; name ``map_Q`` for that of Q. Spectra of a HEALPix map are those of its
-    spherical harmonics (healpy), of one map at a time.
+    Of maps of I, Q and U the spectra are those of I (``map``), E and B (``map_E``, ``map_B``), with
+    the cross spectra ``map_TE``, ``map_TB`` and ``map_EB``, in COSMO's convention; name ``map_Q``
+    for that of Q. Spectra of a HEALPix map are those of its spherical harmonics (healpy), of one
+    map at a time.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
@@ -86,22 +102,29 @@ class MapSpectrum(Output):
     one_band: ClassVar[bool] = True
 
     maps: list[str] = Field([], max_length=7)
-    """Names of products, e.g. [map, source_free/map]. Default: the map and what holds noise alone."""
+    """Names of products, e.g. [map, source_free/map]. Default: the map and what holds noise alone.
+    """
     bins: int = Field(24, ge=2, le=500)
     """Number of rings, of equal width in the logarithm of the scale."""
     least_coverage: float = Field(0.1, ge=0, lt=1)
-    """Where the (beam-smoothed) samples per pixel are below this share of their 99th percentile, the window is zero."""
+    """Where the (beam-smoothed) samples per pixel are below this share of their 99th percentile,
+    the window is zero.
+    """
     taper: Angle | None = Field(None, gt=0)
     """Width of the window's cosine edge; where absent, it reaches to the middle."""
 
     def check(self, data: Data) -> list[str]:
-        """Raises PipelineError where the maps that will be made are none of which there is a spectrum."""
+        """Raises PipelineError where the maps that will be made are none of which there is a
+        spectrum.
+        """
         for name in self.maps:
             check_map(data, name, self.label)
         made = kinds_of_maps(data)
         kinds = [made.get(name.rpartition("/")[2], "TAN") for name in self.maps]
         if len(kinds) > 1 and "HEALPix" in kinds:
-            raise PipelineError(SEVERAL_HEALPIX, place=self.label, cure="name one map in each MapSpectrum")
+            raise PipelineError(
+                SEVERAL_HEALPIX, place=self.label, cure="name one map in each MapSpectrum"
+            )
         if bad := [name for name, kind in zip(self.maps, kinds, strict=True) if kind not in USABLE]:
             raise PipelineError(f"there is no TAN map {bad[0]!r}", place=self.label, cure=CURE)
         if not self.maps and made and not set(made.values()) & USABLE:
@@ -110,16 +133,22 @@ class MapSpectrum(Output):
 
     def finalize(self, data: Data) -> None:
         """Raises PipelineError where there is no map, or none of which there is a spectrum."""
-        found = map_spectra(data.products, Wanted(self.maps, self.bins, self.least_coverage, self.taper), self.label)
+        found = map_spectra(
+            data.products, Wanted(self.maps, self.bins, self.least_coverage, self.taper), self.label
+        )
         key = key_of(self, "map_spectra")
         data.products[key] = found
         if data.output is not None:
-            write_ecsv(product_path(data.output, data.named(key), ".ecsv"), found.columns(), about(data))
+            write_ecsv(
+                product_path(data.output, data.named(key), ".ecsv"), found.columns(), about(data)
+            )
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is asked for: names of maps (empty: the map and what holds noise alone), rings, least coverage, taper [rad]."""
+    """What is asked for: names of maps (empty: the map and what holds noise alone), rings, least
+    coverage, taper [rad].
+    """
 
     maps: list[str]
     bins: int
@@ -129,7 +158,11 @@ class Wanted:
 
 def map_spectra(products: Mapping[str, Any], wanted: Wanted, place: str) -> MapSpectra:
     """Spectra of maps among the products of a run. Raises PipelineError about ``place``."""
-    whole = {name: product for name, product in maps_of(products, split=False).items() if product.contents == "all"}
+    whole = {
+        name: product
+        for name, product in maps_of(products, split=False).items()
+        if product.contents == "all"
+    }
     flat = {name: product for name, product in whole.items() if product.projection == "TAN"}
     flat |= {name: product for name, product in maps_of(flat).items() if name not in whole}
     usable = [name for name in whole if "/" not in name and whole[name].projection in USABLE]
@@ -138,7 +171,9 @@ def map_spectra(products: Mapping[str, Any], wanted: Wanted, place: str) -> MapS
         product = whole[names[0]]
         found = sphere_spectra(names[0], product, wanted.bins, wanted.least, place)
         return MapSpectra(found, {name: name for name in found.power}, product.fwhm)
-    if len(names) > 1 and any(name in whole and whole[name].projection == "HEALPix" for name in names):
+    if len(names) > 1 and any(
+        name in whole and whole[name].projection == "HEALPix" for name in names
+    ):
         raise PipelineError(SEVERAL_HEALPIX, place=place, cure="name one map in each MapSpectrum")
     if missing := [name for name in names if name not in flat]:
         cure = f"name some of these: {', '.join(flat)}" if flat else CURE
@@ -148,7 +183,9 @@ def map_spectra(products: Mapping[str, Any], wanted: Wanted, place: str) -> MapS
     return _of_planes(flat, names, wanted, place)
 
 
-def _of_planes(flat: Mapping[str, MapProduct], names: list[str], wanted: Wanted, place: str) -> MapSpectra:
+def _of_planes(
+    flat: Mapping[str, MapProduct], names: list[str], wanted: Wanted, place: str
+) -> MapSpectra:
     """Spectra of TAN maps, of polarized ones those of I, E and B."""
     first = flat[names[0]]
     planes: dict[str, Floats] = {}
@@ -164,7 +201,9 @@ def _of_planes(flat: Mapping[str, MapProduct], names: list[str], wanted: Wanted,
 
     def add_noise(name: str, product: MapProduct) -> None:
         own = [product] if name not in polarized else [product.stokes(which) for which in IQU]
-        noise.update(zip((name, *polarized.get(name, ())), (each.noise for each in own), strict=True))
+        noise.update(
+            zip((name, *polarized.get(name, ())), (each.noise for each in own), strict=True)
+        )
 
     for name in names:
         add(name, flat[name])
@@ -177,12 +216,19 @@ def _of_planes(flat: Mapping[str, MapProduct], names: list[str], wanted: Wanted,
             if plane == "signal":
                 add_noise(name, product)
     if any(values.shape != first.signal.shape for values in planes.values()):
-        raise PipelineError("the maps have different grids", place=place, cure="name maps of one step")
+        raise PipelineError(
+            "the maps have different grids", place=place, cure="name maps of one step"
+        )
     window = window_of(first, None, wanted.taper, wanted.least)
     known = {name: np.where(window > 0, values, np.nan) for name, values in noise.items()}
     sigma = first.smoothed_by / FWHM_PER_SIGMA
-    white = {name: np.nan_to_num(values) for name, values in known.items() if np.isfinite(values).any()}
+    white = {
+        name: np.nan_to_num(values) for name, values in known.items() if np.isfinite(values).any()
+    }
     edges = ring_edges(first.signal.shape, first.pixel, wanted.bins)
     spectra = radial_spectra(planes, window, first.pixel, edges, white, sigma, polarized)
-    words = {f"half_difference{end}": f"half the difference{more}, {first.difference}" for end, more in HALVES.items()}
+    words = {
+        f"half_difference{end}": f"half the difference{more}, {first.difference}"
+        for end, more in HALVES.items()
+    }
     return MapSpectra(spectra, {name: words.get(name, name) for name in spectra.power}, first.fwhm)

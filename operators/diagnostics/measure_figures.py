@@ -19,19 +19,23 @@ from .series import about, key_of, kinds_of_maps
 
 
 class ProductsRead:
-    """The ``requires`` of `MeasureFigures`: none for the class, what its metrics read in an object."""
+    """The ``requires`` of `MeasureFigures`: none for the class, what its metrics read in an
+    object.
+    """
 
     def __get__(self, operator: Any, owner: type) -> frozenset[str]:
         return frozenset[str]().union(*(m.reads for m in _metrics(operator)))
 
 
 class MeasureFigures(Output):
-    """Figures of a run: the numbers that it is judged by, with units and, where they are known, standard errors.
+    """Figures of a run: the numbers that it is judged by, with units and, where they are known,
+    standard errors.
 
     Metrics are those of the group ``zonda.metrics`` that are one number, e.g. ``central_rms`` or
-    ``{transfer_at: {scale: 60 arcsec}}``. The signals that they need are made for this step, unless `runs` has them. Makes the
-    product ``figures`` (a `Figures`), or one under this step's own name where it has one; where there is an output folder, it is
-    written there as a table, ``figures.ecsv``. `Report` shows it.
+    ``{transfer_at: {scale: 60 arcsec}}``. The signals that they need are made for this step, unless
+    `runs` has them. Makes the product ``figures`` (a `Figures`), or one under this step's own name
+    where it has one; where there is an output folder, it is written there as a table,
+    ``figures.ecsv``. `Report` shows it.
 
     Raises `PipelineError` or `InputError` where a metric cannot be measured on what the run made.
     """
@@ -64,7 +68,9 @@ class MeasureFigures(Output):
         return plain or signal in self.shown or signal in self.named_signals()
 
     def check(self, data: Data) -> list[str]:
-        """Raises `ZondaError` where a metric cannot be measured on the kind of map that will be made."""
+        """Raises `ZondaError` where a metric cannot be measured on the kind of map that will be
+        made.
+        """
         for metric in _metrics(self):
             metric.look(kinds_of_maps(data))
         return []
@@ -87,13 +93,20 @@ class MeasureFigures(Output):
 
 
 def _figure(choice: Choice, data: Data, names: list[str]) -> Figure:
-    """As `Choice.figure`; NaN, with the reason, for what cannot be measured on the sum of a campaign's scans."""
+    """As `Choice.figure`; NaN, with the reason, for what cannot be measured on the sum of a
+    campaign's scans.
+    """
     try:
         return choice.figure(data, names)
     except InputError as err:
         if not data.laid_out:
             raise
-        return Figure(choice.name, math.nan, getattr(choice.metric, "unit", ""), description=f"not known: {err.message}")
+        return Figure(
+            choice.name,
+            math.nan,
+            getattr(choice.metric, "unit", ""),
+            description=f"not known: {err.message}",
+        )
 
 
 def _metrics(operator: Any) -> list[FigureMetric]:

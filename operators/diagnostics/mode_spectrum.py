@@ -33,13 +33,15 @@ class Found:
 
 
 class ModeSpectrum(Operator):
-    """Singular values of the matrix detectors x time of `signal` at this step, their shares, and the leading modes.
+    """Singular values of the matrix detectors x time of `signal` at this step, their shares, and
+    the leading modes.
 
-    They are the principal components of the detectors' streams: of the values at one instant, or, with ``delays``, of the values
-    at several delays (time-lagged components), which see what moves across the field. Flagged samples and detectors are left out.
-    Makes the product ``modes`` (a `Modes`), or one under this step's own name where it has one: shares are means over the scans,
-    streams those of the first. Where there is an output folder, both are written there as tables (ECSV). `Plots` and `Report`
-    show them.
+    They are the principal components of the detectors' streams: of the values at one instant, or,
+    with ``delays``, of the values at several delays (time-lagged components), which see what moves
+    across the field. Flagged samples and detectors are left out. Makes the product ``modes`` (a
+    `Modes`), or one under this step's own name where it has one: shares are means over the scans,
+    streams those of the first. Where there is an output folder, both are written there as tables
+    (ECSV). `Plots` and `Report` show them.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -98,7 +100,11 @@ class ModeSpectrum(Operator):
                 found.columns(),
                 {**made, "SCANS": len(found.values)},
             )
-            write_ecsv(product_path(data.output, data.named(f"{found.product}_streams"), ".ecsv"), found.stream_columns(), made)
+            write_ecsv(
+                product_path(data.output, data.named(f"{found.product}_streams"), ".ecsv"),
+                found.stream_columns(),
+                made,
+            )
 
 
 def _find(step: ModeSpectrum, stream: Stream) -> Modes | None:
@@ -106,21 +112,36 @@ def _find(step: ModeSpectrum, stream: Stream) -> Modes | None:
     observation = stream.observation
     usable = np.flatnonzero(observation.good_detectors)
     count = min(usable.size, step.detectors)
-    chosen = usable[np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))]
+    chosen = usable[
+        np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
+    ]
     lag = max(1, round(step.delay * observation.sample_rate))
     lagged = Lagged(stream, chosen, step.delays, lag)
     if chosen.size < 2 or np.count_nonzero(lagged.good) < 2:
-        observation.tally.count(step.label, "scans without two detectors and two samples: no modes", 1)
+        observation.tally.count(
+            step.label, "scans without two detectors and two samples: no modes", 1
+        )
         return None
     found = components(lagged, step.modes, center=step.center, normalize=step.normalize)
-    observation.tally.count(step.label, "detectors left out: signal not finite", int(np.count_nonzero(~found.used)))
+    observation.tally.count(
+        step.label, "detectors left out: signal not finite", int(np.count_nonzero(~found.used))
+    )
     if not found.energy > 0:
         observation.tally.count(step.label, "scans whose signal is constant: no modes", 1)
         return None
     values, n = np.zeros((1, KEPT)), min(KEPT, found.values.size)
     values[0, :n] = found.values[:n]
     return Modes(
-        values, np.array([found.energy]), observation.seconds, found.times, found.vectors,
-        [observation.focalplane.names[d] for d in chosen], step.delays, lag / observation.sample_rate if step.delays else 0.0,
-        "" if step.normalize else "K_RJ", observation.name, step.label, key_of(step, "modes"),
-    )  # fmt: skip
+        values,
+        np.array([found.energy]),
+        observation.seconds,
+        found.times,
+        found.vectors,
+        [observation.focalplane.names[d] for d in chosen],
+        step.delays,
+        lag / observation.sample_rate if step.delays else 0.0,
+        "" if step.normalize else "K_RJ",
+        observation.name,
+        step.label,
+        key_of(step, "modes"),
+    )

@@ -67,12 +67,19 @@ class ModeSpectrumPlanning(Planning[Any]):
     def memory(self, observation: Observation) -> int:
         """Covariance, eigenvectors and their work; a tile; the modes in time."""
         rows, modes = self._rows(observation), int(self.operator.modes)
-        return int(8 * (6 * rows**2 + 4 * rows * TILE_SAMPLES + (2 * modes + 2) * observation.n_samples))
+        return int(
+            8 * (6 * rows**2 + 4 * rows * TILE_SAMPLES + (2 * modes + 2) * observation.n_samples)
+        )
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
         rows = self._rows(context.first)
-        return Estimate((), Cost(fixed=1e-9 * rows**3, per_sample=5e-9 + 1e-10 * rows**2 / context.first.n_detectors))
+        return Estimate(
+            (),
+            Cost(
+                fixed=1e-9 * rows**3, per_sample=5e-9 + 1e-10 * rows**2 / context.first.n_detectors
+            ),
+        )
 
 
 class CompareMapsPlanning(Planning[Any]):
@@ -109,7 +116,14 @@ class PowerSpectrumPlanning(Planning[PowerSpectrum]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        return Estimate((), Cost(0.02, 0.0, 3.8e-9 * min(1.0, self.operator.detectors / context.first.n_detectors) * 14))
+        return Estimate(
+            (),
+            Cost(
+                0.02,
+                0.0,
+                3.8e-9 * min(1.0, self.operator.detectors / context.first.n_detectors) * 14,
+            ),
+        )
 
 
 class CompareStreamsPlanning(Planning[Any]):
@@ -123,9 +137,14 @@ class CompareStreamsPlanning(Planning[Any]):
         count: int = min(observation.n_detectors, self.operator.detectors)
         from .compare_streams import LEAST_SEGMENTS
 
-        length: float = min(observation.n_samples / LEAST_SEGMENTS, self.operator.segment * observation.sample_rate)
+        length: float = min(
+            observation.n_samples / LEAST_SEGMENTS, self.operator.segment * observation.sample_rate
+        )
         return round(16 * observation.n_samples + (64 * CHUNK + 16 * count) * length)
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
-        return Estimate((), Cost(0.02, 0.0, 8e-8 * min(1.0, self.operator.detectors / context.first.n_detectors)))
+        return Estimate(
+            (),
+            Cost(0.02, 0.0, 8e-8 * min(1.0, self.operator.detectors / context.first.n_detectors)),
+        )

@@ -63,16 +63,28 @@ LARGEST = 1500
 
 
 DRAWN = frozenset(
-    ["map", "spectrum", "time_streams", "transfer_function", "modes", "comparison", "map_spectra", "screens", "stream_comparison"]
+    [
+        "map",
+        "spectrum",
+        "time_streams",
+        "transfer_function",
+        "modes",
+        "comparison",
+        "map_spectra",
+        "screens",
+        "stream_comparison",
+    ]
 )
 """Products with pictures."""
 
 
 class Plots(Output):
-    """Pictures of the products, as PNG, PDF or SVG files in the output folder, each where there is something to show.
+    """Pictures of the products, as PNG, PDF or SVG files in the output folder, each where there is
+    something to show.
 
-    ``input.png``, ``noiseless_map.png``, ``map.png``, ``noise_map.png``, ``coverage.png``, ``power_spectra.png``, ``tod.png``,
-    ``scan.png``, ``transfer_function.png``, ``modes.png``, ``comparison.png``, ``map_spectra.png``. The report shows them too.
+    ``input.png``, ``noiseless_map.png``, ``map.png``, ``noise_map.png``, ``coverage.png``,
+    ``power_spectra.png``, ``tod.png``, ``scan.png``, ``transfer_function.png``, ``modes.png``,
+    ``comparison.png``, ``map_spectra.png``. The report shows them too.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
@@ -81,14 +93,20 @@ class Plots(Output):
     provides: ClassVar[frozenset[str]] = frozenset({"pictures"})
 
     smooth: Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"] = "beam"
-    """Smooth image maps that are not smoothed yet for their pictures: with the beam, with a Gaussian of this FWHM, or not."""
+    """Smooth image maps that are not smoothed yet for their pictures: with the beam, with a
+    Gaussian of this FWHM, or not.
+    """
     central_diameter: Angle | None = Field(None, gt=0)
-    """Diameter of the circle that noise maps show, in which their rms is taken; where absent 1 arcmin, or five beams or pixels
-    where these are wider."""
+    """Diameter of the circle that noise maps show, in which their rms is taken; where absent 1
+    arcmin, or five beams or pixels where these are wider."""
     least_coverage: float = Field(0.1, ge=0, lt=1)
-    """Map pixels with fewer samples than this share of the 99th percentile are left grey in the pictures."""
+    """Map pixels with fewer samples than this share of the 99th percentile are left grey in the
+    pictures.
+    """
     contours: list[float] = Field([], max_length=20)
-    """Levels of the signal-to-noise ratio, in sigma, at which maps have contours, e.g. [-8, -4, -2, 2, 4]."""
+    """Levels of the signal-to-noise ratio, in sigma, at which maps have contours, e.g. [-8, -4, -2,
+    2, 4].
+    """
     formats: list[Literal["png", "pdf", "svg"]] = Field(["png"], min_length=1)
     """Files of each picture; PDF and SVG for print."""
     dpi: float = Field(DPI, ge=50, le=600)
@@ -98,11 +116,15 @@ class Plots(Output):
     _begun: dict[str, Future[Any]] = PrivateAttr(default_factory=dict)
 
     def observe(self, data: Data) -> None:
-        """Refuse a missing or unwritable output folder before anything is simulated; let a second process be started."""
+        """Refuse a missing or unwritable output folder before anything is simulated; let a second
+        process be started.
+        """
         output_folder(data, self.label)
         self._begun = {}
         with suppress(OSError):
-            self._artist = take(Artist) if self._artist is None and data.threads > 1 else self._artist
+            self._artist = (
+                take(Artist) if self._artist is None and data.threads > 1 else self._artist
+            )
 
     def watch(self, data: Data, done: Progress) -> None:
         """Begin with the pictures of what will not change any more."""
@@ -110,12 +132,16 @@ class Plots(Output):
             style = self.style()
             for drawing in _drawings(data, style):
                 if (drawing.at_once or done == "maps") and drawing.key not in self._begun:
-                    self._begun[drawing.key] = self._artist.submit(printed, drawing.function, style, *drawing.arguments())
+                    self._begun[drawing.key] = self._artist.submit(
+                        printed, drawing.function, style, *drawing.arguments()
+                    )
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
         try:
-            data.products["pictures"] = _write_all(folder, data, self.style(), self._begun, self._artist)
+            data.products["pictures"] = _write_all(
+                folder, data, self.style(), self._begun, self._artist
+            )
         finally:
             self._begun = {}
             if self._artist is not None:
@@ -126,7 +152,14 @@ class Plots(Output):
         """Its parameters, for another process."""
         smooth: Any = {"beam": None, "none": 0.0}.get(str(self.smooth), self.smooth)
         formats = tuple(dict.fromkeys(self.formats))
-        return Style(smooth, self.central_diameter, self.least_coverage, tuple(self.contours), formats, self.dpi)
+        return Style(
+            smooth,
+            self.central_diameter,
+            self.least_coverage,
+            tuple(self.contours),
+            formats,
+            self.dpi,
+        )
 
 
 @dataclass(frozen=True)
@@ -142,14 +175,18 @@ class Drawing:
     at_once: bool = False
 
 
-def _write_all(folder: Path, data: Data, style: Style, begun: Mapping[str, Future[Any]], artist: Artist | None) -> list[Picture]:
+def _write_all(
+    folder: Path, data: Data, style: Style, begun: Mapping[str, Future[Any]], artist: Artist | None
+) -> list[Picture]:
     """Write every picture; while the disk writes one, the next is drawn."""
     written = []
     with ThreadPoolExecutor(MOST_AT_ONCE, "Plots") as pool:
 
         def write(picture: Picture) -> None:
             for kind, content in picture.files.items():
-                written.append(pool.submit(_write, product_path(folder, picture.name, f".{kind}"), content))
+                written.append(
+                    pool.submit(_write, product_path(folder, picture.name, f".{kind}"), content)
+                )
 
         made = pictures(data, style, begun, artist, write)
         if artist is not None:
@@ -173,12 +210,15 @@ def pictures(
 ) -> list[Picture]:
     """Every picture that the products allow, in reading order.
 
-    ``begun``: by `Drawing.key`, what ``artist`` is drawing. ``there`` is told of every picture as soon as it is there.
+    ``begun``: by `Drawing.key`, what ``artist`` is drawing. ``there`` is told of every picture as
+    soon as it is there.
     """
     drawings, coming = list(_drawings(data, style)), dict(begun or {})
     for drawing in drawings:
         if artist is not None and drawing.key not in coming:
-            coming[drawing.key] = artist.submit(printed, drawing.function, style, *drawing.arguments())
+            coming[drawing.key] = artist.submit(
+                printed, drawing.function, style, *drawing.arguments()
+            )
     for future in as_completed(coming.values()):
         for picture in future.result() or ():
             there(picture)
@@ -201,19 +241,33 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
         if isinstance(image, Image) and "/" not in name:
             yield Drawing(f"input {name}", draw_input, partial(_input, name, image), True)
             for plane in ("Q", "U") if image.polarization is not None else ():
-                yield Drawing(f"input {name}_{plane}", draw_input, partial(_input, name, image, plane), True)
-    for name in sorted(maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)):
+                yield Drawing(
+                    f"input {name}_{plane}", draw_input, partial(_input, name, image, plane), True
+                )
+    for name in sorted(
+        maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)
+    ):
         if not name.startswith("source_free/") and maps[name].contents == "all":
             yield Drawing(f"map {name}", draw_map, partial(_map, name, maps[name], style, maps))
     for name, product in data.products.items():
-        if isinstance(product, MapProduct) and product.polarization is not None and not name.startswith(("source_free/", "_")):
-            yield Drawing(f"map {name}_P", draw_map, partial(_map, f"{name}_P", product.stokes("P"), style, maps))
+        if (
+            isinstance(product, MapProduct)
+            and product.polarization is not None
+            and not name.startswith(("source_free/", "_"))
+        ):
+            yield Drawing(
+                f"map {name}_P",
+                draw_map,
+                partial(_map, f"{name}_P", product.stokes("P"), style, maps),
+            )
     for name, product in maps.items():
         if "/" not in name and name in data.products:  # Q and U have the hits of I
             yield Drawing(f"coverage {name}", draw_coverage, partial(_coverage, name, product))
         if "/" not in name and name in data.products and product.directions is not None:
             file = f"crosslinking{'' if name == 'map' else f'_{name}'}"
-            yield Drawing(f"crosslinking {name}", draw_crosslinking, partial(_crosslinking, file, product))
+            yield Drawing(
+                f"crosslinking {name}", draw_crosslinking, partial(_crosslinking, file, product)
+            )
         if sources := noise_sources(maps, name):
             yield Drawing(f"noise {name}", draw_noise, partial(_noise, name, sources, style))
     if data.observations:
@@ -221,46 +275,82 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
     early = {p.product: p for p in data.partial.values() if isinstance(p, TimeStream)}
     for name, product in (data.products | early).items():
         file = product_path("", name).name
-        band = next((f"_{b.name}" for b in data.scene.instrument.bands if name.endswith(f"_{b.name}")), "")
+        band = next(
+            (f"_{b.name}" for b in data.scene.instrument.bands if name.endswith(f"_{b.name}")), ""
+        )
         if isinstance(product, Spectrum):
             file = f"power_spectra{band}" if name == f"spectrum{band}" else f"power_spectra_{file}"
-            yield Drawing(f"spectra {name}", draw_spectra, partial(tuple, (file, product, before.get(product.label, ""))))
+            yield Drawing(
+                f"spectra {name}",
+                draw_spectra,
+                partial(tuple, (file, product, before.get(product.label, ""))),
+            )
         elif isinstance(product, TimeStream):
             file = f"tod{band}" if name == f"time_streams{band}" else f"tod_{file}"
-            yield Drawing(f"streams {name}", draw_streams, partial(_streams, file, product, before), True)
+            yield Drawing(
+                f"streams {name}", draw_streams, partial(_streams, file, product, before), True
+            )
         elif isinstance(product, Modes):
-            yield Drawing(f"modes {name}", draw_modes, partial(tuple, (file, product, before.get(product.label, ""))))
+            yield Drawing(
+                f"modes {name}",
+                draw_modes,
+                partial(tuple, (file, product, before.get(product.label, ""))),
+            )
         elif isinstance(product, Transfer):
-            yield Drawing(f"transfer function {name}", draw_transfer, partial(tuple, (file, product)))
+            yield Drawing(
+                f"transfer function {name}", draw_transfer, partial(tuple, (file, product))
+            )
         elif isinstance(product, Drawable):
             yield Drawing(f"own {name}", draw_own, partial(tuple, (file, product)))
         elif isinstance(product, Comparison):
-            yield Drawing(f"comparison {name}", draw_comparison, partial(tuple, (file, product, style.contours)))
+            yield Drawing(
+                f"comparison {name}",
+                draw_comparison,
+                partial(tuple, (file, product, style.contours)),
+            )
         elif isinstance(product, MapSpectra):
             yield Drawing(f"map spectra {name}", draw_map_spectra, partial(tuple, (file, product)))
         elif isinstance(product, StreamComparison):
-            yield Drawing(f"stream comparison {name}", draw_stream_comparison, partial(tuple, (file, product)))
+            yield Drawing(
+                f"stream comparison {name}", draw_stream_comparison, partial(tuple, (file, product))
+            )
 
 
 def _steps_before(data: Data) -> dict[str, str]:
-    """For every step's label, the last step above it that may have changed the streams: where a spectrum was taken."""
+    """For every step's label, the last step above it that may have changed the streams: where a
+    spectrum was taken.
+    """
     found, last = {}, ""
     for label, kind, _ in data.provenance.get("operators", []):
         found[label] = last
-        if kind not in ("PowerSpectrum", "TimeStreams", "ModeSpectrum", "CompareStreams", "SaveTOD"):
+        if kind not in (
+            "PowerSpectrum",
+            "TimeStreams",
+            "ModeSpectrum",
+            "CompareStreams",
+            "SaveTOD",
+        ):
             last = label
     return found
 
 
 def _plain(header: Any) -> dict[str, Any]:
     """The header's numbers and texts, without comments."""
-    return {key: header[key] for key in header if key and isinstance(header[key], bool | int | float | str)}
+    return {
+        key: header[key]
+        for key in header
+        if key and isinstance(header[key], bool | int | float | str)
+    }
 
 
 def _input(name: str, image: Image, plane: str = "") -> tuple[Any, ...]:
     image, name = (image.stokes(plane), f"{name}_{plane}") if plane else (image, name)
     step = -(-max(image.values.shape) // LARGEST)
-    values, axes, header = image.values[::step, ::step], SkyAxes.of(image.header), _plain(image.header)
+    values, axes, header = (
+        image.values[::step, ::step],
+        SkyAxes.of(image.header),
+        _plain(image.header),
+    )
     if step > 1 and axes is not None:
         axes = axes.thinned(step)
     elif step > 1:
@@ -276,7 +366,9 @@ def _flat(
     per_beam: AnyFloats | float | None = None,
 ) -> FlatMap:
     """What pictures need of a map; a HEALPix or CAR map on a plane about its centre."""
-    found = {"hits": product.known_hits} | {plane: getattr(product, plane) for plane in ("weights", *planes)}
+    found = {"hits": product.known_hits} | {
+        plane: getattr(product, plane) for plane in ("weights", *planes)
+    }
     header, is_flat = product.header, product.projection == "TAN"
     rms: dict[str, float] = {}
     if not is_flat:
@@ -286,29 +378,57 @@ def _flat(
             there = found.pop("per_beam")
             per_beam = np.where(np.isfinite(there), there, np.nanmean(there))
         header = wcs.to_header(relax=True)
-        radius = None if style is None or style.central_diameter is None else style.central_diameter / 2
-        rms = {} if style is None else {p: product.rms(radius, of=p) for p in planes if p != "crosslinking"}
+        radius = (
+            None if style is None or style.central_diameter is None else style.central_diameter / 2
+        )
+        rms = (
+            {}
+            if style is None
+            else {p: product.rms(radius, of=p) for p in planes if p != "crosslinking"}
+        )
     arrays = {plane: np.asarray(values, np.float32) for plane, values in found.items()}
     return FlatMap(
-        {plane: arrays[plane] for plane in planes}, arrays["hits"], np.nan_to_num(arrays["weights"]), SkyAxes.of(header),
-        _plain(header), product.centre, product.pixel, product.fwhm, product.smoothed_by, rms, is_flat, per_beam,
+        {plane: arrays[plane] for plane in planes},
+        arrays["hits"],
+        np.nan_to_num(arrays["weights"]),
+        SkyAxes.of(header),
+        _plain(header),
+        product.centre,
+        product.pixel,
+        product.fwhm,
+        product.smoothed_by,
+        rms,
+        is_flat,
+        per_beam,
         product.difference.replace(" - ", " minus "),
-    )  # fmt: skip
+    )
 
 
-def _map(name: str, product: MapProduct, style: Style, maps: Mapping[str, MapProduct]) -> tuple[Any, ...]:
+def _map(
+    name: str, product: MapProduct, style: Style, maps: Mapping[str, MapProduct]
+) -> tuple[Any, ...]:
     run, _, key = name.rpartition("/")
     flat = _flat(_smoothed(product, style), "signal")
     snr = None
     if style.contours and not run:
-        snr = _snr(product, style, noise_alone(maps, name) if name in maps else _of_q_and_u(maps, name.removesuffix("_P")))
+        snr = _snr(
+            product,
+            style,
+            noise_alone(maps, name) if name in maps else _of_q_and_u(maps, name.removesuffix("_P")),
+        )
     return product_path("", name).name, run, key, flat, style, snr
 
 
 def _smoothed(product: MapProduct, style: Style) -> MapProduct:
-    """A CAR map as it is shown: smoothed on its own pixels, before it is brought to a plane. Others as they are."""
+    """A CAR map as it is shown: smoothed on its own pixels, before it is brought to a plane. Others
+    as they are.
+    """
     smoothing = product.fwhm if style.smooth is None else style.smooth
-    return product if product.projection != "CAR" or product.smoothed_by or not smoothing else product.smoothed(smoothing)
+    return (
+        product
+        if product.projection != "CAR" or product.smoothed_by or not smoothing
+        else product.smoothed(smoothing)
+    )
 
 
 def _of_q_and_u(maps: Mapping[str, MapProduct], name: str) -> tuple[Floats, str] | None:
@@ -317,12 +437,20 @@ def _of_q_and_u(maps: Mapping[str, MapProduct], name: str) -> tuple[Floats, str]
     return None if q is None or u is None else (np.hypot(q[0], u[0]) / math.sqrt(2), q[1])
 
 
-def _snr(product: MapProduct, style: Style, alone: tuple[Floats, str] | None) -> tuple[AnyFloats, str] | None:
-    """The SNR of a map as it is shown, and what its noise is, in words; None where it is not known. ``alone``: `noise_alone`."""
+def _snr(
+    product: MapProduct, style: Style, alone: tuple[Floats, str] | None
+) -> tuple[AnyFloats, str] | None:
+    """The SNR of a map as it is shown, and what its noise is, in words; None where it is not known.
+    ``alone``: `noise_alone`.
+    """
     flat = product.projection == "TAN"
     smoothing = product.fwhm if style.smooth is None else style.smooth
     as_it_is = product.smoothed_by or product.projection == "HEALPix"
-    plane = replace(plane_of(product, "map", alone), fwhm=0.0).smoothed(0.0 if as_it_is else smoothing).measured()
+    plane = (
+        replace(plane_of(product, "map", alone), fwhm=0.0)
+        .smoothed(0.0 if as_it_is else smoothing)
+        .measured()
+    )
     if plane.noise is None or not np.isfinite(plane.noise).any():
         return None
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -330,15 +458,26 @@ def _snr(product: MapProduct, style: Style, alone: tuple[Floats, str] | None) ->
     return snr if flat else on_plane(product, {"signal": snr})[0]["signal"], plane.noise_in_words
 
 
-def _noise(name: str, sources: dict[Noise, tuple[MapProduct, Any]], style: Style) -> tuple[Any, ...]:
-    flat = {of: _flat(_smoothed(product, style), plane, style=style) for of, (product, plane) in sources.items()}
+def _noise(
+    name: str, sources: dict[Noise, tuple[MapProduct, Any]], style: Style
+) -> tuple[Any, ...]:
+    flat = {
+        of: _flat(_smoothed(product, style), plane, style=style)
+        for of, (product, plane) in sources.items()
+    }
     return product_path("", f"noise_{name}").name, flat, style
 
 
 def _coverage(name: str, product: MapProduct) -> tuple[Any, ...]:
     hits, per_beam = product.hits, product.seconds_per_beam()
     flat = _flat(product, per_beam=per_beam)
-    return f"coverage{'' if name == 'map' else f'_{name}'}", flat, int(hits.sum()), int((hits > 0).sum()), product.sides
+    return (
+        f"coverage{'' if name == 'map' else f'_{name}'}",
+        flat,
+        int(hits.sum()),
+        int((hits > 0).sum()),
+        product.sides,
+    )
 
 
 def _crosslinking(file: str, product: MapProduct) -> tuple[Any, ...]:
@@ -346,5 +485,7 @@ def _crosslinking(file: str, product: MapProduct) -> tuple[Any, ...]:
 
 
 def _streams(file: str, stream: TimeStream, before: dict[str, str]) -> tuple[Any, ...]:
-    brief = replace(stream, streams={name: values.astype(np.float32) for name, values in stream.streams.items()})
+    brief = replace(
+        stream, streams={name: values.astype(np.float32) for name, values in stream.streams.items()}
+    )
     return file, brief, before.get(stream.label, "")

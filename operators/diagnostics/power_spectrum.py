@@ -28,15 +28,19 @@ ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")
 
 
 CHUNK = 8
-"""Segments that are transformed at a time: numpy works out the roots of unity at every call. It is slower in float32."""
+"""Segments that are transformed at a time: numpy works out the roots of unity at every call. It is
+slower in float32.
+"""
 
 
 class Welch:
     """One-sided power spectral densities of series of ``n`` samples by Welch's method (1967).
 
-    Segments of ``length`` samples overlap by half, each is freed of its straight line and weighted by a Hann window w once:
+    Segments of ``length`` samples overlap by half, each is freed of its straight line and weighted
+    by a Hann window w once:
 
-        P_k = 2 |sum_t w_t x_t e^(-2 pi i k t / L)|^2 / (f_s sum_t w_t^2),    k > 0;  half of it at k = L/2        (1)
+        P_k = 2 |sum_t w_t x_t e^(-2 pi i k t / L)|^2 / (f_s sum_t w_t^2),   k > 0;
+        half of it at k = L/2        (1)
 
     so that white noise of variance s^2 has P = 2 s^2 / f_s.
 
@@ -49,7 +53,11 @@ class Welch:
     """
 
     def __init__(self, n: int, sample_rate: float, length: int) -> None:
-        w = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length) if length > 2 else np.ones(length)
+        w = (
+            0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
+            if length > 2
+            else np.ones(length)
+        )
         self._length, self._step = length, max(1, length // 2)
         self._segments = (n - length) // self._step + 1
         self._line = np.arange(length) - (length - 1) / 2
@@ -65,14 +73,18 @@ class Welch:
         self._memory = threading.local()
 
     def __call__(self, values: Floats) -> Floats:
-        """P (length // 2,) of ``values`` (n,) float64, C-contiguous. May be called from several threads."""
+        """P (length // 2,) of ``values`` (n,) float64, C-contiguous. May be called from several
+        threads.
+        """
         power = np.zeros(2 * (self._length // 2 + 1))
         views = np.lib.stride_tricks.sliding_window_view(values, self._length)[:: self._step]
         for first in range(0, self._segments, CHUNK):
             view = views[first : first + CHUNK]
             segments, found = (part[: len(view)] for part in self._scratch())
             lines = zip(view.mean(axis=1), np.einsum("st,t->s", view, self._slope), strict=True)
-            for row, (mean, slope), segment in zip(view, lines, segments, strict=True):  # each stays in the cache
+            for row, (mean, slope), segment in zip(
+                view, lines, segments, strict=True
+            ):  # each stays in the cache
                 np.multiply(self._line, -slope, out=segment)
                 segment -= mean
                 segment += row
@@ -91,7 +103,9 @@ class Welch:
 
 
 def _quick(n: int) -> int:
-    """Largest number up to ``n`` without a prime factor above 5: transforms of other lengths take up to ten times as long."""
+    """Largest number up to ``n`` without a prime factor above 5: transforms of other lengths take
+    up to ten times as long.
+    """
     best, five = 1, 1
     while five <= n:
         three = five
@@ -106,7 +120,8 @@ def _quick(n: int) -> int:
 class Periodograms:
     """What is found of one scan: spectra by detector and stream.
 
-    ``welch``: None where the scan is too short. ``streams``: those asked for, None: the usual ones. ``place``: the step's label.
+    ``welch``: None where the scan is too short. ``streams``: those asked for, None: the usual ones.
+    ``place``: the step's label.
     """
 
     detectors: NDArray[np.int64]
@@ -125,13 +140,21 @@ class Periodograms:
         for name in self.streams or [s for s in in_order(block.detdata) if s in usual]:
             if name not in block.detdata:
                 have = ", ".join(sorted(block.detdata))
-                raise PipelineError(f"there is no stream {name!r} at this step", place=self.place, cure=f"choose from: {have}")
-            with np.errstate(invalid="ignore", over="ignore"):  # of samples that are not finite: their spectrum is not
+                raise PipelineError(
+                    f"there is no stream {name!r} at this step",
+                    place=self.place,
+                    cure=f"choose from: {have}",
+                )
+            with np.errstate(
+                invalid="ignore", over="ignore"
+            ):  # of samples that are not finite: their spectrum is not
                 power = self.welch(on_sky(block, detector, name, gain))
             if np.isfinite(power).all():
                 found[name] = power
             else:
-                block.observation.tally.count(self.place, f"detectors left out for non-finite samples of {name}", 1)
+                block.observation.tally.count(
+                    self.place, f"detectors left out for non-finite samples of {name}", 1
+                )
         with self.lock:
             self.found[detector] = found
 
@@ -142,7 +165,11 @@ class Periodograms:
             observation.tally.count(self.place, f"scans {why} a power spectrum", 1)
             return None
         every, count = sorted(self.found), len(self.found)
-        rows = {name: [self.found[d][name] for d in every if name in self.found[d]] for d in every for name in self.found[d]}
+        rows = {
+            name: [self.found[d][name] for d in every if name in self.found[d]]
+            for d in every
+            for name in self.found[d]
+        }
         psd = {name: np.mean(rows[name], axis=0) for name in in_order(rows)}
         net = observation.focalplane.net[every]
         white = 2 * float(np.mean(net**2)) if "white" in observation.components else 0.0
@@ -152,16 +179,19 @@ class Periodograms:
             for name in psd
             if name in observation.closed_forms
         }
-        return Spectrum(f, psd, self.welch.independent * count, white, self.place, count, closed_forms=forms)
+        return Spectrum(
+            f, psd, self.welch.independent * count, white, self.place, count, closed_forms=forms
+        )
 
 
 class PowerSpectrum(Operator):
     """Mean one-sided power spectra of the streams at this step, in K_RJ^2/Hz on the calibrated sky.
 
-    Components at the detector are divided as the calibration divides them: `atmosphere` times epsilon, `white`, `pink` and those
-    of plugins, by zeta e^-tau. Streams of other kinds (`pwv`, `opacity`, `path_delay`, `transmission`) keep their units.
-    Each segment is freed of a straight line, which takes the slow drift of the mean emission with elevation out.
-    Makes the product ``spectrum`` (a `Spectrum`), or one under this step's own name where it has one.
+    Components at the detector are divided as the calibration divides them: `atmosphere` times
+    epsilon, `white`, `pink` and those of plugins, by zeta e^-tau. Streams of other kinds (`pwv`,
+    `opacity`, `path_delay`, `transmission`) keep their units. Each segment is freed of a straight
+    line, which takes the slow drift of the mean emission with elevation out. Makes the product
+    ``spectrum`` (a `Spectrum`), or one under this step's own name where it has one.
     """
 
     requires: ClassVar[frozenset[str]] = cast(Any, StreamsNeeded())
@@ -171,13 +201,13 @@ class PowerSpectrum(Operator):
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     streams: list[StreamName] | None = Field(None, min_length=1)
-    """Streams to measure; where absent, `signal` and zonda's own components but `transmission`, as far as they reach
-    this step."""
+    """Streams to measure; where absent, `signal` and zonda's own components but `transmission`, as
+    far as they reach this step."""
     detectors: int = Field(16, ge=1)
     """Number of detectors averaged, chosen evenly among those not flagged."""
     segment: Seconds = quantity("128 s", gt=0)
-    """Length of Welch's segments (at most the scan): the inverse of the frequency resolution. Shortened to a number of samples
-    that has no prime factor above 5."""
+    """Length of Welch's segments (at most the scan): the inverse of the frequency resolution.
+    Shortened to a number of samples that has no prime factor above 5."""
 
     def check(self, data: Data) -> list[str]:
         """Refuse streams that no step makes."""
@@ -188,16 +218,27 @@ class PowerSpectrum(Operator):
         usable = np.flatnonzero(observation.good_detectors)
         count = min(usable.size, self.detectors)
         chosen = np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
-        length = _quick(min(observation.n_samples, max(2, round(self.segment * observation.sample_rate))))
+        length = _quick(
+            min(observation.n_samples, max(2, round(self.segment * observation.sample_rate)))
+        )
         if flagged := int(np.count_nonzero(~observation.good_samples)):
-            observation.tally.count(self.label, "flagged samples that the power spectra include", flagged, observation.n_samples)
-        welch = Welch(observation.n_samples, observation.sample_rate, length) if length >= 4 else None
+            observation.tally.count(
+                self.label,
+                "flagged samples that the power spectra include",
+                flagged,
+                observation.n_samples,
+            )
+        welch = (
+            Welch(observation.n_samples, observation.sample_rate, length) if length >= 4 else None
+        )
         return Periodograms(usable[chosen], welch, self.streams, self.label)
 
     def exec(self, block: Block, state: Periodograms) -> None:
         if block.shape[1] != block.observation.n_samples:
             raise PipelineError(
-                "got a part of a scan, not a whole one", place=self.label, cure="this is a fault of the executor: report it"
+                "got a part of a scan, not a whole one",
+                place=self.label,
+                cure="this is a fault of the executor: report it",
             )
         here = (state.detectors >= block.detectors.start) & (state.detectors < block.detectors.stop)
         for detector in state.detectors[here] if state.welch is not None else ():
@@ -217,7 +258,9 @@ class PowerSpectrum(Operator):
 
 def in_order(streams: Iterable[str]) -> list[str]:
     """Names of streams in the order of pictures."""
-    return sorted(streams, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name))
+    return sorted(
+        streams, key=lambda name: (ORDER.index(name) if name in ORDER else len(ORDER), name)
+    )
 
 
 def calibration(block: Block, detector: int) -> Floats:
@@ -226,15 +269,22 @@ def calibration(block: Block, detector: int) -> Floats:
     transmission = block.observation.smooth.get("transmission")
     if transmission is None:
         return np.array([1 / zeta])
-    return np.asarray(1 / (zeta * transmission.evaluate(slice(detector, detector + 1), block.samples)[0]), np.float64)
+    return np.asarray(
+        1 / (zeta * transmission.evaluate(slice(detector, detector + 1), block.samples)[0]),
+        np.float64,
+    )
 
 
 def on_sky(block: Block, detector: int, name: str, gain: Floats) -> Floats:
-    """One detector's stream as it enters the calibrated sum, float64 (n_samp,): `signal` with its mean, `atmosphere` without.
+    """One detector's stream as it enters the calibrated sum, float64 (n_samp,): `signal` with its
+    mean, `atmosphere` without.
 
     Where flags say that there is no signal it is a straight line, as filters see it.
     """
-    values, there = _as_it_enters(block, detector, name, gain), has_a_signal(block.observation.flags[block.samples])
+    values, there = (
+        _as_it_enters(block, detector, name, gain),
+        has_a_signal(block.observation.flags[block.samples]),
+    )
     if there.all() or not there.any():
         return values
     known = np.flatnonzero(there)
@@ -245,7 +295,11 @@ def on_sky(block: Block, detector: int, name: str, gain: Floats) -> Floats:
 def _as_it_enters(block: Block, detector: int, name: str, gain: Floats) -> Floats:
     """See `on_sky`."""
     row = block.detdata[name][detector - block.detectors.start]
-    enters = {str(c): c.enters for c in (*BUILT_IN, *block.observation.components) if isinstance(c, Component)}
+    enters = {
+        str(c): c.enters
+        for c in (*BUILT_IN, *block.observation.components)
+        if isinstance(c, Component)
+    }
     if name == "atmosphere":
         gain = gain * block.observation.focalplane.illumination_efficiency[detector]
     if (at_detector := enters.get(name) == "at the detector") and name not in block.means:

@@ -31,20 +31,28 @@ def brightness(kelvin: float) -> str:
     """A brightness with three figures, in the unit that reads best."""
     if not math.isfinite(kelvin):
         return "unknown"
-    return scaled(kelvin, ((1, "\u00a0K_RJ"), (1e3, "\u00a0mK_RJ"), (1e6, "\u00a0µK_RJ"))).replace("-", "−")
+    return scaled(kelvin, ((1, "\u00a0K_RJ"), (1e3, "\u00a0mK_RJ"), (1e6, "\u00a0µK_RJ"))).replace(
+        "-", "−"
+    )
 
 
 def flux_density(kelvin: float, fwhm: float, band: Band) -> str:
-    """Flux density of a point source with a flat spectrum whose peak is ``kelvin`` behind a Gaussian beam of ``fwhm`` [rad]."""
-    jansky = kelvin / to_kelvin_rj("Jy/beam", band, beam_solid_angle=math.pi / math.log(16) * fwhm**2)
+    """Flux density of a point source with a flat spectrum whose peak is ``kelvin`` behind a
+    Gaussian beam of ``fwhm`` [rad].
+    """
+    jansky = kelvin / to_kelvin_rj(
+        "Jy/beam", band, beam_solid_angle=math.pi / math.log(16) * fwhm**2
+    )
     return scaled(jansky, ((1, "\u00a0Jy"), (1e3, "\u00a0mJy"), (1e6, "\u00a0µJy")), least=0.9995)
 
 
 def results(data: Data, given: float | None) -> str:
-    """Cards: how much was observed, how noisy and how deep the maps are. ``given``: diameter [rad] of the circle where that is
-    taken; None: `central_diameter` of each map."""
+    """Cards: how much was observed, how noisy and how deep the maps are. ``given``: diameter [rad]
+    of the circle where that is taken; None: `central_diameter` of each map."""
     maps = maps_of(data.products)
-    wide = {name: central_diameter(product.fwhm, product.pixel, given) for name, product in maps.items()}
+    wide = {
+        name: central_diameter(product.fwhm, product.pixel, given) for name, product in maps.items()
+    }
     seconds = sum(o.duration for o in data.scans)
     samples = sum(o.n_samples * o.n_detectors for o in data.observations)
     cards: list[Card] = [
@@ -53,11 +61,21 @@ def results(data: Data, given: float | None) -> str:
         (f"{samples:,}".replace(",", "\u202f"), "samples of all detectors"),
     ]
     whole = maps_of(data.products, split=False)
-    cards += [card for name, product in whole.items() if "/" not in name for card in _unsolved(name, product)]
+    cards += [
+        card
+        for name, product in whole.items()
+        if "/" not in name
+        for card in _unsolved(name, product)
+    ]
     for figure in noise_figures(maps, given):
         cards += _noise(figure, maps[figure.product])
     main = [(name, product) for name, product in maps.items() if "/" not in name]
-    cards += [card for name, product in main if name in data.products for card in _depth(name, product, wide[name])]
+    cards += [
+        card
+        for name, product in main
+        if name in data.products
+        for card in _depth(name, product, wide[name])
+    ]
     if has_white_noise(data):
         cards += [card for name, product in main for card in expected(name, product, wide[name])]
     strongest = {"input": getattr(data.products.get("input"), "values", None)}
@@ -65,12 +83,16 @@ def results(data: Data, given: float | None) -> str:
     for what, values in strongest.items():
         if values is not None and np.isfinite(values).any():
             cards.append((brightness(_extreme(values)), f"strongest pixel of the {what}"))
-    body = "".join(f"<div class=card><b>{escape(b)}</b><span>{escape(s)}</span></div>" for b, s in cards)
+    body = "".join(
+        f"<div class=card><b>{escape(b)}</b><span>{escape(s)}</span></div>" for b, s in cards
+    )
     return f'<div class="cards">{body}</div>'
 
 
 def _unsolved(name: str, product: MapProduct) -> list[Card]:
-    """In how many pixels with samples a map has no I, Q and U: a card, or none where there are all."""
+    """In how many pixels with samples a map has no I, Q and U: a card, or none where there are
+    all.
+    """
     if product.polarization is None:
         return []
     hit, solved = int(np.count_nonzero(product.hits)), int(np.count_nonzero(product.known))
@@ -80,14 +102,22 @@ def _unsolved(name: str, product: MapProduct) -> list[Card]:
 
 
 def _noise(figure: NoiseFigure, product: MapProduct) -> list[Card]:
-    """How noisy the centre of a map is, smoothed with the beam where that can be done, and as it is."""
-    of = {"half_difference": product.difference.replace(" - ", " − "), "source_free": "all but the sky"}[figure.of]
+    """How noisy the centre of a map is, smoothed with the beam where that can be done, and as it
+    is.
+    """
+    of = {
+        "half_difference": product.difference.replace(" - ", " − "),
+        "source_free": "all but the sky",
+    }[figure.of]
     where = f"rms, {_central(figure.diameter, product)}, {of}"
     label = "" if figure.product == "map" else f", {figure.product}"
     if math.isfinite(figure.smoothed):
         how = _smoothed(figure.smoothed, product)
         before = f"the same before smoothing, per {sides_text(*product.sides)} pixel"
-        return [(brightness(figure.smoothed), f"{where}, {how}{label}"), (brightness(figure.rms), before)]
+        return [
+            (brightness(figure.smoothed), f"{where}, {how}{label}"),
+            (brightness(figure.rms), before),
+        ]
     if math.isfinite(figure.rms):
         return [(brightness(figure.rms), f"{where}{label}")]
     return [("unknown", f"{where}{label}: too few pixels; set central_diameter")]
@@ -104,10 +134,11 @@ def has_white_noise(data: Data) -> bool:
 
 
 def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
-    """What the NET and the samples promise for the centre of a map: a card, or none where nothing is known.
+    """What the NET and the samples promise for the centre of a map: a card, or none where nothing
+    is known.
 
-    Smoothing with a beam of width sigma divides the variance of pixels of area A by 4 pi sigma^2 / A: the weight of the pixels
-    1 / noise^2 is added up per solid angle.
+    Smoothing with a beam of width sigma divides the variance of pixels of area A by 4 pi sigma^2 /
+    A: the weight of the pixels 1 / noise^2 is added up per solid angle.
     """
     near = product.distance() <= diameter / 2
     noise, areas = product.noise[near], np.broadcast_to(product.areas(), product.hits.shape)[near]
@@ -118,7 +149,9 @@ def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
     label = "" if name == "map" else f", {name}"
     where = _central(diameter, product)
     side = math.sqrt(float(areas.mean()))
-    factor = side / product.fwhm * math.sqrt(2 * math.log(2) / math.pi) if product.fwhm > 0 else math.inf
+    factor = (
+        side / product.fwhm * math.sqrt(2 * math.log(2) / math.pi) if product.fwhm > 0 else math.inf
+    )
     if product.smoothed_by or factor > 0.5:  # pixels that are not small beside the beam
         return [(brightness(rms), f"white noise by NET and samples, {where}{label}")]
     how = _smoothed(rms * factor, product)
@@ -126,19 +159,30 @@ def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
 
 
 def _smoothed(kelvin: float, product: MapProduct) -> str:
-    """What smoothing with its beam made of a map: its resolution, and the flux density of ``kelvin`` in it."""
+    """What smoothing with its beam made of a map: its resolution, and the flux density of
+    ``kelvin`` in it.
+    """
     resolution = math.sqrt(2) * product.fwhm
     how = f"{angle_text(product.fwhm)} beam and as much smoothing, added in quadrature"
     text = f"smoothed with the beam to {angle_text(resolution)} ({how})"
-    return f"{text}: {flux_density(kelvin, resolution, product.band)} per such beam" if product.band else text
+    return (
+        f"{text}: {flux_density(kelvin, resolution, product.band)} per such beam"
+        if product.band
+        else text
+    )
 
 
 def _depth(name: str, product: MapProduct, diameter: float) -> list[Card]:
-    """How long the centre of a map was observed: a card, or none where that is not known. The median over its pixels."""
+    """How long the centre of a map was observed: a card, or none where that is not known. The
+    median over its pixels.
+    """
     factor, near = product.seconds_per_beam(), product.distance() <= diameter / 2
     if factor is None or not near.any():
         return []
-    samples, each = product.hits[near], np.broadcast_to(np.asarray(factor), product.hits.shape)[near]
+    samples, each = (
+        product.hits[near],
+        np.broadcast_to(np.asarray(factor), product.hits.shape)[near],
+    )
     seconds = float(np.median(samples * each))
     time = f"{seconds:.3g}\u00a0s" if seconds < 6000 else f"{seconds / 3600:.3g}\u00a0h"
     where = _central(diameter, product) + ("" if name == "map" else f", {name}")

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 LONG = 12
-"""Rows of a table that are shown; the rest of a longer one is folded away. Half as many of files, in one cell."""
+"""Rows of a table that are shown; the rest of a longer one is folded away. Half as many of files,
+in one cell.
+"""
 
 
 class Html(str):
@@ -20,28 +22,45 @@ class Html(str):
     __slots__ = ()
 
 
-def table(rows: Iterable[Sequence[Any]], head: Sequence[str] = (), numbers: Sequence[int] = ()) -> str:
-    """A table; the first column is a header. Cells are escaped unless they are `Html`; ``numbers``: right-aligned columns."""
+def table(
+    rows: Iterable[Sequence[Any]], head: Sequence[str] = (), numbers: Sequence[int] = ()
+) -> str:
+    """A table; the first column is a header. Cells are escaped unless they are `Html`; ``numbers``:
+    right-aligned columns.
+    """
 
     def cell(k: int, value: Any) -> str:
         text = value if isinstance(value, Html) else escape(str(value))
         tag, style = ("th" if k == 0 else "td"), (' class="number"' if k in numbers else "")
         return f"<{tag}{style}>{text}</{tag}>"
 
-    body = "".join("<tr>" + "".join(cell(k, v) for k, v in enumerate(row)) + "</tr>" for row in rows)
+    body = "".join(
+        "<tr>" + "".join(cell(k, v) for k, v in enumerate(row)) + "</tr>" for row in rows
+    )
     top = ""
     if head:
-        cells = (f"<th{' class=number' if k in numbers else ''}>{escape(h)}</th>" for k, h in enumerate(head))
+        cells = (
+            f"<th{' class=number' if k in numbers else ''}>{escape(h)}</th>"
+            for k, h in enumerate(head)
+        )
         top = "<thead><tr>" + "".join(cells) + "</tr></thead>"
     style = "" if head else ' class="pairs"'
-    return f'<div class="scroll"><table{style}>{top}<tbody>{body}</tbody></table></div>' if body else ""
+    return (
+        f'<div class="scroll"><table{style}>{top}<tbody>{body}</tbody></table></div>'
+        if body
+        else ""
+    )
 
 
 def folded(rows: Sequence[Sequence[Any]], head: Sequence[str], what: str) -> str:
-    """A table of which the first `LONG` rows are shown, and all others folded away as so many more ``what``."""
+    """A table of which the first `LONG` rows are shown, and all others folded away as so many more
+    ``what``.
+    """
     if len(rows) <= LONG + 3:  # nobody unfolds three rows
         return table(rows, head)
-    return table(rows[:LONG], head) + details(f"{len(rows) - LONG} more {what}", table(rows[LONG:], head))
+    return table(rows[:LONG], head) + details(
+        f"{len(rows) - LONG} more {what}", table(rows[LONG:], head)
+    )
 
 
 def details(summary: str, body: str) -> Html:
@@ -53,11 +72,19 @@ def details(summary: str, body: str) -> Html:
 def small(text: str) -> Html:
     """Docstring text in small letters: escaped, with single and double backquotes as code."""
     plain = escape(" ".join(text.split()))
-    return Html(f"<small>{re.sub(r'``(.+?)``|`(.+?)`', lambda m: f'<code>{m[1] or m[2]}</code>', plain)}</small>")
+    return Html(
+        "<small>"
+        + re.sub(r"``(.+?)``|`(.+?)`", lambda m: f"<code>{m[1] or m[2]}</code>", plain)
+        + "</small>"
+    )
 
 
-def scaled(value: float, units: Sequence[tuple[float, str]], digits: int = 3, least: float = 1.0) -> str:
-    """``value`` in the first unit (factor, name) in which it is at least ``least``, else in the last."""
+def scaled(
+    value: float, units: Sequence[tuple[float, str]], digits: int = 3, least: float = 1.0
+) -> str:
+    """``value`` in the first unit (factor, name) in which it is at least ``least``, else in the
+    last.
+    """
     factor, name = next((u for u in units if abs(value) * u[0] >= least), units[-1])
     return f"{value * factor:.{digits}g}{name}"
 
@@ -66,21 +93,38 @@ def spread(values: Any, unit: str = "") -> str:
     """One number where all are the same, else the range and the mean."""
     low, high = float(np.min(values)), float(np.max(values))
     same = math.isclose(low, high, rel_tol=1e-9)
-    return f"{low:.4g}{unit}" if same else f"{low:.4g} to {high:.4g}{unit}, mean {float(np.mean(values)):.4g}"
+    return (
+        f"{low:.4g}{unit}"
+        if same
+        else f"{low:.4g} to {high:.4g}{unit}, mean {float(np.mean(values)):.4g}"
+    )
 
 
 def sexagesimal(ra: float, dec: float) -> str:
     """``02h32m11.00s −04°40′00.0″``, from rad."""
-    seconds, arcseconds = round(ra % (2 * math.pi) * 43200 / math.pi, 2) % 86400, round(abs(dec) * 648000 / math.pi, 1)
-    hours, degrees = f"{seconds // 3600:02.0f}h{seconds % 3600 // 60:02.0f}m", f"{arcseconds // 3600:02.0f}°"
+    seconds, arcseconds = (
+        round(ra % (2 * math.pi) * 43200 / math.pi, 2) % 86400,
+        round(abs(dec) * 648000 / math.pi, 1),
+    )
+    hours, degrees = (
+        f"{seconds // 3600:02.0f}h{seconds % 3600 // 60:02.0f}m",
+        f"{arcseconds // 3600:02.0f}°",
+    )
     sign = "−" if dec < 0 else "+"
-    return f"{hours}{seconds % 60:05.2f}s {sign}{degrees}{arcseconds % 3600 // 60:02.0f}′{arcseconds % 60:04.1f}″"
+    return (
+        f"{hours}{seconds % 60:05.2f}s"
+        f" {sign}{degrees}{arcseconds % 3600 // 60:02.0f}′{arcseconds % 60:04.1f}″"
+    )
 
 
 _NUMBER = re.compile(r"([-+]?\d+\.?\d*(?:e[-+]?\d+)?) ([A-Za-z][A-Za-z0-9 /()]*)", re.IGNORECASE)
 _UNITS = {
     "rad": [(180 / math.pi, "deg"), (10800 / math.pi, "arcmin"), (648000 / math.pi, "arcsec")],
-    "rad / s": [(180 / math.pi, "deg/s"), (10800 / math.pi, "arcmin/s"), (648000 / math.pi, "arcsec/s")],
+    "rad / s": [
+        (180 / math.pi, "deg/s"),
+        (10800 / math.pi, "arcmin/s"),
+        (648000 / math.pi, "arcsec/s"),
+    ],
     "s": [(1 / 60, "min"), (1, "s"), (1e3, "ms")],
     "Hz": [(1e-9, "GHz"), (1e-3, "kHz"), (1, "Hz")],
     "m": [(1e-3, "km"), (1, "m"), (1e3, "mm")],

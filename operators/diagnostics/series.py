@@ -1,4 +1,6 @@
-"""What steps keep of time streams: power spectra and the streams of a few detectors. numpy alone, for the process that draws."""
+"""What steps keep of time streams: power spectra and the streams of a few detectors. numpy alone,
+for the process that draws.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +34,11 @@ class Spectrum(Record):
     psd
         (n,) per stream, K_RJ^2/Hz on the calibrated sky (`transmission`: relative, 1/Hz).
     averages
-        Equivalent number of independent periodograms in each value: its relative standard error is averages^-1/2 where
-        detectors are independent.
+        Equivalent number of independent periodograms in each value: its relative standard error is
+        averages^-1/2 where detectors are independent.
     white_level
-        2 <NET^2> of the detectors used, K_RJ^2/Hz: the level of white noise; 0 where none is simulated.
+        2 <NET^2> of the detectors used, K_RJ^2/Hz: the level of white noise; 0 where none is
+        simulated.
     label
         Of the step that measured it.
     detectors, observations
@@ -65,18 +68,26 @@ class Spectrum(Record):
         n, m = self.observations, other.observations
         self.psd = {k: (self.psd[k] * n + other.psd[k] * m) / (n + m) for k in self.psd}
         both = self.closed_forms.keys() & other.closed_forms.keys()
-        self.closed_forms = {k: (self.closed_forms[k] * n + other.closed_forms[k] * m) / (n + m) for k in sorted(both)}
+        self.closed_forms = {
+            k: (self.closed_forms[k] * n + other.closed_forms[k] * m) / (n + m)
+            for k in sorted(both)
+        }
         self.white_level = (self.white_level * n + other.white_level * m) / (n + m)
         self.averages += other.averages
         self.detectors, self.observations = other.detectors, n + m
         return self
 
     def regimes(self) -> list[tuple[str, float, float]]:
-        """(component, lowest, highest frequency [Hz]) where one of atmosphere, 1/f and white noise dominates: closed forms.
+        """(component, lowest, highest frequency [Hz]) where one of atmosphere, 1/f and white noise
+        dominates: closed forms.
 
         Empty where there are not two of them.
         """
-        laws: dict[str, Floats] = {name: self.closed_forms[name] for name in ("atmosphere", "pink") if name in self.closed_forms}
+        laws: dict[str, Floats] = {
+            name: self.closed_forms[name]
+            for name in ("atmosphere", "pink")
+            if name in self.closed_forms
+        }
         if self.white_level > 0 and {"white", "signal"} & set(self.psd):
             laws["white"] = np.full(self.frequency.size, self.white_level)
         if len(laws) < 2:
@@ -85,15 +96,23 @@ class Spectrum(Record):
         largest = np.argmax(np.array(list(laws.values())), axis=0)
         cuts = [0, *(np.flatnonzero(np.diff(largest)) + 1).tolist(), f.size]
         ends = [float(f[0]), *(math.sqrt(f[k - 1] * f[k]) for k in cuts[1:-1]), float(f[-1])]
-        return [(names[largest[k]], low, high) for k, low, high in zip(cuts[:-1], ends[:-1], ends[1:], strict=True)]
+        return [
+            (names[largest[k]], low, high)
+            for k, low, high in zip(cuts[:-1], ends[:-1], ends[1:], strict=True)
+        ]
 
     def knee(self) -> float | None:
-        """Highest frequency at which the pink part exceeds the white one [Hz]; None where it never does or one is absent."""
+        """Highest frequency at which the pink part exceeds the white one [Hz]; None where it never
+        does or one is absent.
+        """
         if not {"pink", "white"} <= set(self.psd):
             return None
         edges = np.geomspace(self.frequency[0], self.frequency[-1], 31)
         bins = np.clip(np.searchsorted(edges, self.frequency, "right") - 1, 0, 29)
-        sums = [np.bincount(bins, w, 30) for w in (np.log(self.frequency), self.psd["pink"], self.psd["white"])]
+        sums = [
+            np.bincount(bins, w, 30)
+            for w in (np.log(self.frequency), self.psd["pink"], self.psd["white"])
+        ]
         count = np.bincount(bins, minlength=30)
         used = count > 0
         log_f, pink, white = (s[used] / count[used] for s in sums)
@@ -149,9 +168,16 @@ class TimeStream(Record):
 
 
 def about(data: Data, **more: Any) -> dict[str, Any]:
-    """What tables of a run say of it: pipeline, seed, version, and ``more``; without what is empty."""
+    """What tables of a run say of it: pipeline, seed, version, and ``more``; without what is
+    empty.
+    """
     known = data.provenance
-    meta = {"PIPELINE": known.get("name"), "SEED": data.scene.seed, "ZONDA": known.get("versions", {}).get("zonda"), **more}
+    meta = {
+        "PIPELINE": known.get("name"),
+        "SEED": data.scene.seed,
+        "ZONDA": known.get("versions", {}).get("zonda"),
+        **more,
+    }
     return {key: value for key, value in meta.items() if value not in ("", None)}
 
 
@@ -161,15 +187,27 @@ def key_of(step: Operator, usual: str) -> str:
 
 
 def kinds_of_maps(data: Data) -> dict[str, str]:
-    """In `Operator.check`: the kind of each map that will be made, by its product: its projection, HEALPix, or hits."""
-    return {str(layout["product"]): str(layout["kind"]) for layout in data.layouts.values() if "kind" in layout}
+    """In `Operator.check`: the kind of each map that will be made, by its product: its projection,
+    HEALPix, or hits.
+    """
+    return {
+        str(layout["product"]): str(layout["kind"])
+        for layout in data.layouts.values()
+        if "kind" in layout
+    }
 
 
 def check_map(data: Data, name: str, place: str) -> None:
-    """In `Operator.check`: PipelineError where no step makes the map of this name, of whatever signal and plane."""
+    """In `Operator.check`: PipelineError where no step makes the map of this name, of whatever
+    signal and plane.
+    """
     base = name.rpartition("/")[2]
     known = {*kinds_of_maps(data), *data.made, *({"input"} if "sky" in data.made else ())}
-    if data.made and base.partition(".")[0] not in known and re.sub(r"_([IQUPEB]|half_difference)$", "", base) not in known:
+    if (
+        data.made
+        and base.partition(".")[0] not in known
+        and re.sub(r"_([IQUPEB]|half_difference)$", "", base) not in known
+    ):
         cure = f"name one of these: {', '.join(kinds_of_maps(data)) or 'none is made'}"
         raise PipelineError(f"there is no map {name!r}", place=place, cure=cure)
 
@@ -182,7 +220,11 @@ def check_streams(data: Data, names: Iterable[str], place: str) -> None:
     for name in names if data.made else ():
         if name.partition("/")[0] not in known:
             have = ", ".join(sorted(n for n in known if is_stream(n)))
-            raise PipelineError(f"there is no stream {name!r} at this step", place=place, cure=f"choose from: {have}")
+            raise PipelineError(
+                f"there is no stream {name!r} at this step",
+                place=place,
+                cure=f"choose from: {have}",
+            )
 
 
 def plane_key(key: str, plane: str) -> str:
@@ -197,13 +239,16 @@ class Modes(Record):
     Attributes
     ----------
     values
-        (n_scan, n) leading singular values / (detectors x delays x samples)^1/2, `unit`; zeros behind the last.
+        (n_scan, n) leading singular values / (detectors x delays x samples)^1/2, `unit`; zeros
+        behind the last.
     energy
         (n_scan,) sum of the squares of all.
     seconds, streams
-        (n_samp,) and (m, n_samp): the leading modes in time, of the first scan; NaN at flagged samples.
+        (n_samp,) and (m, n_samp): the leading modes in time, of the first scan; NaN at flagged
+        samples.
     vectors
-        (m, n_det (delays + 1)): the leading modes over detectors (and delays, the first detectors first), of unit length.
+        (m, n_det (delays + 1)): the leading modes over detectors (and delays, the first detectors
+        first), of unit length.
     names
         (n_det) detectors.
     delays, delay
@@ -229,7 +274,10 @@ class Modes(Record):
 
     def __iadd__(self, other: Modes) -> Modes:
         """Values of all scans; streams and vectors of the first."""
-        self.values, self.energy = np.concatenate([self.values, other.values]), np.concatenate([self.energy, other.energy])
+        self.values, self.energy = (
+            np.concatenate([self.values, other.values]),
+            np.concatenate([self.energy, other.energy]),
+        )
         return self
 
     @property
@@ -247,7 +295,10 @@ class Modes(Record):
         """(n,) standard error of `shares` from their scatter over scans; NaN for one scan."""
         each = self._shares()
         n = len(each)
-        return np.asarray(each.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(each.shape[1], np.nan), np.float64)
+        return np.asarray(
+            each.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(each.shape[1], np.nan),
+            np.float64,
+        )
 
     def _shares(self) -> Floats:
         return np.asarray(self.values**2 / self.energy[:, None], np.float64)
@@ -261,16 +312,31 @@ class Modes(Record):
             Column("mode", np.arange(1, share.size + 1), "", "the largest first"),
             Column("singular_value", rms, unit, "/ sqrt(rows x samples), rms over the scans"),
             Column("share", share, "", "of the variance, mean over the scans"),
-            Column("error", self.error[used], "", "standard error of share from its scatter over scans; nan: one scan"),
+            Column(
+                "error",
+                self.error[used],
+                "",
+                "standard error of share from its scatter over scans; nan: one scan",
+            ),
             Column("cumulative", np.cumsum(share), "", "share of this mode and those before"),
         ]
 
     def stream_columns(self) -> list[Column]:
         """The leading modes in time."""
         text = "v(t) = sum over detectors (and delays) of u A"
-        columns = [Column(f"mode_{k + 1}", row, {"K_RJ": "K"}.get(self.unit, ""), text) for k, row in enumerate(self.streams)]
-        return [Column("seconds", self.seconds, "s", f"since the start of {self.observation}"), *columns]
+        columns = [
+            Column(f"mode_{k + 1}", row, {"K_RJ": "K"}.get(self.unit, ""), text)
+            for k, row in enumerate(self.streams)
+        ]
+        return [
+            Column("seconds", self.seconds, "s", f"since the start of {self.observation}"),
+            *columns,
+        ]
 
     def _repr_html_(self) -> str:
-        rows = [(f"mode {k + 1}", f"{100 * share:.3g} %") for k, share in enumerate(self.shares[:8]) if share > 0]
+        rows = [
+            (f"mode {k + 1}", f"{100 * share:.3g} %")
+            for k, share in enumerate(self.shares[:8])
+            if share > 0
+        ]
         return html_table(f"Modes of {self.detectors} detectors", rows)

@@ -1,27 +1,33 @@
 """Two streams beside each other: power, gain, correlation and coherence.
 
-With X, Y the Fourier transforms of the segments of two streams x, y (Welch 1967: they overlap by half, are freed of a straight
-line and weighted by a Hann window), n the equivalent number of independent segments, < > their mean, and one-sided spectra per Hz
+With X, Y the Fourier transforms of the segments of two streams x, y (Welch 1967: they overlap by
+half, are freed of a straight line and weighted by a Hann window), n the equivalent number of
+independent segments, < > their mean, and one-sided spectra per Hz
 
-    P_x = <|X|^2>,   P_y = <|Y|^2>,   P_xy = <X Y^*>,   P_d = P_x + P_y - 2 Re P_xy,                          (1)
+    P_x = <|X|^2>,   P_y = <|Y|^2>,   P_xy = <X Y^*>,   P_d = P_x + P_y - 2 Re P_xy,   (1)
 
-    sigma_x^2 = sum P_x df,   g = Re sum P_xy / sum P_y,   r = Re sum P_xy / (sum P_x sum P_y)^1/2,           (2)
+    sigma_x^2 = sum P_x df,   g = Re sum P_xy / sum P_y,
+    r = Re sum P_xy / (sum P_x sum P_y)^1/2,   (2)
 
-    C(f) = |P_xy|^2 / (P_x P_y).                                                                             (3)
+    C(f) = |P_xy|^2 / (P_x P_y).                                                                 (3)
 
-All sums are over the frequencies above zero: what is slower than a segment is not in them. The estimate of C is biased,
+All sums are over the frequencies above zero: what is slower than a segment is not in them. The
+estimate of C is biased,
 
-    <C> - C = (1 - C)^2 / n                                                                                  (4)
+    <C> - C = (1 - C)^2 / n                                                                      (4)
 
-to first order in 1/n (Carter, Knapp & Nuttall 1973; Bendat & Piersol 2010, section 9.2): independent streams have 1/n, a single
-segment has 1. The mean over detectors and scans has the same bias. With the residual e = x - g y of the spectrum
-P_e = P_x + g^2 P_y - 2 g Re P_xy, Gaussian streams, and df' = 35/18 df for what the window shares between neighbouring
-frequencies,
+to first order in 1/n (Carter, Knapp & Nuttall 1973; Bendat & Piersol 2010, section 9.2):
+independent streams have 1/n, a single segment has 1. The mean over detectors and scans has the same
+bias. With the residual e = x - g y of the spectrum P_e = P_x + g^2 P_y - 2 g Re P_xy, Gaussian
+streams, and df' = 35/18 df for what the window shares between neighbouring frequencies,
 
-    var g = df' sum P_e P_y / (2 n (sum P_y)^2),   var ln sigma^2 = df' sum P^2 / (n (sum P)^2) / (1 + 1/n),  (5)
-    var r = (1 - r^2)^2 (r^2 (var ln sigma_e^2 + var ln sigma_y^2) / 4 + (sigma_y / sigma_x)^2 var g)         (6)
+    var g = df' sum P_e P_y / (2 n (sum P_y)^2),
+    var ln sigma^2 = df' sum P^2 / (n (sum P)^2) / (1 + 1/n),   (5)
+    var r = (1 - r^2)^2
+            (r^2 (var ln sigma_e^2 + var ln sigma_y^2) / 4 + (sigma_y / sigma_x)^2 var g)  (6)
 
-(first-order propagation of r^-2 = 1 + sigma_e^2 / (g sigma_y)^2; of white streams of N samples it is (1 - r^2)^2 / N).
+(first-order propagation of r^-2 = 1 + sigma_e^2 / (g sigma_y)^2; of white streams of N samples it
+is (1 - r^2)^2 / N).
 """
 
 from __future__ import annotations
@@ -73,7 +79,9 @@ class Pair:
 
 
 def pair(x: Floats, y: Floats, sample_rate: float, length: int) -> Pair:
-    """Equation (1) of two series (n_samp,) in segments of ``length`` samples at ``sample_rate`` [Hz]."""
+    """Equation (1) of two series (n_samp,) in segments of ``length`` samples at ``sample_rate``
+    [Hz].
+    """
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
     line = np.arange(length) - (length - 1) / 2
     views = [np.lib.stride_tricks.sliding_window_view(v, length)[:: length // 2] for v in (x, y)]
@@ -83,7 +91,11 @@ def pair(x: Floats, y: Floats, sample_rate: float, length: int) -> Pair:
         for view in views:
             part = view[first : first + CHUNK]
             slope = np.einsum("st,t->s", part, line) / (line**2).sum()
-            parts.append(np.fft.rfft((part - part.mean(axis=1, keepdims=True) - slope[:, None] * line) * window))
+            parts.append(
+                np.fft.rfft(
+                    (part - part.mean(axis=1, keepdims=True) - slope[:, None] * line) * window
+                )
+            )
         power += [(part.real**2 + part.imag**2).sum(axis=0) for part in parts]
         cross += (parts[0] * parts[1].conj()).sum(axis=0)
     scale = np.full(length // 2 + 1, 2 / (len(views[0]) * sample_rate * (window**2).sum()))
@@ -94,10 +106,18 @@ def pair(x: Floats, y: Floats, sample_rate: float, length: int) -> Pair:
 
 
 def figures(found: Pair, step: float, segments: float) -> tuple[list[float], list[float]]:
-    """(`FIGURES`, `ERRORS`) of one detector: equations (2), (5), (6). ``step``: df, Hz; NaN where a stream is zero."""
+    """(`FIGURES`, `ERRORS`) of one detector: equations (2), (5), (6). ``step``: df, Hz; NaN where a
+    stream is zero.
+    """
     x, y, cross = (float(p.sum()) for p in (found.power, found.reference, found.cross.real))
     if not (x > 0 and y > 0):
-        return [math.sqrt(x * step), math.sqrt(y * step), math.sqrt((x + y) * step), math.nan, math.nan], [math.nan] * 2
+        return [
+            math.sqrt(x * step),
+            math.sqrt(y * step),
+            math.sqrt((x + y) * step),
+            math.nan,
+            math.nan,
+        ], [math.nan] * 2
     gain, r = cross / y, max(-1.0, min(1.0, cross / math.sqrt(x * y)))
     rest = found.rest(gain)
     shared = SHARED / segments  # df' / df / n, of sums without df
@@ -108,7 +128,9 @@ def figures(found: Pair, step: float, segments: float) -> tuple[list[float], lis
 
     var_gain = shared * float(rest @ found.reference) / (2 * y * y)
     inner = r * r * (log_variance(rest) + log_variance(found.reference)) / 4 + y / x * var_gain
-    rms = [math.sqrt(float(p.sum()) * step) for p in (found.power, found.reference, found.rest(1.0))]
+    rms = [
+        math.sqrt(float(p.sum()) * step) for p in (found.power, found.reference, found.rest(1.0))
+    ]
     return [*rms, r, gain], [(1 - r * r) * math.sqrt(inner), math.sqrt(var_gain)]
 
 
@@ -123,8 +145,8 @@ class StreamComparison(Record):
     names
         (n_det) detectors.
     values, errors
-        (n_det, 5) `FIGURES` and (n_det, 2) standard errors of `ERRORS`, means over the scans. `rms_difference` is NaN where the
-        streams have not the same unit.
+        (n_det, 5) `FIGURES` and (n_det, 2) standard errors of `ERRORS`, means over the scans.
+        `rms_difference` is NaN where the streams have not the same unit.
     frequency
         (n,) Hz, without zero.
     power, coherence
@@ -153,16 +175,35 @@ class StreamComparison(Record):
 
     @classmethod
     def of_pairs(
-        cls, pairs: Sequence[Pair], frequency: Floats, segments: float, names: list[str], what: tuple[str, str, str, str]
+        cls,
+        pairs: Sequence[Pair],
+        frequency: Floats,
+        segments: float,
+        names: list[str],
+        what: tuple[str, str, str, str],
     ) -> StreamComparison:
-        """Of one scan, from the spectra of each detector; ``what``: stream, reference, label, product."""
+        """Of one scan, from the spectra of each detector; ``what``: stream, reference, label,
+        product.
+        """
         found = [figures(p, float(frequency[0]), segments) for p in pairs]
         values, errors = (np.array(rows, np.float64) for rows in zip(*found, strict=True))
         power = np.mean([(p.power, p.reference, p.rest(1.0)) for p in pairs], axis=0)
         if unit_of_stream(what[0]) != unit_of_stream(what[1]):
             values[:, FIGURES.index("rms_difference")] = power[2] = np.nan
         coherence = np.mean([p.coherence for p in pairs], axis=0)
-        return cls(what[0], what[1], names, values, errors, frequency, power, coherence, segments, what[2], what[3])
+        return cls(
+            what[0],
+            what[1],
+            names,
+            values,
+            errors,
+            frequency,
+            power,
+            coherence,
+            segments,
+            what[2],
+            what[3],
+        )
 
     def __iadd__(self, other: StreamComparison) -> StreamComparison:
         """The mean of all scans, each with the same weight."""
@@ -178,7 +219,9 @@ class StreamComparison(Record):
         return self
 
     def over_detectors(self, figure: str) -> tuple[float, float, float]:
-        """(mean over detectors, their standard deviation, standard error of one detector or NaN) of one of `FIGURES`."""
+        """(mean over detectors, their standard deviation, standard error of one detector or NaN) of
+        one of `FIGURES`.
+        """
         values = self.values[:, FIGURES.index(figure)]
         scatter = float(values.std(ddof=1)) if values.size > 1 else math.nan
         error = float(self.errors[:, ERRORS.index(figure)].mean()) if figure in ERRORS else math.nan
@@ -194,15 +237,33 @@ class StreamComparison(Record):
         x, y, d = self.power
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = x / y
-        units = [{"K_RJ": "K2 / Hz", "m": "m2 / Hz"}.get(unit_of_stream(n), "1 / Hz") for n in (self.stream, self.reference)]
+        units = [
+            {"K_RJ": "K2 / Hz", "m": "m2 / Hz"}.get(unit_of_stream(n), "1 / Hz")
+            for n in (self.stream, self.reference)
+        ]
         return [
             Column("frequency", self.frequency, "Hz", ""),
             Column("power", x, units[0], f"of {self.stream}, mean over detectors and scans"),
             Column("power_reference", y, units[1], f"of {self.reference}"),
-            Column("power_difference", d, units[0], f"of {self.stream} - {self.reference}; nan: not the same unit"),
+            Column(
+                "power_difference",
+                d,
+                units[0],
+                f"of {self.stream} - {self.reference}; nan: not the same unit",
+            ),
             Column("ratio", ratio, "", "power / power_reference"),
-            Column("coherence", self.coherence, "", "|P_xy|^2 / (P_x P_y), mean over detectors and scans"),
-            Column("coherence_bias", self.bias, "", "(1 - C)^2 / n: expected excess of the coherence, not subtracted"),
+            Column(
+                "coherence",
+                self.coherence,
+                "",
+                "|P_xy|^2 / (P_x P_y), mean over detectors and scans",
+            ),
+            Column(
+                "coherence_bias",
+                self.bias,
+                "",
+                "(1 - C)^2 / n: expected excess of the coherence, not subtracted",
+            ),
         ]
 
     def detector_columns(self) -> list[Column]:
@@ -219,7 +280,11 @@ class StreamComparison(Record):
         ):
             rows.append(Column(name, self.values[:, FIGURES.index(name)], kind, text))
             if name in ERRORS:
-                rows.append(Column(f"{name}_error", self.errors[:, ERRORS.index(name)], "", "standard error"))
+                rows.append(
+                    Column(
+                        f"{name}_error", self.errors[:, ERRORS.index(name)], "", "standard error"
+                    )
+                )
         return rows
 
     def lines(self) -> list[tuple[str, str]]:
@@ -227,7 +292,11 @@ class StreamComparison(Record):
         found = []
         for figure in FIGURES:
             mean, scatter, error = self.over_detectors(figure)
-            unit = f" {unit_of_stream(self.reference if figure == 'rms_reference' else self.stream)}" if "rms" in figure else ""
+            unit = (
+                f" {unit_of_stream(self.reference if figure == 'rms_reference' else self.stream)}"
+                if "rms" in figure
+                else ""
+            )
             text = f"{mean:.4g}{unit.rstrip()}"
             text += f" +- {error:.2g}" if math.isfinite(error) else ""
             text += f", scatter over detectors {scatter:.2g}" if math.isfinite(scatter) else ""

@@ -18,9 +18,10 @@ from .series import TimeStream, key_of
 class TimeStreams(Operator):
     """Streams of a few detectors of one scan at this step, for a picture: product ``time_streams``.
 
-    Components (`sky`, `white`, those of plugins ...) are at the detector, before the calibration; `signal` is the calibrated sum.
-    `signal` holds the mean emission of the atmosphere, `atmosphere` is the fluctuation about it.
-    Further streams are those that a step above makes, e.g. `pwv`, `opacity` and `path_delay` (`AtmosphereLayers.outputs`).
+    Components (`sky`, `white`, those of plugins ...) are at the detector, before the calibration;
+    `signal` is the calibrated sum. `signal` holds the mean emission of the atmosphere, `atmosphere`
+    is the fluctuation about it. Further streams are those that a step above makes, e.g. `pwv`,
+    `opacity` and `path_delay` (`AtmosphereLayers.outputs`).
     """
 
     requires: ClassVar[frozenset[str]] = cast(Any, StreamsNeeded())
@@ -47,11 +48,21 @@ class TimeStreams(Operator):
     def prepare(self, observation: Observation) -> TimeStream | None:
         if observation.index != self.observation:
             return None
-        n, shape = observation.n_detectors, (min(observation.n_detectors, self.detectors), observation.n_samples)
+        n, shape = (
+            observation.n_detectors,
+            (min(observation.n_detectors, self.detectors), observation.n_samples),
+        )
         chosen = np.linspace(0, n - 1, shape[0]).round().astype(int)
         names = [observation.focalplane.names[d] for d in chosen]
         streams: dict[str, Floats] = {name: np.full(shape, np.nan) for name in self.streams}
-        return TimeStream(observation.seconds, streams, names, observation.name, self.label, key_of(self, "time_streams"))
+        return TimeStream(
+            observation.seconds,
+            streams,
+            names,
+            observation.name,
+            self.label,
+            key_of(self, "time_streams"),
+        )
 
     def exec(self, block: Block, state: TimeStream | None) -> None:
         if state is None:

@@ -1,20 +1,23 @@
 """What the filters leave of each angular scale of the sky.
 
-a is the map of the sky alone, binned without any filter; b the map of the sky alone through all filters; both of the same
-samples and pixels, so that beam, pixels and coverage are in both and only the filters tell them apart. With a window w and the
-Fourier transforms a_k, b_k of w (m - <m>_w), and rings i of wavenumbers k,
+a is the map of the sky alone, binned without any filter; b the map of the sky alone through all
+filters; both of the same samples and pixels, so that beam, pixels and coverage are in both and only
+the filters tell them apart. With a window w and the Fourier transforms a_k, b_k of w (m - <m>_w),
+and rings i of wavenumbers k,
 
-    T_i = Re sum_i b_k a_k^* / sum_i |a_k|^2,                                                                 (1)
-    S_i = sqrt( sum_i |b_k|^2 / sum_i |a_k|^2 ) >= |T_i|.                                                     (2)
+    T_i = Re sum_i b_k a_k^* / sum_i |a_k|^2,   (1)
+    S_i = sqrt( sum_i |b_k|^2 / sum_i |a_k|^2 ) >= |T_i|.                                        (2)
 
-T is the share that is left, in phase; S is the definition of van Marrewijk, Morris et al. (2024), which also counts what the
-filters bring from other scales and places. The standard error of T is that from the scatter of the modes of the ring, the sky
-being one of many with its spectrum (the maps have no noise):
+T is the share that is left, in phase; S is the definition of van Marrewijk, Morris et al. (2024),
+which also counts what the filters bring from other scales and places. The standard error of T is
+that from the scatter of the modes of the ring, the sky being one of many with its spectrum (the
+maps have no noise):
 
-    sigma_i^2 = N / (N - 1) 2 c sum_i (Re (b_k - T_i a_k) a_k^*)^2 / (sum_i |a_k|^2)^2,   N = n_i / (2 c),    (3)
+    sigma_i^2 = N / (N - 1) 2 c sum_i (Re (b_k - T_i a_k) a_k^*)^2 / (sum_i |a_k|^2)^2,
+    N = n_i / (2 c),   (3)
 
-n_i modes, each in the ring twice since maps are real, c = n_pixels sum w^4 / (sum w^2)^2 for the correlation of neighbours
-through the window.
+n_i modes, each in the ring twice since maps are real, c = n_pixels sum w^4 / (sum w^2)^2 for the
+correlation of neighbours through the window.
 """
 
 from __future__ import annotations
@@ -44,20 +47,26 @@ from zonda.core.types import Floats
 from .comparison.radial import tapered
 from .series import check_map, key_of, kinds_of_maps, plane_key
 
-NOT_TAN, CURE = "a transfer function needs a TAN map of the signal", "leave nside, projection and contents of the map out"
+NOT_TAN, CURE = (
+    "a transfer function needs a TAN map of the signal",
+    "leave nside, projection and contents of the map out",
+)
 
 NO_POWER = 1e-12
 """Share of the largest ring's power per mode below which a ring holds nothing but rounding."""
 
 
 class TransferFunction(Output):
-    """Transfer function of the filters: the share of the sky that they leave in the map at each angular scale.
+    """Transfer function of the filters: the share of the sky that they leave in the map at each
+    angular scale.
 
-    The map of the sky alone is compared with the same map binned without filters: the ratio of their cross spectrum to the
-    spectrum of the latter, in rings of equal width in the logarithm of the scale. The two signals are made for this step, unless
-    `runs` has them. Makes the product ``transfer_function`` (a `Transfer`), or one under this step's own name where it has one;
-    where there is an output folder, it is written there as a table (ECSV). Of a map of I, Q and U each plane has its own:
-    ``transfer_function_Q`` and ``transfer_function_U`` stand beside ``transfer_function``, which is of I.
+    The map of the sky alone is compared with the same map binned without filters: the ratio of
+    their cross spectrum to the spectrum of the latter, in rings of equal width in the logarithm of
+    the scale. The two signals are made for this step, unless `runs` has them. Makes the product
+    ``transfer_function`` (a `Transfer`), or one under this step's own name where it has one; where
+    there is an output folder, it is written there as a table (ECSV). Of a map of I, Q and U each
+    plane has its own: ``transfer_function_Q`` and ``transfer_function_U`` stand beside
+    ``transfer_function``, which is of I.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
@@ -65,7 +74,9 @@ class TransferFunction(Output):
     one_band: ClassVar[bool] = True
 
     modes: Literal["sky", "full"] = "sky"
-    """Singular modes of the sky alone (`sky`: the paper's noiseless map), or of the complete data, applied to it (`full`)."""
+    """Singular modes of the sky alone (`sky`: the paper's noiseless map), or of the complete data,
+    applied to it (`full`).
+    """
     bins: int = Field(12, ge=1, le=500)
     """Number of rings, of equal width in the logarithm of the scale."""
     largest: Angle | None = Field(None, gt=0)
@@ -77,7 +88,9 @@ class TransferFunction(Output):
     taper: Angle | None = Field(None, gt=0)
     """Width of the window's cosine edge; where absent, it reaches to the middle."""
     least_coverage: float = Field(0.1, ge=0, lt=1)
-    """Where the (beam-smoothed) samples per pixel are below this share of their 99th percentile, the window is zero."""
+    """Where the (beam-smoothed) samples per pixel are below this share of their 99th percentile,
+    the window is zero.
+    """
     map: str = Field("map", pattern=r"^[A-Za-z0-9_]+$")
     """Which map, by its name among the products."""
 
@@ -100,26 +113,45 @@ class TransferFunction(Output):
         return []
 
     def finalize(self, data: Data) -> None:
-        """Compare the two maps. Raises PipelineError where there is none, or none that can be compared."""
+        """Compare the two maps. Raises PipelineError where there is none, or none that can be
+        compared.
+        """
         after, before = (_map(data, name, self.map, self.label) for name in self.shown)
         window = window_of(before, self.radius, self.taper, self.least_coverage)
         edges = _edges(self, before, window)
         data.tally.state(self.label, "window", f"{np.count_nonzero(window)} pixels")
         if self.modes == "full":
-            what = "of the complete data" if self.shown[0] else "of the complete data, which are the sky alone"
+            what = (
+                "of the complete data"
+                if self.shown[0]
+                else "of the complete data, which are the sky alone"
+            )
             data.tally.state(self.label, "singular modes", what)
         for plane in ("I",) if before.polarization is None else IQU:
             _add(self, data, plane, (before, after), (window, edges))
 
 
 def _add(
-    step: TransferFunction, data: Data, plane: str, maps: tuple[MapProduct, MapProduct], where: tuple[Floats, Floats]
+    step: TransferFunction,
+    data: Data,
+    plane: str,
+    maps: tuple[MapProduct, MapProduct],
+    where: tuple[Floats, Floats],
 ) -> None:
-    """Make the product of one of I, Q and U. ``maps``: before and after the filters; ``where``: window and edges of the rings."""
-    (window, edges), (a, b) = where, (m if m.polarization is None else m.stokes(plane) for m in maps)
+    """Make the product of one of I, Q and U. ``maps``: before and after the filters; ``where``:
+    window and edges of the rings.
+    """
+    (window, edges), (a, b) = (
+        where,
+        (m if m.polarization is None else m.stokes(plane) for m in maps),
+    )
     rings = compare(a.signal, b.signal, window, a.pixel, edges)
     empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
-    data.tally.count(step.label, f"{'' if plane == 'I' else f'{plane}: '}rings without modes or power: NaN", empty)
+    data.tally.count(
+        step.label,
+        f"{'' if plane == 'I' else f'{plane}: '}rings without modes or power: NaN",
+        empty,
+    )
     key, of = (plane_key(name, plane) for name in (key_of(step, "transfer_function"), step.map))
     found = data.products[key] = Transfer(rings, edges, step.modes, maps[0].fwhm, step.label, of)
     if data.output is not None:
@@ -130,7 +162,9 @@ def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:
     """The map ``name`` of a signal, which can be compared; else a PipelineError about ``place``."""
     product = data.products.get(product_name(stream_of(signal), name))
     any_map = product or data.products.get(name)
-    if isinstance(any_map, MapProduct) and (any_map.projection != "TAN" or any_map.contents == "hits"):
+    if isinstance(any_map, MapProduct) and (
+        any_map.projection != "TAN" or any_map.contents == "hits"
+    ):
         raise PipelineError(NOT_TAN, place=place, cure=CURE)
     if not isinstance(product, MapProduct):
         cure = "set map to the product of the step that makes it, or that step's product to map"
@@ -141,12 +175,16 @@ def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:
 def _edges(step: TransferFunction, before: MapProduct, window: Floats) -> Floats:
     """(bins + 1,) wavenumbers between the rings, rad^-1."""
     if not window.any():
-        raise PipelineError("no pixel is left in the window", place=step.label, cure="choose a larger radius")
+        raise PipelineError(
+            "no pixel is left in the window", place=step.label, cure="choose a larger radius"
+        )
     smallest = step.smallest or max(before.fwhm, 2 * before.pixel)
     largest = step.largest or 2 * before.pixel * math.sqrt(np.count_nonzero(window) / math.pi)
     if largest <= smallest:
         scales = f"scales from {largest / ARCSEC:.3g} to {smallest / ARCSEC:.3g} arcsec are none"
-        raise PipelineError(scales, place=step.label, cure="set largest and smallest, or map a larger field")
+        raise PipelineError(
+            scales, place=step.label, cure="set largest and smallest, or map a larger field"
+        )
     return np.geomspace(1 / largest, 1 / smallest, step.bins + 1)
 
 
@@ -175,7 +213,8 @@ class Rings:
 
 
 def compare(before: Floats, after: Floats, window: Floats, pixel: float, edges: Floats) -> Rings:
-    """Equations (1) to (3) of two maps (ny, nx) of pixels of side ``pixel`` [rad]; NaN counts as nothing.
+    """Equations (1) to (3) of two maps (ny, nx) of pixels of side ``pixel`` [rad]; NaN counts as
+    nothing.
 
     Parameters
     ----------
@@ -190,8 +229,14 @@ def compare(before: Floats, after: Floats, window: Floats, pixel: float, edges: 
     window = np.where(known, window, 0.0)
     a, b = (_spectrum(np.where(known, m, 0.0), window) for m in (before, after))
     k = np.hypot(*np.meshgrid(*(np.fft.fftfreq(n, pixel) for n in window.shape), indexing="ij"))
-    correlated = window.size * (window**4).sum() / (window**2).sum() ** 2 if window.any() else np.inf
-    rows = [_ring(a[ring], b[ring], k[ring], correlated) for low, high in pairwise(edges) for ring in [(k >= low) & (k < high)]]
+    correlated = (
+        window.size * (window**4).sum() / (window**2).sum() ** 2 if window.any() else np.inf
+    )
+    rows = [
+        _ring(a[ring], b[ring], k[ring], correlated)
+        for low, high in pairwise(edges)
+        for ring in [(k >= low) & (k < high)]
+    ]
     found = np.array(rows, np.float64).reshape(-1, 6)
     with np.errstate(invalid="ignore", divide="ignore"):
         each = found[:, 4] / found[:, 5]
@@ -199,17 +244,29 @@ def compare(before: Floats, after: Floats, window: Floats, pixel: float, edges: 
     return Rings(*found.T)
 
 
-def _ring(a: NDArray[np.complex128], b: NDArray[np.complex128], k: Floats, correlated: float) -> tuple[float, ...]:
+def _ring(
+    a: NDArray[np.complex128], b: NDArray[np.complex128], k: Floats, correlated: float
+) -> tuple[float, ...]:
     """One row of `Rings`."""
     power, independent = float((abs(a) ** 2).sum()), k.size / 2 / correlated
     if power == 0 or not k.size:
-        return (float(k.mean()) if k.size else math.nan, math.nan, math.nan, math.nan, power, independent)
+        return (
+            float(k.mean()) if k.size else math.nan,
+            math.nan,
+            math.nan,
+            math.nan,
+            power,
+            independent,
+        )
     transfer = float((b * a.conj()).real.sum()) / power
     amplitude = math.sqrt(float((abs(b) ** 2).sum()) / power)
     error = math.nan
     if independent >= 2:
         rest = ((b - transfer * a) * a.conj()).real
-        error = math.sqrt(independent / (independent - 1) * 2 * correlated * float((rest**2).sum())) / power
+        error = (
+            math.sqrt(independent / (independent - 1) * 2 * correlated * float((rest**2).sum()))
+            / power
+        )
     return float(k.mean()), transfer, error, amplitude, power, independent
 
 
@@ -218,17 +275,27 @@ def _spectrum(values: Floats, window: Floats) -> NDArray[np.complex128]:
     return np.asarray(np.fft.fft2((values - mean) * window), np.complex128)
 
 
-def window_of(product: MapProduct, radius: float | None = None, taper: float | None = None, least: float = 0.1) -> Floats:
+def window_of(
+    product: MapProduct, radius: float | None = None, taper: float | None = None, least: float = 0.1
+) -> Floats:
     """`comparison.radial.tapered`, (ny, nx).
 
-    Inside are pixels with at least ``least`` of the 99th percentile of the beam-smoothed samples, holes filled, within
-    ``radius`` [rad] of the centre.
+    Inside are pixels with at least ``least`` of the 99th percentile of the beam-smoothed samples,
+    holes filled, within ``radius`` [rad] of the centre.
     """
     from scipy.ndimage import binary_fill_holes, gaussian_filter
 
-    hits = gaussian_filter(product.known_hits.astype(np.float64), product.fwhm / FWHM_PER_SIGMA / product.pixel, mode="constant")
+    hits = gaussian_filter(
+        product.known_hits.astype(np.float64),
+        product.fwhm / FWHM_PER_SIGMA / product.pixel,
+        mode="constant",
+    )
     seen = hits[product.known]
-    inside = hits >= max(least * float(np.percentile(seen, 99)), 1e-9) if seen.size else np.zeros(hits.shape, bool)
+    inside = (
+        hits >= max(least * float(np.percentile(seen, 99)), 1e-9)
+        if seen.size
+        else np.zeros(hits.shape, bool)
+    )
     inside = binary_fill_holes(inside)
     if radius is not None:
         inside &= product.distance() <= radius
@@ -264,7 +331,9 @@ class Transfer:
     def scale(self) -> Floats:
         """(n,) angular scales 1/k, rad; in a ring without modes its middle."""
         k = self.rings.wavenumber
-        return np.asarray(1 / np.where(np.isfinite(k), k, np.sqrt(self.edges[1:] * self.edges[:-1])), np.float64)
+        return np.asarray(
+            1 / np.where(np.isfinite(k), k, np.sqrt(self.edges[1:] * self.edges[:-1])), np.float64
+        )
 
     @property
     def kilolambda(self) -> Floats:
@@ -279,8 +348,18 @@ class Transfer:
             Column("scale_largest", 1 / self.edges[:-1] / ARCSEC, "arcsec", "edge of the ring"),
             Column("scale_smallest", 1 / self.edges[1:] / ARCSEC, "arcsec", "edge of the ring"),
             Column("kilolambda", self.kilolambda, "", "wavenumber, 1000 wavelengths"),
-            Column("transfer", r.transfer, "", "Re sum b a* / sum |a|^2: share that the filters leave, in phase"),
-            Column("error", r.error, "", "standard error of transfer from the scatter of the ring's modes"),
+            Column(
+                "transfer",
+                r.transfer,
+                "",
+                "Re sum b a* / sum |a|^2: share that the filters leave, in phase",
+            ),
+            Column(
+                "error",
+                r.error,
+                "",
+                "standard error of transfer from the scatter of the ring's modes",
+            ),
             Column("amplitude", r.amplitude, "", "sqrt(sum |b|^2 / sum |a|^2)"),
             Column("modes", r.modes, "", "independent modes"),
         ]
@@ -301,6 +380,7 @@ class Transfer:
     def _repr_html_(self) -> str:
         r = self.rings
         rows = [
-            (f"{s / ARCSEC:.3g} arcsec", f"{t:.3f} +- {e:.3f}") for s, t, e in zip(self.scale, r.transfer, r.error, strict=True)
+            (f"{s / ARCSEC:.3g} arcsec", f"{t:.3f} +- {e:.3f}")
+            for s, t, e in zip(self.scale, r.transfer, r.error, strict=True)
         ]
         return html_table(f"Transfer function, modes: {self.modes}", rows)

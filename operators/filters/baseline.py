@@ -2,15 +2,17 @@
 
 With B (K, N) the functions, and B_g, x_g their values and the data at the samples that are used,
 
-    y = x - B^T (B_g B_g^T)^-1 B_g x_g,                                                                    (1)
+    y = x - B^T (B_g B_g^T)^-1 B_g x_g,   (1)
 
-a linear least-squares fit, in float64. Samples that are flagged, not finite or in a source mask are not used, but the fit is
-subtracted there too. Functions that no used sample determines get the coefficient 0 (pseudoinverse).
+a linear least-squares fit, in float64. Samples that are flagged, not finite or in a source mask are
+not used, but the fit is subtracted there too. Functions that no used sample determines get the
+coefficient 0 (pseudoinverse).
 
-A mask leaves a detector that looks into it most of the time too little to go by: the fit would be an extrapolation. The mask of a
-detector is not used where fewer functions are determined without its samples, or where at these the variance of the fit,
+A mask leaves a detector that looks into it most of the time too little to go by: the fit would be
+an extrapolation. The mask of a detector is not used where fewer functions are determined without
+its samples, or where at these the variance of the fit,
 
-    mean over the masked samples of b_t^T (B_g B_g^T)^-1 b_t,                                              (2)
+    mean over the masked samples of b_t^T (B_g B_g^T)^-1 b_t,   (2)
 
 is larger than that of a sample.
 """
@@ -33,7 +35,9 @@ DETERMINED = 1e-14
 """Eigenvalues of B_g B_g^T below this share of the largest count as zero."""
 
 MANY = 100
-"""Functions from which those that overlap with few others are solved for by a factor with as few diagonals."""
+"""Functions from which those that overlap with few others are solved for by a factor with as few
+diagonals.
+"""
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,8 @@ class Basis:
     stops
         (n_run,) end of each run of samples, at most `AT_ONCE` of them.
     firsts
-        (n_run,) number of the first function that reaches the run; those that follow it are the next taps - 1.
+        (n_run,) number of the first function that reaches the run; those that follow it are the
+        next taps - 1.
     size
         K, the number of functions.
     """
@@ -68,11 +73,13 @@ class Basis:
         return _inverse(self.normal(use))
 
     def solver(self, use: Mask) -> Floats:
-        """What `solved` takes for the samples ``use`` (N,): `inverse`, or of `MANY` functions, all of them determined and each
-        overlapping with few, a factor (taps, K).
+        """What `solved` takes for the samples ``use`` (N,): `inverse`, or of `MANY` functions, all
+        of them determined and each overlapping with few, a factor (taps, K).
         """
         normal, factor = self.normal(use), np.zeros((len(self.functions), self.size))
-        if self.size < max(MANY, len(factor) + 1) or not _factor(normal, DETERMINED * normal.diagonal().max(), factor):
+        if self.size < max(MANY, len(factor) + 1) or not _factor(
+            normal, DETERMINED * normal.diagonal().max(), factor
+        ):
             return _inverse(normal)
         return factor
 
@@ -94,7 +101,9 @@ class Basis:
 
 
 def runs(value: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Ends of runs of `AT_ONCE` samples or less, each within one chunk, whose ``value`` (N,) is the same."""
+    """Ends of runs of `AT_ONCE` samples or less, each within one chunk, whose ``value`` (N,) is the
+    same.
+    """
     starts = np.append(True, value[1:] != value[:-1])
     starts[::AT_ONCE] = True
     return np.append(np.flatnonzero(starts)[1:], len(value))
@@ -103,12 +112,20 @@ def runs(value: NDArray[np.int64]) -> NDArray[np.int64]:
 def polynomials(n: int, order: int) -> Basis:
     """Legendre polynomials up to ``order`` over a scan of ``n`` samples."""
     time = (2 * np.arange(n) + 1) / n - 1
-    return Basis.of(np.asarray(np.polynomial.legendre.legvander(time, order).T, np.float64), np.zeros(n, np.int64), order + 1)
+    return Basis.of(
+        np.asarray(np.polynomial.legendre.legvander(time, order).T, np.float64),
+        np.zeros(n, np.int64),
+        order + 1,
+    )
 
 
 def splines(n: int, spacing: float) -> Basis:
-    """Cubic B-splines with knots every ``spacing`` samples, a whole number of intervals centred on a scan of ``n`` samples."""
-    inner = max(1, math.ceil((n - 1) / spacing))  # knots inside the scan, half of an interval or less from either end
+    """Cubic B-splines with knots every ``spacing`` samples, a whole number of intervals centred on
+    a scan of ``n`` samples.
+    """
+    inner = max(
+        1, math.ceil((n - 1) / spacing)
+    )  # knots inside the scan, half of an interval or less from either end
     position = (np.arange(n) - (n - 1) / 2) / spacing + (inner - 1) / 2 + 1
     first = np.clip(np.floor(position).astype(np.int64), 0, inner)
     return Basis.of(spline_basis(position - first), first, inner + 4)
@@ -116,7 +133,9 @@ def splines(n: int, spacing: float) -> Basis:
 
 @dataclass(frozen=True)
 class Fit:
-    """Equation (1) for scans whose samples ``use`` (N,) are used; ``inverse``: `Basis.inverse` of these, or `Basis.solver`."""
+    """Equation (1) for scans whose samples ``use`` (N,) are used; ``inverse``: `Basis.inverse` of
+    these, or `Basis.solver`.
+    """
 
     basis: Basis
     use: Mask
@@ -128,8 +147,8 @@ class Fit:
         return cls(basis, use, basis.solver(use))
 
     def remove(self, rows: Rows, masked: Mask | None = None) -> int:
-        """Equation (1) on rows in place. ``masked`` (n_det, N): samples that are not used, of each detector, where equation (2)
-        allows it.
+        """Equation (1) on rows in place. ``masked`` (n_det, N): samples that are not used, of each
+        detector, where equation (2) allows it.
 
         Returns how many samples were not finite; they stay as they were.
         """
@@ -159,7 +178,9 @@ class Fit:
         return found, spoilt
 
     def _outside(self, use: Mask, inverse: Floats, masked: Mask) -> tuple[Mask, Floats]:
-        """Samples to use outside of a mask (N,), and their inverse; those that are given where equation (2) forbids it."""
+        """Samples to use outside of a mask (N,), and their inverse; those that are given where
+        equation (2) forbids it.
+        """
         left, basis = use & ~masked, self.basis
         whole = inverse if len(inverse) == basis.size else basis.inverse(use)
         found, inside = basis.inverse(left), basis.normal(use & masked)
@@ -170,7 +191,8 @@ class Fit:
 
 
 def solved(inverse: Floats, sums: Floats) -> Floats:
-    """(n_det, K): ``inverse`` (K, K), symmetric, times each row of ``sums`` (n_det, K); or the solutions by a factor (taps, K).
+    """(n_det, K): ``inverse`` (K, K), symmetric, times each row of ``sums`` (n_det, K); or the
+    solutions by a factor (taps, K).
 
     Not by BLAS, whose bits depend on how many rows there are.
     """
@@ -189,10 +211,17 @@ def _inverse(normal: Floats) -> Floats:
     return np.asarray((found + found.T) / 2, np.float64)
 
 
-# A sum may be formed in any order within a chunk of one row: the compiler chooses it once, whatever rows stand beside it.
+# A sum may be formed in any order within a chunk of one row: the compiler chooses it once, whatever
+# rows stand beside it.
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
+@nb.njit(
+    nogil=True,
+    cache=True,
+    boundscheck=False,
+    error_model="numpy",
+    fastmath={"contract", "nsz", "reassoc"},
+)
 def dot(a, b):  # type: ignore[no-untyped-def]
     """sum_t a_t b_t of two chunks."""
     total = 0.0
@@ -201,7 +230,9 @@ def dot(a, b):  # type: ignore[no-untyped-def]
     return total
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def lessen(x, c, f):  # type: ignore[no-untyped-def]
     """x -= c f, of two chunks."""
     for t in range(nb.uint64(x.size)):
@@ -218,9 +249,11 @@ def _solve(inverse, sums, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _factor(normal, least, factor):  # type: ignore[no-untyped-def]
-    """Cholesky's factor L of a matrix (K, K) with few diagonals: factor[i, j] = L[j + i, j], and 1 / L[j, j] at i = 0.
+    """Cholesky's factor L of a matrix (K, K) with few diagonals: factor[i, j] = L[j + i, j], and 1
+    / L[j, j] at i = 0.
 
-    False where a square of L[j, j] is not above ``least``: there are functions that no used sample determines.
+    False where a square of L[j, j] is not above ``least``: there are functions that no used sample
+    determines.
     """
     taps, size = factor.shape
     for j in range(size):

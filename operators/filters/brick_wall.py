@@ -2,16 +2,18 @@
 
 A detector's scan x_n, n = 0 .. N - 1, loses a polynomial and then every cosine below the cut:
 
-    y = x - P x,    P x = p + sum_{k < K} a_k cos(pi k (n + 1/2) / N),   K = ceil(2 N f / f_s),                 (1)
+    y = x - P x,   P x = p + sum_{k < K} a_k cos(pi k (n + 1/2) / N),   K = ceil(2 N f / f_s),
+    (1)
 
-p the least-squares polynomial, a_k the DCT-II of x - p: the brick wall on the evenly extended scan, which has no jump at
-its ends (a periodic brick wall wraps a drift around). The low part is smooth, so it is formed on a coarse series: with
-B the cubic B-spline and knots every q = N / M samples,
+p the least-squares polynomial, a_k the DCT-II of x - p: the brick wall on the evenly extended scan,
+which has no jump at its ends (a periodic brick wall wraps a drift around). The low part is smooth,
+so it is formed on a coarse series: with B the cubic B-spline and knots every q = N / M samples,
 
-    s_m = sum_n x_n B((n + 1/2) / q - m),   P x = sum_m c_m B((n + 1/2) / q - m),                             (2)
+    s_m = sum_n x_n B((n + 1/2) / q - m),   P x = sum_m c_m B((n + 1/2) / q - m),   (2)
 
-where c follows from s by a DCT-I of length M + 1 and a division by sinc(k / 2M)^8, the B-spline's response both ways. The
-error of the low part is (K / 2M)^4 at the cut, less below it; the polynomial is exact, because cubic B-splines hold it.
+where c follows from s by a DCT-I of length M + 1 and a division by sinc(k / 2M)^8, the B-spline's
+response both ways. The error of the low part is (K / 2M)^4 at the cut, less below it; the
+polynomial is exact, because cubic B-splines hold it.
 """
 
 from __future__ import annotations
@@ -36,10 +38,13 @@ SHORTEST_STEP = 8
 """Samples per coarse knot below which the full DCT is cheaper and is used instead."""
 
 GROUP = 16
-"""Samples that are worked on together: five knots reach all of them, or six where knots lie closer."""
+"""Samples that are worked on together: five knots reach all of them, or six where knots lie closer.
+"""
 
 FEW, CLOSE = 128, 1 << 12
-"""Largest numbers of cosines and knots for which sums over them are faster than transforms, and their matrices small (4 MB)."""
+"""Largest numbers of cosines and knots for which sums over them are faster than transforms, and
+their matrices small (4 MB).
+"""
 
 ABREAST = TILE_DETECTORS
 """Rows whose sums are formed side by side."""
@@ -54,15 +59,18 @@ class HighpassPlan:
     Attributes
     ----------
     n, cut
-        Samples N, and the number K of cosines removed (0: the scan is shorter than one cycle; polynomial only).
+        Samples N, and the number K of cosines removed (0: the scan is shorter than one cycle;
+        polynomial only).
     knots
         M; 0: use the full DCT.
     first
-        (n_group,): column of s and c, m + 1, of the first knot that the `GROUP` samples from GROUP g on reach.
+        (n_group,): column of s and c, m + 1, of the first knot that the `GROUP` samples from GROUP
+        g on reach.
     taps
         Knots from there on that the samples of a group reach, 5 or 6.
     modes
-        (degree + 1, M + 3): coarse coefficients of orthonormal polynomials; `spread_modes`, the same shape, their s.
+        (degree + 1, M + 3): coarse coefficients of orthonormal polynomials; `spread_modes`, the
+        same shape, their s.
     polynomials
         (degree + 1, N): the polynomials themselves where the full DCT is used.
     response
@@ -85,7 +93,8 @@ class HighpassPlan:
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
     def apply(self, rows: AnyFloats, bad: NDArray[np.intp] = NONE) -> int:
-        """Filter ``rows`` (n_det, N), C order, in place. Returns how many samples were not finite; they stay as they were.
+        """Filter ``rows`` (n_det, N), C order, in place. Returns how many samples were not finite;
+        they stay as they were.
 
         ``bad``: flagged samples, bridged before filtering.
         """
@@ -132,7 +141,9 @@ class HighpassPlan:
         return self.knots - 1 + self.taps
 
     def weights(self, kind: np.dtype[Any]) -> AnyFloats:
-        """(n_group, taps, `GROUP`) of type ``kind``: B at the groups' knots at their samples; 0 past the end."""
+        """(n_group, taps, `GROUP`) of type ``kind``: B at the groups' knots at their samples; 0
+        past the end.
+        """
         with self._lock:
             if kind not in self._weights:
                 self._weights[kind] = _weights(self.n, self.knots, self.first, self.taps, kind)
@@ -143,11 +154,15 @@ class HighpassPlan:
         if self.sums:
             half = -(-s.shape[1] // 2)
             left, right = s[:, :half], s[:, : -half - 1 : -1]
-            even, odd = (product(product(x, a), b) for x, (a, b) in zip((left + right, left - right), self.sums, strict=True))
+            even, odd = (
+                product(product(x, a), b)
+                for x, (a, b) in zip((left + right, left - right), self.sums, strict=True)
+            )
             c = np.empty_like(s)
             c[:, :half], c[:, : -half - 1 : -1] = even + odd, even - odd
             return c
-        # not with BLAS, whose bits in one row depend on how many rows there are and where it stands among them
+        # not with BLAS, whose bits in one row depend on how many rows there are and where it stands
+        # among them
         amplitude = np.einsum("dm,km->dk", s, self.modes)
         rest = s - np.einsum("dk,km->dm", amplitude, self.spread_modes)
         c = np.einsum("dk,km->dm", amplitude, self.modes)
@@ -178,14 +193,17 @@ class HighpassPlan:
 
 
 def first_kept(n: int, frequency: float) -> int:
-    """Number of the first cosine that a cut at ``frequency`` cycles per sample keeps of ``n``; 0: all but means and lines."""
+    """Number of the first cosine that a cut at ``frequency`` cycles per sample keeps of ``n``; 0:
+    all but means and lines.
+    """
     cycles = n * frequency
     return max(1, math.ceil(2 * cycles - 1e-9)) if cycles >= 1 else 0
 
 
 @lru_cache(maxsize=2)
 def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) -> HighpassPlan:
-    """The plan for scans of ``n`` samples and a cut at ``frequency`` cycles per sample; the rest as in `HighpassFilter`.
+    """The plan for scans of ``n`` samples and a cut at ``frequency`` cycles per sample; the rest as
+    in `HighpassFilter`.
 
     Kept for the next scan of that length: not to be changed.
     """
@@ -218,17 +236,25 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     response = 1 / (2 * n * sinc**2)
     modes, spread = norm @ raw, norm @ spread
     sums = _sums(modes, spread, response) if 0 < cut <= FEW and knots <= CLOSE else ()
-    return HighpassPlan(n, cut, knots, *_groups(n, knots), modes, spread, np.zeros((0, n)), response, sums)
+    return HighpassPlan(
+        n, cut, knots, *_groups(n, knots), modes, spread, np.zeros((0, n)), response, sums
+    )
 
 
-def _sums(modes: AnyFloats, spread: AnyFloats, response: AnyFloats) -> tuple[tuple[AnyFloats, AnyFloats], ...]:
-    """For what is even and what is odd about the middle, matrices A (h, k) and B (k, h), h the half of the M + 3 knots:
-    (s_j +- s_(M - j)) A B is that part of c, where equation (2) is written out in polynomials p and cosines C,
+def _sums(
+    modes: AnyFloats, spread: AnyFloats, response: AnyFloats
+) -> tuple[tuple[AnyFloats, AnyFloats], ...]:
+    """For what is even and what is odd about the middle, matrices A (h, k) and B (k, h), h the half
+    of the M + 3 knots: (s_j +- s_(M - j)) A B is that part of c, where equation (2) is written out
+    in polynomials p and cosines C,
 
-        c = a p + r (s - a S) C^T C,    a = s p^T,    S what p spreads,    r = 2 (response), and twice that for k > 0.   (3)
+        c = a p + r (s - a S) C^T C,   a = s p^T,   S what p spreads,
+        r = 2 (response), and twice that for k > 0.   (3)
     """
     knots = modes.shape[1]
-    cosines = np.cos(np.pi * np.multiply.outer(np.arange(response.size), (np.arange(knots) - 1) / (knots - 3)))
+    cosines = np.cos(
+        np.pi * np.multiply.outer(np.arange(response.size), (np.arange(knots) - 1) / (knots - 3))
+    )
     factor = np.where(np.arange(response.size) > 0, 4.0, 2.0) * response
     half, found = -(-knots // 2), []
     for parity in range(2):
@@ -242,7 +268,9 @@ def _sums(modes: AnyFloats, spread: AnyFloats, response: AnyFloats) -> tuple[tup
 
 
 def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], AnyFloats]:
-    """Each sample's interval (m,), counted from the first knot, and B at the four knots around it (4, m)."""
+    """Each sample's interval (m,), counted from the first knot, and B at the four knots around it
+    (4, m).
+    """
     position = (np.arange(samples.start, samples.stop) + 0.5) * (knots / n)
     cell = position.astype(np.int64)
     return cell, spline_basis(position - cell)
@@ -251,11 +279,16 @@ def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], AnyF
 def _groups(n: int, knots: int) -> tuple[NDArray[np.int64], int]:
     """`HighpassPlan.first` and ``taps``."""
     begin = np.arange(0, n, GROUP)
-    first, last = (((at + 0.5) * (knots / n)).astype(np.int64) for at in (begin, np.minimum(begin + GROUP, n) - 1))
+    first, last = (
+        ((at + 0.5) * (knots / n)).astype(np.int64)
+        for at in (begin, np.minimum(begin + GROUP, n) - 1)
+    )
     return first, max(5, 4 + int((last - first).max()))
 
 
-def _weights(n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.dtype[Any]) -> AnyFloats:
+def _weights(
+    n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.dtype[Any]
+) -> AnyFloats:
     """See `HighpassPlan.weights`."""
     found: AnyFloats = empty((first.size, taps * GROUP), kind).reshape(first.size, taps, GROUP)
     for samples in chunks(first.size * GROUP):
@@ -264,21 +297,29 @@ def _weights(n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.d
         part = slice(samples.start // GROUP, samples.stop // GROUP)
         later, each = cell.reshape(-1, GROUP) - first[part, None], weights.reshape(4, -1, GROUP)
         for k in range(taps):
-            found[part, k] = sum(np.where(later == k - j, each[j], 0.0) for j in range(max(0, k + 4 - taps), min(4, k + 1)))
+            found[part, k] = sum(
+                np.where(later == k - j, each[j], 0.0)
+                for j in range(max(0, k + 4 - taps), min(4, k + 1))
+            )
     return found
 
 
 def bridge(row: AnyFloats, gaps: NDArray[np.intp]) -> None:
-    """Replace the samples ``gaps`` by straight lines between their good neighbours (held constant at the ends)."""
+    """Replace the samples ``gaps`` by straight lines between their good neighbours (held constant
+    at the ends).
+    """
     good = np.ones(row.size, bool)
     good[gaps] = False
     known = np.flatnonzero(good)
     row[gaps] = np.interp(gaps, known, row[known])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _spread(rows, first, weights, s):  # type: ignore[no-untyped-def]
-    """s[first + j, d] += sum_n weights[j, n] rows[d, n] of up to `ABREAST` rows (n_det, N): s (n_knot, ABREAST).
+    """s[first + j, d] += sum_n weights[j, n] rows[d, n] of up to `ABREAST` rows (n_det, N): s
+    (n_knot, ABREAST).
 
     Groups are turned round, so that rows are neighbours: no vector is ever summed up.
     """
@@ -295,10 +336,18 @@ def _spread(rows, first, weights, s):  # type: ignore[no-untyped-def]
         m = np.uintp(first[g])
         for j in range(np.uintp(w.shape[1])):
             for d in range(np.uintp(ABREAST)):
-                a = (x[0, d] * w[g, j, 0] + x[1, d] * w[g, j, 1]) + (x[2, d] * w[g, j, 2] + x[3, d] * w[g, j, 3])
-                b = (x[4, d] * w[g, j, 4] + x[5, d] * w[g, j, 5]) + (x[6, d] * w[g, j, 6] + x[7, d] * w[g, j, 7])
-                e = (x[8, d] * w[g, j, 8] + x[9, d] * w[g, j, 9]) + (x[10, d] * w[g, j, 10] + x[11, d] * w[g, j, 11])
-                f = (x[12, d] * w[g, j, 12] + x[13, d] * w[g, j, 13]) + (x[14, d] * w[g, j, 14] + x[15, d] * w[g, j, 15])
+                a = (x[0, d] * w[g, j, 0] + x[1, d] * w[g, j, 1]) + (
+                    x[2, d] * w[g, j, 2] + x[3, d] * w[g, j, 3]
+                )
+                b = (x[4, d] * w[g, j, 4] + x[5, d] * w[g, j, 5]) + (
+                    x[6, d] * w[g, j, 6] + x[7, d] * w[g, j, 7]
+                )
+                e = (x[8, d] * w[g, j, 8] + x[9, d] * w[g, j, 9]) + (
+                    x[10, d] * w[g, j, 10] + x[11, d] * w[g, j, 11]
+                )
+                f = (x[12, d] * w[g, j, 12] + x[13, d] * w[g, j, 13]) + (
+                    x[14, d] * w[g, j, 14] + x[15, d] * w[g, j, 15]
+                )
                 s[m + j, d] += np.float64((a + b) + (e + f))
 
 
@@ -306,7 +355,9 @@ AT_ONCE = 64
 """Groups that all rows pass through together, while their weights are in the cache."""
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _subtract(rows, first, weights, c):  # type: ignore[no-untyped-def]
     """rows[d, n] -= sum_j weights[j, n] c[d, first + j]."""
     n_det, n, w = np.uintp(rows.shape[0]), np.uintp(rows.shape[1]), weights
@@ -316,9 +367,21 @@ def _subtract(rows, first, weights, c):  # type: ignore[no-untyped-def]
         for d in range(n_det):
             for g in range(begin, min(begin + np.uintp(AT_ONCE), whole)):
                 m, start = np.uintp(first[g]), g * np.uintp(GROUP)
-                c0, c1, c2, c3, c4 = c[d, m], c[d, m + one], c[d, m + two], c[d, m + three], c[d, m + four]
+                c0, c1, c2, c3, c4 = (
+                    c[d, m],
+                    c[d, m + one],
+                    c[d, m + two],
+                    c[d, m + three],
+                    c[d, m + four],
+                )
                 for i in range(np.uintp(GROUP)):
-                    low = c0 * w[g, 0, i] + c1 * w[g, 1, i] + c2 * w[g, 2, i] + c3 * w[g, 3, i] + c4 * w[g, 4, i]
+                    low = (
+                        c0 * w[g, 0, i]
+                        + c1 * w[g, 1, i]
+                        + c2 * w[g, 2, i]
+                        + c3 * w[g, 3, i]
+                        + c4 * w[g, 4, i]
+                    )
                     rows[d, start + i] -= low
                 if w.shape[1] > 5:
                     c5 = c[d, m + five]
@@ -327,4 +390,6 @@ def _subtract(rows, first, weights, c):  # type: ignore[no-untyped-def]
     for d in range(n_det):
         for t in range(whole * np.uintp(GROUP), n):
             for j in range(np.uintp(w.shape[1])):
-                rows[d, t] -= c[d, np.uintp(first[whole]) + j] * w[whole, j, t - whole * np.uintp(GROUP)]
+                rows[d, t] -= (
+                    c[d, np.uintp(first[whole]) + j] * w[whole, j, t - whole * np.uintp(GROUP)]
+                )

@@ -1,23 +1,27 @@
 """Removes what all detectors see alike: the first singular modes of the signal.
 
-With A the stream (detectors x samples) and u_i the leading eigenvectors of G = A A^T, eigenvalues sigma_i^2,
+With A the stream (detectors x samples) and u_i the leading eigenvectors of G = A A^T, eigenvalues
+sigma_i^2,
 
-    A <- A - sum_i u_i v_i^T,   v_i = A^T u_i.                                                            (1)
+    A <- A - sum_i u_i v_i^T,
+    v_i = A^T u_i.                                                            (1)
 
 G is never formed (`gram`); the modes are iterated (`lanczos`) until
 
-    |G u_i - sigma_i^2 u_i| <= residual * sigma_i^2   for every mode that is removed.                        (2)
+    |G u_i - sigma_i^2 u_i| <= residual * sigma_i^2   for every mode that is removed.            (2)
 
-The detectors' mean (`method: mean`) is found in one reading (`focal_plane_mean`), so that the stream may be larger than memory
-and disk; the iteration needs it whole.
+The detectors' mean (`method: mean`) is found in one reading (`focal_plane_mean`), so that the
+stream may be larger than memory and disk; the iteration needs it whole.
 
-The u_i depend on A. With `modes: full` those of the complete data A act on another signal B (the sky alone):
+The u_i depend on A. With `modes: full` those of the complete data A act on another signal B (the
+sky alone):
 
-    B <- B - sum_i u_i (B^T u_i)^T.                                                                          (3)
+    B <- B - sum_i u_i (B^T u_i)^T.                                                              (3)
 
-That is what (1) does to the part B of A = B + C: (3) of B plus (3) of C is (1) of A. (1) also changes with B because B turns
-the modes: to first order the filtered A changes by (1 - u u^T) B (1 - v v^T / |v|^2), which is (3) but for one degree of
-freedom in N_samples for each mode, and for terms of order sigma_2 / sigma_1.
+That is what (1) does to the part B of A = B + C: (3) of B plus (3) of C is (1) of A. (1) also
+changes with B because B turns the modes: to first order the filtered A changes by (1 - u u^T) B (1
+- v v^T / |v|^2), which is (3) but for one degree of freedom in N_samples for each mode, and for
+terms of order sigma_2 / sigma_1.
 """
 
 from __future__ import annotations
@@ -47,14 +51,17 @@ ROUNDING = 2.0**-24 / np.sqrt(3.0)
 
 KEPT = "modes kept because the data do not determine them (rank)"
 UNDETERMINED = "degenerate modes (the next singular value is nearly as large)"
-"""Counts of the log. Degenerate: the next singular value is more than `gap` times the mode's own."""
+"""Counts of the log. Degenerate: the next singular value is more than `gap` times the mode's own.
+"""
 
 
 class CommonModeFilter(CommonModeParameters):
-    """Filter that removes the leading singular modes of each scan, equation (1). Flagged samples and detectors are excluded.
+    """Filter that removes the leading singular modes of each scan, equation (1). Flagged samples
+    and detectors are excluded.
 
-    Detectors whose complete signal is not finite are flagged, and those whose complete signal is constant: they are dead. In a
-    scene of the sky alone a constant signal is a valid zero, which takes part.
+    Detectors whose complete signal is not finite are flagged, and those whose complete signal is
+    constant: they are dead. In a scene of the sky alone a constant signal is a valid zero, which
+    takes part.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -81,8 +88,14 @@ class CommonModeFilter(CommonModeParameters):
         return []
 
     def measure(self, stream: Stream, model: Modes | None = None) -> Modes:
-        """Find the modes; given those of the complete signal (``model``), their times in this one."""
-        return _wafer_by_wafer(self, stream, model) if self.group == "wafer" else _modes(self, stream, model)
+        """Find the modes; given those of the complete signal (``model``), their times in this
+        one.
+        """
+        return (
+            _wafer_by_wafer(self, stream, model)
+            if self.group == "wafer"
+            else _modes(self, stream, model)
+        )
 
     def exec(self, block: Block, state: Modes) -> None:
         """Equation (1) on one block."""
@@ -103,10 +116,15 @@ def _wafer_by_wafer(step: CommonModeFilter, stream: Stream, model: Modes | None)
         part, others = copy.copy(stream), whole.focalplane.wafer != wafer
         part.observation = copy.copy(whole)
         part.observation.name = f"{whole.name}, wafer {wafer}"
-        part.observation.detector_flags = whole.detector_flags | np.where(others, DEAD, 0).astype(np.uint8)
+        part.observation.detector_flags = whole.detector_flags | np.where(others, DEAD, 0).astype(
+            np.uint8
+        )
         parts.append(_modes(step, part, model.parts[k] if model else None))
         whole.detector_flags[~others] |= part.observation.detector_flags[~others]
-    detectors, times = (np.concatenate(found) for found in zip(*((p.detectors, p.times) for p in parts), strict=True))
+    detectors, times = (
+        np.concatenate(found)
+        for found in zip(*((p.detectors, p.times) for p in parts), strict=True)
+    )
     return Modes(detectors, times, None, tuple(parts))
 
 
@@ -118,7 +136,8 @@ def _modes(step: CommonModeFilter, stream: Stream, model: Modes | None) -> Modes
     place = f"{step.label}, {stream.observation.name}"
     if stream.means.get("signal") is not None and stream.dtype != np.float64:
         raise PipelineError(
-            "the mean emission, tens of kelvin, is still part of the signal and float32 cannot carry it",
+            "the mean emission, tens of kelvin, is still part of the signal and float32 cannot"
+            " carry it",
             place=place,
             cure="put a HighpassFilter before, or set precision: float64",
         )
@@ -127,19 +146,27 @@ def _modes(step: CommonModeFilter, stream: Stream, model: Modes | None) -> Modes
     _tell(step, stream, detectors, found, inside)
     _check_precision(found, detectors, stream, place)
     scale = np.ones(detectors.use.size) if detectors.scale is None else detectors.scale
-    return Modes(found.detectors[: found.count] * scale, found.times[: found.count], detectors.scale)
+    return Modes(
+        found.detectors[: found.count] * scale, found.times[: found.count], detectors.scale
+    )
 
 
-def _singular_modes(step: CommonModeFilter, stream: Stream, inside: Inside | None) -> tuple[Usable, Ritz]:
+def _singular_modes(
+    step: CommonModeFilter, stream: Stream, inside: Inside | None
+) -> tuple[Usable, Ritz]:
     """The leading singular modes, with the number of those to remove."""
     with ThreadPoolExecutor(max(1, stream.threads)) as pool:
         gram = Gram(stream, pool, None, _sees_nothing(stream), inside, step.scale == "rms")
-        found = lanczos(gram, step.modes, step.residual, None if step.on_undetermined == "remove" else step.gap)
+        found = lanczos(
+            gram, step.modes, step.residual, None if step.on_undetermined == "remove" else step.gap
+        )
         found.count = _choose(step, found, gram, stream.observation)
     return gram, found
 
 
-def _mean_mode(step: CommonModeFilter, stream: Stream, inside: Inside | None) -> tuple[Usable, Ritz]:
+def _mean_mode(
+    step: CommonModeFilter, stream: Stream, inside: Inside | None
+) -> tuple[Usable, Ritz]:
     """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
     observation = stream.observation
     good = observation.good_samples
@@ -153,7 +180,15 @@ def _mean_mode(step: CommonModeFilter, stream: Stream, inside: Inside | None) ->
         root = np.sqrt(detectors.n_good)
         v = reading.total / root
         rank = 1 + (reading.least_left > NOTHING * detectors.energy)
-        found = Ritz(np.array([v @ v]), (detectors.use / root)[None], v[None], np.zeros(1), rank, 1, "detector mean")
+        found = Ritz(
+            np.array([v @ v]),
+            (detectors.use / root)[None],
+            v[None],
+            np.zeros(1),
+            rank,
+            1,
+            "detector mean",
+        )
     found.count = min(1, max(0, found.rank - 1))
     observation.tally.count(step.label, KEPT, 1 - found.count)
     return detectors, found
@@ -191,50 +226,76 @@ def _times(stream: Stream, model: Modes, method: str, inside: Inside | None) -> 
     return np.array(times).reshape(len(modes), stream.shape[1])
 
 
-def _tell(step: CommonModeFilter, stream: Stream, detectors: Usable, found: Ritz, inside: Inside | None) -> None:
+def _tell(
+    step: CommonModeFilter, stream: Stream, detectors: Usable, found: Ritz, inside: Inside | None
+) -> None:
     """State what was found; flag the dead detectors, which the complete signal shows."""
     observation, tally, who = stream.observation, stream.observation.tally, step.label
     if inside is not None:
         masked, covered = counts(inside, observation.n_samples)
         tally.count(who, MASKED, masked, observation.n_detectors * observation.n_samples)
-        tally.count(who, "instants with all detectors in the source mask: no mode removed", covered, observation.n_samples)
+        tally.count(
+            who,
+            "instants with all detectors in the source mask: no mode removed",
+            covered,
+            observation.n_samples,
+        )
     if stream.signal == MAIN:
         for name, dead in (("not finite", detectors.not_finite), ("constant", detectors.constant)):
             tally.count(who, f"detectors flagged: signal {name}", int(dead.sum()))
             observation.detector_flags[dead] |= DEAD
-    sizes = np.sqrt(np.maximum(found.values[: step.modes + 1], 0.0) / max(1, detectors.n_good * detectors.n_used))
+    sizes = np.sqrt(
+        np.maximum(found.values[: step.modes + 1], 0.0)
+        / max(1, detectors.n_good * detectors.n_used)
+    )
     values = ", ".join(f"{s:.4g}" for s in sizes)
     worst = found.residuals[: found.count].max(initial=0.0)
     unit = "K" if detectors.scale is None else "of the detectors' rms"
-    tally.state(who, f"{observation.name}: singular values / sqrt(detectors x samples)", f"{values or 'none'} {unit}")
-    tally.state(who, f"{observation.name}: residual of the modes", f"{worst:.1e} after {found.steps} steps")
+    tally.state(
+        who,
+        f"{observation.name}: singular values / sqrt(detectors x samples)",
+        f"{values or 'none'} {unit}",
+    )
+    tally.state(
+        who, f"{observation.name}: residual of the modes", f"{worst:.1e} after {found.steps} steps"
+    )
     tally.state(who, f"{observation.name}: modes removed", f"{found.count} ({found.what})")
 
 
 def _check_precision(found: Ritz, detectors: Usable, stream: Stream, place: str) -> None:
     if stream.dtype != np.float32 or not found.count or detectors.energy <= 0:
         return
-    left = max(detectors.energy - float(found.energies[: found.count].sum()), 0.0) / detectors.energy
+    left = (
+        max(detectors.energy - float(found.energies[: found.count].sum()), 0.0) / detectors.energy
+    )
     if 0.01 * np.sqrt(left) < ROUNDING:
         unit = 1.0 if detectors.scale is None else float(np.median(detectors.scale[detectors.use]))
-        rms, ratio = unit * np.sqrt(detectors.energy / (detectors.n_good * detectors.n_used)), 1 / max(np.sqrt(left), 1e-30)
+        rms, ratio = (
+            unit * np.sqrt(detectors.energy / (detectors.n_good * detectors.n_used)),
+            1 / max(np.sqrt(left), 1e-30),
+        )
         raise PipelineError(
-            f"the common mode, {rms:.3g} K rms, is {ratio:.1e} times what is left, more than float32 can carry",
+            f"the common mode, {rms:.3g} K rms, is {ratio:.1e} times what is left, more than"
+            " float32 can carry",
             place=place,
             cure="set precision: float64",
         )
 
 
 def _sees_nothing(stream: Stream) -> bool:
-    """Whether a constant signal may be that of a detector in order: where it is the sky alone, or not the complete signal, which
-    shows what is dead."""
-    of_the_sky = bool(stream.components) and all(c.enters == "above the atmosphere" for c in stream.components)
+    """Whether a constant signal may be that of a detector in order: where it is the sky alone, or
+    not the complete signal, which shows what is dead."""
+    of_the_sky = bool(stream.components) and all(
+        c.enters == "above the atmosphere" for c in stream.components
+    )
     return stream.signal != MAIN or of_the_sky
 
 
 @dataclass
 class Modes:
-    """Modes to remove: u (k, n_det), unit vectors, and v (k, n_samp), K_RJ; with a ``scale`` (n_det,), K_RJ, R u and v / K_RJ."""
+    """Modes to remove: u (k, n_det), unit vectors, and v (k, n_samp), K_RJ; with a ``scale``
+    (n_det,), K_RJ, R u and v / K_RJ.
+    """
 
     detectors: Floats
     times: Floats
@@ -243,7 +304,9 @@ class Modes:
     """Those of each wafer, where modes are found wafer by wafer."""
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _remove(signal, u, v):  # type: ignore[no-untyped-def]
     """signal -= u v^T in float64, rounded once."""
     n_det, n = signal.shape

@@ -19,10 +19,12 @@ MOST = 2000
 
 
 class Despline(Operator):
-    """Remove the cubic spline that fits each detector's scan best: equation (1) of `baseline` with B-splines.
+    """Remove the cubic spline that fits each detector's scan best: equation (1) of `baseline` with
+    B-splines.
 
-    The knots are those of the mapper of maria 1.0.0: equally spaced, and centred on the scan. (Its own spacing is always 60 s: it
-    gives `get_bspline_basis` the spacing under a name that this ignores.) Flagged samples are not used.
+    The knots are those of the mapper of maria 1.0.0: equally spaced, and centred on the scan. (Its
+    own spacing is always 60 s: it gives `get_bspline_basis` the spacing under a name that this
+    ignores.) Flagged samples are not used.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -43,18 +45,23 @@ class Despline(Operator):
     def _check_number(self, observation: Observation) -> None:
         if observation.duration > MOST * self.knots:
             raise PipelineError(
-                f"knots every {self.knots:g} s are more than {MOST} in a scan of {observation.duration:g} s",
+                f"knots every {self.knots:g} s are more than {MOST} in a scan of"
+                f" {observation.duration:g} s",
                 place=f"{self.label}, {observation.name}",
                 cure="choose longer knots, or a HighpassFilter",
             )
 
     def prepare(self, observation: Observation) -> Fit:
-        """The fit to this observation's good samples. Raises PipelineError for more than `MOST` knots."""
+        """The fit to this observation's good samples. Raises PipelineError for more than `MOST`
+        knots.
+        """
         spacing = self.knots * observation.sample_rate
         use = has_a_signal(observation.flags)
         self._check_number(observation)
         basis = splines(observation.n_samples, spacing)
-        observation.tally.state(self.label, f"{observation.name}: functions fitted to each detector", f"{basis.size}")
+        observation.tally.state(
+            self.label, f"{observation.name}: functions fitted to each detector", f"{basis.size}"
+        )
         return Fit.of(basis, use)
 
     def exec(self, block: Block, state: Fit) -> None:

@@ -16,9 +16,11 @@ from .source_mask import Inside, SourceMask, check_mask, check_masks
 
 
 class Detrend(Operator):
-    """Remove the polynomial that fits each detector's scan best, the mean of the atmosphere included: equation (1) of `baseline`.
+    """Remove the polynomial that fits each detector's scan best, the mean of the atmosphere
+    included: equation (1) of `baseline`.
 
-    Order 1 is what the mapper of maria 1.0.0 does first (``scipy.signal.detrend``). Flagged samples are not used.
+    Order 1 is what the mapper of maria 1.0.0 does first (``scipy.signal.detrend``). Flagged samples
+    are not used.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})

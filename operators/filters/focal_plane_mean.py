@@ -1,11 +1,13 @@
 """The detectors' mean at each instant, found in one reading of a stream of any size, or two.
 
-    m_t = (1 / n) sum_d x_dt  over the n good detectors                                                      (1)
+    m_t = (1 / n) sum_d x_dt  over the n good detectors                                          (1)
 
-With a source mask the sum is over the detectors outside of it at that instant, and so is n; the mean is 0 where there is none.
+With a source mask the sum is over the detectors outside of it at that instant, and so is n; the
+mean is 0 where there is none.
 
-The sum runs over the `TILE_DETECTORS` detectors of a tile, then over the tiles in order, in float64: it has the same bits
-however the stream is cut. A second reading is made only where the first finds detectors that must not take part.
+The sum runs over the `TILE_DETECTORS` detectors of a tile, then over the tiles in order, in
+float64: it has the same bits however the stream is cut. A second reading is made only where the
+first finds detectors that must not take part.
 """
 
 from __future__ import annotations
@@ -48,16 +50,25 @@ class Reading:
 
     @property
     def least_left(self) -> float:
-        """Lower bound of the energy that is left without the mean: sum_t (high - low)^2 / 2, no cancellation in it."""
+        """Lower bound of the energy that is left without the mean: sum_t (high - low)^2 / 2, no
+        cancellation in it.
+        """
         seen = self.high > self.low
         return float(0.5 * ((self.high[seen] - self.low[seen]) ** 2).sum())
 
 
 def read(stream: Stream, use: Mask, good: Mask, inside: Inside | None = None) -> Reading:
-    """One sweep over a stream. ``use`` (n_det,), ``good`` (n_samp,): which detectors and samples take part; ``inside``: a source
-    mask, for which `Reading.total` is n times the mean of the others."""
+    """One sweep over a stream. ``use`` (n_det,), ``good`` (n_samp,): which detectors and samples
+    take part; ``inside``: a source mask, for which `Reading.total` is n times the mean of the
+    others."""
     n_det, n_samp = stream.shape
-    reading = Reading(np.zeros(n_samp), np.full(n_samp, np.inf), np.full(n_samp, -np.inf), np.zeros(n_det), np.zeros(n_det))
+    reading = Reading(
+        np.zeros(n_samp),
+        np.full(n_samp, np.inf),
+        np.full(n_samp, -np.inf),
+        np.zeros(n_det),
+        np.zeros(n_det),
+    )
     field = stream.means.get(stream.name)
 
     taking = np.zeros(n_samp)  # detectors outside of the mask
@@ -80,7 +91,9 @@ def read(stream: Stream, use: Mask, good: Mask, inside: Inside | None = None) ->
             if inside is None:
                 _look(tile, begin, end, use[detectors], sums[:, here], range_of[:, here], added)
                 continue
-            _look(tile, begin, end, np.zeros(rows, np.bool_), sums[:, here], range_of[:, here], added)
+            _look(
+                tile, begin, end, np.zeros(rows, np.bool_), sums[:, here], range_of[:, here], added
+            )
             seen = use[detectors, None] & ~inside.at(detectors, at)
             for k in range(0, rows, TILE_DETECTORS):
                 few = slice(k, k + TILE_DETECTORS)
@@ -105,12 +118,17 @@ def read(stream: Stream, use: Mask, good: Mask, inside: Inside | None = None) ->
 
 
 LANES = 32
-"""Partial sums of a detector's moments: fixed, so that bits do not depend on the machine's vectors."""
+"""Partial sums of a detector's moments: fixed, so that bits do not depend on the machine's vectors.
+"""
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def add_moments(row, lanes, out):  # type: ignore[no-untyped-def]
-    """Add the sum and the sum of squares of ``row`` (n,) to ``out`` (2,). ``lanes`` (2, LANES): scratch."""
+    """Add the sum and the sum of squares of ``row`` (n,) to ``out`` (2,). ``lanes`` (2, LANES):
+    scratch.
+    """
     n = row.size
     whole = n // LANES * LANES
     first, second = lanes[0], lanes[1]
@@ -130,9 +148,13 @@ def add_moments(row, lanes, out):  # type: ignore[no-untyped-def]
         out[1] += second[i]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _look(part, start, stop, use, sums, range_of, moments):  # type: ignore[no-untyped-def]
-    """Add samples start .. stop - 1 of ``part`` to ``sums`` (tiles, n), ``range_of`` (2, n) and ``moments`` (2, n_det)."""
+    """Add samples start .. stop - 1 of ``part`` to ``sums`` (tiles, n), ``range_of`` (2, n) and
+    ``moments`` (2, n_det).
+    """
     n = stop - start
     lanes = np.empty((2, LANES))
     low, high = range_of[0], range_of[1]

@@ -1,4 +1,6 @@
-"""G = A A^T of a stream A (detectors x samples), as an operator on vectors over detectors: compiled, and never formed."""
+"""G = A A^T of a stream A (detectors x samples), as an operator on vectors over detectors:
+compiled, and never formed.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ from zonda.core.types import Floats
 from .source_mask import Inside
 
 MOST_COPIED = 100_000_000
-"""Bytes of a tile's copy. Tiles of more detectors are shorter, down to `SHORTEST_TILE`, in memory too: the bits are the same."""
+"""Bytes of a tile's copy. Tiles of more detectors are shorter, down to `SHORTEST_TILE`, in memory
+too: the bits are the same.
+"""
 
 SHORTEST_TILE = 64
 """Samples."""
@@ -34,11 +38,13 @@ PARTS = 1 << 20
 """Bytes of the sums that a thread makes of several tiles before they are added."""
 
 SEVERAL, MANY = 4, 1024
-"""Tiles that are read together, and the number of detectors from which on: one tile of theirs exceeds the cache, and long rows
-are read faster."""
+"""Tiles that are read together, and the number of detectors from which on: one tile of theirs
+exceeds the cache, and long rows are read faster."""
 
 LANES = 16
-"""Partial sums: fixed, so that bits do not depend on the machine's vectors. Each takes two samples at a time."""
+"""Partial sums: fixed, so that bits do not depend on the machine's vectors. Each takes two samples
+at a time.
+"""
 
 
 class Usable:
@@ -69,7 +75,8 @@ class Usable:
         return int(self.use.sum())
 
     def judge(self, total: Floats, square: Floats, noiseless: bool = False) -> bool:
-        """Exclude detectors that are constant or not finite, by their sums (n_det,); returns whether there are any.
+        """Exclude detectors that are constant or not finite, by their sums (n_det,); returns
+        whether there are any.
 
         ``noiseless``: without noise a constant detector is valid: it sees nothing.
         """
@@ -84,17 +91,20 @@ class Usable:
 
 
 class Gram(Usable):
-    """G = A A^T as an operator on vectors over detectors, without flagged samples, flagged and dead detectors.
+    """G = A A^T as an operator on vectors over detectors, without flagged samples, flagged and dead
+    detectors.
 
-    Work is cut into absolute tiles of `tile_length` samples, whose parts are added in order: the bits do not depend on the
-    number of threads. A spilled stream is read from its file, tile by tile, by as many threads as there is memory for copies:
-    pages that are touched in a mapping count as the process's memory, and the system maps those around them too.
+    Work is cut into absolute tiles of `tile_length` samples, whose parts are added in order: the
+    bits do not depend on the number of threads. A spilled stream is read from its file, tile by
+    tile, by as many threads as there is memory for copies: pages that are touched in a mapping
+    count as the process's memory, and the system maps those around them too.
 
-    Samples inside a source mask are replaced, in the copy of a tile, by the mean of the other detectors at that instant (each in
-    units of its `scale`), 0 where there is none: linear in the data.
+    Samples inside a source mask are replaced, in the copy of a tile, by the mean of the other
+    detectors at that instant (each in units of its `scale`), 0 where there is none: linear in the
+    data.
 
-    The detectors' moments, which identify dead ones, come with the product that the iteration begins with; where no detector is
-    dead, `apply` returns that product.
+    The detectors' moments, which identify dead ones, come with the product that the iteration
+    begins with; where no detector is dead, `apply` returns that product.
     """
 
     def __init__(
@@ -106,22 +116,32 @@ class Gram(Usable):
         inside: Inside | None = None,
         unit_rms: bool = False,
     ) -> None:
-        """``use``: the detectors to use, where they are known; they are found otherwise. ``noiseless``: see `Usable.judge`.
-        ``inside``: a source mask. ``unit_rms``: let `scale` be the detectors' rms about their means, where ``use`` is found."""
+        """``use``: the detectors to use, where they are known; they are found otherwise.
+        ``noiseless``: see `Usable.judge`. ``inside``: a source mask. ``unit_rms``: let `scale` be
+        the detectors' rms about their means, where ``use`` is found."""
         self.good_samples = stream.observation.good_samples
-        super().__init__(stream.observation.good_detectors if use is None else use, int(self.good_samples.sum()))
+        super().__init__(
+            stream.observation.good_detectors if use is None else use, int(self.good_samples.sum())
+        )
         self.stream, self.pool, self.n_samples = stream, pool, stream.shape[1]
         self.length = tile_length(stream.shape[0], stream.dtype.itemsize)
         self.copied = isinstance(stream.array, np.memmap)
         self.inside, self.copied = inside, self.copied or inside is not None
-        self.whole = stream.means.get("signal") is None and bool(self.good_samples.all()) and not self.copied
+        self.whole = (
+            stream.means.get("signal") is None and bool(self.good_samples.all()) and not self.copied
+        )
         copy = stream.shape[0] * min(self.length, self.n_samples) * stream.dtype.itemsize
         self._copies = Semaphore(max(1, min(stream.threads, 1 + stream.room // max(1, copy))))
         self._known: tuple[Floats, Floats, Floats] | None = None
         if use is None:
             if inside is not None:  # what fills the mask would bring the dead to life
                 self.inside = None
-                self.judge(*self._pass(near_the_mean(self.use), np.flatnonzero(self.use), moments=True)[:2], noiseless)
+                self.judge(
+                    *self._pass(near_the_mean(self.use), np.flatnonzero(self.use), moments=True)[
+                        :2
+                    ],
+                    noiseless,
+                )
                 self.inside = inside
             vector = near_the_mean(self.use)
             total, square, image, times = self._pass(vector, np.flatnonzero(self.use), moments=True)
@@ -133,15 +153,18 @@ class Gram(Usable):
                 self._scale_to_unit_rms(total, square)
 
     def _scale_to_unit_rms(self, total: Floats, square: Floats) -> None:
-        """Set `scale` and the energy in its units; the sums (n_det,) are of all good samples. 1 where nothing varies."""
+        """Set `scale` and the energy in its units; the sums (n_det,) are of all good samples. 1
+        where nothing varies.
+        """
         with np.errstate(invalid="ignore"):
             variance = square / max(1, self.n_used) - (total / max(1, self.n_used)) ** 2
         self.scale = np.sqrt(np.where(self.use & (variance > 0), variance, 1.0))
         self.energy = float(np.where(self.use, square / self.scale**2, 0.0).sum())
 
     def _on_tile(self, samples: slice, act: Callable[[NDArray[Any], int, int], Any]) -> Any:
-        """``act(array, start, stop)`` on an array that has these samples, mean emission included and zero where flagged, from
-        ``start`` to ``stop``. Waits until there is memory for a copy, if it needs one."""
+        """``act(array, start, stop)`` on an array that has these samples, mean emission included
+        and zero where flagged, from ``start`` to ``stop``. Waits until there is memory for a copy,
+        if it needs one."""
         mean, good = self.stream.means.get("signal"), self.good_samples[samples]
         if not self.copied and mean is None and good.all():
             return act(np.asarray(self.stream.array), samples.start, samples.stop)
@@ -168,8 +191,12 @@ class Gram(Usable):
         for rows, masked in zip(chunks(len(tile), ROWS), masks, strict=True):
             tile[rows] = np.where(masked, unit[rows, None] * mean, tile[rows])
 
-    def _pass(self, q: Floats, rows: NDArray[np.intp], moments: bool = False) -> tuple[Floats, Floats, Floats, Floats]:
-        """(A 1, squares, G q, A^T q), the first two (n_det,) only where wanted: one reading of the stream."""
+    def _pass(
+        self, q: Floats, rows: NDArray[np.intp], moments: bool = False
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """(A 1, squares, G q, A^T q), the first two (n_det,) only where wanted: one reading of the
+        stream.
+        """
         times, tiles = np.zeros(self.n_samples), chunks(self.n_samples, self.length)
         found = np.zeros((3, q.size))
 
@@ -177,10 +204,24 @@ class Gram(Usable):
             parts = np.zeros((len(group), 3, q.size))
             if self.whole and self.length == TILE_SAMPLES:  # no tile needs a copy: all in one call
                 at = slice(group[0].start, group[-1].stop)
-                _products(np.asarray(self.stream.array), at.start, at.stop, q, rows, times[at], moments, parts)
+                _products(
+                    np.asarray(self.stream.array),
+                    at.start,
+                    at.stop,
+                    q,
+                    rows,
+                    times[at],
+                    moments,
+                    parts,
+                )
                 return parts
             for samples, part in zip(group, parts, strict=True):
-                self._on_tile(samples, partial(_products, q=q, rows=rows, v=times[samples], moments=moments, out=part[None]))
+                self._on_tile(
+                    samples,
+                    partial(
+                        _products, q=q, rows=rows, v=times[samples], moments=moments, out=part[None]
+                    ),
+                )
             return parts
 
         threads, most = self.stream.threads, max(1, PARTS // (24 * q.size))
@@ -193,7 +234,9 @@ class Gram(Usable):
         return total, square, image, times
 
     def apply(self, q: Floats) -> tuple[Floats, Floats]:
-        """(G q, A^T q): shapes (n_det,) and (n_samp,); A^T q is 0 at flagged samples. Rows of A are divided by `scale`."""
+        """(G q, A^T q): shapes (n_det,) and (n_samp,); A^T q is 0 at flagged samples. Rows of A are
+        divided by `scale`.
+        """
         if self._known is not None and np.array_equal(q, self._known[0]):
             return self._known[1], self._known[2]
         if self.scale is None:
@@ -217,7 +260,9 @@ class Gram(Usable):
             return total
 
         tiles = chunks(self.n_samples, self.length)
-        return float(sum(self._each(lambda samples: self._on_tile(samples, partial(energy, samples)), tiles)))
+        return float(
+            sum(self._each(lambda samples: self._on_tile(samples, partial(energy, samples)), tiles))
+        )
 
     def _each(self, work: Callable[[Any], Any], items: list[Any]) -> Iterable[Any]:
         """Results of ``work``, in order."""
@@ -225,7 +270,9 @@ class Gram(Usable):
 
 
 def tile_length(n_detectors: int, itemsize: int) -> int:
-    """Samples of a tile: as many as `MOST_COPIED` allows, `TILE_SAMPLES` or less by a power of two."""
+    """Samples of a tile: as many as `MOST_COPIED` allows, `TILE_SAMPLES` or less by a power of
+    two.
+    """
     length = TILE_SAMPLES
     while n_detectors * length * itemsize > MOST_COPIED and length > SHORTEST_TILE:
         length //= 2
@@ -245,8 +292,8 @@ def directions(step: int, n_detectors: int) -> Floats:
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-untyped-def]
-    """v = A^T q of the samples start .. stop - 1, tile by tile: out (n_tile, 3, n_det) takes each tile's sums and squares,
-    where wanted, and A v, of the detectors ``rows``."""
+    """v = A^T q of the samples start .. stop - 1, tile by tile: out (n_tile, 3, n_det) takes each
+    tile's sums and squares, where wanted, and A v, of the detectors ``rows``."""
     together = SEVERAL if rows.size >= MANY else 1
     for k in range(0, -(-(stop - start) // TILE_SAMPLES), together):
         low = start + k * TILE_SAMPLES
@@ -259,7 +306,9 @@ def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-
             _image(array, low, high, rows, series, None, out[k:])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
     """v = A^T q at samples start .. stop - 1, eight detectors at a time."""
     n = stop - start
@@ -273,8 +322,12 @@ def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
         e, f = array[rows[k + 4], start:stop], array[rows[k + 5], start:stop]
         g, h = array[rows[k + 6], start:stop], array[rows[k + 7], start:stop]
         for t in range(n):
-            x = (q0 * np.float64(a[t]) + q1 * np.float64(b[t])) + (q2 * np.float64(c[t]) + q3 * np.float64(d[t]))
-            y = (q4 * np.float64(e[t]) + q5 * np.float64(f[t])) + (q6 * np.float64(g[t]) + q7 * np.float64(h[t]))
+            x = (q0 * np.float64(a[t]) + q1 * np.float64(b[t])) + (
+                q2 * np.float64(c[t]) + q3 * np.float64(d[t])
+            )
+            y = (q4 * np.float64(e[t]) + q5 * np.float64(f[t])) + (
+                q6 * np.float64(g[t]) + q7 * np.float64(h[t])
+            )
             v[t] += x + y
     for k in range(eights, rows.size):
         q0, a = q[rows[k]], array[rows[k], start:stop]
@@ -282,10 +335,12 @@ def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
             v[t] += q0 * np.float64(a[t])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _image(array, begin, end, rows, series, moments, out):  # type: ignore[no-untyped-def]
-    """out[:, 2] = A v of each tile of the samples begin .. end - 1, four detectors at a time; unless ``moments`` is None,
-    out[:, 0] = A 1 and out[:, 1] = squares in the same reading."""
+    """out[:, 2] = A v of each tile of the samples begin .. end - 1, four detectors at a time;
+    unless ``moments`` is None, out[:, 0] = A 1 and out[:, 1] = squares in the same reading."""
     half, last = np.uintp(LANES), rows.size - 1
     lanes = np.empty((4, 3, LANES))
     for k in range(0, rows.size, 4):
@@ -293,7 +348,10 @@ def _image(array, begin, end, rows, series, moments, out):  # type: ignore[no-un
             stop = min(start + TILE_SAMPLES, end)
             v, to = series[start - begin : stop - begin], out[(start - begin) // TILE_SAMPLES]
             a, b = array[rows[k], start:stop], array[rows[min(k + 1, last)], start:stop]
-            c, d = array[rows[min(k + 2, last)], start:stop], array[rows[min(k + 3, last)], start:stop]
+            c, d = (
+                array[rows[min(k + 2, last)], start:stop],
+                array[rows[min(k + 3, last)], start:stop],
+            )
             n = np.uintp(stop - start)
             whole = n // (half + half) * (half + half)
             lanes[:] = 0.0

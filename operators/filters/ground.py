@@ -1,18 +1,23 @@
 """Removes from each detector's scan what repeats with the azimuth.
 
-With G (n_bin, N), G_bt = 1 where sample t is in the azimuth bin b, T (K, N) the Legendre polynomials of order 1 to K over the
-scan, and g the samples that are used, the least-squares fit of both together is removed:
+With G (n_bin, N), G_bt = 1 where sample t is in the azimuth bin b, T (K, N) the Legendre
+polynomials of order 1 to K over the scan, and g the samples that are used, the least-squares fit of
+both together is removed:
 
-    y = x - G^T a - T^T c,   (a, c) = argmin sum_g (x - G^T a - T^T c)^2                                     (1)
+    y = x - G^T a - T^T c,
+    (a, c) = argmin sum_g (x - G^T a - T^T c)^2                                     (1)
 
-(`GroundFilter` of TOAST with bins). With T' = T - T G_g^T (G_g G_g^T)^-1 G, the trend without what the bins hold, this is
+(`GroundFilter` of TOAST with bins). With T' = T - T G_g^T (G_g G_g^T)^-1 G, the trend without what
+the bins hold, this is
 
-    c = (T'_g T'_g^T)^-1 T'_g x_g,   a = (G_g G_g^T)^-1 G_g (x_g - T_g^T c)                                  (2)
+    c = (T'_g T'_g^T)^-1 T'_g x_g,
+    a = (G_g G_g^T)^-1 G_g (x_g - T_g^T c)                                  (2)
 
-(Frisch & Waugh 1933), where G_g G_g^T is diagonal: the number of samples in each bin. White noise loses n_bin + K degrees of
-freedom. A bin without used samples removes nothing. T' has no mean over the used samples of a bin, so that
+(Frisch & Waugh 1933), where G_g G_g^T is diagonal: the number of samples in each bin. White noise
+loses n_bin + K degrees of freedom. A bin without used samples removes nothing. T' has no mean over
+the used samples of a bin, so that
 
-    G^T a + T^T c = G^T (G_g G_g^T)^-1 G_g x_g + T'^T c:                                                     (3)
+    G^T a + T^T c = G^T (G_g G_g^T)^-1 G_g x_g + T'^T c:                                         (3)
 
 the sums of x over bins and with T' are found in one reading.
 """
@@ -40,10 +45,11 @@ from .rows import AT_ONCE, Mask, Rows, by_rows, read, write
 
 
 class GroundFilter(Operator):
-    """Remove a template of each detector in bins of the boresight's azimuth, fitted together with a trend in time.
+    """Remove a template of each detector in bins of the boresight's azimuth, fitted together with a
+    trend in time.
 
-    What the ground adds repeats with the azimuth at constant elevation. Flagged samples are not used for the fit;
-    turnarounds are.
+    What the ground adds repeats with the azimuth at constant elevation. Flagged samples are not
+    used for the fit; turnarounds are.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -55,22 +61,33 @@ class GroundFilter(Operator):
     bin: Angle = quantity("0.5 deg", gt=0, le=1)
     """Width of the bins of the mount's azimuth."""
     split: bool = False
-    """One template for samples in which the azimuth increases (left to right), another for those in which it decreases."""
+    """One template for samples in which the azimuth increases (left to right), another for those in
+    which it decreases.
+    """
     trend: int = Field(1, ge=0, le=20)
-    """Order of the polynomial in time that is fitted and removed with the template (0: none besides the mean, which is the
-    template's)."""
+    """Order of the polynomial in time that is fitted and removed with the template (0: none besides
+    the mean, which is the template's)."""
 
     def prepare(self, observation: Observation) -> Template:
-        """The template's bins and the trend of this observation. Warns where all samples are in one bin."""
+        """The template's bins and the trend of this observation. Warns where all samples are in one
+        bin.
+        """
         number = _bins(observation, self.bin, self.split)
         size = int(number.max()) + 1
         if size == 1:
             reach = np.degrees(np.ptp(np.unwrap(observation.azimuth)))
-            text = f"{observation.name} spans {reach:.3g} deg of azimuth, one bin of {np.degrees(self.bin):.3g} deg"
-            warnings.warn(f"{self.label}: {text}: the template is a mean; choose a smaller bin", stacklevel=2)
+            text = (
+                f"{observation.name} spans {reach:.3g} deg of azimuth, one bin of"
+                f" {np.degrees(self.bin):.3g} deg"
+            )
+            warnings.warn(
+                f"{self.label}: {text}: the template is a mean; choose a smaller bin", stacklevel=2
+            )
         observation.tally.state(self.label, f"{observation.name}: bins of the template", f"{size}")
         use = has_a_signal(observation.flags)
-        return Template.of(number, polynomials(observation.n_samples, self.trend).functions[1:], use)
+        return Template.of(
+            number, polynomials(observation.n_samples, self.trend).functions[1:], use
+        )
 
     def exec(self, block: Block, state: Template) -> None:
         """Subtract the template and the trend from each row."""
@@ -79,11 +96,17 @@ class GroundFilter(Operator):
 
 def _bins(observation: Observation, width: float, split: bool) -> NDArray[np.int64]:
     """(n,) bin of each sample, from 0; bins that are nowhere are not counted."""
-    azimuth = observation.azimuth if observation.recorded_azimuth is None else observation.recorded_azimuth
+    azimuth = (
+        observation.azimuth
+        if observation.recorded_azimuth is None
+        else observation.recorded_azimuth
+    )
     around = round(2 * np.pi / width)
     if abs(around * width - 2 * np.pi) > 1e-9:  # no whole number of bins
         azimuth, around = azimuth % (2 * np.pi), 1 << 32
-    number = np.floor_divide(azimuth, width).astype(np.int64) % around  # as TOAST, at the edges of bins too
+    number = (
+        np.floor_divide(azimuth, width).astype(np.int64) % around
+    )  # as TOAST, at the edges of bins too
     if split and len(azimuth) > 1:
         number = 2 * number + (np.gradient(np.unwrap(azimuth)) > 0)
     return np.asarray(np.unique(number, return_inverse=True)[1], np.int64)
@@ -128,8 +151,13 @@ class Template:
         return cls(bins, raw, use, runs(bins), share, trend)
 
     def remove(self, rows: Rows) -> int:
-        """Equation (3) on rows in place. Returns how many samples were not finite; they stay as they were."""
-        sums, means = np.zeros((len(rows.values), len(self.raw))), np.zeros((len(rows.values), len(self.share)))
+        """Equation (3) on rows in place. Returns how many samples were not finite; they stay as
+        they were.
+        """
+        sums, means = (
+            np.zeros((len(rows.values), len(self.raw))),
+            np.zeros((len(rows.values), len(self.share))),
+        )
         functions, number = self.trend.basis.functions, self.bins[self.stops - 1]
         _sums(*rows, self.use, functions, self.stops, number, sums, means)
         means *= self.share
@@ -150,7 +178,13 @@ class Template:
         return len(spoilt)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
+@nb.njit(
+    nogil=True,
+    cache=True,
+    boundscheck=False,
+    error_model="numpy",
+    fastmath={"contract", "nsz", "reassoc"},
+)
 def _total(x):  # type: ignore[no-untyped-def]
     total = 0.0
     for t in range(nb.uint64(x.size)):
@@ -162,7 +196,9 @@ def _total(x):  # type: ignore[no-untyped-def]
 def _sums(  # type: ignore[no-untyped-def]
     values, lines, cell, inside, start, begin, use, functions, stops, number, sums, totals
 ):
-    """sums (n_row, K) += T'_g x_g, and totals (n_row, n_bin) += G_g x_g; the first arguments are those of `Rows`."""
+    """sums (n_row, K) += T'_g x_g, and totals (n_row, n_bin) += G_g x_g; the first arguments are
+    those of `Rows`.
+    """
     chunk, first = np.empty(AT_ONCE), 0
     for low in range(0, use.size, AT_ONCE):
         high, last = min(low + AT_ONCE, use.size), first
@@ -185,7 +221,9 @@ def _sums(  # type: ignore[no-untyped-def]
 def _subtract(  # type: ignore[no-untyped-def]
     values, lines, cell, inside, start, begin, which, functions, stops, number, trend, means
 ):
-    """Subtract T'^T ``trend`` (n_row, K) and G^T ``means`` (n_row, n_bin) from the rows ``which`` (n_row,)."""
+    """Subtract T'^T ``trend`` (n_row, K) and G^T ``means`` (n_row, n_bin) from the rows ``which``
+    (n_row,).
+    """
     chunk, first, n = np.empty(AT_ONCE), 0, stops[-1]
     for low in range(0, n, AT_ONCE):
         high, last = min(low + AT_ONCE, n), first

@@ -1,4 +1,6 @@
-"""High-pass filters of whole scans: a brick wall without phase (`brick_wall`), or the causal Bessel filter of `bessel`."""
+"""High-pass filters of whole scans: a brick wall without phase (`brick_wall`), or the causal Bessel
+filter of `bessel`.
+"""
 
 from __future__ import annotations
 
@@ -32,15 +34,17 @@ class State(NamedTuple):
 
 
 class HighpassFilter(HighpassParameters):
-    """High-pass filter of each detector's scan: a brick wall without phase, equations (1) and (2) of `brick_wall`, or the causal
-    Bessel filter of the paper's authors (`bessel`).
+    """High-pass filter of each detector's scan: a brick wall without phase, equations (1) and (2)
+    of `brick_wall`, or the causal Bessel filter of the paper's authors (`bessel`).
 
-    The brick wall drops the modelled mean emission that accompanies the signal analytically, before anything else; with a `mask`,
-    it acts on all of the signal. A scan that is shorter than 1 / `frequency` loses its mean and a line alone; the log says so. A
-    frequency so near the Nyquist frequency that nothing of a scan is left is refused.
+    The brick wall drops the modelled mean emission that accompanies the signal analytically, before
+    anything else; with a `mask`, it acts on all of the signal. A scan that is shorter than 1 /
+    `frequency` loses its mean and a line alone; the log says so. A frequency so near the Nyquist
+    frequency that nothing of a scan is left is refused.
 
-    The Bessel filter acts on all of the signal, and begins in the state zero: what does not begin with zero has a transient of
-    about 1 / `frequency`, which `degree`, `Detrend` and `Taper` lessen and `trim` flags.
+    The Bessel filter acts on all of the signal, and begins in the state zero: what does not begin
+    with zero has a transient of about 1 / `frequency`, which `degree`, `Detrend` and `Taper` lessen
+    and `trim` flags.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -50,21 +54,31 @@ class HighpassFilter(HighpassParameters):
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     def check(self, data: Data) -> list[str]:
-        """Scans that are shorter than one cycle of the cut. Raises PipelineError where a run would find nothing left of one."""
+        """Scans that are shorter than one cycle of the cut. Raises PipelineError where a run would
+        find nothing left of one.
+        """
         for observation in data.observations:
             place = f"{self.label}, {observation.name}"
             _trimmed(self, *observation.sampling, place)
             _check_cut(self, *observation.sampling, place)
         check_masks(self.mask, data, self.label)
-        short, every = sum(o.duration * self.frequency < 1 for o in data.observations), len(data.observations)
-        text = f"{short} of {every} scans are shorter than 1/frequency, {1 / self.frequency:g} s: {_short(self)}"
+        short, every = (
+            sum(o.duration * self.frequency < 1 for o in data.observations),
+            len(data.observations),
+        )
+        text = (
+            f"{short} of {every} scans are shorter than 1/frequency, {1 / self.frequency:g} s:"
+            f" {_short(self)}"
+        )
         return [text] if short else []
 
     def prepare(self, observation: Observation) -> State:
         """Tables for this observation's length, flagged samples; flags the trimmed ends."""
         fine = has_a_signal(observation.flags)
         _trim(self, observation)
-        observation.tally.count(self.label, "flagged samples bridged before filtering", int((~fine).sum()), fine.size)
+        observation.tally.count(
+            self.label, "flagged samples bridged before filtering", int((~fine).sum()), fine.size
+        )
         inside = self.mask.of(observation) if self.mask else None
         if inside is not None:
             check_mask(inside, observation, f"{self.label}, {observation.name}")
@@ -79,42 +93,64 @@ class HighpassFilter(HighpassParameters):
         plan, bad, inside = state
         if inside is None and isinstance(plan, HighpassPlan):
             block.means.pop("signal", None)
-            block.observation.tally.count(self.label, SPOILT, plan.apply(block.detdata["signal"], bad))
+            block.observation.tally.count(
+                self.label, SPOILT, plan.apply(block.detdata["signal"], bad)
+            )
             return
         act = plan.apply if isinstance(plan, BesselPlan) else partial(_brick_wall, plan)
         in_double(self.label, block, lambda rows, masked: act(rows, bad, masked), inside)
 
 
-def _brick_wall(plan: HighpassPlan, rows: Floats, bad: NDArray[np.intp], masked: NDArray[np.bool_] | None) -> int:
-    """Equation (1) of `source_mask` on rows (n_det, N) in place; returns how many samples were not finite."""
+def _brick_wall(
+    plan: HighpassPlan, rows: Floats, bad: NDArray[np.intp], masked: NDArray[np.bool_] | None
+) -> int:
+    """Equation (1) of `source_mask` on rows (n_det, N) in place; returns how many samples were not
+    finite.
+    """
 
     def act(row: AnyFloats) -> None:
         plan.apply(row[None])
 
-    return sum(filter_outside(row, bad, None if masked is None else masked[d], act) for d, row in enumerate(rows))
+    return sum(
+        filter_outside(row, bad, None if masked is None else masked[d], act)
+        for d, row in enumerate(rows)
+    )
 
 
 def _check_cut(step: HighpassFilter, n: int, rate: float, place: str) -> None:
     """Raise PipelineError for a cut at which nothing is left of a scan of ``n`` samples."""
-    text = f"a cut at {step.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz contain no higher frequency"
+    text = (
+        f"a cut at {step.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz contain no"
+        " higher frequency"
+    )
     if step.response == "bessel":
         if step.frequency >= rate / 2:
-            raise PipelineError(text, place=place, cure=f"choose a frequency below {rate / 2:.6g} Hz")
+            raise PipelineError(
+                text, place=place, cure=f"choose a frequency below {rate / 2:.6g} Hz"
+            )
     elif first_kept(n, step.frequency / rate) >= n:
         cure = f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan"
         raise PipelineError(text, place=place, cure=cure)
 
 
 def _bessel(step: HighpassFilter, observation: Observation, fine: NDArray[np.bool_]) -> BesselPlan:
-    """The causal filter of a scan. Raises PipelineError for a cutoff at the Nyquist frequency or above."""
+    """The causal filter of a scan. Raises PipelineError for a cutoff at the Nyquist frequency or
+    above.
+    """
     rate = observation.sample_rate
     _check_cut(step, observation.n_samples, rate, f"{step.label}, {observation.name}")
-    trend = None if step.degree is None else Fit.of(polynomials(observation.n_samples, step.degree), fine)
+    trend = (
+        None
+        if step.degree is None
+        else Fit.of(polynomials(observation.n_samples, step.degree), fine)
+    )
     return BesselPlan(sections(step.frequency, rate), trend)
 
 
 def _trimmed(step: HighpassFilter, n: int, rate: float, place: str) -> int:
-    """Samples at either end that are trimmed of ``n``. Raises PipelineError where nothing is left."""
+    """Samples at either end that are trimmed of ``n``. Raises PipelineError where nothing is
+    left.
+    """
     trimmed = min(round(step.trim * rate), n)
     if 2 * trimmed >= n and trimmed:
         text = f"trimming {step.trim:g} s at either end leaves nothing of a scan of {n / rate:g} s"
@@ -138,7 +174,11 @@ def _planned(step: HighpassFilter, observation: Observation) -> HighpassPlan:
     degree = step.degree or 0
     plan = plan_highpass(n, step.frequency / rate, degree, step.oversampling)
     if plan.cut == 0:
-        text = _short(step) if n > 1 + min(degree, 1) else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
+        text = (
+            _short(step)
+            if n > 1 + min(degree, 1)
+            else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
+        )
         observation.tally.state(step.label, f"{observation.name} is shorter than 1/frequency", text)
     return plan
 

@@ -1,4 +1,6 @@
-"""Kernels to compile ahead (`core.compilation.compile_ahead`); `python benchmarks/startup.py --kernels` writes this file."""
+"""Kernels to compile ahead (`core.compilation.compile_ahead`); `python benchmarks/startup.py
+--kernels` writes this file.
+"""
 
 KERNELS = (
     "23 0.5 zonda.operators.filters.brick_wall _spread f4:2C i8:1C f4:3C f8:2C",

@@ -1,8 +1,9 @@
 """Leading eigenpairs of G = A A^T by the Lanczos iteration (full reorthogonalization, float64).
 
-One step reads the stream once and gives A^T q and A A^T q together. It starts near the detector mean and stops when
+One step reads the stream once and gives A^T q and A A^T q together. It starts near the detector
+mean and stops when
 
-    |G u_i - sigma_i^2 u_i| <= residual * sigma_i^2   for every mode that is wanted.                        (1)
+    |G u_i - sigma_i^2 u_i| <= residual * sigma_i^2   for every mode that is wanted.             (1)
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ EMPTY = 1e-13
 """Share of the stream's energy, per detector, that G cannot tell from rounding."""
 
 NOTHING = 1e-26
-"""Share of the stream's energy below which what is left after subtraction is float64 rounding: there is no further mode."""
+"""Share of the stream's energy below which what is left after subtraction is float64 rounding:
+there is no further mode.
+"""
 
 
 @dataclass
@@ -57,14 +60,17 @@ class Ritz:
     @classmethod
     def nothing(cls, n_det: int, n_samples: int, why: str = "no good detector") -> Ritz:
         """No mode at all."""
-        return cls(np.zeros(0), np.zeros((0, n_det)), np.zeros((0, n_samples)), np.zeros(0), 0, 0, why)
+        return cls(
+            np.zeros(0), np.zeros((0, n_det)), np.zeros((0, n_samples)), np.zeros(0), 0, 0, why
+        )
 
 
 def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz:
     """The leading ``wanted`` modes of ``gram`` to a residual, equation (1).
 
-    ``gap``: the largest ratio of a singular value to the one before at which the modes are of use; where every ratio is larger
-    the iteration ends at residuals of a tenth. None: they are wanted in any case.
+    ``gap``: the largest ratio of a singular value to the one before at which the modes are of use;
+    where every ratio is larger the iteration ends at residuals of a tenth. None: they are wanted in
+    any case.
     """
     n = gram.n_good
     if n == 0:
@@ -101,7 +107,9 @@ def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz
                 seen = vectors[:, :rank].T
                 rank += gram.left(seen @ space, _combined(seen, times)) > NOTHING * gram.energy
             leading = vectors[:, :k].T
-            return Ritz(values, np.array(leading @ space), _combined(leading, times), residuals[:k], rank, m)
+            return Ritz(
+                values, np.array(leading @ space), _combined(leading, times), residuals[:k], rank, m
+            )
         if beta <= 1e-14 * gram.energy:  # an invariant subspace: go on in a new direction
             rest = gram.use * directions(m, gram.use.size)
             for _ in range(2):

@@ -24,7 +24,9 @@ CURE = "give a two-dimensional image with a celestial WCS, 0 where there is no s
 
 @dataclass(frozen=True)
 class MaskImage:
-    """``masked`` (ny, nx); ``matrix`` (3, 3) from directions on the sky to its pixels (`projection.pixel_matrix`)."""
+    """``masked`` (ny, nx); ``matrix`` (3, 3) from directions on the sky to its pixels
+    (`projection.pixel_matrix`).
+    """
 
     masked: NDArray[np.bool_]
     matrix: Floats
@@ -73,8 +75,8 @@ class InsideImage:
 def read_mask(path: Path) -> MaskImage:
     """The first image of a FITS file.
 
-    Raises InputError for what is no image with a tangent-plane (TAN) WCS, for NaN, which is neither masked nor not,
-    and for zeros alone.
+    Raises InputError for what is no image with a tangent-plane (TAN) WCS, for NaN, which is neither
+    masked nor not, and for zeros alone.
     """
     return _read(path, path.stat().st_mtime_ns)
 
@@ -89,14 +91,22 @@ def _read(path: Path, changed: int) -> MaskImage:
         check_size(path, hdu, place)
         values, header = np.array(hdu.data), hdu.header.copy()
     if np.isnan(values).any():
-        raise InputError("has pixels that are NaN", place=place, cure="write 1 where samples are masked and 0 elsewhere")
+        raise InputError(
+            "has pixels that are NaN",
+            place=place,
+            cure="write 1 where samples are masked and 0 elsewhere",
+        )
     if not values.any():
         raise InputError(
-            "all of its pixels are 0: it masks nothing", place=place, cure="write 1 where samples are masked, or leave it out"
+            "all of its pixels are 0: it masks nothing",
+            place=place,
+            cure="write 1 where samples are masked, or leave it out",
         )
     header, _ = with_known_frame(header, place)
     try:
-        return MaskImage(values != 0, pixel_matrix(tangent.plain(header) or _astropy(header, place)))
+        return MaskImage(
+            values != 0, pixel_matrix(tangent.plain(header) or _astropy(header, place))
+        )
     except InputError as err:
         raise InputError(err.message, place=place, cure=err.cure or CURE) from None
 

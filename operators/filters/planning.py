@@ -27,32 +27,38 @@ FUNCTION = 0.55e-9
 """Seconds per sample of one function of time that is fitted and removed."""
 
 STANDS_OUT = 0.3
-"""Ratio of the noise's singular values to the common mode's up to which the second is far from `gap`,
-were the scan's common mode half of the ensemble's."""
+"""Ratio of the noise's singular values to the common mode's up to which the second is far from
+`gap`, were the scan's common mode half of the ensemble's."""
 
 START = 1e-3
 """Residual of the first vector, the detectors' mean."""
 
 
 class HighpassPlanning(Planning[HighpassFilter]):
-    """Knots of the coarse series: the low part errs by (f / f_cut)^4 q^-4 below the cut, q knots per cycle of the cut."""
+    """Knots of the coarse series: the low part errs by (f / f_cut)^4 q^-4 below the cut, q knots
+    per cycle of the cut.
+    """
 
     of = HighpassFilter
     knobs = (Knob("oversampling", (8, 12, 24, 48), "slow part formed on a coarse series in time"),)
 
     def traits(self, observation: Observation) -> Traits:
-        """A brick wall; a scan shorter than one cycle loses only a line. Of the Bessel filter, what passes a hundredth counts as
-        passed."""
+        """A brick wall; a scan shorter than one cycle loses only a line. Of the Bessel filter, what
+        passes a hundredth counts as passed."""
         frequency, rate = self.operator.frequency, observation.sample_rate
         if self.operator.response == "bessel" and frequency < rate / 2:
             tried = np.geomspace(1e-3, 1, 200) * frequency
-            lowest = float(tried[np.argmax(amplitude(tried, frequency, rate) >= 0.01)])  # the last, 0.7, is
+            lowest = float(
+                tried[np.argmax(amplitude(tried, frequency, rate) >= 0.01)]
+            )  # the last, 0.7, is
             return Traits(response=lambda f: float(f >= lowest))
         cut = frequency if observation.duration * frequency >= 1 else 0.0
         return Traits(response=lambda f: float(f >= cut))
 
     def memory(self, observation: Observation) -> int:
-        """Spline weights; where the full DCT is used, the polynomials and what they are made from."""
+        """Spline weights; where the full DCT is used, the polynomials and what they are made
+        from.
+        """
         return 120 * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
@@ -65,43 +71,65 @@ class HighpassPlanning(Planning[HighpassFilter]):
         choices = [full(f"{full_q:g} knots per cycle of the cut")]
         low, text = low_part(context, cut), DECIMATION
         for q in self.coarser("oversampling"):
-            error = sum(LEAKS * math.hypot(low * images(x)[0], aliased(context, cut, x)) for x in (q, full_q))
+            error = sum(
+                LEAKS * math.hypot(low * images(x)[0], aliased(context, cut, x))
+                for x in (q, full_q)
+            )
             share = sum(images(x)[1] for x in (q, full_q))
             bound = context.bound(error, 1 / cut, common=True)
             bound |= context.sky_error(share) | {"psd": 2 * share + share**2}
-            saved = 2e-8 * (knots - q * cut * o.duration) * o.n_detectors * len(context.observations)
+            saved = (
+                2e-8 * (knots - q * cut * o.duration) * o.n_detectors * len(context.observations)
+            )
             settings = {"oversampling": q}
-            choices.append(Choice("coarse", f"{q:g} knots per cycle", settings, bound=bound, formula=text, seconds=saved))
+            choices.append(
+                Choice(
+                    "coarse",
+                    f"{q:g} knots per cycle",
+                    settings,
+                    bound=bound,
+                    formula=text,
+                    seconds=saved,
+                )
+            )
         size = context.bound(context.fluctuation, o.duration, common=True)
         effect = Effect(
-            "high-pass decimation", tuple(choices), size, "rms of the stream: its low part removed wrongly altogether"
+            "high-pass decimation",
+            tuple(choices),
+            size,
+            "rms of the stream: its low part removed wrongly altogether",
         )
         return Estimate((effect,), cost, _left_in(context))
 
 
 DECIMATION = (
-    "1.5 x rms of images of the cosines a_k below the cut, sqrt(sum a_k^2 (k / K)^8) / q^4, and of what lies at their places"
+    "1.5 x rms of images of the cosines a_k below the cut, sqrt(sum a_k^2 (k / K)^8) / q^4, and of"
+    " what lies at their places"
 )
 
 
 def images(q: float) -> tuple[float, float]:
-    """rms and sum of the amplitudes of the two images that a coarse series of ``q`` knots per cycle of the
-    cut makes of a cosine at the cut: sinc(k / 2M)^4 at 2M -+ k over that at k is (k / (2M -+ k))^4 = (q -+ 1)^-4."""
+    """rms and sum of the amplitudes of the two images that a coarse series of ``q`` knots per cycle
+    of the cut makes of a cosine at the cut: sinc(k / 2M)^4 at 2M -+ k over that at k is (k / (2M -+
+    k))^4 = (q -+ 1)^-4."""
     below, above = (q - 1) ** -4, (q + 1) ** -4
     return math.hypot(below, above), below + above
 
 
 def aliased(context: Context, cut: float, q: float) -> float:
-    """rms of what the coarse series takes for the low part, K: what lies at the places of the images, weighed as they are; the
-    mean of (k / K)^8 over the cosines is 1 / 9."""
+    """rms of what the coarse series takes for the low part, K: what lies at the places of the
+    images, weighed as they are; the mean of (k / K)^8 over the cosines is 1 / 9."""
     top = 0.5 * context.first.sample_rate
     if (q - 1) * cut >= top:
         return 0.0
-    return context.weighted(lambda f: 1.0, (q - 1) * cut, min((q + 1) * cut, top)) * (q - 1) ** -4 / 3
+    return (
+        context.weighted(lambda f: 1.0, (q - 1) * cut, min((q + 1) * cut, top)) * (q - 1) ** -4 / 3
+    )
 
 
 def low_part(context: Context, cut: float) -> float:
-    """sqrt(<sum_{k < K} a_k^2 (k / K)^8>), K: cosines below the cut of a scan of T, by their part in the error of the low part.
+    """sqrt(<sum_{k < K} a_k^2 (k / K)^8>), K: cosines below the cut of a scan of T, by their part
+    in the error of the low part.
 
     A wave exp(i w t) has its own cosine, k = w T / pi, and in the others, as a scan has ends,
 
@@ -146,17 +174,25 @@ class PolynomialPlanning(Planning[Any]):
     def estimate(self, context: Context) -> Estimate:
         """Its cost; leaving it out leaves the mean and the slow part in."""
         cost, left = polynomial_cost(self.operator.order), _left_in(context)
-        return Estimate((Effect("polynomials", (full(f"exact, order {self.operator.order}"),), left, LEFT_IN),), cost, left)
+        return Estimate(
+            (Effect("polynomials", (full(f"exact, order {self.operator.order}"),), left, LEFT_IN),),
+            cost,
+            left,
+        )
 
 
 def polynomial_cost(order: int) -> Cost:
     """Of polynomials that are fitted to each detector and removed."""
     functions = order + 1
-    return Cost(fixed=0.01, per_time=2e-8 + 8e-9 * functions, per_sample=3.5e-9 + FUNCTION * functions)
+    return Cost(
+        fixed=0.01, per_time=2e-8 + 8e-9 * functions, per_sample=3.5e-9 + FUNCTION * functions
+    )
 
 
 def polynomial_memory(operator: Any, observation: Observation) -> int:
-    """Bytes: the polynomials, and a row in float64; with a mask, its pointing, and where some rows are in it."""
+    """Bytes: the polynomials, and a row in float64; with a mask, its pointing, and where some rows
+    are in it.
+    """
     masked = 3 + 2.5 * ROWS if operator.mask else 0.0
     order: int = operator.order
     return math.ceil(8 * (order + 5 + masked) * observation.n_samples)
@@ -177,14 +213,18 @@ class GroundPlanning(Planning[Any]):
         trend: int = self.operator.trend
         cost = Cost(fixed=0.01, per_time=1e-7 + 2e-8 * trend, per_sample=3e-9 + FUNCTION * trend)
         left = _left_in(context)
-        return Estimate((Effect("template in azimuth", (full("exact"),), left, LEFT_IN),), cost, left)
+        return Estimate(
+            (Effect("template in azimuth", (full("exact"),), left, LEFT_IN),), cost, left
+        )
 
 
 LEFT_IN = "rms of the stream + mean emission, which no filter before it takes; all of the sky"
 
 
 def _left_in(context: Context) -> dict[str, float]:
-    """Bound on what is in the stream and the map where a filter that removes the mean is left out."""
+    """Bound on what is in the stream and the map where a filter that removes the mean is left
+    out.
+    """
     size = context.bound(context.fluctuation, context.first.duration, common=True)
     return {m: size[m] + context.mean_emission for m in size} | context.sky_error(1.0)
 
@@ -214,8 +254,9 @@ class TaperPlanning(Planning[Any]):
 class CommonModePlanning(Planning[CommonModeFilter]):
     """Residual of the modes.
 
-    A residual r turns the mode by at most r sigma_1^2 / (sigma_1^2 - sigma_2^2) <= r / (1 - gap^2), a mode that is determined
-    having sigma_2 <= gap sigma_1: equation (2) of `common_mode`, Davis & Kahan (1970).
+    A residual r turns the mode by at most r sigma_1^2 / (sigma_1^2 - sigma_2^2) <= r / (1 - gap^2),
+    a mode that is determined having sigma_2 <= gap sigma_1: equation (2) of `common_mode`, Davis &
+    Kahan (1970).
     """
 
     of = CommonModeFilter
@@ -227,7 +268,9 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         return Traits(removes_common=several, turns=several and self.operator.method == "svd")
 
     def memory(self, observation: Observation) -> int:
-        """Series over the scan: one for each step of the iteration, or the sums of `focal_plane_mean`; the copy of one tile."""
+        """Series over the scan: one for each step of the iteration, or the sums of
+        `focal_plane_mean`; the copy of one tile.
+        """
         n_det, n_samp = observation.n_detectors, observation.n_samples
         if self.operator.method == "mean":
             return 8 * 8 * n_samp + 100 * n_det
@@ -240,7 +283,11 @@ class CommonModePlanning(Planning[CommonModeFilter]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost, and the saving and error of larger residuals."""
-        modes, tightest, svd = self.operator.modes, self.operator.residual, self.operator.method == "svd"
+        modes, tightest, svd = (
+            self.operator.modes,
+            self.operator.residual,
+            self.operator.method == "svd",
+        )
         count = steps(tightest, modes, context) if svd else 1.0
         cost = Cost(fixed=0.01, per_sample=2e-9 + LANCZOS * count)
         slow = 1 / context.cut if context.cut > 0 else context.first.duration
@@ -252,28 +299,57 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         text = "rms of the stream behind the high-pass filter x residual / (1 - gap^2)"
         for residual in self.coarser("residual") if self._stands_out(context) else ():
             share = (residual + tightest) / (1 - self.operator.gap**2)
-            bound = context.bound(share * context.passed, slow, common=True) | {"psd": 2 * share + share**2}
+            bound = context.bound(share * context.passed, slow, common=True) | {
+                "psd": 2 * share + share**2
+            }
             bound |= context.sky_error(share)
             saved = LANCZOS * (count - steps(residual, modes, context)) * context.samples
             settings = {"residual": residual}
-            choices.append(Choice("coarse", f"residual {residual:g}", settings, bound=bound, formula=text, seconds=saved))
-        effect = Effect("common-mode residual", tuple(choices), size, "rms of the stream: no common mode removed at all")
+            choices.append(
+                Choice(
+                    "coarse",
+                    f"residual {residual:g}",
+                    settings,
+                    bound=bound,
+                    formula=text,
+                    seconds=saved,
+                )
+            )
+        effect = Effect(
+            "common-mode residual",
+            tuple(choices),
+            size,
+            "rms of the stream: no common mode removed at all",
+        )
         return Estimate((effect,), cost, without)
 
     def _stands_out(self, context: Context) -> bool:
-        """Whether one mode alone is removed, which stands far above the noise, of the complete signal alone. Else the second
-        singular value is near the first, which a large residual does not show: another number of modes is then removed."""
-        own = any(s.filtered and not s.takes_model(self.operator.label) for s in context.work.signals[1:])
+        """Whether one mode alone is removed, which stands far above the noise, of the complete
+        signal alone. Else the second singular value is near the first, which a large residual does
+        not show: another number of modes is then removed."""
+        own = any(
+            s.filtered and not s.takes_model(self.operator.label) for s in context.work.signals[1:]
+        )
         return self.operator.modes == 1 and not own and shrinkage(context) <= STANDS_OUT**2
 
 
 def steps(residual: float, modes: int, context: Context) -> int:
-    """Steps that a residual takes: each lessens it by the square of the ratio of the noise's singular values to the mode's."""
-    return modes + max(1, math.ceil(math.log(residual / START) / math.log(min(shrinkage(context), 0.5))))
+    """Steps that a residual takes: each lessens it by the square of the ratio of the noise's
+    singular values to the mode's.
+    """
+    return modes + max(
+        1, math.ceil(math.log(residual / START) / math.log(min(shrinkage(context), 0.5)))
+    )
 
 
 def shrinkage(context: Context) -> float:
-    """Square of the ratio of the noise's singular values to that of what all detectors see alike."""
+    """Square of the ratio of the noise's singular values to that of what all detectors see
+    alike.
+    """
     n_det, noise = context.first.n_detectors, max(context.noise, 1e-12)
-    common = max((context.passed / LEAKS) ** 2 - noise**2, 0.0) if context.cut > 0 else context.fluctuation**2
+    common = (
+        max((context.passed / LEAKS) ** 2 - noise**2, 0.0)
+        if context.cut > 0
+        else context.fluctuation**2
+    )
     return noise**2 * (1 / n_det + 1e-4) / max(common, 1e-30)

@@ -1,12 +1,14 @@
 """Removes a polynomial from every interval of each detector's scan.
 
-In interval i, B_i the Legendre polynomials up to `order` over its samples and g the samples that are used,
+In interval i, B_i the Legendre polynomials up to `order` over its samples and g the samples that
+are used,
 
-    y = x - B_i^T (B_ig B_ig^T)^-1 B_ig x_g                                                                (1)
+    y = x - B_i^T (B_ig B_ig^T)^-1 B_ig x_g                                                      (1)
 
-(equation (1) of `baseline` for each interval by itself; `PolyFilter` of TOAST). A sample between two intervals belongs to none.
-It loses the straight line from the last value of the polynomial before it to the first value of the one behind it, before the
-first interval and behind the last one a constant, so that what is removed does not jump there; it is flagged, and no map uses it.
+(equation (1) of `baseline` for each interval by itself; `PolyFilter` of TOAST). A sample between
+two intervals belongs to none. It loses the straight line from the last value of the polynomial
+before it to the first value of the one behind it, before the first interval and behind the last one
+a constant, so that what is removed does not jump there; it is flagged, and no map uses it.
 """
 
 from __future__ import annotations
@@ -32,16 +34,23 @@ from .rows import Rows, by_rows
 from .source_mask import Inside, SourceMask, check_mask, check_masks
 
 Part = Literal[
-    "whole", "scanning", "throw", "throw_leftright", "throw_rightleft", "scan_leftright", "scan_rightleft"
-]  # fmt: skip
+    "whole",
+    "scanning",
+    "throw",
+    "throw_leftright",
+    "throw_rightleft",
+    "scan_leftright",
+    "scan_rightleft",
+]
 """The whole scan, or one of TOAST's names of intervals (`core.intervals`)."""
 
 
 class PolynomialFilter(Operator):
     """Remove the polynomial that fits each interval of each detector's scan best (least squares).
 
-    Flagged samples are not used for the fit; turnarounds are, where the interval contains them. Where an interval has
-    too few samples for all orders, the polynomials that they determine are removed.
+    Flagged samples are not used for the fit; turnarounds are, where the interval contains them.
+    Where an interval has too few samples for all orders, the polynomials that they determine are
+    removed.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -53,8 +62,8 @@ class PolynomialFilter(Operator):
     order: int = Field(3, ge=0, le=20)
     """Order of the polynomials (0: the mean, 1: a line)."""
     interval: Part = "whole"
-    """What each polynomial is fitted to: the whole scan, every pass at constant speed (`scanning`, or one direction alone), or
-    every pass with half of the turnarounds on either side (`throw`)."""
+    """What each polynomial is fitted to: the whole scan, every pass at constant speed (`scanning`,
+    or one direction alone), or every pass with half of the turnarounds on either side (`throw`)."""
     mask: SourceMask | None = None
     """Source whose samples are not used for the fit; it is subtracted there too."""
 
@@ -72,8 +81,12 @@ class PolynomialFilter(Operator):
         use = has_a_signal(observation.flags)
         pieces = Pieces.of(parts, self.order, use)
         observation.flags[pieces.outside] |= TRIMMED
-        observation.tally.count(self.label, "samples between intervals, flagged", int(pieces.outside.sum()), n)
-        observation.tally.state(self.label, f"{observation.name}: polynomials of order {self.order}", f"{len(parts)}")
+        observation.tally.count(
+            self.label, "samples between intervals, flagged", int(pieces.outside.sum()), n
+        )
+        observation.tally.state(
+            self.label, f"{observation.name}: polynomials of order {self.order}", f"{len(parts)}"
+        )
         inside = self.mask.of(observation) if self.mask else None
         if inside is not None:
             check_mask(inside, observation, f"{self.label}, {observation.name}")
@@ -81,9 +94,15 @@ class PolynomialFilter(Operator):
 
     def _parts(self, observation: Observation) -> list[slice]:
         """The intervals of a scan. Raises PipelineError where there are none of that name."""
-        found = [p for p in ranges(observation.intervals.get(self.interval, []), observation.seconds) if p.stop > p.start]
+        found = [
+            p
+            for p in ranges(observation.intervals.get(self.interval, []), observation.seconds)
+            if p.stop > p.start
+        ]
         if not found:
-            there = ", ".join(name for name, spans in observation.intervals.items() if spans) or "none"
+            there = (
+                ", ".join(name for name, spans in observation.intervals.items() if spans) or "none"
+            )
             raise PipelineError(
                 f"the scan has no interval {self.interval!r}; it has {there}",
                 place=f"{self.label}, {observation.name}",
@@ -118,27 +137,42 @@ class Pieces:
 
     @classmethod
     def of(cls, parts: list[slice], order: int, use: NDArray[np.bool_]) -> Pieces:
-        """Polynomials up to ``order`` fitted to the samples ``use`` (n,) of each part; a part begins behind the one before."""
+        """Polynomials up to ``order`` fitted to the samples ``use`` (n,) of each part; a part
+        begins behind the one before.
+        """
         outside = np.ones(len(use), bool)
         for part in parts:
             outside[part] = False
-        fits = [Fit(_basis(n, order), use[p], _inverse(n, order, use[p])) for p in parts for n in (p.stop - p.start,)]
+        fits = [
+            Fit(_basis(n, order), use[p], _inverse(n, order, use[p]))
+            for p in parts
+            for n in (p.stop - p.start,)
+        ]
         starts, stops = [0, *(p.stop for p in parts)], [*(p.start for p in parts), len(use)]
-        gaps = [(k, slice(a, b), _basis(b - a, 1)) for k, (a, b) in enumerate(zip(starts, stops, strict=True)) if b > a]
+        gaps = [
+            (k, slice(a, b), _basis(b - a, 1))
+            for k, (a, b) in enumerate(zip(starts, stops, strict=True))
+            if b > a
+        ]
         return cls(parts, fits, gaps, outside)
 
     def remove(self, rows: Rows, masked: NDArray[np.bool_] | None = None) -> int:
         """Equation (1) on rows in place; the rest as of `Fit.remove`."""
         spoilt, removed = 0, list[Floats]()
         for part, fit in zip(self.parts, self.fits, strict=True):
-            found, bad = fit.coefficients(rows.at(part.start), None if masked is None else masked[:, part])
+            found, bad = fit.coefficients(
+                rows.at(part.start), None if masked is None else masked[:, part]
+            )
             fit.basis.subtract(rows.at(part.start), found)
             removed.extend(product(found, fit.basis.functions[:, [0, -1]]).T)
             spoilt += bad
         removed = [removed[0], *removed, removed[-1]]
         for k, gap, lines in self.gaps:
             before, behind, n = removed[2 * k], removed[2 * k + 1], gap.stop - gap.start
-            line = (before + behind) / 2, (behind - before) / (2 + 2 / n)  # through the samples on either side of the gap
+            line = (
+                (before + behind) / 2,
+                (behind - before) / (2 + 2 / n),
+            )  # through the samples on either side of the gap
             lines.subtract(rows.at(gap.start), np.stack(line, axis=1))
         return spoilt
 

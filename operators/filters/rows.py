@@ -1,7 +1,8 @@
 """Rows of a stream in float64, with the mean that stands beside it.
 
-Tens of kelvin of mean emission stand beside microkelvins: their sum is formed in float64, and what is removed from it is removed
-before it is rounded. `read` forms it a chunk at a time, where it is used: a copy of whole rows would not stay in the cache.
+Tens of kelvin of mean emission stand beside microkelvins: their sum is formed in float64, and what
+is removed from it is removed before it is rounded. `read` forms it a chunk at a time, where it is
+used: a copy of whole rows would not stay in the cache.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ SPOILT = "samples not finite"
 """Count of samples that are left as they are."""
 
 ROWS = 8
-"""Detectors that are worked on at a time: what they share is read once for all, and their scans stay in the last cache."""
+"""Detectors that are worked on at a time: what they share is read once for all, and their scans
+stay in the last cache.
+"""
 
 AT_ONCE = 512
 """Samples of a chunk: what all rows share of them stays in the first cache."""
@@ -33,7 +36,9 @@ Mask = NDArray[np.bool_]
 
 
 class Rows(NamedTuple):
-    """Samples of several detectors, and the series of their mean (`core.numerics.smooth.Series`). Kernels take the fields."""
+    """Samples of several detectors, and the series of their mean (`core.numerics.smooth.Series`).
+    Kernels take the fields.
+    """
 
     values: AnyFloats
     """(n_det, N), C order. What is changed is written here, without the mean."""
@@ -62,13 +67,23 @@ class Rows(NamedTuple):
         return out
 
 
-def by_rows(label: str, block: Block, remove: Callable[[Rows, Mask | None], int], inside: Inside | None = None) -> None:
+def by_rows(
+    label: str,
+    block: Block,
+    remove: Callable[[Rows, Mask | None], int],
+    inside: Inside | None = None,
+) -> None:
     """Let ``remove`` change the signal of a block, its mean included; no mean is left beside it.
 
-    ``remove(rows, masked)`` changes up to `ROWS` detectors in place and returns how many samples were not finite; ``masked``
-    (n_det, n_samp): which of them are ``inside`` a source mask. The step ``label`` counts both.
+    ``remove(rows, masked)`` changes up to `ROWS` detectors in place and returns how many samples
+    were not finite; ``masked`` (n_det, n_samp): which of them are ``inside`` a source mask. The
+    step ``label`` counts both.
     """
-    signal, mean, tally = block.detdata["signal"], block.means.pop("signal", None), block.observation.tally
+    signal, mean, tally = (
+        block.detdata["signal"],
+        block.means.pop("signal", None),
+        block.observation.tally,
+    )
     spoilt, inside_mask = 0, 0
     for part in chunks(len(signal), ROWS):
         detectors = slice(block.detectors.start + part.start, block.detectors.start + part.stop)
@@ -85,7 +100,12 @@ def by_rows(label: str, block: Block, remove: Callable[[Rows, Mask | None], int]
     tally.count(label, SPOILT, spoilt)
 
 
-def in_double(label: str, block: Block, remove: Callable[[Floats, Mask | None], int], inside: Inside | None = None) -> None:
+def in_double(
+    label: str,
+    block: Block,
+    remove: Callable[[Floats, Mask | None], int],
+    inside: Inside | None = None,
+) -> None:
     """As `by_rows`, for what changes samples (n_det, n_samp) of whole rows in float64."""
 
     def on_a_copy(rows: Rows, masked: Mask | None) -> int:
@@ -99,7 +119,9 @@ def in_double(label: str, block: Block, remove: Callable[[Floats, Mask | None], 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def read(values, lines, cell, inside, start, d, low, into):  # type: ignore[no-untyped-def]
-    """Samples low .. low + into.size - 1 of row ``d`` in float64, with the mean; the other arguments are those of `Rows`."""
+    """Samples low .. low + into.size - 1 of row ``d`` in float64, with the mean; the other
+    arguments are those of `Rows`.
+    """
     n, row = nb.uint64(into.size), values[d, low : low + into.size]
     if lines.shape[0]:
         series_into(lines[d], cell, inside, start + low, into)

@@ -1,8 +1,10 @@
 """Source masks: samples near a source, which filters do not use to find what they remove.
 
-A filter y = F x that acts on each detector's scan becomes, with b the data in which masked samples are bridged by straight lines,
+A filter y = F x that acts on each detector's scan becomes, with b the data in which masked samples
+are bridged by straight lines,
 
-    y = F b + m (x - b),   m = 1 inside the mask, 0 outside:                                                (1)
+    y = F b + m (x - b),
+    m = 1 inside the mask, 0 outside:                                                (1)
 
 what is removed, b - F b, is found outside of the mask and is subtracted inside too.
 """
@@ -39,20 +41,26 @@ MASKED = "samples in the source mask, not used to find what is removed"
 
 
 class SourceMask(Parameters):
-    """A disc on the sky, or masked pixels of an image, whose samples a filter does not use to find what it removes."""
+    """A disc on the sky, or masked pixels of an image, whose samples a filter does not use to find
+    what it removes.
+    """
 
     radius: Angle | None = Field(None, gt=0, le=0.5)
     """Radius of the disc; where absent, 1 arcmin."""
     centre: Target | None = None
     """Centre of the disc; where absent, the target of the scan."""
     file: InputPath | None = None
-    """In place of a disc: a FITS image (TAN) that is not zero where samples are masked. Beyond it nothing is."""
+    """In place of a disc: a FITS image (TAN) that is not zero where samples are masked. Beyond it
+    nothing is.
+    """
 
     @field_validator("centre")
     @classmethod
     def _on_the_sky(cls, value: Target | None) -> Target | None:
         if value is not None and value.frame == "horizontal":
-            raise ValueError("the centre of a mask must be fixed on the sky; give ICRS or galactic coordinates")
+            raise ValueError(
+                "the centre of a mask must be fixed on the sky; give ICRS or galactic coordinates"
+            )
         return value
 
     @model_validator(mode="after")
@@ -62,7 +70,9 @@ class SourceMask(Parameters):
         return self
 
     def of(self, observation: Observation) -> Inside:
-        """Where the samples of a scan are inside. Raises InputError for a file that cannot be used."""
+        """Where the samples of a scan are inside. Raises InputError for a file that cannot be
+        used.
+        """
         if self.file is not None:
             return read_mask(self.file).of(observation)
         ra, dec = self.centre.icrs() if self.centre else observation.centre
@@ -73,7 +83,11 @@ class SourceMask(Parameters):
             seen[:, s] = sum(turn[:, k, :].T * centre[k] for k in range(3))
         plane = observation.focalplane
         rays = np.stack([-plane.eta, -plane.xi, np.ones(len(plane))])
-        return InsideDisc(seen, rays / np.sqrt((rays * rays).sum(axis=0)), float(np.sin((self.radius or RADIUS) / 2)))
+        return InsideDisc(
+            seen,
+            rays / np.sqrt((rays * rays).sum(axis=0)),
+            float(np.sin((self.radius or RADIUS) / 2)),
+        )
 
 
 class Inside(Protocol):
@@ -129,12 +143,16 @@ def counts(inside: Inside, n_samples: int) -> tuple[int, int]:
 
 
 def filter_outside(
-    row: AnyFloats, bad: NDArray[np.intp], inside: NDArray[np.bool_] | None, act: Callable[[AnyFloats], None]
+    row: AnyFloats,
+    bad: NDArray[np.intp],
+    inside: NDArray[np.bool_] | None,
+    act: Callable[[AnyFloats], None],
 ) -> int:
     """Equation (1) on one detector's scan ``row`` (N,) in place; ``act`` is F, in place.
 
-    Flagged samples ``bad`` are bridged, and so are those that are not finite; returns how many of these, which stay as they were.
-    A detector that never leaves the mask is filtered as if there were none.
+    Flagged samples ``bad`` are bridged, and so are those that are not finite; returns how many of
+    these, which stay as they were. A detector that never leaves the mask is filtered as if there
+    were none.
     """
     lost = np.flatnonzero(~np.isfinite(row))
     spoilt, gaps = row[lost], np.union1d(bad, lost)
@@ -157,7 +175,9 @@ def check_mask(inside: Inside, observation: Observation, place: str) -> None:
     """Raise PipelineError where a mask covers all that the middle detector sees."""
     middle = int(np.argmin(np.hypot(observation.focalplane.xi, observation.focalplane.eta)))
     if inside.at(slice(middle, middle + 1), slice(0, observation.n_samples)).all():
-        raise PipelineError("the source mask covers the whole scan", place=place, cure="choose a smaller one")
+        raise PipelineError(
+            "the source mask covers the whole scan", place=place, cure="choose a smaller one"
+        )
 
 
 ENOUGH = 256
@@ -165,7 +185,9 @@ ENOUGH = 256
 
 
 def check_masks(mask: SourceMask | None, data: Data, label: str) -> list[str]:
-    """What `Operator.check` finds of a mask: InputError for a file that cannot be used, PipelineError as `check_mask`."""
+    """What `Operator.check` finds of a mask: InputError for a file that cannot be used,
+    PipelineError as `check_mask`.
+    """
     for observation in data.observations if mask is not None else ():
         inside = mask.of(observation) if mask is not None else None
         if inside is not None and observation.n_samples >= min(ENOUGH, observation.sampling[0]):

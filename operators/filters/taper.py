@@ -1,6 +1,6 @@
 """A window that goes smoothly to zero at either end of a scan.
 
-    w_n = sin^2(pi n / (a (N - 1)))   while n < a (N - 1) / 2, the same from the end, 1 between                (1)
+    w_n = sin^2(pi n / (a (N - 1)))   while n < a (N - 1) / 2, the same from the end, 1 between  (1)
 
 is Tukey's window (`scipy.signal.windows.tukey`), a the share of the scan in which it is not 1.
 """
@@ -25,14 +25,16 @@ MEAN = "samples with mean emission under the window: put a Detrend before it"
 
 
 class Taper(Operator):
-    """Multiply each scan by Tukey's window, equation (1), so that a filter behind it finds no jump at its ends.
+    """Multiply each scan by Tukey's window, equation (1), so that a filter behind it finds no jump
+    at its ends.
 
-    A map weighs samples by the window: it is the sum of w W d over that of w W, W d what filters made of the windowed signal.
-    So a source keeps its brightness, the ends of scans count less, and the noise of a pixel follows. What steps behind the
-    window add there, e.g. the transient of a filter, the window does not lessen, and the division by W raises it: what W <
-    1/10 leaves is in no map. It is what the mapper of maria 1.0.0 does (without that limit), behind a linear `Detrend`, which
-    should stand before: the window acts on the mean emission too, tens of kelvin, and what it takes off is rounded as a part
-    of it. The log says so.
+    A map weighs samples by the window: it is the sum of w W d over that of w W, W d what filters
+    made of the windowed signal. So a source keeps its brightness, the ends of scans count less, and
+    the noise of a pixel follows. What steps behind the window add there, e.g. the transient of a
+    filter, the window does not lessen, and the division by W raises it: what W < 1/10 leaves is in
+    no map. It is what the mapper of maria 1.0.0 does (without that limit), behind a linear
+    `Detrend`, which should stand before: the window acts on the mean emission too, tens of kelvin,
+    and what it takes off is rounded as a part of it. The log says so.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
@@ -52,8 +54,14 @@ class Taper(Operator):
         return window
 
     def exec(self, block: Block, state: Floats) -> None:
-        """Multiply the block's rows in place. Beside a mean M that stands beside x, W (x + M) - M takes the place of x."""
-        window, signal, mean = state[block.samples], block.detdata["signal"], block.means.get("signal")
+        """Multiply the block's rows in place. Beside a mean M that stands beside x, W (x + M) - M
+        takes the place of x.
+        """
+        window, signal, mean = (
+            state[block.samples],
+            block.detdata["signal"],
+            block.means.get("signal"),
+        )
         if mean is None:
             signal *= window
             return
@@ -67,4 +75,8 @@ class Taper(Operator):
         tally.count(self.label, MEAN, int((window < 1).sum()) * len(signal), signal.size)
         if largest:
             step = largest * float(np.finfo(signal.dtype).eps) / 2
-            tally.state(self.label, "rounding of the mean emission", f"up to {step * 1e6:.2g} µK in a sample")
+            tally.state(
+                self.label,
+                "rounding of the mean emission",
+                f"up to {step * 1e6:.2g} µK in a sample",
+            )

@@ -1,5 +1,5 @@
-"""Time-ordered data as FITS binary tables: ``TOD`` (one row per detector), ``SAMPLES``, ``DETECTORS``, ``PROVENANCE``,
-``INTERVALS``."""
+"""Time-ordered data as FITS binary tables: ``TOD`` (one row per detector), ``SAMPLES``,
+``DETECTORS``, ``PROVENANCE``, ``INTERVALS``."""
 
 from __future__ import annotations
 
@@ -55,10 +55,12 @@ _WEATHER = (  # key, our name, unit, meaning
 
 
 class Writer:
-    """Writes one observation, streams in rectangles and in any order; same interface as `toast_hdf5.Writer`.
+    """Writes one observation, streams in rectangles and in any order; same interface as
+    `toast_hdf5.Writer`.
 
-    The table ``TOD`` comes first, at a place known beforehand, so that rectangles go straight to their bytes; the tables
-    ``SAMPLES``, ``DETECTORS`` (with the flags as they are at the end), ``PROVENANCE`` and ``INTERVALS`` are appended by `finish`.
+    The table ``TOD`` comes first, at a place known beforehand, so that rectangles go straight to
+    their bytes; the tables ``SAMPLES``, ``DETECTORS`` (with the flags as they are at the end),
+    ``PROVENANCE`` and ``INTERVALS`` are appended by `finish`.
     """
 
     def __init__(self, path: Path, tod: TimeOrderedData, streams: list[str], dtype: str) -> None:
@@ -70,7 +72,9 @@ class Writer:
         self._name_bytes = max(len(d.encode()) for d in tod.names)
         n, code = tod.n_samples, {"float64": "D", "float32": "E"}[dtype]
         columns = [fits.Column("DETECTOR", f"{self._name_bytes}A")]
-        columns += [fits.Column(s.upper(), f"{n}{code}", unit=UNITS.get(s, "K") or None) for s in streams]
+        columns += [
+            fits.Column(s.upper(), f"{n}{code}", unit=UNITS.get(s, "K") or None) for s in streams
+        ]
         table = fits.BinTableHDU.from_columns(columns, nrows=0, name="TOD")
         table.header["NAXIS2"] = tod.n_detectors
         primary = fits.PrimaryHDU(header=_primary_header(tod)).header
@@ -88,7 +92,11 @@ class Writer:
 
     def write(self, stream: str, detectors: slice, samples: slice, values: AnyFloats) -> None:
         """A rectangle of a stream."""
-        column = self._name_bytes + (self._streams.index(stream) * self._tod.n_samples + samples.start) * self._dtype.itemsize
+        column = (
+            self._name_bytes
+            + (self._streams.index(stream) * self._tod.n_samples + samples.start)
+            * self._dtype.itemsize
+        )
         rows = np.ascontiguousarray(values, self._dtype)
         with writing(self.path):
             for d, row in zip(range(detectors.start, detectors.stop), rows, strict=True):
@@ -100,7 +108,12 @@ class Writer:
         with writing(self.path):
             try:
                 self._file.seek(0, os.SEEK_END)
-                for table in (_samples_table, _detectors_table, _provenance_table, _intervals_table):
+                for table in (
+                    _samples_table,
+                    _detectors_table,
+                    _provenance_table,
+                    _intervals_table,
+                ):
                     self._file.write(_bytes_of(table(self._tod)))
             finally:
                 self._file.close()
@@ -144,16 +157,25 @@ def _samples_table(tod: TimeOrderedData) -> Any:
     columns = [
         column("SECONDS", "D", unit="s", array=tod.seconds),
         column("TIME", "D", unit="s", array=tod.times),
-        *(column(name, kind, unit=unit, array=values) for name, kind, unit, values in pointing if len(values)),
+        *(
+            column(name, kind, unit=unit, array=values)
+            for name, kind, unit, values in pointing
+            if len(values)
+        ),
         column("FLAGS", "B", array=tod.flags),
-        *([] if tod.hwp_angle is None else [column("HWP_ANGLE", "D", unit="rad", array=tod.hwp_angle)]),
+        *(
+            []
+            if tod.hwp_angle is None
+            else [column("HWP_ANGLE", "D", unit="rad", array=tod.hwp_angle)]
+        ),
     ]
     table = fits.BinTableHDU.from_columns(columns, name="SAMPLES")
     table.header["FLAGBITS"] = ("TOAST", "bits of FLAGS")
     for key, name, unit, meaning in _WEATHER if tod.weather is not None else ():
         table.header[key] = (getattr(tod.weather, name), f"[{unit}] {meaning}" if unit else meaning)
     table.header.add_comment(
-        "SECONDS counts from DATE-OBS of the primary header; TIME is POSIX. Quaternions are x, y, z, w as TOAST's."
+        "SECONDS counts from DATE-OBS of the primary header; TIME is POSIX. Quaternions are x, y,"
+        " z, w as TOAST's."
     )
     return table
 
@@ -184,7 +206,9 @@ def _detectors_table(tod: TimeOrderedData) -> Any:
         column("ETA", "D", array=tod.eta),
         column("FLAGS", "B", array=tod.detector_flags),
     ]
-    columns += [column(k.upper(), "D", unit=_DETECTOR_UNITS.get(k), array=v) for k, v in tod.columns.items()]
+    columns += [
+        column(k.upper(), "D", unit=_DETECTOR_UNITS.get(k), array=v) for k, v in tod.columns.items()
+    ]
     table = fits.BinTableHDU.from_columns(columns, name="DETECTORS")
     table.header["FLAGBITS"] = ("TOAST", "bits of FLAGS")
     table.header.add_comment("XI and ETA are tangents (a gnomonic plane); sotodlib's are sines.")
@@ -196,7 +220,8 @@ def _provenance_table(tod: TimeOrderedData) -> Any:
 
     keys, values = list(tod.metadata), [json.dumps(v) for v in tod.metadata.values()]
     columns = [
-        fits.Column(name, f"{max(map(len, [*texts, ' ']))}A", array=texts) for name, texts in (("KEY", keys), ("VALUE", values))
+        fits.Column(name, f"{max(map(len, [*texts, ' ']))}A", array=texts)
+        for name, texts in (("KEY", keys), ("VALUE", values))
     ]
     return fits.BinTableHDU.from_columns(columns, name="PROVENANCE")
 
@@ -229,24 +254,39 @@ class Reader:
             if missing:
                 raise InputError(f"has no table {missing[0]}", place=self.place, cure=CURE)
             self.tod = _read(file)
-            columns, row, begin = file["TOD"].columns, int(file["TOD"].header["NAXIS1"]), file["TOD"].fileinfo()["datLoc"]
+            columns, row, begin = (
+                file["TOD"].columns,
+                int(file["TOD"].header["NAXIS1"]),
+                file["TOD"].fileinfo()["datLoc"],
+            )
             shape = self.tod.n_detectors, self.tod.n_samples
             if int(file["TOD"].header["NAXIS2"]) != shape[0]:
-                raise InputError("TOD and DETECTORS have other numbers of rows", place=self.place, cure=CURE)
+                raise InputError(
+                    "TOD and DETECTORS have other numbers of rows", place=self.place, cure=CURE
+                )
         self.streams, self._at = {}, {}
         for column in columns:
             kind = {"D": ">f8", "E": ">f4"}.get(column.format[-1:])
             if kind and (column.format[:-1] or "1") == str(shape[1]):
                 self.streams[column.name.lower()] = column.unit or ""
-                self._at[column.name.lower()] = begin + columns.dtype.fields[column.name][1], np.dtype(kind)
+                self._at[column.name.lower()] = (
+                    begin + columns.dtype.fields[column.name][1],
+                    np.dtype(kind),
+                )
         self._row, self._lock = row, threading.Lock()
         if Path(path).suffix.lower() in COMPRESSED:
-            raise InputError("is compressed: its streams cannot be read in parts", place=self.place, cure="unpack it first")
+            raise InputError(
+                "is compressed: its streams cannot be read in parts",
+                place=self.place,
+                cure="unpack it first",
+            )
         self.tod.check(self.place)
         self._file = open(path, "rb", buffering=0)  # noqa: SIM115
 
     def read(self, stream: str, detectors: NDArray[np.intp], samples: slice) -> AnyFloats:
-        """(n, m) values of a stream: rows ``detectors`` (n,) of the file, in its own units and type."""
+        """(n, m) values of a stream: rows ``detectors`` (n,) of the file, in its own units and
+        type.
+        """
         begin, kind = self._at[stream]
         found = np.empty((len(detectors), samples.stop - samples.start), kind)
         for row, detector in zip(found, detectors.tolist(), strict=True):
@@ -263,7 +303,9 @@ class Reader:
     def noise(self, model: str | None, mask: int) -> dict[str, Floats]:
         """The file has no noise models. Raises InputError where one is asked for."""
         if model is not None:
-            raise InputError("is FITS, which has no noise models", place=self.place, cure="leave noise_model out")
+            raise InputError(
+                "is FITS, which has no noise models", place=self.place, cure="leave noise_model out"
+            )
         return {}
 
     def close(self) -> None:
@@ -293,7 +335,9 @@ def read(path: str | os.PathLike[str]) -> TimeOrderedData:
 
 
 def _quaternions(samples: Any, name: str) -> Floats:
-    return np.asarray(_native(samples[name]) if name in samples.names else np.zeros((0, 4)), np.float64)
+    return np.asarray(
+        _native(samples[name]) if name in samples.names else np.zeros((0, 4)), np.float64
+    )
 
 
 def _native(values: Any) -> Any:
@@ -305,7 +349,9 @@ def _native(values: Any) -> Any:
 def _read(file: Any) -> TimeOrderedData:
     """All but the streams."""
     header = file[0].header
-    samples, detectors, provenance = (file[name].data for name in ("SAMPLES", "DETECTORS", "PROVENANCE"))
+    samples, detectors, provenance = (
+        file[name].data for name in ("SAMPLES", "DETECTORS", "PROVENANCE")
+    )
     fixed = {"NAME", "QUAT", "XI", "ETA", "FLAGS"}
     about = file["SAMPLES"].header
     flags, detector_flags = _native(samples["FLAGS"]), _native(detectors["FLAGS"])
@@ -313,11 +359,20 @@ def _read(file: Any) -> TimeOrderedData:
         raise KeyError("there is no table INTERVALS")
     intervals: Intervals = {}
     if "FLAGBITS" not in about:
-        flags, detector_flags = of_before(flags, samples=True), of_before(detector_flags, samples=False)
-        intervals[TRIMMED_INTERVALS] = runs((flags & np.uint8(PROCESSING)) != 0, _native(samples["SECONDS"]))
+        flags, detector_flags = (
+            of_before(flags, samples=True),
+            of_before(detector_flags, samples=False),
+        )
+        intervals[TRIMMED_INTERVALS] = runs(
+            (flags & np.uint8(PROCESSING)) != 0, _native(samples["SECONDS"])
+        )
     for row in file["INTERVALS"].data if "INTERVALS" in file else ():
         intervals.setdefault(str(row["NAME"]), []).append((float(row["START"]), float(row["STOP"])))
-    weather = GroundWeather(**{name: float(about[key]) for key, name, _, _ in _WEATHER}) if "WEATHERT" in about else None
+    weather = (
+        GroundWeather(**{name: float(about[key]) for key, name, _, _ in _WEATHER})
+        if "WEATHERT" in about
+        else None
+    )
     return TimeOrderedData(
         name=header["OBJECT"],
         start=header["DATE-OBS"],
@@ -326,7 +381,12 @@ def _read(file: Any) -> TimeOrderedData:
         sample_rate=header["SAMPRATE"],
         telescope=header["TELESCOP"],
         field_of_view=float(np.radians(header["FOV"])),
-        site=(header["SITE"], float(np.radians(header["SITELAT"])), float(np.radians(header["SITELON"])), header["SITEALT"]),
+        site=(
+            header["SITE"],
+            float(np.radians(header["SITELAT"])),
+            float(np.radians(header["SITELON"])),
+            header["SITEALT"],
+        ),
         boresight_azel=_quaternions(samples, "BORESIGHT_AZEL"),
         boresight_radec=_quaternions(samples, "BORESIGHT_RADEC"),
         flags=flags,
@@ -338,6 +398,9 @@ def _read(file: Any) -> TimeOrderedData:
         weather=weather,
         hwp_angle=_native(samples["HWP_ANGLE"]) if "HWP_ANGLE" in samples.names else None,
         azimuth=_native(samples["AZ"]) if "AZ" in samples.names else None,
-        metadata={str(key): json.loads(value) for key, value in zip(provenance["KEY"], provenance["VALUE"], strict=True)},
+        metadata={
+            str(key): json.loads(value)
+            for key, value in zip(provenance["KEY"], provenance["VALUE"], strict=True)
+        },
         offsets=np.stack([_native(detectors["XI"]), _native(detectors["ETA"])], axis=1),
     )

@@ -41,7 +41,9 @@ SAME_DIRECTION = 1e-9
 """Largest difference of the boresights (quaternions) of files that are bands of one scan."""
 
 SAME_AZIMUTH = np.radians(1.0)
-"""Largest distance of the azimuth that a file states from that of its boresight: more than any pointing model."""
+"""Largest distance of the azimuth that a file states from that of its boresight: more than any
+pointing model.
+"""
 
 SAME_NUMBER = 1e-6
 """Largest relative difference of the sites and sample rates of such files."""
@@ -60,21 +62,28 @@ class _Provides:
     """What a `LoadTOD` makes: no stream where none is wanted."""
 
     def __get__(self, operator: LoadTOD | None, owner: type) -> frozenset[str]:
-        return frozenset({"boresight"} if operator is not None and operator.signal is None else {"boresight", RECORDED})
+        return frozenset(
+            {"boresight"}
+            if operator is not None and operator.signal is None
+            else {"boresight", RECORDED}
+        )
 
 
 class LoadTOD(RecordedFiles):
-    """Recorded scans with their streams: TOAST's HDF5 (what `SaveTOD` writes, too) or `SaveTOD`'s FITS.
+    """Recorded scans with their streams: TOAST's HDF5 (what `SaveTOD` writes, too) or `SaveTOD`'s
+    FITS.
 
-    Pointing, focal plane, flags, intervals, noise and weather are those of the file, and so are instrument and site: a pipeline
-    with this step needs neither. The stream enters as the component `recorded`: alone it is the signal, which filters and map
-    makers then treat as any other; a `SkyMap` behind it is added to it; with `signal: none` there is the pointing alone, on which
-    the other steps simulate a twin. Streams are read block by block. A mean that is large beside the scatter stands beside the
-    stream, so that float32 keeps what is on top of tens of kelvin.
+    Pointing, focal plane, flags, intervals, noise and weather are those of the file, and so are
+    instrument and site: a pipeline with this step needs neither. The stream enters as the component
+    `recorded`: alone it is the signal, which filters and map makers then treat as any other; a
+    `SkyMap` behind it is added to it; with `signal: none` there is the pointing alone, on which the
+    other steps simulate a twin. Streams are read block by block. A mean that is large beside the
+    scatter stands beside the stream, so that float32 keeps what is on top of tens of kelvin.
 
-    Samples with a bit of `flag_mask` and detectors with one of `detector_mask` are not used; a single sample of a detector that
-    the file flags (``detdata/flags``) becomes NaN, which filters bridge and maps drop. Streams compressed with FLAC need the
-    package flacarray (``pip install 'zonda[flac]'``).
+    Samples with a bit of `flag_mask` and detectors with one of `detector_mask` are not used; a
+    single sample of a detector that the file flags (``detdata/flags``) becomes NaN, which filters
+    bridge and maps drop. Streams compressed with FLAC need the package flacarray (``pip install
+    'zonda[flac]'``).
     """
 
     provides: ClassVar[Any] = _Provides()
@@ -85,10 +94,11 @@ class LoadTOD(RecordedFiles):
         return _look(self, data)
 
     def observe(self, data: Data) -> None:
-        """Append an observation for each scan; the scene's instrument and site become those of the files.
+        """Append an observation for each scan; the scene's instrument and site become those of the
+        files.
 
-        Where the camera has several bands, the scans of each band then get the flags, intervals, weather and half-wave plate of
-        their own files.
+        Where the camera has several bands, the scans of each band then get the flags, intervals,
+        weather and half-wave plate of their own files.
         """
         if not data.band:
             self._scans.update(_append(self, data))
@@ -111,7 +121,9 @@ class LoadTOD(RecordedFiles):
         if state.mean is not None:
             block.means[RECORDED] = state.mean
         spoilt = state.add(block.detectors, block.samples, out)
-        block.observation.tally.count(self.label, "samples of single detectors that the file flags", spoilt)
+        block.observation.tally.count(
+            self.label, "samples of single detectors that the file flags", spoilt
+        )
 
     def collect(self, data: Data, observation: Observation, state: RecordedStream | None) -> None:
         """Close the file."""
@@ -139,7 +151,10 @@ def _append(step: LoadTOD, data: Data) -> dict[int, list[File]]:
     """Append the observations; the files of each by its number."""
     given, found = data.scene, dict[int, list[File]]()
     if data.observations:
-        cure = "give all files to one LoadTOD, file: [FILE, ...], and leave out other steps that point the telescope"
+        cure = (
+            "give all files to one LoadTOD, file: [FILE, ...], and leave out other steps that point"
+            " the telescope"
+        )
         raise InputError("stands behind a step that has made scans", place=step.label, cure=cure)
     own = step.own_scene(given.instrument)
     if abs(given.time.seconds_since(own["time"])) > MOMENT:
@@ -158,14 +173,20 @@ def _append(step: LoadTOD, data: Data) -> dict[int, list[File]]:
         observation = _observation(step, data, _of_bands(step, scan, own["instrument"], most))
         found[observation.index] = [File.of(part, step.flag_mask) for part in scan]
         if not own["instrument"].bands:
-            file = next(file for file in found[observation.index] if observation.focalplane.names[0] in file.rows)
+            file = next(
+                file
+                for file in found[observation.index]
+                if observation.focalplane.names[0] in file.rows
+            )
             _tell(step.label, observation, file)
         data.observations.append(observation)
     return found
 
 
 def _check_new(step: LoadTOD, part: RecordedScan, known: dict[Any, RecordedScan]) -> None:
-    """Note the used detectors of a file: start, name and direction. Raises InputError where a file before it has one of them."""
+    """Note the used detectors of a file: start, name and direction. Raises InputError where a file
+    before it has one of them.
+    """
     tod, xi, eta = part.tod, part.tod.xi.tolist(), part.tod.eta.tolist()
     rows = np.concatenate(part.rows)
     for row in rows[(tod.detector_flags[rows] & np.uint8(step.detector_mask)) == 0].tolist():
@@ -173,15 +194,23 @@ def _check_new(step: LoadTOD, part: RecordedScan, known: dict[Any, RecordedScan]
         if (other := known.setdefault(key, part)) is not part:
             what = f"the detector {tod.names[row]} at the times at which {other.path.name} has it"
             cure = "give each file once"
-            raise InputError(f"has {what}: the same data would count twice", place=f"{step.label}, {part.path}", cure=cure)
+            raise InputError(
+                f"has {what}: the same data would count twice",
+                place=f"{step.label}, {part.path}",
+                cure=cure,
+            )
 
 
 def _tell(label: str, observation: Observation, file: File) -> None:
     """State what an observation of one band has of its file, and what is left out of it."""
     good, dead = flags.good(file.flags, flags.EXCLUDE_SAMPLE), observation.detector_flags != 0
     observation.tally.state(label, "noise of the detectors", file.noise)
-    observation.tally.count(label, "samples that the file's flags exclude", int((~good).sum()), good.size)
-    observation.tally.count(label, "detectors that the file's flags exclude", int(np.count_nonzero(dead)), len(dead))
+    observation.tally.count(
+        label, "samples that the file's flags exclude", int((~good).sum()), good.size
+    )
+    observation.tally.count(
+        label, "detectors that the file's flags exclude", int(np.count_nonzero(dead)), len(dead)
+    )
 
 
 def _of_bands(step: LoadTOD, scan: Scan, instrument: Instrument, most: int) -> list[_Band]:
@@ -190,15 +219,25 @@ def _of_bands(step: LoadTOD, scan: Scan, instrument: Instrument, most: int) -> l
     Raises InputError where it is of another camera, lacks a band, or has one more.
     """
     place = f"{step.label}, {scan[0].path.name}"
-    every = [_Band(part, *each) for part in scan for each in zip(part.cameras, part.rows, strict=True)]
+    every = [
+        _Band(part, *each) for part in scan for each in zip(part.cameras, part.rows, strict=True)
+    ]
     bands = {band.camera.band.name: band for band in every}
     for name, camera in instrument.cameras.items():
         of = bands.get(name)
-        if of is None or of.camera.name != camera.name or not np.isclose(of.camera.band.centre, camera.band.centre, rtol=1e-3):
-            what = ", ".join(f"{b.camera.name} at {b.camera.band.centre / 1e9:.4g} GHz" for b in every)
+        if (
+            of is None
+            or of.camera.name != camera.name
+            or not np.isclose(of.camera.band.centre, camera.band.centre, rtol=1e-3)
+        ):
+            what = ", ".join(
+                f"{b.camera.name} at {b.camera.band.centre / 1e9:.4g} GHz" for b in every
+            )
             first = f"{camera.name} at {camera.band.centre / 1e9:.4g} GHz"
             cure = "load the files of one instrument, all bands of each scan; or choose a band"
-            raise InputError(f"was recorded with {what}, the first scan with {first}", place=place, cure=cure)
+            raise InputError(
+                f"was recorded with {what}, the first scan with {first}", place=place, cure=cure
+            )
     if len(every) > most:
         text = f"has the bands {', '.join(bands)}, the first scan {', '.join(instrument.cameras)}"
         raise InputError(text, place=place, cure="begin with a scan of all bands; or choose a band")
@@ -206,13 +245,24 @@ def _of_bands(step: LoadTOD, scan: Scan, instrument: Instrument, most: int) -> l
         for name in ("boresight_azel", "boresight_radec"):
             one, other = getattr(scan[0].tod, name), getattr(part.tod, name)
             if one.shape != other.shape or not np.allclose(one, other, rtol=0, atol=SAME_DIRECTION):
-                text = f"looks elsewhere than {scan[0].path.name}, which has the same times ({name})"
-                raise InputError(text, place=f"{step.label}, {part.path.name}", cure="load them one after the other")
+                text = (
+                    f"looks elsewhere than {scan[0].path.name}, which has the same times ({name})"
+                )
+                raise InputError(
+                    text,
+                    place=f"{step.label}, {part.path.name}",
+                    cure="load them one after the other",
+                )
         for what, stated in (("site", _place), ("sample rate", lambda tod: (tod.sample_rate,))):
             wanted, own = stated(scan[0].tod), stated(part.tod)
             if not np.allclose(wanted, own, rtol=SAME_NUMBER, atol=SAME_DIRECTION):
-                both = ", not ".join(" ".join(f"{number:.9g}" for number in numbers) for numbers in (own, wanted))
-                text = f"states another {what} than {scan[0].path.name}, which has the same times: {both}"
+                both = ", not ".join(
+                    " ".join(f"{number:.9g}" for number in numbers) for numbers in (own, wanted)
+                )
+                text = (
+                    f"states another {what} than {scan[0].path.name}, which has the same times:"
+                    f" {both}"
+                )
                 cure = "correct the one that is wrong, or choose a band"
                 raise InputError(text, place=f"{step.label}, {part.path.name}", cure=cure)
     return [bands[name] for name in instrument.cameras]
@@ -230,8 +280,14 @@ def _observation(step: LoadTOD, data: Data, bands: list[_Band]) -> Observation:
     start, plane = Instant.parse(tod.start), joined([b.camera for b in bands], place).focalplane()
     if (np.diff(tod.seconds) <= 0).any():
         row = int(np.flatnonzero(np.diff(tod.seconds) <= 0)[0]) + 1
-        raise InputError(f"the times do not increase at sample {row}", place=place, cure="leave out the samples that repeat")
-    fwhm = tod.columns.get("fwhm", plane.fwhm)  # of all bands of the file, whichever are used; these alone have been checked
+        raise InputError(
+            f"the times do not increase at sample {row}",
+            place=place,
+            cure="leave out the samples that repeat",
+        )
+    fwhm = tod.columns.get(
+        "fwhm", plane.fwhm
+    )  # of all bands of the file, whichever are used; these alone have been checked
     tolerance = step.interpolation_error * float(fwhm[fwhm > 0].min())
     found = boresights(tod, start, scene.site, step.celestial, tolerance, place)
     good = flags.good(sample_flags := tod.sample_flags(step.flag_mask), flags.EXCLUDE_SAMPLE)
@@ -262,8 +318,8 @@ def _observation(step: LoadTOD, data: Data, bands: list[_Band]) -> Observation:
 
 
 def _recorded_azimuth(label: str, observation: Observation, tod: TimeOrderedData) -> Floats | None:
-    """The azimuth that a file states (n_samp,) [rad], and that of the boresight where it is no number; None: it states none, or
-    one that is not the boresight's."""
+    """The azimuth that a file states (n_samp,) [rad], and that of the boresight where it is no
+    number; None: it states none, or one that is not the boresight's."""
     if tod.azimuth is None:
         return None
     own = np.asarray(observation.azimuth, np.float64)
@@ -276,7 +332,9 @@ def _recorded_azimuth(label: str, observation: Observation, tod: TimeOrderedData
     return np.where(known, tod.azimuth, own)
 
 
-def _centre(step: LoadTOD, tod: TimeOrderedData, scene: Any, radec: Any, good: Any) -> tuple[float, float]:
+def _centre(
+    step: LoadTOD, tod: TimeOrderedData, scene: Any, radec: Any, good: Any
+) -> tuple[float, float]:
     """ICRS (ra, dec) [rad] of the centre of the map."""
     target = step.target or scene.target
     if target is not None and target.frame != "horizontal":
@@ -299,7 +357,10 @@ def _unique(name: str, bands: list[_Band], data: Data) -> str:
 
 def _summary(o: Observation) -> str:
     good = o.good_samples
-    text = f"{o.name}: {o.n_detectors} detectors x {o.n_samples} samples at {o.sample_rate:.6g} Hz, {o.start}"
+    text = (
+        f"{o.name}: {o.n_detectors} detectors x {o.n_samples} samples at {o.sample_rate:.6g} Hz,"
+        f" {o.start}"
+    )
     if good.any():
         low, high = np.degrees([o.elevation[good].min(), o.elevation[good].max()])
         text += f", elevation {low:.2f} to {high:.2f} deg"

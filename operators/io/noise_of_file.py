@@ -25,7 +25,10 @@ COLUMNS = {
     "net": ("K s(1/2)", "white noise: rms of one second of integration"),
     "net_error": ("K s(1/2)", "standard error"),
     "knee": ("Hz", "where 1/f noise equals white noise; 0: none was found"),
-    "knee_error": ("Hz", "standard error; where none was found, the lowest frequency that was looked at"),
+    "knee_error": (
+        "Hz",
+        "standard error; where none was found, the lowest frequency that was looked at",
+    ),
     "slope": ("", "1/f noise falls as f^-slope"),
     "slope_error": ("", "standard error"),
     "chi_square": ("", "of the fit, over its degrees of freedom"),
@@ -34,17 +37,22 @@ COLUMNS = {
 """Of the table, beside the names and positions of the detectors."""
 
 Estimate = Callable[[Floats, NDArray[np.bool_], float], Any]
-"""From samples [K], which of them may be used, and their rate [Hz], an object with `COLUMNS`; None: there is no estimate."""
+"""From samples [K], which of them may be used, and their rate [Hz], an object with `COLUMNS`; None:
+there is no estimate.
+"""
 
 
-def noise_of(path: Path, signal: str, estimate: Estimate, *, subtract_mean: bool) -> tuple[TimeOrderedData, dict[str, Any]]:
-    """All but the streams of a file, and the noise of each detector that is not flagged, by name; None: no estimate.
+def noise_of(
+    path: Path, signal: str, estimate: Estimate, *, subtract_mean: bool
+) -> tuple[TimeOrderedData, dict[str, Any]]:
+    """All but the streams of a file, and the noise of each detector that is not flagged, by name;
+    None: no estimate.
 
     Parameters
     ----------
     subtract_mean
-        Subtract at each sample the mean over the detectors of a band, in which the atmosphere is; the noise of n detectors then
-        loses 1/n of its variance, which is given back.
+        Subtract at each sample the mean over the detectors of a band, in which the atmosphere is;
+        the noise of n detectors then loses 1/n of its variance, which is given back.
 
     Raises
     ------
@@ -56,21 +64,29 @@ def noise_of(path: Path, signal: str, estimate: Estimate, *, subtract_mean: bool
         tod, place = file.tod, f"zonda noise, {path}"
         if signal not in file.streams:
             have = ", ".join(sorted(file.streams)) or "none"
-            raise InputError(f"has no stream {signal!r}", place=place, cure=f"choose --signal from: {have}")
+            raise InputError(
+                f"has no stream {signal!r}", place=place, cure=f"choose --signal from: {have}"
+            )
         usable = (tod.detector_flags & np.uint8(flags.DETECTOR_MASK)) == 0
         if not usable.any():
-            raise InputError("all detectors are flagged", place=place, cure="unflag those that can be used")
+            raise InputError(
+                "all detectors are flagged", place=place, cure="unflag those that can be used"
+            )
         good = (tod.flags & np.uint8(flags.SAMPLE_MASK)) == 0
         found = {}
         for band in rows_of_bands(tod, None, place):
             use = band[usable[band]]
             stream = RecordedStream(file, signal, use, np.uint8(flags.DETECTOR_MASK))
-            mean = _mean(stream, len(use), tod.n_samples) if subtract_mean and len(use) > 1 else None
+            mean = (
+                _mean(stream, len(use), tod.n_samples) if subtract_mean and len(use) > 1 else None
+            )
             back = 1.0 if mean is None else np.sqrt(len(use) / (len(use) - 1))
             for rows in chunks(len(use), TILE_DETECTORS):
                 values, _ = stream.read(rows, slice(0, tod.n_samples))
                 for number, row in enumerate(values, rows.start):
-                    found[tod.names[use[number]]] = estimate(row if mean is None else (row - mean) * back, good, tod.sample_rate)
+                    found[tod.names[use[number]]] = estimate(
+                        row if mean is None else (row - mean) * back, good, tod.sample_rate
+                    )
     finally:
         file.close()
     return tod, found
@@ -87,8 +103,12 @@ def _mean(stream: RecordedStream, n_detectors: int, n_samples: int) -> Floats:
     return np.asarray(np.divide(total, number, out=np.full(n_samples, np.nan), where=number > 0))
 
 
-def write_noise(path: Path, tod: TimeOrderedData, found: Mapping[str, Any], meta: Mapping[str, Any]) -> Path:
-    """Write the table that `LoadTOD` reads (``noise:``): a row for each detector with an estimate."""
+def write_noise(
+    path: Path, tod: TimeOrderedData, found: Mapping[str, Any], meta: Mapping[str, Any]
+) -> Path:
+    """Write the table that `LoadTOD` reads (``noise:``): a row for each detector with an
+    estimate.
+    """
     rows = [k for k, name in enumerate(tod.names) if found.get(name) is not None]
     names = [tod.names[k] for k in rows]
     columns = [Column("name", names, "", "detector")]

@@ -39,7 +39,9 @@ class SaveTODPlanning(Planning[SaveTOD]):
 
 
 class LoadTODPlanning(Planning[LoadTOD]):
-    """What the recorded stream brings into the map: the noise that the file states, fluctuations as they are in parts of it."""
+    """What the recorded stream brings into the map: the noise that the file states, fluctuations as
+    they are in parts of it.
+    """
 
     of = LoadTOD
 

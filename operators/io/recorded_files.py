@@ -25,7 +25,14 @@ from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
 from .noise_table import NoiseTable, read_noise
-from .recorded_scan import RecordedInstrument, instrument_of, is_near, joined, rows_of_bands, site_of
+from .recorded_scan import (
+    RecordedInstrument,
+    instrument_of,
+    is_near,
+    joined,
+    rows_of_bands,
+    site_of,
+)
 from .recorded_stream import RecordedStream
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
@@ -44,7 +51,9 @@ MOST_FILES = 4096
 
 @dataclass(frozen=True)
 class RecordedScan:
-    """A file, all but its streams: its cameras of one band each, and the rows of their detectors."""
+    """A file, all but its streams: its cameras of one band each, and the rows of their
+    detectors.
+    """
 
     path: Path
     tod: TimeOrderedData
@@ -55,7 +64,9 @@ class RecordedScan:
 
 @dataclass(frozen=True)
 class File:
-    """A file of a scan that is read: the rows of its detectors, what it states of the scan, whose noise it has in words."""
+    """A file of a scan that is read: the rows of its detectors, what it states of the scan, whose
+    noise it has in words.
+    """
 
     path: Path
     rows: dict[str, int]
@@ -69,7 +80,9 @@ class File:
     def of(cls, part: RecordedScan, mask: int) -> File:
         """``mask``: bits of the flags that exclude a sample."""
         tod, rows = part.tod, np.concatenate(part.rows).tolist()
-        intervals = tod.scan_intervals or {"scanning": runs(np.ones(tod.n_samples, bool), tod.seconds)}
+        intervals = tod.scan_intervals or {
+            "scanning": runs(np.ones(tod.n_samples, bool), tod.seconds)
+        }
         of_samples = tod.sample_flags(mask)
         names = {tod.names[row]: row for row in rows}
         return cls(part.path, names, of_samples, intervals, tod.weather, tod.hwp_angle, part.noise)
@@ -82,7 +95,9 @@ class File:
 
 Files = Annotated[
     Annotated[InputPath, Tag("one")] | Annotated[list[InputPath], Tag("several")],
-    Discriminator(lambda value: "several" if isinstance(value, list | tuple) else "one"),  # so that mistakes are of one of them
+    Discriminator(
+        lambda value: "several" if isinstance(value, list | tuple) else "one"
+    ),  # so that mistakes are of one of them
 ]
 """A file, or several."""
 
@@ -94,28 +109,36 @@ class RecordedFiles(Operator):
     """The parameters of `LoadTOD`."""
 
     file: Files
-    """HDF5 in TOAST's layout or FITS of `SaveTOD`; several files, [a.h5, b.h5], are the scans of one run, in this order.
-    Files with the same times and other bands are one scan."""
+    """HDF5 in TOAST's layout or FITS of `SaveTOD`; several files, [a.h5, b.h5], are the scans of
+    one run, in this order. Files with the same times and other bands are one scan."""
     signal: str | None = "signal"
     """Name of the stream; none: no stream is read, the file's pointing alone is used."""
     band: Hertz | None = Field(None, gt=0)
-    """Centre of the only band whose detectors are used, e.g. 93 GHz; none: all bands, each with maps of its own."""
+    """Centre of the only band whose detectors are used, e.g. 93 GHz; none: all bands, each with
+    maps of its own.
+    """
     noise: InputPath | None = None
-    """Table that `zonda noise` wrote: NET, knee and slope of each detector, above those of the file."""
+    """Table that `zonda noise` wrote: NET, knee and slope of each detector, above those of the
+    file.
+    """
     noise_model: str | None = None
-    """Noise model of a TOAST file, e.g. el_noise: its spectra give NET, knee and slope. Where absent: what the focal
-    plane states, or else fitted to `noise_model`."""
+    """Noise model of a TOAST file, e.g. el_noise: its spectra give NET, knee and slope. Where
+    absent: what the focal plane states, or else fitted to `noise_model`."""
     celestial: Literal["recorded", "recomputed"] | None = None
-    """Where the boresight is on the sky: as recorded (``boresight_radec``), or recomputed from azimuth, elevation and time. Where
-    absent: as recorded where the file has it."""
+    """Where the boresight is on the sky: as recorded (``boresight_radec``), or recomputed from
+    azimuth, elevation and time. Where absent: as recorded where the file has it."""
     flag_mask: int = Field(flags.SAMPLE_MASK, ge=0, le=255)
     """Bits of the file's flags that exclude a sample; others do not (those of the Sun are kept)."""
     detector_mask: int = Field(flags.DETECTOR_MASK, ge=0, le=255)
     """Bits of the file's flags that exclude a detector, or a sample of one detector."""
     target: Target | None = None
-    """Centre of the map; where absent the scene's target, that of the saved run, or the middle of the scan."""
+    """Centre of the map; where absent the scene's target, that of the saved run, or the middle of
+    the scan.
+    """
     interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
-    """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
+    """Largest error of interpolating the celestial transformation in time, as a fraction of the
+    smallest beam's FWHM.
+    """
 
     _scans: dict[int, list[File]] = PrivateAttr(default_factory=dict)
     """By the observations' numbers."""
@@ -138,7 +161,8 @@ class RecordedFiles(Operator):
         return None if isinstance(value, str) and value.strip().lower() == "none" else value
 
     def own_scene(self, given: Instrument | None) -> Mapping[str, Any]:
-        """Instrument, site and start of the first scan; what it does not state of the instrument is that of ``given``.
+        """Instrument, site and start of the first scan; what it does not state of the instrument is
+        that of ``given``.
 
         The camera has all bands of that scan; only one where ``given`` is the camera of a band.
         """
@@ -146,10 +170,15 @@ class RecordedFiles(Operator):
         cameras = [camera for part in scan for camera in part.cameras]
         chosen = next((camera for camera in cameras if camera.has_the_detectors_of(given)), None)
         instrument = chosen or joined(cameras, f"{self.label}, {scan[0].path}")
-        return {"site": site_of(scan[0].tod), "instrument": instrument, "time": Instant.parse(scan[0].tod.start)}
+        return {
+            "site": site_of(scan[0].tod),
+            "instrument": instrument,
+            "time": Instant.parse(scan[0].tod.start),
+        }
 
     def scene(self, **more: Any) -> Any:
-        """A `Scene` of the file, for `Pipeline.run`: its instrument, site and start, and ``more`` (seed, target, weather).
+        """A `Scene` of the file, for `Pipeline.run`: its instrument, site and start, and ``more``
+        (seed, target, weather).
 
         Raises InputError where the file cannot be read, or does not state what a scene needs.
         """
@@ -163,23 +192,34 @@ class RecordedFiles(Operator):
         return list(self.file) if isinstance(self.file, list) else [self.file]
 
     def open(self, observation: Observation) -> RecordedStream | None:
-        """The stream of an observation of one band, to be read; None: it is not of these files, or none is wanted."""
+        """The stream of an observation of one band, to be read; None: it is not of these files, or
+        none is wanted.
+        """
         file = self.file_of(observation)
         if file is None or self.signal is None:
             return None
         opened = reader(file.path)
         try:
             rows = np.array([file.rows[name] for name in observation.focalplane.names], np.intp)
-            good, usable = flags.good(file.flags, flags.EXCLUDE_SAMPLE), flags.has_a_signal(file.flags)
-            return RecordedStream(opened, self.signal, rows, np.uint8(self.detector_mask), good, usable)
+            good, usable = (
+                flags.good(file.flags, flags.EXCLUDE_SAMPLE),
+                flags.has_a_signal(file.flags),
+            )
+            return RecordedStream(
+                opened, self.signal, rows, np.uint8(self.detector_mask), good, usable
+            )
         except BaseException:
             opened.close()
             raise
 
     def file_of(self, observation: Observation) -> File | None:
-        """The file with the detectors of an observation of one band; None: it is not of these files."""
+        """The file with the detectors of an observation of one band; None: it is not of these
+        files.
+        """
         first = observation.focalplane.names[0]
-        return next((file for file in self._scans.get(observation.index, ()) if first in file.rows), None)
+        return next(
+            (file for file in self._scans.get(observation.index, ()) if first in file.rows), None
+        )
 
     def scans(self, given: Instrument | None) -> Iterator[Scan]:
         """The scans in the order of their first files."""
@@ -191,10 +231,16 @@ class RecordedFiles(Operator):
         open_ones: dict[Any, list[tuple[set[int], list[Path]]]] = {}
         told = [(path, *_told(path, _stamp(path))) for path in self.files]
         if (wanted := self.band) is not None:  # where no file has it, the first is refused
-            told = [one for one in told if not one[2] or any(is_near(mhz * 1e6, wanted) for mhz in one[2])] or told[:1]
+            told = [
+                one
+                for one in told
+                if not one[2] or any(is_near(mhz * 1e6, wanted) for mhz in one[2])
+            ] or told[:1]
         for path, times, bands in told:
             same = open_ones.setdefault(times, [])
-            beside = next(((known, paths) for known, paths in same if bands and not known & bands), None)
+            beside = next(
+                ((known, paths) for known, paths in same if bands and not known & bands), None
+            )
             if beside is None:
                 beside = set(), []
                 same.append(beside)
@@ -211,7 +257,13 @@ class RecordedFiles(Operator):
         table = read_noise(self.noise) if self.noise is not None else None
         if self.noise_model is not None or not stated:
             try:
-                tod = replace(tod, columns={**tod.columns, **_fitted(path, _stamp(path), self.noise_model, self.detector_mask)})
+                tod = replace(
+                    tod,
+                    columns={
+                        **tod.columns,
+                        **_fitted(path, _stamp(path), self.noise_model, self.detector_mask),
+                    },
+                )
             except InputError:
                 if table is None or self.noise_model is not None:
                     raise
@@ -224,14 +276,22 @@ class RecordedFiles(Operator):
         tod, noise = _with_noise(tod, table, np.concatenate([r[used[r]] for r in rows]), place)
         if table is None and "net" in tod.columns and (self.noise_model is not None or not stated):
             noise = f"fitted to the file's {self.noise_model or 'noise_model'}"
-        return RecordedScan(path, tod, tuple(instrument_of(tod, r, used[r], given, place) for r in rows), tuple(rows), noise)
+        return RecordedScan(
+            path,
+            tod,
+            tuple(instrument_of(tod, r, used[r], given, place) for r in rows),
+            tuple(rows),
+            noise,
+        )
 
 
 def _stamp(path: Path) -> tuple[int, int]:
     try:
         stat = os.stat(path)
     except OSError as err:
-        raise InputError(f"cannot be read: {err.strerror}", place=str(path), cure="was it moved or removed?") from None
+        raise InputError(
+            f"cannot be read: {err.strerror}", place=str(path), cure="was it moved or removed?"
+        ) from None
     return stat.st_size, stat.st_mtime_ns
 
 
@@ -253,7 +313,9 @@ def _head(path: Path, stamp: tuple[int, int]) -> tuple[TimeOrderedData, Mapping[
 
 
 @lru_cache(maxsize=NEW_SCANS)
-def _fitted(path: Path, stamp: tuple[int, int], model: str | None, mask: int) -> Mapping[str, Floats]:
+def _fitted(
+    path: Path, stamp: tuple[int, int], model: str | None, mask: int
+) -> Mapping[str, Floats]:
     """The noise of a model of a file, of detectors without a bit of ``mask``."""
     opened = reader(path)
     try:
@@ -265,9 +327,15 @@ def _fitted(path: Path, stamp: tuple[int, int], model: str | None, mask: int) ->
 def _with_noise(
     tod: TimeOrderedData, table: NoiseTable | None, rows: NDArray[np.intp], place: str
 ) -> tuple[TimeOrderedData, str]:
-    """The file's data with the noise of a table for the detectors ``rows``, and where its noise comes from."""
+    """The file's data with the noise of a table for the detectors ``rows``, and where its noise
+    comes from.
+    """
     if table is None:
-        what = "the file's" if "net" in tod.columns else "the scene's instrument's, or none: the file states none"
+        what = (
+            "the file's"
+            if "net" in tod.columns
+            else "the scene's instrument's, or none: the file states none"
+        )
         return tod, what
     columns = dict(tod.columns)
     if not rows.size:

@@ -1,4 +1,6 @@
-"""Where the boresight of a recorded scan is, on the sky and above the horizon: as recorded, or one from the other."""
+"""Where the boresight of a recorded scan is, on the sky and above the horizon: as recorded, or one
+from the other.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ if TYPE_CHECKING:
     from zonda.core.site import Site
 
 LOOKED_AT = 10_000
-"""Samples of which the middle of a scan is taken, and at which recorded and recomputed directions are compared."""
+"""Samples of which the middle of a scan is taken, and at which recorded and recomputed directions
+are compared.
+"""
 
 GAP = 1.5
 """Sample intervals from which two samples are a gap apart."""
@@ -30,7 +34,9 @@ GAP = 1.5
 
 @dataclass(frozen=True)
 class Found:
-    """Boresights (n, 4) above the horizon and on the sky, and in words where the latter come from."""
+    """Boresights (n, 4) above the horizon and on the sky, and in words where the latter come
+    from.
+    """
 
     azel: Floats
     radec: Floats
@@ -53,7 +59,11 @@ def boresights(
     for name, values in (("boresight_azel", azel), ("boresight_radec", radec)):
         far = np.flatnonzero(np.abs(np.einsum("ij,ij->i", values, values) - 1) > 1e-6)
         if far.size:
-            raise InputError(f"{name} is no rotation at sample {far[0]}", place=place, cure="make quaternions of length 1")
+            raise InputError(
+                f"{name} is no rotation at sample {far[0]}",
+                place=place,
+                cure="make quaternions of length 1",
+            )
     if celestial == "recorded" and not len(radec):
         cure = "set celestial: recomputed, or leave it out"
         raise InputError("has no boresight_radec", place=place, cure=cure)
@@ -69,8 +79,12 @@ def boresights(
     # what the boresight is turned about itself: Rz(psi) of R = R_upright Rz(psi)
     turn = multiply(conjugate(upright_azel if len(azel) else upright_radec), known)
     if len(azel):
-        return Found(azel, multiply(upright_radec, turn), "recomputed from azimuth, elevation and time")
-    return Found(multiply(upright_azel, turn), radec, "as recorded; azimuth and elevation are computed")
+        return Found(
+            azel, multiply(upright_radec, turn), "recomputed from azimuth, elevation and time"
+        )
+    return Found(
+        multiply(upright_azel, turn), radec, "as recorded; azimuth and elevation are computed"
+    )
 
 
 def state_celestial(label: str, observation: Observation, found: Found, rate: float) -> None:
@@ -81,7 +95,10 @@ def state_celestial(label: str, observation: Observation, found: Found, rate: fl
         what = f"{observation.name}: gaps between samples, which filters and noise do not see"
         observation.tally.count(label, what, gaps, steps.size)
     if observation.jitter * rate > 1e-3:
-        text = f"depart from a comb of {rate:.6g} Hz by {observation.jitter * 1e3:.3g} ms rms; noise and filters count samples"
+        text = (
+            f"depart from a comb of {rate:.6g} Hz by {observation.jitter * 1e3:.3g} ms rms; noise"
+            " and filters count samples"
+        )
         observation.tally.state(label, f"{observation.name}: times of the samples", text)
 
 

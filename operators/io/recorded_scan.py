@@ -1,4 +1,6 @@
-"""What a file of time-ordered data says of its instrument and its site, as an `Instrument`, a `Site` and a focal plane."""
+"""What a file of time-ordered data says of its instrument and its site, as an `Instrument`, a
+`Site` and a focal plane.
+"""
 
 from __future__ import annotations
 
@@ -53,42 +55,63 @@ class RecordedInstrument(Instrument):
     def focalplane(self) -> Focalplane:
         """The files' detectors; several bands follow each other."""
         planes = list(self._planes.values())
-        return planes[0].copy() if len(planes) == 1 else Focalplane.of_bands(self._planes, suffix=False)
+        return (
+            planes[0].copy()
+            if len(planes) == 1
+            else Focalplane.of_bands(self._planes, suffix=False)
+        )
 
     def has_the_detectors_of(self, other: Instrument | None) -> bool:
         """Whether the other is recorded too, and has the same detectors."""
-        return isinstance(other, RecordedInstrument) and self.focalplane().names == other.focalplane().names
+        return (
+            isinstance(other, RecordedInstrument)
+            and self.focalplane().names == other.focalplane().names
+        )
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, RecordedInstrument) or self.model_dump() != other.model_dump():
             return False
         pairs = zip(self._planes.values(), other._planes.values(), strict=True)
-        return all(np.array_equal(v, vars(theirs)[k]) for ours, theirs in pairs for k, v in vars(ours).items())
+        return all(
+            np.array_equal(v, vars(theirs)[k])
+            for ours, theirs in pairs
+            for k, v in vars(ours).items()
+        )
 
     def __hash__(self) -> int:
         return hash((self.name, self.detectors))
 
 
 def site_of(tod: TimeOrderedData) -> Site:
-    """Where the file's telescope stands, with the climatology of a registered site that is nearer than `NEAR`."""
+    """Where the file's telescope stands, with the climatology of a registered site that is nearer
+    than `NEAR`.
+    """
     name, latitude, longitude, altitude = tod.site
     given: dict[str, Any] = {
-        "name": name or "recorded", "latitude": f"{latitude!r} rad", "longitude": f"{longitude!r} rad",
-        "altitude": f"{altitude!r} m", "provenance": "the file of time-ordered data",
-    }  # fmt: skip
+        "name": name or "recorded",
+        "latitude": f"{latitude!r} rad",
+        "longitude": f"{longitude!r} rad",
+        "altitude": f"{altitude!r} m",
+        "provenance": "the file of time-ordered data",
+    }
     for known in sites:
         try:
             other: Site = sites.create(known)
         except ZondaError:  # of a plugin that is not installed whole
             continue
-        if other.climatology and distance((latitude, longitude), other) < NEAR and abs(other.altitude - altitude) < HIGHER:
+        if (
+            other.climatology
+            and distance((latitude, longitude), other) < NEAR
+            and abs(other.altitude - altitude) < HIGHER
+        ):
             given["climatology"] = other.climatology
             break
     return Site(**given)
 
 
 def rows_of_bands(tod: TimeOrderedData, band: float | None, place: str) -> list[NDArray[np.intp]]:
-    """Rows of the detectors of each band, in the order of their centres; ``band``: centre [Hz] of the only one that is used.
+    """Rows of the detectors of each band, in the order of their centres; ``band``: centre [Hz] of
+    the only one that is used.
 
     Raises InputError where there is no such band.
     """
@@ -104,7 +127,9 @@ def rows_of_bands(tod: TimeOrderedData, band: float | None, place: str) -> list[
     cure = f"choose the centre of a band: {', '.join(f'{c / 1e9:.4g} GHz' for c in centres)}"
     near = [rows for rows, c in zip(every, centres, strict=True) if is_near(c, band)]
     if len(near) != 1:
-        raise InputError(f"has no band, or more than one, at {band / 1e9:g} GHz", place=place, cure=cure)
+        raise InputError(
+            f"has no band, or more than one, at {band / 1e9:g} GHz", place=place, cure=cure
+        )
     return near
 
 
@@ -114,19 +139,29 @@ def is_near(centre: float, band: float) -> bool:
 
 
 def joined(cameras: Sequence[RecordedInstrument], place: str) -> RecordedInstrument:
-    """One camera of cameras of one band each, in the order of their centres. Raises InputError where two have one band."""
+    """One camera of cameras of one band each, in the order of their centres. Raises InputError
+    where two have one band.
+    """
     if len(cameras) == 1:
         return cameras[0]
     cameras = sorted(cameras, key=lambda camera: camera.band.centre)
     first, bands = cameras[0], []
     for camera in cameras:
-        own = {key: value for key, value in camera.model_dump(mode="json").items() if key in CameraBand.model_fields}
+        own = {
+            key: value
+            for key, value in camera.model_dump(mode="json").items()
+            if key in CameraBand.model_fields
+        }
         own |= camera.band.model_dump(mode="json", exclude_none=True)
         bands.append(CameraBand.model_validate(own | {"name": _plain(camera.band.name)}))
     names = [band.name for band in bands]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"several bands are called {twice}", place=place, cure="set band, the centre of the one to be used")
+        raise InputError(
+            f"several bands are called {twice}",
+            place=place,
+            cure="set band, the centre of the one to be used",
+        )
     planes = dict(zip(names, (camera.focalplane() for camera in cameras), strict=True))
     made = first.model_copy(update={
         "band": None, "bands": bands, "pixels": "overlaid", "fwhm": None,
@@ -136,7 +171,9 @@ def joined(cameras: Sequence[RecordedInstrument], place: str) -> RecordedInstrum
     try:
         made.focalplane()
     except InputError as err:
-        raise InputError(err.message, place=place, cure="give every detector a name of its own") from None
+        raise InputError(
+            err.message, place=place, cure="give every detector a name of its own"
+        ) from None
     return made
 
 
@@ -153,12 +190,17 @@ def band_of(instrument: Instrument | None, centre: float) -> Instrument | None:
 
 
 def instrument_of(
-    tod: TimeOrderedData, rows: NDArray[np.intp], used: NDArray[np.bool_], given: Instrument | None, place: str
+    tod: TimeOrderedData,
+    rows: NDArray[np.intp],
+    used: NDArray[np.bool_],
+    given: Instrument | None,
+    place: str,
 ) -> RecordedInstrument:
-    """The camera of one band that the file describes; what it does not state is taken from ``given``, the scene's.
+    """The camera of one band that the file describes; what it does not state is taken from
+    ``given``, the scene's.
 
-    ``used`` (len(rows),): what is not known of other detectors is that of a used one. Raises InputError where neither states the
-    beam, or a column of a used detector is not finite.
+    ``used`` (len(rows),): what is not known of other detectors is that of a used one. Raises
+    InputError where neither states the beam, or a column of a used detector is not finite.
     """
     columns = {name: _known(name, values[rows], used) for name, values in tod.columns.items()}
     given = band_of(given, float(np.median(columns.get("band_centre", np.zeros(1)))))
@@ -195,27 +237,45 @@ def instrument_of(
 
 
 def _known(name: str, values: Floats, used: NDArray[np.bool_]) -> Floats:
-    """The values (n_det,), and the median of the used detectors' where one that is not ``used`` has none that can be."""
+    """The values (n_det,), and the median of the used detectors' where one that is not ``used`` has
+    none that can be.
+    """
     known = np.isfinite(values) & ((values > 0) | (name not in POSITIVE))
     found = np.sort(values[used & known])
     return np.where(used | known, values, found[len(found) // 2]) if found.size else values
 
 
-def _band(tod: TimeOrderedData, columns: Mapping[str, Floats], given: Instrument | None, place: str) -> Band:
-    """The passband: flat, of the file's centre and width. It has the name that a file of zonda states, or f150 at 150 GHz."""
+def _band(
+    tod: TimeOrderedData, columns: Mapping[str, Floats], given: Instrument | None, place: str
+) -> Band:
+    """The passband: flat, of the file's centre and width. It has the name that a file of zonda
+    states, or f150 at 150 GHz.
+    """
     if not {"band_centre", "band_width"} <= set(columns):
         if given is None:
             cure = "give the scene an instrument with its band"
             raise InputError("states no band (bandcenter, bandwidth)", place=place, cure=cure)
         return given.band
     centre, width = (float(np.median(columns[name])) for name in ("band_centre", "band_width"))
-    if given is not None and np.isclose(given.band.centre, centre, rtol=1e-9) and np.isclose(given.band.width, width, rtol=1e-9):
+    if (
+        given is not None
+        and np.isclose(given.band.centre, centre, rtol=1e-9)
+        and np.isclose(given.band.width, width, rtol=1e-9)
+    ):
         return given.band
     if not 0 < width < 2 * centre:
         cure = "mend bandcenter and bandwidth, or leave them out and give the scene an instrument"
-        raise InputError(f"states a band of {width / 1e9:g} GHz about {centre / 1e9:g} GHz", place=place, cure=cure)
-    low, high = (float(f"{edge:.12g}") for edge in (centre - width / 2, centre + width / 2))  # without the rounding of their sums
-    own = str(tod.metadata.get("band", "")) if len(columns["band_centre"]) == tod.n_detectors else ""
+        raise InputError(
+            f"states a band of {width / 1e9:g} GHz about {centre / 1e9:g} GHz",
+            place=place,
+            cure=cure,
+        )
+    low, high = (
+        float(f"{edge:.12g}") for edge in (centre - width / 2, centre + width / 2)
+    )  # without the rounding of their sums
+    own = (
+        str(tod.metadata.get("band", "")) if len(columns["band_centre"]) == tod.n_detectors else ""
+    )
     return Band(
         name=_plain(own) or f"f{int(round(centre / 1e9, 6) + 0.5):03d}",
         low=f"{low!r} Hz",
@@ -225,7 +285,11 @@ def _band(tod: TimeOrderedData, columns: Mapping[str, Floats], given: Instrument
 
 
 def _focalplane(
-    tod: TimeOrderedData, columns: Mapping[str, Floats], rows: NDArray[np.intp], given: Instrument | None, place: str
+    tod: TimeOrderedData,
+    columns: Mapping[str, Floats],
+    rows: NDArray[np.intp],
+    given: Instrument | None,
+    place: str,
 ) -> Focalplane:
     n, found = len(rows), dict[str, Any]()
     stated = {
@@ -242,7 +306,11 @@ def _focalplane(
         if name in columns:
             found[name] = columns[name]
         elif otherwise is None:
-            raise InputError("states no beam (fwhm)", place=place, cure="give the scene an instrument with its fwhm")
+            raise InputError(
+                "states no beam (fwhm)",
+                place=place,
+                cure="give the scene an instrument with its fwhm",
+            )
         else:
             found[name] = np.full(n, otherwise)
     if "polarization_efficiency" in columns:
@@ -253,7 +321,12 @@ def _focalplane(
     for name, values in {**found, "xi": tod.xi[rows], "eta": tod.eta[rows]}.items():
         bad = np.flatnonzero(~np.isfinite(values) | ((values <= 0) & (name in POSITIVE)))
         if bad.size:
-            cure = "give it a number in the focal plane of the file; flag the detector if it is not to be used"
-            raise InputError(f"{name} of detector {names[bad[0]]} is {values[bad[0]]:g}", place=place, cure=cure)
+            cure = (
+                "give it a number in the focal plane of the file; flag the detector if it is not to"
+                " be used"
+            )
+            raise InputError(
+                f"{name} of detector {names[bad[0]]} is {values[bad[0]]:g}", place=place, cure=cure
+            )
     found["minimum_frequency"] = np.maximum(found["minimum_frequency"], 1e-9)
     return Focalplane(names=names, xi=tod.xi[rows], eta=tod.eta[rows], **found)

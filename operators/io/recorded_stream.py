@@ -19,7 +19,9 @@ AT_ONCE = 4 * TILE_SAMPLES
 """Samples of `TILE_DETECTORS` detectors that are read at once."""
 
 LITTLE = 10.0
-"""Levels of all detectors up to this many standard deviations of their samples stay in the stream: it has been filtered."""
+"""Levels of all detectors up to this many standard deviations of their samples stay in the stream:
+it has been filtered.
+"""
 
 LARGEST = 1e9
 """K: what is larger is no temperature, but damage."""
@@ -43,9 +45,11 @@ class RecordedStream:
     mask
         Bits of the flags of a detector's samples that make one NaN.
     good, usable
-        (n_samp,) which instants the file's flags leave, and those at which there is a signal that filters use; None: all.
+        (n_samp,) which instants the file's flags leave, and those at which there is a signal that
+        filters use; None: all.
     level
-        (n_det,) K, constant, that stands beside the stream; ``mean``: the same as a field, None where it is zero.
+        (n_det,) K, constant, that stands beside the stream; ``mean``: the same as a field, None
+        where it is zero.
     """
 
     file: Any
@@ -75,12 +79,17 @@ class RecordedStream:
         return self
 
     def add(self, detectors: slice, samples: slice, out: AnyFloats) -> int:
-        """Add what stands above `level` to ``out`` (n, m), in parts of a few megabytes; how many samples are flagged."""
+        """Add what stands above `level` to ``out`` (n, m), in parts of a few megabytes; how many
+        samples are flagged.
+        """
         spoilt = 0
         for rows in chunks(detectors.stop - detectors.start, TILE_DETECTORS):
             for part in chunks(samples.stop - samples.start, AT_ONCE):
                 first, begin = detectors.start + rows.start, samples.start + part.start
-                absolute = slice(first, detectors.start + rows.stop), slice(begin, samples.start + part.stop)
+                absolute = (
+                    slice(first, detectors.start + rows.stop),
+                    slice(begin, samples.start + part.stop),
+                )
                 values, bad = self.read(*absolute)
                 values -= self.level[absolute[0], None]
                 np.add(out[rows, part], values, out=out[rows, part], casting="same_kind")
@@ -90,8 +99,8 @@ class RecordedStream:
     def read(self, detectors: slice, samples: slice) -> tuple[Floats, int]:
         """(n, m) float64 K at absolute detectors and samples, NaN where the file flags one.
 
-        How many these are, too, but for detectors that the file excludes altogether. Raises InputError where a sample that is
-        used is larger than `LARGEST`.
+        How many these are, too, but for detectors that the file excludes altogether. Raises
+        InputError where a sample that is used is larger than `LARGEST`.
         """
         rows = self.rows[detectors]
         values = np.array(self.file.read(self.name, rows, samples), np.float64)
@@ -101,37 +110,60 @@ class RecordedStream:
         if flagged is not None:
             bad = (flagged & self.mask) != 0
             values[bad] = np.nan
-        if values.size and not max(np.fmax.reduce(values, axis=None), -np.fmin.reduce(values, axis=None)) <= LARGEST:
+        if (
+            values.size
+            and not max(np.fmax.reduce(values, axis=None), -np.fmin.reduce(values, axis=None))
+            <= LARGEST
+        ):
             self._refuse_damage(values, rows, samples)
         if flagged is None:
             return values, 0
-        return values, int(np.count_nonzero(bad[(self.file.tod.detector_flags[rows] & self.mask) == 0]))
+        return values, int(
+            np.count_nonzero(bad[(self.file.tod.detector_flags[rows] & self.mask) == 0])
+        )
 
     def _refuse_damage(self, values: Floats, rows: NDArray[np.intp], samples: slice) -> None:
         """InputError for the first sample that is used and cannot be a temperature."""
         used = (self.file.tod.detector_flags[rows] & self.mask) == 0
-        large = (np.abs(values) > LARGEST) & used[:, None] & (True if self.good is None else self.good[samples])
+        large = (
+            (np.abs(values) > LARGEST)
+            & used[:, None]
+            & (True if self.good is None else self.good[samples])
+        )
         for row, column in np.argwhere(large)[:1]:
             name, sample = self.file.tod.names[rows[row]], samples.start + column
-            cure = "the data are damaged: copy or make the file again; or flag the detector or the samples"
-            text = f"the stream {self.name} is {values[row, column]:.3g} K at sample {sample} of detector {name}"
+            cure = (
+                "the data are damaged: copy or make the file again; or flag the detector or the"
+                " samples"
+            )
+            text = (
+                f"the stream {self.name} is {values[row, column]:.3g} K at sample {sample} of"
+                f" detector {name}"
+            )
             raise InputError(f"{text}: no temperature", place=self.file.place, cure=cure)
         values[np.abs(values) > LARGEST] = np.nan  # of what is not used
 
 
 def levels(stream: RecordedStream, n_detectors: int, n_samples: int) -> tuple[Floats, Floats]:
-    """Median and standard deviation (n_detectors,) [K] of a few hundred finite samples of each detector, 0 where there is none.
+    """Median and standard deviation (n_detectors,) [K] of a few hundred finite samples of each
+    detector, 0 where there is none.
 
-    They depend on the file alone, and not on samples that it flags. For the level any number would do: it is subtracted in
-    float64 and added again.
+    They depend on the file alone, and not on samples that it flags. For the level any number would
+    do: it is subtracted in float64 and added again.
     """
     found = np.zeros((2, n_detectors))
     usable = np.arange(n_samples) if stream.usable is None else np.flatnonzero(stream.usable)
-    begins = usable[np.unique(np.linspace(0, max(len(usable) - LENGTH, 0), STRETCHES).astype(int))] if len(usable) else usable
+    begins = (
+        usable[np.unique(np.linspace(0, max(len(usable) - LENGTH, 0), STRETCHES).astype(int))]
+        if len(usable)
+        else usable
+    )
     stretches = [slice(int(b), min(int(b) + LENGTH, n_samples)) for b in begins]
     for rows in chunks(n_detectors, TILE_DETECTORS) if stretches else ():
         known = [slice(None) if stream.usable is None else stream.usable[s] for s in stretches]
-        parts = np.hstack([stream.read(rows, s)[0][:, k] for s, k in zip(stretches, known, strict=True)])
+        parts = np.hstack(
+            [stream.read(rows, s)[0][:, k] for s, k in zip(stretches, known, strict=True)]
+        )
         for number, values in enumerate(parts, rows.start):
             finite = values[np.isfinite(values)]
             found[:, number] = (np.median(finite), np.std(finite)) if finite.size else (0.0, 0.0)
@@ -142,7 +174,11 @@ def kelvin_per(unit: str) -> float | None:
     """Kelvin per unit of a temperature; None: of another quantity."""
     kelvin = read_unit("K")
     measure = read_unit(unit.replace("K_RJ", "K")) if unit.strip() else None
-    return None if measure is None or kelvin is None or measure.powers != kelvin.powers else float(measure.factor)
+    return (
+        None
+        if measure is None or kelvin is None or measure.powers != kelvin.powers
+        else float(measure.factor)
+    )
 
 
 def _kelvin(unit: str, name: str, place: str) -> float:
@@ -150,5 +186,7 @@ def _kelvin(unit: str, name: str, place: str) -> float:
     found = kelvin_per(unit)
     if found is None:
         cure = "calibrate it to a Rayleigh-Jeans temperature, and state its units, e.g. K"
-        raise InputError(f"the stream {name} is in {unit or 'no unit'!r}, not in kelvin", place=place, cure=cure)
+        raise InputError(
+            f"the stream {name} is in {unit or 'no unit'!r}, not in kelvin", place=place, cure=cure
+        )
     return found

@@ -1,4 +1,6 @@
-"""Write the time-ordered data of every scan, block by block, as TOAST's HDF5 or FITS binary tables."""
+"""Write the time-ordered data of every scan, block by block, as TOAST's HDF5 or FITS binary
+tables.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ class Files(Record):
 
 @dataclass
 class _State:
-    """An open file. ``largest``: greatest magnitude written, K, for the statement about rounding."""
+    """An open file. ``largest``: greatest magnitude written, K, for the statement about
+    rounding.
+    """
 
     path: Path
     temporary: Path
@@ -53,11 +57,15 @@ class _State:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
-    def begun(cls, path: Path, module: Any, tod: TimeOrderedData, streams: list[str], dtype: str) -> _State:
+    def begun(
+        cls, path: Path, module: Any, tod: TimeOrderedData, streams: list[str], dtype: str
+    ) -> _State:
         """A file that gets its name when it is finished."""
         if path.is_dir():
             cure = "remove it or choose another output folder"
-            raise OutputError("cannot be written: there is a folder of that name", place=str(path), cure=cure)
+            raise OutputError(
+                "cannot be written: there is a folder of that name", place=str(path), cure=cure
+            )
         temporary = temporary_sibling(path)
         try:
             return cls(path, temporary, tod, module.Writer(temporary, tod, streams, dtype))
@@ -77,9 +85,10 @@ class _State:
 class SaveTOD(StreamOutput):
     """Files of the streams at this step, one per scan: ``tod_<observation>.h5`` or ``.fits``.
 
-    The smooth mean emission is added in float64, so `signal` is the whole T_scan (or what the filters left of it). HDF5
-    files have TOAST 3's layout (version 2), which TOAST and sotodlib read; the noise model in them is the instrument's
-    nominal one. A file gets its name when its scan is complete: a failed or interrupted run leaves no half file.
+    The smooth mean emission is added in float64, so `signal` is the whole T_scan (or what the
+    filters left of it). HDF5 files have TOAST 3's layout (version 2), which TOAST and sotodlib
+    read; the noise model in them is the instrument's nominal one. A file gets its name when its
+    scan is complete: a failed or interrupted run leaves no half file.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
@@ -91,7 +100,9 @@ class SaveTOD(StreamOutput):
     format: Literal["hdf5", "fits"] = "hdf5"
     """File format: hdf5 (TOAST's layout) or fits (binary tables)."""
     streams: list[StreamName] = Field(["signal"], min_length=1)
-    """Streams to write; components (sky, atmosphere ...) are as they entered the calibrated sum, atmosphere without its mean."""
+    """Streams to write; components (sky, atmosphere ...) are as they entered the calibrated sum,
+    atmosphere without its mean.
+    """
     dtype: Literal["float64", "float32"] = "float64"
     """Number type in the file. TOAST wants float64; float32 rounds a mean of 30 K to 2 uK."""
 
@@ -101,15 +112,29 @@ class SaveTOD(StreamOutput):
 
     def prepare(self, observation: Observation) -> _State:
         module = _FORMATS[self.format]
-        stem = f"tod_{observation.name}" if self.label == "SaveTOD" else f"tod_{self.label}_{observation.name}"
+        stem = (
+            f"tod_{observation.name}"
+            if self.label == "SaveTOD"
+            else f"tod_{self.label}_{observation.name}"
+        )
         path = product_path(output_folder(observation, self.label), stem, module.SUFFIX)
-        return _State.begun(path, module, TimeOrderedData.of(observation), list(dict.fromkeys(self.streams)), self.dtype)
+        return _State.begun(
+            path,
+            module,
+            TimeOrderedData.of(observation),
+            list(dict.fromkeys(self.streams)),
+            self.dtype,
+        )
 
     def exec(self, block: Block, state: _State) -> None:
         for name in dict.fromkeys(self.streams):
             if name not in block.detdata:
                 have = ", ".join(sorted(block.detdata))
-                raise OutputError(f"there is no stream {name!r} at this step", place=self.label, cure=f"choose from: {have}")
+                raise OutputError(
+                    f"there is no stream {name!r} at this step",
+                    place=self.label,
+                    cure=f"choose from: {have}",
+                )
             values = block.total(name)
             largest = float(np.abs(values).max(initial=0.0)) if name not in UNITS else 0.0
             with state.lock:
@@ -119,9 +144,13 @@ class SaveTOD(StreamOutput):
     def collect(self, data: Data, observation: Observation, state: _State) -> None:
         state.tod.weather = observation.weather or _weather(data, observation, self.label)
         if self.dtype == "float32":
-            observation.tally.state(self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}")
+            observation.tally.state(
+                self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}"
+            )
         if "white" not in observation.components:
-            observation.tally.state(self.label, "NET of the detectors", "the instrument's; this run has no white noise")
+            observation.tally.state(
+                self.label, "NET of the detectors", "the instrument's; this run has no white noise"
+            )
         state.finish(observation, _provenance(data))
         data.add(self.label, Files([str(state.path)]))
 
@@ -169,7 +198,8 @@ def load_tod(path: str | os.PathLike[str]) -> TimeOrderedData:
 
 
 def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
-    """Write a whole scan, ``tod.streams`` included; the format follows the suffix (.h5, .hdf5, .fits). Returns the path.
+    """Write a whole scan, ``tod.streams`` included; the format follows the suffix (.h5, .hdf5,
+    .fits). Returns the path.
 
     Raises
     ------
@@ -179,7 +209,9 @@ def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
     module: Any = fits_table if is_fits(path) else toast_hdf5
     types = {s.dtype.name for s in tod.streams.values()}
     with atomic_path(path) as temporary:
-        writer = module.Writer(temporary, tod, list(tod.streams), "float64" if types != {"float32"} else "float32")
+        writer = module.Writer(
+            temporary, tod, list(tod.streams), "float64" if types != {"float32"} else "float32"
+        )
         try:
             for name, values in tod.streams.items():
                 writer.write(name, slice(0, tod.n_detectors), slice(0, tod.n_samples), values)
@@ -190,7 +222,9 @@ def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
 
 
 def reader(path: str | os.PathLike[str]) -> fits_table.Reader | toast_reading.Reader:
-    """An open file, whose streams are read in rectangles. Raises InputError when it cannot be read as such."""
+    """An open file, whose streams are read in rectangles. Raises InputError when it cannot be read
+    as such.
+    """
     return fits_table.Reader(path) if is_fits(path) else toast_reading.Reader(path)
 
 

@@ -47,31 +47,37 @@ class TimeOrderedData:
     site
         name, latitude [rad], longitude [rad], altitude [m].
     boresight_azel, boresight_radec
-        (n_samp, 4) quaternions (x, y, z, w), see `Observation`; (0, 4): the file does not have them.
+        (n_samp, 4) quaternions (x, y, z, w), see `Observation`; (0, 4): the file does not have
+        them.
     flags, detector_flags
-        (n_samp,) and (n_det,) uint8, TOAST's bits (`core.flags`): samples with a bit of 15 and detectors with one of 7 are not
-        to be used.
+        (n_samp,) and (n_det,) uint8, TOAST's bits (`core.flags`): samples with a bit of 15 and
+        detectors with one of 7 are not to be used.
     names, quats
         Detector names; (n_det, 4) rotations from the boresight's frame to the detectors'.
     columns
-        Further detector columns, (n_det,) each, SI: fwhm [rad], net [K_RJ sqrt(s)], knee, minimum_frequency [Hz], slope,
-        band_centre, band_width [Hz], main_beam_efficiency, illumination_efficiency, polarization_angle [rad],
-        polarization_efficiency, wafer (whole numbers).
+        Further detector columns, (n_det,) each, SI: fwhm [rad], net [K_RJ sqrt(s)], knee,
+        minimum_frequency [Hz], slope, band_centre, band_width [Hz], main_beam_efficiency,
+        illumination_efficiency, polarization_angle [rad], polarization_efficiency, wafer (whole
+        numbers).
     streams
-        (n_det, n_samp) arrays; K_RJ, but for what is no temperature. NaN: a single sample that is not to be used.
+        (n_det, n_samp) arrays; K_RJ, but for what is no temperature. NaN: a single sample that is
+        not to be used.
     intervals
-        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`). In those called
-        `TRIMMED_INTERVALS` *processing* means that a filter of zonda trimmed the samples.
+        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`).
+        In those called `TRIMMED_INTERVALS` *processing* means that a filter of zonda trimmed the
+        samples.
     weather
         At the telescope; None: not known.
     hwp_angle
         (n_samp,) rad, of a half-wave plate in the focal plane; None: there is none.
     azimuth
-        (n_samp,) rad, of the mount, north through east, as recorded; None: it follows from ``boresight_azel``.
+        (n_samp,) rad, of the mount, north through east, as recorded; None: it follows from
+        ``boresight_azel``.
     metadata
         Text and numbers that say where the data come from.
     offsets
-        (n_det, 2) `xi` and `eta` to the last bit, where the file has them; None: they follow from ``quats``.
+        (n_det, 2) `xi` and `eta` to the last bit, where the file has them; None: they follow from
+        ``quats``.
     """
 
     name: str
@@ -106,37 +112,65 @@ class TimeOrderedData:
         return len(self.names)
 
     def check(self, place: str) -> None:
-        """Raise an `InputError` about ``place`` where shapes do not fit each other, or times and pointing are not finite."""
+        """Raise an `InputError` about ``place`` where shapes do not fit each other, or times and
+        pointing are not finite.
+        """
         n, d = np.shape(self.times)[:1], np.shape(self.names)
         shapes = {"seconds": n, "times": n, "flags": n, "quats": (*d, 4), "detector_flags": d}
-        pointed = [name for name in ("boresight_azel", "boresight_radec") if len(getattr(self, name))]
+        pointed = [
+            name for name in ("boresight_azel", "boresight_radec") if len(getattr(self, name))
+        ]
         shapes |= dict.fromkeys(pointed or ("boresight_azel",), (*n, 4))
         shapes |= {} if self.offsets is None else {"offsets": (*d, 2)}
         shapes |= {name: n for name in ("hwp_angle", "azimuth") if getattr(self, name) is not None}
         wrong = [name for name, shape in shapes.items() if np.shape(getattr(self, name)) != shape]
         wrong += [name for name, column in self.columns.items() if np.shape(column) != d]
-        wrong += [name for name, stream in self.streams.items() if stream.shape[:2] != (*d, *n) or stream.dtype.kind not in "fiu"]
+        wrong += [
+            name
+            for name, stream in self.streams.items()
+            if stream.shape[:2] != (*d, *n) or stream.dtype.kind not in "fiu"
+        ]
         if wrong or not n or not d:
             message = f"does not fit together: {', '.join(wrong)} for {len(self.names)} detectors"
             raise InputError(message, place=place, cure="save it again")
         shapes.pop("azimuth", None)  # where it is no number, that of the boresight is taken
-        numbers = [name for name, shape in shapes.items() if not np.isfinite(getattr(self, name)).all()]
-        if not np.isfinite([self.sample_rate, self.field_of_view, *self.site[1:]]).all() or not self.sample_rate > 0:
+        numbers = [
+            name for name, shape in shapes.items() if not np.isfinite(getattr(self, name)).all()
+        ]
+        if (
+            not np.isfinite([self.sample_rate, self.field_of_view, *self.site[1:]]).all()
+            or not self.sample_rate > 0
+        ):
             numbers.append("sample rate, field of view or site")
-        numbers += [f"intervals {name}" for name, spans in self.intervals.items() if not np.isfinite(spans).all()]
+        numbers += [
+            f"intervals {name}"
+            for name, spans in self.intervals.items()
+            if not np.isfinite(spans).all()
+        ]
         if numbers:
-            raise InputError(f"has NaN or impossible values in {', '.join(numbers)}", place=place, cure="save it again")
+            raise InputError(
+                f"has NaN or impossible values in {', '.join(numbers)}",
+                place=place,
+                cure="save it again",
+            )
 
     def take_flags(self, observation: Observation) -> None:
         """Take the flags that a scan has now, and its intervals."""
         self.flags = in_file(observation.flags, SAMPLE_FLAGS)
         self.detector_flags = in_file(observation.detector_flags, DETECTOR_FLAGS)
-        trimmed = runs((observation.flags & np.uint8(TRIMMED | PROCESSING)) == TRIMMED, observation.seconds)
-        self.intervals = {**observation.intervals, **({TRIMMED_INTERVALS: trimmed} if trimmed else {})}
+        trimmed = runs(
+            (observation.flags & np.uint8(TRIMMED | PROCESSING)) == TRIMMED, observation.seconds
+        )
+        self.intervals = {
+            **observation.intervals,
+            **({TRIMMED_INTERVALS: trimmed} if trimmed else {}),
+        }
 
     def sample_flags(self, mask: int) -> Flags:
         """(n_samp,) bits of `core.flags`; ``mask``: bits of the file that exclude a sample."""
-        return from_file(self.flags, mask, samples_in(self.intervals.get(TRIMMED_INTERVALS, []), self.seconds))
+        return from_file(
+            self.flags, mask, samples_in(self.intervals.get(TRIMMED_INTERVALS, []), self.seconds)
+        )
 
     @property
     def scan_intervals(self) -> Intervals:
@@ -145,20 +179,32 @@ class TimeOrderedData:
 
     @property
     def xi(self) -> NDArray[np.float64]:
-        """(n_det,) offset towards increasing azimuth: a tangent, on the gnomonic plane about the boresight.
+        """(n_det,) offset towards increasing azimuth: a tangent, on the gnomonic plane about the
+        boresight.
 
-        sotodlib's xi is a sine (`xieta_sotodlib`): the same to 3e-7 rad at 0.5 deg, 35 arcsec less at 4 deg, 46 arcmin at 17 deg.
+        sotodlib's xi is a sine (`xieta_sotodlib`): the same to 3e-7 rad at 0.5 deg, 35 arcsec less
+        at 4 deg, 46 arcmin at 17 deg.
         """
-        return np.asarray(-self._directions[1] / self._directions[2]) if self.offsets is None else self.offsets[:, 0]
+        return (
+            np.asarray(-self._directions[1] / self._directions[2])
+            if self.offsets is None
+            else self.offsets[:, 0]
+        )
 
     @property
     def eta(self) -> NDArray[np.float64]:
         """(n_det,) offset towards increasing elevation, as `xi`."""
-        return np.asarray(-self._directions[0] / self._directions[2]) if self.offsets is None else self.offsets[:, 1]
+        return (
+            np.asarray(-self._directions[0] / self._directions[2])
+            if self.offsets is None
+            else self.offsets[:, 1]
+        )
 
-    def xieta_sotodlib(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """xi, eta, gamma (n_det,) [rad] as sotodlib and so3g define them: sines, of the same signs as ours; gamma is the angle of
-        the polarization from increasing eta towards increasing xi.
+    def xieta_sotodlib(
+        self,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """xi, eta, gamma (n_det,) [rad] as sotodlib and so3g define them: sines, of the same signs
+        as ours; gamma is the angle of the polarization from increasing eta towards increasing xi.
         """
         _, _, z, w = self.quats.T
         return (
@@ -174,7 +220,9 @@ class TimeOrderedData:
         return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
     @classmethod
-    def of(cls, observation: Observation, metadata: Mapping[str, str | int | float] | None = None) -> TimeOrderedData:
+    def of(
+        cls, observation: Observation, metadata: Mapping[str, str | int | float] | None = None
+    ) -> TimeOrderedData:
         """Everything but the streams of an observation."""
         o, f, instrument = observation, observation.focalplane, observation.instrument
         n = len(f)
@@ -202,14 +250,18 @@ class TimeOrderedData:
                 "band_centre": np.full(n, instrument.band.centre),
                 "band_width": np.full(n, instrument.band.width),
                 "net": f.net,
-                "knee": np.zeros(n) if "white" in o.components and "pink" not in o.components else f.knee,
+                "knee": np.zeros(n)
+                if "white" in o.components and "pink" not in o.components
+                else f.knee,
                 "minimum_frequency": f.minimum_frequency,
                 "slope": f.slope,
                 "wafer": f.wafer.astype(np.float64),
             },
             weather=o.weather,
             hwp_angle=o.hwp_angle,
-            azimuth=np.asarray(o.azimuth if o.recorded_azimuth is None else o.recorded_azimuth, np.float64),
+            azimuth=np.asarray(
+                o.azimuth if o.recorded_azimuth is None else o.recorded_azimuth, np.float64
+            ),
             metadata={
                 "seed": o.seed,
                 "observation_index": o.index,

@@ -1,7 +1,9 @@
-"""TOAST 3's HDF5 observation file, layout version 2, written with h5py alone (`toast_reading` reads it).
+"""TOAST 3's HDF5 observation file, layout version 2, written with h5py alone (`toast_reading` reads
+it).
 
-What TOAST requires of a file is in its `toast.io.observation_hdf_utils`; sotodlib's ``load_toast_h5_file`` reads the same
-file. TOAST wants float64 signals, and an uncompressed ``detdata/signal``.
+What TOAST requires of a file is in its `toast.io.observation_hdf_utils`; sotodlib's
+``load_toast_h5_file`` reads the same file. TOAST wants float64 signals, and an uncompressed
+``detdata/signal``.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ from .time_ordered_data import TimeOrderedData
 SUFFIX = ".h5"
 
 FLAGS_ARE = "zonda_flags"
-"""Attribute of ``metadata/other`` in files whose flags have TOAST's bits; an earlier zonda wrote none."""
+"""Attribute of ``metadata/other`` in files whose flags have TOAST's bits; an earlier zonda wrote
+none.
+"""
 
 COLUMNS = {  # ours: (TOAST's name, TOAST's unit, SI unit)
     "fwhm": ("fwhm", "arcmin", "rad"),
@@ -44,7 +48,9 @@ COLUMNS = {  # ours: (TOAST's name, TOAST's unit, SI unit)
 }
 
 OFFSETS = ("tangent_xi", "tangent_eta")
-"""Columns of the focal plane: `Focalplane.xi` and `Focalplane.eta`, which quaternions hold to rounding."""
+"""Columns of the focal plane: `Focalplane.xi` and `Focalplane.eta`, which quaternions hold to
+rounding.
+"""
 
 
 def name_uid(name: str) -> int:
@@ -83,15 +89,21 @@ class Writer:
         """A rectangle of a stream."""
         with writing(self.path):
             self._file["detdata"][stream][detectors, samples] = values
-            if not np.isfinite(np.sum(values)):  # what is no number in one stream is not to be used in any
-                self._flags()[detectors, samples] |= np.where(np.isfinite(values), np.uint8(0), np.uint8(INVALID))
+            if not np.isfinite(
+                np.sum(values)
+            ):  # what is no number in one stream is not to be used in any
+                self._flags()[detectors, samples] |= np.where(
+                    np.isfinite(values), np.uint8(0), np.uint8(INVALID)
+                )
             self._disk.check()
 
     def _flags(self) -> Any:
         """The flags of the detectors' samples; made where they are not there yet."""
         group = self._file["detdata"]
         if "flags" not in group:
-            group.create_dataset("flags", (self._tod.n_detectors, self._tod.n_samples), "u1").attrs["units"] = ""
+            group.create_dataset("flags", (self._tod.n_detectors, self._tod.n_samples), "u1").attrs[
+                "units"
+            ] = ""
         return group["flags"]
 
     def finish(self) -> None:
@@ -104,7 +116,9 @@ class Writer:
                 _write_metadata(self._file, self._tod)
                 _write_shared(self._file, self._tod)
                 flags = self._flags()
-                for d in np.flatnonzero(self._tod.detector_flags):  # rows never written are zeros and take no room
+                for d in np.flatnonzero(
+                    self._tod.detector_flags
+                ):  # rows never written are zeros and take no room
                     flags[int(d)] |= self._tod.detector_flags[d]
             finally:
                 self._file.close()
@@ -130,7 +144,9 @@ def _write_root(file: Any, tod: TimeOrderedData) -> None:
 
 
 def _long_attribute(group: Any, name: str, text: str) -> None:
-    """An attribute beyond HDF5's 64 KiB for compact ones (a few thousand detectors) as a variable-length string."""
+    """An attribute beyond HDF5's 64 KiB for compact ones (a few thousand detectors) as a
+    variable-length string.
+    """
     import h5py
 
     group.attrs.create(name, text, dtype=h5py.string_dtype())
@@ -207,7 +223,9 @@ WEATHER = {  # ours: (TOAST's name, unit)
 
 
 def _write_weather(group: Any, weather: GroundWeather) -> None:
-    """As `toast.weather.Weather` reads it; its west wind blows towards east, and there are no clouds."""
+    """As `toast.weather.Weather` reads it; its west wind blows towards east, and there are no
+    clouds.
+    """
     group.attrs["weather_class"] = "toast.weather.Weather"
     group.attrs["weather_time"] = weather.time
     for name in ("ice_water", "liquid_water"):
@@ -231,7 +249,8 @@ def _write_metadata(file: Any, tod: TimeOrderedData) -> None:
 
 
 def nominal_noise(tod: TimeOrderedData) -> tuple[AnyFloats, AnyFloats] | None:
-    """Frequencies (n,) [Hz] and densities (n_det, n) [K^2 s] of the nominal noise; None: the detectors state none.
+    """Frequencies (n,) [Hz] and densities (n_det, n) [K^2 s] of the nominal noise; None: the
+    detectors state none.
 
     In TOAST's two-sided convention: NET^2 (1 + (knee / max(f, f_min))^slope).
     """
@@ -251,8 +270,12 @@ def _write_noise(group: Any, tod: TimeOrderedData, frequency: AnyFloats, psd: An
     group.attrs["class"] = "toast.noise.Noise"
     group.attrs["psd_units"] = "K2 s"
     weights = list(zip(names, 1 / (c["net"] ** 2 * rate), strict=True))
-    group.create_dataset("detector_weights", data=np.array(weights, f"S{width}, f4")).attrs["unit"] = "1 / K2"
-    group.create_dataset("mixing_matrix", data=np.array([(d, d, 1.0) for d in names], f"S{width}, S{width}, f4"))
+    group.create_dataset("detector_weights", data=np.array(weights, f"S{width}, f4")).attrs[
+        "unit"
+    ] = "1 / K2"
+    group.create_dataset(
+        "mixing_matrix", data=np.array([(d, d, 1.0) for d in names], f"S{width}, S{width}, f4")
+    )
     group.create_dataset("psds", data=np.vstack([frequency, psd]).astype("f4"))
     group.create_dataset("psds_indices", data=np.array([name_uid(d) for d in tod.names], np.uint32))
     group.create_dataset("psds_keys", data=np.array(names, f"S{width}"))
@@ -277,7 +300,9 @@ def _write_shared(file: Any, tod: TimeOrderedData) -> None:
     intervals.attrs["times"] = "times"
     for name, spans in tod.intervals.items():
         at = np.searchsorted(tod.seconds, np.reshape(spans, (-1, 2)).T)
-        intervals.create_dataset(name, data=tod.times[np.minimum(at, tod.n_samples - 1)])  # to the last bit those of samples
+        intervals.create_dataset(
+            name, data=tod.times[np.minimum(at, tod.n_samples - 1)]
+        )  # to the last bit those of samples
 
 
 def tod_azimuth_elevation(tod: TimeOrderedData) -> tuple[AnyFloats, AnyFloats]:

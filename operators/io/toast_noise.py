@@ -1,4 +1,6 @@
-"""White level, knee and slope of the noise models (`toast.noise.Noise`) that a file of TOAST holds as power spectra."""
+"""White level, knee and slope of the noise models (`toast.noise.Noise`) that a file of TOAST holds
+as power spectra.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +30,14 @@ def models(file: Any) -> list[str]:
     return [name for name, item in found if "mixing_matrix" in item and "psd_units" in item.attrs]
 
 
-def columns_of_model(group: Any, detectors: list[str], unused: NDArray[np.bool_], place: str) -> dict[str, Floats]:
-    """NET [K sqrt(s)], knee, minimum_frequency [Hz] and slope (n_det,) of the spectra of an open noise model.
+def columns_of_model(
+    group: Any, detectors: list[str], unused: NDArray[np.bool_], place: str
+) -> dict[str, Floats]:
+    """NET [K sqrt(s)], knee, minimum_frequency [Hz] and slope (n_det,) of the spectra of an open
+    noise model.
 
-    The spectrum of a detector is the sum of those that TOAST mixes for it, times their weights squared. Of an ``unused`` detector
-    (n_det,) they are NaN.
+    The spectrum of a detector is the sum of those that TOAST mixes for it, times their weights
+    squared. Of an ``unused`` detector (n_det,) they are NaN.
 
     Raises
     ------
@@ -48,18 +53,24 @@ def columns_of_model(group: Any, detectors: list[str], unused: NDArray[np.bool_]
         detector = detectors[number]
         parts = [(key, weight) for key, weight in mixed.get(detector, ()) if weight != 0]
         if not parts or any(key not in spectra for key, _ in parts):
-            raise InputError(f"{group.name} has no spectrum of detector {detector}", place=place, cure=CURE)
+            raise InputError(
+                f"{group.name} has no spectrum of detector {detector}", place=place, cure=CURE
+            )
         frequency = spectra[parts[0][0]][0]
         total = sum(weight**2 * np.interp(frequency, *spectra[key]) for key, weight in parts)
         digest = frequency.tobytes() + np.asarray(total).tobytes()
         if digest not in known:
-            known[digest] = fit(frequency, np.asarray(total), f"{place}, {group.name}, detector {detector}")
+            known[digest] = fit(
+                frequency, np.asarray(total), f"{place}, {group.name}, detector {detector}"
+            )
         found[:, number] = known[digest]
     return dict(zip(("net", "knee", "minimum_frequency", "slope"), found, strict=True))
 
 
 def _spectra(group: Any, place: str) -> dict[str, tuple[Floats, Floats]]:
-    """By key: frequencies [Hz], without zero, and power spectral densities [K^2 s]. One data set for each set of frequencies."""
+    """By key: frequencies [Hz], without zero, and power spectral densities [K^2 s]. One data set
+    for each set of frequencies.
+    """
     import astropy.units as u
 
     unit = str(group.attrs["psd_units"])
@@ -67,7 +78,9 @@ def _spectra(group: Any, place: str) -> dict[str, tuple[Floats, Floats]]:
         factor = u.Unit(unit).to("K2 s")
     except (ValueError, u.UnitConversionError):
         text = f"{group.name} has spectra in {unit!r}, not in K2 s"
-        raise InputError(text, place=place, cure="calibrate to kelvin, or estimate the noise: zonda noise FILE") from None
+        raise InputError(
+            text, place=place, cure="calibrate to kelvin, or estimate the noise: zonda noise FILE"
+        ) from None
     found = {}
     for name in group:
         if f"{name}_keys" in group:
@@ -84,16 +97,22 @@ def fit(frequency: Floats, power: Floats, place: str) -> Floats:
 
     That of TOAST's form (toast.noise_sim.AnalyticNoise) or of zonda's, whichever comes nearer,
 
-        P(f) = NET^2 (f^a + knee^a) / (f^a + f_min^a),    P(f) = NET^2 (1 + (knee / max(f, f_min))^a),
+        P(f) = NET^2 (f^a + knee^a) / (f^a + f_min^a),
+        P(f) = NET^2 (1 + (knee / max(f, f_min))^a),
 
-    fitted to ln P, each frequency with the share of ln f that it stands for; of many frequencies, means in bins of ln f. The
-    knee is 0 where nothing rises above the white level.
+    fitted to ln P, each frequency with the share of ln f that it stands for; of many frequencies,
+    means in bins of ln f. The knee is 0 where nothing rises above the white level.
 
     Raises InputError for a spectrum that is not positive and finite.
     """
     from scipy.optimize import least_squares
 
-    if len(frequency) < 4 or not np.isfinite(power).all() or (power <= 0).any() or (np.diff(frequency) <= 0).any():
+    if (
+        len(frequency) < 4
+        or not np.isfinite(power).all()
+        or (power <= 0).any()
+        or (np.diff(frequency) <= 0).any()
+    ):
         raise InputError("has a spectrum that is not positive and finite", place=place, cure=CURE)
     x, y = np.log(frequency), np.log(power)
     if len(x) > BINS:
@@ -118,7 +137,11 @@ def fit(frequency: Floats, power: Floats, place: str) -> Floats:
     def away(p: Any, form: Any) -> Any:
         return share * (form(p) - y)
 
-    knee = float(x[np.flatnonzero(y - white > np.log(2.0))[-1]]) if top - white > np.log(2.0) else float(x[0])
+    knee = (
+        float(x[np.flatnonzero(y - white > np.log(2.0))[-1]])
+        if top - white > np.log(2.0)
+        else float(x[0])
+    )
     limits = [white - 5, x[0] - 20, x[0] - 20, 0.05], [white + 5, x[-1] + 5, x[-1], STEEPEST]
     tried = [
         least_squares(away, np.clip(start, *limits), args=(form,), bounds=limits)

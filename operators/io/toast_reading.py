@@ -1,4 +1,6 @@
-"""TOAST 3's HDF5 observation file, layout version 2, read with h5py alone: all but the streams at once, those in rectangles."""
+"""TOAST 3's HDF5 observation file, layout version 2, read with h5py alone: all but the streams at
+once, those in rectangles.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,10 @@ from .recorded_stream import kelvin_per
 from .time_ordered_data import TimeOrderedData
 from .toast_hdf5 import COLUMNS, FLAGS_ARE, OFFSETS, WEATHER
 
-KIND, CURE = "HDF5 in TOAST's layout", "give an HDF5 file in TOAST's layout, whole, as SaveTOD writes it"
+KIND, CURE = (
+    "HDF5 in TOAST's layout",
+    "give an HDF5 file in TOAST's layout, whole, as SaveTOD writes it",
+)
 AGAIN = "save it again with TOAST 3.0 or later, or with SaveTOD"
 
 DEFAULT_MODEL = "noise_model"
@@ -56,7 +61,8 @@ class Reader:
     Raises
     ------
     InputError
-        No such file, not HDF5, another layout, an item that TOAST requires is missing, or what is in it does not fit together.
+        No such file, not HDF5, another layout, an item that TOAST requires is missing, or what is
+        in it does not fit together.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -74,7 +80,9 @@ class Reader:
             raise
 
     def read(self, stream: str, detectors: NDArray[np.intp], samples: slice) -> AnyFloats:
-        """(n, m) values of a stream: rows ``detectors`` (n,) of the file, in its own units and type."""
+        """(n, m) values of a stream: rows ``detectors`` (n,) of the file, in its own units and
+        type.
+        """
         with reading(self.place, KIND, CURE):
             found: AnyFloats = _rectangle(self._file["detdata"][stream], detectors, samples)
             return found
@@ -88,19 +96,25 @@ class Reader:
             return np.asarray(_rectangle(found, detectors, samples), np.uint8)
 
     def noise(self, model: str | None, mask: int) -> dict[str, Floats]:
-        """`TimeOrderedData.columns` of the noise of a model of the file; None: of `DEFAULT_MODEL`, nothing where there is none.
+        """`TimeOrderedData.columns` of the noise of a model of the file; None: of `DEFAULT_MODEL`,
+        nothing where there is none.
 
-        ``mask``: detectors with one of these bits are not used. Raises InputError where there is no model of this name, or it
-        cannot be used.
+        ``mask``: detectors with one of these bits are not used. Raises InputError where there is no
+        model of this name, or it cannot be used.
         """
         have = toast_noise.models(self._file)
         if model is None and DEFAULT_MODEL not in have:
             return {}
         if model is not None and model not in have:
             cure = f"choose from: {', '.join(have)}" if have else "leave noise_model out"
-            raise InputError(f"has no noise model {model!r} (/metadata)", place=self.place, cure=cure)
+            raise InputError(
+                f"has no noise model {model!r} (/metadata)", place=self.place, cure=cure
+            )
         with reading(self.place, KIND, CURE):
-            group, unused = self._file["metadata"][model or DEFAULT_MODEL], (self.tod.detector_flags & np.uint8(mask)) != 0
+            group, unused = (
+                self._file["metadata"][model or DEFAULT_MODEL],
+                (self.tod.detector_flags & np.uint8(mask)) != 0,
+            )
             return toast_noise.columns_of_model(group, self.tod.names, unused, self.place)
 
     def close(self) -> None:
@@ -113,12 +127,20 @@ class Reader:
 
         shape, found = (self.tod.n_detectors, self.tod.n_samples), {}
         for name, item in self._file["detdata"].items():
-            datasets = [item] if isinstance(item, h5py.Dataset) else [d for d in item.values() if isinstance(d, h5py.Dataset)]
+            datasets = (
+                [item]
+                if isinstance(item, h5py.Dataset)
+                else [d for d in item.values() if isinstance(d, h5py.Dataset)]
+            )
             for dataset in datasets:
                 check_size(dataset, self.place, whole=False)
-            if isinstance(item, h5py.Dataset) and (item.shape != shape or item.dtype.kind not in "fiu"):
+            if isinstance(item, h5py.Dataset) and (
+                item.shape != shape or item.dtype.kind not in "fiu"
+            ):
                 what = f"detdata/{name} is {' x '.join(map(str, item.shape))} of {item.dtype}"
-                raise InputError(f"{what}, not {shape[0]} x {shape[1]} numbers", place=self.place, cure=AGAIN)
+                raise InputError(
+                    f"{what}, not {shape[0]} x {shape[1]} numbers", place=self.place, cure=AGAIN
+                )
             if name != "flags":
                 found[name] = str(item.attrs.get("units", "K"))
         return found
@@ -130,7 +152,9 @@ def _check_parts(file: Any, place: str) -> None:
         raise InputError(f"toast_format_version is {version}, not 2", place=place, cure=AGAIN)
     for part, what in PARTS.items():
         if part not in file:
-            raise InputError(f"is incomplete or corrupt: there is {what} (/{part})", place=place, cure=CURE)
+            raise InputError(
+                f"is incomplete or corrupt: there is {what} (/{part})", place=place, cure=CURE
+            )
     for name, item in file["shared"].items():
         if name in NUMBERS and (not hasattr(item, "dtype") or item.dtype.kind not in "fiu"):
             text = f"shared/{name} holds no numbers ({getattr(item, 'dtype', 'a group')})"
@@ -145,15 +169,24 @@ def _rectangle(item: Any, rows: NDArray[np.intp], samples: slice) -> Any:
     import h5py
 
     first, last = int(rows[0]), int(rows[-1]) + 1
-    wanted = slice(first, last) if last - first == len(rows) and (np.diff(rows) == 1).all() else rows.tolist()
+    wanted = (
+        slice(first, last)
+        if last - first == len(rows) and (np.diff(rows) == 1).all()
+        else rows.tolist()
+    )
     if isinstance(item, h5py.Dataset):
         return item[wanted, samples]
     if "flacarray_format_version" not in item.attrs:
-        raise InputError(f"{item.name} is a group, not a data set", cure="save it again, uncompressed or with FLAC")
+        raise InputError(
+            f"{item.name} is a group, not a data set",
+            cure="save it again, uncompressed or with FLAC",
+        )
     try:
         from flacarray.hdf5 import read_array
     except ImportError:
-        raise InputError(f"{item.name} is compressed with FLAC", cure="pip install flacarray") from None  # the extra flac
+        raise InputError(
+            f"{item.name} is compressed with FLAC", cure="pip install flacarray"
+        ) from None  # the extra flac
     keep = np.zeros(int(item["stream_starts"].shape[0]), bool)
     keep[rows] = True
     found = np.asarray(read_array(item, keep=keep, stream_slice=samples)).reshape(len(rows), -1)
@@ -161,7 +194,8 @@ def _rectangle(item: Any, rows: NDArray[np.intp], samples: slice) -> Any:
 
 
 def read(path: str | os.PathLike[str]) -> TimeOrderedData:
-    """Read all of a file. Temperatures are converted to K; single samples that it flags (`DETECTOR_MASK`) become NaN.
+    """Read all of a file. Temperatures are converted to K; single samples that it flags
+    (`DETECTOR_MASK`) become NaN.
 
     Raises InputError as `Reader` does.
     """
@@ -172,7 +206,11 @@ def read(path: str | os.PathLike[str]) -> TimeOrderedData:
         tod = reader.tod
         every = np.arange(tod.n_detectors)
         flags = reader.flags(every, slice(0, tod.n_samples))
-        spoilt = None if flags is None else (flags & ~tod.detector_flags[:, None] & np.uint8(DETECTOR_MASK)) != 0
+        spoilt = (
+            None
+            if flags is None
+            else (flags & ~tod.detector_flags[:, None] & np.uint8(DETECTOR_MASK)) != 0
+        )
         for name in reader.streams:
             item = reader._file["detdata"][name]
             for dataset in [item] if isinstance(item, h5py.Dataset) else []:
@@ -193,7 +231,11 @@ def _read(file: Any, place: str) -> TimeOrderedData:
     import astropy.units as u
 
     instrument, shared = file["instrument"], file["shared"]
-    for dataset in (*shared.values(), *(file["intervals"].values() if "intervals" in file else ()), instrument["focalplane"]):
+    for dataset in (
+        *shared.values(),
+        *(file["intervals"].values() if "intervals" in file else ()),
+        instrument["focalplane"],
+    ):
         check_size(dataset, place)
     names = [str(d) for d in json.loads(file.attrs["observation_detectors"])]
     table, rows = _focalplane(instrument, names, place)
@@ -248,7 +290,9 @@ def columns_of(table: Any, rows: NDArray[np.intp]) -> dict[str, Floats]:
     for ours, (theirs, unit, si) in COLUMNS.items():
         if theirs in table.colnames:
             values = table[theirs][rows]
-            columns[ours] = np.array(u.Quantity(values, unit).to_value(si) if unit else values, np.float64)
+            columns[ours] = np.array(
+                u.Quantity(values, unit).to_value(si) if unit else values, np.float64
+            )
     if "pol_leakage" in table.colnames:
         epsilon = np.asarray(table["pol_leakage"][rows], np.float64)
         columns.setdefault("polarization_efficiency", (1 - epsilon) / (1 + epsilon))
@@ -259,7 +303,9 @@ def columns_of(table: Any, rows: NDArray[np.intp]) -> dict[str, Floats]:
 
 def offsets_of(table: Any, rows: NDArray[np.intp]) -> Floats | None:
     """`TimeOrderedData.offsets` of these rows of TOAST's table of detectors."""
-    return np.array([table[k][rows] for k in OFFSETS]).T if {*OFFSETS} <= set(table.colnames) else None
+    return (
+        np.array([table[k][rows] for k in OFFSETS]).T if {*OFFSETS} <= set(table.colnames) else None
+    )
 
 
 def _focalplane(instrument: Any, names: list[str], place: str) -> tuple[Any, NDArray[np.intp]]:
@@ -276,7 +322,11 @@ def _focalplane(instrument: Any, names: list[str], place: str) -> tuple[Any, NDA
             cure = "give every detector a name of its own, and save it again"
             raise InputError(f"detector {twice!r} is there twice in {of}", place=place, cure=cure)
     if lacking := [name for name in names if name not in order]:
-        raise InputError(f"detector {lacking[0]!r} has data, and no row in the focal plane", place=place, cure=AGAIN)
+        raise InputError(
+            f"detector {lacking[0]!r} has data, and no row in the focal plane",
+            place=place,
+            cure=AGAIN,
+        )
     return table, np.array([order[name] for name in names], np.intp)
 
 
@@ -285,7 +335,9 @@ def _quaternions(shared: Any, name: str) -> Floats:
 
 
 def _flags(file: Any, other: Mapping[str, Any], names: list[str]) -> tuple[Flags, Flags, bool]:
-    """Flags of samples and of detectors, in TOAST's bits; whether an earlier zonda wrote them (its *processing*: trimmed)."""
+    """Flags of samples and of detectors, in TOAST's bits; whether an earlier zonda wrote them (its
+    *processing*: trimmed).
+    """
     shared = file["shared"]
     found = json.loads(file.attrs["observation_detector_flags"])
     flags = shared["flags"][:] if "flags" in shared else np.zeros(len(shared["times"]), np.uint8)
@@ -304,13 +356,21 @@ def _intervals(file: Any, times: AnyFloats, seconds: AnyFloats) -> Intervals:
 
 
 def _weather(attributes: Any) -> GroundWeather | None:
-    """None where there is none, or one that states no numbers (TOAST's simulated weather names its distribution alone)."""
+    """None where there is none, or one that states no numbers (TOAST's simulated weather names its
+    distribution alone).
+    """
     import astropy.units as u
 
-    if not {"weather_time", *(f"weather_{theirs}" for theirs, _ in WEATHER.values())} <= set(attributes):
+    if not {"weather_time", *(f"weather_{theirs}" for theirs, _ in WEATHER.values())} <= set(
+        attributes
+    ):
         return None
     stated = {
-        ours: float(u.Quantity(str(attributes[f"weather_{theirs}"])).to_value(unit or u.dimensionless_unscaled))
+        ours: float(
+            u.Quantity(str(attributes[f"weather_{theirs}"])).to_value(
+                unit or u.dimensionless_unscaled
+            )
+        )
         for ours, (theirs, unit) in WEATHER.items()
     }
     return GroundWeather(time=float(attributes["weather_time"]), **stated)

@@ -1,12 +1,14 @@
 """Averages samples into pixels.
 
-    m_p = sum_i w_i d_i / sum_i w_i over the samples i in pixel p                                        (1)
+    m_p = sum_i w_i d_i / sum_i w_i over the samples i in pixel p                                (1)
 
 Where a `Taper` multiplied the signal by a window W, the samples weigh w W:
 
-    m_p = sum_i w_i (W d)_i / sum_i w_i W_i,   variance (sum_i w_i^2 W_i^2 sigma_i^2) / (sum_i w_i W_i)^2.  (2)
+    m_p = sum_i w_i (W d)_i / sum_i w_i W_i,
+    variance (sum_i w_i^2 W_i^2 sigma_i^2) / (sum_i w_i W_i)^2.  (2)
 
-The sums are kept in fixed point (`sums`), so that they are exact; each sample is rounded to 2^-36 K (1.5e-11 K).
+The sums are kept in fixed point (`sums`), so that they are exact; each sample is rounded to 2^-36 K
+(1.5e-11 K).
 """
 
 from __future__ import annotations
@@ -36,14 +38,25 @@ from .stokes_map import check_polarized, stokes_binnings
 from .stokes_product import StokesSums
 from .stokes_sums import StokesBinning
 from .stokes_sums import add_block as add_polarized
-from .sums import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, WEIGHT, Binning, Sums, add_image, add_list
+from .sums import (
+    FLAGGED,
+    NOT_FINITE,
+    OUTSIDE,
+    TOO_LARGE,
+    WEIGHT,
+    Binning,
+    Sums,
+    add_image,
+    add_list,
+)
 
 NO_WHITE = "what the detectors' NET would make; this scene has no white noise"
 """Said of the noise that the map of such a scene states."""
 
 LIGHTEST = 0.1
-"""Least window of a sample that is in a map. What steps behind the window added is divided by it, and the noise does not know it:
-with transients, pixels that the ends of scans alone reach were up to 100 times their noise without this limit."""
+"""Least window of a sample that is in a map. What steps behind the window added is divided by it,
+and the noise does not know it: with transients, pixels that the ends of scans alone reach were up
+to 100 times their noise without this limit."""
 
 LIGHT = "instants that count as flagged: a window leaves less than a tenth of their weight"
 """A count of the log."""
@@ -53,7 +66,11 @@ class _Requires:
     """What a `BinMap` reads: no signal where only the hits are wanted."""
 
     def __get__(self, operator: BinMap | None, owner: type) -> frozenset[str]:
-        return frozenset({"boresight"} if operator is not None and operator.contents == "hits" else {"signal", "boresight"})
+        return frozenset(
+            {"boresight"}
+            if operator is not None and operator.contents == "hits"
+            else {"signal", "boresight"}
+        )
 
 
 class _Linear:
@@ -64,7 +81,9 @@ class _Linear:
 
 
 class BinMap(MapParameters):
-    """Weighted mean of the samples in each pixel, equation (1), as a FITS image or a HEALPix map; or I, Q and U (`stokes`)."""
+    """Weighted mean of the samples in each pixel, equation (1), as a FITS image or a HEALPix map;
+    or I, Q and U (`stokes`).
+    """
 
     requires: ClassVar[Any] = _Requires()
     provides: ClassVar[frozenset[str]] = frozenset({"map"})
@@ -76,7 +95,9 @@ class BinMap(MapParameters):
     _spare: list[Sums] = PrivateAttr(default_factory=list)
 
     def check(self, data: Data) -> list[str]:
-        """The share of the samples outside a map of a given width. `Data.layouts` has what kind of map there will be."""
+        """The share of the samples outside a map of a given width. `Data.layouts` has what kind of
+        map there will be.
+        """
         data.layouts[self.label] = {"product": self.product, "kind": self.kind}
         if not data.observations:
             return []
@@ -99,7 +120,9 @@ class BinMap(MapParameters):
     def grid(self) -> Grid:
         """The pixels, known once the telescope is pointed. Raises PipelineError before."""
         if self._grid is None:
-            raise PipelineError("no grid: observe() was not called", place=self.label, cure="run it in a Pipeline")
+            raise PipelineError(
+                "no grid: observe() was not called", place=self.label, cure="run it in a Pipeline"
+            )
         return self._grid
 
     def prepare(self, observation: Observation) -> Prepared:
@@ -126,8 +149,9 @@ class BinMap(MapParameters):
 class Prepared:
     """An observation's pointing, weights and sums.
 
-    ``looking``: in which pixels its detectors look. ``binnings``: of each half (`halves_of`), one for all signals or one for each
-    with noise of its own. ``directions``: where the map tells how scans cross.
+    ``looking``: in which pixels its detectors look. ``binnings``: of each half (`halves_of`), one
+    for all signals or one for each with noise of its own. ``directions``: where the map tells how
+    scans cross.
     """
 
     looking: Looking
@@ -135,15 +159,22 @@ class Prepared:
     directions: Directions | None
 
 
-def prepared(step: BinMap, observation: Observation, reference: float, spare: list[Sums]) -> Prepared:
-    """What `BinMap.prepare` makes. ``reference``: unit of the variance, K^2; ``spare``: see `Binning`.
+def prepared(
+    step: BinMap, observation: Observation, reference: float, spare: list[Sums]
+) -> Prepared:
+    """What `BinMap.prepare` makes. ``reference``: unit of the variance, K^2; ``spare``: see
+    `Binning`.
 
-    Raises PipelineError where noise is wanted from the scatter of samples that a window has changed.
+    Raises PipelineError where noise is wanted from the scatter of samples that a window has
+    changed.
     """
     weight, noise = weights_of(step, observation, reference)
     window = observation.window if step.contents == "all" else None
     if window is not None and step.noise == "scatter":
-        text = f"noise: scatter needs samples that no window has changed; {' and '.join(observation.windows)} did"
+        text = (
+            "noise: scatter needs samples that no window has changed;"
+            f" {' and '.join(observation.windows)} did"
+        )
         raise PipelineError(text, place=step.label, cure="leave out noise: scatter, or the window")
     seen = observation.good_samples
     if window is None:
@@ -161,22 +192,44 @@ def prepared(step: BinMap, observation: Observation, reference: float, spare: li
 
 
 def binnings(
-    step: BinMap, looking: Looking, levels: tuple[Any, Any, Any], seen: NDArray[np.bool_], spare: list[Sums]
+    step: BinMap,
+    looking: Looking,
+    levels: tuple[Any, Any, Any],
+    seen: NDArray[np.bool_],
+    spare: list[Sums],
 ) -> list[Binning]:
-    """Of each half (`halves_of`), one binning for all signals or one for each; arguments as of `stokes_binnings`."""
+    """Of each half (`halves_of`), one binning for all signals or one for each; arguments as of
+    `stokes_binnings`.
+    """
     observation, (weight, noise, window) = looking.observation, levels
-    alike = step.noise == "net" and not window.size and bool((weight == weight[0]).all() and (noise == noise[0]).all())
+    alike = (
+        step.noise == "net"
+        and not window.size
+        and bool((weight == weight[0]).all() and (noise == noise[0]).all())
+    )
     signals = 1 if step.contents == "hits" else len(observation.signals)
     others, count = (0, signals) if step.noise == "scatter" else (signals - 1, 1)
     return [
-        Binning(step.grid, looking.pointing, use, (seen & samples).astype(np.uint8), window, weight, noise, alike, others, spare)
+        Binning(
+            step.grid,
+            looking.pointing,
+            use,
+            (seen & samples).astype(np.uint8),
+            window,
+            weight,
+            noise,
+            alike,
+            others,
+            spare,
+        )
         for use, samples in halves_of(step.split, observation)
         for _ in range(count)
     ]
 
 
 def weights_of(step: BinMap, observation: Observation, reference: float) -> tuple[Any, Any]:
-    """(w, w^2 times the variance of one sample) of each detector, in units of the variance ``reference`` [K^2].
+    """(w, w^2 times the variance of one sample) of each detector, in units of the variance
+    ``reference`` [K^2].
 
     Raises PipelineError where they differ by too much, or are not known.
     """
@@ -192,7 +245,9 @@ def weights_of(step: BinMap, observation: Observation, reference: float) -> tupl
         elif (net != net[0]).any():
             bad = observation.focalplane.names[int(np.flatnonzero(net <= 0)[0])]
             raise PipelineError(
-                f"detector {bad} has NET 0, which has no inverse variance", place=step.label, cure="set weights: uniform"
+                f"detector {bad} has NET 0, which has no inverse variance",
+                place=step.label,
+                cure="set weights: uniform",
             )
     weight = np.rint(weight * WEIGHT) / WEIGHT  # so that the sums of w d and of w use the same w
     if weight.max(initial=0.0) > 2.0**20 or weight.min(initial=1.0) < 2.0**-20:
@@ -216,7 +271,8 @@ def add_signals(step: BinMap, block: Block, state: Prepared, reference: float) -
         signals = [block.total(name) if whole else block.detdata[name] for name in block.signals]
         if window.size:  # no filter, no window, acted on these
             signals = [
-                signal * window if name in unfiltered else signal for name, signal in zip(block.signals, signals, strict=True)
+                signal * window if name in unfiltered else signal
+                for name, signal in zip(block.signals, signals, strict=True)
             ]
     if state.directions is not None:
         state.directions.add(signals, block)
@@ -239,18 +295,45 @@ def halves(step: BinMap, state: list[Any]) -> list[Any]:
     return [state] if step.split == "scans" else [state[:middle], state[middle:]]
 
 
-def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], where: tuple[Looking, Binning], reference: float) -> None:
+def add_block(
+    step: BinMap,
+    block: Block,
+    signals: tuple[Any, ...],
+    where: tuple[Looking, Binning],
+    reference: float,
+) -> None:
     """Add the signals of a block to this thread's sums."""
     looking, binning = where
     sums, dropped, largest = binning.of_thread()
-    plane, begin, end, rows = block.observation.focalplane, block.samples.start, block.samples.stop, block.detectors
+    plane, begin, end, rows = (
+        block.observation.focalplane,
+        block.samples.start,
+        block.samples.stop,
+        block.detectors,
+    )
     use = block.observation.good_detectors[rows] & binning.use[rows]
     how = (
-        use, binning.good[begin:end], binning.window[begin:end], binning.weight[rows], binning.noise[rows],
-        step.noise == "scatter", 1 / reference, sums, dropped, largest,
-    )  # fmt: skip
+        use,
+        binning.good[begin:end],
+        binning.window[begin:end],
+        binning.weight[rows],
+        binning.noise[rows],
+        step.noise == "scatter",
+        1 / reference,
+        sums,
+        dropped,
+        largest,
+    )
     if isinstance(binning.grid, TangentGrid):
-        add_image(signals, binning.pointing, begin, plane.xi[rows], plane.eta[rows], *binning.grid.shape, *how)
+        add_image(
+            signals,
+            binning.pointing,
+            begin,
+            plane.xi[rows],
+            plane.eta[rows],
+            *binning.grid.shape,
+            *how,
+        )
         return
     which = np.arange(rows.start, rows.stop)
     for start in range(begin, end, TILE_SAMPLES):
@@ -261,8 +344,12 @@ def add_block(step: BinMap, block: Block, signals: tuple[Any, ...], where: tuple
             dropped[FLAGGED] += (stop - start) * which.size
 
 
-def note_beams(step: BinMap, observation: Observation, sums: MapSums | StokesSums, binned: int) -> None:
-    """Note the beams of an observation's detectors, with what they weigh in the map: ``binned`` samples, as many of each."""
+def note_beams(
+    step: BinMap, observation: Observation, sums: MapSums | StokesSums, binned: int
+) -> None:
+    """Note the beams of an observation's detectors, with what they weigh in the map: ``binned``
+    samples, as many of each.
+    """
     good = observation.good_detectors
     if count := int(np.count_nonzero(good)):
         weight, _ = weights_of(step, observation, step._layout["variance"])
@@ -270,12 +357,18 @@ def note_beams(step: BinMap, observation: Observation, sums: MapSums | StokesSum
 
 
 def add_scan(step: BinMap, data: Data, observation: Observation, state: Prepared) -> None:
-    """Add a scan to the map's sums; what is dropped is counted. Raises PipelineError for samples that are too large."""
+    """Add a scan to the map's sums; what is dropped is counted. Raises PipelineError for samples
+    that are too large.
+    """
     if step.label not in data.partial:
         signals = () if step.contents == "hits" else observation.signals
         n, of_scans = step.grid.n_pixels, step.split == "scans"
         polarized = step.stokes == "IQU"
-        made = StokesSums(n, signals, of_scans) if polarized else MapSums(n, signals, step.noise == "scatter", of_scans)
+        made = (
+            StokesSums(n, signals, of_scans)
+            if polarized
+            else MapSums(n, signals, step.noise == "scatter", of_scans)
+        )
         made.coverage = Coverage.empty(n, step.crosslinking, step.scan_hits)
         data.add(step.label, made)
     sums: Any = data.partial[step.label]
@@ -290,7 +383,11 @@ def add_scan(step: BinMap, data: Data, observation: Observation, state: Prepared
     sums.unknown_variance |= step.weights == "inverse_variance" and not (used > 0).all()
     every, tally = observation.n_detectors * observation.n_samples, observation.tally
     tally.count(step.label, "samples binned", binned, every)
-    for what, number in (("outside the map", OUTSIDE), ("flagged", FLAGGED), ("not finite", NOT_FINITE)):
+    for what, number in (
+        ("outside the map", OUTSIDE),
+        ("flagged", FLAGGED),
+        ("not finite", NOT_FINITE),
+    ):
         tally.count(step.label, f"samples dropped: {what}", int(dropped[number]), every)
     if dropped[TOO_LARGE]:
         raise PipelineError(

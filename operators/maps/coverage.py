@@ -1,19 +1,21 @@
 """How scans cross in the pixels of a map, and which scan hit which.
 
-At each sample a detector moves on the sky in a direction, at the angle psi from the parallel of the map's frame (from east to
-north). In each pixel
+At each sample a detector moves on the sky in a direction, at the angle psi from the parallel of the
+map's frame (from east to north). In each pixel
 
-    X = |sum_i exp(2 i psi_i)| / n                                                                             (1)
+    X = |sum_i exp(2 i psi_i)| / n                                                               (1)
 
-over its n samples says how one-sided their directions are: 1 where all moved along one line, 0 where they crossed evenly. There
-is no weight. This is the crosslinking of ACT's maps (Aiola et al. 2020, arXiv:2007.07288: `xlink`, whose I, Q and U are n and the
-two sums, with weights) and of TOAST's `CrossLinking`. With r the direction that a detector looks at and v how it moves,
+over its n samples says how one-sided their directions are: 1 where all moved along one line, 0
+where they crossed evenly. There is no weight. This is the crosslinking of ACT's maps (Aiola et al.
+2020, arXiv:2007.07288: `xlink`, whose I, Q and U are n and the two sums, with weights) and of
+TOAST's `CrossLinking`. With r the direction that a detector looks at and v how it moves,
 
-    exp(2 i psi) = (e + i n)^2 / |e + i n|^2,   e = (x v_y - y v_x) |r|,   n = (x^2 + y^2) v_z - z (x v_x + y v_y)         (2)
+    exp(2 i psi) = (e + i n)^2 / |e + i n|^2,   e = (x v_y - y v_x) |r|,
+    n = (x^2 + y^2) v_z - z (x v_x + y v_y)         (2)
 
-needs no trigonometry. v is half the difference of the next and the last sample's r. Where a detector does not move its direction
-is not known, and the sample is left out; so is one at the pole. Cosine and sine are rounded to 2^-30: as int64 the sums are
-exact.
+needs no trigonometry. v is half the difference of the next and the last sample's r. Where a
+detector does not move its direction is not known, and the sample is left out; so is one at the
+pole. Cosine and sine are rounded to 2^-30: as int64 the sums are exact.
 """
 
 from __future__ import annotations
@@ -36,14 +38,17 @@ from .looking import Looking, tiles
 from .sums import WEIGHT, Sums
 
 SLOWEST = 1e-10
-"""Radians per sample below which a detector does not move: far below sidereal motion, far above the rounding of directions."""
+"""Radians per sample below which a detector does not move: far below sidereal motion, far above the
+rounding of directions.
+"""
 MOST_ENTRIES = 1 << 27
 """Pixels of all scans together whose hits are kept: 1 GB."""
 
 
 @dataclass
 class Directions:
-    """One observation's directions of motion, and the sums of each thread, (n_pixels, 3): n, and both parts of equation (1).
+    """One observation's directions of motion, and the sums of each thread, (n_pixels, 3): n, and
+    both parts of equation (1).
 
     Attributes
     ----------
@@ -82,14 +87,30 @@ class Directions:
             which = rows + block.detectors.start
             xi, eta = plane.xi[which], plane.eta[which]
             index = self.looking.pixels(which, start, stop)
-            add_directions(self.rays, self.motion, start, xi, eta, index, rows, finite, start - begin, self.good, sums)
+            add_directions(
+                self.rays,
+                self.motion,
+                start,
+                xi,
+                eta,
+                index,
+                rows,
+                finite,
+                start - begin,
+                self.good,
+                sums,
+            )
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
-def add_directions(rays, motion, start, xi, eta, index, rows, finite, first, good, sums):  # type: ignore[no-untyped-def]
-    """Add equation (2) of samples ``start`` .. of detectors at (xi, eta) to their pixels ``index`` (n_det, n), -1 outside.
+def add_directions(  # type: ignore[no-untyped-def]
+    rays, motion, start, xi, eta, index, rows, finite, first, good, sums
+):
+    """Add equation (2) of samples ``start`` .. of detectors at (xi, eta) to their pixels ``index``
+    (n_det, n), -1 outside.
 
-    ``finite`` (n_row, n_samp of the block): of detector ``rows[d]`` from sample ``first`` of the block on.
+    ``finite`` (n_row, n_samp of the block): of detector ``rows[d]`` from sample ``first`` of the
+    block on.
     """
     for d in range(xi.size):
         a, b = xi[d], eta[d]
@@ -134,18 +155,24 @@ class Coverage:
     @classmethod
     def empty(cls, n_pixels: int, crosslinking: bool, scan_hits: bool) -> Coverage:
         """Of no observation."""
-        return cls(np.zeros((n_pixels, 3), np.int64) if crosslinking else None, [] if scan_hits else None)
+        return cls(
+            np.zeros((n_pixels, 3), np.int64) if crosslinking else None, [] if scan_hits else None
+        )
 
     def add_directions(self, found: Directions) -> None:
         """Add an observation's directions."""
         assert self.directions is not None
         for sums in found.parts.values():
             pixels = np.flatnonzero(sums[:, 0])
-            self.directions[pixels] += sums.take(pixels, axis=0)  # of 2^33 samples in a pixel they would overflow
+            self.directions[pixels] += sums.take(
+                pixels, axis=0
+            )  # of 2^33 samples in a pixel they would overflow
         found.parts.clear()
 
     def add_hits(self, hits: Sums, place: str) -> None:
-        """Keep an observation's hits (n_pixels,). Raises PipelineError where all observations' are too many."""
+        """Keep an observation's hits (n_pixels,). Raises PipelineError where all observations' are
+        too many.
+        """
         assert self.pixels is not None
         pixels = np.flatnonzero(hits)
         self.pixels.append(pixels.astype(np.int32))
@@ -156,7 +183,8 @@ class Coverage:
         """Raise PipelineError where hits of more pixels are kept than `MOST_ENTRIES`."""
         if (entries := sum(len(some) for some in self.pixels or [])) > MOST_ENTRIES:
             raise PipelineError(
-                f"the hits of {len(self.hits)} scans in {entries:.3g} pixels would take more than 1 GB",
+                f"the hits of {len(self.hits)} scans in {entries:.3g} pixels would take more than"
+                " 1 GB",
                 place=place,
                 cure="leave out scan_hits, or make larger pixels or maps of fewer scans",
             )

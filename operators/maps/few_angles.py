@@ -1,4 +1,6 @@
-"""Warnings where I, Q and U are wanted and samples see too few angles of polarization to determine them."""
+"""Warnings where I, Q and U are wanted and samples see too few angles of polarization to determine
+them.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +21,18 @@ from zonda.core.types import Floats
 from .parameters import MapParameters
 
 SCANS, SAMPLES, DETECTORS = 32, 256, 2000
-"""How many scans, samples of all of them and detectors are looked at beforehand, at most; scans and detectors drawn at random,
-as angles may repeat from one to the next."""
+"""How many scans, samples of all of them and detectors are looked at beforehand, at most; scans and
+detectors drawn at random, as angles may repeat from one to the next."""
 CURE = (
-    "add detectors at other angles (two pairs at 45 deg whose paths cross), scans at other parallactic angles, or a HalfWavePlate"
+    "add detectors at other angles (two pairs at 45 deg whose paths cross), scans at other"
+    " parallactic angles, or a HalfWavePlate"
 )
 
 
 def warn_before(step: MapParameters, observations: Sequence[Observation]) -> None:
-    """Warn where the samples of all scans, taken together, do not determine I, Q and U within `condition_limit`."""
+    """Warn where the samples of all scans, taken together, do not determine I, Q and U within
+    `condition_limit`.
+    """
     if step.stokes != "IQU":
         return
     bands = np.unique(observations[0].focalplane.band)
@@ -38,7 +43,10 @@ def warn_before(step: MapParameters, observations: Sequence[Observation]) -> Non
         condition = _condition(np.sum(found, axis=0))
         if condition > step.condition_limit:
             of = f", {list(observations[0].instrument.cameras)[band]}" if len(bands) > 1 else ""
-            text = "all samples together see too few angles of polarization, hardly a pixel will have I, Q and U"
+            text = (
+                "all samples together see too few angles of polarization, hardly a pixel will have"
+                " I, Q and U"
+            )
             limit = f"(condition number {condition:.2g}, condition_limit {step.condition_limit:g})"
             warnings.warn(f"{step.label}{of}: {text} {limit}; {CURE}", stacklevel=4)
 
@@ -49,9 +57,16 @@ def warn_after(step: MapParameters, product: MapProduct, band: str) -> None:
         return
     hit, solved = int(np.count_nonzero(product.hits)), int(np.count_nonzero(product.known))
     if 2 * solved < hit:
-        number = f"{hit - solved} of {hit} pixels with samples have no I, Q and U" if solved else "the whole map is NaN"
+        number = (
+            f"{hit - solved} of {hit} pixels with samples have no I, Q and U"
+            if solved
+            else "the whole map is NaN"
+        )
         text = f"{number}: the samples in a pixel see too few angles of polarization"
-        warnings.warn(f"{step.label}{f', {band}' if band else ''}: {text}; {CURE}, or larger pixels", stacklevel=5)
+        warnings.warn(
+            f"{step.label}{f', {band}' if band else ''}: {text}; {CURE}, or larger pixels",
+            stacklevel=5,
+        )
 
 
 def _some(n: int, most: int) -> NDArray[np.intp]:
@@ -59,14 +74,22 @@ def _some(n: int, most: int) -> NDArray[np.intp]:
     return np.random.default_rng(0).permutation(n)[:most]
 
 
-def _weights(step: MapParameters, observation: Observation, rows: NDArray[np.intp], number: int) -> Floats:
-    """(3, 3) sum of (1, c, s) (1, c, s)^T over a ``number`` of samples of some detectors: equation (1) of `core.polarization`."""
+def _weights(
+    step: MapParameters, observation: Observation, rows: NDArray[np.intp], number: int
+) -> Floats:
+    """(3, 3) sum of (1, c, s) (1, c, s)^T over a ``number`` of samples of some detectors: equation
+    (1) of `core.polarization`.
+    """
     rows = rows[observation.good_detectors[rows]]
     rows = rows[_some(rows.size, DETECTORS)]
-    at = (np.linspace(0, 1, number) ** 2 * (observation.n_samples - 1)).astype(np.intp)  # in step with no plate
+    at = (np.linspace(0, 1, number) ** 2 * (observation.n_samples - 1)).astype(
+        np.intp
+    )  # in step with no plate
     plate = None if observation.hwp_angle is None else observation.hwp_angle[at]
     pole = frame_rotation(step.frame)[2]
-    angles = PolarizationAngles.of(replace(observation, hwp_angle=plate), observation.boresight_radec[at], pole)
+    angles = PolarizationAngles.of(
+        replace(observation, hwp_angle=plate), observation.boresight_radec[at], pole
+    )
     x, y = np.moveaxis(angles.axes[rows] @ angles.poles, 1, 0)
     turned = (x - 1j * y) ** 2
     turned /= np.maximum(abs(turned), 1e-30)
@@ -78,6 +101,8 @@ def _weights(step: MapParameters, observation: Observation, rows: NDArray[np.int
 
 
 def _condition(a: Floats) -> float:
-    """Condition number of a symmetric matrix; infinite within rounding, 0 where it is zero (all detectors are flagged)."""
+    """Condition number of a symmetric matrix; infinite within rounding, 0 where it is zero (all
+    detectors are flagged).
+    """
     low = np.linalg.eigvalsh(a)
     return float(low[-1] / low[0]) if low[0] > 1e-12 * low[-1] else math.inf if low[-1] > 0 else 0.0

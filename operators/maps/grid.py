@@ -1,4 +1,6 @@
-"""Pixel grids: tangent-plane (TAN) images and HEALPix (CAR: `plate_carree`), and which of their pixels a sample falls in."""
+"""Pixel grids: tangent-plane (TAN) images and HEALPix (CAR: `plate_carree`), and which of their
+pixels a sample falls in.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,13 @@ from numpy.typing import NDArray
 from zonda.core.compilation.jit import nb
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.projection import boresights, directions, frame_rotation, homographies, pixel_matrix
+from zonda.core.numerics.projection import (
+    boresights,
+    directions,
+    frame_rotation,
+    homographies,
+    pixel_matrix,
+)
 from zonda.core.numerics.tangent import TangentWcs
 from zonda.core.types import Floats
 
@@ -30,19 +38,33 @@ MOST_PIXELS = 1 << 28
 
 
 class TangentGrid(ImageGrid):
-    """A TAN image: its origin is the centre [rad] in ``frame``; pixels are square, east is to the left."""
+    """A TAN image: its origin is the centre [rad] in ``frame``; pixels are square, east is to the
+    left.
+    """
 
     @property
     def wcs(self) -> TangentWcs:
-        """World coordinates whose reference point is the middle of the image, for odd and even sizes alike."""
+        """World coordinates whose reference point is the middle of the image, for odd and even
+        sizes alike.
+        """
         return tangent_wcs(self.origin, self.pixel, self.shape, self.frame)
 
     def pointing(self, observation: Observation) -> Floats:
         """Homographies (9, n_samp), see `core.numerics.projection`."""
         return np.ascontiguousarray(homographies(observation.boresight_radec, self.wcs).T)
 
-    def pixels(self, pointing: Floats, first: int, stop: int, xi: Floats, eta: Floats, out: NDArray[np.int32]) -> None:
-        """Flat pixel indices (n_det, stop - first) of detectors at (xi, eta), -1 outside. Into ``out``."""
+    def pixels(
+        self,
+        pointing: Floats,
+        first: int,
+        stop: int,
+        xi: Floats,
+        eta: Floats,
+        out: NDArray[np.int32],
+    ) -> None:
+        """Flat pixel indices (n_det, stop - first) of detectors at (xi, eta), -1 outside. Into
+        ``out``.
+        """
         tangent_pixels(pointing, first, stop, xi, eta, *self.shape, out)
 
 
@@ -68,16 +90,30 @@ class HealpixGrid:
         """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame."""
         return rays(observation, self.frame)
 
-    def pixels(self, pointing: Floats, first: int, stop: int, xi: Floats, eta: Floats, out: NDArray[np.int32]) -> None:
-        """Indices (n_det, stop - first) into ``pixels_covered`` of detectors at (xi, eta), -1 elsewhere. Into ``out``."""
+    def pixels(
+        self,
+        pointing: Floats,
+        first: int,
+        stop: int,
+        xi: Floats,
+        eta: Floats,
+        out: NDArray[np.int32],
+    ) -> None:
+        """Indices (n_det, stop - first) into ``pixels_covered`` of detectors at (xi, eta), -1
+        elsewhere. Into ``out``.
+        """
         healpix_pixels(pointing, first, stop, xi, eta, self.nside, self.nest, *self.lookup, out)
 
 
 Grid = TangentGrid | PlateCarreeGrid | HealpixGrid
 
 
-def tangent_wcs(centre: tuple[float, float], pixel: float, shape: tuple[int, int], frame: str = "icrs") -> TangentWcs:
-    """World coordinates of a TAN image: (ny, nx) pixels of side ``pixel`` [rad] around ``centre`` [rad, in ``frame``]."""
+def tangent_wcs(
+    centre: tuple[float, float], pixel: float, shape: tuple[int, int], frame: str = "icrs"
+) -> TangentWcs:
+    """World coordinates of a TAN image: (ny, nx) pixels of side ``pixel`` [rad] around ``centre``
+    [rad, in ``frame``].
+    """
     if frame not in ("icrs", "galactic"):
         raise InputError(f"unknown frame {frame!r}", place="map grid", cure="use icrs or galactic")
     step = math.degrees(pixel)
@@ -94,12 +130,20 @@ def in_frame(icrs: tuple[float, float], frame: str) -> tuple[float, float]:
     ra, dec = icrs
     if frame == "icrs":
         return ra, dec
-    x, y, z = frame_rotation(frame) @ [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
+    x, y, z = frame_rotation(frame) @ [
+        math.cos(dec) * math.cos(ra),
+        math.cos(dec) * math.sin(ra),
+        math.sin(dec),
+    ]
     return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
 
 
-def covering_extent(observations: Sequence[Observation], centre: tuple[float, float], frame: str) -> tuple[float, float]:
-    """Half-width and half-height [rad, on the tangent plane] of the TAN image around ``centre`` that holds every sample."""
+def covering_extent(
+    observations: Sequence[Observation], centre: tuple[float, float], frame: str
+) -> tuple[float, float]:
+    """Half-width and half-height [rad, on the tangent plane] of the TAN image around ``centre``
+    that holds every sample.
+    """
     matrix = pixel_matrix(tangent_wcs(centre, 1.0, (1, 1), frame))
     half = np.zeros(2)
     for observation in observations:
@@ -109,28 +153,38 @@ def covering_extent(observations: Sequence[Observation], centre: tuple[float, fl
 
 
 def _extent(observation: Observation, samples: slice, matrix: Floats) -> Floats:
-    """(2,) how far from the centre some samples reach; ``matrix`` turns ICRS directions towards it."""
+    """(2,) how far from the centre some samples reach; ``matrix`` turns ICRS directions towards
+    it.
+    """
     x, y, ahead = matrix @ boresights(observation.boresight_radec[samples])
     if (ahead < math.cos(math.radians(75.0))).any():
         raise InputError(
-            f"{observation.name} reaches more than 75 deg from the map centre, too far for a tangent plane",
+            f"{observation.name} reaches more than 75 deg from the map centre, too far for a"
+            " tangent plane",
             place="map grid",
             cure="give width and height, or nside for a HEALPix map",
         )
     offset = np.stack([x, y]) / ahead
     reach = observation.focalplane.radius
     far = np.hypot(*offset) * reach
-    # a circle of radius r around a point at tangent distance s appears at most r (1 + s^2) / (1 - r s) wide
+    # a circle of radius r around a point at tangent distance s appears at most r (1 + s^2) / (1 - r
+    # s) wide
     if (far > 0.5).any():
         raise InputError(
-            "the field of view is too wide for a tangent plane", place="map grid", cure="give nside for a HEALPix map"
+            "the field of view is too wide for a tangent plane",
+            place="map grid",
+            cure="give nside for a HEALPix map",
         )
     grown = reach * (1 + (offset**2).sum(axis=0)) / (1 - far)
     return np.asarray((np.abs(offset) + grown).max(axis=1))
 
 
-def covered_healpix(observations: Sequence[Observation], nside: int, nest: bool, frame: str) -> NDArray[np.int64]:
-    """Pixels that any sample may hit: discs of the field of view's radius around the boresights. Sorted."""
+def covered_healpix(
+    observations: Sequence[Observation], nside: int, nest: bool, frame: str
+) -> NDArray[np.int64]:
+    """Pixels that any sample may hit: discs of the field of view's radius around the boresights.
+    Sorted.
+    """
     import healpy
 
     size = float(healpy.nside2resol(nside))
@@ -138,14 +192,20 @@ def covered_healpix(observations: Sequence[Observation], nside: int, nest: bool,
     for observation in observations:
         radius = math.atan(observation.focalplane.radius)
         spacing = max(radius, size) / 4
-        boresight = directions(observation.boresight_radec, np.zeros(1), np.zeros(1))[0] @ frame_rotation(frame).T
+        boresight = (
+            directions(observation.boresight_radec, np.zeros(1), np.zeros(1))[0]
+            @ frame_rotation(frame).T
+        )
         fine = 1
         while fine < nside and healpy.nside2resol(fine) > spacing:
             fine *= 2
         cells, first = np.unique(healpy.vec2pix(fine, *boresight.T), return_index=True)
         del cells
         margin = radius + float(healpy.max_pixrad(fine)) * 2
-        pieces += [healpy.query_disc(nside, boresight[k], min(margin, math.pi), inclusive=True, nest=nest) for k in first]
+        pieces += [
+            healpy.query_disc(nside, boresight[k], min(margin, math.pi), inclusive=True, nest=nest)
+            for k in first
+        ]
         pieces = [_union(pieces)]
     return np.asarray(pieces[0], np.int64)
 
@@ -163,9 +223,13 @@ def _union(pieces: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract"})
 def tangent_pixels(h, first, stop, xi, eta, ny, nx, out):  # type: ignore[no-untyped-def]
-    """Flat index y nx + x of the pixel that holds each sample, -1 outside the image or behind it. ``h`` (9, n_samp)."""
+    """Flat index y nx + x of the pixel that holds each sample, -1 outside the image or behind it.
+    ``h`` (9, n_samp).
+    """
     wide, high, row_length = np.float64(nx), np.float64(ny), np.int32(nx)
-    for low in range(first, stop, 256):  # these coefficients stay in the first cache for all detectors
+    for low in range(
+        first, stop, 256
+    ):  # these coefficients stay in the first cache for all detectors
         end = min(low + 256, stop)
         h0, h1, h2 = h[0, low:end], h[1, low:end], h[2, low:end]
         h3, h4, h5 = h[3, low:end], h[4, low:end], h[5, low:end]

@@ -24,19 +24,26 @@ Mask = NDArray[np.bool_]
 
 
 def halves_of(split: Split, observation: Observation) -> list[tuple[Mask, Mask]]:
-    """(detectors (n_det,), samples (n_samp,)) of either half of an observation; of `scans` one part, which is all of it.
+    """(detectors (n_det,), samples (n_samp,)) of either half of an observation; of `scans` one
+    part, which is all of it.
 
-    Detectors are counted as in the focal plane, azimuth is that of the boresight. `radii`: the half of the detectors nearest to
-    the middle of the focal plane, and the rest; detectors at one radius are counted as in the focal plane.
+    Detectors are counted as in the focal plane, azimuth is that of the boresight. `radii`: the half
+    of the detectors nearest to the middle of the focal plane, and the rest; detectors at one radius
+    are counted as in the focal plane.
     """
-    detectors, samples = np.ones(observation.n_detectors, np.bool_), np.ones(observation.n_samples, np.bool_)
+    detectors, samples = (
+        np.ones(observation.n_detectors, np.bool_),
+        np.ones(observation.n_samples, np.bool_),
+    )
     if split == "scans":
         return [(detectors, samples)]
     if split == "detectors":
         even = np.arange(detectors.size) % 2 == 0
         return [(even, samples), (~even, samples)]
     if split == "radii":
-        order = np.argsort(np.hypot(observation.focalplane.xi, observation.focalplane.eta), kind="stable")
+        order = np.argsort(
+            np.hypot(observation.focalplane.xi, observation.focalplane.eta), kind="stable"
+        )
         inner = np.zeros_like(detectors)
         inner[order[: (order.size + 1) // 2]] = True
         return [(inner, samples), (~inner, samples)]

@@ -1,15 +1,18 @@
-"""HEALPix pixels of samples, compiled: the projection of Gorski et al. (2005, ApJ 622, 759), and which covered pixel it is.
+"""HEALPix pixels of samples, compiled: the projection of Gorski et al. (2005, ApJ 622, 759), and
+which covered pixel it is.
 
-With t = 2 phi / pi in [0, 4), sections 5 and 6 there: in the equatorial belt, |z| <= 2/3, a pixel lies between the lines
+With t = 2 phi / pi in [0, 4), sections 5 and 6 there: in the equatorial belt, |z| <= 2/3, a pixel
+lies between the lines
 
-    j+ = floor(nside (t + 1/2 - 3 z / 4)),   j- = floor(nside (t + 1/2 + 3 z / 4));                                  (1)
+    j+ = floor(nside (t + 1/2 - 3 z / 4)),   j- = floor(nside (t + 1/2 + 3 z / 4));   (1)
 
 in a polar cap, with t' = t - floor(t) and s = nside sqrt(3 (1 - |z|)),
 
-    j+ = floor(t' s),   j- = floor((1 - t') s).                                                                      (2)
+    j+ = floor(t' s),
+    j- = floor((1 - t') s).                                                                      (2)
 
-1 - |z| = (x^2 + y^2) / (1 + |z|) has no cancellation at the poles. Directions closer to a border than rounding,
-some 1e-15 in z and phi, may fall in the pixel beyond it.
+1 - |z| = (x^2 + y^2) / (1 + |z|) has no cancellation at the poles. Directions closer to a border
+than rounding, some 1e-15 in z and phi, may fall in the pixel beyond it.
 """
 
 from __future__ import annotations
@@ -29,18 +32,24 @@ MOST_PAGES = 1 << 22
 
 
 class Lookup(NamedTuple):
-    """Where a pixel lies among the sorted ``covered`` ones: by pages of 64 pixels from page ``first`` on, or by search."""
+    """Where a pixel lies among the sorted ``covered`` ones: by pages of 64 pixels from page
+    ``first`` on, or by search.
+    """
 
     covered: NDArray[np.int64]
     first: int
     pages: NDArray[np.int32]
-    """Number of each page in ``places``; -1: no covered pixel. Empty where a binary search is made instead."""
+    """Number of each page in ``places``; -1: no covered pixel. Empty where a binary search is made
+    instead.
+    """
     places: NDArray[np.int32]
     """Index among the covered pixels of each pixel of each page, -1 elsewhere."""
 
 
 def lookup(covered: NDArray[np.int64]) -> Lookup:
-    """The table for ``covered`` (sorted): pages where they take at most some 64 bytes per pixel, else none."""
+    """The table for ``covered`` (sorted): pages where they take at most some 64 bytes per pixel,
+    else none.
+    """
     searched = Lookup(covered, 0, np.empty(0, np.int32), np.empty(0, np.int32))
     if not covered.size:
         return searched
@@ -58,10 +67,21 @@ def lookup(covered: NDArray[np.int64]) -> Lookup:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract"})
-def healpix_pixels(h, first, stop, xi, eta, nside, nest, covered, page, pages, places, out):  # type: ignore[no-untyped-def]
-    """Index among the covered pixels of the pixel that holds each sample, -1 elsewhere. ``h`` (9, n_samp); see `Lookup`."""
-    height, cap, quarter, pixel = np.empty(256), np.empty(256), np.empty(256), np.empty(256, np.int64)
-    for low in range(first, stop, 256):  # these coefficients stay in the first cache for all detectors
+def healpix_pixels(  # type: ignore[no-untyped-def]
+    h, first, stop, xi, eta, nside, nest, covered, page, pages, places, out
+):
+    """Index among the covered pixels of the pixel that holds each sample, -1 elsewhere. ``h`` (9,
+    n_samp); see `Lookup`.
+    """
+    height, cap, quarter, pixel = (
+        np.empty(256),
+        np.empty(256),
+        np.empty(256),
+        np.empty(256, np.int64),
+    )
+    for low in range(
+        first, stop, 256
+    ):  # these coefficients stay in the first cache for all detectors
         end = min(low + 256, stop)
         for d in range(xi.size):
             _angles(h, low, end, xi[d], eta[d], height, cap, quarter)
@@ -77,9 +97,11 @@ def healpix_pixels(h, first, stop, xi, eta, nside, nest, covered, page, pages, p
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract"})
 def _angles(h, low, end, a, b, height, cap, quarter):  # type: ignore[no-untyped-def]
-    """z, s / nside (equation 2) and t of the directions of one detector, without branches: in vectors.
+    """z, s / nside (equation 2) and t of the directions of one detector, without branches: in
+    vectors.
 
-    The arc tangent is Cephes' (Moshier 1989): a rational function below 0.66, pi / 4 + atan((r - 1) / (r + 1)) above.
+    The arc tangent is Cephes' (Moshier 1989): a rational function below 0.66, pi / 4 + atan((r - 1)
+    / (r + 1)) above.
     """
     h0, h1, h2 = h[0, low:end], h[1, low:end], h[2, low:end]
     h3, h4, h5 = h[3, low:end], h[4, low:end], h[5, low:end]
@@ -99,7 +121,10 @@ def _angles(h, low, end, a, b, height, cap, quarter):  # type: ignore[no-untyped
         near = small > 0.66 * large
         r = (small - large if near else small) / (small + large if near else large)
         q = r * r
-        p = (((-8.750608600031904e-1 * q - 1.615753718733365e1) * q - 7.500855792314705e1) * q - 1.2288666844901361e2) * q
+        p = (
+            ((-8.750608600031904e-1 * q - 1.615753718733365e1) * q - 7.500855792314705e1) * q
+            - 1.2288666844901361e2
+        ) * q
         p = (p - 6.485021904942025e1) * q
         w = (((q + 2.485846490142306e1) * q + 1.650270098316988e2) * q + 4.328810604912903e2) * q
         w = (w + 4.853903996359137e2) * q + 1.9455065714826139e2
@@ -122,7 +147,9 @@ def _ring(z, s, t, nside):  # type: ignore[no-untyped-def]
     part = t - np.int64(t)
     ring = np.int64(part * s) + np.int64((1.0 - part) * s) + 1  # from the nearest pole on
     column = np.int64(t * ring)
-    return (2 * ring * (ring - 1) if z > 0.0 else 12 * nside * nside - 2 * ring * (ring + 1)) + column
+    return (
+        2 * ring * (ring - 1) if z > 0.0 else 12 * nside * nside - 2 * ring * (ring + 1)
+    ) + column
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
@@ -155,12 +182,18 @@ def _spread(v):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
 def _by_pages(pixel, page, pages, places, found):  # type: ignore[no-untyped-def]
-    """Index of each pixel among the covered ones, -1 where it is none of them, from the pages of `Lookup`."""
+    """Index of each pixel among the covered ones, -1 where it is none of them, from the pages of
+    `Lookup`.
+    """
     count = np.int64(pages.size)
     for k in range(found.size):
         where = (pixel[k] >> PAGE) - page
         number = np.int64(pages[where]) if 0 <= where < count else np.int64(-1)
-        found[k] = places[(number << PAGE) + (pixel[k] & ((1 << PAGE) - 1))] if number >= 0 else np.int32(-1)
+        found[k] = (
+            places[(number << PAGE) + (pixel[k] & ((1 << PAGE) - 1))]
+            if number >= 0
+            else np.int32(-1)
+        )
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
@@ -174,4 +207,6 @@ def _by_search(pixel, covered, found):  # type: ignore[no-untyped-def]
                 low = middle + 1
             else:
                 high = middle
-        found[k] = np.int32(low) if low < covered.size and covered[low] == pixel[k] else np.int32(-1)
+        found[k] = (
+            np.int32(low) if low < covered.size and covered[low] == pixel[k] else np.int32(-1)
+        )

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """An image: ``shape`` (ny, nx), pixels of side ``pixel`` [rad] in ``frame``; its projection says what ``origin`` is."""
+    """An image: ``shape`` (ny, nx), pixels of side ``pixel`` [rad] in ``frame``; its projection
+    says what ``origin`` is.
+    """
 
     origin: tuple[float, float]
     pixel: float
@@ -29,5 +31,9 @@ class ImageGrid:
 
 
 def rays(observation: Observation, frame: str) -> Floats:
-    """Coefficients (9, n_samp) of the directions that detectors look at, in ``frame`` (`ray_coefficients`)."""
-    return np.ascontiguousarray(ray_coefficients(observation.boresight_radec, frame_rotation(frame)).T)
+    """Coefficients (9, n_samp) of the directions that detectors look at, in ``frame``
+    (`ray_coefficients`).
+    """
+    return np.ascontiguousarray(
+        ray_coefficients(observation.boresight_radec, frame_rotation(frame)).T
+    )

@@ -1,7 +1,7 @@
 """In which pixels detectors look: tile by tile, and once for all bands that look at the same.
 
-Pixels are known by a fingerprint of all numbers that they are made of, not by where these come from: two bands take one another's
-only where each would make the same bits by itself.
+Pixels are known by a fingerprint of all numbers that they are made of, not by where these come
+from: two bands take one another's only where each would make the same bits by itself.
 """
 
 from __future__ import annotations
@@ -49,7 +49,11 @@ class Looking:
         if self.observation.shared is None:
             return None
         grid, plane = self.grid, self.observation.focalplane
-        known = (grid.nside, grid.nest, fingerprint(grid.pixels_covered)) if isinstance(grid, HealpixGrid) else grid
+        known = (
+            (grid.nside, grid.nest, fingerprint(grid.pixels_covered))
+            if isinstance(grid, HealpixGrid)
+            else grid
+        )
         return "pixels", known, fingerprint(self.pointing, plane.xi, plane.eta)
 
     def pixels(self, which: NDArray[np.intp], start: int, stop: int) -> NDArray[np.int32]:
@@ -63,7 +67,12 @@ class Looking:
 
         if self.key is None:
             return make()
-        return of_block(self.observation.shared, (self.key, which.tobytes(), start, stop), 4 * shape[0] * shape[1], make)
+        return of_block(
+            self.observation.shared,
+            (self.key, which.tobytes(), start, stop),
+            4 * shape[0] * shape[1],
+            make,
+        )
 
 
 def fingerprint(*arrays: NDArray[Any]) -> bytes:
@@ -76,7 +85,8 @@ def fingerprint(*arrays: NDArray[Any]) -> bytes:
 
 
 def tiles(block: Block, used: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.int64], int, int]]:
-    """Of a block, in pieces that stay in the cache: rows of the detectors that are ``used`` (n_det,), first and last sample.
+    """Of a block, in pieces that stay in the cache: rows of the detectors that are ``used``
+    (n_det,), first and last sample.
 
     Which detectors are together does not depend on the others.
     """

@@ -1,4 +1,6 @@
-"""`MapSums`: the partial product of a map, sums in pixels of two halves of the samples for every signal."""
+"""`MapSums`: the partial product of a map, sums in pixels of two halves of the samples for every
+signal.
+"""
 
 from __future__ import annotations
 
@@ -31,16 +33,22 @@ class MapSums(PixelSums):
     Attributes
     ----------
     sums
-        (2, n_pixels, 4) of the complete signal, columns as in `sums`; hits and weights are those of all signals.
+        (2, n_pixels, 4) of the complete signal, columns as in `sums`; hits and weights are those of
+        all signals.
     others
-        By stream of the further signals, (2, n_pixels): the sums of w d; ``scatters``: their noise terms, where they differ.
+        By stream of the further signals, (2, n_pixels): the sums of w d; ``scatters``: their noise
+        terms, where they differ.
     """
 
-    def __init__(self, n_pixels: int, signals: Sequence[str], scatter: bool = False, of_scans: bool = True) -> None:
+    def __init__(
+        self, n_pixels: int, signals: Sequence[str], scatter: bool = False, of_scans: bool = True
+    ) -> None:
         super().__init__(signals, of_scans)
         self.sums = zeros(n_pixels, 4)
         self.others = {name: zeros(n_pixels, 1)[..., 0] for name in self.signals[1:]}
-        self.scatters = {name: zeros(n_pixels, 1)[..., 0] for name in self.others} if scatter else {}
+        self.scatters = (
+            {name: zeros(n_pixels, 1)[..., 0] for name in self.others} if scatter else {}
+        )
         self._largest = np.zeros(4)
         self._largest_of = dict.fromkeys(self.others, 0.0)
         self._deepest = [0, 0]
@@ -50,8 +58,11 @@ class MapSums(PixelSums):
         """See `PixelSums.hits`."""
         return self.sums[:, :, HITS]
 
-    def add(self, observation: Observation, halves: Sequence[Sequence[Binning]], place: str) -> tuple[int, Sums]:
-        """Add one observation: (samples binned, dropped (4,)). Raises PipelineError where a sum may have overflowed.
+    def add(
+        self, observation: Observation, halves: Sequence[Sequence[Binning]], place: str
+    ) -> tuple[int, Sums]:
+        """Add one observation: (samples binned, dropped (4,)). Raises PipelineError where a sum may
+        have overflowed.
 
         ``halves``: the binnings of either half of its samples, or one list of all of them.
         """
@@ -67,7 +78,11 @@ class MapSums(PixelSums):
         """Add binnings to the half ``k``: (samples binned, dropped (4,))."""
         names = list(self.others)
         together = binnings[0].n_others == len(names)
-        others = np.stack([self.others[name][k] for name in names], axis=1) if names and together else _nothing(self.sums[k])
+        others = (
+            np.stack([self.others[name][k] for name in names], axis=1)
+            if names and together
+            else _nothing(self.sums[k])
+        )
         inside, deepest, dropped, largest = binnings[0].fold(self.sums[k], others)
         for n, name in enumerate(names):
             if together:
@@ -86,10 +101,16 @@ class MapSums(PixelSums):
     def total(self, stream: str, pixels: slice) -> Sums:
         """Both halves together of some pixels of a signal, (n, 4)."""
         both = len(self.scans) > 1 or not self.of_scans
-        return self.half(stream, 0, pixels) + self.half(stream, 1, pixels) if both else self.half(stream, 0, pixels)
+        return (
+            self.half(stream, 0, pixels) + self.half(stream, 1, pixels)
+            if both
+            else self.half(stream, 0, pixels)
+        )
 
     def half(self, stream: str, k: int, pixels: slice) -> Sums:
-        """Sums of the first (0: even scans) or the second half (1: odd scans) in some pixels of a signal, (n, 4)."""
+        """Sums of the first (0: even scans) or the second half (1: odd scans) in some pixels of a
+        signal, (n, 4).
+        """
         found: Sums = self.sums[k, pixels]
         if stream in self.others:
             found = found.copy()
@@ -99,11 +120,15 @@ class MapSums(PixelSums):
         return found
 
     def __iadd__(self, other: MapSums) -> MapSums:
-        """Add sums whose scans follow those that are here: exact, so that their order does not matter but for which are even."""
+        """Add sums whose scans follow those that are here: exact, so that their order does not
+        matter but for which are even.
+        """
         shift = self.shift
         for k in range(2):
             half, pixels = (k + shift) % 2, np.flatnonzero(other.sums[k, :, HITS])
-            merged = other.sums[k].take(pixels, axis=0) + (self.sums[half].take(pixels, axis=0) if self.scans else 0)
+            merged = other.sums[k].take(pixels, axis=0) + (
+                self.sums[half].take(pixels, axis=0) if self.scans else 0
+            )
             self.sums[half][pixels] = merged
             for mine, theirs in ((self.others, other.others), (self.scatters, other.scatters)):
                 for name in mine:
@@ -118,8 +143,10 @@ class MapSums(PixelSums):
     def arrays(self) -> dict[str, Any]:
         """Numbers of the pixels with hits, and their sums."""
         found = self._about() | {
-            "largest": self._largest, "largest_of": dict(self._largest_of), "scatter": bool(self.scatters),
-        }  # fmt: skip
+            "largest": self._largest,
+            "largest_of": dict(self._largest_of),
+            "scatter": bool(self.scatters),
+        }
         for k in range(2):
             pixels = np.flatnonzero(self.sums[k, :, HITS])
             found |= {f"pixels_{k}": pixels, f"sums_{k}": self.sums[k].take(pixels, axis=0)}
@@ -132,7 +159,12 @@ class MapSums(PixelSums):
     @classmethod
     def of(cls, arrays: Mapping[str, Any]) -> MapSums:
         """See `Product.of`."""
-        made = cls(int(arrays["n_pixels"]), list(arrays["signals"]), bool(arrays["scatter"]), bool(arrays["of_scans"]))
+        made = cls(
+            int(arrays["n_pixels"]),
+            list(arrays["signals"]),
+            bool(arrays["scatter"]),
+            bool(arrays["of_scans"]),
+        )
         made._with_about(arrays)
         made._largest_of = {name: float(high) for name, high in arrays["largest_of"].items()}
         for k in range(2):
@@ -142,16 +174,22 @@ class MapSums(PixelSums):
                 made.others[name][k][pixels] = arrays[f"others_{k}_{n}"]
                 if made.scatters:
                     made.scatters[name][k][pixels] = arrays[f"scatters_{k}_{n}"]
-            made._note(k, int(sums[:, HITS].max(initial=0)), np.asarray(arrays["largest"], np.float64))
+            made._note(
+                k, int(sums[:, HITS].max(initial=0)), np.asarray(arrays["largest"], np.float64)
+            )
         return made
 
     def subtract(self, stream: str, parts: Sequence[str]) -> None:
-        """The sums of w d are subtracted, exactly. Its largest term is at most the sum of theirs."""
+        """The sums of w d are subtracted, exactly. Its largest term is at most the sum of
+        theirs.
+        """
         rest = self.sums[..., DATA].copy()
         for part in parts:
             rest -= self.others[part]
         self.others[stream] = rest
-        self._largest_of[stream] = float(self._largest[DATA]) + sum(self._largest_of[part] for part in parts)
+        self._largest_of[stream] = float(self._largest[DATA]) + sum(
+            self._largest_of[part] for part in parts
+        )
         self.signals += (stream,)
         self._check(stream)
 

@@ -1,7 +1,8 @@
 """Several targets in one image: about which point, and how large.
 
-Each target has a field, a rectangle on its own tangent plane. A gnomonic projection turns straight edges into straight edges, so
-that the box around the images of the corners on another tangent plane holds the whole field.
+Each target has a field, a rectangle on its own tangent plane. A gnomonic projection turns straight
+edges into straight edges, so that the box around the images of the corners on another tangent plane
+holds the whole field.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ FARTHEST = math.radians(45.0)
 
 
 def whole_of(fields: Sequence[Sequence[float]], place: str) -> tuple[float, float, float, float]:
-    """(longitude, latitude, half the width, half the height) [rad] of the image that holds all fields, each given likewise.
+    """(longitude, latitude, half the width, half the height) [rad] of the image that holds all
+    fields, each given likewise.
 
     Of one field: itself. Raises InputError where they are too far apart for an image.
     """
@@ -65,6 +67,9 @@ def _projected(corners: Floats, axes: Floats, place: str) -> Floats:
         raise InputError(
             f"the scans reach over {apart:.0f} deg, too far for one image (tangent plane)",
             place=place,
-            cure="give nside for a HEALPix map, or make a map of each target (in a campaign: leave target out of combine)",
+            cure=(
+                "give nside for a HEALPix map, or make a map of each target (in a campaign: leave"
+                " target out of combine)"
+            ),
         )
     return np.asarray([east / ahead, north / ahead])

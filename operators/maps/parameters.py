@@ -28,10 +28,12 @@ class MapParameters(MapMaker):
     height: Angle | None = Field(None, gt=0)
     """Height of the map; where absent, the width if that is given, else it covers the scans."""
     centre: Target | None = None
-    """Centre of the map; where absent, the scans' target; of several targets the middle of all scans."""
+    """Centre of the map; where absent, the scans' target; of several targets the middle of all
+    scans.
+    """
     projection: Literal["TAN", "CAR"] = "TAN"
-    """Projection of the image: TAN (tangent plane), or CAR (plate carrée), whose pixels are those of pixell's full-sky maps.
-    Width and height are those on the sky at the centre."""
+    """Projection of the image: TAN (tangent plane), or CAR (plate carrée), whose pixels are those
+    of pixell's full-sky maps. Width and height are those on the sky at the centre."""
     frame: Literal["icrs", "galactic"] = "icrs"
     """Celestial frame of the map."""
     nside: int | None = Field(None, ge=1, le=2**20)
@@ -41,28 +43,28 @@ class MapParameters(MapMaker):
     weights: Literal["uniform", "inverse_variance"] = "inverse_variance"
     """Equal weights, or weights by the inverse variance that follows from each detector's NET."""
     noise: Literal["net", "scatter"] = "net"
-    """Noise of each pixel: from the detectors' NET, or from the scatter of its samples. From the NET also where the scene has no
-    white noise; the log then says so."""
+    """Noise of each pixel: from the detectors' NET, or from the scatter of its samples. From the
+    NET also where the scene has no white noise; the log then says so."""
     stokes: Literal["I", "IQU"] = "I"
-    """`IQU`: solve for I, Q and U in each pixel (polarized detectors are needed). Q and U are COSMO's, from the meridians of
-    `frame`."""
+    """`IQU`: solve for I, Q and U in each pixel (polarized detectors are needed). Q and U are
+    COSMO's, from the meridians of `frame`."""
     condition_limit: float = Field(1000.0, ge=2.0, le=1e7)
-    """Of I, Q and U: pixels in which the condition number of the samples' angles is larger are NaN, and counted. It is 2 at
-    best, where polarizers are perfect."""
+    """Of I, Q and U: pixels in which the condition number of the samples' angles is larger are NaN,
+    and counted. It is 2 at best, where polarizers are perfect."""
     contents: Literal["all", "hits"] = "all"
     """`hits`: count the samples in each pixel, no more; a plan then simulates no signal at all."""
     half_difference: bool | Split = True
-    """Keep two halves of the samples apart and make a noise map of their difference: even and odd scans (`scans` or true; needs
-    two), even and odd detectors, the first and the second half of each scan, samples of rising and of falling
-    azimuth, or inner and outer detectors (`radii`)."""
+    """Keep two halves of the samples apart and make a noise map of their difference: even and odd
+    scans (`scans` or true; needs two), even and odd detectors, the first and the second half of
+    each scan, samples of rising and of falling azimuth, or inner and outer detectors (`radii`)."""
     crosslinking: bool = False
-    """Keep the directions in which detectors moved through each pixel: 0 where they crossed evenly, 1 where all moved along one
-    line."""
+    """Keep the directions in which detectors moved through each pixel: 0 where they crossed evenly,
+    1 where all moved along one line."""
     scan_hits: bool = False
     """Keep the hits of each scan in each pixel."""
     smooth: Angle | Literal["beam"] | None = None
-    """Smooth the map with a Gaussian of this FWHM, or with the instrument's beam; the resolution is then that of both, added in
-    quadrature."""
+    """Smooth the map with a Gaussian of this FWHM, or with the instrument's beam; the resolution is
+    then that of both, added in quadrature."""
     product: str = Field("map", pattern=r"^[A-Za-z0-9_]+$")
     """Name of the map among the products."""
 
@@ -74,7 +76,11 @@ class MapParameters(MapMaker):
     @property
     def split(self) -> Split:
         """Which halves are kept apart."""
-        return "scans" if isinstance(self.half_difference, bool) or self.contents == "hits" else self.half_difference
+        return (
+            "scans"
+            if isinstance(self.half_difference, bool) or self.contents == "hits"
+            else self.half_difference
+        )
 
     @field_validator("nside")
     @classmethod
@@ -87,7 +93,9 @@ class MapParameters(MapMaker):
     @classmethod
     def _on_the_sky(cls, value: Target | None) -> Target | None:
         if value is not None and value.frame == "horizontal":
-            raise ValueError("the centre of a map must be fixed on the sky; give ICRS or galactic coordinates")
+            raise ValueError(
+                "the centre of a map must be fixed on the sky; give ICRS or galactic coordinates"
+            )
         return value
 
     @field_validator("smooth")
@@ -96,7 +104,10 @@ class MapParameters(MapMaker):
         if isinstance(value, float) and value <= 0:
             raise ValueError("smooth must be positive; leave it out for no smoothing")
         if isinstance(value, float) and value > WIDEST_SMOOTH:
-            raise ValueError(f"smooth must be at most {WIDEST_SMOOTH:g} rad (5.7 deg): the kernel would be wider than any map")
+            raise ValueError(
+                f"smooth must be at most {WIDEST_SMOOTH:g} rad (5.7 deg): the kernel would be wider"
+                " than any map"
+            )
         return value
 
     @model_validator(mode="after")
@@ -106,22 +117,36 @@ class MapParameters(MapMaker):
                 raise ValueError("condition_limit belongs to stokes: IQU")
             return self
         if self.noise == "scatter":
-            raise ValueError("noise: scatter is for maps of I; with stokes: IQU noise follows from the NET")
+            raise ValueError(
+                "noise: scatter is for maps of I; with stokes: IQU noise follows from the NET"
+            )
         if self.contents == "hits":
             raise ValueError("contents: hits needs no stokes: IQU; leave that out")
         if self.half_difference == "detectors":
             cure = "set half_difference to scans, halves, directions or radii"
-            raise ValueError(f"even and odd detectors of pairs see one polarization each, which determines no I, Q and U; {cure}")
+            raise ValueError(
+                "even and odd detectors of pairs see one polarization each, which determines no I,"
+                f" Q and U; {cure}"
+            )
         return self
 
     @model_validator(mode="after")
     def _one_grid(self) -> MapParameters:
         image_only = {"pixel", "width", "height", "centre", "projection"} & self.model_fields_set
         if self.nside is not None and image_only:
-            raise ValueError(f"{sorted(image_only)[0]} belongs to an image, nside to a HEALPix map; give one of them")
-        if self.projection == "CAR" and abs(self.pixel * (n := round(math.pi / self.pixel)) / math.pi - 1) > 1e-9:
+            raise ValueError(
+                f"{sorted(image_only)[0]} belongs to an image, nside to a HEALPix map; give one of"
+                " them"
+            )
+        if (
+            self.projection == "CAR"
+            and abs(self.pixel * (n := round(math.pi / self.pixel)) / math.pi - 1) > 1e-9
+        ):
             cure = f"{math.degrees(math.pi / n) * 3600:.9g} arcsec"
-            raise ValueError(f"in a CAR map 180 deg must be a whole number of pixels; the nearest that fits is {cure}")
+            raise ValueError(
+                "in a CAR map 180 deg must be a whole number of pixels; the nearest that fits is"
+                f" {cure}"
+            )
         if self.nside is None and "ordering" in self.model_fields_set:
             raise ValueError("ordering belongs to a HEALPix map; give nside too")
         return self

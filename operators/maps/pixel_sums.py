@@ -23,7 +23,8 @@ MOST = 2.0**62
 
 
 class PixelSums(Product):
-    """Sums of two halves of the samples: of the even and of the odd observations, in their order, or of halves of each.
+    """Sums of two halves of the samples: of the even and of the odd observations, in their order,
+    or of halves of each.
 
     Attributes
     ----------
@@ -79,10 +80,15 @@ class PixelSums(Product):
     def _about(self) -> dict[str, Any]:
         """What `_with_about` takes."""
         return {
-            "signals": list(self.signals), "of_scans": self.of_scans, "scans": list(self.scans), "rates": sorted(self.rates),
-            "unknown_variance": self.unknown_variance, "n_pixels": self.hits.shape[1], "coverage": self.coverage.arrays(),
+            "signals": list(self.signals),
+            "of_scans": self.of_scans,
+            "scans": list(self.scans),
+            "rates": sorted(self.rates),
+            "unknown_variance": self.unknown_variance,
+            "n_pixels": self.hits.shape[1],
+            "coverage": self.coverage.arrays(),
             "beams": [list(pair) for pair in sorted(self.beams.weights.items())],
-        }  # fmt: skip
+        }
 
     def _with_about(self, arrays: Mapping[str, Any]) -> Self:
         self.scans, self.rates = list(arrays["scans"]), {float(rate) for rate in arrays["rates"]}
@@ -92,11 +98,14 @@ class PixelSums(Product):
         return self
 
     def _refuse_overflow(self, largest: float, highest: float, place: str) -> None:
-        """Raise PipelineError where a sum may have overflowed: ``largest`` term of any, ``highest`` of those of the data."""
+        """Raise PipelineError where a sum may have overflowed: ``largest`` term of any, ``highest``
+        of those of the data.
+        """
         deepest = float(self.hits.sum(axis=0).max(initial=0))
         if deepest * largest >= MOST:
             raise PipelineError(
-                f"{deepest:.0f} samples in one pixel, each up to {highest / VALUE:.3g} K, overflow the map's fixed-point sums",
+                f"{deepest:.0f} samples in one pixel, each up to {highest / VALUE:.3g} K, overflow"
+                " the map's fixed-point sums",
                 place=place,
                 cure="make smaller pixels, or put a HighpassFilter before",
             )

@@ -20,13 +20,19 @@ class BinMapPlanning(Planning[BinMap]):
     smaller = "choose a larger pixel or a smaller width"
 
     def traits(self, observation: Observation) -> Traits:
-        """Size of the pixels (the root of their solid angle in the middle of the map), and the weights."""
+        """Size of the pixels (the root of their solid angle in the middle of the map), and the
+        weights.
+        """
         step = self.operator
         side = math.sqrt(4 * math.pi / (12 * step.nside**2)) if step.nside else step.pixel
         if step.projection == "CAR" and not step.nside:
-            _, latitude = in_frame(step.centre.icrs() if step.centre else observation.centre, step.frame)
+            _, latitude = in_frame(
+                step.centre.icrs() if step.centre else observation.centre, step.frame
+            )
             side *= math.sqrt(max(math.cos(latitude), side))
-        return Traits(pixel=side, weighs=step.weights == "inverse_variance" and step.contents == "all")
+        return Traits(
+            pixel=side, weighs=step.weights == "inverse_variance" and step.contents == "all"
+        )
 
     def estimate(self, context: Context) -> Estimate:
         """Its cost."""
@@ -37,12 +43,16 @@ class BinMapPlanning(Planning[BinMap]):
         return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, more + 3.2e-9))
 
     def shares_blocks(self, observation: Observation) -> bool:
-        """The pixels, which `looking.Looking` finds once; those of an image of I are found where they are used."""
+        """The pixels, which `looking.Looking` finds once; those of an image of I are found where
+        they are used.
+        """
         step = self.operator
         return step.stokes == "IQU" or step.crosslinking or not isinstance(step.grid, TangentGrid)
 
     def memory(self, observation: Observation) -> int:
-        """Sums of two threads, two halves, the products of all signals; and the pointing, twice while it is laid out."""
+        """Sums of two threads, two halves, the products of all signals; and the pointing, twice
+        while it is laid out.
+        """
         others = len(observation.signals) - 1
         more = (96 if self.operator.crosslinking else 0) + (40 if self.operator.scan_hits else 0)
         samples = 144 * observation.n_samples if self.operator.crosslinking else 0
@@ -50,6 +60,10 @@ class BinMapPlanning(Planning[BinMap]):
 
     def _sums(self, observation: Observation, others: int) -> int:
         """Of ``others`` signals beside the first."""
-        if self.operator.stokes == "IQU":  # hits, six sums and three for each signal, in two threads and two halves
-            return (32 * (7 + 3 * (1 + others)) + 240 * (1 + others)) * self.operator.grid.n_pixels + 250 * observation.n_samples
+        if (
+            self.operator.stokes == "IQU"
+        ):  # hits, six sums and three for each signal, in two threads and two halves
+            return (
+                32 * (7 + 3 * (1 + others)) + 240 * (1 + others)
+            ) * self.operator.grid.n_pixels + 250 * observation.n_samples
         return (128 + 72 * others) * self.operator.grid.n_pixels + 150 * observation.n_samples

@@ -1,10 +1,14 @@
-"""Plate carrée (CAR) images, whose pixels are pixels of the full-sky maps that `pixell` makes by default (Fejer's first rule).
+"""Plate carrée (CAR) images, whose pixels are pixels of the full-sky maps that `pixell` makes by
+default (Fejer's first rule).
 
-With N = pi / pixel rows from pole to pole, an integer, pixel (i, j) of the full sky, counted from 0, lies at
+With N = pi / pixel rows from pole to pole, an integer, pixel (i, j) of the full sky, counted from
+0, lies at
 
-    longitude = pi - i pixel,   latitude = (j + 1/2) pixel - pi / 2.                                              (1)
+    longitude = pi - i pixel,
+    latitude = (j + 1/2) pixel - pi / 2.                                              (1)
 
-An image is a rectangle of these pixels: two images of one pixel size fit together without interpolation.
+An image is a rectangle of these pixels: two images of one pixel size fit together without
+interpolation.
 """
 
 from __future__ import annotations
@@ -30,7 +34,9 @@ if TYPE_CHECKING:
     from .parameters import MapParameters
 
 Box = tuple[int, int, int, int]
-"""First column, first row, last column, last row of full-sky pixels, columns possibly beyond 0 to 2 N - 1."""
+"""First column, first row, last column, last row of full-sky pixels, columns possibly beyond 0 to 2
+N - 1.
+"""
 
 
 @dataclass(frozen=True)
@@ -41,12 +47,16 @@ class PlateCarreeGrid(ImageGrid):
 
     @property
     def wcs(self) -> Any:
-        """An `astropy.wcs.WCS` whose reference point lies on the equator, at the longitude of the image's middle column."""
+        """An `astropy.wcs.WCS` whose reference point lies on the equator, at the longitude of the
+        image's middle column.
+        """
         from astropy.wcs import WCS
 
         rows, degrees, middle = rows_of(self.pixel), 180.0 / rows_of(self.pixel), self.shape[1] // 2
         wcs = WCS(naxis=2)
-        wcs.wcs.ctype = ["RA---CAR", "DEC--CAR"] if self.frame == "icrs" else ["GLON-CAR", "GLAT-CAR"]
+        wcs.wcs.ctype = (
+            ["RA---CAR", "DEC--CAR"] if self.frame == "icrs" else ["GLON-CAR", "GLAT-CAR"]
+        )
         wcs.wcs.crval = [(180.0 - (self.origin[0] + middle) * degrees) % 360.0, 0.0]
         wcs.wcs.crpix = [middle + 1.0, rows / 2 + 0.5 - self.origin[1]]
         wcs.wcs.cdelt = [-degrees, degrees]
@@ -59,9 +69,21 @@ class PlateCarreeGrid(ImageGrid):
         """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame."""
         return rays(observation, self.frame)
 
-    def pixels(self, pointing: Floats, first: int, stop: int, xi: Floats, eta: Floats, out: NDArray[np.int32]) -> None:
-        """Flat pixel indices (n_det, stop - first) of detectors at (xi, eta), -1 outside. Into ``out``."""
-        plate_carree_pixels(pointing, first, stop, xi, eta, rows_of(self.pixel), *self.origin, *self.shape, out)
+    def pixels(
+        self,
+        pointing: Floats,
+        first: int,
+        stop: int,
+        xi: Floats,
+        eta: Floats,
+        out: NDArray[np.int32],
+    ) -> None:
+        """Flat pixel indices (n_det, stop - first) of detectors at (xi, eta), -1 outside. Into
+        ``out``.
+        """
+        plate_carree_pixels(
+            pointing, first, stop, xi, eta, rows_of(self.pixel), *self.origin, *self.shape, out
+        )
 
 
 def rows_of(pixel: float) -> int:
@@ -78,18 +100,24 @@ def grid_of_box(box: Sequence[int], pixel: float, frame: str) -> PlateCarreeGrid
 def centre_of(box: Sequence[int], pixel: float) -> tuple[float, float]:
     """(longitude, latitude) [rad] of a box's centre, equation (1)."""
     left, low, right, high = box
-    return (math.pi - (left + right) / 2 * pixel) % (2 * math.pi), ((low + high + 1) * pixel - math.pi) / 2
+    return (math.pi - (left + right) / 2 * pixel) % (2 * math.pi), (
+        (low + high + 1) * pixel - math.pi
+    ) / 2
 
 
 def box_about(step: MapParameters, centre: tuple[float, float]) -> Box:
-    """The pixels of a map of given width and height on the sky about ``centre`` (longitude, latitude) [rad]."""
+    """The pixels of a map of given width and height on the sky about ``centre`` (longitude,
+    latitude) [rad].
+    """
     assert step.width is not None
     height = step.height if step.height is not None else step.width
     half = min(step.width / 2 / max(math.cos(centre[1]), 1e-9), math.pi)
     return _box(centre[0], half, centre[1] - height / 2, centre[1] + height / 2, step.pixel)
 
 
-def box_of(step: MapParameters, observations: Sequence[Observation], before: Sequence[int] | None) -> Box:
+def box_of(
+    step: MapParameters, observations: Sequence[Observation], before: Sequence[int] | None
+) -> Box:
     """The pixels that hold every sample of the observations, and those of a box ``before``."""
     turn = frame_rotation(step.frame)
     found = None if before is None else _whole(before, step.pixel)
@@ -97,19 +125,27 @@ def box_of(step: MapParameters, observations: Sequence[Observation], before: Seq
         reach = math.atan(observation.focalplane.radius)
         for some in chunks(observation.n_samples):
             x, y, z = turn @ boresights(observation.boresight_radec[some])
-            found = _joined(found, _around(np.arctan2(y, x), np.arcsin(np.clip(z, -1.0, 1.0)), reach, step.pixel), step.pixel)
+            found = _joined(
+                found,
+                _around(np.arctan2(y, x), np.arcsin(np.clip(z, -1.0, 1.0)), reach, step.pixel),
+                step.pixel,
+            )
     assert found is not None
     return found
 
 
 def share_outside(grid: PlateCarreeGrid, observations: Sequence[Observation]) -> float:
-    """About what share of all samples lies beyond the image; some hundred instants of each scan are looked at."""
+    """About what share of all samples lies beyond the image; some hundred instants of each scan are
+    looked at.
+    """
     beyond = looked = 0
     for observation in observations:
         at = slice(None, None, -(-observation.n_samples // 256))
         plane = observation.focalplane
         rows = slice(None, None, -(-len(plane) // 37))
-        h = np.ascontiguousarray(ray_coefficients(observation.boresight_radec[at], frame_rotation(grid.frame)).T)
+        h = np.ascontiguousarray(
+            ray_coefficients(observation.boresight_radec[at], frame_rotation(grid.frame)).T
+        )
         index = np.empty((len(plane.xi[rows]), h.shape[1]), np.int32)
         grid.pixels(h, 0, h.shape[1], plane.xi[rows], plane.eta[rows], index)
         beyond, looked = beyond + int(np.count_nonzero(index < 0)), looked + index.size
@@ -117,7 +153,9 @@ def share_outside(grid: PlateCarreeGrid, observations: Sequence[Observation]) ->
 
 
 def middle_of(fields: Sequence[Sequence[float]], pixel: float) -> tuple[float, float]:
-    """(longitude, latitude) [rad] of the only one of some fields (`map_layout.fields_of`), else the middle of all of them."""
+    """(longitude, latitude) [rad] of the only one of some fields (`map_layout.fields_of`), else the
+    middle of all of them.
+    """
     if len(fields) == 1:
         return fields[0][0], fields[0][1]
     found = None
@@ -146,10 +184,14 @@ def _around(longitude: Floats, latitude: Floats, reach: float, pixel: float) -> 
 
 
 def _box(middle: float, half: float, low: float, high: float, pixel: float) -> Box:
-    """Pixels within ``half`` [rad] of a longitude and between two latitudes, with one more on each side."""
+    """Pixels within ``half`` [rad] of a longitude and between two latitudes, with one more on each
+    side.
+    """
     rows = rows_of(pixel)
     begin, end = ((latitude + math.pi / 2) / math.pi * rows for latitude in (low, high))
-    left, right = ((math.pi - longitude) / math.pi * rows for longitude in (middle + half, middle - half))
+    left, right = (
+        (math.pi - longitude) / math.pi * rows for longitude in (middle + half, middle - half)
+    )
     bottom, top = max(math.floor(begin) - 1, 0), min(math.floor(end) + 1, rows - 1)
     return _whole((round(left) - 1, bottom, round(right) + 1, top), pixel)
 
@@ -170,19 +212,33 @@ def _joined(one: Box | None, other: Box, pixel: float) -> Box:
         return other
     around = 2 * rows_of(pixel)
     shifted = [(other[0] + k * around, other[2] + k * around) for k in (-1, 0, 1)]
-    left, right = min(((min(one[0], a), max(one[2], b)) for a, b in shifted), key=lambda ends: ends[1] - ends[0])
+    left, right = min(
+        ((min(one[0], a), max(one[2], b)) for a, b in shifted), key=lambda ends: ends[1] - ends[0]
+    )
     return _whole((left, min(one[1], other[1]), right, max(one[3], other[3])), pixel)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def plate_carree_pixels(h, first, stop, xi, eta, rows, column, row, ny, nx, out):  # type: ignore[no-untyped-def]
-    """Flat index y nx + x of the pixel that holds each sample, -1 outside the image, equation (1). ``h`` (9, n_samp)."""
+def plate_carree_pixels(  # type: ignore[no-untyped-def]
+    h, first, stop, xi, eta, rows, column, row, ny, nx, out
+):
+    """Flat index y nx + x of the pixel that holds each sample, -1 outside the image, equation (1).
+    ``h`` (9, n_samp).
+    """
     per_radian, around = rows / math.pi, 2 * rows
     for d in range(xi.size):
         for t in range(first, stop):
             x = h[0, t] * xi[d] + h[1, t] * eta[d] + h[2, t]
             y = h[3, t] * xi[d] + h[4, t] * eta[d] + h[5, t]
             z = h[6, t] * xi[d] + h[7, t] * eta[d] + h[8, t]
-            i = (np.int64(np.floor((math.pi - math.atan2(y, x)) * per_radian + 0.5)) - column) % around
-            j = min(np.int64((math.atan2(z, math.sqrt(x * x + y * y)) + math.pi / 2) * per_radian), rows - 1) - row
+            i = (
+                np.int64(np.floor((math.pi - math.atan2(y, x)) * per_radian + 0.5)) - column
+            ) % around
+            j = (
+                min(
+                    np.int64((math.atan2(z, math.sqrt(x * x + y * y)) + math.pi / 2) * per_radian),
+                    rows - 1,
+                )
+                - row
+            )
             out[d, t - first] = np.int32(j * nx + i) if i < nx and 0 <= j < ny else np.int32(-1)

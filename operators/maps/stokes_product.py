@@ -42,8 +42,11 @@ class StokesSums(PixelSums):
         """See `PixelSums.hits`."""
         return self.matrix[:, :, HIT]
 
-    def add(self, observation: Observation, halves: Sequence[StokesBinning], place: str) -> tuple[int, Sums]:
-        """Add one observation: (samples binned, dropped (4,)). Raises PipelineError where a sum may have overflowed.
+    def add(
+        self, observation: Observation, halves: Sequence[StokesBinning], place: str
+    ) -> tuple[int, Sums]:
+        """Add one observation: (samples binned, dropped (4,)). Raises PipelineError where a sum may
+        have overflowed.
 
         ``halves``: the binning of either half of its samples, or one of all of them.
         """
@@ -75,7 +78,9 @@ class StokesSums(PixelSums):
         return self.noise
 
     def parts(self, stream: str, pixels: slice, half: int | None = None) -> tuple[Sums, Sums, Sums]:
-        """(hits and A (n, 7), b (n, 3), N (n, 6)) in some pixels of a signal; of one half, or of both together."""
+        """(hits and A (n, 7), b (n, 3), N (n, 6)) in some pixels of a signal; of one half, or of
+        both together.
+        """
         noise = self.matrix[..., MATRIX] if self.noise is None else self.noise
         found = [array[:, pixels] for array in (self.matrix, self.data[stream], noise)]
         a, b, n = (x[0] + x[1] if half is None else x[half] for x in found)
@@ -102,12 +107,17 @@ class StokesSums(PixelSums):
     def arrays(self) -> dict[str, Any]:
         """Numbers of the pixels with hits, and their sums."""
         found = self._about() | {
-            "largest": self._largest, "largest_of": dict(self._largest_of), "own_noise": self.noise is not None,
-        }  # fmt: skip
+            "largest": self._largest,
+            "largest_of": dict(self._largest_of),
+            "own_noise": self.noise is not None,
+        }
         for k in range(2):
             pixels = np.flatnonzero(self.matrix[k, :, HIT])
             found |= {f"pixels_{k}": pixels, f"matrix_{k}": self.matrix[k].take(pixels, axis=0)}
-            found |= {f"data_{k}_{n}": data[k].take(pixels, axis=0) for n, data in enumerate(self.data.values())}
+            found |= {
+                f"data_{k}_{n}": data[k].take(pixels, axis=0)
+                for n, data in enumerate(self.data.values())
+            }
             if self.noise is not None:
                 found[f"noise_{k}"] = self.noise[k].take(pixels, axis=0)
         return found
@@ -117,7 +127,10 @@ class StokesSums(PixelSums):
         """See `Product.of`."""
         made = cls(int(arrays["n_pixels"]), list(arrays["signals"]), bool(arrays["of_scans"]))
         made._with_about(arrays)
-        made._note(float(arrays["largest"]), {name: float(high) for name, high in arrays["largest_of"].items()})
+        made._note(
+            float(arrays["largest"]),
+            {name: float(high) for name, high in arrays["largest_of"].items()},
+        )
         if arrays["own_noise"]:
             made._with_noise()
         for k in range(2):
@@ -135,7 +148,9 @@ class StokesSums(PixelSums):
         for part in parts:
             rest -= self.data[part]
         self.data[stream] = rest
-        self._largest_of[stream] = self._largest_of[self.signals[0]] + sum(self._largest_of[part] for part in parts)
+        self._largest_of[stream] = self._largest_of[self.signals[0]] + sum(
+            self._largest_of[part] for part in parts
+        )
         self.signals += (stream,)
         self._check(stream)
 

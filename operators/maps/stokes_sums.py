@@ -1,19 +1,22 @@
 """Sums of samples in pixels for maps of I, Q and U, in fixed point.
 
-A sample of a detector of polarization efficiency p whose axis is at the angle psi from the meridian sees (1, c, s) of (I, Q, U),
-with c = p cos 2 psi and s = p sin 2 psi (`core.polarization`). The map m that fits the samples d of a pixel best, with weights w:
+A sample of a detector of polarization efficiency p whose axis is at the angle psi from the meridian
+sees (1, c, s) of (I, Q, U), with c = p cos 2 psi and s = p sin 2 psi (`core.polarization`). The map
+m that fits the samples d of a pixel best, with weights w:
 
-    A m = b,   A = sum_i w_i (1, c_i, s_i)^T (1, c_i, s_i),   b = sum_i w_i d_i (1, c_i, s_i).                    (1)
+    A m = b,   A = sum_i w_i (1, c_i, s_i)^T (1, c_i, s_i),
+    b = sum_i w_i d_i (1, c_i, s_i).                    (1)
 
-A window W that multiplied the signals multiplies w in A (`bin_map`, equation 2). The covariance of m is
+A window W that multiplied the signals multiplies w in A (`bin_map`, equation 2). The covariance of
+m is
 
-    A^-1 N A^-1,   N = sum_i w_i^2 W_i^2 sigma_i^2 (1, c_i, s_i)^T (1, c_i, s_i),                                  (2)
+    A^-1 N A^-1,   N = sum_i w_i^2 W_i^2 sigma_i^2 (1, c_i, s_i)^T (1, c_i, s_i),   (2)
 
 which is A^-1 where weights are inverse variances and there is no window: then N is not added up.
 
-c and s are rounded to 2^-30 once, and all sums take the rounded ones. The terms of A and N are rounded to 2^-30 of the reference
-weight, those of b to 2^-36 K: as int64 the sums are exact, and their bits depend neither on the order of blocks nor on the number
-of threads or workers.
+c and s are rounded to 2^-30 once, and all sums take the rounded ones. The terms of A and N are
+rounded to 2^-30 of the reference weight, those of b to 2^-36 K: as int64 the sums are exact, and
+their bits depend neither on the order of blocks nor on the number of threads or workers.
 """
 
 from __future__ import annotations
@@ -49,7 +52,8 @@ class StokesBinning:
     looking, angles
         The same of both halves of an observation.
     use, good, window
-        (n_det,), (n_samp,) uint8: which detectors and samples count; (n_samp,): `Observation.window`, or (0,).
+        (n_det,), (n_samp,) uint8: which detectors and samples count; (n_samp,):
+        `Observation.window`, or (0,).
     weight, noise
         (n_det,): w, and w^2 times the variance of one sample, in units of the reference variance.
     signals
@@ -59,8 +63,8 @@ class StokesBinning:
     spare
         Arrays of zeros that served the scans before.
     key
-        The same for all bands whose samples fall in the same pixels at the same angles, whatever their weights; None where there
-        is no other band.
+        The same for all bands whose samples fall in the same pixels at the same angles, whatever
+        their weights; None where there is no other band.
     """
 
     looking: Looking
@@ -93,7 +97,9 @@ class StokesBinning:
             return self.parts[mine]
 
     def taken(self) -> Iterator[tuple[NDArray[np.int64], Sums, Sums, Floats]]:
-        """Of each thread: numbers of the pixels with hits, their sums, dropped (4,), largest (2,). They are zero afterwards."""
+        """Of each thread: numbers of the pixels with hits, their sums, dropped (4,), largest (2,).
+        They are zero afterwards.
+        """
         for sums, dropped, largest in self.parts.values():
             pixels = np.flatnonzero(sums[:, HIT])
             found = sums.take(pixels, axis=0)
@@ -104,7 +110,9 @@ class StokesBinning:
 
 
 class Part(NamedTuple):
-    """What a block adds to the sums of one band: ``signals`` (n_det, n) each, ``binnings`` of the halves of its observation."""
+    """What a block adds to the sums of one band: ``signals`` (n_det, n) each, ``binnings`` of the
+    halves of its observation.
+    """
 
     binnings: Sequence[StokesBinning]
     signals: tuple[AnyFloats, ...]
@@ -113,17 +121,28 @@ class Part(NamedTuple):
     def used(self) -> list[NDArray[np.bool_]]:
         """Of each half, which of the block's detectors count (n_det,)."""
         rows = self.block.detectors
-        return [one.use[rows] & self.block.observation.good_detectors[rows] for one in self.binnings]
+        return [
+            one.use[rows] & self.block.observation.good_detectors[rows] for one in self.binnings
+        ]
 
 
-def add_block(label: str, binnings: Sequence[StokesBinning], signals: tuple[AnyFloats, ...], block: Block) -> None:
-    """Add a block's ``signals``, each (n_det, n), to this thread's sums of the ``binnings`` of one observation.
+def add_block(
+    label: str, binnings: Sequence[StokesBinning], signals: tuple[AnyFloats, ...], block: Block
+) -> None:
+    """Add a block's ``signals``, each (n_det, n), to this thread's sums of the ``binnings`` of one
+    observation.
 
-    It is done for all bands in step at once whose samples fall in the same pixels at the same angles (`StokesBinning.key`).
+    It is done for all bands in step at once whose samples fall in the same pixels at the same
+    angles (`StokesBinning.key`).
     """
     part, shared, key = Part(binnings, signals, block), block.observation.shared, binnings[0].key
     same = key, len(signals), signals[0].dtype.str
-    if key is None or not block.stays or shared is None or not shared.put_off(label, same, part, add_parts):
+    if (
+        key is None
+        or not block.stays
+        or shared is None
+        or not shared.put_off(label, same, part, add_parts)
+    ):
         add_parts([part])
 
 
@@ -136,7 +155,11 @@ def add_parts(parts: Sequence[Part]) -> None:
                 add_parts([part])
             return
     block, looking, a = parts[0].block, parts[0].binnings[0].looking, parts[0].binnings[0].angles
-    detectors, samples, halves = block.detectors, block.samples, list(zip(*(part.binnings for part in parts), strict=True))
+    detectors, samples, halves = (
+        block.detectors,
+        block.samples,
+        list(zip(*(part.binnings for part in parts), strict=True)),
+    )
     angles = a.poles, a.axes, a.plate, a.gamma, block.observation.focalplane.polarization_efficiency
     signals = tuple(signal for part in parts for signal in part.signals)
     sums = [[band.of_thread() for band in half] for half in halves]
@@ -151,8 +174,15 @@ def add_parts(parts: Sequence[Part]) -> None:
                 for _, dropped, _ in mine:
                     dropped[FLAGGED] += (stop - start) * at.size
             elif at.size:
-                index = looking.pixels(rows + detectors.start, start, stop) if index is None else index
+                index = (
+                    looking.pixels(rows + detectors.start, start, stop) if index is None else index
+                )
                 which = rows[at] + detectors.start
                 where = start - samples.start, rows[at], at, index, angles, which, start
-                bands = tuple((band.weight[which], band.noise[which], *own) for band, own in zip(half, mine, strict=True))
-                add_stokes(signals, *where, good, half[0].window[start:stop], half[0].own_noise, bands)
+                bands = tuple(
+                    (band.weight[which], band.noise[which], *own)
+                    for band, own in zip(half, mine, strict=True)
+                )
+                add_stokes(
+                    signals, *where, good, half[0].window[start:stop], half[0].own_noise, bands
+                )

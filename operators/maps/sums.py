@@ -1,15 +1,16 @@
 """Sums of samples in pixels, in fixed point.
 
-    D_p = sum_i rint(2^36 w_i d_i),   H_p = sum_i 1,   W_p = sum_i rint(2^30 w_i),   N_p = sum_i rint(2^30 n_i)         (1)
+    D_p = sum_i rint(2^36 w_i d_i),   H_p = sum_i 1,   W_p = sum_i rint(2^30 w_i),
+    N_p = sum_i rint(2^30 n_i)         (1)
 
-over the samples i in pixel p, as int64: exact, so that their bits depend neither on the order of blocks nor on the number of
-threads. Where all detectors weigh the same, W and N follow from H.
+over the samples i in pixel p, as int64: exact, so that their bits depend neither on the order of
+blocks nor on the number of threads. Where all detectors weigh the same, W and N follow from H.
 
-A thread's sums have a border for what falls outside of the map: a pixel all around an image, row 0 before a list of pixels.
-What is flagged, not finite or too large goes to row 0 too.
+A thread's sums have a border for what falls outside of the map: a pixel all around an image, row 0
+before a list of pixels. What is flagged, not finite or too large goes to row 0 too.
 
-Several signals share pixels, hits, weights and noise: the data of those beside the first follow its columns. What one of them
-lacks is dropped from all.
+Several signals share pixels, hits, weights and noise: the data of those beside the first follow its
+columns. What one of them lacks is dropped from all.
 """
 
 from __future__ import annotations
@@ -40,13 +41,19 @@ MAGIC = 1.5 * 2.0**52
 MAGIC_BITS = 0x4338000000000000
 
 TOGETHER = 4
-"""Detectors that are scattered side by side: successive samples of one often fall in the same pixel and would wait for it."""
+"""Detectors that are scattered side by side: successive samples of one often fall in the same pixel
+and would wait for it.
+"""
 
 AHEAD = 16
-"""Samples by which pixels are fetched beforehand: those of a map larger than the cache come from memory."""
+"""Samples by which pixels are fetched beforehand: those of a map larger than the cache come from
+memory.
+"""
 
 AT_ONCE = 256
-"""Samples of `TOGETHER` detectors whose pixels, values and pointing are in the first cache together."""
+"""Samples of `TOGETHER` detectors whose pixels, values and pointing are in the first cache
+together.
+"""
 
 DATA, HITS, WEIGHTS, NOISE = range(4)
 OUTSIDE, FLAGGED, NOT_FINITE, TOO_LARGE = range(4)
@@ -61,15 +68,18 @@ class Binning:
     pointing
         What `Grid.pointing` gives.
     use, good, window
-        (n_det,), (n_samp,) uint8: which detectors (of its half) and samples count; (n_samp,): `Observation.window`, or (0,).
+        (n_det,), (n_samp,) uint8: which detectors (of its half) and samples count; (n_samp,):
+        `Observation.window`, or (0,).
     weight, noise
         (n_det,): w, and w^2 times the variance of one sample, in units of the reference variance.
     alike
         All detectors weigh the same: the sums of weights and noise follow from the hits.
     n_others
-        Number of signals beside the first: sums of w d of their own, after the columns of the first.
+        Number of signals beside the first: sums of w d of their own, after the columns of the
+        first.
     spare
-        Arrays of zeros that served the scans before: touching fresh memory costs more than the sums.
+        Arrays of zeros that served the scans before: touching fresh memory costs more than the
+        sums.
     """
 
     grid: Grid
@@ -86,7 +96,9 @@ class Binning:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def of_thread(self) -> tuple[Sums, Sums, Floats]:
-        """(sums with their border (n, 4 + n_others, or 2 + n_others where alike), dropped (4,), largest (4 + n_others,))."""
+        """(sums with their border (n, 4 + n_others, or 2 + n_others where alike), dropped (4,),
+        largest (4 + n_others,)).
+        """
         mine = threading.get_ident()
         with self.lock:
             if mine not in self.parts:
@@ -106,11 +118,14 @@ class Binning:
         return sums
 
     def fold(self, half: Sums, others: Sums) -> tuple[int, int, Sums, Floats]:
-        """Add all threads' sums to ``half`` (n_pixels, 4) and ``others`` (n_pixels, n_others): (samples binned, most in a pixel,
-        dropped (4,), largest (4 + n_others,))."""
+        """Add all threads' sums to ``half`` (n_pixels, 4) and ``others`` (n_pixels, n_others):
+        (samples binned, most in a pixel, dropped (4,), largest (4 + n_others,))."""
         dropped, largest, inside, deepest = np.zeros(4, np.int64), np.zeros(4 + self.n_others), 0, 0
         rows, columns = self.grid.shape if isinstance(self.grid, TangentGrid) else (0, 0)
-        weight, noise = (np.int64(np.rint(x[0] * WEIGHT)) if x.size else np.int64(0) for x in (self.weight, self.noise))
+        weight, noise = (
+            np.int64(np.rint(x[0] * WEIGHT)) if x.size else np.int64(0)
+            for x in (self.weight, self.noise)
+        )
         for sums, part_dropped, part_largest in self.parts.values():
             binned, outside, most = _fold(sums, rows, columns, weight, noise, half, others)
             inside, deepest = inside + binned, max(deepest, most)
@@ -123,8 +138,28 @@ class Binning:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def add_image(signals, h, start, xi, eta, ny, nx, use, good, window, weight, noise, scatter, per_var, sums, dropped, largest):  # type: ignore[no-untyped-def]
-    """Add a block that begins at sample ``start`` to an image of (ny, nx) pixels; the rest as in `_add`."""
+def add_image(  # type: ignore[no-untyped-def]
+    signals,
+    h,
+    start,
+    xi,
+    eta,
+    ny,
+    nx,
+    use,
+    good,
+    window,
+    weight,
+    noise,
+    scatter,
+    per_var,
+    sums,
+    dropped,
+    largest,
+):
+    """Add a block that begins at sample ``start`` to an image of (ny, nx) pixels; the rest as in
+    `_add`.
+    """
     n = signals[0].shape[1]
     space = np.empty(xi.size * AT_ONCE, np.int32)
     for low in range(0, n, AT_ONCE):
@@ -133,12 +168,30 @@ def add_image(signals, h, start, xi, eta, ny, nx, use, good, window, weight, noi
         for d in range(xi.size):
             if use[d]:
                 _cells(h, start + low, xi[d], eta[d], ny, nx, cells[d])
-        _add(signals, low, cells, nx + 2, use, good, window, weight, noise, scatter, per_var, sums, dropped, largest)
+        _add(
+            signals,
+            low,
+            cells,
+            nx + 2,
+            use,
+            good,
+            window,
+            weight,
+            noise,
+            scatter,
+            per_var,
+            sums,
+            dropped,
+            largest,
+        )
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _cells(h, start, a, b, ny, nx, cells):  # type: ignore[no-untyped-def]
-    """Place (y + 1) (nx + 2) + x + 1 of the pixel that holds each sample of a detector at (a, b); beyond the edge, the border's.
+    """Place (y + 1) (nx + 2) + x + 1 of the pixel that holds each sample of a detector at (a, b);
+    beyond the edge, the border's.
 
     ``h`` (9, n_samp): homographies. ``start``: sample of the first of ``cells`` (n,).
     """
@@ -160,19 +213,67 @@ def _cells(h, start, a, b, ny, nx, cells):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def add_list(signals, first, index, use, good, window, weight, noise, scatter, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
-    """Add samples first .. of a block to the pixels ``index`` (n_det, n) of a list, -1 outside; the rest as in `_add`."""
+def add_list(  # type: ignore[no-untyped-def]
+    signals,
+    first,
+    index,
+    use,
+    good,
+    window,
+    weight,
+    noise,
+    scatter,
+    per_variance,
+    sums,
+    dropped,
+    largest,
+):
+    """Add samples first .. of a block to the pixels ``index`` (n_det, n) of a list, -1 outside; the
+    rest as in `_add`.
+    """
     places = index + np.int32(1)  # other bands may need the pixels as they are
-    _add(signals, first, places, 0, use, good, window, weight, noise, scatter, per_variance, sums, dropped, largest)
+    _add(
+        signals,
+        first,
+        places,
+        0,
+        use,
+        good,
+        window,
+        weight,
+        noise,
+        scatter,
+        per_variance,
+        sums,
+        dropped,
+        largest,
+    )
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _add(signals, first, cells, stride, use, good, window, weight, noise, scatter, per_variance, sums, dropped, largest):  # type: ignore[no-untyped-def]
-    """Add samples of all ``signals`` (a tuple) to their places in ``sums`` (n, 4 and one for each further signal; or 2: all
-    detectors weigh the same); count what is dropped; note the largest terms, those of the data to the next power of two.
+def _add(  # type: ignore[no-untyped-def]
+    signals,
+    first,
+    cells,
+    stride,
+    use,
+    good,
+    window,
+    weight,
+    noise,
+    scatter,
+    per_variance,
+    sums,
+    dropped,
+    largest,
+):
+    """Add samples of all ``signals`` (a tuple) to their places in ``sums`` (n, 4 and one for each
+    further signal; or 2: all detectors weigh the same); count what is dropped; note the largest
+    terms, those of the data to the next power of two.
 
-    ``cells`` (n_det, n): places of the samples first .. first + n - 1 of the block, like ``good``. ``stride``: places in a row of
-    an image, 0 for a list. What is dropped for another reason is counted out of those outside: all of the border will be added.
+    ``cells`` (n_det, n): places of the samples first .. first + n - 1 of the block, like ``good``.
+    ``stride``: places in a row of an image, 0 for a list. What is dropped for another reason is
+    counted out of those outside: all of the border will be added.
     """
     n, m = cells.shape[1], len(signals)
     flat, columns = sums.reshape(-1), np.uintp(sums.shape[1])
@@ -201,7 +302,18 @@ def _add(signals, first, cells, stride, use, good, window, weight, noise, scatte
                 highest[s] = float(high + 1)
                 drop |= high >= limit * factor
             if drop:
-                _drop(signals, d, first, fine, limit, cells[d], units[:, k], stride, sums.shape[0] // max(stride, 1), dropped)
+                _drop(
+                    signals,
+                    d,
+                    first,
+                    fine,
+                    limit,
+                    cells[d],
+                    units[:, k],
+                    stride,
+                    sums.shape[0] // max(stride, 1),
+                    dropped,
+                )
                 for s in range(m):
                     high = 0
                     for t in range(n):
@@ -212,8 +324,14 @@ def _add(signals, first, cells, stride, use, good, window, weight, noise, scatte
                 largest[NOISE + s] = max(largest[NOISE + s], highest[s])
             if base == 4:
                 unit, places = units[0, k], cells[d]
-                w, term = np.int64(np.rint(weight[d] * WEIGHT)), np.int64(np.rint(noise[d] * WEIGHT))
-                largest[WEIGHTS], largest[NOISE] = max(largest[WEIGHTS], float(w)), max(largest[NOISE], float(term))
+                w, term = (
+                    np.int64(np.rint(weight[d] * WEIGHT)),
+                    np.int64(np.rint(noise[d] * WEIGHT)),
+                )
+                largest[WEIGHTS], largest[NOISE] = (
+                    max(largest[WEIGHTS], float(w)),
+                    max(largest[NOISE], float(term)),
+                )
                 for t in range(n):
                     if window.size:
                         share = window[first + t]
@@ -240,19 +358,24 @@ def _add(signals, first, cells, stride, use, good, window, weight, noise, scatte
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _scales(weight, per_variance, scatter):  # type: ignore[no-untyped-def]
-    """Of one detector: the largest |d| [K] that is accepted, units of w d per K, and units of the scatter per K^2."""
+    """Of one detector: the largest |d| [K] that is accepted, units of w d per K, and units of the
+    scatter per K^2.
+    """
     limit, square = LARGEST / VALUE / max(weight, 1.0), weight * per_variance * WEIGHT
     if scatter:
         limit = min(limit, math.sqrt(2.0**60 / square))
     return limit, weight * VALUE, square
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _units(row, factor, shifted, units):  # type: ignore[no-untyped-def]
-    """w d in fixed point, and all their bits together (of ~q where q < 0): an upper bound of |q| below the next power of two.
+    """w d in fixed point, and all their bits together (of ~q where q < 0): an upper bound of |q|
+    below the next power of two.
 
-    ``units`` are the bits of ``shifted``: adding `MAGIC` rounds to an integer in the low bits. What is not finite or beyond
-    2^51 gives a bound above that.
+    ``units`` are the bits of ``shifted``: adding `MAGIC` rounds to an integer in the low bits. What
+    is not finite or beyond 2^51 gives a bound above that.
     """
     for t in range(row.size):
         shifted[t] = np.float64(row[t]) * factor + MAGIC
@@ -265,8 +388,12 @@ def _units(row, factor, shifted, units):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _drop(signals, d, first, fine, limit, places, units, stride, n_rows, dropped):  # type: ignore[no-untyped-def]
-    """Send what is flagged, or in one signal not finite or too large, to place 0 with no value, and count it once."""
+def _drop(  # type: ignore[no-untyped-def]
+    signals, d, first, fine, limit, places, units, stride, n_rows, dropped
+):
+    """Send what is flagged, or in one signal not finite or too large, to place 0 with no value, and
+    count it once.
+    """
     for t in range(places.size):
         place, size = places[t], 0.0
         for s in range(len(signals)):
@@ -296,7 +423,9 @@ def _drop(signals, d, first, fine, limit, places, units, stride, n_rows, dropped
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _scatter(flat, columns, cells, rows, units):  # type: ignore[no-untyped-def]
-    """Add fixed-point values (`TOGETHER`, n) and hits to the places of the detectors ``rows``, side by side."""
+    """Add fixed-point values (`TOGETHER`, n) and hits to the places of the detectors ``rows``, side
+    by side.
+    """
     hit, last = np.uintp(HITS), np.uintp(cells.shape[1] - 1)
     a, b, c, d = cells[rows[0]], cells[rows[1]], cells[rows[2]], cells[rows[3]]
     p, q, r, s = units
@@ -322,7 +451,9 @@ def _scatter(flat, columns, cells, rows, units):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _scatter_two(flat, columns, base, cells, rows, units):  # type: ignore[no-untyped-def]
-    """`_scatter` of two signals (2, `TOGETHER`, n); the second one's data are in the column ``base``."""
+    """`_scatter` of two signals (2, `TOGETHER`, n); the second one's data are in the column
+    ``base``.
+    """
     hit, last = np.uintp(HITS), np.uintp(cells.shape[1] - 1)
     a, b, c, d = cells[rows[0]], cells[rows[1]], cells[rows[2]], cells[rows[3]]
     p, q, r, s = units[0]
@@ -370,8 +501,8 @@ def _scatter_any(flat, columns, base, cells, rows, units):  # type: ignore[no-un
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _fold(sums, ny, nx, weight, noise, out, others):  # type: ignore[no-untyped-def]
-    """Move a thread's sums to ``out`` (n_pixels, 4), those of further signals to ``others`` (n_pixels, m - 1): hits inside, on
-    the border, and the most in a pixel. ``ny``: 0 for a list.
+    """Move a thread's sums to ``out`` (n_pixels, 4), those of further signals to ``others``
+    (n_pixels, m - 1): hits inside, on the border, and the most in a pixel. ``ny``: 0 for a list.
 
     ``weight``, ``noise``: of every sample, where ``sums`` has no columns for them.
     """

@@ -2,21 +2,25 @@
 
 The one-sided power spectral density is taken to be
 
-    P(f) = 2 NET^2 (1 + (f_knee / f)^slope).                                                              (1)
+    P(f) = 2 NET^2 (1 + (f_knee / f)^slope).                                                     (1)
 
-It is estimated by Welch's method (1967, IEEE Trans. Audio Electroacoust. 15, 70) with Hann windows that overlap by half, a line
-removed from each; of the K segments without a flagged sample the *median* is taken, divided by the median of the mean of
-exponential deviates (Allen et al. 2012, Phys. Rev. D 85, 122006, appendix B). Segments with a glitch are left out: those
-whose power in the upper half of the band is more than `OUTLYING` robust standard deviations from their median.
-Frequencies are averaged in logarithmic bins, and ln P is fitted by least squares with the covariance of the bins. A frequency has
-the relative variance
+It is estimated by Welch's method (1967, IEEE Trans. Audio Electroacoust. 15, 70) with Hann windows
+that overlap by half, a line removed from each; of the K segments without a flagged sample the
+*median* is taken, divided by the median of the mean of exponential deviates (Allen et al. 2012,
+Phys. Rev. D 85, 122006, appendix B). Segments with a glitch are left out: those whose power in the
+upper half of the band is more than `OUTLYING` robust standard deviations from their median.
+Frequencies are averaged in logarithmic bins, and ln P is fitted by least squares with the
+covariance of the bins. A frequency has the relative variance
 
-    sigma^2 = (1 + 2 c) v / K ,   v = 1 / ln(2)^2                                                         (2)
+    sigma^2 = (1 + 2 c) v / K ,
+    v = 1 / ln(2)^2                                                         (2)
 
-v / K that of the median of K independent exponential deviates, in the limit of large K. The powers of Hann's windows that overlap
-by half are correlated by 1/36, those of frequencies of one window that are one or two apart by 4/9 and 1/36; medians of such
-powers are correlated less, by the probability q that both lie below their median: c = 4 q - 1, `MEDIANS`. What the window mixes
-into a frequency from others, a tenth of the power of the lowest for slope 1, is in the expectation that is fitted.
+v / K that of the median of K independent exponential deviates, in the limit of large K. The powers
+of Hann's windows that overlap by half are correlated by 1/36, those of frequencies of one window
+that are one or two apart by 4/9 and 1/36; medians of such powers are correlated less, by the
+probability q that both lie below their median: c = 4 q - 1, `MEDIANS`. What the window mixes into a
+frequency from others, a tenth of the power of the lowest for slope 1, is in the expectation that is
+fitted.
 """
 
 from __future__ import annotations
@@ -44,7 +48,9 @@ HIGHEST = 0.9
 LEAST_SLOPE = 0.5
 """A flatter spectrum cannot be told from white noise."""
 MEDIANS = 0.2627, 0.0145
-"""c of equation (2) for powers that are correlated by 4/9 and 1/36 (of 4e6 pairs of complex normal deviates)."""
+"""c of equation (2) for powers that are correlated by 4/9 and 1/36 (of 4e6 pairs of complex normal
+deviates).
+"""
 VARIANCE = (1 + 2 * MEDIANS[1]) / math.log(2) ** 2
 """Of equation (2), times the number of segments."""
 MIXED = 32
@@ -58,11 +64,13 @@ class Noise:
     Attributes
     ----------
     net, knee, slope
-        K sqrt(s); Hz, 0: none was found, and ``knee_error`` is the lowest frequency that was looked at; exponent.
+        K sqrt(s); Hz, 0: none was found, and ``knee_error`` is the lowest frequency that was looked
+        at; exponent.
     segments
         Those that were used.
     chi_square
-        Of the fit, over its degrees of freedom: far above 1 where equation (1) does not describe the spectrum.
+        Of the fit, over its degrees of freedom: far above 1 where equation (1) does not describe
+        the spectrum.
     """
 
     net: float
@@ -76,7 +84,8 @@ class Noise:
 
 
 def segment_length(n_samples: int, rate: float, seconds: float | None, place: str) -> int:
-    """Samples of a segment: those of ``seconds``, or the most of which there are `SEGMENTS`, but for a fast transform.
+    """Samples of a segment: those of ``seconds``, or the most of which there are `SEGMENTS`, but
+    for a fast transform.
 
     Raises InputError for a scan that is too short.
     """
@@ -92,13 +101,18 @@ def segment_length(n_samples: int, rate: float, seconds: float | None, place: st
 
 
 def median_bias(segments: int) -> float:
-    """The expected median of so many exponential deviates, over their mean: 1 - 1/2 + 1/3 ... (odd numbers of terms)."""
+    """The expected median of so many exponential deviates, over their mean: 1 - 1/2 + 1/3 ... (odd
+    numbers of terms).
+    """
     terms = np.arange(1, segments + 1 - (segments + 1) % 2)
     return float(np.sum((-1.0) ** (terms + 1) / terms))
 
 
-def spectrum(row: Floats, good: NDArray[np.bool_], rate: float, length: int) -> tuple[Floats, Floats, int]:
-    """Frequencies [Hz] without zero, one-sided power spectral density [K^2 / Hz], number of segments used (0: too few are good).
+def spectrum(
+    row: Floats, good: NDArray[np.bool_], rate: float, length: int
+) -> tuple[Floats, Floats, int]:
+    """Frequencies [Hz] without zero, one-sided power spectral density [K^2 / Hz], number of
+    segments used (0: too few are good).
 
     ``row`` (n,) K; ``good`` (n,): samples that may be used.
     """
@@ -114,22 +128,34 @@ def spectrum(row: Floats, good: NDArray[np.bool_], rate: float, length: int) -> 
     parts = np.stack([row[b : b + length] for b in begins])
     parts = parts - parts.mean(axis=1, keepdims=True)
     parts -= (parts @ line / (line @ line))[:, None] * line
-    power = np.abs(np.fft.rfft(parts * window, axis=1)[:, 1:]) ** 2 * (2 / (rate * (window @ window)))
+    power = np.abs(np.fft.rfft(parts * window, axis=1)[:, 1:]) ** 2 * (
+        2 / (rate * (window @ window))
+    )
     level = power[:, power.shape[1] // 2 :].mean(axis=1)
     away = np.abs(level - np.median(level))
     power = power[away <= OUTLYING * 1.4826 * np.median(away)]
-    return frequency, np.asarray(np.median(power, axis=0) / median_bias(len(power)), np.float64), len(power)
+    return (
+        frequency,
+        np.asarray(np.median(power, axis=0) / median_bias(len(power)), np.float64),
+        len(power),
+    )
 
 
 def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
-    """Equation (1) fitted to a spectrum of `spectrum`; None: there is none to fit, or it is zero."""
-    use = (frequency <= HIGHEST * frequency[-1]) & (np.arange(len(frequency)) >= 1)  # the line takes the lowest
+    """Equation (1) fitted to a spectrum of `spectrum`; None: there is none to fit, or it is
+    zero.
+    """
+    use = (frequency <= HIGHEST * frequency[-1]) & (
+        np.arange(len(frequency)) >= 1
+    )  # the line takes the lowest
     if not segments or not (power[use] > 0).all():
         return None
     every, bins = frequency[use], _Bins.of(frequency[use])
     f, p = bins.mean(every), bins.mean(power[use])
     covariance = bins.covariance() * (VARIANCE / segments)
-    log_p = np.log(p) + np.diag(covariance) / 2  # the mean of a logarithm lies below the logarithm of the mean
+    log_p = (
+        np.log(p) + np.diag(covariance) / 2
+    )  # the mean of a logarithm lies below the logarithm of the mean
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     alike = whiten.sum(axis=1)  # a level that all bins have in common
     start = math.log(float(np.median(p[f > f[-1] / 3])))
@@ -148,14 +174,22 @@ def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
 
     low = float(log_p[0])
     limits = [-np.inf, start - 40, LEAST_SLOPE], [np.inf, np.inf, 4.0]
-    guesses = [[start, max(low, start - 2.0) - slope * math.log(middle / f[0]), slope] for slope in (1.0, 2.0)]
-    found = min((least_squares(residual, guess, bounds=limits) for guess in guesses), key=lambda tried: float(tried.cost))
+    guesses = [
+        [start, max(low, start - 2.0) - slope * math.log(middle / f[0]), slope]
+        for slope in (1.0, 2.0)
+    ]
+    found = min(
+        (least_squares(residual, guess, bounds=limits) for guess in guesses),
+        key=lambda tried: float(tried.cost),
+    )
     level, variance = float(alike @ whiten @ log_p / (alike @ alike)), float(1 / (alike @ alike))
     white_cost = 0.5 * float(np.sum((whiten @ (level - log_p)) ** 2))
     inside = float(found.x[1] - found.x[0]) < float(found.x[2]) * math.log(
         f[-1] / middle
     )  # the knee lies below the last frequency
-    if white_cost - found.cost < 3.0 or not inside:  # two more parameters do as much by chance in one of twenty cases
+    if (
+        white_cost - found.cost < 3.0 or not inside
+    ):  # two more parameters do as much by chance in one of twenty cases
         net = math.sqrt(math.exp(level) / 2)
         chi = 2 * white_cost / max(len(f) - 1, 1)
         return Noise(net, net * math.sqrt(variance) / 2, 0.0, float(f[0]), 1.0, 0.0, segments, chi)
@@ -176,7 +210,9 @@ def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
 
 
 def _mixed(frequency: Floats, step: float) -> tuple[Floats, Floats]:
-    """Frequencies (n, m) that Hann's window mixes into each, which are ``step`` apart, and the share (m,) of each."""
+    """Frequencies (n, m) that Hann's window mixes into each, which are ``step`` apart, and the
+    share (m,) of each.
+    """
     x = np.linspace(-1.9, 1.9, 39)
     window = np.sinc(x) / np.where(np.abs(np.abs(x) - 1) < 1e-9, np.inf, 1 - x**2)
     window[np.abs(np.abs(x) - 1) < 1e-9] = 0.5
@@ -198,7 +234,9 @@ class _Bins:
         return cls(first, number.astype(np.float64))
 
     def covariance(self) -> Floats:
-        """Of the bins' means, where the values are of variance 1 and correlated by `MEDIANS` with those one and two on."""
+        """Of the bins' means, where the values are of variance 1 and correlated by `MEDIANS` with
+        those one and two on.
+        """
         which = np.repeat(np.arange(len(self.number)), self.number.astype(int))
         found = np.diag(self.number)
         for apart, common in enumerate(MEDIANS, 1):

@@ -1,4 +1,6 @@
-"""Base class of noise models, and the fixed NET. Others are plugins: the entry-point group ``zonda.noise_models`` names them."""
+"""Base class of noise models, and the fixed NET. Others are plugins: the entry-point group
+``zonda.noise_models`` names them.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ class NoiseModel(Parameters):
     name: str = ""
     """Name under which the model is registered (filled in by the pipeline)."""
     reference: Literal["sky", "detector"] = "sky"
-    """Where the temperature applies: on the sky, after division by zeta e^-tau, or at the detector."""
+    """Where the temperature applies: on the sky, after division by zeta e^-tau, or at the detector.
+    """
 
     def check(self, focalplane: Focalplane) -> None:
         """Refuse parameters that contradict the detectors (`InputError`)."""
@@ -42,12 +45,16 @@ class FixedNet(NoiseModel):
     """The same NET for any load."""
 
     level: KelvinRootSecond | None = Field(None, ge=0)
-    """Noise-equivalent temperature; None: each detector's own, from the instrument (quoted on the sky)."""
+    """Noise-equivalent temperature; None: each detector's own, from the instrument (quoted on the
+    sky).
+    """
 
     @model_validator(mode="after")
     def _reference_of_level(self) -> FixedNet:
         if self.level is None and self.reference == "detector":
-            raise ValueError("reference: detector needs level; the instrument's NET is quoted on the sky")
+            raise ValueError(
+                "reference: detector needs level; the instrument's NET is quoted on the sky"
+            )
         return self
 
     @classmethod
@@ -64,7 +71,8 @@ class FixedNet(NoiseModel):
 
 
 def noise_model(value: Any) -> Any:
-    """A `NoiseModel` from its registered name, from a mapping with ``name`` and its parameters, or as it is.
+    """A `NoiseModel` from its registered name, from a mapping with ``name`` and its parameters, or
+    as it is.
 
     Raises ValueError (shown at the place in the file) for what is not a noise model.
     """
@@ -72,7 +80,10 @@ def noise_model(value: Any) -> Any:
         return value
     name = value.get("name") if isinstance(value, dict) else value
     if not isinstance(name, str) or not name:
-        raise ValueError("name a noise model, e.g. background_limited, or give a mapping with name and parameters")
+        raise ValueError(
+            "name a noise model, e.g. background_limited, or give a mapping with name and"
+            " parameters"
+        )
     try:
         found = noise_models.get(name)
         if isinstance(value, dict) or isinstance(found, type):

@@ -29,28 +29,37 @@ if TYPE_CHECKING:
 class PinkNoise(Operator):
     """Gaussian noise with a power-law spectrum, independent for each detector and observation.
 
-    One-sided power spectral density 2 NET^2 (f_knee / f)^slope from `minimum_frequency` to the Nyquist frequency, at the
-    detector as for `WhiteNoise`; flat below. Made by a recursive filter (`power_law_filter`) of white noise, stationary from
-    the first sample and of any length. The log of the run states the error of the fitted spectrum. Its variance is that of the
-    stated spectrum within 10 %: where a chain of real poles misses that, as for slopes above 1, complex ones make the corner.
+    One-sided power spectral density 2 NET^2 (f_knee / f)^slope from `minimum_frequency` to the
+    Nyquist frequency, at the detector as for `WhiteNoise`; flat below. Made by a recursive filter
+    (`power_law_filter`) of white noise, stationary from the first sample and of any length. The log
+    of the run states the error of the fitted spectrum. Its variance is that of the stated spectrum
+    within 10 %: where a chain of real poles misses that, as for slopes above 1, complex ones make
+    the corner.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"pink"})
 
     net: KelvinRootSecond | None = Field(None, ge=0)
-    """White level that the knee refers to; None: that of `WhiteNoise`, or the instrument's where there is none."""
+    """White level that the knee refers to; None: that of `WhiteNoise`, or the instrument's where
+    there is none.
+    """
     reference: Literal["sky", "detector"] = "sky"
     """Whether `net` is quoted on the sky, after division by zeta e^-tau, or at the detector."""
     knee: Hertz | None = Field(None, ge=0)
-    """Frequency at which pink noise equals white noise; None: each detector's own; 0: no pink noise."""
+    """Frequency at which pink noise equals white noise; None: each detector's own; 0: no pink
+    noise.
+    """
     slope: float | None = Field(None, gt=0, le=3)
-    """The power spectrum falls as f^-slope; None: each detector's own, where they differ rounded to a tenth."""
+    """The power spectrum falls as f^-slope; None: each detector's own, where they differ rounded to
+    a tenth.
+    """
     minimum_frequency: Hertz | None = Field(None, gt=0)
     """The spectrum is flat below; None: the instrument's."""
     poles: int = Field(8, ge=2, le=16)
-    """Accuracy of the spectrum: its error falls about threefold for every two more poles (1.8 % with 8, 0.06 % with 16 for 1/f
-    noise over 4.7 decades; with 16 at most 0.45 % for slopes to 2, 1 % to 3, over 7.7 decades)."""
+    """Accuracy of the spectrum: its error falls about threefold for every two more poles (1.8 %
+    with 8, 0.06 % with 16 for 1/f noise over 4.7 decades; with 16 at most 0.45 % for slopes to 2, 1
+    % to 3, over 7.7 decades)."""
     shared: Fraction = Field(0.0, ge=0, le=1)
     """Share of the variance that all detectors have in common."""
 
@@ -61,12 +70,19 @@ class PinkNoise(Operator):
         return self
 
     def check(self, data: Data) -> list[str]:
-        """Fit the filter, as `prepare` does: InputError where it cannot be. Warn of a knee that no noise has."""
+        """Fit the filter, as `prepare` does: InputError where it cannot be. Warn of a knee that no
+        noise has.
+        """
         for observation in data.observations[:1]:
             spectrum, nyquist = PinkSpectrum.of(self, observation), observation.sampling[1] / 2
-            text = "" if spectrum is None else doubt(f"{self.label}: knee", spectrum.knee, KNEE, "Hz")
+            text = (
+                "" if spectrum is None else doubt(f"{self.label}: knee", spectrum.knee, KNEE, "Hz")
+            )
             if spectrum is not None and spectrum.knee > nyquist:
-                text = f"{self.label}: the knee of {spectrum.knee:g} Hz is above the Nyquist frequency, {nyquist:g} Hz"
+                text = (
+                    f"{self.label}: the knee of {spectrum.knee:g} Hz is above the Nyquist"
+                    f" frequency, {nyquist:g} Hz"
+                )
             if text:
                 warnings.warn(text, stacklevel=2)
         for rate in {observation.sampling[1] for observation in data.observations}:
@@ -90,25 +106,42 @@ class PinkNoise(Operator):
             return
         add = "pink" in block.detdata
         out = block.new("pink", zero=False)
-        level = state.amplitude.of(block.observation).series(block.detectors, block.samples, out.dtype)
+        level = state.amplitude.of(block.observation).series(
+            block.detectors, block.samples, out.dtype
+        )
         shared = state.common[..., block.samples]
-        state.streams.add(block.detectors.start, block.samples.start, out, level, shared, self.shared, over=not add)
+        state.streams.add(
+            block.detectors.start,
+            block.samples.start,
+            out,
+            level,
+            shared,
+            self.shared,
+            over=not add,
+        )
 
     def collect(self, data: Data, observation: Observation, state: _State | None) -> None:
         """State the rms."""
         if state is not None:
-            middle = np.median(state.amplitude.of(observation).time_mean() * np.sqrt(state.streams.variance))
-            observation.tally.state(self.label, "rms at the detector, median (mK)", f"{1e3 * middle:.4g}")
+            middle = np.median(
+                state.amplitude.of(observation).time_mean() * np.sqrt(state.streams.variance)
+            )
+            observation.tally.state(
+                self.label, "rms at the detector, median (mK)", f"{1e3 * middle:.4g}"
+            )
 
 
 class _State(NamedTuple):
     amplitude: Amplitude
     streams: Streams | StreamsOfSlopes
     common: NDArray[np.float32]
-    """(n_samp,), or one for each slope (n_slopes, n_samp); without samples where nothing is shared."""
+    """(n_samp,), or one for each slope (n_slopes, n_samp); without samples where nothing is shared.
+    """
 
 
-def _fitted(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation) -> dict[float, PowerLawFilter]:
+def _fitted(
+    pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation
+) -> dict[float, PowerLawFilter]:
     """The filter of the spectrum's own slope, and of each that a detector has.
 
     Raises InputError where the number of poles cannot fit the spectrum (see `power_law_filter`).
@@ -124,13 +157,19 @@ def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation)
     """Raises InputError as `_fitted`."""
     each, laws = spectrum.of_detectors(pink, observation), _fitted(pink, spectrum, observation)
     law = laws[spectrum.slope]
-    observation.tally.state(pink.label, "power over that of white noise", each.describe() + spectrum.describe(law))
+    observation.tally.state(
+        pink.label, "power over that of white noise", each.describe() + spectrum.describe(law)
+    )
     resolve(observation)
     level = level_of(pink, observation)
     net = level.sky_net(observation)
     spectrum.state(observation, net, each)
-    squares = np.where(observation.good_detectors, net**2, 0.0) / max(int(observation.good_detectors.sum()), 1)
-    observation.closed_forms.setdefault("pink", []).append(lambda f: 2 * each.over_white(f, squares))
+    squares = np.where(observation.good_detectors, net**2, 0.0) / max(
+        int(observation.good_detectors.sum()), 1
+    )
+    observation.closed_forms.setdefault("pink", []).append(
+        lambda f: 2 * each.over_white(f, squares)
+    )
     gain = np.sqrt([laws[slope].gain for slope in each.slope.tolist()])
     amplitude = Amplitude(pink.label, level, observation, each.factor * gain)
     key, start = observation.detector_key(pink.label), observation.detector_key(pink.label, "start")
@@ -146,7 +185,8 @@ def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation)
 
 @dataclass(frozen=True)
 class PinkSpectrum:
-    """The spectrum of pink noise over that of white noise: (f / knee)^-slope from ``minimum`` to the Nyquist frequency.
+    """The spectrum of pink noise over that of white noise: (f / knee)^-slope from ``minimum`` to
+    the Nyquist frequency.
 
     Frequencies in Hz; ``rate`` is that of the samples.
     """
@@ -164,7 +204,11 @@ class PinkSpectrum:
         if pink.knee is None and not knee:  # the median; single detectors may have some
             knee = float(instrument.focalplane().knee.max())
         minimum = pink.minimum_frequency or instrument.pink_minimum_frequency
-        return cls(knee, pink.slope or instrument.slope, minimum, observation.sample_rate) if knee else None
+        return (
+            cls(knee, pink.slope or instrument.slope, minimum, observation.sample_rate)
+            if knee
+            else None
+        )
 
     @property
     def factor(self) -> float:
@@ -173,7 +217,9 @@ class PinkSpectrum:
 
     def over_white(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
         """(f / knee)^-slope, level below the minimum."""
-        return np.asarray((np.maximum(frequency, self.minimum) / self.knee) ** -self.slope, np.float64)
+        return np.asarray(
+            (np.maximum(frequency, self.minimum) / self.knee) ** -self.slope, np.float64
+        )
 
     def filter(self, poles: int) -> PowerLawFilter:
         """The recursive filter that makes it of white noise of the rms `factor`."""
@@ -181,23 +227,37 @@ class PinkSpectrum:
 
     def describe(self, law: PowerLawFilter) -> str:
         """The spectrum in words, with the errors of its filter."""
-        text = f"(f / {self.knee:g} Hz)^-{self.slope:g} from {self.minimum:g} Hz to {self.rate / 2:g} Hz "
+        text = (
+            f"(f / {self.knee:g} Hz)^-{self.slope:g} from {self.minimum:g} Hz to"
+            f" {self.rate / 2:g} Hz "
+        )
         text += f"within {100 * law.error:.2g} %, "
-        return text + f"levelling off below to {law.plateau:.2g} times its value at {self.minimum:g} Hz"
+        return (
+            text
+            + f"levelling off below to {law.plateau:.2g} times its value at {self.minimum:g} Hz"
+        )
 
     def of_detectors(self, pink: PinkNoise, observation: Observation) -> Detectors:
-        """The spectra of the single detectors: those that the instrument's focal plane has, where the step states none."""
+        """The spectra of the single detectors: those that the instrument's focal plane has, where
+        the step states none.
+        """
         n, instrument = observation.n_detectors, observation.instrument
         knee, slope = np.full(n, self.knee), np.full(n, self.slope)
         if pink.knee is None or pink.slope is None:
             plane = instrument.focalplane()
             if plane.names == observation.focalplane.names:
                 knee = plane.knee if pink.knee is None and np.ptp(plane.knee) else knee
-                slope = np.clip(plane.slope.round(1), 0.1, 3.0) if pink.slope is None and np.ptp(plane.slope) else slope
+                slope = (
+                    np.clip(plane.slope.round(1), 0.1, 3.0)
+                    if pink.slope is None and np.ptp(plane.slope)
+                    else slope
+                )
         return Detectors(knee, slope, self.minimum)
 
     def state(self, observation: Observation, net: NDArray[np.float64], each: Detectors) -> None:
-        """Write it to the focal plane, where the knee refers to the white noise of that: here it refers to ``net`` (n_det,)."""
+        """Write it to the focal plane, where the knee refers to the white noise of that: here it
+        refers to ``net`` (n_det,).
+        """
         plane = observation.focalplane
         white = np.where(plane.net > 0, plane.net, net)
         ratio = np.divide(net, white, out=np.ones(len(plane)), where=white > 0)
@@ -220,7 +280,9 @@ class Detectors:
 
     @property
     def factor(self) -> NDArray[np.float64]:
-        """(n_det,) root of the spectrum at its ``minimum``; by single numbers, whose powers have the same bits anywhere."""
+        """(n_det,) root of the spectrum at its ``minimum``; by single numbers, whose powers have
+        the same bits anywhere.
+        """
         pairs = zip(self.knee.tolist(), self.slope.tolist(), strict=True)
         return np.array([(knee / self.minimum) ** (slope / 2) for knee, slope in pairs])
 
@@ -233,8 +295,12 @@ class Detectors:
         ]
         return f"{', '.join(spans)}; at the median " if spans else ""
 
-    def over_white(self, frequency: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sum over detectors of ``weights`` (n_det,) times the spectra over those of white noise, (n,)."""
+    def over_white(
+        self, frequency: NDArray[np.float64], weights: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Sum over detectors of ``weights`` (n_det,) times the spectra over those of white noise,
+        (n,).
+        """
         f = np.maximum(frequency, self.minimum)
         found = np.zeros(len(f))
         for slope in self.slopes:

@@ -29,7 +29,9 @@ class WhitePlanning(Planning[WhiteNoise]):
     of = WhiteNoise
 
     def traits(self, observation: Observation) -> Traits:
-        """rms of one calibrated sample of each detector, under the load of ``observation.smooth``."""
+        """rms of one calibrated sample of each detector, under the load of
+        ``observation.smooth``.
+        """
         each = calibrated(observation.noise_levels[self.operator.label], observation)
         return Traits(noise=float(each.min(initial=np.inf)) if each.size else 0.0, each=each)
 
@@ -47,28 +49,47 @@ class PinkPlanning(Planning[PinkNoise]):
 
     of = PinkNoise
     knobs = (
-        Knob("poles", (4, 6, 8, 12, 16), "power law by a filter of few poles (their first states are drawn anew)", redraws=True),
+        Knob(
+            "poles",
+            (4, 6, 8, 12, 16),
+            "power law by a filter of few poles (their first states are drawn anew)",
+            redraws=True,
+        ),
     )
 
     def memory(self, observation: Observation) -> int:
         """Filter states that are kept, and the common part."""
-        kept = -(-observation.n_detectors // TILE_DETECTORS) * (observation.n_samples // CHECKPOINT + 3)
+        kept = -(-observation.n_detectors // TILE_DETECTORS) * (
+            observation.n_samples // CHECKPOINT + 3
+        )
         common = 12 * observation.n_samples if self.operator.shared > 0 else 0
         if spectrum := PinkSpectrum.of(self.operator, observation):
             slopes = spectrum.of_detectors(self.operator, observation).slope
-            kept, common = math.ceil(kept * filters_in_a_tile(slopes)), common * len(np.unique(slopes))
-        return kept * (4 * TILE_DETECTORS * (self.operator.poles + 3) + 300) + common + 80 * observation.n_detectors
+            kept, common = (
+                math.ceil(kept * filters_in_a_tile(slopes)),
+                common * len(np.unique(slopes)),
+            )
+        return (
+            kept * (4 * TILE_DETECTORS * (self.operator.poles + 3) + 300)
+            + common
+            + 80 * observation.n_detectors
+        )
 
     def traits(self, observation: Observation) -> Traits:
         """rms of one calibrated sample, and of its part that is faster than a frequency."""
         spectrum = PinkSpectrum.of(self.operator, observation)
         if spectrum is None:
             return Traits()
-        law, amplitude = spectrum.filter(self.operator.poles), self._amplitude(spectrum, observation)
+        law, amplitude = (
+            spectrum.filter(self.operator.poles),
+            self._amplitude(spectrum, observation),
+        )
         rate, rms = observation.sample_rate, amplitude * math.sqrt(law.gain * law.variance)
         grid = np.geomspace(1e-9, 0.5, 600)
         power = np.abs(_response(law, grid)) ** 2
-        above = np.append(np.cumsum((np.diff(grid) * (power[1:] + power[:-1]))[::-1])[::-1], 0.0)  # 2 int_f^(1/2) g |H|^2 df
+        above = np.append(
+            np.cumsum((np.diff(grid) * (power[1:] + power[:-1]))[::-1])[::-1], 0.0
+        )  # 2 int_f^(1/2) g |H|^2 df
 
         def faster(frequency: float) -> float:
             share = float(np.interp(math.log(max(frequency / rate, 1e-9)), np.log(grid), above))
@@ -77,7 +98,9 @@ class PinkPlanning(Planning[PinkNoise]):
         return Traits(rms=rms, faster=faster)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size and cost; the saving and error of fewer poles (whose first states are drawn anew), or of no pink noise."""
+        """Its size and cost; the saving and error of fewer poles (whose first states are drawn
+        anew), or of no pink noise.
+        """
         pink, o = self.operator, context.lowest
         spectrum = PinkSpectrum.of(pink, o)
         if spectrum is None:
@@ -91,7 +114,10 @@ class PinkPlanning(Planning[PinkNoise]):
         if context.before_filters:
             size["tod"] = traits.rms
         size["psd"] = level * float(law.response(np.array([0.1 / (o.duration * o.sample_rate)]))[0])
-        text = "1.5 (2 NET^2 int (f_knee/f)^slope R^2 df)^(1/2), correlated for int |rho| dt; R: high-pass filter"
+        text = (
+            "1.5 (2 NET^2 int (f_knee/f)^slope R^2 df)^(1/2), correlated for int |rho| dt; R:"
+            " high-pass filter"
+        )
         cost = pole_cost(pink.poles, filters_in_a_tile(spectrum.of_detectors(pink, o).slope))
         left_out = context.behind_modes(size)
         text += OTHER_MODES if context.turns else ""
@@ -99,15 +125,27 @@ class PinkPlanning(Planning[PinkNoise]):
         if pink.shared == 0 and not context.kept_streams & pink.provides:
             # a common part would be what a singular mode consists of: it is not dropped
             saved = cost.seconds(context.times, o.n_detectors) + 0.5e-9 * context.samples
-            choices.append(Choice("dropped", "none", leave_out=True, bound=left_out, formula=text, seconds=saved))
+            choices.append(
+                Choice(
+                    "dropped", "none", leave_out=True, bound=left_out, formula=text, seconds=saved
+                )
+            )
         return Estimate((Effect("poles", tuple(choices), left_out, text),), cost, size)
 
     def _coarser(self, context: Context, spectrum: PinkSpectrum, level: float) -> list[Choice]:
-        """Filters of fewer poles; ``level``: of the white noise that they filter, over that of all white noise."""
+        """Filters of fewer poles; ``level``: of the white noise that they filter, over that of all
+        white noise.
+        """
         pink, o, choices = self.operator, context.lowest, []
         law, amplitude = spectrum.filter(pink.poles), self._amplitude(spectrum, o)
-        correlated, common = _correlated(law, context), pink.shared > 0 and not context.removes_common
-        text = "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R: high-pass filter"
+        correlated, common = (
+            _correlated(law, context),
+            pink.shared > 0 and not context.removes_common,
+        )
+        text = (
+            "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R:"
+            " high-pass filter"
+        )
         text += OTHER_MODES if context.turns else ""
         passes = filters_in_a_tile(spectrum.of_detectors(pink, o).slope)
         seconds = pole_cost(pink.poles, passes).seconds(context.times, o.n_detectors)
@@ -117,24 +155,43 @@ class PinkPlanning(Planning[PinkNoise]):
             except ZondaError:
                 break
             power = difference(law, coarse, context, o.sample_rate, o.duration)
-            bound = context.bound(amplitude * math.sqrt(power), correlated=correlated, common=common)
+            bound = context.bound(
+                amplitude * math.sqrt(power), correlated=correlated, common=common
+            )
             if context.before_filters:
-                free = difference(law, coarse, replace(context, traits={}), o.sample_rate, o.duration)
+                free = difference(
+                    law, coarse, replace(context, traits={}), o.sample_rate, o.duration
+                )
                 bound["tod"] = amplitude * math.sqrt(free)
             bound["psd"] = psd_error(law, coarse, level)
             bound = context.behind_modes(bound)
             saved = seconds - pole_cost(poles, passes).seconds(context.times, o.n_detectors)
-            choices.append(Choice("coarse", f"{poles} poles", {"poles": poles}, bound=bound, formula=text, seconds=saved))
+            choices.append(
+                Choice(
+                    "coarse",
+                    f"{poles} poles",
+                    {"poles": poles},
+                    bound=bound,
+                    formula=text,
+                    seconds=saved,
+                )
+            )
         return choices
 
     def _amplitude(self, spectrum: PinkSpectrum, observation: Observation) -> float:
-        """rms of the white noise that is filtered, in the calibrated stream; of the noisiest detector, K."""
+        """rms of the white noise that is filtered, in the calibrated stream; of the noisiest
+        detector, K.
+        """
         each = spectrum.of_detectors(self.operator, observation)
-        return float(np.max(calibrated(level_of(self.operator, observation), observation) * each.factor))
+        return float(
+            np.max(calibrated(level_of(self.operator, observation), observation) * each.factor)
+        )
 
 
 def calibrated(level: WhiteLevel, observation: Observation) -> Floats:
-    """(n_det,) rms of one calibrated sample over the scan, K, under the load of its smooth means."""
+    """(n_det,) rms of one calibrated sample over the scan, K, under the load of its smooth
+    means.
+    """
     return np.asarray(level.sky_net(observation) * math.sqrt(observation.sample_rate), np.float64)
 
 
@@ -143,31 +200,46 @@ def pole_cost(poles: int, passes: float = 1.0) -> Cost:
 
     ``passes``: filters in a tile of detectors (`filters_in_a_tile`).
     """
-    return Cost(fixed=0.01 * passes, per_sample=(1.7e-9 + 0.75e-9 * math.ceil(poles / 4)) * passes, kernel="random")
+    return Cost(
+        fixed=0.01 * passes,
+        per_sample=(1.7e-9 + 0.75e-9 * math.ceil(poles / 4)) * passes,
+        kernel="random",
+    )
 
 
 def filters_in_a_tile(slopes: Floats) -> float:
-    """Different slopes (n_det,) in a tile of detectors, on average: each is a filter that is run for the whole tile."""
-    tiles = [slopes[first : first + TILE_DETECTORS] for first in range(0, len(slopes), TILE_DETECTORS)]
+    """Different slopes (n_det,) in a tile of detectors, on average: each is a filter that is run
+    for the whole tile.
+    """
+    tiles = [
+        slopes[first : first + TILE_DETECTORS] for first in range(0, len(slopes), TILE_DETECTORS)
+    ]
     return float(np.mean([len(np.unique(tile)) for tile in tiles])) if tiles else 1.0
 
 
-def difference(a: PowerLawFilter, b: PowerLawFilter, context: Context, rate: float, duration: float) -> float:
-    """Variance of the difference of two filters' outputs for the same white noise of unit variance, after the filters R.
+def difference(
+    a: PowerLawFilter, b: PowerLawFilter, context: Context, rate: float, duration: float
+) -> float:
+    """Variance of the difference of two filters' outputs for the same white noise of unit variance,
+    after the filters R.
 
-    2 int_0^(1/2) |sqrt(g_a) H_a - sqrt(g_b) H_b|^2 R^2 df, in logarithmic steps. The stationary first states are drawn
-    independently: what they differ by dies out within 1 / (2 pi f) at a frequency f, which adds
-    2 S(f) R^2 / (2 pi f T) to the integrand's spectrum S.
+    2 int_0^(1/2) |sqrt(g_a) H_a - sqrt(g_b) H_b|^2 R^2 df, in logarithmic steps. The stationary
+    first states are drawn independently: what they differ by dies out within 1 / (2 pi f) at a
+    frequency f, which adds 2 S(f) R^2 / (2 pi f T) to the integrand's spectrum S.
     """
     f = np.geomspace(1e-3 / (duration * rate), 0.5, 4000)
     delta = np.abs(_response(a, f) - _response(b, f)) ** 2
-    start = 2 * np.abs(_response(a, f)) ** 2 * np.minimum(1.0, 1 / (2 * np.pi * f * rate * duration))
+    start = (
+        2 * np.abs(_response(a, f)) ** 2 * np.minimum(1.0, 1 / (2 * np.pi * f * rate * duration))
+    )
     passed = np.array([context.response(float(x * rate)) ** 2 for x in f])
     return float(2 * np.trapezoid((delta + start) * passed, f))
 
 
 def psd_error(a: PowerLawFilter, b: PowerLawFilter, level: float) -> float:
-    """Largest relative error of the spectrum of pink plus white noise; ``level``: of unit responses over white noise."""
+    """Largest relative error of the spectrum of pink plus white noise; ``level``: of unit responses
+    over white noise.
+    """
     f = np.geomspace(1e-8, 0.5, 4000)
     first, second = level * a.response(f), level * b.response(f)
     return float((np.abs(second - first) / (1 + first)).max())
@@ -177,16 +249,19 @@ def _response(law: PowerLawFilter, f: Any) -> Any:
     """sqrt(g) H, complex, of equation (1) of `one_over_f`."""
     back = np.exp(-2j * np.pi * f)
     zeros, poles = (
-        np.r_[single, pair, pair.conj()] for single, pair in ((law.zeros, law.pair_zeros), (law.poles, law.pair_poles))
+        np.r_[single, pair, pair.conj()]
+        for single, pair in ((law.zeros, law.pair_zeros), (law.poles, law.pair_poles))
     )
     top = np.prod(1 - (1 - zeros[:, None]) * back, axis=0)
     return math.sqrt(law.gain) * top / np.prod(1 - (1 - poles[:, None]) * back, axis=0)
 
 
 def _correlated(law: PowerLawFilter, context: Context) -> float:
-    """int |rho| dt over all lags, s, of noise that the high-pass filter has freed of what is slower than its cut.
+    """int |rho| dt over all lags, s, of noise that the high-pass filter has freed of what is slower
+    than its cut.
 
-    rho from the power above the cut f_c, on a grid of f_c / 16 up to 256 f_c: what is faster correlates less.
+    rho from the power above the cut f_c, on a grid of f_c / 16 up to 256 f_c: what is faster
+    correlates less.
     """
     if context.cut <= 0:
         return context.first.duration

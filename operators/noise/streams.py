@@ -40,8 +40,9 @@ class _Tile:
 class Streams:
     """Filtered white noise of every detector at every sample, of unit innovations.
 
-    Detectors are made in absolute tiles of 16, side by side in vector registers. A state is kept every `CHECKPOINT` samples
-    and where the latest request ended: visits in order cost nothing extra, any other order gives the same bits.
+    Detectors are made in absolute tiles of 16, side by side in vector registers. A state is kept
+    every `CHECKPOINT` samples and where the latest request ended: visits in order cost nothing
+    extra, any other order gives the same bits.
 
     Parameters
     ----------
@@ -51,9 +52,13 @@ class Streams:
         Random-stream keys of the white noise and of the stationary first states.
     """
 
-    def __init__(self, law: PowerLawFilter, key: NDArray[np.uint32], start_key: NDArray[np.uint32]) -> None:
+    def __init__(
+        self, law: PowerLawFilter, key: NDArray[np.uint32], start_key: NDArray[np.uint32]
+    ) -> None:
         self.law, self.key, self.start_key = law, key, start_key
-        padding = -law.poles.size % 4  # the kernel takes sections four at a time; a section with z = q passes its input on
+        padding = (
+            -law.poles.size % 4
+        )  # the kernel takes sections four at a time; a section with z = q passes its input on
         self._rate = np.append(law.poles, np.ones(padding)).astype(np.float32)
         self._tap = np.append(law.zeros - law.poles, np.zeros(padding)).astype(np.float32)
         self._pairs = np.ascontiguousarray(law.pairs, np.float32)
@@ -75,17 +80,24 @@ class Streams:
         shared: float = 0.0,
         over: bool = False,
     ) -> None:
-        """Add level * noise to ``out`` (n_det, n_samp), whose first element is (detector, sample). Thread-safe.
+        """Add level * noise to ``out`` (n_det, n_samp), whose first element is (detector, sample).
+        Thread-safe.
 
-        ``level``: of the same detectors and samples; absent: 1. ``common`` (n_samp,): a stream that makes up the share
-        ``shared`` of the variance. ``over``: put it into ``out``, whatever is there.
+        ``level``: of the same detectors and samples; absent: 1. ``common`` (n_samp,): a stream that
+        makes up the share ``shared`` of the variance. ``over``: put it into ``out``, whatever is
+        there.
         """
         n_det, n_samp = out.shape
         if level is None:
             ones = SmoothField.constant(np.ones(n_det), sample + n_samp)
             level = ones.series(slice(0, n_det), slice(sample, sample + n_samp), out.dtype)
         shares = np.sqrt(np.array([1 - shared, shared])).astype(out.dtype)
-        edges = [detector, *range((detector // TILE_DETECTORS + 1) * TILE_DETECTORS, detector + n_det, TILE_DETECTORS)]
+        edges = [
+            detector,
+            *range(
+                (detector // TILE_DETECTORS + 1) * TILE_DETECTORS, detector + n_det, TILE_DETECTORS
+            ),
+        ]
         for low, high in pairwise([*edges, detector + n_det]):
             rows = slice(low - detector, high - detector)
             part = Series(level.lines[rows], level.first, level.inside)
@@ -112,7 +124,20 @@ class Streams:
             state = tile.kept[nearest].copy()
             law = self._rate, self._tap, self._pairs
             for start, stop in _pieces(nearest, sample):
-                _filter(self.key, number, start, stop - start, state, *law, 0, *level, common[:0], shares, over, out[:0])
+                _filter(
+                    self.key,
+                    number,
+                    start,
+                    stop - start,
+                    state,
+                    *law,
+                    0,
+                    *level,
+                    common[:0],
+                    shares,
+                    over,
+                    out[:0],
+                )
                 self._keep(tile, stop, state)
             for start, stop in _pieces(sample, sample + out.shape[1]):
                 part = slice(start - sample, stop - sample)
@@ -127,7 +152,9 @@ class Streams:
 
     def _first_state(self, number: int) -> NDArray[np.float32]:
         n, sections = len(self.law.start), self.law.poles.size
-        deviates = normals(self.start_key, 0, n * TILE_DETECTORS, stream=number).reshape(n, TILE_DETECTORS)
+        deviates = normals(self.start_key, 0, n * TILE_DETECTORS, stream=number).reshape(
+            n, TILE_DETECTORS
+        )
         begun = self.law.start @ deviates
         state = np.zeros((self._rate.size + n - sections, TILE_DETECTORS), np.float32)
         state[:sections], state[self._rate.size :] = begun[:sections], begun[sections:]
@@ -150,14 +177,31 @@ class StreamsOfSlopes:
         self.variance = np.array([made[slope].variance for slope in slopes.tolist()])
 
     def add(
-        self, detector: int, sample: int, out: AnyFloats, level: Series, common: NDArray[np.float32], shared: float, over: bool
+        self,
+        detector: int,
+        sample: int,
+        out: AnyFloats,
+        level: Series,
+        common: NDArray[np.float32],
+        shared: float,
+        over: bool,
     ) -> None:
-        """As `Streams.add`; ``common`` (number of slopes, n_samp): one for each filter, in the order of ``made``."""
+        """As `Streams.add`; ``common`` (number of slopes, n_samp): one for each filter, in the
+        order of ``made``.
+        """
         n_det, n_samp = out.shape
-        edges = [detector, *range((detector // TILE_DETECTORS + 1) * TILE_DETECTORS, detector + n_det, TILE_DETECTORS)]
+        edges = [
+            detector,
+            *range(
+                (detector // TILE_DETECTORS + 1) * TILE_DETECTORS, detector + n_det, TILE_DETECTORS
+            ),
+        ]
         for low, high in pairwise([*edges, detector + n_det]):
             rows = slice(low - detector, high - detector)
-            part, tile = Series(level.lines[rows], level.first, level.inside), np.empty((high - low, n_samp), out.dtype)
+            part, tile = (
+                Series(level.lines[rows], level.first, level.inside),
+                np.empty((high - low, n_samp), out.dtype),
+            )
             for slope in np.unique(self._slopes[low:high]).tolist():
                 mine = common[list(self._made).index(slope)]
                 self._made[slope].add(low, sample, tile, part, mine, shared, over=True)
@@ -174,25 +218,50 @@ def _pieces(start: int, stop: int) -> list[tuple[int, int]]:
     return list(pairwise(cuts)) if stop > start else []
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _filter(key, tile, start, n, state, rate, tap, pairs, lane, lines, cell, inside, common, shares, over, out):  # type: ignore[no-untyped-def]
-    """Equations (2), (3) of `one_over_f` for 16 detectors x n samples; adds level * y of those from ``lane`` on to ``out``
-    (``over``: puts it there).
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
+def _filter(  # type: ignore[no-untyped-def]
+    key,
+    tile,
+    start,
+    n,
+    state,
+    rate,
+    tap,
+    pairs,
+    lane,
+    lines,
+    cell,
+    inside,
+    common,
+    shares,
+    over,
+    out,
+):
+    """Equations (2), (3) of `one_over_f` for 16 detectors x n samples; adds level * y of those from
+    ``lane`` on to ``out`` (``over``: puts it there).
 
-    ``state`` (K + 2 M, 16), K a multiple of 4, M the number of ``pairs`` (M, 4), is moved on by n samples. Deviate 16 t + lane
-    of stream ``tile`` drives sample t.
-    ``lines, cell, inside``: the `Series` of the level. shares[0] y + shares[1] common takes the place of y; an empty ``common``
+    ``state`` (K + 2 M, 16), K a multiple of 4, M the number of ``pairs`` (M, 4), is moved on by n
+    samples. Deviate 16 t + lane of stream ``tile`` drives sample t. ``lines, cell, inside``: the
+    `Series` of the level. shares[0] y + shares[1] common takes the place of y; an empty ``common``
     stream is 0.
     """
     x = np.empty(16 * _CHUNK, np.float32)
     words, bits, _ = normal_scratch()
-    level, mixed, nothing = np.empty(_CHUNK, out.dtype), np.empty(_CHUNK, out.dtype), np.zeros(_CHUNK, np.float32)
+    level, mixed, nothing = (
+        np.empty(_CHUNK, out.dtype),
+        np.empty(_CHUNK, out.dtype),
+        np.zeros(_CHUNK, np.float32),
+    )
     for done in range(0, n, _CHUNK):
         m = min(_CHUNK, n - done)
         origin = nb.int64(16) * (nb.int64(start) + done)
         if origin % TILE == 0 and 16 * m % TILE == 0:
             for k in range(16 * m // TILE):
-                normal_tile(key, tile, origin // TILE + k, words, bits, x[k * TILE : (k + 1) * TILE])
+                normal_tile(
+                    key, tile, origin // TILE + k, words, bits, x[k * TILE : (k + 1) * TILE]
+                )
         else:
             fill_normals(key, tile, origin, x[: 16 * m])
         for k in range(0, rate.size, 4):
@@ -211,7 +280,9 @@ def _filter(key, tile, start, n, state, rate, tap, pairs, lane, lines, cell, ins
                 row[t] += size[t] * mixed[t]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _pair(x, s, pair):  # type: ignore[no-untyped-def]
     """Equation (3) in place on x (m, 16) and the pair's state s (2, 16), both flat."""
     a, b, to_real, to_imaginary = pair[0], pair[1], pair[2], pair[3]
@@ -224,9 +295,13 @@ def _pair(x, s, pair):  # type: ignore[no-untyped-def]
             x[now + d] = y + (to_real * r + to_imaginary * i)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _four_sections(x, s, rate, tap):  # type: ignore[no-untyped-def]
-    """Four sections in place on x (m, 16) and their states s (4, 16), both flat. The inner loop fills vector registers."""
+    """Four sections in place on x (m, 16) and their states s (4, 16), both flat. The inner loop
+    fills vector registers.
+    """
     q0, q1, q2, q3 = rate[0], rate[1], rate[2], rate[3]
     c0, c1, c2, c3 = tap[0], tap[1], tap[2], tap[3]
     for t in range(uint64(x.size // 16)):

@@ -29,7 +29,10 @@ if TYPE_CHECKING:
     from zonda.core.observation import Observation
 
 _SCHEMA = {
-    "anyOf": [{"type": "string"}, {"type": "object", "properties": {"name": {"type": "string"}}, "required": ["name"]}],
+    "anyOf": [
+        {"type": "string"},
+        {"type": "object", "properties": {"name": {"type": "string"}}, "required": ["name"]},
+    ],
     "examples": ["background_limited", {"name": "background_limited", "optical_efficiency": 0.3}],
 }
 
@@ -37,29 +40,39 @@ _SCHEMA = {
 class WhiteNoise(Operator):
     """Independent Gaussian noise in every sample of every detector.
 
-    One sample has standard deviation NET sqrt(f_s); the one-sided power spectral density is 2 NET^2. Quoted on the sky, NET
-    enters the stream ``white`` as NET zeta <e^-tau>. The NET on the sky, whatever it follows from, is written to
-    ``observation.focalplane.net`` in ``prepare``, before later steps are prepared; of several steps with white noise, all of it.
+    One sample has standard deviation NET sqrt(f_s); the one-sided power spectral density is 2
+    NET^2. Quoted on the sky, NET enters the stream ``white`` as NET zeta <e^-tau>. The NET on the
+    sky, whatever it follows from, is written to ``observation.focalplane.net`` in ``prepare``,
+    before later steps are prepared; of several steps with white noise, all of it.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"white"})
 
     net: KelvinRootSecond | None = Field(None, ge=0)
-    """Noise-equivalent temperature: the rms of one second of integration; None: the instrument's."""
+    """Noise-equivalent temperature: the rms of one second of integration; None: the instrument's.
+    """
     reference: Literal["sky", "detector"] = "sky"
     """Whether `net` is quoted on the sky, after division by zeta e^-tau, or at the detector."""
     scatter: Fraction = Field(0.0, ge=0, le=2)
-    """Relative scatter of NET from detector to detector (log-normal, mean 1, the same in every observation)."""
-    model: Annotated[SerializeAsAny[NoiseModel], BeforeValidator(noise_model), WithJsonSchema(_SCHEMA)] | None = None
-    """Noise model that gives NET instead: a registered name, or a mapping with name and parameters."""
+    """Relative scatter of NET from detector to detector (log-normal, mean 1, the same in every
+    observation).
+    """
+    model: (
+        Annotated[SerializeAsAny[NoiseModel], BeforeValidator(noise_model), WithJsonSchema(_SCHEMA)]
+        | None
+    ) = None
+    """Noise model that gives NET instead: a registered name, or a mapping with name and parameters.
+    """
 
     @model_validator(mode="after")
     def _one_source(self) -> WhiteNoise:
         if self.model is not None and self.model_fields_set & {"net", "reference"}:
             raise ValueError("give either net (with reference) or model: the model sets both")
         if self.reference == "detector" and self.net is None:
-            raise ValueError("reference: detector needs net; the instrument's NET is quoted on the sky")
+            raise ValueError(
+                "reference: detector needs net; the instrument's NET is quoted on the sky"
+            )
         return self
 
     def observe(self, data: Data) -> None:
@@ -71,7 +84,9 @@ class WhiteNoise(Operator):
 
     def check(self, data: Data) -> list[str]:
         """Refuse a noise model that contradicts the detectors; warn of a NET that none has."""
-        if self.net is not None and (text := doubt(f"{self.label}: net", self.net, NET, "K s(1/2)")):
+        if self.net is not None and (
+            text := doubt(f"{self.label}: net", self.net, NET, "K s(1/2)")
+        ):
             warnings.warn(text, stacklevel=2)
         for observation in data.observations:
             self._check(observation.focalplane)
@@ -92,16 +107,22 @@ class WhiteNoise(Operator):
         """Add noise to ``white``."""
         add = "white" in block.detdata
         out = block.new("white", zero=False)
-        level = state.amplitude.of(block.observation).series(block.detectors, block.samples, out.dtype)
+        level = state.amplitude.of(block.observation).series(
+            block.detectors, block.samples, out.dtype
+        )
         _add_normals(state.key, block.detectors.start, block.samples.start, *level, add, out)
 
     def collect(self, data: Data, observation: Observation, state: _State) -> None:
         """State the level."""
         level = state.amplitude.level
         net = 1e3 * level.sky_net(observation)
-        text = f"{np.median(net):.4g}" + (f" ({net.min():.4g} to {net.max():.4g})" if net.max() > net.min() else "")
+        text = f"{np.median(net):.4g}" + (
+            f" ({net.min():.4g} to {net.max():.4g})" if net.max() > net.min() else ""
+        )
         whose = f"{observation.name}: " if level.follows_load else ""  # differs from scan to scan
-        observation.tally.state(self.label, f"{whose}NET on the sky, median (range), mK s^1/2", text)
+        observation.tally.state(
+            self.label, f"{whose}NET on the sky, median (range), mK s^1/2", text
+        )
 
 
 class _State(NamedTuple):
@@ -111,8 +132,8 @@ class _State(NamedTuple):
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
 def _add_normals(key, first, start, lines, cell, inside, add, out):  # type: ignore[no-untyped-def]
-    """out[d, t] = (or, to ``add``, +=) level n: level the `Series` (lines, cell, inside) of detector first + d at sample
-    start + t, n normal deviate start + t of stream first + d."""
+    """out[d, t] = (or, to ``add``, +=) level n: level the `Series` (lines, cell, inside) of
+    detector first + d at sample start + t, n normal deviate start + t of stream first + d."""
     words, bits, tile = normal_scratch()
     level = np.empty(TILE, out.dtype)
     stop = start + out.shape[1]
@@ -121,7 +142,11 @@ def _add_normals(key, first, start, lines, cell, inside, add, out):  # type: ign
             origin = number * TILE
             low, high = max(start, origin), min(stop, origin + TILE)
             normal_tile(key, first + d, number, words, bits, tile)
-            deviates, row, size = tile[low - origin : high - origin], out[d, low - start : high - start], level[: high - low]
+            deviates, row, size = (
+                tile[low - origin : high - origin],
+                out[d, low - start : high - start],
+                level[: high - low],
+            )
             series_into(lines[d], cell, inside, low, size)
             if add:
                 for t in range(uint64(row.size)):  # unsigned: vectorized

@@ -1,13 +1,16 @@
-"""From brightness on the sky to the calibrated scan: telescope efficiencies, opacity and calibration.
+"""From brightness on the sky to the calibrated scan: telescope efficiencies, opacity and
+calibration.
 
-    T_scan = (epsilon T_atm + zeta e^-tau T_astro + T_white + T_pink) / (zeta <e^-tau>)            (1)
+    T_scan = (epsilon T_atm + zeta e^-tau T_astro + T_white + T_pink) / (zeta <e^-tau>)          (1)
 
-(van Marrewijk, Morris et al. 2024). With t = <e^-tau> the smooth band transmission, e^-tau = t (1 + x) and
-T_atm = E + A, mean emission and fluctuation, equation (1) reads
+(van Marrewijk, Morris et al. 2024). With t = <e^-tau> the smooth band transmission, e^-tau = t (1 +
+x) and T_atm = E + A, mean emission and fluctuation, equation (1) reads
 
-    T_scan = T_astro (1 + x) + (epsilon A + T_white + T_pink) / (zeta t) + M,   M = epsilon E / (zeta t).     (2)
+    T_scan = T_astro (1 + x) + (epsilon A + T_white + T_pink) / (zeta t) + M,
+    M = epsilon E / (zeta t).     (2)
 
-M, tens of kelvin, stays beside the stream as a float64 `SmoothField`; everything else is the stream ``signal``.
+M, tens of kelvin, stays beside the stream as a float64 `SmoothField`; everything else is the stream
+``signal``.
 """
 
 from __future__ import annotations
@@ -40,20 +43,29 @@ KNOWN = frozenset({"atmosphere", "transmission", "white", "pink"})
 
 
 class Efficiency(Operator):
-    """Telescope efficiencies, opacity and calibration, equation (1): forms ``signal`` from the components."""
+    """Telescope efficiencies, opacity and calibration, equation (1): forms ``signal`` from the
+    components.
+    """
 
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     knows_means: ClassVar[bool] = True
     linear: ClassVar[bool] = True
-    optional: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere", "transmission", "white", "pink"})
+    optional: ClassVar[frozenset[str]] = frozenset(
+        {"sky", "atmosphere", "transmission", "white", "pink"}
+    )
 
     main_beam: Fraction | None = Field(None, gt=0, le=1)
-    """zeta, the share of an astronomical signal that the main beam delivers; where absent, the instrument's."""
+    """zeta, the share of an astronomical signal that the main beam delivers; where absent, the
+    instrument's.
+    """
     illumination: Fraction | None = Field(None, gt=0, le=1)
-    """epsilon, the share of the atmosphere's emission that reaches a detector; where absent, the instrument's."""
+    """epsilon, the share of the atmosphere's emission that reaches a detector; where absent, the
+    instrument's.
+    """
     scatter: Fraction = quantity("0 %", ge=0, le=0.5)
-    """Relative rms of zeta between detectors (normal). The calibration knows it: the sky keeps its gain, and so does a NET quoted
-    on the sky. The atmosphere's fluctuation, and noise given at the detector (`reference: detector`), vary as 1 / zeta."""
+    """Relative rms of zeta between detectors (normal). The calibration knows it: the sky keeps its
+    gain, and so does a NET quoted on the sky. The atmosphere's fluctuation, and noise given at the
+    detector (`reference: detector`), vary as 1 / zeta."""
     calibration: Literal["mean", "instantaneous"] = "mean"
     """Divide by e^-tau at the mean PWV and current elevation, or by the fluctuating e^-tau."""
     calibration_error: Fraction = quantity("0 %", ge=0, le=0.5)
@@ -83,7 +95,10 @@ class Efficiency(Operator):
             raise PipelineError(
                 f"a mean stands beside {beside[0]} in block.means, which is not calibrated",
                 place=self.label,
-                cure="let the step that makes it add the mean to the stream, or set observation.smooth['atmosphere']",
+                cure=(
+                    "let the step that makes it add the mean to the stream, or set"
+                    " observation.smooth['atmosphere']"
+                ),
             )
         instantaneous = self.calibration == "instantaneous" and "transmission" in block.detdata
         clipped = _make_signal(block, state, instantaneous)
@@ -94,7 +109,9 @@ class Efficiency(Operator):
 
 @dataclass(frozen=True)
 class Calibration:
-    """What `Efficiency` knows of one observation: per-detector factors (n_det,), t and M of equation (2)."""
+    """What `Efficiency` knows of one observation: per-detector factors (n_det,), t and M of
+    equation (2).
+    """
 
     zeta: Floats
     epsilon: Floats
@@ -120,7 +137,10 @@ def _scatter(step: Efficiency, observation: Observation) -> None:
 
 
 def _coefficients(step: Efficiency, observation: Observation) -> Calibration:
-    zeta, epsilon = observation.focalplane.main_beam_efficiency, observation.focalplane.illumination_efficiency
+    zeta, epsilon = (
+        observation.focalplane.main_beam_efficiency,
+        observation.focalplane.illumination_efficiency,
+    )
     gain, transmission, mean = np.ones(len(zeta)), observation.smooth.get("transmission"), None
     if step.calibration_error > 0:
         gain += step.calibration_error * _normals(observation, step.label, "gain")
@@ -137,22 +157,34 @@ def _coefficients(step: Efficiency, observation: Observation) -> Calibration:
 
 
 def _make_signal(block: Block, state: Calibration, instantaneous: bool) -> int:
-    """Put the signal and its mean into a block. Returns how many samples of 1 + x were raised to `LEAST_TRANSMISSION`."""
+    """Put the signal and its mean into a block. Returns how many samples of 1 + x were raised to
+    `LEAST_TRANSMISSION`.
+    """
     have, signal = block.detdata, block.buffer("signal", block.shape)
     absent = np.empty((0, 0), block.dtype)
     divisor = level = Series(absent, 0, np.ones(1, block.dtype))
     mean = None if block.components and "atmosphere" not in block.components else state.mean
-    sky = _sum(block, "sky", [n for n in block.entering("above the atmosphere") if n not in ("sky", "transmission")])
+    sky = _sum(
+        block,
+        "sky",
+        [n for n in block.entering("above the atmosphere") if n not in ("sky", "transmission")],
+    )
     pink = _sum(block, "pink", [n for n in block.entering("at the detector") if n not in KNOWN])
     noisy = pink.size > 0 or any(name in have for name in ("atmosphere", "white"))
     if state.transmission is not None and noisy:
         divisor = state.transmission.series(block.detectors, block.samples, signal.dtype)
     if instantaneous and mean is not None:
         level = mean.series(block.detectors, block.samples, signal.dtype)
-    streams = [sky, *(have.get(name, absent) for name in ("transmission", "atmosphere", "white")), pink]
+    streams = [
+        sky,
+        *(have.get(name, absent) for name in ("transmission", "atmosphere", "white")),
+        pink,
+    ]
     first = np.array([block.samples.start, divisor.first, level.first], np.int64)
     smooth = divisor.lines, divisor.inside, level.lines, level.inside
-    factors = np.array([a[block.detectors] for a in (state.gain, state.epsilon, state.zeta)], block.dtype)
+    factors = np.array(
+        [a[block.detectors] for a in (state.gain, state.epsilon, state.zeta)], block.dtype
+    )
     if noisy or instantaneous:
         clipped = _calibrate(*streams, first, *smooth, factors, instantaneous, signal)
     else:
@@ -180,7 +212,9 @@ def _sum(block: Block, name: str, others: Sequence[str]) -> AnyFloats:
     return total
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _calibrate_sky(sky, fluctuation, gain, out):  # type: ignore[no-untyped-def]
     """Equation (2) where there is nothing but the sky: the same bits in a third of the time."""
     one = out.dtype.type(1)
@@ -196,13 +230,27 @@ def _calibrate_sky(sky, fluctuation, gain, out):  # type: ignore[no-untyped-def]
     return 0
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
 def _calibrate(  # type: ignore[no-untyped-def]
-    sky, fluctuation, emission, white, pink, first, divisor, inside, mean, mean_inside, factors, instantaneous, out
+    sky,
+    fluctuation,
+    emission,
+    white,
+    pink,
+    first,
+    divisor,
+    inside,
+    mean,
+    mean_inside,
+    factors,
+    instantaneous,
+    out,
 ):
-    """Equation (2); absent streams have no rows. ``fluctuation`` is x; ``divisor``, t, and ``mean``, M, are lines of `Series`;
-    ``first`` (3,): the first sample, and the first cells of t and M; ``factors`` (3, n_det): gain, epsilon, zeta.
-    ``instantaneous``: calibrated by 1 + x too.
+    """Equation (2); absent streams have no rows. ``fluctuation`` is x; ``divisor``, t, and
+    ``mean``, M, are lines of `Series`; ``first`` (3,): the first sample, and the first cells of t
+    and M; ``factors`` (3, n_det): gain, epsilon, zeta. ``instantaneous``: calibrated by 1 + x too.
 
     Returns how many samples of 1 + x were raised to `LEAST_TRANSMISSION`.
     """
@@ -213,7 +261,11 @@ def _calibrate(  # type: ignore[no-untyped-def]
     one, opaque = out.dtype.type(1), out.dtype.type(LEAST_TRANSMISSION)
     noisy = emission.shape[0] or white.shape[0] or pink.shape[0]
     piece = 2048
-    nothing, scale, level = np.zeros(piece, out.dtype), np.empty(piece, out.dtype), np.zeros(piece, out.dtype)
+    nothing, scale, level = (
+        np.zeros(piece, out.dtype),
+        np.empty(piece, out.dtype),
+        np.zeros(piece, out.dtype),
+    )
     for d in range(n_det):
         factor = gain[d] / zeta[d] if noisy else out.dtype.type(0)
         for begin in range(0, n, piece):
@@ -230,7 +282,9 @@ def _calibrate(  # type: ignore[no-untyped-def]
             if not instantaneous:
                 for t in range(m):
                     noise = epsilon[d] * a[t] + w[t] + p[t]
-                    row[t] = gain[d] * s[t] * (one + x[t]) + noise * (factor / max(scale[t], opaque))
+                    row[t] = gain[d] * s[t] * (one + x[t]) + noise * (
+                        factor / max(scale[t], opaque)
+                    )
             else:
                 if mean.shape[0]:
                     series_into(mean[d], mean_cell, mean_inside, start + begin, level[:m])
@@ -238,7 +292,10 @@ def _calibrate(  # type: ignore[no-untyped-def]
                     passed = max(one + x[t], opaque)
                     clipped += not one + x[t] >= opaque
                     noise = epsilon[d] * a[t] + w[t] + p[t]
-                    row[t] = gain[d] * s[t] + (noise * (factor / max(scale[t], opaque)) - level[t] * x[t]) / passed
+                    row[t] = (
+                        gain[d] * s[t]
+                        + (noise * (factor / max(scale[t], opaque)) - level[t] * x[t]) / passed
+                    )
     return clipped
 
 
@@ -248,7 +305,9 @@ def _normals(observation: Observation, *names: str) -> Floats:
 
 
 def _flag_opaque(label: str, observation: Observation, transmission: SmoothField) -> None:
-    """Flag detectors that are opaque most of the time, and the samples at which one of the others is."""
+    """Flag detectors that are opaque most of the time, and the samples at which one of the others
+    is.
+    """
     knots = knots_of(transmission, transmission.step)
     dead, cell = np.zeros(len(transmission.weights), bool), np.zeros(knots.shape[1], bool)
     for rows in chunks(len(dead), AT_ONCE):
@@ -259,8 +318,14 @@ def _flag_opaque(label: str, observation: Observation, transmission: SmoothField
     bad = np.repeat(cell[:-1] | cell[1:], transmission.step)[: observation.n_samples]
     observation.flags[bad] |= flags.OPAQUE
     observation.tally.count(
-        label, f"detectors flagged: band transmission below {LEAST_TRANSMISSION:g}", int(dead.sum()), observation.n_detectors
+        label,
+        f"detectors flagged: band transmission below {LEAST_TRANSMISSION:g}",
+        int(dead.sum()),
+        observation.n_detectors,
     )
     observation.tally.count(
-        label, f"samples flagged: band transmission below {LEAST_TRANSMISSION:g}", int(bad.sum()), observation.n_samples
+        label,
+        f"samples flagged: band transmission below {LEAST_TRANSMISSION:g}",
+        int(bad.sum()),
+        observation.n_samples,
     )

@@ -2,11 +2,13 @@
 
 At the detector d the boresight's azimuth A and elevation e give
 
-    T = G_d rms (e / 45 deg)^power sum_(m = 1) sqrt(p_m) (a_m cos m A + b_m sin m A),   p_m ~ exp(-m^2 s^2),        (1)
+    T = G_d rms (e / 45 deg)^power sum_(m = 1) sqrt(p_m) (a_m cos m A + b_m sin m A),
+    p_m ~ exp(-m^2 s^2),   (1)
 
-sum_m p_m = 1, a_m and b_m standard normal deviates: a Gaussian process on the horizon whose correlation falls as a Gaussian of
-the angle, that of sidelobes of a given FWHM (s = FWHM / sqrt(8 ln 2)). TOAST's `SimScanSynchronousSignal` smooths a random map of
-the ground with such a lobe and has the same dependence on elevation. G_d scatters about 1.
+sum_m p_m = 1, a_m and b_m standard normal deviates: a Gaussian process on the horizon whose
+correlation falls as a Gaussian of the angle, that of sidelobes of a given FWHM (s = FWHM / sqrt(8
+ln 2)). TOAST's `SimScanSynchronousSignal` smooths a random map of the ground with such a lobe and
+has the same dependence on elevation. G_d scatters about 1.
 """
 
 from __future__ import annotations
@@ -29,10 +31,12 @@ from zonda.core.types import Floats
 
 
 class GroundPickup(Operator):
-    """Radiation of the ground that depends on the boresight's azimuth and elevation: the component ``ground``.
+    """Radiation of the ground that depends on the boresight's azimuth and elevation: the component
+    ``ground``.
 
-    A Gaussian process of the azimuth, smoothed by sidelobes of `fwhm`, times (elevation / 45 deg)^power. It enters at the
-    detector (K_RJ, before calibration). The ground is the same in all scans of one seed.
+    A Gaussian process of the azimuth, smoothed by sidelobes of `fwhm`, times (elevation / 45
+    deg)^power. It enters at the detector (K_RJ, before calibration). The ground is the same in all
+    scans of one seed.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -47,26 +51,36 @@ class GroundPickup(Operator):
     scatter: Fraction = quantity("0 %", ge=0, le=1)
     """Relative rms of the pickup between detectors (normal, the same in all scans)."""
     realization: int | None = Field(None, ge=0)
-    """Number of the ground: the same for every seed. Where absent the seed draws it, and in a campaign every entry has
-    another."""
+    """Number of the ground: the same for every seed. Where absent the seed draws it, and in a
+    campaign every entry has another."""
 
     def prepare(self, observation: Observation) -> _Pickup:
         """Equation (1) over the scan."""
         seed = observation.seed if self.realization is None else self.realization
         profile = self.rms * horizon(
-            np.asarray(observation.azimuth, np.float64), self.fwhm, stream_key(seed, "ground", self.label)
+            np.asarray(observation.azimuth, np.float64),
+            self.fwhm,
+            stream_key(seed, "ground", self.label),
         )
         profile *= (observation.elevation / (math.pi / 4)) ** self.power
-        observation.tally.state(self.label, f"{observation.name}: rms at the detector", f"{1e3 * profile.std():.3g} mK_RJ")
+        observation.tally.state(
+            self.label,
+            f"{observation.name}: rms at the detector",
+            f"{1e3 * profile.std():.3g} mK_RJ",
+        )
         gains = np.ones(observation.n_detectors)
         if self.scatter > 0:
-            gains += self.scatter * normals(observation.camera_key(self.label), 0, len(gains)).astype(np.float64)
+            gains += self.scatter * normals(
+                observation.camera_key(self.label), 0, len(gains)
+            ).astype(np.float64)
         return _Pickup(profile, gains)
 
     def exec(self, block: Block, state: _Pickup) -> None:
         """Add it to ``ground``."""
         stream = block.new("ground")
-        stream += np.multiply.outer(state.gains[block.detectors], state.profile[block.samples]).astype(stream.dtype)
+        stream += np.multiply.outer(
+            state.gains[block.detectors], state.profile[block.samples]
+        ).astype(stream.dtype)
 
 
 class _Pickup(NamedTuple):
@@ -77,7 +91,9 @@ class _Pickup(NamedTuple):
 
 
 def horizon(azimuth: Floats, fwhm: float, key: NDArray[np.uint32]) -> Floats:
-    """The sum of equation (1) at ``azimuth`` (n,) [rad]: of unit variance over grounds, 0 on average over azimuths."""
+    """The sum of equation (1) at ``azimuth`` (n,) [rad]: of unit variance over grounds, 0 on
+    average over azimuths.
+    """
     s = fwhm / math.sqrt(8 * math.log(2))
     waves = np.arange(1, math.ceil(6 / s) + 1)
     power = np.exp(-((waves * s) ** 2))

@@ -14,10 +14,12 @@ from zonda.core.operator import Operator
 
 
 class HalfWavePlate(Operator):
-    """Continuously rotating half-wave plate: polarization is modulated at four times its frequency (`core.polarization`).
+    """Continuously rotating half-wave plate: polarization is modulated at four times its frequency
+    (`core.polarization`).
 
-    chi = 2 pi frequency t + angle, in the focal plane as the detectors' polarization angles, t since the start of the scan; an
-    ideal plate, whose loss and emission are not simulated. `SaveTOD` writes chi as TOAST's ``hwp_angle``.
+    chi = 2 pi frequency t + angle, in the focal plane as the detectors' polarization angles, t
+    since the start of the scan; an ideal plate, whose loss and emission are not simulated.
+    `SaveTOD` writes chi as TOAST's ``hwp_angle``.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -35,14 +37,19 @@ class HalfWavePlate(Operator):
 
     def configure(self, observation: Observation) -> None:
         """Set `Observation.hwp_angle`."""
-        observation.hwp_angle = np.mod(2 * np.pi * self.frequency * observation.seconds + self.angle, 2 * np.pi)
+        observation.hwp_angle = np.mod(
+            2 * np.pi * self.frequency * observation.seconds + self.angle, 2 * np.pi
+        )
 
     def prepare(self, observation: Observation) -> None:
         """State it; with detectors that are not polarized it has no effect."""
         modulated = 4 * abs(self.frequency)
         observation.tally.state(self.label, "polarization is modulated at", f"{modulated:g} Hz")
         if modulated >= observation.sample_rate / 2:
-            what = f"{modulated:g} Hz is not below half the sample rate, {observation.sample_rate / 2:g} Hz"
+            what = (
+                f"{modulated:g} Hz is not below half the sample rate,"
+                f" {observation.sample_rate / 2:g} Hz"
+            )
             observation.tally.state(self.label, "modulation aliased", what)
         if not observation.focalplane.polarized:
             observation.tally.state(self.label, "no effect", "no detector is polarized")

@@ -15,15 +15,18 @@ from zonda.core.types import Floats
 
 
 class Leakage(Operator):
-    """Instrumental polarization: optics in front of the detectors and of a half-wave plate polarize a share of the intensity.
+    """Instrumental polarization: optics in front of the detectors and of a half-wave plate polarize
+    a share of the intensity.
 
-        d = I + p l I cos(2 (gamma - beta)),   with a half-wave plate   d = I + p l I cos(4 chi - 2 gamma - 2 beta)        (1)
+        d = I + p l I cos(2 (gamma - beta)),
+        with a half-wave plate   d = I + p l I cos(4 chi - 2 gamma - 2 beta)        (1)
 
-    with the share l, its direction beta, a detector's angle gamma and the plate's chi, all in the focal plane, and the
-    polarization efficiency p. It is the monopole leakage gamma_1 + i gamma_2 = l exp(2 i beta) of Hu, Hedman & Zaldarriaga
-    (2003, Phys. Rev. D 67, 043004), constant over the field. What comes through the optics leaks: the sky and the atmosphere, its
-    mean too. The detectors' noise does not, nor do glitches and what sidelobes pick up of the ground. It changes the components:
-    put it behind those, and behind a half-wave plate, before `Efficiency`.
+    with the share l, its direction beta, a detector's angle gamma and the plate's chi, all in the
+    focal plane, and the polarization efficiency p. It is the monopole leakage gamma_1 + i gamma_2 =
+    l exp(2 i beta) of Hu, Hedman & Zaldarriaga (2003, Phys. Rev. D 67, 043004), constant over the
+    field. What comes through the optics leaks: the sky and the atmosphere, its mean too. The
+    detectors' noise does not, nor do glitches and what sidelobes pick up of the ground. It changes
+    the components: put it behind those, and behind a half-wave plate, before `Efficiency`.
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere"})
@@ -36,13 +39,21 @@ class Leakage(Operator):
     """beta, its direction in the focal plane, counted as the detectors' polarization angles."""
 
     def prepare(self, observation: Observation) -> tuple[Floats, Floats]:
-        """p l exp(-2 i (beta - gamma)) of each detector, or with a plate p l exp(-2 i (beta + gamma)) and 4 chi."""
+        """p l exp(-2 i (beta - gamma)) of each detector, or with a plate p l exp(-2 i (beta +
+        gamma)) and 4 chi.
+        """
         plane, chi = observation.focalplane, observation.hwp_angle
-        turn = self.angle - plane.polarization_angle if chi is None else self.angle + plane.polarization_angle
+        turn = (
+            self.angle - plane.polarization_angle
+            if chi is None
+            else self.angle + plane.polarization_angle
+        )
         size = self.share * plane.polarization_efficiency
         if not plane.polarized:
             observation.tally.state(self.label, "no effect", "no detector is polarized")
-        return np.stack([size * np.cos(2 * turn), size * np.sin(2 * turn)]), np.zeros(0) if chi is None else 4 * chi
+        return np.stack([size * np.cos(2 * turn), size * np.sin(2 * turn)]), np.zeros(
+            0
+        ) if chi is None else 4 * chi
 
     def exec(self, block: Block, state: tuple[Floats, Floats]) -> None:
         """Equation (1): a gain of each detector, which the plate modulates."""

@@ -49,9 +49,13 @@ class GroundPlanning(Planning[Any]):
         return 64 * observation.n_samples + 8 * observation.n_detectors
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size and cost. A filter that removes what the detectors have in common removes most of it: that is not counted."""
+        """Its size and cost. A filter that removes what the detectors have in common removes most
+        of it: that is not counted.
+        """
         step, o = self.operator, context.first
-        size = context.bound(max(self._rms(x) for x in context.observations), o.duration, common=True)
+        size = context.bound(
+            max(self._rms(x) for x in context.observations), o.duration, common=True
+        )
         text = "rms (e / 45 deg)^power at the lowest elevation, at the detector, over zeta e^-tau"
         cost = Cost(fixed=0.01, per_time=5e-9 * 50 / step.fwhm, per_sample=1e-9)
         return Estimate((Effect("ground pickup", (full("exact"),), size, text),), cost, size)
@@ -60,7 +64,9 @@ class GroundPlanning(Planning[Any]):
         step = self.operator
         elevation = observation.elevation
         ends = np.array([elevation.min(), elevation.max()]) / (np.pi / 4)
-        return float(step.rms * (1 + 3 * step.scatter) * np.max(ends**step.power) * calibration(observation))
+        return float(
+            step.rms * (1 + 3 * step.scatter) * np.max(ends**step.power) * calibration(observation)
+        )
 
 
 class HalfWavePlatePlanning(Planning[Any]):
@@ -73,11 +79,24 @@ class HalfWavePlatePlanning(Planning[Any]):
         return 8 * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size: without it polarized detectors see Q and U at other angles, up to 2 (Q^2 + U^2)^(1/2) apart."""
-        most = 2 * context.peak * float(context.first.focalplane.polarization_efficiency.max(initial=0.0))
-        size = {"tod": most, "map_rms": most, "peak": most, "transfer": 2.0} if most else {"tod": 0.0, "map_rms": 0.0}
+        """Its size: without it polarized detectors see Q and U at other angles, up to 2 (Q^2 +
+        U^2)^(1/2) apart.
+        """
+        most = (
+            2
+            * context.peak
+            * float(context.first.focalplane.polarization_efficiency.max(initial=0.0))
+        )
+        size = (
+            {"tod": most, "map_rms": most, "peak": most, "transfer": 2.0}
+            if most
+            else {"tod": 0.0, "map_rms": 0.0}
+        )
         text = "2 p x the sky's brightness, which its polarized one cannot exceed"
-        return Estimate((Effect("half-wave plate", (full("exact: ideal, of one angle"),), size, text),), Cost(0.001, 3e-8))
+        return Estimate(
+            (Effect("half-wave plate", (full("exact: ideal, of one angle"),), size, text),),
+            Cost(0.001, 3e-8),
+        )
 
 
 class LeakagePlanning(Planning[Any]):
@@ -93,7 +112,9 @@ class LeakagePlanning(Planning[Any]):
         """Its size; its cost: a product of whole streams, or with a plate one of their own."""
         plate, o = context.first.hwp_angle is not None, context.first
         share = self.operator.share * float(o.focalplane.polarization_efficiency.max(initial=0.0))
-        size = context.bound(share * (context.fluctuation + context.mean_emission), o.duration, common=True)
+        size = context.bound(
+            share * (context.fluctuation + context.mean_emission), o.duration, common=True
+        )
         text = "p l x (rms of the stream + mean emission); of the sky, p l"
         effect = Effect("leakage", (full("exact"),), size | context.sky_error(share), text)
         return Estimate((effect,), Cost(0.001, 3e-8, 8e-9 if plate else 5e-9))

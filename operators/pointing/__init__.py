@@ -1,1 +1,3 @@
-"""Pointing: simulated and recorded scans, and the transformation between the sky and the horizon."""
+"""Pointing: simulated and recorded scans, and the transformation between the sky and the
+horizon.
+"""

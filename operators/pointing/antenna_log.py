@@ -1,8 +1,10 @@
-"""Antenna logs of the ASTE telescope, as DESHIMA's observations have them (``.ant``): text, one row every 0.1 s.
+"""Antenna logs of the ASTE telescope, as DESHIMA's observations have them (``.ant``): text, one row
+every 0.1 s.
 
-A line of names begins with ``#time``; rows have the UTC time (``20171113070543.1``), 17 numbers in degrees and millimetres and
-what the telescope did. The beam is where the programme without the pointing model's corrections wanted it, plus the
-error of tracking (as DESHIMA's own package demerge takes it):
+A line of names begins with ``#time``; rows have the UTC time (``20171113070543.1``), 17 numbers in
+degrees and millimetres and what the telescope did. The beam is where the programme without the
+pointing model's corrections wanted it, plus the error of tracking (as DESHIMA's own package demerge
+takes it):
 
     azimuth = az-prog(no-cor) + az-real - az-prg,      the same for the elevation.          (1)
 """
@@ -25,12 +27,20 @@ BEGINS = b"#time ra-"
 AZ_PRG, EL_PRG, AZ_REAL, EL_REAL, AZ_NO_COR, EL_NO_COR, COLUMNS = 2, 3, 4, 5, 13, 14, 17
 """Places of the columns behind the time; how many there are."""
 
-NAMES = {AZ_PRG: "az-prg", EL_PRG: "el-prg", AZ_REAL: "az-real", EL_REAL: "el-real", AZ_NO_COR: "az-prg(no-cor)",
-         EL_NO_COR: "el-prg(no-cor)"}  # fmt: skip
+NAMES = {
+    AZ_PRG: "az-prg",
+    EL_PRG: "el-prg",
+    AZ_REAL: "az-real",
+    EL_REAL: "el-real",
+    AZ_NO_COR: "az-prg(no-cor)",
+    EL_NO_COR: "el-prg(no-cor)",
+}
 """What a log calls the columns that are read; it also writes `prog` for `prg`."""
 
 TYPES = {"SCAN": 0, "ON": 0, "ACC": flags.TURNAROUND, "TRAN": flags.TURNAROUND}
-"""What the telescope did, and the flags of such a row; of others: `flags.IRREGULAR` (slews, off-source positions)."""
+"""What the telescope did, and the flags of such a row; of others: `flags.IRREGULAR` (slews,
+off-source positions).
+"""
 
 END = "END"
 """The last row, which is no measurement."""
@@ -56,20 +66,34 @@ def read_log(path: Path, place: str) -> tuple[Instant, Floats, Floats, Floats, f
                 values = [float(word) for word in words[1:-1]]
             except ValueError as err:
                 cure = "leave the row out, or copy the log again"
-                raise InputError(f"line {line} is no row of an antenna log: {err}", place=place, cure=cure) from None
+                raise InputError(
+                    f"line {line} is no row of an antenna log: {err}", place=place, cure=cure
+                ) from None
             if len(values) != COLUMNS:
                 text = f"line {line} has {len(values)} numbers between time and type, not {COLUMNS}"
-                raise InputError(text, place=place, cure="is the log complete? copy it again, or leave the row out")
+                raise InputError(
+                    text,
+                    place=place,
+                    cure="is the log complete? copy it again, or leave the row out",
+                )
             moments.append((moment - EPOCH) / timedelta(microseconds=1))
             numbers.append(values)
             bits.append(TYPES.get(words[-1], flags.IRREGULAR))
     if not numbers:
-        raise InputError("has no row of a scan", place=place, cure="give the log of another observation")
+        raise InputError(
+            "has no row of a scan", place=place, cure="give the log of another observation"
+        )
     table = np.radians(np.array(numbers))
     first = round(moments[0])
     azimuth = table[:, AZ_NO_COR] + _difference(table[:, AZ_REAL], table[:, AZ_PRG])
     elevation = table[:, EL_NO_COR] + table[:, EL_REAL] - table[:, EL_PRG]
-    return Instant(first * 1000), (np.array(moments) - first) * 1e-6, azimuth, elevation, np.array(bits, np.uint8)
+    return (
+        Instant(first * 1000),
+        (np.array(moments) - first) * 1e-6,
+        azimuth,
+        elevation,
+        np.array(bits, np.uint8),
+    )
 
 
 def _check_names(names: list[str], place: str) -> None:
@@ -79,7 +103,9 @@ def _check_names(names: list[str], place: str) -> None:
             raise InputError(
                 f"column {at + 2} of the antenna log is {found}, where {name} is read",
                 place=place,
-                cure="give a log with the columns of ASTE, or a table of time, azimuth and elevation",
+                cure=(
+                    "give a log with the columns of ASTE, or a table of time, azimuth and elevation"
+                ),
             )
 
 

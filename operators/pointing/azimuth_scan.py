@@ -28,13 +28,16 @@ if TYPE_CHECKING:
 class PointingBackAndForth(Pointing):
     """Constant-elevation scan back and forth in azimuth, with smooth turnarounds.
 
-    It is centred on an az/el target, or on where a celestial target stands in the middle of the scan. Each leg crosses
-    `throw` at constant `speed`, both measured on the sky (azimuth angle times the cosine of the elevation); then the
-    telescope turns round outside `throw` within T = 4 speed / acceleration. With u the fraction of T that has passed
+    It is centred on an az/el target, or on where a celestial target stands in the middle of the
+    scan. Each leg crosses `throw` at constant `speed`, both measured on the sky (azimuth angle
+    times the cosine of the elevation); then the telescope turns round outside `throw` within T = 4
+    speed / acceleration. With u the fraction of T that has passed
 
-        x'' = -acceleration sin^2(pi u),   x - throw/2 = speed T [u - u^2 + (1 - cos(2 pi u)) / (2 pi^2)]      (1)
+        x'' = -acceleration sin^2(pi u),
+        x - throw/2 = speed T [u - u^2 + (1 - cos(2 pi u)) / (2 pi^2)]      (1)
 
-    so position to jerk are continuous; it ends 1.41 speed^2 / acceleration beyond. Flags tell while the Sun is up or near.
+    so position to jerk are continuous; it ends 1.41 speed^2 / acceleration beyond. Flags tell while
+    the Sun is up or near.
     """
 
     throw: Angle = quantity("30 arcmin", gt=0, le=2 * math.pi)
@@ -44,7 +47,9 @@ class PointingBackAndForth(Pointing):
     acceleration: AngularAcceleration = quantity("1 arcmin/s2", gt=0)
     """Largest acceleration on the sky in a turnaround."""
     flag_turnarounds: bool = False
-    """Flag the samples in turnarounds (bit value 4), so that no map uses them; without it they are used like all others."""
+    """Flag the samples in turnarounds (bit value 4), so that no map uses them; without it they are
+    used like all others.
+    """
 
     slows: ClassVar[dict[str, tuple[int, int]]] = {"speed": (-1, 1), "acceleration": (-1, 2)}
 
@@ -63,28 +68,45 @@ class PointingBackAndForth(Pointing):
 
     def in_turnaround(self, seconds: Floats) -> NDArray[np.bool_]:
         """(n,) True in turnarounds."""
-        return np.asarray(np.mod(seconds, self.throw / self.speed + self.turnaround) > self.throw / self.speed)
+        return np.asarray(
+            np.mod(seconds, self.throw / self.speed + self.turnaround) > self.throw / self.speed
+        )
 
     def directions(self, aim: Aim, seconds: Floats) -> Floats:
         longitude, elevation = _middle(aim, seconds)
         elevation += aim.offset[1]
-        _check_turn(self.throw / 2 + self.speed**2 / self.acceleration * (1 + 4 / np.pi**2), elevation, self.label)
+        _check_turn(
+            self.throw / 2 + self.speed**2 / self.acceleration * (1 + 4 / np.pi**2),
+            elevation,
+            self.label,
+        )
         found = series(3, len(seconds))
         for chunk in chunks(len(seconds)):
             x, _ = self.path(seconds[chunk])
-            found[chunk] = unit_vectors(longitude - (x + aim.offset[0]) / math.cos(elevation), np.full(len(x), elevation))
+            found[chunk] = unit_vectors(
+                longitude - (x + aim.offset[0]) / math.cos(elevation), np.full(len(x), elevation)
+            )
         return found
 
     def flag(self, seconds: Floats) -> NDArray[np.uint8]:
-        return np.where(self.flag_turnarounds & self.in_turnaround(seconds), TURNAROUND, 0).astype(np.uint8)
+        return np.where(self.flag_turnarounds & self.in_turnaround(seconds), TURNAROUND, 0).astype(
+            np.uint8
+        )
 
     def intervals(self, seconds: Floats) -> Intervals:
-        return _intervals(seconds, self.throw / self.speed, self.turnaround, self.in_turnaround(seconds))
+        return _intervals(
+            seconds, self.throw / self.speed, self.turnaround, self.in_turnaround(seconds)
+        )
 
     def describe(self, observation: Observation) -> None:
         mark_sun(observation)
         what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
-        observation.tally.count(self.label, what, int(self.in_turnaround(observation.seconds).sum()), observation.n_samples)
+        observation.tally.count(
+            self.label,
+            what,
+            int(self.in_turnaround(observation.seconds).sum()),
+            observation.n_samples,
+        )
 
 
 def _middle(aim: Aim, seconds: Floats) -> tuple[float, float]:
@@ -97,19 +119,26 @@ def _middle(aim: Aim, seconds: Floats) -> tuple[float, float]:
 
 
 def _check_turn(widest: float, elevation: float, place: str) -> None:
-    """Refuse a scan that reaches ``widest`` [rad] from its middle, half a turn of azimuth or more at its elevation."""
+    """Refuse a scan that reaches ``widest`` [rad] from its middle, half a turn of azimuth or more
+    at its elevation.
+    """
     if elevation >= math.pi / 2 or widest > math.pi * math.cos(elevation):
         raise PointingError(
-            f"the scan spans more than a whole turn of azimuth at elevation {math.degrees(elevation):.2f} deg",
+            "the scan spans more than a whole turn of azimuth at elevation"
+            f" {math.degrees(elevation):.2f} deg",
             place=place,
             cure="lower throw, or choose a lower elevation",
         )
 
 
-def _intervals(seconds: Floats, leg: float, turnaround: float, turning: NDArray[np.bool_]) -> Intervals:
-    """TOAST's intervals. Left to right is towards larger azimuth; a turnaround has the direction of the scan before it.
+def _intervals(
+    seconds: Floats, leg: float, turnaround: float, turning: NDArray[np.bool_]
+) -> Intervals:
+    """TOAST's intervals. Left to right is towards larger azimuth; a turnaround has the direction of
+    the scan before it.
 
-    A throw goes from the middle of a turnaround to that of the next (the parameter `throw` is the length of a *scan*).
+    A throw goes from the middle of a turnaround to that of the next (the parameter `throw` is the
+    length of a *scan*).
     """
     cycle = leg + turnaround
     first, throw = (np.floor(t / cycle) % 2 == 0 for t in (seconds, seconds + turnaround / 2))

@@ -1,4 +1,6 @@
-"""Base of the simulated scans: target, times, offsets, the telescope's limits, and the `Observation`s that they append."""
+"""Base of the simulated scans: target, times, offsets, the telescope's limits, and the
+`Observation`s that they append.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,9 @@ def _kind(value: Any) -> str:
 
 
 Offsets = Annotated[
-    Annotated[Literal["none", "box"], Tag("name")] | Annotated[list[tuple[Angle, Angle]], Tag("list")], Discriminator(_kind)
+    Annotated[Literal["none", "box"], Tag("name")]
+    | Annotated[list[tuple[Angle, Angle]], Tag("list")],
+    Discriminator(_kind),
 ]
 """A named pattern of offsets, or the offsets themselves."""
 
@@ -66,10 +70,12 @@ class Aim(NamedTuple):
 
 
 class Pointing(Operator):
-    """Base of the pointing operators: `scans` observations of `scan_duration`, `gap` apart, around one target.
+    """Base of the pointing operators: `scans` observations of `scan_duration`, `gap` apart, around
+    one target.
 
-    The mount is alt-azimuth without a field derotator: the focal plane's eta points to the zenith, so the parallactic
-    rotation is in ``boresight_radec``. No refraction. A subclass gives `path`, the offsets from the target, or `directions`.
+    The mount is alt-azimuth without a field derotator: the focal plane's eta points to the zenith,
+    so the parallactic rotation is in ``boresight_radec``. No refraction. A subclass gives `path`,
+    the offsets from the target, or `directions`.
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -77,7 +83,9 @@ class Pointing(Operator):
     target: Target | None = None
     """Centre of the scans; the scene's target where absent."""
     targets: list[Target] | None = Field(None, min_length=1, max_length=10_000)
-    """Several targets instead, for a mosaic in one map: `scans` of the first, then as many of the next, and so on."""
+    """Several targets instead, for a mosaic in one map: `scans` of the first, then as many of the
+    next, and so on.
+    """
     scan_duration: Seconds = quantity("8.6 min", gt=0, le=86400 * 31)
     """Length of one scan."""
     scans: int = Field(1, ge=1, le=1_000_000)
@@ -85,18 +93,25 @@ class Pointing(Operator):
     gap: Seconds = quantity("30 s", ge=0)
     """Time between the end of a scan and the start of the next (slew and settle)."""
     offsets: Offsets = "none"
-    """Where the scans are centred, in turn: all on the target; on the corners of a box of side `offset_size`, so that each
-    scan moves by that much; or a list of offsets on the sky (towards east and north, for az/el towards azimuth and up)."""
+    """Where the scans are centred, in turn: all on the target; on the corners of a box of side
+    `offset_size`, so that each scan moves by that much; or a list of offsets on the sky (towards
+    east and north, for az/el towards azimuth and up)."""
     offset_size: Angle = quantity("1 arcmin", gt=0, le=0.1)
     """Side of the box of `offsets: box`."""
     sample_rate: Hertz | None = Field(None, gt=0, le=1e6)
     """Read-out rate; the instrument's where absent."""
     jitter: Seconds = quantity("0 s", ge=0, le=1)
-    """rms by which samples are taken early or late (Gaussian, known: the times in the products are the true ones)."""
+    """rms by which samples are taken early or late (Gaussian, known: the times in the products are
+    the true ones).
+    """
     check_limits: Literal["error", "warn"] = "error"
-    """Whether a scan beyond the telescope's largest speed, acceleration or jerk is an error, or a warning."""
+    """Whether a scan beyond the telescope's largest speed, acceleration or jerk is an error, or a
+    warning.
+    """
     interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
-    """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
+    """Largest error of interpolating the celestial transformation in time, as a fraction of the
+    smallest beam's FWHM.
+    """
 
     @model_validator(mode="after")
     def _one_or_several_targets(self) -> Pointing:
@@ -109,7 +124,9 @@ class Pointing(Operator):
     @model_validator(mode="after")
     def _offsets_are_used(self) -> Pointing:
         if self.offsets != "box" and abs(self.offset_size - _OFFSET_SIZE) > 1e-15:
-            raise ValueError("offset_size is the side of the box: set offsets: box with it, or leave it out")
+            raise ValueError(
+                "offset_size is the side of the box: set offsets: box with it, or leave it out"
+            )
         if isinstance(self.offsets, list):
             if not self.offsets:
                 raise ValueError("the list of offsets is empty; write none instead")
@@ -118,12 +135,16 @@ class Pointing(Operator):
         return self
 
     slows: ClassVar[dict[str, tuple[int, int]]] = {}
-    """Parameters that make a scan easier for the telescope: -1 to lower, 1 to raise it; and the power of 1/s in its unit."""
+    """Parameters that make a scan easier for the telescope: -1 to lower, 1 to raise it; and the
+    power of 1/s in its unit.
+    """
 
     # -- what a subclass gives --
 
     def of_scan(self, number: int, instrument: Instrument) -> Pointing:
-        """The step as it is in the scan ``number``, counted from 0: itself, where scans do not differ."""
+        """The step as it is in the scan ``number``, counted from 0: itself, where scans do not
+        differ.
+        """
         return self
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
@@ -134,15 +155,21 @@ class Pointing(Operator):
         raise NotImplementedError
 
     def directions(self, aim: Aim, seconds: Floats) -> Floats:
-        """Horizontal unit vectors (n, 3) north, west, up at ``seconds`` (n,) since the start of the scan."""
+        """Horizontal unit vectors (n, 3) north, west, up at ``seconds`` (n,) since the start of the
+        scan.
+        """
         target, offset = aim.target, aim.offset
         found = series(3, len(seconds))
         for chunk in chunks(len(seconds)):
             if target.frame == "horizontal":
                 x, y = self.path(seconds[chunk])
-                found[chunk] = _on_tangent_plane(-target.longitude, target.latitude, -(x + offset[0]), y + offset[1])
+                found[chunk] = _on_tangent_plane(
+                    -target.longitude, target.latitude, -(x + offset[0]), y + offset[1]
+                )
             else:
-                found[chunk] = aim.transform.horizontal(self._on_the_sky(aim, seconds[chunk]), seconds[chunk])
+                found[chunk] = aim.transform.horizontal(
+                    self._on_the_sky(aim, seconds[chunk]), seconds[chunk]
+                )
         return found
 
     def flag(self, seconds: Floats) -> NDArray[np.uint8]:
@@ -150,7 +177,9 @@ class Pointing(Operator):
         return np.zeros(len(seconds), np.uint8)
 
     def intervals(self, seconds: Floats) -> Intervals:
-        """Parts of a scan whose samples are taken at ``seconds`` (n,), by TOAST's names; by default all is *scanning*."""
+        """Parts of a scan whose samples are taken at ``seconds`` (n,), by TOAST's names; by default
+        all is *scanning*.
+        """
         return {}
 
     def describe(self, observation: Observation) -> None:
@@ -185,11 +214,20 @@ class Pointing(Operator):
         self._observe(data, range(self.number), rate)
 
     def check(self, data: Data) -> list[str]:
-        """A selection of scans and instants: elevation, speed and acceleration, samples per beam."""
+        """A selection of scans and instants: elevation, speed and acceleration, samples per
+        beam.
+        """
         rate = self.sample_rate or data.scene.instrument.sample_rate
-        looked = sorted({round(k) for k in np.linspace(0, self.number - 1, min(self.number, SCANS_LOOKED_AT))})
-        coarse = min(rate, max(INSTANTS_LOOKED_AT / (len(looked) * self.scan_duration), 1 / self.scan_duration))
-        self._seconds(max(min(round(self.scan_duration * rate), POINTS), 1), rate, self._jitter_key(data, 0))
+        looked = sorted(
+            {round(k) for k in np.linspace(0, self.number - 1, min(self.number, SCANS_LOOKED_AT))}
+        )
+        coarse = min(
+            rate,
+            max(INSTANTS_LOOKED_AT / (len(looked) * self.scan_duration), 1 / self.scan_duration),
+        )
+        self._seconds(
+            max(min(round(self.scan_duration * rate), POINTS), 1), rate, self._jitter_key(data, 0)
+        )
         first = len(data.observations)
         self.model_copy(update={"jitter": 0.0})._observe(data, looked, coarse)
         made = data.observations[first:]
@@ -198,11 +236,16 @@ class Pointing(Operator):
         elevations = np.degrees([(o.elevation.min(), o.elevation.max()) for o in made])
         part = "" if len(looked) == self.number else f" ({len(looked)} of them looked at)"
         several = f" of {len(self.targets)} targets" if self.targets else ""
-        lines = [f"{self.number} scan{'s' if self.number > 1 else ''}{several} from {made[0].start}{part}"]
+        lines = [
+            f"{self.number} scan{'s' if self.number > 1 else ''}{several} from"
+            f" {made[0].start}{part}"
+        ]
         lines.append(f"elevation: {elevations.min():.2f} to {elevations.max():.2f} deg")
         motion = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
         lines += distances(made)
-        return lines + [f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(motion)]
+        return lines + [
+            f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(motion)
+        ]
 
     def _observe(self, data: Data, which: Sequence[int], rate: float) -> None:
         """Append the scans ``which``, sampled at ``rate`` [Hz]."""
@@ -222,7 +265,9 @@ class Pointing(Operator):
         for k in which:
             start = begin.shifted(k * (self.scan_duration + self.gap))
             target = targets[k // self.scans]
-            observation = self.of_scan(k, scene.instrument)._scan(data, target, start, before + k, self._offset(k), rate, moved)
+            observation = self.of_scan(k, scene.instrument)._scan(
+                data, target, start, before + k, self._offset(k), rate, moved
+            )
             sampled.add(observation, self.sample_rate or scene.instrument.sample_rate)
             data.observations.append(observation)
         report(self.label, data.observations[first:], moved, sampled)
@@ -242,22 +287,32 @@ class Pointing(Operator):
     ) -> Observation:
         """The observation ``index``, sampled at ``rate`` [Hz]."""
         scene, instrument = data.scene, data.scene.instrument
-        seconds = self._seconds(max(round(self.scan_duration * rate), 1), rate, self._jitter_key(data, index))
+        seconds = self._seconds(
+            max(round(self.scan_duration * rate), 1), rate, self._jitter_key(data, index)
+        )
         beam = float(instrument.focalplane().fwhm.min())
-        transform = CelestialTransform(scene.site, start, seconds[-1], self.interpolation_error * beam)
+        transform = CelestialTransform(
+            scene.site, start, seconds[-1], self.interpolation_error * beam
+        )
         aim = Aim(transform, target, offset)
         horizontal, *boresight = self.boresight(aim, seconds)
         place = f"{self.label}, scan {index} from {start}"
         total = self.number * self.scan_duration + (self.number - 1) * self.gap
         check_elevation(horizontal, transform, target, instrument.telescope, total, place)
-        samples = Samples(seconds, rate, (boresight[0], boresight[1]), self.flag(seconds), self.intervals(seconds))
-        observation = observed(self.label, scene, index, transform, centre_of(transform, target, seconds), samples)
+        samples = Samples(
+            seconds, rate, (boresight[0], boresight[1]), self.flag(seconds), self.intervals(seconds)
+        )
+        observation = observed(
+            self.label, scene, index, transform, centre_of(transform, target, seconds), samples
+        )
         self._check_motion(observation, aim, None if self.jitter else horizontal, place, moved)
         if self.jitter > 0:
             state_times(self.label, observation)
         if (wanted := self.scan_duration * rate) < 0.5:
             observation.tally.state(
-                self.label, f"{observation.name}: shorter than a sample", f"{wanted:.2g} of one; one is taken"
+                self.label,
+                f"{observation.name}: shorter than a sample",
+                f"{wanted:.2g} of one; one is taken",
             )
         self.describe(observation)
         return observation
@@ -270,7 +325,8 @@ class Pointing(Operator):
         seconds += self.jitter * normals(key, 0, n).astype(np.float64)
         if (np.diff(seconds) <= 0).any():
             raise PointingError(
-                f"a jitter of {self.jitter * 1e3:.4g} ms would reorder samples: they come every {1e3 / rate:.4g} ms",
+                f"a jitter of {self.jitter * 1e3:.4g} ms would reorder samples: they come every"
+                f" {1e3 / rate:.4g} ms",
                 place=self.label,
                 cure=f"lower jitter to {100 / rate:.3g} ms",
             )
@@ -279,23 +335,38 @@ class Pointing(Operator):
     # -- what the telescope can do --
 
     def _check_motion(
-        self, observation: Observation, aim: Aim, horizontal: Floats | None, place: str, moved: LargestMotion
+        self,
+        observation: Observation,
+        aim: Aim,
+        horizontal: Floats | None,
+        place: str,
+        moved: LargestMotion,
     ) -> None:
-        """Compare the track with the telescope's limits; raise where it exceeds one that it must keep."""
+        """Compare the track with the telescope's limits; raise where it exceeds one that it must
+        keep.
+        """
         rate, limits = observation.sample_rate, moved.limits
         length = observation.n_samples / rate
 
         def track(scan: Pointing, step: float) -> Floats:
-            return scan.directions(aim, np.arange(max(round(length / step), 1), dtype=np.float64) * step)
+            return scan.directions(
+                aim, np.arange(max(round(length / step), 1), dtype=np.float64) * step
+            )
 
         def of(scan: Pointing) -> dict[Quantity, LargestDerivative]:
             coarse = min(rate, POINTS / length)
             return motion(track(scan, 1 / coarse), coarse, limits, lambda step: track(scan, step))
 
-        found = of(self) if horizontal is None else motion(horizontal, rate, limits, lambda step: track(self, step))
+        found = (
+            of(self)
+            if horizontal is None
+            else motion(horizontal, rate, limits, lambda step: track(self, step))
+        )
         over = excess(found, limits)
         if over and self.check_limits == "error":
-            cure = what_fits(self, self.slows, found, over, lambda scan: not excess(of(scan), limits))
+            cure = what_fits(
+                self, self.slows, found, over, lambda scan: not excess(of(scan), limits)
+            )
             raise PointingError(moved.too_fast(next(iter(over)), found), place=place, cure=cure)
         moved.add(observation.name, found)
 
@@ -309,7 +380,9 @@ class Pointing(Operator):
 
 
 def _on_tangent_plane(longitude: float, latitude: float, x: Floats, y: Floats) -> Floats:
-    """Unit vectors (n, 3) at gnomonic offsets x (towards increasing longitude) and y (latitude) [rad]."""
+    """Unit vectors (n, 3) at gnomonic offsets x (towards increasing longitude) and y (latitude)
+    [rad].
+    """
     east = np.array([-math.sin(longitude), math.cos(longitude), 0.0])
     centre = unit_vectors(longitude, latitude)
     north = np.cross(centre, east)

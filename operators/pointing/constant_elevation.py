@@ -1,12 +1,15 @@
-"""The track of a constant-elevation scan between two azimuths of the mount, and of a nod in elevation.
+"""The track of a constant-elevation scan between two azimuths of the mount, and of a nod in
+elevation.
 
-The scan begins at the lesser azimuth, towards larger ones. It crosses the width w at the constant rate v; outside the limits the
-mount turns round within T, u seconds after it began to:
+The scan begins at the lesser azimuth, towards larger ones. It crosses the width w at the constant
+rate v; outside the limits the mount turns round within T, u seconds after it began to:
 
-    A = v u - a u^2 / 2,                          T = 2 v / a   (constant acceleration, TOAST's `SimGround`),      (1)
-    A = v T [u/T - (u/T)^2 + (1 - cos(2 pi u / T)) / (2 pi^2)],   T = 4 v / a   (smooth, equation (1) of `azimuth_scan`).   (2)
+    A = v u - a u^2 / 2,   T = 2 v / a   (constant acceleration, TOAST's `SimGround`),   (1)
+    A = v T [u/T - (u/T)^2 + (1 - cos(2 pi u / T)) / (2 pi^2)],
+    T = 4 v / a   (smooth, equation (1) of `azimuth_scan`).   (2)
 
-A nod goes from one elevation to the next from rest to rest: constant acceleration, constant speed, constant deceleration.
+A nod goes from one elevation to the next from rest to rest: constant acceleration, constant speed,
+constant deceleration.
 """
 
 from __future__ import annotations
@@ -23,8 +26,8 @@ from zonda.core.types import Floats
 
 @dataclass(frozen=True)
 class Sweep:
-    """Back and forth over ``width`` [rad] of azimuth at ``rate`` [rad/s], turned round with ``acceleration`` [rad/s^2], all of
-    the mount; ``smooth``: equation (2)."""
+    """Back and forth over ``width`` [rad] of azimuth at ``rate`` [rad/s], turned round with
+    ``acceleration`` [rad/s^2], all of the mount; ``smooth``: equation (2)."""
 
     width: float
     rate: float
@@ -66,11 +69,15 @@ class Sweep:
         return np.asarray(np.mod(seconds, self.leg + self.turnaround) > self.leg)
 
     def intervals(self, seconds: Floats, inside: NDArray[np.bool_]) -> Intervals:
-        """TOAST's intervals of the samples ``inside`` (n,); a throw goes from the middle of a turnaround to that of the next."""
+        """TOAST's intervals of the samples ``inside`` (n,); a throw goes from the middle of a
+        turnaround to that of the next.
+        """
         if self.width == 0:
             return {"scanning": runs(inside, seconds)}
         cycle, turning = self.leg + self.turnaround, self.turning(seconds)
-        first, throw = (np.floor(t / cycle) % 2 == 0 for t in (seconds, seconds + self.turnaround / 2))
+        first, throw = (
+            np.floor(t / cycle) % 2 == 0 for t in (seconds, seconds + self.turnaround / 2)
+        )
         found: Intervals = {}
         for way, after, going in (("leftright", first, throw), ("rightleft", ~first, ~throw)):
             found[f"throw_{way}"] = runs(inside & going, seconds)
@@ -83,7 +90,9 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Nod:
-    """From 0 to the ``stops`` [rad] in turn, at most at ``rate`` [rad/s], with ``acceleration`` [rad/s^2]."""
+    """From 0 to the ``stops`` [rad] in turn, at most at ``rate`` [rad/s], with ``acceleration``
+    [rad/s^2].
+    """
 
     stops: tuple[float, ...]
     rate: float
@@ -100,7 +109,12 @@ class Nod:
         for start, way, ramp, coast in self._moves():
             u, v = np.clip(seconds - begin, 0.0, 2 * ramp + coast), self.acceleration * ramp
             up, down = np.minimum(u, ramp), np.maximum(u - ramp - coast, 0.0)
-            gone = self.acceleration * up**2 / 2 + v * np.clip(u - ramp, 0.0, coast) + v * down - self.acceleration * down**2 / 2
+            gone = (
+                self.acceleration * up**2 / 2
+                + v * np.clip(u - ramp, 0.0, coast)
+                + v * down
+                - self.acceleration * down**2 / 2
+            )
             found = np.where(seconds >= begin, start + way * gone, found)
             begin += 2 * ramp + coast
         return found
@@ -111,7 +125,11 @@ class Nod:
         for stop in self.stops:
             far = abs(stop - at)
             ramp = min(self.rate / self.acceleration, math.sqrt(far / self.acceleration))
-            coast = max(far / self.rate - ramp, 0.0) if ramp * self.acceleration >= self.rate * (1 - 1e-12) else 0.0
+            coast = (
+                max(far / self.rate - ramp, 0.0)
+                if ramp * self.acceleration >= self.rate * (1 - 1e-12)
+                else 0.0
+            )
             moves.append((at, math.copysign(1.0, stop - at), ramp, coast))
             at = stop
         return moves

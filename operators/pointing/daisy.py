@@ -21,10 +21,11 @@ class PointingDaisy(Pointing):
     With x + iy the tangent-plane offset,
 
         phi = phase + speed t / radius
-        x + iy = radius [sin(phi) exp(i phi / n) + a sin(phi + pi/2) exp(i sqrt(2) phi / n)]                   (1)
+        x + iy = radius [sin(phi) exp(i phi / n) + a sin(phi + pi/2) exp(i sqrt(2) phi / n)]     (1)
 
-    towards east and north of an ICRS or Galactic target, towards azimuth and zenith of an az/el one. `speed` is that of the
-    outer term through the centre; the boresight is never farther than 1.011 radius for a = 0.15.
+    towards east and north of an ICRS or Galactic target, towards azimuth and zenith of an az/el
+    one. `speed` is that of the outer term through the centre; the boresight is never farther than
+    1.011 radius for a = 0.15.
     """
 
     radius: Angle = quantity("4 arcmin", gt=0, le=0.5)
@@ -32,7 +33,9 @@ class PointingDaisy(Pointing):
     speed: AngularSpeed = quantity("50 arcsec/s", gt=0)
     """Speed of the outer term through the centre."""
     petals: float = Field(10 / math.pi, gt=0, le=1000)
-    """n of equation (1): how slowly the petals turn; 10/pi gives 20 petals in one turn, which takes 20 radius / speed."""
+    """n of equation (1): how slowly the petals turn; 10/pi gives 20 petals in one turn, which takes
+    20 radius / speed.
+    """
     inner: Fraction = Field(0.15, ge=0, lt=1)
     """a of equation (1): amplitude of the inner daisy, as a fraction of `radius`."""
     phase: Angle = quantity("0 rad")

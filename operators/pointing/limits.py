@@ -1,4 +1,5 @@
-"""Limits of a telescope: elevations, and speed, acceleration and jerk of its axes. Errors say what would be possible.
+"""Limits of a telescope: elevations, and speed, acceleration and jerk of its axes. Errors say what
+would be possible.
 
 What would make a scan fit is found by trying values of its own parameters on the scan itself.
 """
@@ -33,9 +34,15 @@ STILL = 1e-9
 
 
 def check_elevation(
-    horizontal: Floats, transform: CelestialTransform, target: Target, telescope: Telescope, total: float, place: str
+    horizontal: Floats,
+    transform: CelestialTransform,
+    target: Target,
+    telescope: Telescope,
+    total: float,
+    place: str,
 ) -> None:
-    """Raise PointingError where a direction (n, 3) lies outside the telescope's elevation limits; say when none would.
+    """Raise PointingError where a direction (n, 3) lies outside the telescope's elevation limits;
+    say when none would.
 
     ``total`` [s] is how long all scans take, for the message.
     """
@@ -47,42 +54,73 @@ def check_elevation(
     worst = elevation.min() if under > over else elevation.max()
     reached = f"{'down' if under > over else 'up'} to elevation {np.degrees(worst):.2f} deg"
     raise PointingError(
-        f"the scan of target '{target}' goes {reached}; {telescope.name} reaches {_range(low, high)}",
+        f"the scan of target '{target}' goes {reached}; {telescope.name} reaches"
+        f" {_range(low, high)}",
         place=place,
         cure=_when(horizontal, transform, target, low, high, total),
     )
 
 
-def _when(horizontal: Floats, transform: CelestialTransform, target: Target, low: float, high: float, total: float) -> str:
+def _when(
+    horizontal: Floats,
+    transform: CelestialTransform,
+    target: Target,
+    low: float,
+    high: float,
+    total: float,
+) -> str:
     if target.frame == "horizontal":
         return f"choose an elevation from {_range(low, high)}, with room for the scan"
     site, start = transform.site, transform.start
     seconds = np.arange(0.0, DAY + 1, 60.0)
-    day = CelestialTransform(site, start, DAY, 1e-6).horizontal(unit_vectors(*target.icrs()), seconds)
+    day = CelestialTransform(site, start, DAY, 1e-6).horizontal(
+        unit_vectors(*target.icrs()), seconds
+    )
     _, elevation = angles(day)
     below, above = _span(horizontal, transform, target)
-    within = (elevation >= low + below) & (elevation <= (high - above if high < np.pi / 2 else np.pi))
+    within = (elevation >= low + below) & (
+        elevation <= (high - above if high < np.pi / 2 else np.pi)
+    )
     if not within.any():
         if elevation.max() < low + below:
             highest = f"highest {np.degrees(elevation.max()):.2f} deg"
-            never = f"at {site.name} it never rises far enough above {np.degrees(low):g} deg ({highest})"
+            never = (
+                f"at {site.name} it never rises far enough above {np.degrees(low):g} deg"
+                f" ({highest})"
+            )
             return f"{never}: choose another target or site"
-        return f"at {site.name} it is within the limits at no time of the next 24 h: choose another target or site"
+        return (
+            f"at {site.name} it is within the limits at no time of the next 24 h: choose another"
+            " target or site"
+        )
     edges = np.flatnonzero(np.diff(np.concatenate([[0], within.astype(np.int8), [0]])))
     spans = [
-        f"{start.shifted(seconds[a]).datetime:%Y-%m-%dT%H:%M:%SZ} to {start.shifted(seconds[b - 1]).datetime:%Y-%m-%dT%H:%M:%SZ}"
+        f"{start.shifted(seconds[a]).datetime:%Y-%m-%dT%H:%M:%SZ} to"
+        f" {start.shifted(seconds[b - 1]).datetime:%Y-%m-%dT%H:%M:%SZ}"
         for a, b in edges.reshape(-1, 2)
     ]
-    need = f"the scans take {total / 60:.1f} min" if total < 7200 else f"the scans take {total / 3600:.1f} h"
-    return f"within the next 24 h it is up (UTC) from {' and from '.join(spans)}: start then ({need})"
+    need = (
+        f"the scans take {total / 60:.1f} min"
+        if total < 7200
+        else f"the scans take {total / 3600:.1f} h"
+    )
+    return (
+        f"within the next 24 h it is up (UTC) from {' and from '.join(spans)}: start then ({need})"
+    )
 
 
 def _span(horizontal: Floats, transform: CelestialTransform, target: Target) -> tuple[float, float]:
-    """How far below and above its target the boresight (n, 3) goes in elevation, over at most 1000 samples."""
+    """How far below and above its target the boresight (n, 3) goes in elevation, over at most 1000
+    samples.
+    """
     n = len(horizontal)
     looked = np.unique(np.linspace(0, n - 1, min(n, 1000)).astype(int))
-    centre = transform.horizontal(unit_vectors(*target.icrs()), looked * (transform.duration / max(n - 1, 1)))
-    lower = np.arcsin(np.clip(centre[:, 2], -1, 1)) - np.arcsin(np.clip(horizontal[looked, 2], -1, 1))
+    centre = transform.horizontal(
+        unit_vectors(*target.icrs()), looked * (transform.duration / max(n - 1, 1))
+    )
+    lower = np.arcsin(np.clip(centre[:, 2], -1, 1)) - np.arcsin(
+        np.clip(horizontal[looked, 2], -1, 1)
+    )
     return max(float(lower.max()), 0.0), max(float(-lower.min()), 0.0)
 
 
@@ -101,18 +139,26 @@ LIMITS: dict[Quantity, str] = {
 WORDS = {1: "speed", 2: "acceleration", 3: "jerk"}
 
 ROUNDING = 1e-6
-"""Share by which a figure may exceed its limit: a scan that was laid out to reach it exactly is none too fast."""
+"""Share by which a figure may exceed its limit: a scan that was laid out to reach it exactly is
+none too fast.
+"""
 
 
-def excess(found: dict[Quantity, LargestDerivative], limits: dict[Quantity, float]) -> dict[Quantity, float]:
+def excess(
+    found: dict[Quantity, LargestDerivative], limits: dict[Quantity, float]
+) -> dict[Quantity, float]:
     """By how much each limit is exceeded, a factor > 1, the worst first."""
     ratio = {q: found[q].figure / limit for q, limit in limits.items() if q in found}
     over = {q: r for q, r in ratio.items() if r > 1 + ROUNDING}
     return dict(sorted(over.items(), key=lambda item: -(item[1] ** (1 / item[0][1]))))
 
 
-def lower_elevation(found: Mapping[Quantity, LargestDerivative], over: Mapping[Quantity, float]) -> float | None:
-    """Elevation [rad] at which the scan would fit, where only the azimuth axis is too fast: it turns by 1 / cos(elevation)."""
+def lower_elevation(
+    found: Mapping[Quantity, LargestDerivative], over: Mapping[Quantity, float]
+) -> float | None:
+    """Elevation [rad] at which the scan would fit, where only the azimuth axis is too fast: it
+    turns by 1 / cos(elevation).
+    """
     if any(axis != "azimuth" for axis, _ in over):
         return None
     cosine = min(1.0, max(r * math.cos(found[q].elevation) for q, r in over.items()))
@@ -120,14 +166,20 @@ def lower_elevation(found: Mapping[Quantity, LargestDerivative], over: Mapping[Q
 
 
 class LargestMotion:
-    """The largest speeds, accelerations and jerks of several scans, and the telescope's limits to them."""
+    """The largest speeds, accelerations and jerks of several scans, and the telescope's limits to
+    them.
+    """
 
     TOPICS = ("largest speed", "largest acceleration", "over the limit")
     """How its statements begin."""
 
     def __init__(self, telescope: Telescope) -> None:
         self.telescope = telescope
-        self.limits = {q: limit for q, name in LIMITS.items() if (limit := getattr(telescope, name)) is not None}
+        self.limits = {
+            q: limit
+            for q, name in LIMITS.items()
+            if (limit := getattr(telescope, name)) is not None
+        }
         """Those that the telescope states, rad/s^order."""
         self._found: dict[Quantity, LargestDerivative] = {}
         self._where: dict[Quantity, str] = {}
@@ -138,19 +190,29 @@ class LargestMotion:
             if q not in self._found or peak.figure > self._found[q].figure:
                 self._found[q], self._where[q] = peak, name
 
-    def too_fast(self, quantity: Quantity, found: dict[Quantity, LargestDerivative], name: str = "the scan") -> str:
+    def too_fast(
+        self, quantity: Quantity, found: dict[Quantity, LargestDerivative], name: str = "the scan"
+    ) -> str:
         """The message about a limit that the scan exceeds."""
         (axis, order), peak = quantity, found[quantity]
         word = WORDS[order]
-        where = f"{peak.second:.4g} s after its start, at elevation {np.degrees(peak.elevation):.2f} deg"
+        where = (
+            f"{peak.second:.4g} s after its start, at elevation"
+            f" {np.degrees(peak.elevation):.2f} deg"
+        )
         whose = "on the sky" if axis == "sky" else f"of the {axis} axis"
-        reaches = f"{name} reaches {'an' if word == 'acceleration' else 'a'} {word} {whose} of {rate_text(peak.figure, order)}"
+        reaches = (
+            f"{name} reaches {'an' if word == 'acceleration' else 'a'} {word} {whose} of"
+            f" {rate_text(peak.figure, order)}"
+        )
         limit = rate_text(self.limits[quantity], order)
         return f"{reaches} ({where}); {self.telescope.name}'s largest {word} {whose} is {limit}"
 
     def warnings(self) -> list[str]:
         """Each limit that is exceeded (with ``check_limits: warn``)."""
-        return [self.too_fast(q, self._found, self._where[q]) for q in excess(self._found, self.limits)]
+        return [
+            self.too_fast(q, self._found, self._where[q]) for q in excess(self._found, self.limits)
+        ]
 
     def statements(self) -> list[tuple[str, str]]:
         """(what, text) for the tally."""
@@ -161,12 +223,18 @@ class LargestMotion:
                 peak, limit = self._found.get((axis, order)), self.limits.get((axis, order))
                 if peak is not None and (limit or axis != "sky"):
                     figure = peak.figure if peak.figure > STILL else 0.0
-                    share = f" ({100 * figure / limit:.3g} % of {rate_text(limit, order)})" if limit else ""
+                    share = (
+                        f" ({100 * figure / limit:.3g} % of {rate_text(limit, order)})"
+                        if limit
+                        else ""
+                    )
                     parts.append(f"{axis} {rate_text(figure, order)}{share}")
             if parts:
                 none = "" if self.limits else f"; {self.telescope.name} states no limits"
                 said.append((f"largest {WORDS[order]} of the axes", ", ".join(parts) + none))
-        for (axis, order), text in zip(excess(self._found, self.limits), self.warnings(), strict=True):
+        for (axis, order), text in zip(
+            excess(self._found, self.limits), self.warnings(), strict=True
+        ):
             said.append((f"over the limit of {axis} {WORDS[order]} (check_limits: warn)", text))
         return said
 
@@ -182,12 +250,15 @@ def what_fits(
     over: Mapping[Quantity, float],
     fits: Callable[[Scan], bool],
 ) -> str:
-    """The cure of a scan that is too fast: values of its parameters ``slows`` (`Pointing.slows`) at which it exceeds no limit.
+    """The cure of a scan that is too fast: values of its parameters ``slows`` (`Pointing.slows`) at
+    which it exceeds no limit.
 
     ``found`` are its largest derivatives, ``over`` those beyond their limits (`limits.excess`).
     """
     alone = [_slower(scan, {name: slows[name]}, fits) for name in slows]
-    cures = [text for text in alone if text] or [text for text in (_slower(scan, slows, fits),) if text]
+    cures = [text for text in alone if text] or [
+        text for text in (_slower(scan, slows, fits),) if text
+    ]
     if (elevation := lower_elevation(found, over)) is not None:
         cures.append(f"an elevation below {math.floor(10 * math.degrees(elevation)) / 10:g} deg")
     other = "scan more slowly, or in larger curves" if slows else "choose another target or time"
@@ -196,23 +267,31 @@ def what_fits(
 
 
 def _slower(scan: Scan, slows: Mapping[str, tuple[int, int]], fits: Callable[[Scan], bool]) -> str:
-    """Parameters with values, all changed by one factor (at most 1000), at which the scan fits; empty where none does."""
+    """Parameters with values, all changed by one factor (at most 1000), at which the scan fits;
+    empty where none does.
+    """
 
     def values(share: float) -> dict[str, float]:
         found = {}
         for name, (sign, _) in slows.items():
             value = math.degrees(getattr(scan, name)) * 3600 * 10.0 ** (3 * share * sign)
             unit = 10.0 ** (math.floor(math.log10(value)) - 2)  # three digits, on the safe side
-            found[name] = math.radians((math.floor if sign < 0 else math.ceil)(value / unit) * unit / 3600)
+            found[name] = math.radians(
+                (math.floor if sign < 0 else math.ceil)(value / unit) * unit / 3600
+            )
         return found
 
     def allowed(name: str, value: float) -> bool:
-        return all(value <= getattr(m, "le", math.inf) for m in type(scan).model_fields[name].metadata)
+        return all(
+            value <= getattr(m, "le", math.inf) for m in type(scan).model_fields[name].metadata
+        )
 
     def good(share: float) -> bool:
         tried = values(share)
         with suppress(PointingError):  # e.g. turnarounds so long that they reach round the sky
-            return all(allowed(*item) for item in tried.items()) and fits(scan.model_copy(update=tried))
+            return all(allowed(*item) for item in tried.items()) and fits(
+                scan.model_copy(update=tried)
+            )
         return False
 
     enough = next((share for share in (1 / 8, 1 / 4, 1 / 2, 1.0) if slows and good(share)), None)
@@ -222,4 +301,6 @@ def _slower(scan: Scan, slows: Mapping[str, tuple[int, int]], fits: Callable[[Sc
     for _ in range(8):
         middle = (enough + too_little) / 2
         enough, too_little = (middle, too_little) if good(middle) else (enough, middle)
-    return " with ".join(f"{name} {rate_text(value, slows[name][1])}" for name, value in values(enough).items())
+    return " with ".join(
+        f"{name} {rate_text(value, slows[name][1])}" for name, value in values(enough).items()
+    )

@@ -1,15 +1,19 @@
 """Errors of the pointing: where the telescope looks is not where it says that it looks.
 
-The true boresight lies beside the recorded one by (x, y) on the sky, towards increasing azimuth and elevation,
+The true boresight lies beside the recorded one by (x, y) on the sky, towards increasing azimuth and
+elevation,
 
-    (x, y) = offset + scan + jitter,                                                                          (1)
+    (x, y) = offset + scan + jitter,   (1)
 
-`offset` constant, `scan` one pair of normal deviates per scan, `jitter` a Gauss-Markov (Ornstein-Uhlenbeck) process in either
-direction, of correlation exp(-|t| / tau) from sample to sample:
+`offset` constant, `scan` one pair of normal deviates per scan, `jitter` a Gauss-Markov
+(Ornstein-Uhlenbeck) process in either direction, of correlation exp(-|t| / tau) from sample to
+sample:
 
-    j_n = rho j_(n-1) + sqrt(1 - rho^2) sigma g_n,   rho = e^(-1 / (tau f_s)),   j_0 = sigma g_0,                (2)
+    j_n = rho j_(n-1) + sqrt(1 - rho^2) sigma g_n,   rho = e^(-1 / (tau f_s)),   j_0 = sigma g_0,
+    (2)
 
-stationary from the first sample on (Uhlenbeck & Ornstein 1930). All rms values are of each direction.
+stationary from the first sample on (Uhlenbeck & Ornstein 1930). All rms values are of each
+direction.
 """
 
 from __future__ import annotations
@@ -31,10 +35,12 @@ if TYPE_CHECKING:
 
 
 class Mispointing(Operator):
-    """The true boresight differs from the recorded one by an offset, an error per scan and a jitter.
+    """The true boresight differs from the recorded one by an offset, an error per scan and a
+    jitter.
 
-    The sky is seen where the telescope looks in fact; maps, filters and files take the recorded pointing. Atmosphere and ground,
-    whose statistics do not change, stay where the recorded pointing is. It stands behind the pointing step.
+    The sky is seen where the telescope looks in fact; maps, filters and files take the recorded
+    pointing. Atmosphere and ground, whose statistics do not change, stay where the recorded
+    pointing is. It stands behind the pointing step.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -53,9 +59,13 @@ class Mispointing(Operator):
         """Note the true boresight of every scan that there is."""
         for observation in data.observations:
             x, y = self.errors(observation)
-            turned = observation.derotate("boresight_azel")[2]  # of the focal plane: xi is not along the azimuth then
+            turned = observation.derotate("boresight_azel")[
+                2
+            ]  # of the focal plane: xi is not along the azimuth then
             cosine, sine = np.cos(turned), np.sin(turned)
-            observation.pointed_radec = beside(observation.sky_boresight, x * cosine - y * sine, y * cosine + x * sine)
+            observation.pointed_radec = beside(
+                observation.sky_boresight, x * cosine - y * sine, y * cosine + x * sine
+            )
             rms = np.degrees([np.sqrt(np.mean(x * x)), np.sqrt(np.mean(y * y))]) * 3600
             what = f"{observation.name}: rms error towards azimuth and elevation"
             observation.tally.state(self.label, what, f"{rms[0]:.3g} and {rms[1]:.3g} arcsec")
@@ -69,7 +79,9 @@ class Mispointing(Operator):
         if self.jitter_rms > 0:
             rho = math.exp(-1 / (self.jitter_time * observation.sample_rate))
             for k in (0, 1):
-                found[k] += self.jitter_rms * _markov(rho, normals(key, 0, n, stream=1 + k).astype(np.float64))
+                found[k] += self.jitter_rms * _markov(
+                    rho, normals(key, 0, n, stream=1 + k).astype(np.float64)
+                )
         return found[0], found[1]
 
 
@@ -84,10 +96,11 @@ def _markov(rho: float, drawn: Floats) -> Floats:
 
 
 def beside(quaternions: Floats, x: Floats, y: Floats) -> Floats:
-    """Boresights (n, 4) turned by ``x`` and ``y`` (n,) [rad] in their own frames towards xi and eta.
+    """Boresights (n, 4) turned by ``x`` and ``y`` (n,) [rad] in their own frames towards xi and
+    eta.
 
-    The frame's direction (-eta, -xi, 1) is that of a detector at (xi, eta): the turn that takes (0, 0, 1) there along a great
-    circle.
+    The frame's direction (-eta, -xi, 1) is that of a detector at (xi, eta): the turn that takes (0,
+    0, 1) there along a great circle.
     """
     angle = np.hypot(x, y)
     half = np.sinc(angle / (2 * np.pi)) / 2  # sin(angle / 2) / angle

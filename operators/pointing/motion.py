@@ -1,11 +1,12 @@
 """Speed, acceleration and jerk of a scan: of the axes, and of the beam on the sky, from its track.
 
-Finite differences of the track over a step h are means of the derivatives over at most k h: they never exceed the largest
-derivative (mean value theorem), and fall short of it by O(h^2). What is missing is estimated from steps h and 2 h (Richardson),
-and from the second difference c of D_h at its largest, a mean over k h that may stand half a step beside the peak (h may be such
-a part of a period that neither step meets one):
+Finite differences of the track over a step h are means of the derivatives over at most k h: they
+never exceed the largest derivative (mean value theorem), and fall short of it by O(h^2). What is
+missing is estimated from steps h and 2 h (Richardson), and from the second difference c of D_h at
+its largest, a mean over k h that may stand half a step beside the peak (h may be such a part of a
+period that neither step meets one):
 
-    error = max(|max D_h - max D_2h| / 3, c / 8 + k c / 24)                                                 (1)
+    error = max(|max D_h - max D_2h| / 3, c / 8 + k c / 24)                                      (1)
 
 The step is halved until the error is below `ACCURACY` for every figure that has a limit.
 """
@@ -27,7 +28,9 @@ POINTS, MOST_POINTS = 1 << 14, 1 << 20
 """Points of the track that are looked at first, and at most."""
 
 SHORTEST_STEP = 1e-3
-"""s: rounding (4e-16 rad) is below 4e-9 rad/s^2 of acceleration and 1e-5 rad/s^3 of jerk at this step."""
+"""s: rounding (4e-16 rad) is below 4e-9 rad/s^2 of acceleration and 1e-5 rad/s^3 of jerk at this
+step.
+"""
 
 Quantity = tuple[str, int]
 """Axis (``azimuth``, ``elevation`` or ``sky``) and order of the derivative (1 to 3)."""
@@ -54,7 +57,10 @@ class LargestDerivative(NamedTuple):
 
 
 def motion(
-    horizontal: Floats, rate: float, limits: Mapping[Quantity, float], finer: Callable[[float], Floats]
+    horizontal: Floats,
+    rate: float,
+    limits: Mapping[Quantity, float],
+    finer: Callable[[float], Floats],
 ) -> dict[Quantity, LargestDerivative]:
     """The largest derivatives of a track.
 
@@ -67,15 +73,26 @@ def motion(
     finer
         The same track in steps of so many seconds, where samples are too far apart.
     """
-    stride = 1 << max(0, math.ceil(math.log2(max(len(horizontal) / POINTS, rate * SHORTEST_STEP, 1e-9))))
+    stride = 1 << max(
+        0, math.ceil(math.log2(max(len(horizontal) / POINTS, rate * SHORTEST_STEP, 1e-9)))
+    )
     step = stride / rate
     while True:
         track = horizontal[::stride] if stride else finer(step)
         found = _peaks(track, step)
-        known = all(found[q].error <= ACCURACY * max(found[q].figure, 0.3 * limit) for q, limit in limits.items() if q in found)
+        known = all(
+            found[q].error <= ACCURACY * max(found[q].figure, 0.3 * limit)
+            for q, limit in limits.items()
+            if q in found
+        )
         points = 2 * len(track)
         enough = known and (found or not limits)
-        if enough or step / 2 < SHORTEST_STEP or points > max(MOST_POINTS, len(horizontal)) or len(horizontal) < 2:
+        if (
+            enough
+            or step / 2 < SHORTEST_STEP
+            or points > max(MOST_POINTS, len(horizontal))
+            or len(horizontal) < 2
+        ):
             return found
         stride, step = stride // 2, step / 2
 
@@ -83,21 +100,30 @@ def motion(
 def _peaks(track: Floats, step: float) -> dict[Quantity, LargestDerivative]:
     azimuth = np.unwrap(np.arctan2(-track[:, 1], track[:, 0]))
     elevation = np.arctan2(track[:, 2], np.hypot(track[:, 0], track[:, 1]))
-    fine, coarse = _derivatives(azimuth, elevation, 1, step), _derivatives(azimuth, elevation, 2, step)
+    fine, coarse = (
+        _derivatives(azimuth, elevation, 1, step),
+        _derivatives(azimuth, elevation, 2, step),
+    )
     found = {}
     for (axis, order), rates in fine.items():
         k = int(rates.argmax())
         largest = float(rates[k])
         around = rates[max(k - 1, 0) : k + 2]
         bend = 2 * largest - float(around[0] + around[-1]) if len(around) == 3 else 0.0
-        error = max(abs(largest - float(coarse[axis, order].max(initial=0.0))) / 3, bend * (3 + order) / 24)
+        error = max(
+            abs(largest - float(coarse[axis, order].max(initial=0.0))) / 3, bend * (3 + order) / 24
+        )
         there = float(elevation[min(k + order // 2, len(elevation) - 1)])
         found[axis, order] = LargestDerivative(largest, (k + order / 2) * step, there, error)
     return found
 
 
-def _derivatives(azimuth: Floats, elevation: Floats, lag: int, step: float) -> dict[Quantity, Floats]:
-    """Magnitudes of difference quotients over ``lag`` steps, (n - order lag,) each; without those of no points."""
+def _derivatives(
+    azimuth: Floats, elevation: Floats, lag: int, step: float
+) -> dict[Quantity, Floats]:
+    """Magnitudes of difference quotients over ``lag`` steps, (n - order lag,) each; without those
+    of no points.
+    """
     axes, found = {"azimuth": azimuth, "elevation": elevation}, {}
     for order in (1, 2, 3):
         axes = {axis: values[lag:] - values[:-lag] for axis, values in axes.items()}
@@ -111,7 +137,9 @@ def _derivatives(azimuth: Floats, elevation: Floats, lag: int, step: float) -> d
 
 
 def rate_text(value: float, order: int) -> str:
-    """An angle, speed, acceleration or jerk [rad/s^order] in degrees, or in arcseconds where it is small."""
+    """An angle, speed, acceleration or jerk [rad/s^order] in degrees, or in arcseconds where it is
+    small.
+    """
     degrees = math.degrees(value)
     number, unit = (degrees, "deg") if degrees >= 0.1 else (degrees * 3600, "arcsec")
     return f"{number:.4g} {unit}" + (f"/s{order if order > 1 else ''}" if order else "")

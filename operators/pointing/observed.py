@@ -1,4 +1,6 @@
-"""From directions at instants to an `Observation` with its entries in the tally: what all pointing steps share."""
+"""From directions at instants to an `Observation` with its entries in the tally: what all pointing
+steps share.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples of a scan: when they are taken, where the boresight is then, and which are flagged.
+    """The samples of a scan: when they are taken, where the boresight is then, and which are
+    flagged.
 
     Attributes
     ----------
@@ -58,9 +61,11 @@ def observed(
     samples: Samples,
     called: str = "",
 ) -> Observation:
-    """The scan of ``samples`` that begins where ``transform`` does, about ``centre``, ICRS (ra, dec) [rad].
+    """The scan of ``samples`` that begins where ``transform`` does, about ``centre``, ICRS (ra,
+    dec) [rad].
 
-    ``called``: what its name says beside its number; what files cannot be called becomes an underscore.
+    ``called``: what its name says beside its number; what files cannot be called becomes an
+    underscore.
     """
     more = re.sub(r"[^A-Za-z0-9.+-]+", "_", called).strip("_.")
     observation = Observation(
@@ -80,15 +85,22 @@ def observed(
         intervals=samples.intervals,
     )
     beam = float(observation.focalplane.fwhm.min())
-    error = f"{transform.error:.1e} rad, {transform.error / beam:.1e} of a beam (nodes every {transform.spacing:g} s)"
+    error = (
+        f"{transform.error:.1e} rad, {transform.error / beam:.1e} of a beam (nodes every"
+        f" {transform.spacing:g} s)"
+    )
     observation.tally.state(label, "interpolation error of the pointing", error)
     observation.tally.state(label, "Earth orientation", transform.source)
     if not transform.orientation_known:
-        warnings.warn(f"{label}: Earth orientation at {transform.start}: {transform.source}", stacklevel=4)
+        warnings.warn(
+            f"{label}: Earth orientation at {transform.start}: {transform.source}", stacklevel=4
+        )
     return observation
 
 
-def centre_of(transform: CelestialTransform, target: Target, seconds: Floats) -> tuple[float, float]:
+def centre_of(
+    transform: CelestialTransform, target: Target, seconds: Floats
+) -> tuple[float, float]:
     """ICRS (ra, dec) of a target; of an az/el one where it points to in the middle of the scan."""
     if target.frame != "horizontal":
         return target.icrs()
@@ -98,7 +110,9 @@ def centre_of(transform: CelestialTransform, target: Target, seconds: Floats) ->
 
 
 def state_times(label: str, observation: Observation) -> None:
-    """State how far the samples' times are from a comb, and what those steps make of it that count samples."""
+    """State how far the samples' times are from a comb, and what those steps make of it that count
+    samples.
+    """
     late = observation.departures
     rms, most, rate = observation.jitter, float(abs(late).max()), observation.sample_rate
     step = np.diff(observation.seconds) * rate
@@ -106,8 +120,9 @@ def state_times(label: str, observation: Observation) -> None:
     observation.tally.state(
         label,
         f"{observation.name}: times of the samples",
-        f"depart from a comb of {rate:.6g} Hz by {rms * 1e3:.3g} ms rms, {most * 1e3:.3g} ms at most "
-        f"(intervals of {step.min():.3g} to {step.max():.3g} of the mean); pointing and atmosphere follow them",
+        f"depart from a comb of {rate:.6g} Hz by {rms * 1e3:.3g} ms rms, {most * 1e3:.3g} ms at"
+        f" most (intervals of {step.min():.3g} to {step.max():.3g} of the mean); pointing and"
+        " atmosphere follow them",
     )
     observation.tally.state(
         label,
@@ -117,7 +132,9 @@ def state_times(label: str, observation: Observation) -> None:
     )
 
 
-def report(label: str, observations: Sequence[Observation], *findings: LargestMotion | SamplesPerBeam) -> None:
+def report(
+    label: str, observations: Sequence[Observation], *findings: LargestMotion | SamplesPerBeam
+) -> None:
     """Enter findings in the tally of each observation, and warn."""
     for found in findings:
         for what, text in found.statements():

@@ -1,6 +1,7 @@
 """Planning of the pointing: bounds on what it leaves out or carries exactly (`core.plan`).
 
-A shift delta of the beam changes a point source by at most 1.43 delta / FWHM of its peak, the steepest slope of a Gaussian.
+A shift delta of the beam changes a point source by at most 1.43 delta / FWHM of its peak, the
+steepest slope of a Gaussian.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ STEEPEST = math.sqrt(8 * math.log(2)) * math.exp(-0.5)
 """Largest slope of a Gaussian beam, in peaks per FWHM."""
 
 REFRACTIVITY = 2.9e-4
-"""Of air at sea level, for radio waves in dry air: refraction is N cot(elevation) rad. Moist air adds up to a third."""
+"""Of air at sea level, for radio waves in dry air: refraction is N cot(elevation) rad. Moist air
+adds up to a third.
+"""
 
 INSTANTS = 4096
 """Of a scan that are looked at for its extremes."""
@@ -41,10 +44,18 @@ ABERRATION = 1.0e-4
 
 
 class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule]):
-    """Planning of the pointing: refraction, aberration, rotation of the field, sampling in time, precision."""
+    """Planning of the pointing: refraction, aberration, rotation of the field, sampling in time,
+    precision.
+    """
 
     of: ClassVar[type[Operator]] = Pointing
-    knobs = (Knob("interpolation_error", (0.1, 0.01, 1e-3, 1e-4), "celestial transformation interpolated between nodes in time"),)
+    knobs = (
+        Knob(
+            "interpolation_error",
+            (0.1, 0.01, 1e-3, 1e-4),
+            "celestial transformation interpolated between nodes in time",
+        ),
+    )
 
     def estimate(self, context: Context) -> Estimate:
         """Each effect by the shift of the beam that it makes."""
@@ -60,28 +71,58 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
         resolution = float(np.spacing(o.seconds[-1])) * speed
         effects = (
             not_simulated(
-                "refraction", "the pointing model takes out its mean", shift(_bend(context)),
-                "1.43 / FWHM x 1.33 N cosec^2(el) x throw in elevation: what a constant correction leaves",
+                "refraction",
+                "the pointing model takes out its mean",
+                shift(_bend(context)),
+                "1.43 / FWHM x 1.33 N cosec^2(el) x throw in elevation: what a constant correction"
+                " leaves",
             ),
-            Effect("aberration", (full("exact"),), shift(ABERRATION * _extent(context)),
-                   "1.43 / FWHM x v/c x reach of the scan; a shift common to all is in the target's coordinates"),
-            not_simulated("aberration across the field", "scale of the focal plane", shift(ABERRATION * radius),
-                          "1.43 / FWHM x v/c x radius of the field"),
-            Effect("sky rotation", (full("exact"),), shift(rotation),
-                   "1.43 / FWHM x rotation during a scan x radius of the field"),
-            Effect("pointing interpolation", (full(f"within {error:g} of a beam"),), shift(error * fwhm),
-                   "1.43 x interpolation_error"),
-            not_simulated("sample integration", "samples are instants", context.sky_error(smear),
-                          "(v / f_s)^2 8 ln 2 / (24 FWHM^2): loss of a point source's peak along the scan"),
+            Effect(
+                "aberration",
+                (full("exact"),),
+                shift(ABERRATION * _extent(context)),
+                "1.43 / FWHM x v/c x reach of the scan; a shift common to all is in the target's"
+                " coordinates",
+            ),
+            not_simulated(
+                "aberration across the field",
+                "scale of the focal plane",
+                shift(ABERRATION * radius),
+                "1.43 / FWHM x v/c x radius of the field",
+            ),
+            Effect(
+                "sky rotation",
+                (full("exact"),),
+                shift(rotation),
+                "1.43 / FWHM x rotation during a scan x radius of the field",
+            ),
+            Effect(
+                "pointing interpolation",
+                (full(f"within {error:g} of a beam"),),
+                shift(error * fwhm),
+                "1.43 x interpolation_error",
+            ),
+            not_simulated(
+                "sample integration",
+                "samples are instants",
+                context.sky_error(smear),
+                "(v / f_s)^2 8 ln 2 / (24 FWHM^2): loss of a point source's peak along the scan",
+            ),
             *(Effect(what, (full("checked"),), {}, text) for what, text in _motion(context)),
-            Effect("time stamps", (full("float64 seconds since the start"),), shift(resolution),
-                   "1.43 / FWHM x spacing of float64 at the scan's end x speed"),
-        )  # fmt: skip
+            Effect(
+                "time stamps",
+                (full("float64 seconds since the start"),),
+                shift(resolution),
+                "1.43 / FWHM x spacing of float64 at the scan's end x speed",
+            ),
+        )
         return Estimate(effects, Cost(fixed=0.01, per_time=0.5e-6, kernel="python"))
 
 
 def _motion(context: Context) -> list[tuple[str, str]]:
-    """What is known of the telescope's motion: (what, text). Samples per beam are those of the band that is planned."""
+    """What is known of the telescope's motion: (what, text). Samples per beam are those of the band
+    that is planned.
+    """
     topics = LargestMotion.TOPICS if context.band else MOTION
     found = [(what, text) for _, what, text in context.first.tally if what.startswith(topics)]
     sampled = SamplesPerBeam()
@@ -114,10 +155,15 @@ class MispointingPlanning(Planning[Mispointing]):
     def estimate(self, context: Context) -> Estimate:
         """Its size by the shift of the beam, three standard deviations."""
         step, fwhm = self.operator, float(context.first.focalplane.fwhm.min())
-        delta = math.hypot(*(step.offset or (0.0, 0.0))) + 3 * math.hypot(step.scan_rms, step.jitter_rms)
+        delta = math.hypot(*(step.offset or (0.0, 0.0))) + 3 * math.hypot(
+            step.scan_rms, step.jitter_rms
+        )
         size = context.sky_error(min(STEEPEST * delta / fwhm, 1.0))
         text = "1.43 / FWHM x (offset + 3 rms)"
-        return Estimate((Effect("mispointing", (full("exact"),), size, text),), Cost(fixed=0.001, per_time=1.5e-7))
+        return Estimate(
+            (Effect("mispointing", (full("exact"),), size, text),),
+            Cost(fixed=0.001, per_time=1.5e-7),
+        )
 
 
 def _bend(context: Context) -> float:
@@ -126,11 +172,15 @@ def _bend(context: Context) -> float:
     reached = [_thin(x).elevation for x in context.observations]
     throw = max(float(np.ptp(e)) for e in reached) + 2 * o.focalplane.radius
     pressure = math.exp(-o.site.altitude / 8000)
-    return 1.33 * REFRACTIVITY * pressure / math.sin(min(float(e.min()) for e in reached)) ** 2 * throw
+    return (
+        1.33 * REFRACTIVITY * pressure / math.sin(min(float(e.min()) for e in reached)) ** 2 * throw
+    )
 
 
 def _thin(o: Observation) -> Observation:
-    """At most `INSTANTS` of it, evenly taken: none of what is bounded changes between them by more than a part in 1000."""
+    """At most `INSTANTS` of it, evenly taken: none of what is bounded changes between them by more
+    than a part in 1000.
+    """
     at = np.unique(np.linspace(0, o.n_samples - 1, min(INSTANTS, o.n_samples)).astype(int))
     return o.thinned(at)
 

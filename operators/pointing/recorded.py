@@ -42,20 +42,24 @@ ANOTHER_DAY = 86400.0
 
 
 FAR = np.radians(0.1)
-"""rad between recorded and recomputed directions on the sky from which a run warns: no difference of conventions is as large."""
+"""rad between recorded and recomputed directions on the sky from which a run warns: no difference
+of conventions is as large.
+"""
 
 
 class PointingRecorded(Operator):
     """Recorded scan: times and directions of the boresight, read from a file.
 
-    HDF5 in TOAST's layout (what `SaveTOD` writes, too) or with datasets ``time``, ``az`` and ``el`` (or ``ra`` and ``dec``,
-    ICRS; attribute ``units``), a FITS table with such columns, CSV that begins with ``time [s], az [deg], el [deg]``; a column
-    ``flags`` is kept, and TOAST's intervals. An antenna log of ASTE (DESHIMA's ``.ant``): scans alone are used. Azimuth and
-    elevation are where the beam looks: the pointing model is applied.
+    HDF5 in TOAST's layout (what `SaveTOD` writes, too) or with datasets ``time``, ``az`` and ``el``
+    (or ``ra`` and ``dec``, ICRS; attribute ``units``), a FITS table with such columns, CSV that
+    begins with ``time [s], az [deg], el [deg]``; a column ``flags`` is kept, and TOAST's intervals.
+    An antenna log of ASTE (DESHIMA's ``.ant``): scans alone are used. Azimuth and elevation are
+    where the beam looks: the pointing model is applied.
 
-    Times need not be a perfect comb. Pointing and atmosphere follow them as they are; noise and filters count samples. Gaps
-    and rows that are not numbers become flagged samples: their noise and atmosphere go on, no map uses them, filters bridge
-    them. All is counted. The telescope's limits of speed are not checked: it did move like that.
+    Times need not be a perfect comb. Pointing and atmosphere follow them as they are; noise and
+    filters count samples. Gaps and rows that are not numbers become flagged samples: their noise
+    and atmosphere go on, no map uses them, filters bridge them. All is counted. The telescope's
+    limits of speed are not checked: it did move like that.
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -63,20 +67,26 @@ class PointingRecorded(Operator):
     file: InputPath
     """HDF5, FITS table, CSV or antenna log of ASTE."""
     clock: Clock = "unix"
-    """What times count: seconds since 1970 UTC (unix), days (mjd, UTC), or seconds since the scene's time (scene). Files of
-    `SaveTOD` carry their own start."""
+    """What times count: seconds since 1970 UTC (unix), days (mjd, UTC), or seconds since the
+    scene's time (scene). Files of `SaveTOD` carry their own start."""
     split: Seconds = quantity("60 s", gt=0)
-    """A longer gap ends the scan; what follows is another observation. Shorter ones are flagged samples."""
+    """A longer gap ends the scan; what follows is another observation. Shorter ones are flagged
+    samples.
+    """
     target: Target | None = None
     """Centre of the map; the scene's target where absent, or else the middle of the scan."""
     flag_mask: int | None = Field(None, ge=0, le=255)
-    """Bits of the file's flags that exclude a sample; others do not (those of the Sun are kept). Where absent: 15 in TOAST's
-    layout and `SaveTOD`'s files (invalid, processing, turnaround, irregular); any bit in other files."""
+    """Bits of the file's flags that exclude a sample; others do not (those of the Sun are kept).
+    Where absent: 15 in TOAST's layout and `SaveTOD`'s files (invalid, processing, turnaround,
+    irregular); any bit in other files."""
     celestial: Literal["recorded", "recomputed"] | None = None
-    """Where the boresight is on the sky: as recorded (``boresight_radec`` in TOAST's layout and `SaveTOD`'s files), or recomputed
-    from azimuth, elevation and time. Where absent: as recorded where the file has it."""
+    """Where the boresight is on the sky: as recorded (``boresight_radec`` in TOAST's layout and
+    `SaveTOD`'s files), or recomputed from azimuth, elevation and time. Where absent: as recorded
+    where the file has it."""
     interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
-    """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
+    """Largest error of interpolating the celestial transformation in time, as a fraction of the
+    smallest beam's FWHM.
+    """
 
     def check(self, data: Data) -> list[str]:
         """What is in the file, and whether the telescope can look there."""
@@ -104,15 +114,21 @@ class PointingRecorded(Operator):
 
     def _read(self) -> tuple[Recording, Comb]:
         place = f"{self.label}, {self.file}"
-        recording = _on_the_sky(read_recording(self.file, self.clock, self.flag_mask), self.celestial, place)
+        recording = _on_the_sky(
+            read_recording(self.file, self.clock, self.flag_mask), self.celestial, place
+        )
         return recording, comb(recording, self.split, place)
 
 
 def _on_the_sky(recording: Recording, celestial: str | None, place: str) -> Recording:
-    """The recording with those directions on the sky that ``celestial`` (`PointingRecorded`) asks for."""
+    """The recording with those directions on the sky that ``celestial`` (`PointingRecorded`) asks
+    for.
+    """
     if celestial == "recorded" and recording.frame == "azel" and recording.radec is None:
         raise InputError(
-            "has azimuth and elevation and no boresight_radec", place=place, cure="set celestial: recomputed, or leave it out"
+            "has azimuth and elevation and no boresight_radec",
+            place=place,
+            cure="set celestial: recomputed, or leave it out",
         )
     return replace(recording, radec=None) if celestial == "recomputed" else recording
 
@@ -121,9 +137,14 @@ def _doubts(recording: Recording, found: Comb, time: Instant, file: Path) -> lis
     """What a run warns of: a record of another day than the scene's, rows out of order."""
     texts, start = [], recording.start or time
     if abs(time.seconds_since(start)) > ANOTHER_DAY:
-        texts.append(f"the record begins {start}, the weather is that of {time}: set the scene's time")
+        texts.append(
+            f"the record begins {start}, the weather is that of {time}: set the scene's time"
+        )
     if number := found.counts[OUT_OF_ORDER]:
-        texts.append(f"{number} rows of {file} were dropped: their times jump ahead or back; is its clock right?")
+        texts.append(
+            f"{number} rows of {file} were dropped: their times jump ahead or back; is its clock"
+            " right?"
+        )
     return texts
 
 
@@ -131,12 +152,20 @@ def _thinned(scan: Scan) -> Scan:
     """At most about `MOST_CHECKED` samples of a scan."""
     thin = slice(None, None, -(-len(scan.seconds) // MOST_CHECKED))
     series = {k: getattr(scan, k)[thin] for k in ("seconds", "longitude", "latitude", "flags")}
-    return replace(scan, rate=scan.rate / thin.step, radec=None if scan.radec is None else scan.radec[thin], **series)
+    return replace(
+        scan,
+        rate=scan.rate / thin.step,
+        radec=None if scan.radec is None else scan.radec[thin],
+        **series,
+    )
 
 
 def _summary(scan: Scan, frame: str) -> str:
     """Samples, length and elevations of a scan."""
-    text = f"{len(scan.seconds)} samples at {scan.rate:.6g} Hz, {scan.seconds[-1] - scan.seconds[0]:.1f} s"
+    text = (
+        f"{len(scan.seconds)} samples at {scan.rate:.6g} Hz,"
+        f" {scan.seconds[-1] - scan.seconds[0]:.1f} s"
+    )
     good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
     if frame == "azel" and good.any():
         low, high = np.degrees([scan.latitude[good].min(), scan.latitude[good].max()])
@@ -144,7 +173,9 @@ def _summary(scan: Scan, frame: str) -> str:
     return text
 
 
-def _observation(step: PointingRecorded, data: Data, scan: Scan, recording: Recording) -> Observation:
+def _observation(
+    step: PointingRecorded, data: Data, scan: Scan, recording: Recording
+) -> Observation:
     """The observation of one scan. Raises PointingError where the telescope cannot look there."""
     scene = data.scene
     start = (recording.start or scene.time).shifted(float(scan.seconds[0]))
@@ -156,7 +187,9 @@ def _observation(step: PointingRecorded, data: Data, scan: Scan, recording: Reco
     else:
         horizontal = transform.horizontal(unit_vectors(scan.longitude, scan.latitude), seconds)
     good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
-    _check_elevation(horizontal, seconds, good, scene.instrument.telescope, f"{step.label}, {step.file}", start)
+    _check_elevation(
+        horizontal, seconds, good, scene.instrument.telescope, f"{step.label}, {step.file}", start
+    )
     _, azel, computed = transform.boresight(horizontal, seconds)
     radec = computed if scan.radec is None else scan.radec
     target = step.target or scene.target
@@ -173,14 +206,29 @@ def _observation(step: PointingRecorded, data: Data, scan: Scan, recording: Reco
 
 
 def _check_elevation(
-    horizontal: Floats, seconds: Floats, good: NDArray[np.bool_], telescope: Telescope, place: str, start: Instant
+    horizontal: Floats,
+    seconds: Floats,
+    good: NDArray[np.bool_],
+    telescope: Telescope,
+    place: str,
+    start: Instant,
 ) -> None:
-    """Raise PointingError where an unflagged direction (n, 3) lies outside the telescope's elevation limits."""
+    """Raise PointingError where an unflagged direction (n, 3) lies outside the telescope's
+    elevation limits.
+    """
     _, elevation = angles(horizontal)
-    outside = (elevation < telescope.elevation_min - 1e-9) | (elevation > telescope.elevation_max + 1e-9)
+    outside = (elevation < telescope.elevation_min - 1e-9) | (
+        elevation > telescope.elevation_max + 1e-9
+    )
     if (wrong := np.flatnonzero(outside & good)).size:
-        limits = f"{np.degrees(telescope.elevation_min):g} deg to {np.degrees(telescope.elevation_max):g} deg"
-        where = f"elevation {np.degrees(elevation[wrong[0]]):.2f} deg, {seconds[wrong[0]]:.4g} s after {start}"
+        limits = (
+            f"{np.degrees(telescope.elevation_min):g} deg to"
+            f" {np.degrees(telescope.elevation_max):g} deg"
+        )
+        where = (
+            f"elevation {np.degrees(elevation[wrong[0]]):.2f} deg, {seconds[wrong[0]]:.4g} s after"
+            f" {start}"
+        )
         raise PointingError(
             f"the boresight is at {where}; {telescope.name} reaches {limits}",
             place=place,
@@ -188,17 +236,26 @@ def _check_elevation(
         )
 
 
-def _state_celestial(label: str, observation: Observation, computed: Floats, good: NDArray[np.bool_]) -> None:
-    """State which directions on the sky are used, and how far recorded ones are from those that follow from az and el."""
+def _state_celestial(
+    label: str, observation: Observation, computed: Floats, good: NDArray[np.bool_]
+) -> None:
+    """State which directions on the sky are used, and how far recorded ones are from those that
+    follow from az and el.
+    """
     text = "recomputed from azimuth, elevation and time"
     if observation.boresight_radec is not computed:
         looked = np.flatnonzero(good)[:: max(1, int(good.sum()) // MOST_CHECKED)]
-        apart = np.linalg.norm(_directions(observation.boresight_radec[looked]) - _directions(computed[looked]), axis=1)
+        apart = np.linalg.norm(
+            _directions(observation.boresight_radec[looked]) - _directions(computed[looked]), axis=1
+        )
         most = 2 * float(np.arcsin(apart.max(initial=0.0) / 2))
         text = f"as recorded, up to {np.degrees(most) * 3600:.3g} arcsec from those {text}"
         if most > FAR:
             cure = "are site and clock right? celestial: recomputed takes azimuth and elevation"
-            warnings.warn(f"{label}: {observation.name}: directions on the sky are {text}: {cure}", stacklevel=4)
+            warnings.warn(
+                f"{label}: {observation.name}: directions on the sky are {text}: {cure}",
+                stacklevel=4,
+            )
     observation.tally.state(label, f"{observation.name}: directions on the sky", text)
 
 

@@ -1,4 +1,5 @@
-"""Recorded pointing: times and directions of a file, laid out on the comb of samples that comes nearest.
+"""Recorded pointing: times and directions of a file, laid out on the comb of samples that comes
+nearest.
 
 Nothing is repaired silently: `Comb` counts what it drops and flags what was not recorded.
 """
@@ -19,7 +20,9 @@ from zonda.core.intervals import Intervals
 from zonda.core.types import Floats
 
 UNEVEN = 0.25
-"""rms of the intervals between rows, over whole numbers of samples, beyond which they are no comb with jitter."""
+"""rms of the intervals between rows, over whole numbers of samples, beyond which they are no comb
+with jitter.
+"""
 
 OUT_OF_ORDER = "rows out of order, dropped"
 """Count of rows whose time is not between those of the rows around them."""
@@ -36,13 +39,15 @@ class Recording:
     seconds
         (n,) s; NaN where the file has no time.
     longitude, latitude
-        (n,) rad: azimuth (north through east) and elevation, or right ascension and declination (ICRS).
+        (n,) rad: azimuth (north through east) and elevation, or right ascension and declination
+        (ICRS).
     frame
         Which of the two.
     flags
         (n,) uint8, bits of `core.flags`.
     radec
-        (n, 4) quaternions of the boresight on the sky (ICRS), where the file has them beside azimuth and elevation.
+        (n, 4) quaternions of the boresight on the sky (ICRS), where the file has them beside
+        azimuth and elevation.
     intervals
         Parts of the scan, counted as ``seconds``; none where the file has none.
     """
@@ -70,7 +75,8 @@ class Scan:
     longitude, latitude
         (n,) rad, interpolated where nothing was recorded.
     flags
-        (n,) bits of `core.flags`: those of the rows; `NOT_RECORDED` in a gap, and where a row is not a number.
+        (n,) bits of `core.flags`: those of the rows; `NOT_RECORDED` in a gap, and where a row is
+        not a number.
     radec
         (n, 4) as recorded, interpolated where nothing was.
     """
@@ -94,7 +100,8 @@ class Comb:
 def comb(recording: Recording, split: float, place: str) -> Comb:
     """Lay a recording out on combs of samples; a gap longer than ``split`` [s] begins another scan.
 
-    Drops the fewest rows that leave the times in order (`longest_rising`): a single stamp that jumps ahead or back goes alone.
+    Drops the fewest rows that leave the times in order (`longest_rising`): a single stamp that
+    jumps ahead or back goes alone.
 
     Raises
     ------
@@ -108,17 +115,23 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
     rising = longest_rising(recording.seconds[rows])
     rest = np.setdiff1d(np.arange(len(rows)), rising, assume_unique=True)
     kept_before = rising[np.maximum(np.searchsorted(rising, rest) - 1, 0)]
-    repeated = int(np.count_nonzero(recording.seconds[rows[rest]] == recording.seconds[rows[kept_before]]))
+    repeated = int(
+        np.count_nonzero(recording.seconds[rows[rest]] == recording.seconds[rows[kept_before]])
+    )
     counts[OUT_OF_ORDER], counts["rows repeated, dropped"] = len(rest) - repeated, repeated
     rows = rows[rising]
     seconds = recording.seconds[rows]
     if len(rows) < 2:
         raise InputError(
-            f"has {len(rows)} rows with increasing times", place=place, cure="check the column of times and its unit"
+            f"has {len(rows)} rows with increasing times",
+            place=place,
+            cure="check the column of times and its unit",
         )
     step = float(np.median(np.diff(seconds)))
     apart = np.r_[True, np.diff(seconds) >= step / 2]
-    counts["rows closer than half a sample to the one before, dropped"] = int(np.count_nonzero(~apart))
+    counts["rows closer than half a sample to the one before, dropped"] = int(
+        np.count_nonzero(~apart)
+    )
     rows, seconds = rows[apart], seconds[apart]
     interval = np.diff(seconds) / step
     ahead = np.maximum(np.rint(interval), 1.0)
@@ -126,7 +139,8 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
     uneven = float(np.sqrt(np.mean((interval - ahead)[near] ** 2))) if near.any() else 0.0
     if uneven > UNEVEN:
         raise InputError(
-            f"the intervals between rows vary by {100 * uneven:.0f} % of a sample ({1e3 * step:.4g} ms): there is no sample rate",
+            f"the intervals between rows vary by {100 * uneven:.0f} % of a sample ({1e3 * step:.4g}"
+            " ms): there is no sample rate",
             place=place,
             cure="resample it to equal steps first",
         )
@@ -138,10 +152,16 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
         if np.count_nonzero(good[part]) < 2:
             alone += len(part)
             continue
-        scans.append(_scan(recording, rows[part], seconds[part], ahead[part[:-1]].astype(np.int64), good[part]))
+        scans.append(
+            _scan(
+                recording, rows[part], seconds[part], ahead[part[:-1]].astype(np.int64), good[part]
+            )
+        )
     counts["rows alone between gaps, dropped"] = alone
     if not scans:
-        raise InputError("no two consecutive directions are numbers", place=place, cure="check the columns")
+        raise InputError(
+            "no two consecutive directions are numbers", place=place, cure="check the columns"
+        )
     missing = sum(len(s.seconds) for s in scans) - (len(rows) - alone)
     flagged = sum(int(np.count_nonzero(s.flags & NOT_RECORDED)) for s in scans)
     counts["samples in gaps, flagged"] = missing
@@ -152,9 +172,11 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
 
 
 def longest_rising(values: Floats) -> NDArray[np.intp]:
-    """Indices of the longest strictly rising subsequence of ``values`` (n,); the others are out of order, however far.
+    """Indices of the longest strictly rising subsequence of ``values`` (n,); the others are out of
+    order, however far.
 
-    Of several such choices, that whose values rise least (Schensted 1961); of equal values the first. O(n log n).
+    Of several such choices, that whose values rise least (Schensted 1961); of equal values the
+    first. O(n log n).
     """
     if (np.diff(values) > 0).all():
         return np.arange(len(values))
@@ -179,7 +201,11 @@ def longest_rising(values: Floats) -> NDArray[np.intp]:
 
 
 def _scan(
-    recording: Recording, rows: NDArray[np.intp], seconds: Floats, ahead: NDArray[np.int64], good: NDArray[np.bool_]
+    recording: Recording,
+    rows: NDArray[np.intp],
+    seconds: Floats,
+    ahead: NDArray[np.int64],
+    good: NDArray[np.bool_],
 ) -> Scan:
     slot = np.r_[0, np.cumsum(ahead)]
     every = np.arange(slot[-1] + 1)
@@ -187,7 +213,9 @@ def _scan(
     flags[slot[good]] = 0
     flags[slot] |= recording.flags[rows]
     longitude = np.unwrap(recording.longitude[rows][good])
-    radec = None if recording.radec is None else _turned(every, slot[good], recording.radec[rows][good])
+    radec = (
+        None if recording.radec is None else _turned(every, slot[good], recording.radec[rows][good])
+    )
     return Scan(
         seconds=np.interp(every, slot, seconds),
         rate=float(slot[-1] / (seconds[-1] - seconds[0])),
@@ -199,7 +227,9 @@ def _scan(
 
 
 def _turned(every: NDArray[np.intp], at: NDArray[np.intp], quaternions: Floats) -> Floats:
-    """Quaternions (n, 4) at ``every`` slot from those known ``at`` some slots: unchanged there, interpolated between."""
+    """Quaternions (n, 4) at ``every`` slot from those known ``at`` some slots: unchanged there,
+    interpolated between.
+    """
     turn = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0, -1.0, 1.0)
     steady = quaternions * np.cumprod(np.r_[1.0, turn])[:, None]  # q and -q are one rotation
     found = np.stack([np.interp(every, at, q) for q in steady.T], axis=1)

@@ -1,21 +1,25 @@
-"""Rows back and forth and up and down: the path of a raster, and the values that suit a camera and its telescope.
+"""Rows back and forth and up and down: the path of a raster, and the values that suit a camera and
+its telescope.
 
-A row of length w is crossed at constant speed v. Outside of it the telescope turns round within T and steps by s to the next
-row. With u the fraction of T that has passed, at constant acceleration
+A row of length w is crossed at constant speed v. Outside of it the telescope turns round within T
+and steps by s to the next row. With u the fraction of T that has passed, at constant acceleration
 
-    x = w/2 + v T (u - u^2),                                y = s (2 u^2; from u = 1/2 on 1 - 2 (1 - u)^2)          (1)
+    x = w/2 + v T (u - u^2),   y = s (2 u^2; from u = 1/2 on 1 - 2 (1 - u)^2)          (1)
 
 or, with continuous acceleration,
 
-    x = w/2 + v T [u - u^2 + (1 - cos(2 pi u)) / (2 pi^2)],  y = s [u - sin(2 pi u) / (2 pi)].                        (2)
+    x = w/2 + v T [u - u^2 + (1 - cos(2 pi u)) / (2 pi^2)],
+    y = s [u - sin(2 pi u) / (2 pi)].                        (2)
 
-The largest accelerations of x and y are b v / T and c s / T^2, (b, c) = (2, 4) or (4, 2 pi). T is the shortest with
-(b v / T)^2 + (c s / T^2)^2 <= a^2 and a largest speed of y, 2 s / T, of at most v:
+The largest accelerations of x and y are b v / T and c s / T^2, (b, c) = (2, 4) or (4, 2 pi). T is
+the shortest with (b v / T)^2 + (c s / T^2)^2 <= a^2 and a largest speed of y, 2 s / T, of at most
+v:
 
-    T^2 = [b^2 v^2 + sqrt(b^4 v^4 + 4 a^2 c^2 s^2)] / (2 a^2),  T >= 2 s / v.                                         (3)
+    T^2 = [b^2 v^2 + sqrt(b^4 v^4 + 4 a^2 c^2 s^2)] / (2 a^2),
+    T >= 2 s / v.                                         (3)
 
-The last row is crossed twice, and the rows are then gone back: 1, 2, ..., n, n, ..., 2, 1, 1, 2, ...; every second pass of a row
-has the other direction.
+The last row is crossed twice, and the rows are then gone back: 1, 2, ..., n, n, ..., 2, 1, 1, 2,
+...; every second pass of a row has the other direction.
 """
 
 from __future__ import annotations
@@ -36,13 +40,17 @@ WIDEST = math.radians(5.0)
 BEAMS = 6
 """Smallest side of such a raster, in beams."""
 SHARE = 0.3
-"""Fraction of the telescope's limits that it uses: the azimuth axis turns 1 / cos(elevation) times as fast as the beam."""
+"""Fraction of the telescope's limits that it uses: the azimuth axis turns 1 / cos(elevation) times
+as fast as the beam.
+"""
 ROW_TIME, TURN_TIME = 5.0, 2.0
 """Shortest time for a row and a turnaround whose speed and acceleration are not given, s."""
 
 
 class Rows(NamedTuple):
-    """A raster: ``n`` rows of length ``width`` [rad], ``spacing`` [rad] apart, at ``speed`` [rad/s]."""
+    """A raster: ``n`` rows of length ``width`` [rad], ``spacing`` [rad] apart, at ``speed``
+    [rad/s].
+    """
 
     width: float
     spacing: float
@@ -69,12 +77,16 @@ class Rows(NamedTuple):
 
     @property
     def overshoot(self) -> float:
-        """How far a turnaround reaches beyond the end of a row, rad: equations (1) and (2) at u = 1/2."""
+        """How far a turnaround reaches beyond the end of a row, rad: equations (1) and (2) at u =
+        1/2.
+        """
         return self.speed * self.turnaround * (0.25 + 1 / math.pi**2 if self.smooth else 0.25)
 
     @property
     def speed_within(self) -> float:
-        """The speed, rad/s, whose turnarounds reach a row's length beyond its ends at this acceleration; steps apart."""
+        """The speed, rad/s, whose turnarounds reach a row's length beyond its ends at this
+        acceleration; steps apart.
+        """
         b, reach = (4.0, 0.25 + 1 / math.pi**2) if self.smooth else (2.0, 0.25)
         return math.sqrt(self.acceleration * self.width / (b * reach))
 
@@ -84,7 +96,9 @@ class Rows(NamedTuple):
         return self.n * (self.leg + self.turnaround) - self.turnaround
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
-        """(x, y) [rad] along the rows and across them, from the middle; each (n,) at ``seconds`` (n,)."""
+        """(x, y) [rad] along the rows and across them, from the middle; each (n,) at ``seconds``
+        (n,).
+        """
         turn = self.turnaround
         number, within = np.divmod(seconds, self.leg + turn)
         u = np.clip((within - self.leg) / turn, 0.0, 1.0)
@@ -108,26 +122,33 @@ class Rows(NamedTuple):
 
 
 def side_of(instrument: Instrument) -> float:
-    """Side [rad] of a raster for a camera: its field of view; at least some beams, at most `WIDEST`."""
+    """Side [rad] of a raster for a camera: its field of view; at least some beams, at most
+    `WIDEST`.
+    """
     return min(max(instrument.field_of_view, BEAMS * instrument.beam_fwhm), WIDEST)
 
 
 def spacing_of(instrument: Instrument) -> float:
     """Spacing [rad] of rows: a quarter of the field of view, half a beam where that is more.
 
-    The coverage of a disc of diameter D along rows s apart ripples by 4 J_1(pi D / s) / (pi D / s), relative: 5 % at s = D / 4.
+    The coverage of a disc of diameter D along rows s apart ripples by 4 J_1(pi D / s) / (pi D / s),
+    relative: 5 % at s = D / 4.
     """
     return max(min(instrument.field_of_view, WIDEST) / 4, instrument.beam_fwhm / 2)
 
 
 def speed_of(width: float, instrument: Instrument) -> float:
-    """Speed [rad/s] for rows of ``width`` [rad]: four samples per beam, `ROW_TIME`, `SHARE` of the telescope's limits."""
+    """Speed [rad/s] for rows of ``width`` [rad]: four samples per beam, `ROW_TIME`, `SHARE` of the
+    telescope's limits.
+    """
     sampled = instrument.beam_fwhm * instrument.sample_rate / 4
     return min([sampled, width / ROW_TIME, *_share(instrument.telescope, "speed")])
 
 
 def acceleration_of(speed: float, telescope: Telescope) -> float:
-    """Acceleration [rad/s^2] of turnarounds from ``speed`` [rad/s]: `TURN_TIME`, `SHARE` of the telescope's limits."""
+    """Acceleration [rad/s^2] of turnarounds from ``speed`` [rad/s]: `TURN_TIME`, `SHARE` of the
+    telescope's limits.
+    """
     return min([2 * speed / TURN_TIME, *_share(telescope, "acceleration")])
 
 

@@ -14,14 +14,16 @@ from zonda.core.types import Floats
 from .motion import POINTS, rate_text
 
 FEW = 2.0
-"""Samples per FWHM below which a scan warns: the beam's transfer at the Nyquist frequency, exp(-pi^2 N^2 / (16 ln 2)), is then
-more than 3 % (41 % at one sample), folded to other scales. Samples are instants: what is simulated stays right."""
+"""Samples per FWHM below which a scan warns: the beam's transfer at the Nyquist frequency,
+exp(-pi^2 N^2 / (16 ln 2)), is then more than 3 % (41 % at one sample), folded to other scales.
+Samples are instants: what is simulated stays right."""
 
 
 class SamplesPerBeam:
     """Samples per FWHM of several scans, where the sky passes fastest.
 
-    The speed is that of the outermost detector on the sky: the boresight's, and the field's rotation times its radius.
+    The speed is that of the outermost detector on the sky: the boresight's, and the field's
+    rotation times its radius.
     """
 
     TOPICS = ("samples per FWHM",)
@@ -32,11 +34,17 @@ class SamplesPerBeam:
 
     def add(self, observation: Observation, rate: float) -> None:
         """Take a scan into account, read out at ``rate`` [Hz]."""
-        speed, turn = on_the_sky(observation.boresight_radec, observation.seconds, observation.good_samples)
+        speed, turn = on_the_sky(
+            observation.boresight_radec, observation.seconds, observation.good_samples
+        )
         total = speed + turn * math.atan(observation.focalplane.radius)
         if len(total) and total.max() > self._fastest:
             self._fastest, self._usual = float(total.max()), float(np.median(total))
-            self._fwhm, self._rate, self._where = float(observation.focalplane.fwhm.min()), rate, observation.name
+            self._fwhm, self._rate, self._where = (
+                float(observation.focalplane.fwhm.min()),
+                rate,
+                observation.name,
+            )
 
     @property
     def least(self) -> float:
@@ -48,8 +56,13 @@ class SamplesPerBeam:
         if not self._fastest:
             return []
         usual = self._fwhm * self._rate / max(self._usual, 1e-3 * self._fastest)
-        text = f"{self.least:.3g} at {rate_text(self._fastest, 1)} on the sky, {usual:.3g} in the median; {self._lost}"
-        return [(f"samples per FWHM of {self._beam}", f"{text} (not simulated: samples are instants)")]
+        text = (
+            f"{self.least:.3g} at {rate_text(self._fastest, 1)} on the sky, {usual:.3g} in the"
+            f" median; {self._lost}"
+        )
+        return [
+            (f"samples per FWHM of {self._beam}", f"{text} (not simulated: samples are instants)")
+        ]
 
     def warnings(self) -> list[str]:
         """Warnings where there are fewer than `FEW`."""
@@ -57,9 +70,15 @@ class SamplesPerBeam:
             return []
         folded = math.exp(-((math.pi * self.least) ** 2) / (16 * math.log(2)))
         what = f"only {self.least:.3g} samples per FWHM of {self._beam} in {self._where}"
-        cost = f"{self._lost}, and up to {100 * folded:.3g} % of the beam's transfer is folded to other scales"
+        cost = (
+            f"{self._lost}, and up to {100 * folded:.3g} % of the beam's transfer is folded to"
+            " other scales"
+        )
         cure = f"scan at {rate_text(self._fwhm * self._rate / FEW, 1)} or less"
-        return [f"{what}: {cost}; {cure}, or read out at {math.ceil(FEW * self._fastest / self._fwhm)} Hz or more"]
+        return [
+            f"{what}: {cost}; {cure}, or read out at {math.ceil(FEW * self._fastest / self._fwhm)}"
+            " Hz or more"
+        ]
 
     @property
     def _beam(self) -> str:
@@ -67,25 +86,33 @@ class SamplesPerBeam:
 
     @property
     def _lost(self) -> str:
-        return f"integrating over its interval, a sample loses {100 * peak_lost(self.least):.2g} % of a point source's peak"
+        return (
+            f"integrating over its interval, a sample loses {100 * peak_lost(self.least):.2g} % of"
+            " a point source's peak"
+        )
 
 
 def on_the_sky(boresight: Floats, seconds: Floats, use: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Speed of the beam and rate of the field's rotation [rad/s] at up to about `POINTS` pairs of neighbouring samples.
+    """Speed of the beam and rate of the field's rotation [rad/s] at up to about `POINTS` pairs of
+    neighbouring samples.
 
-    ``boresight``: quaternions (n, 4) at ``seconds`` (n,), of which those to ``use`` (n,) count. From the rotation between
-    neighbours, in the focal plane's own axes.
+    ``boresight``: quaternions (n, 4) at ``seconds`` (n,), of which those to ``use`` (n,) count.
+    From the rotation between neighbours, in the focal plane's own axes.
     """
     at = np.arange(0, max(len(boresight) - 1, 0), max(1, len(boresight) // POINTS))
     at = at[use[at] & use[at + 1]]
     x, y, z, _ = multiply(conjugate(boresight[at]), boresight[at + 1]).T
     step = seconds[at + 1] - seconds[at]
     # sines of half angles: at most 1 but for rounding
-    return 2 * np.arcsin(np.minimum(np.hypot(x, y), 1.0)) / step, 2 * np.arcsin(np.minimum(abs(z), 1.0)) / step
+    return (
+        2 * np.arcsin(np.minimum(np.hypot(x, y), 1.0)) / step,
+        2 * np.arcsin(np.minimum(abs(z), 1.0)) / step,
+    )
 
 
 def peak_lost(samples_per_fwhm: float) -> float:
-    """Share of a point source's peak that a sample loses which integrates over its whole interval, along the scan.
+    """Share of a point source's peak that a sample loses which integrates over its whole interval,
+    along the scan.
 
     A Gaussian beam averaged over FWHM / N: 1 - sqrt(pi) erf(a) / (2 a), a = sqrt(ln 2) / N.
     """

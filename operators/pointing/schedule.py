@@ -22,13 +22,16 @@ if TYPE_CHECKING:
     from zonda.core.data import Data
 
 EARTH, NEAR, FAR = 6.371e6, 5e3, 1e5
-"""m: the Earth's radius; how far from the scene a schedule's site is another one, and how far its azimuths make no sense."""
+"""m: the Earth's radius; how far from the scene a schedule's site is another one, and how far its
+azimuths make no sense.
+"""
 
 CHECKED = 1 << 14
 """Samples of all scans together that `zonda check` looks at."""
 
 ANOTHER_DAY = 86400.0
-"""s between the schedule and the scene's time from which a run warns: the weather is the scene's."""
+"""s between the schedule and the scene's time from which a run warns: the weather is the scene's.
+"""
 
 
 MOST_LOOKED_AT = 64
@@ -36,8 +39,9 @@ MOST_LOOKED_AT = 64
 
 
 def _some(rows: Sequence[Row]) -> list[Row]:
-    """Rows evenly over a schedule, with the lowest and the highest (where the mount turns fastest), the widest and the narrowest
-    throw, and the longest and the shortest scan: a limit of the telescope that any row exceeds, one of these does."""
+    """Rows evenly over a schedule, with the lowest and the highest (where the mount turns fastest),
+    the widest and the narrowest throw, and the longest and the shortest scan: a limit of the
+    telescope that any row exceeds, one of these does."""
     if len(rows) <= MOST_LOOKED_AT:
         return list(rows)
     found = {round(k) for k in np.linspace(0, len(rows) - 1, MOST_LOOKED_AT - 6)}
@@ -53,10 +57,11 @@ def _some(rows: Sequence[Row]) -> list[Row]:
 class PointingSchedule(ScheduleParameters):
     """Constant-elevation scans of an observing schedule in TOAST's formats, one observation a row.
 
-    Azimuth limits and `acceleration` are those of the mount, `speed` is on the sky (the mount turns 1 / cos(elevation) as fast):
-    as in TOAST's `SimGround`, whose turnarounds, flags and intervals are the default. A scan begins at the lesser azimuth,
-    towards larger ones, and has as many whole samples as fit. Its name ends with the patch, scan and subscan of the row. A
-    schedule that states its site is compared with the scene's: 5 km apart are a warning, 100 km an error.
+    Azimuth limits and `acceleration` are those of the mount, `speed` is on the sky (the mount turns
+    1 / cos(elevation) as fast): as in TOAST's `SimGround`, whose turnarounds, flags and intervals
+    are the default. A scan begins at the lesser azimuth, towards larger ones, and has as many whole
+    samples as fit. Its name ends with the patch, scan and subscan of the row. A schedule that
+    states its site is compared with the scene's: 5 km apart are a warning, 100 km an error.
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -78,14 +83,21 @@ class PointingSchedule(ScheduleParameters):
         end = max(row.start.shifted(row.duration) for row in rows)
         total = sum(row.duration for row in rows) / 3600
         part = "" if len(looked) == len(rows) else f" ({len(looked)} of them looked at)"
-        lines = [f"{len(rows)} scan{'s' if len(rows) > 1 else ''} from {rows[0].start} to {end}, {total:.3g} h in all{part}"]
+        lines = [
+            f"{len(rows)} scan{'s' if len(rows) > 1 else ''} from {rows[0].start} to {end},"
+            f" {total:.3g} h in all{part}"
+        ]
         lines.append(f"elevation: {elevations.min():.2f} to {elevations.max():.2f} deg")
         lines += distances(made)
         topics = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
-        return lines + [f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(topics)]
+        return lines + [
+            f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(topics)
+        ]
 
     def _compare_sites(self, data: Data) -> None:
-        """Warn where the schedule was made for another site; PointingError where that is far away."""
+        """Warn where the schedule was made for another site; PointingError where that is far
+        away.
+        """
         stated, site = read_site(self.schedule), data.scene.site
         if stated is None:
             return
@@ -93,11 +105,19 @@ class PointingSchedule(ScheduleParameters):
         apart = EARTH * float(separation(*there, (site.longitude, site.latitude))[0])
         if apart > NEAR:
             place = f"{np.degrees(stated.latitude):.4f} deg, {np.degrees(stated.longitude):.4f} deg"
-            text = f"the schedule was made for {stated.name} ({place}), {apart / 1e3:.4g} km from the scene's site {site.name}"
-            cure = "set the scene's site, or give a schedule of this site (or remove the site from its header)"
+            text = (
+                f"the schedule was made for {stated.name} ({place}), {apart / 1e3:.4g} km from the"
+                f" scene's site {site.name}"
+            )
+            cure = (
+                "set the scene's site, or give a schedule of this site (or remove the site from its"
+                " header)"
+            )
             if apart > FAR:
                 raise PointingError(
-                    f"{text}: its azimuths look elsewhere from here", place=f"{self.label}, {self.schedule}", cure=cure
+                    f"{text}: its azimuths look elsewhere from here",
+                    place=f"{self.label}, {self.schedule}",
+                    cure=cure,
                 )
             warnings.warn(f"{self.label}: {text}: {cure}", stacklevel=4)
 
@@ -107,7 +127,10 @@ class PointingSchedule(ScheduleParameters):
         rows = some or read_schedule(self.schedule, self.nod.duration)
         self._compare_sites(data)
         if abs(scene.time.seconds_since(rows[0].start)) > ANOTHER_DAY:
-            text = f"the schedule begins {rows[0].start}, the weather is that of {scene.time}: set the scene's time"
+            text = (
+                f"the schedule begins {rows[0].start}, the weather is that of {scene.time}: set the"
+                " scene's time"
+            )
             warnings.warn(f"{self.label}: {text}", stacklevel=3)
         moved, sampled = LargestMotion(scene.instrument.telescope), SamplesPerBeam()
         for row in rows:

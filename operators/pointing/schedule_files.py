@@ -19,17 +19,34 @@ from zonda.core.storage.files import reading
 from zonda.core.storage.table_mistakes import Mistakes
 from zonda.core.types import Floats
 
-COLUMNS = ("start_time", "stop_time", "boresight_angle", "name", "azmin", "azmax", "el", "scan_index", "subscan_index")
+COLUMNS = (
+    "start_time",
+    "stop_time",
+    "boresight_angle",
+    "name",
+    "azmin",
+    "azmax",
+    "el",
+    "scan_index",
+    "subscan_index",
+)
 """In the order of version 4."""
 OVERLAP = 1.0
 """s: rows may overlap by as much, since schedules round their times to seconds."""
 WIDEST_WRAP = np.pi
-"""rad: azmax below azmin is read as a sweep through north; a wider one is taken for exchanged limits."""
-CURE = f"give a schedule of TOAST, version 5 (ECSV with the columns {', '.join(COLUMNS)}) or version 4 to 1 (text)"
+"""rad: azmax below azmin is read as a sweep through north; a wider one is taken for exchanged
+limits.
+"""
+CURE = (
+    f"give a schedule of TOAST, version 5 (ECSV with the columns {', '.join(COLUMNS)}) or version 4"
+    " to 1 (text)"
+)
 TWO_WORDS = (11, 23, 24)
 """Fields of a row whose dates and times are two words: versions 3 and 1."""
 CONCISE = {9: range(9), 21: (0, 1, 4, 5, 6, 7, 8, 19, 20), 22: (0, 1, 4, 5, 6, 7, 8, 19, 20)}
-"""Where `COLUMNS` stand in a row of so many fields: of versions 4 and 3; of 2 and 1, whose last may lack."""
+"""Where `COLUMNS` stand in a row of so many fields: of versions 4 and 3; of 2 and 1, whose last may
+lack.
+"""
 
 
 @dataclass(frozen=True)
@@ -72,7 +89,8 @@ class SchedulesSite:
 
 
 def read_site(path: Path) -> SchedulesSite | None:
-    """The site that the head of a schedule states; None where it states none, or one that is not known (TOAST's default).
+    """The site that the head of a schedule states; None where it states none, or one that is not
+    known (TOAST's default).
 
     Raises InputError for a latitude or longitude that is none.
     """
@@ -102,13 +120,22 @@ def _head_of_ecsv(lines: list[str]) -> dict[str, Any]:
 
     head = [line[2:] for line in lines if line.startswith("# ")]
     begin = next((k for k, line in enumerate(head) if line.startswith("meta:")), len(head))
-    end = next((k for k, line in enumerate(head[begin + 1 :], begin + 1) if not line.startswith((" ", "-"))), len(head))
+    end = next(
+        (
+            k
+            for k, line in enumerate(head[begin + 1 :], begin + 1)
+            if not line.startswith((" ", "-"))
+        ),
+        len(head),
+    )
     try:
         about = (yaml.load("\n".join(head[begin:end])) or {}).get("meta")
     except Exception:  # what other programs wrote there with tags of their own
         return {}
     if isinstance(about, list):
-        return dict(pair for one in about for pair in (one.items() if isinstance(one, Mapping) else [one]))
+        return dict(
+            pair for one in about for pair in (one.items() if isinstance(one, Mapping) else [one])
+        )
     return dict(about) if isinstance(about, Mapping) else {}
 
 
@@ -127,7 +154,8 @@ def _degrees(value: Any) -> float:
 
 
 def read_schedule(path: Path, nods: float = 0.0) -> list[Row]:
-    """The rows of a schedule. Raises InputError for a file that is none, and for a row that makes no sense.
+    """The rows of a schedule. Raises InputError for a file that is none, and for a row that makes
+    no sense.
 
     ``nods``: seconds before each scan in which the telescope nods.
     """
@@ -138,21 +166,36 @@ def read_schedule(path: Path, nods: float = 0.0) -> list[Row]:
 
 
 def _of_text(path: Path, place: str) -> Table:
-    """The table of a text schedule: a line about the site, then the fields of a row a line, between bars or blanks.
+    """The table of a text schedule: a line about the site, then the fields of a row a line, between
+    bars or blanks.
 
     Rows that are SPECIAL (cooler cycles) are no scans; as in TOAST they are left out.
     """
     with reading(place, "a schedule", CURE):
         text = path.read_text(encoding="utf-8").splitlines()
-    written = [(number, line) for number, line in enumerate(text, 1) if line.strip() and not line.startswith("#")]
+    written = [
+        (number, line)
+        for number, line in enumerate(text, 1)
+        if line.strip() and not line.startswith("#")
+    ]
     special = [number for number, line in written if re.match(r"\s*SPECIAL\b", line)]
     written = [(number, line) for number, line in written if number not in special]
     if special:
-        text_of = f"{len(special)} rows are SPECIAL, no scans (line {special[0]}{', ...' * (len(special) > 1)})"
+        text_of = (
+            f"{len(special)} rows are SPECIAL, no scans (line"
+            f" {special[0]}{', ...' * (len(special) > 1)})"
+        )
         warnings.warn(f"{place}: {text_of}: they are left out", stacklevel=2)
-    rows = [[field.strip() for field in line.split("|")] if "|" in line else line.split() for _, line in written]
+    rows = [
+        [field.strip() for field in line.split("|")] if "|" in line else line.split()
+        for _, line in written
+    ]
     if len(rows) < 2 or len(rows[0]) != 5:
-        raise InputError("is no schedule: there is no line about the site, or none behind it", place=place, cure=CURE)
+        raise InputError(
+            "is no schedule: there is no line about the site, or none behind it",
+            place=place,
+            cure=CURE,
+        )
     mistakes, lines = Mistakes(place), [number for number, _ in written]
     found = []
     for line, row in zip(lines[1:], rows[1:], strict=True):
@@ -165,7 +208,9 @@ def _of_text(path: Path, place: str) -> Table:
     mistakes.tell()
     columns = [list(column) for column in zip(*found, strict=True)]
     units = dict.fromkeys(("boresight_angle", "azmin", "azmax", "el"), "deg")
-    named = {name: (column, units.get(name, "")) for name, column in zip(COLUMNS, columns, strict=True)}
+    named = {
+        name: (column, units.get(name, "")) for name, column in zip(COLUMNS, columns, strict=True)
+    }
     return Table(place, named, [*lines[1:], lines[0]])
 
 
@@ -224,27 +269,42 @@ def _wrong_limits(row: Row, stated: float) -> tuple[str, str] | None:
     low, high = row.azimuth
     text = f"azmin is {np.degrees(low):g} deg and azmax {np.degrees(stated):g} deg"
     if high - low < 1e-12:
-        return f"{text}: there is no sweep between them", "give limits that differ, or remove that row"
+        return (
+            f"{text}: there is no sweep between them",
+            "give limits that differ, or remove that row",
+        )
     if stated < low and high - low > WIDEST_WRAP * (1 + 1e-12):
         wide = f"azmax: {np.degrees(high):g} deg where the sweep is as wide"
-        return f"{text}: that is a sweep of {np.degrees(high - low):g} deg through north", f"exchange them, or write {wide}"
+        return (
+            f"{text}: that is a sweep of {np.degrees(high - low):g} deg through north",
+            f"exchange them, or write {wide}",
+        )
     return None
 
 
 def _note_overlaps(rows: list[Row], nods: float, lines: Sequence[int], mistakes: Mistakes) -> None:
-    """Note each row that begins, with its ``nods`` [s] before it, before an earlier one stops: the telescope is in one place at
-    a time."""
+    """Note each row that begins, with its ``nods`` [s] before it, before an earlier one stops: the
+    telescope is in one place at a time."""
     sound = [k for k, row in enumerate(rows) if row.duration > 0]
     begins = {k: rows[k].start.seconds_since(rows[sound[0]].start) for k in sound}
     before, stops = -1, -math.inf
     for k in sorted(sound, key=begins.__getitem__):
-        early, what, cure = stops - begins[k], "begins", "shift or shorten one of them, or remove one"
+        early, what, cure = (
+            stops - begins[k],
+            "begins",
+            "shift or shorten one of them, or remove one",
+        )
         if early <= OVERLAP + 1e-6 and nods:
-            early, cure = early + nods, f"leave {nods:.6g} s between the rows for the nods, or change elevation_nods"
+            early, cure = (
+                early + nods,
+                f"leave {nods:.6g} s between the rows for the nods, or change elevation_nods",
+            )
             what = f"its elevation nods of {nods:.6g} s begin"
         if early > OVERLAP + 1e-6:
             other = f"{rows[before].label} (line {lines[before]})"
-            mistakes.add(lines[k], f"{rows[k].label}: {what} {early:.6g} s before {other} stops", cure)
+            mistakes.add(
+                lines[k], f"{rows[k].label}: {what} {early:.6g} s before {other} stops", cure
+            )
         if begins[k] + rows[k].duration > stops:
             before, stops = k, begins[k] + rows[k].duration
 

@@ -1,4 +1,6 @@
-"""Scans of an observing schedule: what a pointing step knows of them, and the observation of each row."""
+"""Scans of an observing schedule: what a pointing step knows of them, and the observation of each
+row.
+"""
 
 from __future__ import annotations
 
@@ -50,11 +52,11 @@ class ScheduleParameters(Operator):
     flag_turnarounds: bool = True
     """Flag the samples in turnarounds, so that no map uses them."""
     sun_close: Angle = quantity("45 deg", gt=0, le=math.pi)
-    """Distance of the Sun below which samples are flagged *sun close*. They are used all the same, as are those while the Sun is
-    up: both are flags and intervals of files."""
+    """Distance of the Sun below which samples are flagged *sun close*. They are used all the same,
+    as are those while the Sun is up: both are flags and intervals of files."""
     elevation_nods: list[Angle] = Field(default_factory=list, max_length=100)
-    """Offsets in elevation to which the telescope goes in turn before each scan, the last of them 0, e.g. [1 deg, -1 deg, 0 deg];
-    flagged irregular."""
+    """Offsets in elevation to which the telescope goes in turn before each scan, the last of them
+    0, e.g. [1 deg, -1 deg, 0 deg]; flagged irregular."""
     elevation_speed: AngularSpeed = quantity("1 deg/s", gt=0)
     """Largest speed of nods."""
     elevation_acceleration: AngularAcceleration = quantity("1 deg/s2", gt=0)
@@ -62,15 +64,21 @@ class ScheduleParameters(Operator):
     sample_rate: Hertz | None = Field(None, gt=0, le=1e6)
     """Read-out rate; the instrument's where absent."""
     check_limits: Literal["error", "warn"] = "error"
-    """Whether a scan beyond the telescope's largest speed, acceleration or jerk is an error, or a warning."""
+    """Whether a scan beyond the telescope's largest speed, acceleration or jerk is an error, or a
+    warning.
+    """
     interpolation_error: Fraction = Field(1e-3, gt=0, le=0.1)
-    """Largest error of interpolating the celestial transformation in time, as a fraction of the smallest beam's FWHM."""
+    """Largest error of interpolating the celestial transformation in time, as a fraction of the
+    smallest beam's FWHM.
+    """
 
     @field_validator("elevation_nods")
     @classmethod
     def _to_the_scan(cls, value: list[float]) -> list[float]:
         if value and value[-1] != 0:
-            raise ValueError("nods end at the elevation of the scan: write 0 deg as the last of them")
+            raise ValueError(
+                "nods end at the elevation of the scan: write 0 deg as the last of them"
+            )
         return value
 
     @property
@@ -79,11 +87,15 @@ class ScheduleParameters(Operator):
         return Nod(tuple(self.elevation_nods), self.elevation_speed, self.elevation_acceleration)
 
 
-def scan_of(step: ScheduleParameters, data: Data, row: Row, rate: float, moved: LargestMotion) -> Observation:
+def scan_of(
+    step: ScheduleParameters, data: Data, row: Row, rate: float, moved: LargestMotion
+) -> Observation:
     """The observation of a row, sampled at ``rate`` [Hz]."""
     scene, place = data.scene, f"{step.label}, {step.schedule}, {row.label}"
     mount = step.speed / math.cos(row.elevation)
-    sweep = Sweep(row.azimuth[1] - row.azimuth[0], mount, step.acceleration, step.turnaround == "smooth")
+    sweep = Sweep(
+        row.azimuth[1] - row.azimuth[0], mount, step.acceleration, step.turnaround == "smooth"
+    )
     nod = step.nod
     ahead = math.ceil(nod.duration * rate * (1 - 1e-12))
     seconds = np.arange(ahead + max(int(row.duration * rate * (1 + 1e-12)), 1)) / rate
@@ -91,7 +103,9 @@ def scan_of(step: ScheduleParameters, data: Data, row: Row, rate: float, moved: 
     start = row.start.shifted(-delay)
 
     def track(at: Floats) -> Floats:
-        azimuth = row.azimuth[0] + np.where(at >= delay, sweep.path(np.maximum(at - delay, 0.0)), 0.0)
+        azimuth = row.azimuth[0] + np.where(
+            at >= delay, sweep.path(np.maximum(at - delay, 0.0)), 0.0
+        )
         elevation = row.elevation + np.where(at < delay, nod.path(at), 0.0)
         return unit_vectors(-azimuth, elevation)
 
@@ -103,7 +117,9 @@ def scan_of(step: ScheduleParameters, data: Data, row: Row, rate: float, moved: 
     boresight = (_turned(azel, row.rotation), _turned(radec, row.rotation))
     scanning = seconds >= delay
     intervals = sweep.intervals(seconds - delay, scanning)
-    intervals = {name: [(a + delay, b + delay) for a, b in spans] for name, spans in intervals.items()}
+    intervals = {
+        name: [(a + delay, b + delay) for a, b in spans] for name, spans in intervals.items()
+    }
     flags = np.where(scanning, 0, IRREGULAR).astype(np.uint8)
     if ahead:
         intervals["elnod"] = runs(~scanning, seconds)
@@ -113,19 +129,29 @@ def scan_of(step: ScheduleParameters, data: Data, row: Row, rate: float, moved: 
     lit, suns = sunlit(scene.site, start, seconds, azel, step.sun_close)
     centre = _centre(data, row, transform, delay)
     samples = Samples(seconds, rate, boresight, flags | lit, intervals | suns)
-    observation = observed(step.label, scene, len(data.observations), transform, centre, samples, row.label)
+    observation = observed(
+        step.label, scene, len(data.observations), transform, centre, samples, row.label
+    )
     _check_motion(step, observation.name, track, (0.0, delay), False, place, moved)
-    _check_motion(step, observation.name, track, (delay, len(seconds) / rate), sweep.smooth, place, moved)
+    _check_motion(
+        step, observation.name, track, (delay, len(seconds) / rate), sweep.smooth, place, moved
+    )
     observation.tally.state(step.label, f"{observation.name}: row of the schedule", row.label)
     what = "samples in turnarounds" + (", flagged" if step.flag_turnarounds else ", used")
     observation.tally.count(step.label, what, int(turning.sum()), len(seconds))
     if ahead:
-        observation.tally.count(step.label, "samples in elevation nods, flagged", ahead, len(seconds))
+        observation.tally.count(
+            step.label, "samples in elevation nods, flagged", ahead, len(seconds)
+        )
     return observation
 
 
-def _centre(data: Data, row: Row, transform: CelestialTransform, delay: float) -> tuple[float, float]:
-    """ICRS (ra, dec) of the scene's target; of the middle of the scan where it has none, or one fixed on the ground."""
+def _centre(
+    data: Data, row: Row, transform: CelestialTransform, delay: float
+) -> tuple[float, float]:
+    """ICRS (ra, dec) of the scene's target; of the middle of the scan where it has none, or one
+    fixed on the ground.
+    """
     target = data.scene.target
     if target is not None and target.frame != "horizontal":
         return target.icrs()
@@ -149,11 +175,18 @@ def _check_elevation(horizontal: Floats, telescope: Telescope, place: str) -> No
 
 
 def _check_motion(
-    step: ScheduleParameters, name: str, track: Track, part: tuple[float, float], smooth: bool, place: str, moved: LargestMotion
+    step: ScheduleParameters,
+    name: str,
+    track: Track,
+    part: tuple[float, float],
+    smooth: bool,
+    place: str,
+    moved: LargestMotion,
 ) -> None:
     """Compare a part of the track, from begin to end [s], with the telescope's limits.
 
-    A scan begins at full speed: from the nod to the scan there is no motion to compare. Not ``smooth``: its jerk has no bound.
+    A scan begins at full speed: from the nod to the scan there is no motion to compare. Not
+    ``smooth``: its jerk has no bound.
     """
     begin, end = part
     if end <= begin:
@@ -161,11 +194,17 @@ def _check_motion(
     limits = {q: limit for q, limit in moved.limits.items() if smooth or q[1] < 3}
 
     def at(step: float) -> Floats:
-        return track(begin + np.arange(max(round((end - begin) / step), 1), dtype=np.float64) * step)
+        return track(
+            begin + np.arange(max(round((end - begin) / step), 1), dtype=np.float64) * step
+        )
 
     coarse = POINTS / (end - begin)
     found = motion(at(1 / coarse), coarse, limits, at)
-    found = {q: peak._replace(second=begin + peak.second) for q, peak in found.items() if smooth or q[1] < 3}
+    found = {
+        q: peak._replace(second=begin + peak.second)
+        for q, peak in found.items()
+        if smooth or q[1] < 3
+    }
     over = excess(found, limits)
     if over and step.check_limits == "error":
         cure = "lower speed or acceleration, or set check_limits: warn"

@@ -20,7 +20,9 @@ LOOKED_AT = 256
 
 
 def distances(observations: Sequence[Observation]) -> list[str]:
-    """One line for each body: its distance from the boresight over the scans, and whether it is up."""
+    """One line for each body: its distance from the boresight over the scans, and whether it is
+    up.
+    """
     each = max(LOOKED_AT // max(len(observations), 1), 3)
     times, directions = [], []
     for o in observations:
@@ -29,7 +31,9 @@ def distances(observations: Sequence[Observation]) -> list[str]:
         directions.append(looking(o.boresight_azel[at]))
     when, track = np.concatenate(times), Track(np.concatenate(directions))
     lines = []
-    for name, body in zip(("Sun", "Moon"), tracks(observations[0].site, when, "sun", "moon"), strict=True):
+    for name, body in zip(
+        ("Sun", "Moon"), tracks(observations[0].site, when, "sun", "moon"), strict=True
+    ):
         apart, up = np.degrees(track.distance(body)), body.elevation > math.radians(-0.5)
         where = "up" if up.all() else "up part of the time" if up.any() else "below the horizon"
         lines.append(f"distance of the {name}: {apart.min():.1f} to {apart.max():.1f} deg, {where}")

@@ -1,6 +1,8 @@
-"""Maps that are given as arrays in Python: numpy arrays, astropy quantities and FITS units in memory.
+"""Maps that are given as arrays in Python: numpy arrays, astropy quantities and FITS units in
+memory.
 
-Each becomes what a FITS file would hold, so that everything behind it is the same: units, beams, projections, missing pixels.
+Each becomes what a FITS file would hold, so that everything behind it is the same: units, beams,
+projections, missing pixels.
 """
 
 from __future__ import annotations
@@ -25,11 +27,27 @@ from zonda.core.storage.fits_image import Cards
 
 from .healpix import is_healpix
 
-IN_A_FILE = "an array is given in Python, as in SkyMap(map=array); in a pipeline file write file: my_map.fits"
+IN_A_FILE = (
+    "an array is given in Python, as in SkyMap(map=array); in a pipeline file write file:"
+    " my_map.fits"
+)
 GIVEN = "ZARRAY"
 """FITS key of a file that an array was written to: `ArrayMap.text`."""
 _STRUCTURE = frozenset(
-    ["SIMPLE", "XTENSION", "BITPIX", "PCOUNT", "GCOUNT", "EXTEND", "BSCALE", "BZERO", "BLANK", "END", "COMMENT", "HISTORY"]
+    [
+        "SIMPLE",
+        "XTENSION",
+        "BITPIX",
+        "PCOUNT",
+        "GCOUNT",
+        "EXTEND",
+        "BSCALE",
+        "BZERO",
+        "BLANK",
+        "END",
+        "COMMENT",
+        "HISTORY",
+    ]
 )
 """Keys that say how an array lies in a file, or nothing about the map."""
 
@@ -73,7 +91,9 @@ class ArrayMap:
         if isinstance(value, Mapping):
             raise mistake(IN_A_FILE)
         if isinstance(value, list) and any(hasattr(hdu, "header") for hdu in value):
-            raise mistake("map takes one HDU, not a list of them", f"choose one: map=hdus[{_first(value)}]")
+            raise mistake(
+                "map takes one HDU, not a list of them", f"choose one: map=hdus[{_first(value)}]"
+            )
         if hasattr(value, "header") and hasattr(value, "data"):
             return cls._of_hdu(value)
         header = Cards()
@@ -87,8 +107,13 @@ class ArrayMap:
         if values.dtype.kind not in "fiu" or values.dtype.itemsize > 8:
             raise mistake(f"expected an array of numbers, got {value!r:.60}")
         if values.ndim == 1:
-            cure = "give a HEALPix map as a table HDU, or write it with healpy.write_map and give file="
-            raise mistake(f"expected an image (ny, nx), got an array of shape {values.shape}; {cure}")
+            cure = (
+                "give a HEALPix map as a table HDU, or write it with healpy.write_map and give"
+                " file="
+            )
+            raise mistake(
+                f"expected an image (ny, nx), got an array of shape {values.shape}; {cure}"
+            )
         if values.ndim < 2 or not values.size:
             raise mistake(f"expected an image (ny, nx), got an array of shape {values.shape}")
         if values.ndim == 3 and len(values) == 3:
@@ -103,7 +128,9 @@ class ArrayMap:
             raise mistake("the HDU holds neither an image nor a HEALPix table")
         values = np.array(hdu.data)
         if values.ndim < 2:
-            raise mistake(f"expected an image of two axes or more, got an HDU of shape {values.shape}")
+            raise mistake(
+                f"expected an image of two axes or more, got an HDU of shape {values.shape}"
+            )
         return cls._image(values, _cards(hdu.header))
 
     @classmethod
@@ -118,8 +145,12 @@ class ArrayMap:
     def digest(self) -> str:
         """Hash of the numbers and of the header."""
         found = hashlib.blake2b(digest_size=8)
-        found.update(repr((self.values.dtype.str, self.values.shape, sorted(self.header.items()))).encode())
-        found.update((self.values if self.table is None else np.ascontiguousarray(self.table.data)).data)
+        found.update(
+            repr((self.values.dtype.str, self.values.shape, sorted(self.header.items()))).encode()
+        )
+        found.update(
+            (self.values if self.table is None else np.ascontiguousarray(self.table.data)).data
+        )
         return found.hexdigest()
 
     @property
@@ -135,7 +166,9 @@ class ArrayMap:
 
     def with_wcs(self, header: Cards) -> ArrayMap:
         """The image with these world coordinates."""
-        return ArrayMap(self.values, self.header.copy().add(header), self.table, self.given or self.digest)
+        return ArrayMap(
+            self.values, self.header.copy().add(header), self.table, self.given or self.digest
+        )
 
     @property
     def text(self) -> str:
@@ -146,17 +179,26 @@ class ArrayMap:
     def record(self) -> dict[str, Any]:
         """What products say of it: shape, type, unit, hash."""
         unit = {"unit": self.header["BUNIT"]} if "BUNIT" in self.header else {}
-        shape = {"healpix": int(self.header.get("NSIDE") or 0)} if self.table is not None else {"array": list(self.values.shape)}
+        shape = (
+            {"healpix": int(self.header.get("NSIDE") or 0)}
+            if self.table is not None
+            else {"array": list(self.values.shape)}
+        )
         return {**shape, "type": self.values.dtype.name, **unit, "hash": self.digest}
 
     def write(self, path: Path) -> None:
-        """As a FITS file that reads back to the same bits: header values are rounded as astropy does, in memory too.
+        """As a FITS file that reads back to the same bits: header values are rounded as astropy
+        does, in memory too.
 
         The key `GIVEN` says what it was.
         """
         from astropy.io import fits
 
-        made = fits.PrimaryHDU(self.values, fits.Header(dict(self.header.items()))) if self.table is None else self.table.copy()
+        made = (
+            fits.PrimaryHDU(self.values, fits.Header(dict(self.header.items())))
+            if self.table is None
+            else self.table.copy()
+        )
         made.header[GIVEN] = self.text
         made.writeto(path, overwrite=True)
 
@@ -170,12 +212,18 @@ class ArrayMap:
         return f"<{self.name}, hash {self.digest}>"
 
     @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        written = core_schema.plain_serializer_function_ser_schema(lambda found: found.record(), when_used="json")
+    def __get_pydantic_core_schema__(
+        cls, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        written = core_schema.plain_serializer_function_ser_schema(
+            lambda found: found.record(), when_used="json"
+        )
         return core_schema.no_info_plain_validator_function(cls.parse, serialization=written)
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        cls, schema: Any, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         return {"type": "null"}
 
 
@@ -202,24 +250,39 @@ class WorldCoordinates(Cards):
     """(ny, nx) of the image that they are made for; None: not known."""
 
     @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+    def __get_pydantic_core_schema__(
+        cls, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
         written = core_schema.plain_serializer_function_ser_schema(dict, when_used="json")
         return core_schema.no_info_plain_validator_function(cls.parse, serialization=written)
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        cls, schema: Any, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         return {"type": "null"}
 
 
 def check_shape(array: ArrayMap, wcs: WorldCoordinates) -> None:
     """Raise ValueError for world coordinates of another image."""
-    if wcs.shape is not None and array.table is None and tuple(wcs.shape[-2:]) != array.values.shape[-2:]:
-        ours, theirs = (" x ".join(str(n) for n in reversed(shape[-2:])) for shape in (array.values.shape, wcs.shape))
-        raise ValueError(f"the WCS is that of an image of {theirs} pixels, the array has {ours} (array[y, x])")
+    if (
+        wcs.shape is not None
+        and array.table is None
+        and tuple(wcs.shape[-2:]) != array.values.shape[-2:]
+    ):
+        ours, theirs = (
+            " x ".join(str(n) for n in reversed(shape[-2:]))
+            for shape in (array.values.shape, wcs.shape)
+        )
+        raise ValueError(
+            f"the WCS is that of an image of {theirs} pixels, the array has {ours} (array[y, x])"
+        )
 
 
 def checked_unit(array: ArrayMap, given: str | None) -> None:
-    """Raise ValueError where ``unit`` contradicts the unit of a quantity: its prefix would be read twice."""
+    """Raise ValueError where ``unit`` contradicts the unit of a quantity: its prefix would be read
+    twice.
+    """
     own = array.header.get("BUNIT")
     if not isinstance(own, str) or given is None:
         return
@@ -229,14 +292,24 @@ def checked_unit(array: ArrayMap, given: str | None) -> None:
     except InputError:
         return  # said when the map is read
     if (scale, factor) != (own_scale, own_factor):
-        raise ValueError(f"the map is a quantity in {own}, and unit is {given}; convert one of them")
+        raise ValueError(
+            f"the map is a quantity in {own}, and unit is {given}; convert one of them"
+        )
 
 
 def _cards(header: Any) -> Cards:
-    """A header without what says how the numbers lie in a file. Values that FITS cannot hold are left out by FITS itself."""
+    """A header without what says how the numbers lie in a file. Values that FITS cannot hold are
+    left out by FITS itself.
+    """
     made = Cards()
     for key in dict.fromkeys(header):
-        if not key or key.upper() in _STRUCTURE or key.upper().startswith("NAXIS") or " " in key or len(key) > 8:
+        if (
+            not key
+            or key.upper() in _STRUCTURE
+            or key.upper().startswith("NAXIS")
+            or " " in key
+            or len(key) > 8
+        ):
             continue
         value = header[key]
         if isinstance(value, bool | int | float | str | np.bool_ | np.integer | np.floating):
@@ -252,7 +325,11 @@ def _exact(wcs: Any) -> dict[str, Any]:
     numbers = wcs.wcs
     for i in range(numbers.naxis):
         exact = {"CRPIX": numbers.crpix, "CRVAL": numbers.crval, "CDELT": numbers.get_cdelt()}
-        header |= {f"{key}{i + 1}": float(values[i]) for key, values in exact.items() if f"{key}{i + 1}" in header}
+        header |= {
+            f"{key}{i + 1}": float(values[i])
+            for key, values in exact.items()
+            if f"{key}{i + 1}" in header
+        }
         for j in range(numbers.naxis):
             if f"PC{i + 1}_{j + 1}" in header:
                 header[f"PC{i + 1}_{j + 1}"] = float(numbers.get_pc()[i, j])
@@ -260,7 +337,9 @@ def _exact(wcs: Any) -> dict[str, Any]:
 
 
 def _in_known_unit(quantity: Any) -> tuple[NDArray[Any], str]:
-    """The numbers of a quantity and their unit as headers write it; an intensity becomes MJy/sr. Empty: a pure number."""
+    """The numbers of a quantity and their unit as headers write it; an intensity becomes MJy/sr.
+    Empty: a pure number.
+    """
     text = str(quantity.unit).strip()
     try:
         parse_unit(text, place="map", temperature_scale="K_RJ")
@@ -270,7 +349,9 @@ def _in_known_unit(quantity: Any) -> tuple[NDArray[Any], str]:
         if text and quantity.unit.is_equivalent("K"):
             return np.asarray(quantity.to_value("K")), "K"
         if text:
-            raise mistake(f"'{text}' is no unit of a map of the sky; use K, Jy/beam, Jy/pix or MJy/sr") from None
+            raise mistake(
+                f"'{text}' is no unit of a map of the sky; use K, Jy/beam, Jy/pix or MJy/sr"
+            ) from None
     return np.asarray(quantity.value), text
 
 

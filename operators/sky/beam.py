@@ -2,27 +2,30 @@
 
 The image is a brightness T_j at the pixel centres r_j, each standing for its pixel's area A:
 
-    (T * B)(r) = sum_j A T_j B(r - r_j)                                                                         (1)
+    (T * B)(r) = sum_j A T_j B(r - r_j)                                                          (1)
 
-with B of unit integral. Equation (1) is evaluated on a grid of step (pixel / q), q >= 1, such that the FWHM has at least
-`PIXELS_PER_FWHM` steps (or as many as asked for): the image is set on every q-th point and multiplied in Fourier space by the
-analytic transform of B,
+with B of unit integral. Equation (1) is evaluated on a grid of step (pixel / q), q >= 1, such that
+the FWHM has at least `PIXELS_PER_FWHM` steps (or as many as asked for): the image is set on every
+q-th point and multiplied in Fourier space by the analytic transform of B,
 
-    exp(-2 pi^2 k C k),   C = sigma^2 (J^T J)^-1,   sigma = FWHM / sqrt(8 ln 2)                                 (2)
+    exp(-2 pi^2 k C k),   C = sigma^2 (J^T J)^-1,
+    sigma = FWHM / sqrt(8 ln 2)                                 (2)
 
-with J [rad per pixel] the linear map from pixels to the tangent plane, so rotated, skewed and oblong pixels are right. A single
-bright pixel comes out as an exact Gaussian of the FWHM, a uniform image ripples by 4 exp(-2 pi^2 (sigma / pixel)^2):
-3e-6 at 2 pixels per FWHM. J is constant here: images for which it is not are spread (`spread`).
+with J [rad per pixel] the linear map from pixels to the tangent plane, so rotated, skewed and
+oblong pixels are right. A single bright pixel comes out as an exact Gaussian of the FWHM, a uniform
+image ripples by 4 exp(-2 pi^2 (sigma / pixel)^2): 3e-6 at 2 pixels per FWHM. J is constant here:
+images for which it is not are spread (`spread`).
 
 Along an axis with fewer the image is taken as smooth instead (`Convolved.coarse`): the cubic spline
 through its pixels, with the transform
 
-    sinc^4(k) / sum_m sinc^4(k + m)   (k in cycles per pixel)                                                   (3)
+    sinc^4(k) / sum_m sinc^4(k + m)   (k in cycles per pixel)                                    (3)
 
-is convolved with B and taken at the pixel centres again (q = 1), which folds the product of (2) and (3) over k + m. Nothing is
-ever deconvolved: what smoothing the pixels of the input carry stays.
+is convolved with B and taken at the pixel centres again (q = 1), which folds the product of (2) and
+(3) over k + m. Nothing is ever deconvolved: what smoothing the pixels of the input carry stays.
 
-Beyond its edge the image has the value `outside`; the grid reaches `REACH` sigma further, where the beam has left the image.
+Beyond its edge the image has the value `outside`; the grid reaches `REACH` sigma further, where the
+beam has left the image.
 """
 
 from __future__ import annotations
@@ -45,8 +48,9 @@ SPLINE_MARGIN = 4
 """Grid points beyond the reach, for the 4 x 4 coefficients of the last sample."""
 SIGMA = 1.0 / np.sqrt(8.0 * np.log(2.0))
 TINY = 1e-16
-"""Coefficients smaller than this share of the largest are set to zero: they are rounding of the transform, and as float32
-denormals they would slow the sampling. A sample is a mean of 16 coefficients, so it changes by no more of the image's peak."""
+"""Coefficients smaller than this share of the largest are set to zero: they are rounding of the
+transform, and as float32 denormals they would slow the sampling. A sample is a mean of 16
+coefficients, so it changes by no more of the image's peak."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +60,8 @@ class Convolved:
     Attributes
     ----------
     coefficients
-        Of the values minus ``outside``, by type name (``float32``, ``float64``), each (ny, nx) in C order; the values between
-        which is interpolated where that is linear.
+        Of the values minus ``outside``, by type name (``float32``, ``float64``), each (ny, nx) in C
+        order; the values between which is interpolated where that is linear.
     to_grid
         (3, 3): homogeneous input pixel (0-based) to homogeneous grid point.
     bounds
@@ -83,22 +87,34 @@ def convolve(
     pixels_per_fwhm: float = PIXELS_PER_FWHM,
     linear: bool = False,
 ) -> Convolved:
-    """Equations (1) and (2) for ``values`` (ny, nx), ``jacobian`` J (2, 2) [rad per pixel] and ``fwhm`` [rad]; 0: no beam.
+    """Equations (1) and (2) for ``values`` (ny, nx), ``jacobian`` J (2, 2) [rad per pixel] and
+    ``fwhm`` [rad]; 0: no beam.
 
-    ``linear``: for linear interpolation, whose mean response sinc^2(k h) along each axis is divided out (`linear`).
+    ``linear``: for linear interpolation, whose mean response sinc^2(k h) along each axis is divided
+    out (`linear`).
     """
     covariance = (SIGMA * fwhm) ** 2 * np.linalg.inv(jacobian.T @ jacobian)  # pixel^2
     width = np.sqrt(np.diag(covariance))  # sigma in pixels along (x, y)
     across = fwhm / np.linalg.norm(jacobian, axis=0)  # pixels per FWHM along (x, y)
-    qx, qy = (int(np.ceil(pixels_per_fwhm / a - 1e-9)) if SMOOTH_BELOW <= a < pixels_per_fwhm else 1 for a in across)
+    qx, qy = (
+        int(np.ceil(pixels_per_fwhm / a - 1e-9)) if SMOOTH_BELOW <= a < pixels_per_fwhm else 1
+        for a in across
+    )
     _check_size(values.shape, width, across, (qx, qy))
-    pad_x, pad_y = (int(np.ceil(REACH * width[k] * q)) + SPLINE_MARGIN + q for k, q in ((0, qx), (1, qy)))
+    pad_x, pad_y = (
+        int(np.ceil(REACH * width[k] * q)) + SPLINE_MARGIN + q for k, q in ((0, qx), (1, qy))
+    )
     rows, columns = values.shape
     ny, nx = fast_length(rows * qy + 2 * pad_y), fast_length(columns * qx + 2 * pad_x)
     grid = np.zeros((ny, nx))
-    grid[pad_y : pad_y + rows * qy : qy, pad_x : pad_x + columns * qx : qx] = (values - outside) * (qx * qy)
+    grid[pad_y : pad_y + rows * qy : qy, pad_x : pad_x + columns * qx : qx] = (values - outside) * (
+        qx * qy
+    )
     if fwhm > 0:
-        kx, ky = np.float64(qx) * np.fft.rfftfreq(nx), np.float64(qy) * np.fft.fftfreq(ny)[:, None]  # cycles per input pixel
+        kx, ky = (
+            np.float64(qx) * np.fft.rfftfreq(nx),
+            np.float64(qy) * np.fft.fftfreq(ny)[:, None],
+        )  # cycles per input pixel
         transfer = _transfer(covariance, kx, ky, across < SMOOTH_BELOW)
         if linear:
             transfer /= np.sinc(kx / qx) ** 2 * np.sinc(ky / qy) ** 2
@@ -112,17 +128,28 @@ def convolve(
     return Convolved(
         coefficients={"float64": grid, "float32": grid.astype(np.float32)},
         to_grid=np.array([[qx, 0.0, pad_x], [0.0, qy, pad_y], [0.0, 0.0, 1.0]]),
-        bounds=np.array([pad_x - qx / 2, pad_x + (columns - 0.5) * qx, pad_y - qy / 2, pad_y + (rows - 0.5) * qy]),
+        bounds=np.array(
+            [
+                pad_x - qx / 2,
+                pad_x + (columns - 0.5) * qx,
+                pad_y - qy / 2,
+                pad_y + (rows - 0.5) * qy,
+            ]
+        ),
         steps=(qx, qy),
         coarse=bool((across < SMOOTH_BELOW).any()),
     )
 
 
-def convolve_evenly(values: Floats, step: float, variance: float, outside: float, linear: bool = False) -> Convolved:
-    """``values`` (ny, nx) on a grid of ``step`` [rad], convolved with a Gaussian of ``variance`` [rad^2] of either axis.
+def convolve_evenly(
+    values: Floats, step: float, variance: float, outside: float, linear: bool = False
+) -> Convolved:
+    """``values`` (ny, nx) on a grid of ``step`` [rad], convolved with a Gaussian of ``variance``
+    [rad^2] of either axis.
 
-    They fade out towards the edges. What interpolation between points takes from a wave is divided out: sinc^4(k h) of cubic
-    B-splines and sinc^2(k h) of lines; what is left are its images, half of which are at the points and half between them.
+    They fade out towards the edges. What interpolation between points takes from a wave is divided
+    out: sinc^4(k h) of cubic B-splines and sinc^2(k h) of lines; what is left are its images, half
+    of which are at the points and half between them.
     """
     rows, columns = values.shape
     ny, nx = fast_length(rows), fast_length(columns)
@@ -141,23 +168,35 @@ def convolve_evenly(values: Floats, step: float, variance: float, outside: float
     )
 
 
-def _check_size(shape: tuple[int, ...], width: Floats, across: Floats, steps: tuple[int, int]) -> None:
-    """Refuse a map whose margins, a beam wide, do not fit the memory: pixels far smaller than the beam (`InputError`)."""
+def _check_size(
+    shape: tuple[int, ...], width: Floats, across: Floats, steps: tuple[int, int]
+) -> None:
+    """Refuse a map whose margins, a beam wide, do not fit the memory: pixels far smaller than the
+    beam (`InputError`).
+    """
     from zonda.core.machine import available_memory
 
-    cells = float(np.prod([n * q + 2 * REACH * w * q for n, w, q in zip(shape[::-1], width, steps, strict=True)]))
+    cells = float(
+        np.prod(
+            [n * q + 2 * REACH * w * q for n, w, q in zip(shape[::-1], width, steps, strict=True)]
+        )
+    )
     free = available_memory()
-    if not 4 * 8 * cells <= free:  # the grid, its transform, the beam's transform, and one on the way
+    if (
+        not 4 * 8 * cells <= free
+    ):  # the grid, its transform, the beam's transform, and one on the way
         raise InputError(
-            f"convolving the map with the beam needs {4 * 8 * cells / 1e9:.3g} GB, {free / 1e9:.3g} GB are free: a beam is "
-            f"{np.max(across):.3g} of its pixels wide",
+            f"convolving the map with the beam needs {4 * 8 * cells / 1e9:.3g} GB, {free / 1e9:.3g}"
+            f" GB are free: a beam is {np.max(across):.3g} of its pixels wide",
             place="sky map",
             cure="check the map's pixel size, or rebin it to some ten pixels per FWHM",
         )
 
 
 def _transfer(covariance: Floats, kx: Floats, ky: Floats, smooth: NDArray[np.bool_]) -> Floats:
-    """Equation (2) at frequencies ``kx``, ``ky`` [cycles per pixel]; folded with (3) along the axes that are ``smooth``."""
+    """Equation (2) at frequencies ``kx``, ``ky`` [cycles per pixel]; folded with (3) along the axes
+    that are ``smooth``.
+    """
     total = np.zeros(np.broadcast_shapes(kx.shape, ky.shape))
     folds_x, folds_y = (FOLDS if s else (0,) for s in smooth)
     for m in folds_x:
@@ -165,7 +204,9 @@ def _transfer(covariance: Floats, kx: Floats, ky: Floats, smooth: NDArray[np.boo
         for n in folds_y:
             weight_y = _spline_transform(ky, n) if smooth[1] else 1.0
             x, y = kx + m, ky + n
-            exponent = covariance[0, 0] * x**2 + 2 * covariance[0, 1] * x * y + covariance[1, 1] * y**2
+            exponent = (
+                covariance[0, 0] * x**2 + 2 * covariance[0, 1] * x * y + covariance[1, 1] * y**2
+            )
             total += weight_x * weight_y * np.exp(-2 * np.pi**2 * exponent)
     return total
 

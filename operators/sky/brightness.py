@@ -40,8 +40,8 @@ class Conversion:
     Attributes
     ----------
     factor
-        K_RJ per unit, (ny, nx) where pixels differ; K_RJ sr per unit where ``per_area``: then each pixel is divided by its own
-        solid angle while it is resampled.
+        K_RJ per unit, (ny, nx) where pixels differ; K_RJ sr per unit where ``per_area``: then each
+        pixel is divided by its own solid angle while it is resampled.
     typical
         K_RJ per unit, at the median pixel where pixels differ.
     text
@@ -85,7 +85,9 @@ def tangent_areas(matrix: Floats, shape: tuple[int, int]) -> Floats:
     With H its inverse, a pixel p = (x, y, 1) looks along H p, and dOmega = |det H| / |H p|^3 dx dy.
     """
     inverse = np.linalg.inv(matrix)
-    return np.asarray(abs(np.linalg.det(inverse)) / np.linalg.norm(_rays(inverse, shape), axis=2) ** 3)
+    return np.asarray(
+        abs(np.linalg.det(inverse)) / np.linalg.norm(_rays(inverse, shape), axis=2) ** 3
+    )
 
 
 def tangent_directions(matrix: Floats, shape: tuple[int, int]) -> Floats:
@@ -114,7 +116,8 @@ class Brightness:
     notes, counts
         What was chosen, and what was taken for something else, for the tally.
     polarization
-        (2, ny, nx) Q and U from the meridians through `Grid.axis`; 0 where nothing is known. None: there are none.
+        (2, ny, nx) Q and U from the meridians through `Grid.axis`; 0 where nothing is known. None:
+        there are none.
     resolution
         FWHM [rad] of the Gaussians by which pixels were spread; 0: they were not.
     """
@@ -130,10 +133,16 @@ class Brightness:
 
     @property
     def nbytes(self) -> int:
-        return self.values.nbytes + self.covered.nbytes + (0 if self.polarization is None else self.polarization.nbytes)
+        return (
+            self.values.nbytes
+            + self.covered.nbytes
+            + (0 if self.polarization is None else self.polarization.nbytes)
+        )
 
     def image(self, label: str, axis: Floats) -> Image:
-        """For pictures and comparisons; NaN where nothing is known. ``label``: the operator's; ``axis``: the grid's."""
+        """For pictures and comparisons; NaN where nothing is known. ``label``: the operator's;
+        ``axis``: the grid's.
+        """
         header = self.wcs.to_header(relax=True)
         header["BUNIT"], header["TEMPSCAL"], header["OPERATOR"] = "K", "K_RJ", label
         if self.resolution:
@@ -143,52 +152,97 @@ class Brightness:
 
 
 def on_own_pixels(grid: Grid, found: Conversion, scale: float, place: str) -> Brightness:
-    """The values of a TAN image times ``scale``. Raises InputError where it is brighter than anything."""
+    """The values of a TAN image times ``scale``. Raises InputError where it is brighter than
+    anything.
+    """
     source = grid.source
     values = source.values * found.factor * scale
     check_brightness(values, place)
     pixel = np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0) * 3600
     notes = {
         **source.notes,
-        "input map": f"TAN, {grid.shape[1]} x {grid.shape[0]} pixels of {pixel[0]:.6g} x {pixel[1]:.6g} arcsec",
+        "input map": (
+            f"TAN, {grid.shape[1]} x {grid.shape[0]} pixels of {pixel[0]:.6g} x {pixel[1]:.6g}"
+            " arcsec"
+        ),
         "conversion": found.text,
     }
     polarization = None
     if source.polarization is not None and grid.pole is not None:
-        turn = between_meridians(tangent_directions(pixel_matrix(grid.wcs), grid.shape), grid.pole, grid.axis)
+        turn = between_meridians(
+            tangent_directions(pixel_matrix(grid.wcs), grid.shape), grid.pole, grid.axis
+        )
         polarization = turned_by(source.polarization * (found.factor * scale), turn)
         check_brightness(polarization, place)
-    return Brightness(grid.key, values, np.zeros((0, 0), bool), grid.wcs, notes, {ZEROED: source.zeroed}, polarization)
+    return Brightness(
+        grid.key,
+        values,
+        np.zeros((0, 0), bool),
+        grid.wcs,
+        notes,
+        {ZEROED: source.zeroed},
+        polarization,
+    )
 
 
 def resampled(
-    grid: Grid, found: Conversion, scale: float, outside: float, place: str, progress: Progress, spread: Spread | None
+    grid: Grid,
+    found: Conversion,
+    scale: float,
+    outside: float,
+    place: str,
+    progress: Progress,
+    spread: Spread | None,
 ) -> Brightness:
-    """A map on a TAN grid, spread or interpolated; ``outside`` where it has no data. Raises as `on_own_pixels`."""
+    """A map on a TAN grid, spread or interpolated; ``outside`` where it has no data. Raises as
+    `on_own_pixels`.
+    """
     assert isinstance(found.factor, float)  # of own pixels alone there is one for each
     source, wcs, factor = grid.source, grid.wcs, found.factor * scale
-    least_and_largest = np.array([np.min(source.values, initial=0.0), np.max(source.values, initial=0.0)])
+    least_and_largest = np.array(
+        [np.min(source.values, initial=0.0), np.max(source.values, initial=0.0)]
+    )
     check_brightness(least_and_largest * (found.typical * scale), place)
     counts, axis = {ZEROED: source.zeroed}, None if source.polarization is None else grid.axis
     if isinstance(source, HealpixMap):
         kind = f"HEALPix of nside {source.nside}"
     else:
         kind, counts[LOST] = f"projection {', '.join(source.wcs.wcs.ctype)}", _lost(source)
-    part = f", of which {grid.points / np.prod(grid.shape):.0%} is reached" if grid.tiles is not None else ""
+    part = (
+        f", of which {grid.points / np.prod(grid.shape):.0%} is reached"
+        if grid.tiles is not None
+        else ""
+    )
     where = (
-        f"TAN grid of {grid.shape[1]} x {grid.shape[0]} pixels of {np.degrees(grid.step) * 3600:.6g} arcsec about the observation"
+        f"TAN grid of {grid.shape[1]} x {grid.shape[0]} pixels of"
+        f" {np.degrees(grid.step) * 3600:.6g} arcsec about the observation"
     )
     if spread is not None:
         how = f"its pixels spread, by their own solid angles, over a {where}{part}"
         values, covered = spread_map(
-            source, wcs, spread, factor, per_area=found.per_area, outside=outside, tiles=grid.tiles, progress=progress, axis=axis
-        )  # fmt: skip
+            source,
+            wcs,
+            spread,
+            factor,
+            per_area=found.per_area,
+            outside=outside,
+            tiles=grid.tiles,
+            progress=progress,
+            axis=axis,
+        )
     else:
-        how = f"interpolated (third order) onto a {where}{part}; its error falls with the third power of the input's pixel size"
+        how = (
+            f"interpolated (third order) onto a {where}{part}; its error falls with the third power"
+            " of the input's pixel size"
+        )
         if isinstance(source, HealpixMap):
-            values, covered, counts[POOR] = resample_healpix(source, wcs, grid.tiles, progress, axis)
+            values, covered, counts[POOR] = resample_healpix(
+                source, wcs, grid.tiles, progress, axis
+            )
         else:
-            values, covered = resample_image(source, wcs, grid.tiles, progress, found.per_area, axis)
+            values, covered = resample_image(
+                source, wcs, grid.tiles, progress, found.per_area, axis
+            )
         values *= factor
     progress(0, 0)
     notes = {**source.notes, "input map": f"{kind}, {how}", "conversion": found.text}
@@ -196,11 +250,15 @@ def resampled(
     intensity = values if axis is None else values[0]
     bright = np.where(covered, intensity, outside) if spread is None else intensity + outside
     resolution = 0.0 if spread is None else spread.resolution
-    return Brightness(grid.key, bright, mask, wcs, notes, counts, None if axis is None else values[1:], resolution)
+    return Brightness(
+        grid.key, bright, mask, wcs, notes, counts, None if axis is None else values[1:], resolution
+    )
 
 
 def _lost(image: WcsMap) -> int:
-    """How many bright pixels in Jy/pixel lie beyond the projection, where there is no sky; of `CHECKED` and more an estimate."""
+    """How many bright pixels in Jy/pixel lie beyond the projection, where there is no sky; of
+    `CHECKED` and more an estimate.
+    """
     if image.unit != "Jy/pixel":
         return 0
     step = int(np.ceil(np.sqrt(image.values.size / CHECKED)))
@@ -210,10 +268,13 @@ def _lost(image: WcsMap) -> int:
 
 
 def too_bright(peak: float, conversion: str) -> str:
-    """The warning about a sky whose brightness in the beam is up to ``peak`` [K_RJ]; empty where that is plausible."""
+    """The warning about a sky whose brightness in the beam is up to ``peak`` [K_RJ]; empty where
+    that is plausible.
+    """
     if peak <= BRIGHT:
         return ""
     return (
-        f"in the beam the sky is as bright as {peak:.3g} K_RJ, and the Sun has 6000 K; is the map's unit right ({conversion}), "
-        "or are its pixels counts? `unit` replaces the header's, `scale` multiplies the map"
+        f"in the beam the sky is as bright as {peak:.3g} K_RJ, and the Sun has 6000 K; is the map's"
+        f" unit right ({conversion}), or are its pixels counts? `unit` replaces the header's,"
+        " `scale` multiplies the map"
     )

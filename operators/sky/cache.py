@@ -14,7 +14,8 @@ class Cache:
     Parameters
     ----------
     limit
-        Bytes kept; the values least recently used go first (an observation that needs them holds them itself).
+        Bytes kept; the values least recently used go first (an observation that needs them holds
+        them itself).
     """
 
     def __init__(self, limit: int = 2**30) -> None:
@@ -27,7 +28,9 @@ class Cache:
         with self._lock:
             if key not in self._kept:
                 self._kept[key] = make()
-                while len(self._kept) > 1 and sum(v.nbytes for v in self._kept.values()) > self._limit:
+                while (
+                    len(self._kept) > 1 and sum(v.nbytes for v in self._kept.values()) > self._limit
+                ):
                     self._kept.popitem(last=False)
             self._kept.move_to_end(key)
             return self._kept[key]

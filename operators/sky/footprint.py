@@ -1,4 +1,6 @@
-"""Where an input map lies on the sky, by its header alone: what `zonda check` and ``target: map`` need."""
+"""Where an input map lies on the sky, by its header alone: what `zonda check` and ``target: map``
+need.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ class Footprint:
     shape: tuple[int, int]
 
     def holds(self, direction: Floats) -> bool:
-        """Whether an ICRS direction (3,) is on the map; of another projection than TAN: within its `radius`."""
+        """Whether an ICRS direction (3,) is on the map; of another projection than TAN: within its
+        `radius`.
+        """
         if self.matrix is None:
             return bool(direction @ self.centre >= np.cos(self.radius))
         x, y, depth = self.matrix @ direction
@@ -66,9 +70,11 @@ class Footprint:
 def footprint(
     header: Any, shape: tuple[int, int], pixel_size: float | None, centre: Target | None, place: str
 ) -> Footprint | None:
-    """The footprint of an image (`header_of`); None where it has no place of its own: an image without a WCS.
+    """The footprint of an image (`header_of`); None where it has no place of its own: an image
+    without a WCS.
 
-    ``pixel_size`` [rad] and ``centre`` as `SkyMap` has them. Raises `InputError` as `read.read_map`.
+    ``pixel_size`` [rad] and ``centre`` as `SkyMap` has them. Raises `InputError` as
+    `read.read_map`.
     """
     wcs, scale = geometry(place, header, pixel_size, centre is not None, {})
     turn = None
@@ -88,17 +94,24 @@ def footprint(
         found, _ = extent(wcs, turn, shape)
     if found is None:
         return None
-    return Footprint(found.centre, found.radius, pixel_matrix(wcs) if is_plain_tan(wcs) else None, shape)
+    return Footprint(
+        found.centre, found.radius, pixel_matrix(wcs) if is_plain_tan(wcs) else None, shape
+    )
 
 
 def extent(wcs: Any, turn: Floats, shape: tuple[int, int]) -> tuple[Disc | None, bool]:
-    """A circle that holds an image, None where its middle is beyond its projection; and whether all of it is on the sky.
+    """A circle that holds an image, None where its middle is beyond its projection; and whether all
+    of it is on the sky.
 
     ``turn`` (3, 3): from ICRS directions to those in the frame of ``wcs``.
     """
     ny, nx = shape
     x, y = np.meshgrid(np.linspace(0, nx - 1, LATTICE), np.linspace(0, ny - 1, LATTICE))
-    lon, lat = np.radians(wcs.wcs_pix2world([[(nx - 1) / 2, (ny - 1) / 2], *zip(x.ravel(), y.ravel(), strict=True)], 0).T)
+    lon, lat = np.radians(
+        wcs.wcs_pix2world(
+            [[(nx - 1) / 2, (ny - 1) / 2], *zip(x.ravel(), y.ravel(), strict=True)], 0
+        ).T
+    )
     lon, lat = (lon, lat) if wcs.wcs.lng == 0 else (lat, lon)
     rays = unit_vectors(lon, lat) @ turn
     middle, known = rays[0], np.isfinite(rays.sum(axis=1))
@@ -108,28 +121,39 @@ def extent(wcs: Any, turn: Floats, shape: tuple[int, int]) -> tuple[Disc | None,
     return Disc(middle, min(radius, np.pi)), bool(known.all())
 
 
-def header_of(path: Path, wanted: int | str | None, place: str) -> tuple[Any, tuple[int, int]] | None:
-    """Header and (ny, nx) of a file's first image, or of the extension ``wanted``; None: a HEALPix table."""
+def header_of(
+    path: Path, wanted: int | str | None, place: str
+) -> tuple[Any, tuple[int, int]] | None:
+    """Header and (ny, nx) of a file's first image, or of the extension ``wanted``; None: a HEALPix
+    table.
+    """
     plain = read_image(path) if wanted in (None, 0) else None
     if plain is not None and plain[1].ndim == 2:
         return plain[0], (plain[1].shape[0], plain[1].shape[1])
-    with opened(path, place, "check the file, e.g. with fitsinfo or fitsverify, or copy it again") as hdus:
+    with opened(
+        path, place, "check the file, e.g. with fitsinfo or fitsverify, or copy it again"
+    ) as hdus:
         hdu, _ = chosen(hdus, wanted, place)
         if is_healpix(hdu):
             return None
-        return hdu.header.copy(), (int(hdu.header.get("NAXIS2", 1)), int(hdu.header.get("NAXIS1", 1)))
+        return hdu.header.copy(), (
+            int(hdu.header.get("NAXIS2", 1)),
+            int(hdu.header.get("NAXIS1", 1)),
+        )
 
 
 def off_the_map(found: Footprint, centre: tuple[float, float], label: str) -> str:
-    """The warning about a scan about ``centre``, ICRS (ra, dec) [rad], that is not on the map; empty where it is."""
+    """The warning about a scan about ``centre``, ICRS (ra, dec) [rad], that is not on the map;
+    empty where it is.
+    """
     ra, dec = centre
     direction = unit_vectors(ra, dec)
     if found.holds(direction):
         return ""
     away = np.degrees(angle_between(direction, found.centre))
     return (
-        f"{label}: the target {position(ra, dec)} is not on the input map, whose centre, {position(*found.target.icrs())}, is "
-        f"{away:.3g} deg away; `target: map` looks there"
+        f"{label}: the target {position(ra, dec)} is not on the input map, whose centre,"
+        f" {position(*found.target.icrs())}, is {away:.3g} deg away; `target: map` looks there"
     )
 
 

@@ -45,7 +45,9 @@ class FullSky(Operator):
         show_input(self.label, data)
 
     def sampler(self, maps: Floats, unit: str, coordsys: str) -> SkyMap:
-        """The step that samples maps (1 or 3, n_pix) of I, or I, Q and U: ring order, COSMO's convention, ``coordsys`` C or G."""
+        """The step that samples maps (1 or 3, n_pix) of I, or I, Q and U: ring order, COSMO's
+        convention, ``coordsys`` C or G.
+        """
         found = SkyMap(map=_table(maps, unit, coordsys))
         found._label = self.label
         return found
@@ -56,8 +58,16 @@ def _table(maps: Floats, unit: str, coordsys: str) -> Any:
     import healpy
     from astropy.io import fits
 
-    columns = [fits.Column(name, "D", unit=unit, array=values) for name, values in zip("IQU", maps, strict=False)]
+    columns = [
+        fits.Column(name, "D", unit=unit, array=values)
+        for name, values in zip("IQU", maps, strict=False)
+    ]
     table = fits.BinTableHDU.from_columns(columns)
-    table.header.update(PIXTYPE="HEALPIX", ORDERING="RING", NSIDE=healpy.npix2nside(maps.shape[1]), COORDSYS=coordsys)
+    table.header.update(
+        PIXTYPE="HEALPIX",
+        ORDERING="RING",
+        NSIDE=healpy.npix2nside(maps.shape[1]),
+        COORDSYS=coordsys,
+    )
     table.header.update(INDXSCHM="IMPLICIT", POLCCONV="COSMO")
     return table

@@ -1,4 +1,6 @@
-"""Where the pixels of an image lie, by its header (the WCS, or pixels of a known size), or where the user puts them."""
+"""Where the pixels of an image lie, by its header (the WCS, or pixels of a known size), or where
+the user puts them.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,13 @@ _ANGLES = {
 }
 ROUNDED = 1e-12
 """rad by which a map that is moved along is not turned."""
-_IN_RADIANS = {"deg": np.pi / 180, "rad": 1.0, "arcmin": np.pi / 10800, "arcsec": np.pi / 648000, "mas": np.pi / 648e6}
+_IN_RADIANS = {
+    "deg": np.pi / 180,
+    "rad": 1.0,
+    "arcmin": np.pi / 10800,
+    "arcsec": np.pi / 648000,
+    "mas": np.pi / 648e6,
+}
 
 
 def geometry(
@@ -43,19 +51,27 @@ def geometry(
         raise InputError(
             "the pixel size is missing",
             place=place,
-            cure="set the header keys CDELT1, CDELT2 and CUNIT1, CUNIT2 ('deg' or 'rad'), or the operator's parameter "
-            "pixel_size: 1 arcsec",
+            cure=(
+                "set the header keys CDELT1, CDELT2 and CUNIT1, CUNIT2 ('deg' or 'rad'), or the"
+                " operator's parameter pixel_size: 1 arcsec"
+            ),
         )
     if not all(_celestial(header, axis) for axis in "12"):
         if pixel_size is None and not header.get("CUNIT1"):
             raise InputError(
                 "the unit of the pixel size is missing",
                 place=place,
-                cure="set the header keys CUNIT1 and CUNIT2 ('deg' or 'rad'), or the operator's parameter pixel_size: 1 arcsec",
+                cure=(
+                    "set the header keys CUNIT1 and CUNIT2 ('deg' or 'rad'), or the operator's"
+                    " parameter pixel_size: 1 arcsec"
+                ),
             )
         if pixel_size is None and not centred:
             raise _no_position(place, "CTYPE1, CTYPE2, CRVAL1, CRVAL2, CRPIX1, CRPIX2")
-        notes["position"] = "the file has no WCS: its centre is put on the target, its first axis runs west, its second north"
+        notes["position"] = (
+            "the file has no WCS: its centre is put on the target, its first axis runs west, its"
+            " second north"
+        )
         return None, _plain_scale(place, header, scaled, pixel_size)
     header, note = _with_frame(header, place)
     if note:
@@ -69,11 +85,14 @@ def geometry(
         return wcs, None
     if not is_plain_tan(wcs):
         raise InputError(
-            f"pixel_size cannot replace the scale of a map in projection {', '.join(wcs.wcs.ctype)}",
+            "pixel_size cannot replace the scale of a map in projection"
+            f" {', '.join(wcs.wcs.ctype)}",
             place=place,
             cure="remove pixel_size, or give a TAN map",
         )
-    notes["pixel size"] = f"{np.degrees(pixel_size) * 3600:g} arcsec as given; the header's scale is overridden"
+    notes["pixel size"] = (
+        f"{np.degrees(pixel_size) * 3600:g} arcsec as given; the header's scale is overridden"
+    )
     cd = matrix if scaled else np.diag([-1.0, 1.0])
     return rescaled(wcs, cd / np.linalg.norm(cd, axis=0) * np.degrees(pixel_size)), None
 
@@ -86,7 +105,9 @@ def _with_known_units(header: Any, place: str) -> Any:
         if written and written.lower() in _ANGLES:
             header[key] = _ANGLES[written.lower()]
         elif written and _celestial(header, key[-1]):
-            raise InputError(f"{key} = '{written}' is no angle", place=place, cure=f"set {key} to 'deg' or 'rad'")
+            raise InputError(
+                f"{key} = '{written}' is no angle", place=place, cure=f"set {key} to 'deg' or 'rad'"
+            )
     return header
 
 
@@ -114,17 +135,25 @@ def _wcs(header: Any, place: str) -> tuple[Any, Floats]:
         matrix = np.asarray(wcs.pixel_scale_matrix)
     except Exception as err:  # wcslib has a dozen exception classes of its own
         raise InputError(
-            f"the WCS is broken: {first_line(err)}", place=place, cure="check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"
+            f"the WCS is broken: {first_line(err)}",
+            place=place,
+            cure="check CTYPE, CRVAL, CRPIX, CDELT, PC or CD",
         ) from err
     with np.errstate(over="ignore"):
         area = np.linalg.det(matrix)
     if not np.isfinite([*matrix.ravel(), *wcs.wcs.crval, *wcs.wcs.crpix]).all() or area == 0.0:
-        raise InputError("the WCS is singular: its pixels have no area", place=place, cure="check CDELT1, CDELT2, PC and CD")
+        raise InputError(
+            "the WCS is singular: its pixels have no area",
+            place=place,
+            cure="check CDELT1, CDELT2, PC and CD",
+        )
     return wcs, matrix
 
 
 def rescaled(wcs: Any, matrix: Floats) -> Any:
-    """A copy of a plain TAN ``wcs`` with the pixel scale matrix (2, 2) [deg], whether it had CD, PC, CDELT or CROTA."""
+    """A copy of a plain TAN ``wcs`` with the pixel scale matrix (2, 2) [deg], whether it had CD,
+    PC, CDELT or CROTA.
+    """
     from astropy.wcs import WCS
 
     made = WCS(naxis=2)
@@ -138,7 +167,9 @@ def rescaled(wcs: Any, matrix: Floats) -> Any:
 
 def is_celestial(ctype: str) -> bool:
     """Whether an axis of this CTYPE is a longitude or a latitude on the sky."""
-    return re.match(r"(RA--|DEC-|[GESH]L(ON|AT)|HP(LN|LT)|[A-Z]{2}L[NT])", ctype.upper()) is not None
+    return (
+        re.match(r"(RA--|DEC-|[GESH]L(ON|AT)|HP(LN|LT)|[A-Z]{2}L[NT])", ctype.upper()) is not None
+    )
 
 
 def _celestial(header: Any, axis: str) -> bool:
@@ -154,32 +185,49 @@ def _no_position(place: str, keys: str) -> InputError:
     return InputError(
         "the map has no world coordinates, so its position on the sky is unknown",
         place=place,
-        cure=f"set the header keys {keys}, or the operator's parameter centre (a position, or 'target')",
+        cure=(
+            f"set the header keys {keys}, or the operator's parameter centre (a position, or"
+            " 'target')"
+        ),
     )
 
 
 def _plain_scale(place: str, header: Any, scaled: bool, pixel_size: float | None) -> Floats:
-    """(2, 2) rad for a map without celestial axes: the first axis runs west whatever the sign of its CDELT."""
+    """(2, 2) rad for a map without celestial axes: the first axis runs west whatever the sign of
+    its CDELT.
+    """
     if pixel_size is not None:
         return np.diag([-pixel_size, pixel_size])
     sizes = []
     for k in (1, 2):
         written = str(header.get(f"CUNIT{k}") or header.get("CUNIT1")).strip()
         if written not in _IN_RADIANS:
-            raise InputError(f"CUNIT{k} = '{written}' is no angle", place=place, cure=f"set CUNIT{k} to 'deg' or 'rad'")
+            raise InputError(
+                f"CUNIT{k} = '{written}' is no angle",
+                place=place,
+                cure=f"set CUNIT{k} to 'deg' or 'rad'",
+            )
         step = number(header, f"CDELT{k}", place)
         if step is None:
             step = math.hypot(*(number(header, f"CD{i}_{k}", place) or 0.0 for i in (1, 2)))
         sizes.append(abs(step) * _IN_RADIANS[written])
     if not all(np.isfinite(s) and s > 0 for s in sizes):
-        raise InputError("the pixel size is zero or not finite", place=place, cure="check CDELT1 and CDELT2")
+        raise InputError(
+            "the pixel size is zero or not finite", place=place, cure="check CDELT1 and CDELT2"
+        )
     check_sides(np.degrees(sizes), place, "check CDELT1 and CDELT2")
     return np.diag([-sizes[0], sizes[1]])
 
 
 def is_plain_tan(wcs: Any) -> bool:
-    """True for a gnomonic projection without distortions, which needs no resampling; in a frame that is a rotation of ICRS."""
-    if not all(str(c).endswith("-TAN") for c in wcs.wcs.ctype) or wcs.has_distortion or len(wcs.wcs.get_pv()):
+    """True for a gnomonic projection without distortions, which needs no resampling; in a frame
+    that is a rotation of ICRS.
+    """
+    if (
+        not all(str(c).endswith("-TAN") for c in wcs.wcs.ctype)
+        or wcs.has_distortion
+        or len(wcs.wcs.get_pv())
+    ):
         return False
     try:
         wcs_frame_rotation(wcs)
@@ -189,7 +237,8 @@ def is_plain_tan(wcs: Any) -> bool:
 
 
 def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
-    """The TAN `WCS` of an image, or None where it must be resampled (another projection, distortions).
+    """The TAN `WCS` of an image, or None where it must be resampled (another projection,
+    distortions).
 
     Parameters
     ----------
@@ -211,7 +260,11 @@ def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
     wcs.wcs.radesys, wcs.wcs.lonpole = "ICRS", 180.0
     if image.wcs is None:
         assert image.scale is not None  # the reader gives one or the other
-        wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix = ["RA---TAN", "DEC--TAN"], np.degrees(centre), middle
+        wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix = (
+            ["RA---TAN", "DEC--TAN"],
+            np.degrees(centre),
+            middle,
+        )
         return rescaled(wcs, np.degrees(image.scale))
     lng, lat = image.wcs.wcs.lng, image.wcs.wcs.lat
     wcs.wcs.ctype = ["DEC--TAN", "RA---TAN"] if lng == 1 else ["RA---TAN", "DEC--TAN"]
@@ -223,9 +276,13 @@ def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
     )  # of the tangent point, in ICRS there
     ra, dec = centre if (crpix == middle).all() else (float(v) for v in angles(own[0]))
     _, east, north = local_axes(ra, dec)
-    angle = float(np.arctan2(own[2] @ east, own[2] @ north)) + np.radians(float(image.wcs.wcs.lonpole) - 180.0)
+    angle = float(np.arctan2(own[2] @ east, own[2] @ north)) + np.radians(
+        float(image.wcs.wcs.lonpole) - 180.0
+    )
     matrix = np.asarray(image.wcs.pixel_scale_matrix, np.float64)
-    if abs(angle) > ROUNDED:  # east and north of the image's matrix are its own: each is turned from north to east
+    if (
+        abs(angle) > ROUNDED
+    ):  # east and north of the image's matrix are its own: each is turned from north to east
         c, s = np.cos(angle), np.sin(angle)
         matrix = np.array([[c, s], [-s, c]] if lng == 0 else [[c, -s], [s, c]]) @ matrix
     wcs.wcs.crval = np.degrees([dec, ra] if lng == 1 else [ra, dec])
@@ -234,10 +291,12 @@ def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
 
 
 def turned(image: WcsMap, centre: tuple[float, float], place: str = "") -> WcsMap:
-    """An image of any projection moved over the sky with its centre to ``centre``, ICRS (ra, dec) [rad].
+    """An image of any projection moved over the sky with its centre to ``centre``, ICRS (ra, dec)
+    [rad].
 
-    The sphere is turned, so that the image keeps its shape, and directions at its centre keep their angles from ICRS north: what
-    lies east stays east, whatever the frame of the image. Its Q and U turn with it.
+    The sphere is turned, so that the image keeps its shape, and directions at its centre keep their
+    angles from ICRS north: what lies east stays east, whatever the frame of the image. Its Q and U
+    turn with it.
 
     Raises InputError where the image's centre is beyond its projection.
     """
@@ -251,5 +310,7 @@ def turned(image: WcsMap, centre: tuple[float, float], place: str = "") -> WcsMa
             cure="remove centre, or cut the map",
         )
     lon, lat = (float(v) for v in angles(middle))
-    back = local_axes(lon, lat).T @ local_axes(*centre)  # from ICRS directions there to those where the image was
+    back = local_axes(lon, lat).T @ local_axes(
+        *centre
+    )  # from ICRS directions there to those where the image was
     return replace(image, turn=sky.to_own(lon, lat) @ back)

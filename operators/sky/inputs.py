@@ -1,4 +1,6 @@
-"""Sky maps as their files have them (images and HEALPix maps), and the user's options for reading them."""
+"""Sky maps as their files have them (images and HEALPix maps), and the user's options for reading
+them.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +18,17 @@ Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the user says of a file: the parameters of `SkyMap` of these names, angles in rad, and whether the map is centred.
+    """What the user says of a file: the parameters of `SkyMap` of these names, angles in rad, and
+    whether the map is centred.
 
     Attributes
     ----------
     centred
-        True where the caller says where the map's centre lies: then the header's position is not needed.
+        True where the caller says where the map's centre lies: then the header's position is not
+        needed.
     plane
-        Of a cube, counted from 1; one number for each axis that is longer than one. None: the only one, or that of Stokes I.
+        Of a cube, counted from 1; one number for each axis that is longer than one. None: the only
+        one, or that of Stokes I.
     polarized
         True where Q and U are read, too.
     convention
@@ -31,7 +36,8 @@ class Wanted:
     column
         Of a HEALPix table, by name or counted from 1: the column of I.
     header_alone
-        True for a look at a large file: everything but its values is read and checked; they are zeros.
+        True for a look at a large file: everything but its values is read and checked; they are
+        zeros.
     """
 
     unit: str | None = None
@@ -59,9 +65,11 @@ class WcsMap:
     unit
         ``Jy/pixel``, ``Jy/beam``, ``MJy/sr``, ``K_RJ``, ``K_CMB`` or ``y``.
     wcs
-        Two-dimensional celestial `astropy.wcs.WCS`; None where the file has none: then `scale` says how large pixels are.
+        Two-dimensional celestial `astropy.wcs.WCS`; None where the file has none: then `scale` says
+        how large pixels are.
     scale
-        (2, 2) rad, where there is no WCS: a step of one pixel along (x, y) moves (east, north) by its columns.
+        (2, 2) rad, where there is no WCS: a step of one pixel along (x, y) moves (east, north) by
+        its columns.
     beam_solid_angle
         sr, of the beam of a ``Jy/beam`` map.
     notes
@@ -69,9 +77,11 @@ class WcsMap:
     zeroed
         Missing pixels set to zero on request.
     turn
-        (3, 3) a direction on the sky (ICRS) to the one in the frame of `wcs` at which the image is looked up; None: the same one.
+        (3, 3) a direction on the sky (ICRS) to the one in the frame of `wcs` at which the image is
+        looked up; None: the same one.
     polarization
-        (2, ny, nx) Q and U in `unit`, COSMO, from the meridians of the frame of `wcs`; None: there are none, or none are wanted.
+        (2, ny, nx) Q and U in `unit`, COSMO, from the meridians of the frame of `wcs`; None: there
+        are none, or none are wanted.
     beam
         FWHM (major, minor) [rad] of the beam that it was made with; None: the file names none.
     """
@@ -94,9 +104,11 @@ class WcsMap:
 
 @dataclass
 class HealpixMap:
-    """A HEALPix map: ``values[k]`` float64 belongs to pixel ``pixels[k]`` (sorted; the others are not covered); None: to pixel k.
+    """A HEALPix map: ``values[k]`` float64 belongs to pixel ``pixels[k]`` (sorted; the others are
+    not covered); None: to pixel k.
 
-    ``pixels`` are numbers in the ordering ``nest``; ``frame`` is an astropy frame name. Other attributes as `WcsMap`.
+    ``pixels`` are numbers in the ordering ``nest``; ``frame`` is an astropy frame name. Other
+    attributes as `WcsMap`.
     """
 
     values: Floats
@@ -113,4 +125,6 @@ class HealpixMap:
 
     @property
     def nbytes(self) -> int:
-        return self.values.nbytes + sum(0 if part is None else part.nbytes for part in (self.pixels, self.polarization))
+        return self.values.nbytes + sum(
+            0 if part is None else part.nbytes for part in (self.pixels, self.polarization)
+        )

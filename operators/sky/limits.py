@@ -1,4 +1,6 @@
-"""Largest and smallest values accepted in a sky map: beyond them arithmetic overflows, and no sky has them."""
+"""Largest and smallest values accepted in a sky map: beyond them arithmetic overflows, and no sky
+has them.
+"""
 
 from __future__ import annotations
 
@@ -23,27 +25,39 @@ EQUINOXES = (1500.0, 2500.0)
 def check_values(values: Floats, place: str, most: float, unit: str, cure: str) -> None:
     """Raise InputError where a value of a map is larger than ``most``. ``values`` may hold NaN."""
     if values.size and (size := float(np.nanmax(np.abs(values), initial=0.0))) > most:
-        raise InputError(f"its largest value is {size:.3g} {unit}, more than {most:g}", place=place, cure=cure)
+        raise InputError(
+            f"its largest value is {size:.3g} {unit}, more than {most:g}", place=place, cure=cure
+        )
 
 
 def check_brightness(values: Floats, place: str) -> None:
     """Raise InputError where a map in K_RJ is brighter than anything."""
     check_values(
-        values, place, BRIGHTEST, "K_RJ", "check its unit (the header's, or the parameter unit), and the parameter scale"
+        values,
+        place,
+        BRIGHTEST,
+        "K_RJ",
+        "check its unit (the header's, or the parameter unit), and the parameter scale",
     )
 
 
 def check_sides(sides: Any, place: str, cure: str) -> None:
-    """Raise InputError where the side of a pixel, or the width of a beam, [deg] is none that a map has."""
+    """Raise InputError where the side of a pixel, or the width of a beam, [deg] is none that a map
+    has.
+    """
     for side in np.abs(np.asarray(sides, np.float64)):
         if not SMALLEST_PIXEL <= side <= LARGEST_PIXEL:
             raise InputError(
-                f"{side:.3g} deg is no size of a pixel or beam, which is 1e-6 arcsec to 360 deg", place=place, cure=cure
+                f"{side:.3g} deg is no size of a pixel or beam, which is 1e-6 arcsec to 360 deg",
+                place=place,
+                cure=cure,
             )
 
 
 def check_geometry(matrix: Floats, crpix: Any, header: Any, place: str) -> None:
-    """Raise InputError where a WCS with the pixel scale ``matrix`` (2, 2) [deg] cannot be that of a map."""
+    """Raise InputError where a WCS with the pixel scale ``matrix`` (2, 2) [deg] cannot be that of a
+    map.
+    """
     check_sides(np.hypot(matrix[0], matrix[1]), place, "check CDELT1, CDELT2, PC and CD")
     if np.abs(np.asarray(crpix, np.float64)).max() > FARTHEST:
         message = f"the reference point is pixel {', '.join(f'{p:.3g}' for p in crpix)}"
@@ -51,4 +65,8 @@ def check_geometry(matrix: Floats, crpix: Any, header: Any, place: str) -> None:
     for key in ("EQUINOX", "EPOCH"):
         year = header.get(key)
         if isinstance(year, int | float) and year and not EQUINOXES[0] <= year <= EQUINOXES[1]:
-            raise InputError(f"{key} = {year:g} is no year of an equinox", place=place, cure=f"set {key}, e.g. to 2000.0")
+            raise InputError(
+                f"{key} = {year:g} is no year of an equinox",
+                place=place,
+                cure=f"set {key}, e.g. to 2000.0",
+            )

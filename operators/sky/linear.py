@@ -1,9 +1,11 @@
-"""Sampling a convolved map at every detector and instant by bilinear interpolation: less work than `sampling`, less exact.
+"""Sampling a convolved map at every detector and instant by bilinear interpolation: less work than
+`sampling`, less exact.
 
-Between grid points h apart it errs by h^2 / 2 u (1 - u) f'' along each axis, u the fraction, h^2 / 12 f'' in the mean over u. The
-mean is taken out beforehand, by dividing the map's transform by sinc^2(k h) (`beam.convolve`), which leaves
+Between grid points h apart it errs by h^2 / 2 u (1 - u) f'' along each axis, u the fraction, h^2 /
+12 f'' in the mean over u. The mean is taken out beforehand, by dividing the map's transform by
+sinc^2(k h) (`beam.convolve`), which leaves
 
-    |e| <= h^2 / 12 (|f_xx| + |f_yy|)                                                                               (1)
+    |e| <= h^2 / 12 (|f_xx| + |f_yy|)                                                            (1)
 
 and no mean attenuation (Blu, Thevenaz & Unser 2001 call it quasi-interpolation).
 """
@@ -18,9 +20,15 @@ from zonda.core.compilation.jit import nb
 from .sampling import CHUNK, count_covered, locate, misses, span_on_grid
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def add_lines(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out):  # type: ignore[no-untyped-def]
-    """As `sampling.add_splines`, from the grid's values. Samples within two points of its border are left as they are."""
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
+def add_lines(  # type: ignore[no-untyped-def]
+    h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out
+):
+    """As `sampling.add_splines`, from the grid's values. Samples within two points of its border
+    are left as they are.
+    """
     place = np.empty(CHUNK, np.int32)
     u, v = np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype)
     beyond, behind = 0, 0
@@ -34,7 +42,9 @@ def add_lines(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, ov
             if misses(box[k], xi[d], eta[d], limits[k]):
                 beyond += count
                 continue
-            inside, front = locate(h[k], xi[d], eta[d], count, limits[k], constants, ones[k], int32(nx), place, u, v)
+            inside, front = locate(
+                h[k], xi[d], eta[d], count, limits[k], constants, ones[k], int32(nx), place, u, v
+            )
             if covered.size > 0:
                 inside = count_covered(place, u, v, count, nx, covered)
             beyond += count - inside
@@ -45,9 +55,18 @@ def add_lines(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, ov
     return beyond, behind
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}, inline="always")
+@nb.njit(
+    nogil=True,
+    cache=True,
+    boundscheck=False,
+    error_model="numpy",
+    fastmath={"contract", "nsz"},
+    inline="always",
+)
 def _add_bilinear(f, place, u, v, first, stop, nx, constants, row):  # type: ignore[no-untyped-def]
-    """The four grid points around each sample, one right and one up of its first spline coefficient; 0 off the grid."""
+    """The four grid points around each sample, one right and one up of its first spline
+    coefficient; 0 off the grid.
+    """
     one, zero = constants[3], constants[6]
     for t in range(uint64(first), uint64(stop)):
         on = one if place[t] >= 0 else zero

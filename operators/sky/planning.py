@@ -29,7 +29,9 @@ COORDINATES = 5e-4 / 4
 """Error of float32 coordinates, beams (`sampling`)."""
 
 LINEAR = 1.1 * 2 * 8 * math.log(2) / 12
-"""Times n^-2: error of linear sampling on n points per FWHM, of a point source's peak: 1.1 h^2 / 12 (|f_xx| + |f_yy|)."""
+"""Times n^-2: error of linear sampling on n points per FWHM, of a point source's peak: 1.1 h^2 / 12
+(|f_xx| + |f_yy|).
+"""
 
 FASTER = 1.6e-9
 """Seconds per sample that linear sampling saves."""
@@ -45,7 +47,9 @@ CONVOLUTION = 1.2e-6
 
 
 def chromaticity(band: Band) -> float:
-    """Relative change of a point source's peak where FWHM ~ 1 / nu: |<(nu / nu_0)^2> - 1| over the band."""
+    """Relative change of a point source's peak where FWHM ~ 1 / nu: |<(nu / nu_0)^2> - 1| over the
+    band.
+    """
     nu, t = band.frequency, band.transmission
     return abs(float(np.trapezoid(t * (nu / band.centre) ** 2, nu) / np.trapezoid(t, nu)) - 1)
 
@@ -56,28 +60,51 @@ class SkyPlanning(Planning[SkyMap]):
     of = SkyMap
     knobs = (
         Knob("pixels_per_fwhm", (2, 3, 4, 6, 8), "sky interpolated between points"),
-        Knob("interpolation", ("linear", "cubic"), "sky linear between points, not by cubic splines"),
+        Knob(
+            "interpolation", ("linear", "cubic"), "sky linear between points, not by cubic splines"
+        ),
     )
 
     def memory(self, observation: Observation) -> int:
-        """The map, its Fourier transform while it is convolved, and the coefficients of each beam."""
+        """The map, its Fourier transform while it is convolved, and the coefficients of each
+        beam.
+        """
         widths, _ = beam_widths(self.operator, observation)
         grid = grid_of(self.operator, observation)
         angles = 0 if grid.pole is None else 40 * observation.n_samples
-        each = 2 if grid.spread is None or grid.is_flat else 3  # of a wide field pixels are spread for each beam
-        return (5 + each * len(widths)) * grid.nbytes + (grid.source.nbytes if grid.resampled else 0) + angles
+        each = (
+            2 if grid.spread is None or grid.is_flat else 3
+        )  # of a wide field pixels are spread for each beam
+        return (
+            (5 + each * len(widths)) * grid.nbytes
+            + (grid.source.nbytes if grid.resampled else 0)
+            + angles
+        )
 
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""
-        sky, grid, band = self.operator, grid_of(self.operator, observation), observation.instrument.band
+        sky, grid, band = (
+            self.operator,
+            grid_of(self.operator, observation),
+            observation.instrument.band,
+        )
         if not grid.reached(observation, self._widest(observation)):
             return Traits(peak=abs(sky.outside))
         if not grid.resampled:
-            return Traits(peak=float(np.nanmax(np.abs(brightness_on(grid, sky, band).values - sky.outside), initial=0.0)))
+            return Traits(
+                peak=float(
+                    np.nanmax(
+                        np.abs(brightness_on(grid, sky, band).values - sky.outside), initial=0.0
+                    )
+                )
+            )
         found = conversion(grid, band, sky.spectral_index)
         factor = sky.scale * float(np.asarray(found.factor).max())
         return Traits(
-            peak=max(abs(v * factor - sky.outside) for v in extremes(grid.source, grid.wcs, grid.tiles, found.per_area))
+            peak=max(
+                abs(v * factor - sky.outside)
+                for v in extremes(grid.source, grid.wcs, grid.tiles, found.per_area)
+            )
         )
 
     def _widest(self, observation: Observation) -> float:
@@ -87,9 +114,15 @@ class SkyPlanning(Planning[SkyMap]):
         """Each effect as a share of a point source's peak."""
         o, widest = context.first, self._widest(context.first)
         grids = [grid_of(self.operator, observation) for observation in context.observations]
-        reached = any(g.reached(x, widest) for x, g in zip(context.observations, grids, strict=True))
+        reached = any(
+            g.reached(x, widest) for x, g in zip(context.observations, grids, strict=True)
+        )
         grid, distinct = grids[0], {g.key: g for g in grids}
-        fwhm = float(self.operator.fwhm or o.focalplane.fwhm.max()) if self.operator.beam == "gaussian" and reached else 0.0
+        fwhm = (
+            float(self.operator.fwhm or o.focalplane.fwhm.max())
+            if self.operator.beam == "gaussian" and reached
+            else 0.0
+        )
         size = float(np.prod(grid.shape))
         points = 2.0 * size
         convolution = CONVOLUTION * sum(float(np.prod(g.shape)) for g in distinct.values())
@@ -98,20 +131,36 @@ class SkyPlanning(Planning[SkyMap]):
         per_sample = (5e-9 if planes == 1 else 1.5e-8) if reached else 0.3e-9
         cost = Cost(fixed=0.01 + 3e-8 * points, per_time=5e-8 * planes, per_sample=per_sample,
                     once=made + (planes * convolution if reached else 0.0))  # fmt: skip
-        what = "Gaussian" if fwhm else "none" if reached else "not convolved: no detector reaches the map"
+        what = (
+            "Gaussian"
+            if fwhm
+            else "none"
+            if reached
+            else "not convolved: no detector reaches the map"
+        )
         choices = [full(what), *self._without_beam(context, fwhm, convolution)]
         effects = (
             Effect("beam convolution", tuple(choices), context.sky_error(1.0), "the sky's peak"),
             self._order(context, grid, fwhm),
-            Effect("coordinate precision", (full("float32 offsets, float64 origins"),), context.sky_error(1.43 * COORDINATES),
-                   "1.43 x 5e-4 pixel of a quarter beam"),
-            not_simulated("beam chromaticity", "one beam for the band", context.sky_error(chromaticity(o.instrument.band)),
-                          "|<(nu / nu_0)^2> - 1| over the band: FWHM ~ 1 / nu, a point source's peak"),
-        )  # fmt: skip
+            Effect(
+                "coordinate precision",
+                (full("float32 offsets, float64 origins"),),
+                context.sky_error(1.43 * COORDINATES),
+                "1.43 x 5e-4 pixel of a quarter beam",
+            ),
+            not_simulated(
+                "beam chromaticity",
+                "one beam for the band",
+                context.sky_error(chromaticity(o.instrument.band)),
+                "|<(nu / nu_0)^2> - 1| over the band: FWHM ~ 1 / nu, a point source's peak",
+            ),
+        )
         return Estimate(effects, cost)
 
     def _without_beam(self, context: Context, fwhm: float, convolution: float) -> list[Choice]:
-        """A pencil beam changes waves on the map by 1 - exp(-2 pi^2 sigma^2 k^2), most at the pixels' Nyquist frequency."""
+        """A pencil beam changes waves on the map by 1 - exp(-2 pi^2 sigma^2 k^2), most at the
+        pixels' Nyquist frequency.
+        """
         if not fwhm or not context.coverage:
             return []
         exponent = 2 * math.pi**2 * fwhm**2 / (8 * math.log(2)) / (2 * context.coverage.pixel) ** 2
@@ -119,7 +168,9 @@ class SkyPlanning(Planning[SkyMap]):
         bound = context.sky_error(-math.expm1(-exponent))
         bound["transfer"] = math.expm1(min(exponent, 700.0))  # of the waves under the beam
         settings = {"beam": "none", "fwhm": None}
-        return [Choice("dropped", "no beam", settings, bound=bound, formula=text, seconds=convolution)]
+        return [
+            Choice("dropped", "no beam", settings, bound=bound, formula=text, seconds=convolution)
+        ]
 
     def _order(self, context: Context, grid: Grid, fwhm: float) -> Effect:
         """Linear sampling for cubic splines: on the grid there is, or on one twice as fine."""
@@ -127,19 +178,39 @@ class SkyPlanning(Planning[SkyMap]):
         if operator.interpolation == "linear" or not fwhm:
             what = "linear" if operator.interpolation == "linear" else "cubic B-spline"
             return Effect("sampling order", (full(what),), cubic, "0.3 % of a point source's peak")
-        points = fwhm / float(np.radians(np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0)).max())
-        n = points * (math.ceil(operator.pixels_per_fwhm / points - 1e-9) if 2 <= points < operator.pixels_per_fwhm else 1)
+        points = fwhm / float(
+            np.radians(np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0)).max()
+        )
+        n = points * (
+            math.ceil(operator.pixels_per_fwhm / points - 1e-9)
+            if 2 <= points < operator.pixels_per_fwhm
+            else 1
+        )
         saved = FASTER * context.samples
-        text = "1.1 h^2 / 12 (|f_xx| + |f_yy|) of a point source on n points h apart per FWHM: 1.02 / n^2 of its peak"
+        text = (
+            "1.1 h^2 / 12 (|f_xx| + |f_yy|) of a point source on n points h apart per FWHM: 1.02 /"
+            " n^2 of its peak"
+        )
         choices = [full("cubic B-spline")]
         wanted = 2 * points * math.ceil(n / points - 1e-9)
         if points >= 2 and wanted <= 16:  # the finest grid that the operator makes
             extra = CONVOLUTION * float(np.prod(grid.shape)) * 3
             settings = {"interpolation": "linear", "pixels_per_fwhm": min(wanted, 16.0)}
             bound, what = context.sky_error(LINEAR / wanted**2), "linear, on twice as fine a grid"
-            choices.append(Choice("coarse", what, settings, bound=bound, formula=text, seconds=saved - extra))
+            choices.append(
+                Choice("coarse", what, settings, bound=bound, formula=text, seconds=saved - extra)
+            )
         bound = context.sky_error(LINEAR / n**2)
-        choices.append(Choice("coarse", "linear", {"interpolation": "linear"}, bound=bound, formula=text, seconds=saved))
+        choices.append(
+            Choice(
+                "coarse",
+                "linear",
+                {"interpolation": "linear"},
+                bound=bound,
+                formula=text,
+                seconds=saved,
+            )
+        )
         return Effect("sampling order", tuple(choices), bound, text)
 
 
@@ -165,12 +236,19 @@ class SourcesPlanning(Planning[Any]):
         _, entries = self._seen(o)
         in_view = entries / max(-(-o.n_samples // 256), 1)
         cost = Cost(fixed=0.01, per_time=1e-7, per_sample=0.5e-9 + 2e-9 * in_view)
-        effect = not_simulated("beam chromaticity", "one beam for the band", context.sky_error(chromaticity(o.instrument.band)),
-                               "|<(nu / nu_0)^2> - 1| over the band: FWHM ~ 1 / nu, a point source's peak")  # fmt: skip
+        effect = not_simulated(
+            "beam chromaticity",
+            "one beam for the band",
+            context.sky_error(chromaticity(o.instrument.band)),
+            "|<(nu / nu_0)^2> - 1| over the band: FWHM ~ 1 / nu, a point source's peak",
+        )
         peak = self.traits(o).peak or 0.0
         size = {"tod": peak, "map_rms": peak, "peak": peak, "transfer": 1.0}
         sources = Effect(
-            "point sources", (full("exact: each through its beam"),), size, "the brightest source in the smallest beam"
+            "point sources",
+            (full("exact: each through its beam"),),
+            size,
+            "the brightest source in the smallest beam",
         )
         return Estimate((sources, effect), cost)
 
@@ -195,17 +273,25 @@ class CMBPlanning(Planning[Any]):
     of = "zonda.operators.sky.cmb:CMBSky"
 
     def traits(self, observation: Observation) -> Traits:
-        """Four and a half standard deviations of the sky, which is larger than 1 K_RJ per K_CMB nowhere."""
+        """Four and a half standard deviations of the sky, which is larger than 1 K_RJ per K_CMB
+        nowhere.
+        """
         spectra = self.operator.read().values
         ell = np.arange(spectra.shape[1])
-        return Traits(peak=4.5 * math.sqrt(float(((2 * ell + 1) * spectra[0]).sum()) / (4 * math.pi)))
+        return Traits(
+            peak=4.5 * math.sqrt(float(((2 * ell + 1) * spectra[0]).sum()) / (4 * math.pi))
+        )
 
     def memory(self, observation: Observation) -> int:
-        """Bytes while the maps become a table: more than drawing them takes. 47 and 110 were measured for each pixel."""
+        """Bytes while the maps become a table: more than drawing them takes. 47 and 110 were
+        measured for each pixel.
+        """
         return int(12 * self.operator.nside**2 * (110 if self._polarized(observation) else 50))
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost: maps from multipoles, of each ring and each pair (l, m); and what `SkyMap` does with them."""
+        """Its cost: maps from multipoles, of each ring and each pair (l, m); and what `SkyMap` does
+        with them.
+        """
         nside, polarized = self.operator.nside, self._polarized(context.first)
         highest = min(self.operator.read().values.shape[1] - 1, 3 * nside - 1)
         drawn = (POLARIZED if polarized else INTENSITY) * highest**2 * nside
@@ -215,7 +301,9 @@ class CMBPlanning(Planning[Any]):
         text = "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB"
         effect = Effect("CMB", (full(f"drawn at nside {self.operator.nside}"),), size, text)
         per_time, per_sample = (1.5e-7, 1.5e-8) if polarized else (5e-8, 5e-9)
-        return Estimate((effect,), Cost(fixed=0.05, per_time=per_time, per_sample=per_sample, once=once))
+        return Estimate(
+            (effect,), Cost(fixed=0.05, per_time=per_time, per_sample=per_sample, once=once)
+        )
 
     def _polarized(self, observation: Observation) -> bool:
         """Whether I, Q and U are drawn."""
@@ -223,7 +311,9 @@ class CMBPlanning(Planning[Any]):
 
 
 class PySMPlanning(Planning[Any]):
-    """Planning of `PySMSky`, which has no coarser form. The map of the band is made for it, and serves the run."""
+    """Planning of `PySMSky`, which has no coarser form. The map of the band is made for it, and
+    serves the run.
+    """
 
     of = "zonda.operators.sky.pysm:PySMSky"
 
@@ -243,7 +333,10 @@ class PySMPlanning(Planning[Any]):
         peak = self.traits(context.first).peak or 0.0
         size = {"tod": peak, "map_rms": peak, "peak": peak, "transfer": 1.0}
         effect = Effect(
-            "sky of PySM", (full(f"at nside {self.operator.nside}"),), size, "largest brightness where the scan looks"
+            "sky of PySM",
+            (full(f"at nside {self.operator.nside}"),),
+            size,
+            "largest brightness where the scan looks",
         )
         frequencies = len(band_weights(context.first.instrument.band)[0])
         once = PYSM * frequencies * self._number * 12 * self.operator.nside**2

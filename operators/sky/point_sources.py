@@ -2,10 +2,12 @@
 
 A source of flux S at the angle theta from where a detector of FWHM w looks gives
 
-    T = S <c^2 (nu / nu_0)^alpha / (2 k nu^2)> / Omega exp(-4 ln 2 theta^2 / w^2),   Omega = pi w^2 / (4 ln 2),        (1)
+    T = S <c^2 (nu / nu_0)^alpha / (2 k nu^2)> / Omega exp(-4 ln 2 theta^2 / w^2),
+    Omega = pi w^2 / (4 ln 2),   (1)
 
-averaged over the band (equation (1) of `core.numerics.radiation`). No grid lies between catalogue and samples: the flux in a map
-is the source's within the share of the beam beyond `REACH` standard deviations, 2e-8.
+averaged over the band (equation (1) of `core.numerics.radiation`). No grid lies between catalogue
+and samples: the flux in a map is the source's within the share of the beam beyond `REACH` standard
+deviations, 2e-8.
 """
 
 from __future__ import annotations
@@ -47,10 +49,12 @@ PIECE = 256
 
 
 class PointSources(Operator):
-    """Point sources of a catalogue above the atmosphere (K_RJ), seen through Gaussian beams: part of the component ``sky``.
+    """Point sources of a catalogue above the atmosphere (K_RJ), seen through Gaussian beams: part
+    of the component ``sky``.
 
-    The catalogue is a table (ECSV or CSV) with the columns `ra` and `dec` (ICRS) and `flux`, with units. Columns
-    `spectral_index` (S ~ frequency^index; otherwise 0) and `frequency` (of the flux) are optional.
+    The catalogue is a table (ECSV or CSV) with the columns `ra` and `dec` (ICRS) and `flux`, with
+    units. Columns `spectral_index` (S ~ frequency^index; otherwise 0) and `frequency` (of the flux)
+    are optional.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -59,39 +63,68 @@ class PointSources(Operator):
     catalogue: InputPath
     """Table of the sources."""
     frequency: Hertz | None = Field(None, gt=0)
-    """Frequency of the fluxes, where the catalogue has no column of it. Default: the band's centre."""
+    """Frequency of the fluxes, where the catalogue has no column of it. Default: the band's centre.
+    """
     scale: float = Field(1.0, ge=-1e30, le=1e30)
     """Factor on all fluxes."""
 
     def check(self, data: Data) -> list[str]:
-        """Number of sources, the brightest flux, columns that are not read. Raises InputError where the catalogue is wrong."""
+        """Number of sources, the brightest flux, columns that are not read. Raises InputError where
+        the catalogue is wrong.
+        """
         catalogue = Catalogue.read(self)
         for camera in data.scene.instrument.cameras.values() if data is not None else ():
             catalogue.brightness(camera.band, self.scale)
         brightest = float(np.abs(catalogue.flux).max()) * abs(self.scale)
-        if text := doubt(f"{self.label}: the brightest source of {self.catalogue.name}", brightest, FLUX, "Jy"):
+        if text := doubt(
+            f"{self.label}: the brightest source of {self.catalogue.name}", brightest, FLUX, "Jy"
+        ):
             warnings.warn(text, stacklevel=2)
         unused = [f"not used: {', '.join(catalogue.unused)}"] if catalogue.unused else []
-        return [f"{len(catalogue.flux)} sources in {self.catalogue}, the brightest of {brightest:.4g} Jy", *unused]
+        return [
+            (
+                f"{len(catalogue.flux)} sources in {self.catalogue}, the brightest of"
+                f" {brightest:.4g} Jy"
+            ),
+            *unused,
+        ]
 
     def prepare(self, observation: Observation) -> Sources:
         """The sources with their brightness, and which of them are in view when."""
         catalogue = Catalogue.read(self)
-        found = Sources.of(catalogue, catalogue.brightness(observation.instrument.band, self.scale), observation)
-        observation.tally.state(self.label, f"{observation.name}: sources", f"{found.in_view} of {len(catalogue.flux)} in view")
+        found = Sources.of(
+            catalogue, catalogue.brightness(observation.instrument.band, self.scale), observation
+        )
+        observation.tally.state(
+            self.label,
+            f"{observation.name}: sources",
+            f"{found.in_view} of {len(catalogue.flux)} in view",
+        )
         return found
 
     def exec(self, block: Block, state: Sources) -> None:
         """Add the sources to ``sky``."""
         stream, at = block.new("sky"), block.detectors
-        matrices = rotation_matrices(np.asarray(block.observation.sky_boresight[block.samples], np.float64))
+        matrices = rotation_matrices(
+            np.asarray(block.observation.sky_boresight[block.samples], np.float64)
+        )
         beams = state.rays[at], state.width[at], state.per_area[at]
-        _add_sources(matrices, block.samples.start, *beams, state.towards, state.power, state.first, state.number, stream)
+        _add_sources(
+            matrices,
+            block.samples.start,
+            *beams,
+            state.towards,
+            state.power,
+            state.first,
+            state.number,
+            stream,
+        )
 
 
 @dataclass(frozen=True)
 class Catalogue:
-    """Sources: directions (n, 3), fluxes [Jy] at `frequency` [Hz] (NaN: the band's centre), spectral indices; each (n,).
+    """Sources: directions (n, 3), fluxes [Jy] at `frequency` [Hz] (NaN: the band's centre),
+    spectral indices; each (n,).
 
     ``unused``: columns of the table that are not read.
     """
@@ -104,40 +137,77 @@ class Catalogue:
 
     @classmethod
     def read(cls, step: PointSources) -> Catalogue:
-        """Raises InputError for a table without the columns, or with a declination that there is not."""
+        """Raises InputError for a table without the columns, or with a declination that there is
+        not.
+        """
         table = read_table(step.catalogue)
         units = {"ra": "rad", "dec": "rad", "flux": "Jy", "spectral_index": "", "frequency": "Hz"}
         mistakes, found = Mistakes(table.place), dict[str, Floats]()
-        for name in ["ra", "dec", "flux", *({"spectral_index", "frequency"} & table.columns.keys())]:
+        for name in [
+            "ra",
+            "dec",
+            "flux",
+            *({"spectral_index", "frequency"} & table.columns.keys()),
+        ]:
             with mistakes.noted():
                 found[name] = table.numbers(name, units[name])
         for row in np.flatnonzero(np.abs(found.get("ra", np.zeros(0))) > 2 * np.pi + 1e-9).tolist():
-            mistakes.add(table.lines[row], f"ra is {np.degrees(found['ra'][row]):g} deg", "mend that row, or the unit of ra")
+            mistakes.add(
+                table.lines[row],
+                f"ra is {np.degrees(found['ra'][row]):g} deg",
+                "mend that row, or the unit of ra",
+            )
         for row in np.flatnonzero(found.get("frequency", np.ones(0)) <= 0).tolist():
-            mistakes.add(table.lines[row], f"frequency is {found['frequency'][row]:g} Hz", "mend that row")
-        for row in np.flatnonzero(np.abs(found.get("spectral_index", np.zeros(0))) > STEEPEST).tolist():
+            mistakes.add(
+                table.lines[row], f"frequency is {found['frequency'][row]:g} Hz", "mend that row"
+            )
+        for row in np.flatnonzero(
+            np.abs(found.get("spectral_index", np.zeros(0))) > STEEPEST
+        ).tolist():
             text = f"spectral_index is {found['spectral_index'][row]:g}, beyond {STEEPEST:g}"
             mistakes.add(table.lines[row], text, "mend that row")
-        for row in np.flatnonzero(np.abs(found.get("dec", np.zeros(0))) > np.pi / 2 + 1e-12).tolist():
-            mistakes.add(table.lines[row], f"dec is {np.degrees(found['dec'][row]):g} deg", "mend that row")
+        for row in np.flatnonzero(
+            np.abs(found.get("dec", np.zeros(0))) > np.pi / 2 + 1e-12
+        ).tolist():
+            mistakes.add(
+                table.lines[row], f"dec is {np.degrees(found['dec'][row]):g} deg", "mend that row"
+            )
         mistakes.tell()
         ra, dec, flux = found["ra"], found["dec"], found["flux"]
         index = found.get("spectral_index", np.zeros(len(flux)))
         if "frequency" in table.columns:
             if step.frequency is not None:
                 raise InputError(
-                    "has a column frequency", place=table.place, cure=f"remove {step.label}.frequency, or the column"
+                    "has a column frequency",
+                    place=table.place,
+                    cure=f"remove {step.label}.frequency, or the column",
                 )
             frequency = found["frequency"]
         else:
             frequency = np.full(len(flux), math.nan if step.frequency is None else step.frequency)
-        return cls(unit_vectors(ra, dec), flux, index, frequency, tuple(name for name in table.columns if name not in units))
+        return cls(
+            unit_vectors(ra, dec),
+            flux,
+            index,
+            frequency,
+            tuple(name for name in table.columns if name not in units),
+        )
 
     def brightness(self, band: Band, scale: float) -> Floats:
         """(n,) S <...> of equation (1), K_RJ sr."""
-        at_centre = np.where(np.isnan(self.frequency), 1.0, band.centre / self.frequency) ** self.index
-        factors = {alpha: to_kelvin_rj("Jy/beam", band, None, alpha, 1.0) for alpha in np.unique(self.index).tolist()}
-        return np.asarray(scale * self.flux * at_centre * np.array([factors[alpha] for alpha in self.index.tolist()]))
+        at_centre = (
+            np.where(np.isnan(self.frequency), 1.0, band.centre / self.frequency) ** self.index
+        )
+        factors = {
+            alpha: to_kelvin_rj("Jy/beam", band, None, alpha, 1.0)
+            for alpha in np.unique(self.index).tolist()
+        }
+        return np.asarray(
+            scale
+            * self.flux
+            * at_centre
+            * np.array([factors[alpha] for alpha in self.index.tolist()])
+        )
 
 
 @dataclass(frozen=True)
@@ -147,7 +217,8 @@ class Sources:
     Attributes
     ----------
     rays, width, per_area
-        Of the detectors: (n_det, 3) unit vectors in the boresight's frame, (n_det,) 4 ln 2 / w^2, (n_det,) 1 / Omega.
+        Of the detectors: (n_det, 3) unit vectors in the boresight's frame, (n_det,) 4 ln 2 / w^2,
+        (n_det,) 1 / Omega.
     towards, power
         Of the sources: (n, 3) ICRS, (n,) K_RJ sr.
     first, number
@@ -175,11 +246,21 @@ class Sources:
             looks = boresights(observation.sky_boresight[begin : begin + PIECE])
             middle = looks[:, looks.shape[1] // 2]
             reach = float(np.arccos(np.clip(middle @ looks, -1, 1)).max()) + field + 1e-9
-            lists.append(np.flatnonzero(catalogue.directions @ middle >= math.cos(min(reach, math.pi))))
+            lists.append(
+                np.flatnonzero(catalogue.directions @ middle >= math.cos(min(reach, math.pi)))
+            )
             first.append(first[-1] + len(lists[-1]))
         area = np.pi * plane.fwhm**2 / (4 * math.log(2))
         lines = 4 * math.log(2) / plane.fwhm**2
-        return cls(rays, lines, 1 / area, catalogue.directions, power, np.array(first), np.concatenate(lists))
+        return cls(
+            rays,
+            lines,
+            1 / area,
+            catalogue.directions,
+            power,
+            np.array(first),
+            np.concatenate(lists),
+        )
 
     @property
     def in_view(self) -> int:
@@ -188,8 +269,12 @@ class Sources:
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _add_sources(matrices, start, rays, width, per_area, towards, power, first, number, out):  # type: ignore[no-untyped-def]
-    """Add equation (1) to ``out`` (n_det, n) from sample ``start`` on: each sample sums over the sources in their order."""
+def _add_sources(  # type: ignore[no-untyped-def]
+    matrices, start, rays, width, per_area, towards, power, first, number, out
+):
+    """Add equation (1) to ``out`` (n_det, n) from sample ``start`` on: each sample sums over the
+    sources in their order.
+    """
     farthest = REACH * REACH / 2  # of the exponent
     seen = np.empty(3)
     for t in range(out.shape[1]):
@@ -198,11 +283,15 @@ def _add_sources(matrices, start, rays, width, per_area, towards, power, first, 
             s = number[k]
             for i in range(3):  # the source in the boresight's frame
                 seen[i] = (
-                    matrices[t, 0, i] * towards[s, 0] + matrices[t, 1, i] * towards[s, 1] + matrices[t, 2, i] * towards[s, 2]
+                    matrices[t, 0, i] * towards[s, 0]
+                    + matrices[t, 1, i] * towards[s, 1]
+                    + matrices[t, 2, i] * towards[s, 2]
                 )
             for d in range(out.shape[0]):
                 x, y, z = seen[0] - rays[d, 0], seen[1] - rays[d, 1], seen[2] - rays[d, 2]
                 chord = x * x + y * y + z * z
-                exponent = width[d] * chord * (1 + chord / 12)  # theta^2 = chord^2 (1 + chord^2 / 12 + ...)
+                exponent = (
+                    width[d] * chord * (1 + chord / 12)
+                )  # theta^2 = chord^2 (1 + chord^2 / 12 + ...)
                 if exponent < farthest:
                     out[d, t] += power[s] * per_area[d] * np.exp(-exponent)

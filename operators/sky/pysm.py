@@ -1,4 +1,6 @@
-"""The Galactic and extragalactic sky of PySM 3 (Thorne et al. 2017, MNRAS 469, 2821; Zonca et al. 2021, JOSS 6, 3783)."""
+"""The Galactic and extragalactic sky of PySM 3 (Thorne et al. 2017, MNRAS 469, 2821; Zonca et al.
+2021, JOSS 6, 3783).
+"""
 
 from __future__ import annotations
 
@@ -32,18 +34,23 @@ Components = Annotated[dict[str, dict[str, Any]], AfterValidator(_absolute)]
 
 
 class PySMSky(FullSky):
-    """Emission of the Galaxy, and of all else that PySM 3 models, over each band: part of the component ``sky``.
+    """Emission of the Galaxy, and of all else that PySM 3 models, over each band: part of the
+    component ``sky``.
 
-    Needs the extra pysm. Galactic coordinates, I, Q and U in COSMO's convention. Nothing is downloaded unless `download` says so.
+    Needs the extra pysm. Galactic coordinates, I, Q and U in COSMO's convention. Nothing is
+    downloaded unless `download` says so.
     """
 
     models: list[str] = Field(default_factory=list)
-    """PySM's presets by name: d1, s1, f1, a1 ... Their sum, with that of `components`, is the sky."""
+    """PySM's presets by name: d1, s1, f1, a1 ... Their sum, with that of `components`, is the sky.
+    """
     components: Components = Field(default_factory=dict)
-    """Components by a name of yours, as in PySM's `component_config`: {class: PowerLaw, map_I: FILE, freq_ref_I: 23 GHz, ...}.
-    Relative paths start at the pipeline file's folder."""
+    """Components by a name of yours, as in PySM's `component_config`: {class: PowerLaw, map_I:
+    FILE, freq_ref_I: 23 GHz, ...}. Relative paths start at the pipeline file's folder."""
     nside: Nside = 512
-    """Of the HEALPix maps; templates of another are degraded or repeated. A pixel should be smaller than half of the beam."""
+    """Of the HEALPix maps; templates of another are degraded or repeated. A pixel should be smaller
+    than half of the beam.
+    """
     download: bool = False
     """Whether PySM may fetch templates that are neither in its local folders nor in its cache."""
 
@@ -59,7 +66,9 @@ class PySMSky(FullSky):
         return self
 
     def observe(self, data: Data) -> None:
-        """Raises InputError where PySM is not installed, has no such model, or lacks templates that may not be downloaded."""
+        """Raises InputError where PySM is not installed, has no such model, or lacks templates that
+        may not be downloaded.
+        """
         config = configuration(self.models, self.components, self.label)
         if not self.download:
             check_templates(config, self.nside, self.label)
@@ -80,7 +89,9 @@ class PySMSky(FullSky):
         return sky, sky.prepare(observation)
 
     def sky(self, observation: Observation) -> SkyMap:
-        """The step that samples the map of an observation's band; made once for each band. Raises InputError as `emission`."""
+        """The step that samples the map of an observation's band; made once for each band. Raises
+        InputError as `emission`.
+        """
         band, polarized = observation.instrument.band, observation.focalplane.polarized
         key = band.frequency.tobytes(), band.transmission.tobytes(), bytes([polarized])
         with ALONE:

@@ -2,11 +2,13 @@
 
 A band sees
 
-    T = sum_k w_k nu_k^2 T(nu_k) d_k / sum_k w_k nu_k^2 d_k,   w_k nu_k^2 d_k = integral t(nu) h_k(nu) dnu,              (1)
+    T = sum_k w_k nu_k^2 T(nu_k) d_k / sum_k w_k nu_k^2 d_k,
+    w_k nu_k^2 d_k = integral t(nu) h_k(nu) dnu,   (1)
 
-with T in K_RJ, t the transmission per unit of Rayleigh-Jeans temperature, h_k the straight lines that are 1 at nu_k and 0 at the
-other frequencies, d_k the widths of the trapezoidal rule: PySM's weights w are of power. (1) is the band's average of the T that
-is straight between the nu_k; a power law nu^n errs by n (n - 1) / 12 of the square of their relative distance.
+with T in K_RJ, t the transmission per unit of Rayleigh-Jeans temperature, h_k the straight lines
+that are 1 at nu_k and 0 at the other frequencies, d_k the widths of the trapezoidal rule: PySM's
+weights w are of power. (1) is the band's average of the T that is straight between the nu_k; a
+power law nu^n errs by n (n - 1) / 12 of the square of their relative distance.
 """
 
 from __future__ import annotations
@@ -36,17 +38,25 @@ STEP = 0.005
 FILES = (".fits", ".gz", ".h5", ".hdf5", ".dat", ".txt")
 """Ends of texts in a component that are names of files."""
 ALONE = threading.RLock()
-"""PySM draws from numpy's global generator, and whether astropy may download is a setting of the process."""
+"""PySM draws from numpy's global generator, and whether astropy may download is a setting of the
+process.
+"""
 
 
-def configuration(models: Sequence[str], components: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """Presets and components as PySM takes them. Raises InputError: it is not installed, or has no such preset."""
+def configuration(
+    models: Sequence[str], components: Mapping[str, Any], place: str
+) -> dict[str, Any]:
+    """Presets and components as PySM takes them. Raises InputError: it is not installed, or has no
+    such preset.
+    """
     presets: dict[str, Any] = needed("pysm3", EXTRA, place).sky.PRESET_MODELS
     for name in models:
         if name not in presets:
             cure = nearest(name, list(presets)) or f"choose from: {', '.join(presets)}"
             raise InputError(f"PySM has no model {name!r}", place=place, cure=cure)
-    return {name: presets[name] for name in models} | {name: _texts(item) for name, item in components.items()}
+    return {name: presets[name] for name in models} | {
+        name: _texts(item) for name, item in components.items()
+    }
 
 
 def check_templates(config: Mapping[str, Any], nside: int, place: str) -> None:
@@ -74,19 +84,25 @@ def band_weights(band: Band) -> tuple[Floats, Floats]:
     shares = np.concatenate([third, 4 * third, third]) * np.interp(points, nu, t)
     k = np.clip(np.searchsorted(at, points, side="right") - 1, 0, number - 1)
     along = (points - at[k]) / (at[k + 1] - at[k])
-    sums = np.bincount(k, shares * (1 - along), number + 1) + np.bincount(k + 1, shares * along, number + 1)
+    sums = np.bincount(k, shares * (1 - along), number + 1) + np.bincount(
+        k + 1, shares * along, number + 1
+    )
     widths = np.full(number + 1, (high - low) / number)
     widths[[0, -1]] /= 2
     return at, sums / widths / at**2
 
 
-def emission(config: Mapping[str, Any], nside: int, band: Band, download: bool, place: str) -> Floats:
-    """The sum of PySM's components over a band: (3, n_pix) I, Q and U in COSMO's convention, Galactic, K_RJ, ring order.
+def emission(
+    config: Mapping[str, Any], nside: int, band: Band, download: bool, place: str
+) -> Floats:
+    """The sum of PySM's components over a band: (3, n_pix) I, Q and U in COSMO's convention,
+    Galactic, K_RJ, ring order.
 
     Raises
     ------
     InputError
-        PySM is not installed, refuses a component, or lacks a template that may not or cannot be downloaded.
+        PySM is not installed, refuses a component, or lacks a template that may not or cannot be
+        downloaded.
     """
     import astropy.units as u
 
@@ -97,9 +113,15 @@ def emission(config: Mapping[str, Any], nside: int, band: Band, download: bool, 
     total = np.zeros((3, 12 * nside**2))
     with ALONE, _offline(not download), _same_numbers():
         try:
-            for component in pysm3.sky.create_components_from_config(_seeded(config, pysm3.models), nside=nside):
-                found = np.atleast_2d(component.get_emission(frequencies, weights).to_value(pysm3.units.uK_RJ))
-                total[: len(found)] += 1e-6 * found  # a sum of PySM's own would add I alone to Q and U as well
+            for component in pysm3.sky.create_components_from_config(
+                _seeded(config, pysm3.models), nside=nside
+            ):
+                found = np.atleast_2d(
+                    component.get_emission(frequencies, weights).to_value(pysm3.units.uK_RJ)
+                )
+                total[: len(found)] += (
+                    1e-6 * found
+                )  # a sum of PySM's own would add I alone to Q and U as well
         except URLError as err:
             raise _lacks(str(err.reason).partition(" was supposed")[0], place, download) from None
         except Exception as err:  # of any kind, also mistakes of PySM's own
@@ -110,8 +132,12 @@ def emission(config: Mapping[str, Any], nside: int, band: Band, download: bool, 
 
 def _lacks(what: str, place: str, download: bool = False) -> InputError:
     own = "put PySM's own under the folder that the environment variable PYSM_LOCAL_DATA names"
-    cure = f"correct the path; {own}, or {'check the network' if download else 'set download: true'}"
-    return InputError(f"neither files nor templates that PySM has on this machine: {what}", place=place, cure=cure)
+    cure = (
+        f"correct the path; {own}, or {'check the network' if download else 'set download: true'}"
+    )
+    return InputError(
+        f"neither files nor templates that PySM has on this machine: {what}", place=place, cure=cure
+    )
 
 
 def _texts(config: Any) -> Any:
@@ -122,11 +148,15 @@ def _texts(config: Any) -> Any:
 
 
 def _seeded(config: Any, models: Any) -> Any:
-    """The configuration with seeds for classes that draw another sky each time where none are given."""
+    """The configuration with seeds for classes that draw another sky each time where none are
+    given.
+    """
     if not isinstance(config, Mapping):
         return config
     made = getattr(models, str(config.get("class")), None)
-    seeds = {"seeds": [1, 2, 3]} if made is not None and "seeds" in signature(made).parameters else {}
+    seeds = (
+        {"seeds": [1, 2, 3]} if made is not None and "seeds" in signature(made).parameters else {}
+    )
     return seeds | {key: _seeded(item, models) for key, item in config.items()}
 
 
@@ -162,7 +192,8 @@ class _Asked(Exception):
 
 
 def _asked_for(item: Mapping[str, Any], nside: int) -> list[str]:
-    """Files whose names a class puts together: the first that it asks for when it is made, or its maps of all frequencies.
+    """Files whose names a class puts together: the first that it asks for when it is made, or its
+    maps of all frequencies.
 
     Nothing is read. Empty where the class cannot be made, which `emission` tells.
     """
@@ -190,7 +221,9 @@ def _is_here(name: str) -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CacheMissingWarning)
         cached = is_url_in_cache(DATAURL + name)
-    return cached or any(os.path.exists(os.path.join(folder, name)) for folder in ("", *RemoteData().data_folders))
+    return cached or any(
+        os.path.exists(os.path.join(folder, name)) for folder in ("", *RemoteData().data_folders)
+    )
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Reading sky maps from FITS files: images with or without a celestial WCS, and HEALPix tables.
 
-Nothing is guessed: where the unit, the scale or the position is neither in the file nor given, the error lists the header
-keys and the parameters that would mend it.
+Nothing is guessed: where the unit, the scale or the position is neither in the file nor given, the
+error lists the header keys and the parameters that would mend it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ T = TypeVar("T", WcsMap, HealpixMap, WcsMap | HealpixMap)
 
 
 def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
-    """An image or HEALPix table of a FITS file; of Stokes parameters I, and a note names those that are not used.
+    """An image or HEALPix table of a FITS file; of Stokes parameters I, and a note names those that
+    are not used.
 
     Parameters
     ----------
@@ -43,17 +44,21 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
     Raises
     ------
     InputError
-        Unreadable file; no map in it; unit, scale or position missing; unknown unit; NaN; a cube of which no plane is wanted;
-        no I; options that do not apply.
+        Unreadable file; no map in it; unit, scale or position missing; unknown unit; NaN; a cube of
+        which no plane is wanted; no I; options that do not apply.
     """
     wanted = Wanted(**options)
     place = f"sky map {path}"
     cure = "check the file, e.g. with fitsinfo or fitsverify, or copy it again"
     plain = read_image(path) if wanted.hdu in (None, 0) and not wanted.header_alone else None
-    if plain is not None and plain[1].ndim > 1 and tangent.plain(plain[0]) is not None:  # nothing that astropy need be asked
+    if (
+        plain is not None and plain[1].ndim > 1 and tangent.plain(plain[0]) is not None
+    ):  # nothing that astropy need be asked
         with reading(place, "FITS", cure):
             check_memory(8 * plain[1].size, "the array or table", place)
-            return _told(_image(place, plain[1].astype(np.float64), plain[0], wanted), plain[0].get(GIVEN))
+            return _told(
+                _image(place, plain[1].astype(np.float64), plain[0], wanted), plain[0].get(GIVEN)
+            )
     with opened(path, place, cure) as hdus:
         hdu, notes = chosen(hdus, wanted.hdu, place)
         check_size(path, hdu, place, whole=not wanted.header_alone)
@@ -62,7 +67,9 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
         else:
             q_and_u = None
             if wanted.hdu is None:
-                notes |= stokes.of_extensions(hdu.name, [other.name for other in hdus if other.is_image], place)
+                notes |= stokes.of_extensions(
+                    hdu.name, [other.name for other in hdus if other.is_image], place
+                )
                 q_and_u = _extensions(path, hdus, hdu, wanted, place) if wanted.polarized else None
             found = _image(place, _pixels(hdu, wanted), hdu.header, wanted, q_and_u)
         found.notes = notes | found.notes
@@ -89,17 +96,25 @@ def _told(found: T, given: object) -> T:
 
 def _pixels(hdu: Any, wanted: Wanted) -> Floats:
     """The array of an image; of the header alone one of zeros that takes no memory."""
-    return np.broadcast_to(np.float64(0.0), hdu.shape) if wanted.header_alone else np.asarray(hdu.data)
+    return (
+        np.broadcast_to(np.float64(0.0), hdu.shape) if wanted.header_alone else np.asarray(hdu.data)
+    )
 
 
 def _extensions(path: Path, hdus: Any, first: Any, wanted: Wanted, place: str) -> Floats | None:
-    """(2, ny, nx) Q and U of a file that has them as extensions beside its ``first`` image; None where it has none."""
+    """(2, ny, nx) Q and U of a file that has them as extensions beside its ``first`` image; None
+    where it has none.
+    """
     images = [hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) == 2]
     found = columns_of_q_and_u([hdu.name for hdu in images])
     if found is None:
         return None
     if any(images[k].shape != first.shape for k in found):
-        raise InputError("its images of I, Q and U differ in size", place=place, cure="give three images of one grid")
+        raise InputError(
+            "its images of I, Q and U differ in size",
+            place=place,
+            cure="give three images of one grid",
+        )
     for k in found:
         check_size(path, images[k], place, whole=not wanted.header_alone)
         _check_extension(images[k], first, wanted, place)
@@ -110,18 +125,38 @@ def _check_extension(hdu: Any, first: Any, wanted: Wanted, place: str) -> None:
     """Refuse an image of Q or U in another unit than that of I."""
     units = [text(h.header, "BUNIT", place) for h in (first, hdu)]
     if wanted.unit is None and units[1] not in ("", units[0]):
-        cure = "write all three in one unit, or set the operator's parameter unit, which then holds for all"
-        raise InputError(f"its image {hdu.name} is in {units[1]}, and I in {units[0] or '(none)'}", place=place, cure=cure)
+        cure = (
+            "write all three in one unit, or set the operator's parameter unit, which then holds"
+            " for all"
+        )
+        raise InputError(
+            f"its image {hdu.name} is in {units[1]}, and I in {units[0] or '(none)'}",
+            place=place,
+            cure=cure,
+        )
 
 
-def _image(place: str, values: Floats, header: Any, wanted: Wanted, q_and_u: Floats | None = None) -> WcsMap:
+def _image(
+    place: str, values: Floats, header: Any, wanted: Wanted, q_and_u: Floats | None = None
+) -> WcsMap:
     if values.ndim < 2 or values.size == 0:
-        raise InputError("the image has no pixels", place=place, cure="give a two-dimensional image")
+        raise InputError(
+            "the image has no pixels", place=place, cure="give a two-dimensional image"
+        )
     if values.dtype.kind not in "iuf":
-        raise InputError(f"its pixels are {values.dtype}, not numbers", place=place, cure="give an image of numbers")
-    for name, is_given in (("coordsys", wanted.coordsys is not None), ("column", wanted.column is not None)):
+        raise InputError(
+            f"its pixels are {values.dtype}, not numbers",
+            place=place,
+            cure="give an image of numbers",
+        )
+    for name, is_given in (
+        ("coordsys", wanted.coordsys is not None),
+        ("column", wanted.column is not None),
+    ):
         if is_given:
-            cure = f"remove {name}" + (": CTYPE says what an image's are" if name == "coordsys" else "")
+            cure = f"remove {name}" + (
+                ": CTYPE says what an image's are" if name == "coordsys" else ""
+            )
             raise InputError(f"{name} is for HEALPix maps", place=place, cure=cure)
     plane, notes = plane_of_cube(header, values.shape, wanted.plane, place)
     planes = stokes.planes_of_q_and_u(header, values.shape, plane) if wanted.polarized else None
@@ -130,7 +165,9 @@ def _image(place: str, values: Floats, header: Any, wanted: Wanted, q_and_u: Flo
     wcs, scale = geometry(place, header, wanted.pixel_size, wanted.centred, notes)
     sides = np.radians(np.asarray(wcs.pixel_scale_matrix)) if scale is None else scale
     x, y = np.linalg.norm(sides, axis=0)
-    check_beam(place, beam, (float(x), float(y)), values.shape[-2:], wanted.input_beam is not None, notes)
+    check_beam(
+        place, beam, (float(x), float(y)), values.shape[-2:], wanted.input_beam is not None, notes
+    )
     if planes is not None and not wanted.header_alone:
         q_and_u = np.stack([np.array(values[k], np.float64) for k in planes])
     if planes is not None or q_and_u is not None:
@@ -142,7 +179,22 @@ def _image(place: str, values: Floats, header: Any, wanted: Wanted, q_and_u: Flo
     zeroed = filled(place, values, wanted.missing, "row {}, column {} (counted from 1)")
     values *= factor
     if q_and_u is not None:
-        zeroed += filled(place, q_and_u, wanted.missing, "plane {} of Q and U, row {}, column {} (counted from 1)")
+        zeroed += filled(
+            place,
+            q_and_u,
+            wanted.missing,
+            "plane {} of Q and U, row {}, column {} (counted from 1)",
+        )
         q_and_u *= factor
         q_and_u[1] *= sign
-    return WcsMap(values, unit, wcs, scale, beam, notes, zeroed, polarization=q_and_u, beam=made_with(header, wanted.input_beam))
+    return WcsMap(
+        values,
+        unit,
+        wcs,
+        scale,
+        beam,
+        notes,
+        zeroed,
+        polarization=q_and_u,
+        beam=made_with(header, wanted.input_beam),
+    )

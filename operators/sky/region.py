@@ -1,4 +1,6 @@
-"""The part of a tangent-plane lattice that the detectors of a scan reach: all that is read from a larger map."""
+"""The part of a tangent-plane lattice that the detectors of a scan reach: all that is read from a
+larger map.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,20 @@ if TYPE_CHECKING:
     from zonda.core.data import Observation
 
 WIDEST = np.radians(60.0)
-"""Largest distance from the tangent point: beyond it a gnomonic projection stretches pixels by more than 1 / cos^2 = 4."""
+"""Largest distance from the tangent point: beyond it a gnomonic projection stretches pixels by more
+than 1 / cos^2 = 4.
+"""
 MOST_PIXELS = 2**27
 MARGIN = 16
-"""Points of a lattice beyond the last sample's beam: the spline feels the border by 0.27^16 = 8e-10 there."""
+"""Points of a lattice beyond the last sample's beam: the spline feels the border by 0.27^16 = 8e-10
+there.
+"""
 TILE = 64
 """Side, in points, of the squares that are worked on or not."""
 SPARSE = 0.5
-"""Share of the tiles that are reached above which all are worked on: scans of nearly one shape then share them."""
+"""Share of the tiles that are reached above which all are worked on: scans of nearly one shape then
+share them.
+"""
 
 
 @dataclass(frozen=True)
@@ -43,7 +51,8 @@ class Region:
     Attributes
     ----------
     box
-        (x0, x1, y0, y1): columns x0 .. x1 - 1 west and rows y0 .. y1 - 1 north of the tangent point; multiples of `TILE`.
+        (x0, x1, y0, y1): columns x0 .. x1 - 1 west and rows y0 .. y1 - 1 north of the tangent
+        point; multiples of `TILE`.
     tiles
         (rows, columns) of tiles: True where detectors come near; None: everywhere.
     """
@@ -64,8 +73,11 @@ class Region:
         return ny * nx if self.tiles is None else int(self.tiles.sum()) * TILE**2
 
 
-def region(observation: Observation, step: float, reach: float, disc: Disc | None, place: str) -> Region:
-    """Region of the lattice of ``step`` [rad] about the observation's centre; one tile that is not reached where there is none.
+def region(
+    observation: Observation, step: float, reach: float, disc: Disc | None, place: str
+) -> Region:
+    """Region of the lattice of ``step`` [rad] about the observation's centre; one tile that is not
+    reached where there is none.
 
     Parameters
     ----------
@@ -77,7 +89,8 @@ def region(observation: Observation, step: float, reach: float, disc: Disc | Non
     Raises
     ------
     InputError
-        The scan goes further from its centre than a gnomonic projection serves, or the box has too many points.
+        The scan goes further from its centre than a gnomonic projection serves, or the box has too
+        many points.
     """
     around = float(np.arctan(observation.focalplane.radius)) + reach
     axes = local_axes(*observation.centre)
@@ -88,20 +101,24 @@ def region(observation: Observation, step: float, reach: float, disc: Disc | Non
             boxes.append((x.min(), x.max(), y.min(), y.max()))
     if furthest + around > WIDEST:
         raise InputError(
-            f"the scan reaches {np.degrees(furthest + around):.0f} deg from its centre; a map that must be resampled serves up "
-            f"to {np.degrees(WIDEST):.0f} deg",
+            f"the scan reaches {np.degrees(furthest + around):.0f} deg from its centre; a map that"
+            f" must be resampled serves up to {np.degrees(WIDEST):.0f} deg",
             place=place,
             cure="scan a smaller field, or give a TAN map",
         )
     if not boxes:
         return Region((0, TILE, 0, TILE), np.zeros((1, 1), bool))
     pad = (np.tan(furthest + around) - np.tan(furthest)) / step + MARGIN
-    low, high = np.min(boxes, axis=0)[[0, 2]] / step - pad, np.max(boxes, axis=0)[[1, 3]] / step + pad
+    low, high = (
+        np.min(boxes, axis=0)[[0, 2]] / step - pad,
+        np.max(boxes, axis=0)[[1, 3]] / step + pad,
+    )
     x0, x1, y0, y1 = _snapped(low, high)
     ny, nx = y1 - y0, x1 - x0
     if nx * ny > MOST_PIXELS:
         raise InputError(
-            f"the working grid would have {nx} x {ny} pixels of {np.degrees(step) * 3600:.3g} arcsec",
+            f"the working grid would have {nx} x {ny} pixels of {np.degrees(step) * 3600:.3g}"
+            " arcsec",
             place=place,
             cure="scan a smaller field, or give a TAN map of it",
         )
@@ -113,7 +130,9 @@ def region(observation: Observation, step: float, reach: float, disc: Disc | Non
 
 
 def _on_plane(observation: Observation, axes: Floats, disc: Disc | None, around: float) -> Any:
-    """Chunks of (x, y, theta) [tan rad west, tan rad north, rad] of the boresight where it comes ``around`` the map."""
+    """Chunks of (x, y, theta) [tan rad west, tan rad north, rad] of the boresight where it comes
+    ``around`` the map.
+    """
     boresight = observation.sky_boresight
     for chunk in chunks(observation.n_samples):
         d = boresights(boresight[chunk])
@@ -126,24 +145,35 @@ def _on_plane(observation: Observation, axes: Floats, disc: Disc | None, around:
 
 
 def _snapped(low: Floats, high: Floats) -> tuple[int, int, int, int]:
-    """Edges on an absolute raster of a power of two tiles, an eighth of the box or less: scans of nearly one size share it."""
+    """Edges on an absolute raster of a power of two tiles, an eighth of the box or less: scans of
+    nearly one size share it.
+    """
     power = max(0, int(np.floor(np.log2(max(float((high - low).max()) / TILE / 8, 1.0)))))
     raster = TILE * 2**power
-    (x0, y0), (x1, y1) = np.floor(low / raster).astype(int) * raster, np.ceil(high / raster).astype(int) * raster
+    (x0, y0), (x1, y1) = (
+        np.floor(low / raster).astype(int) * raster,
+        np.ceil(high / raster).astype(int) * raster,
+    )
     return int(x0), int(x1), int(y0), int(y1)
 
 
 def _grown(tiles: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     """True also within ``by`` tiles along both axes."""
     for axis in (0, 1):
-        total = np.cumsum(np.pad(tiles, [(by + 1, by) if k == axis else (0, 0) for k in (0, 1)]), axis=axis)
+        total = np.cumsum(
+            np.pad(tiles, [(by + 1, by) if k == axis else (0, 0) for k in (0, 1)]), axis=axis
+        )
         n, width = tiles.shape[axis], 2 * by + 1
-        tiles = np.take(total, np.arange(width, width + n), axis) > np.take(total, np.arange(n), axis)
+        tiles = np.take(total, np.arange(width, width + n), axis) > np.take(
+            total, np.arange(n), axis
+        )
     return tiles
 
 
 def tangent_wcs(ra: float, dec: float, box: tuple[int, int, int, int], step: float) -> Any:
-    """A north-up TAN `WCS` (ICRS) about (ra, dec) of the points in ``box`` (`Region`); `pixel_shape` is set. All in rad."""
+    """A north-up TAN `WCS` (ICRS) about (ra, dec) of the points in ``box`` (`Region`);
+    `pixel_shape` is set. All in rad.
+    """
     from astropy.wcs import WCS
 
     x0, x1, y0, y1 = box

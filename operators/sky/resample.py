@@ -1,6 +1,8 @@
-"""Bringing maps that are not gnomonic (other projections, HEALPix) onto a gnomonic grid about the observation.
+"""Bringing maps that are not gnomonic (other projections, HEALPix) onto a gnomonic grid about the
+observation.
 
-The grid is worked on in blocks, and of each block the tiles that a scan reaches; each block takes of the map what lies under it.
+The grid is worked on in blocks, and of each block the tiles that a scan reaches; each block takes
+of the map what lies under it.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ AT_ONCE = 16384
 
 @dataclass(frozen=True)
 class Block:
-    """Points of a grid of ``step`` [rad]: ``y``, ``x`` (n,) and their ICRS directions ``d`` (n, 3)."""
+    """Points of a grid of ``step`` [rad]: ``y``, ``x`` (n,) and their ICRS directions ``d`` (n,
+    3).
+    """
 
     y: NDArray[np.int64]
     x: NDArray[np.int64]
@@ -46,18 +50,29 @@ class Block:
     step: float
 
 
-def blocks(target: Any, tiles: NDArray[np.bool_] | None, progress: Progress, thin: int = 1) -> Iterator[Block]:
-    """The points of the TAN grid ``target`` in squares of `BLOCK`; of the ``tiles`` that are True, where given.
+def blocks(
+    target: Any, tiles: NDArray[np.bool_] | None, progress: Progress, thin: int = 1
+) -> Iterator[Block]:
+    """The points of the TAN grid ``target`` in squares of `BLOCK`; of the ``tiles`` that are True,
+    where given.
 
     ``thin``: only every ``thin``-th point along each axis.
     """
     nx, ny = target.pixel_shape
-    to_sky, step = np.linalg.inv(pixel_matrix(target)).T, float(np.radians(abs(target.wcs.cdelt[1])))
+    to_sky, step = (
+        np.linalg.inv(pixel_matrix(target)).T,
+        float(np.radians(abs(target.wcs.cdelt[1]))),
+    )
     total, done = nx * ny if tiles is None else int(tiles.sum()) * TILE**2, 0
     progress(0, total)
     for first in range(0, ny, BLOCK):
         for left in range(0, nx, BLOCK):
-            y, x = (k.ravel() for k in np.mgrid[first : min(first + BLOCK, ny) : thin, left : min(left + BLOCK, nx) : thin])
+            y, x = (
+                k.ravel()
+                for k in np.mgrid[
+                    first : min(first + BLOCK, ny) : thin, left : min(left + BLOCK, nx) : thin
+                ]
+            )
             if tiles is not None:
                 wanted = tiles[y // TILE, x // TILE]
                 y, x = y[wanted], x[wanted]
@@ -73,7 +88,8 @@ def no_progress(done: int, total: int) -> None:
     """Progress callback that does nothing."""
 
 
-# ------------------------------------------------------------------------------------------------------------ images
+# --------------------------------------------------------------------------------------------------
+# images
 
 
 def resample_image(
@@ -84,7 +100,8 @@ def resample_image(
     per_area: bool = False,
     axis: Floats | None = None,
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """(values, covered) of an image on the TAN grid ``target``, by cubic B-splines. NaN-free: not covered is 0.
+    """(values, covered) of an image on the TAN grid ``target``, by cubic B-splines. NaN-free: not
+    covered is 0.
 
     A cylindrical map that goes round the sky is joined at its seam.
 
@@ -93,15 +110,21 @@ def resample_image(
     tiles
         `region.Region.tiles`: where False nothing is worked on, and not covered.
     per_area
-        Divide each pixel by its solid angle [sr]; one beyond the projection, which has none, counts as 0.
+        Divide each pixel by its solid angle [sr]; one beyond the projection, which has none, counts
+        as 0.
     axis
-        ICRS direction (3,) of a pole: values are (3, ny, nx) I, Q and U, and each pixel's Q and U are turned to the meridians
-        through that pole before they are interpolated. None: I alone, (ny, nx).
+        ICRS direction (3,) of a pole: values are (3, ny, nx) I, Q and U, and each pixel's Q and U
+        are turned to the meridians through that pole before they are interpolated. None: I alone,
+        (ny, nx).
     """
     from scipy.ndimage import map_coordinates, spline_filter
 
     nx, ny = target.pixel_shape
-    found, covered, sky = np.zeros((1 if axis is None else 3, ny, nx)), np.zeros((ny, nx), bool), ImageOnSky(image)
+    found, covered, sky = (
+        np.zeros((1 if axis is None else 3, ny, nx)),
+        np.zeros((ny, nx), bool),
+        ImageOnSky(image),
+    )
     for block in blocks(target, tiles, progress):
         x, y, inside = sky.for_splines(block.d)
         if not inside.any():
@@ -116,14 +139,18 @@ def resample_image(
                 planes = np.where(np.isfinite(areas) & (areas > 0), planes / areas, 0.0)
         at = np.array([y - rows[0], x - columns[0]])
         for values, plane in zip(found, planes, strict=True):
-            smooth = map_coordinates(spline_filter(plane, 3, mode="mirror"), at, order=3, prefilter=False, mode="mirror")
+            smooth = map_coordinates(
+                spline_filter(plane, 3, mode="mirror"), at, order=3, prefilter=False, mode="mirror"
+            )
             values[block.y[inside], block.x[inside]] = smooth
         covered[block.y[inside], block.x[inside]] = True
     return found if axis is not None else found[0], covered
 
 
 class ImageOnSky:
-    """Pixels of an image by ICRS directions: their places, solid angles and values, in any projection."""
+    """Pixels of an image by ICRS directions: their places, solid angles and values, in any
+    projection.
+    """
 
     def __init__(self, image: WcsMap) -> None:
         self.image = image
@@ -152,7 +179,9 @@ class ImageOnSky:
             return np.asarray(self._areas[y])
         xx, xy, yy = self.grid.metric(x, y)
         found = np.asarray(np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)))
-        if (edge := ~np.isfinite(found)).any():  # a part is beyond the projection: the mean of the rest
+        if (
+            edge := ~np.isfinite(found)
+        ).any():  # a part is beyond the projection: the mean of the rest
             cuts = np.linspace(-0.5, 0.5, CUTS + 1)
             corner = self.grid.at(x[edge, None, None] + cuts, y[edge, None, None] + cuts[:, None])
             a, b = corner[:, 1:, 1:] - corner[:, :-1, :-1], corner[:, 1:, :-1] - corner[:, :-1, 1:]
@@ -164,7 +193,9 @@ class ImageOnSky:
         return found
 
     def is_own(self, x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether pixels are those that hold their centres: of several that stand for the same sky, one."""
+        """Whether pixels are those that hold their centres: of several that stand for the same sky,
+        one.
+        """
         if self._period or self.grid.kind in ZENITHAL or self.grid.wcs.has_distortion:
             return np.ones(x.shape, bool)
         u, v = self.grid.coordinates(self.grid.at(x, y))
@@ -173,18 +204,26 @@ class ImageOnSky:
             return np.asarray((np.abs(u - x) < near) & (np.abs(v - y) < near))
 
     def planes(self, x: NDArray[np.int64], y: NDArray[np.int64], axis: Floats | None) -> Floats:
-        """(k, ...) I of pixels, or I, Q and U from the meridians through the ICRS direction ``axis``."""
+        """(k, ...) I of pixels, or I, Q and U from the meridians through the ICRS direction
+        ``axis``.
+        """
         intensity = self.image.values[None, y, x]
         if axis is None or self.image.polarization is None:
             return np.asarray(intensity)
         own = self.grid.at(x, y)
         known = np.asarray(np.isfinite(own).all(axis=-1))
         to = (wcs_frame_rotation(self.image.wcs) if self._turn is None else self._turn) @ axis
-        turn = between_meridians(np.where(known[..., None], own, 0.0), np.array([0.0, 0.0, 1.0]), to)
-        return np.concatenate([intensity, turned_by(np.where(known, self.image.polarization[:, y, x], 0.0), turn)])
+        turn = between_meridians(
+            np.where(known[..., None], own, 0.0), np.array([0.0, 0.0, 1.0]), to
+        )
+        return np.concatenate(
+            [intensity, turned_by(np.where(known, self.image.polarization[:, y, x], 0.0), turn)]
+        )
 
     def at(self, d: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """0-based pixels (x, y) of ICRS directions (n, 3), NaN beyond the projection, and whether they are on the image."""
+        """0-based pixels (x, y) of ICRS directions (n, 3), NaN beyond the projection, and whether
+        they are on the image.
+        """
         own = d @ self._turn.T if self._turn is not None else _between(d, "icrs", self._frame)
         x, y = self.grid.coordinates(own)
         ny, nx = self.grid.shape
@@ -192,24 +231,39 @@ class ImageOnSky:
             return x, y, (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
 
     def for_splines(self, d: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """As `at`; where the image goes round the sky, x is continuous about where most of the directions are."""
+        """As `at`; where the image goes round the sky, x is continuous about where most of the
+        directions are.
+        """
         x, y, inside = self.at(d)
         if self.joined and inside.any():
             middle = np.median(x[inside])
             x = (x - middle + self._period / 2) % self._period - self._period / 2 + middle
         return x, y, inside
 
-    def around(self, x: Floats, y: Floats, margin: int = MARGIN) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns with a margin that splines at pixels (x, y) feel; columns beyond a seam go on counting."""
+    def around(
+        self, x: Floats, y: Floats, margin: int = MARGIN
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns with a margin that splines at pixels (x, y) feel; columns beyond a seam
+        go on counting.
+        """
         ny, nx = self.grid.shape
         low, high = int(np.floor(x.min())) - margin, int(np.ceil(x.max())) + margin + 1
         columns = np.arange(low, high) if self.joined else np.arange(max(low, 0), min(high, nx))
-        return np.arange(max(int(np.floor(y.min())) - margin, 0), min(int(np.ceil(y.max())) + margin + 1, ny)), columns
+        return (
+            np.arange(
+                max(int(np.floor(y.min())) - margin, 0), min(int(np.ceil(y.max())) + margin + 1, ny)
+            ),
+            columns,
+        )
 
-    def under(self, block: Block, rim: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Rows and columns that hold all pixels nearest to points of a block, and which of these points are on the image.
+    def under(
+        self, block: Block, rim: Floats
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Rows and columns that hold all pixels nearest to points of a block, and which of these
+        points are on the image.
 
-        ``rim``: ICRS directions (n, 3) around the block, a step beyond it. No column stands for the same sky as another one.
+        ``rim``: ICRS directions (n, 3) around the block, a step beyond it. No column stands for the
+        same sky as another one.
         """
         ny, nx = self.grid.shape
         x, y, there = self.at(np.concatenate([block.d, rim]))
@@ -228,11 +282,15 @@ class ImageOnSky:
                 columns = columns[(columns - first) % self._period <= np.ptp(off) + 2 * more]
         else:
             columns = columns[(columns >= x.min() - more) & (columns <= x.max() + more)]
-        rows = np.arange(max(int(np.floor(y.min())) - more, 0), min(int(np.ceil(y.max())) + more + 1, ny))
+        rows = np.arange(
+            max(int(np.floor(y.min())) - more, 0), min(int(np.ceil(y.max())) + more + 1, ny)
+        )
         return rows, columns, there[: len(block.d)]
 
     def to_own(self, ra: float, dec: float) -> Floats:
-        """(3, 3) from ICRS directions to those in the image's frame; of FK4 as it is at (ra, dec) [rad]."""
+        """(3, 3) from ICRS directions to those in the image's frame; of FK4 as it is at (ra, dec)
+        [rad].
+        """
         if self._turn is not None:
             return self._turn
         axes = local_axes(ra, dec)
@@ -253,12 +311,15 @@ def _between(d: Floats, frame: Any, other: Any) -> Floats:
     from astropy.coordinates import SkyCoord
 
     known = np.isfinite(d).all(axis=-1, keepdims=True)
-    sky = SkyCoord(*np.moveaxis(np.where(known, d, 1.0), -1, 0), representation_type="cartesian", frame=frame)
+    sky = SkyCoord(
+        *np.moveaxis(np.where(known, d, 1.0), -1, 0), representation_type="cartesian", frame=frame
+    )
     found = np.moveaxis(np.asarray(sky.transform_to(other).cartesian.xyz.value), 0, -1)
     return np.where(known, found / np.linalg.norm(found, axis=-1, keepdims=True), np.nan)
 
 
-# ----------------------------------------------------------------------------------------------------------- HEALPix
+# --------------------------------------------------------------------------------------------------
+# HEALPix
 
 
 def resample_healpix(
@@ -268,20 +329,25 @@ def resample_healpix(
     progress: Progress = no_progress,
     axis: Floats | None = None,
 ) -> tuple[Floats, NDArray[np.bool_], int]:
-    """(values, covered, poor) of a HEALPix map on the TAN grid ``target``. A grid point is covered where its HEALPix pixel is.
+    """(values, covered, poor) of a HEALPix map on the TAN grid ``target``. A grid point is covered
+    where its HEALPix pixel is.
 
-    Each value comes from the polynomial of third degree that best fits the `NEIGHBOURS` nearest covered pixel centres in the
-    tangent plane, with weights 1 / distance^4 (moving least squares): it passes through the pixel values, whatever the
-    orientation of the pixels. Where the neighbours do not determine it, it is their weighted mean: ``poor`` counts those. Of a
-    map with fewer pixels all are neighbours.
-    ``tiles`` and ``axis`` as of `resample_image`.
+    Each value comes from the polynomial of third degree that best fits the `NEIGHBOURS` nearest
+    covered pixel centres in the tangent plane, with weights 1 / distance^4 (moving least squares):
+    it passes through the pixel values, whatever the orientation of the pixels. Where the neighbours
+    do not determine it, it is their weighted mean: ``poor`` counts those. Of a map with fewer
+    pixels all are neighbours. ``tiles`` and ``axis`` as of `resample_image`.
     """
     import healpy
     from scipy.spatial import cKDTree
 
     to_frame, matrix = frame_rotation(sky.frame), pixel_matrix(target)
     nx, ny = target.pixel_shape
-    planes, covered, poor = np.zeros((1 if axis is None else 3, ny, nx)), np.zeros((ny, nx), bool), 0
+    planes, covered, poor = (
+        np.zeros((1 if axis is None else 3, ny, nx)),
+        np.zeros((ny, nx), bool),
+        0,
+    )
     values = planes if axis is not None else planes[0]
     if not len(sky.values):
         return values, covered, poor
@@ -301,14 +367,20 @@ def resample_healpix(
             data = np.concatenate([data, turned_by(sky.polarization[:, near[front]], turn)])
         tree = cKDTree(points)
         at = np.stack([block.x[seen], block.y[seen]], axis=1).astype(np.float64)
-        parts = [_local_fit(tree, points, data, at[k : k + AT_ONCE]) for k in range(0, len(at), AT_ONCE)]
-        planes[:, block.y[seen], block.x[seen]] = np.concatenate([found for found, _ in parts], axis=1)
+        parts = [
+            _local_fit(tree, points, data, at[k : k + AT_ONCE]) for k in range(0, len(at), AT_ONCE)
+        ]
+        planes[:, block.y[seen], block.x[seen]] = np.concatenate(
+            [found for found, _ in parts], axis=1
+        )
         covered[block.y[seen], block.x[seen]] = True
         poor += sum(undetermined for _, undetermined in parts)
     return values, covered, poor
 
 
-def slots(sky: HealpixMap, numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def slots(
+    sky: HealpixMap, numbers: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Where pixels of these numbers stand in ``sky.values``, and whether they are there."""
     if sky.pixels is None:
         return numbers, np.ones(len(numbers), bool)
@@ -317,15 +389,25 @@ def slots(sky: HealpixMap, numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64
 
 
 def _near(sky: HealpixMap, d: Floats) -> NDArray[np.int64]:
-    """Places in ``sky.values`` of the pixels about directions (n, 3) in the map's frame; more of them where few are covered."""
+    """Places in ``sky.values`` of the pixels about directions (n, 3) in the map's frame; more of
+    them where few are covered.
+    """
     import healpy
 
     middle = d.mean(axis=0)
     middle /= np.linalg.norm(middle)
-    radius, pixel = float(np.arccos(np.clip((d @ middle).min(), -1, 1))), float(np.sqrt(healpy.nside2pixarea(sky.nside)))
+    radius, pixel = (
+        float(np.arccos(np.clip((d @ middle).min(), -1, 1))),
+        float(np.sqrt(healpy.nside2pixarea(sky.nside))),
+    )
     numbers = np.zeros(0, np.int64)
     for margin in (MARGIN * pixel, 8 * MARGIN * pixel, np.pi):
-        numbers, there = slots(sky, np.sort(healpy.query_disc(sky.nside, middle, min(radius + margin, np.pi), nest=sky.nest)))
+        numbers, there = slots(
+            sky,
+            np.sort(
+                healpy.query_disc(sky.nside, middle, min(radius + margin, np.pi), nest=sky.nest)
+            ),
+        )
         numbers = numbers[there]
         if len(numbers) >= NEIGHBOURS:
             break
@@ -333,9 +415,11 @@ def _near(sky: HealpixMap, d: Floats) -> NDArray[np.int64]:
 
 
 def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Floats, int]:
-    """Moving least squares of third degree at ``at`` (n, 2) from scattered ``data`` (k, m) at ``points`` (m, 2).
+    """Moving least squares of third degree at ``at`` (n, 2) from scattered ``data`` (k, m) at
+    ``points`` (m, 2).
 
-    The values (k, n), and at how many points they are weighted means because the fit is not determined.
+    The values (k, n), and at how many points they are weighted means because the fit is not
+    determined.
     """
     distance, index = tree.query(at, np.arange(1, min(NEIGHBOURS, tree.n) + 1))
     scale = np.maximum(distance[:, -1:], 1e-300)
@@ -343,7 +427,9 @@ def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Flo
     weight = 1.0 / ((distance / scale) ** 2 + 1e-6)
     if tree.n < 10:  # fewer than the coefficients
         return np.sum(weight**2 * data[:, index], axis=2) / np.sum(weight**2, axis=1), len(at)
-    cubic = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], axis=2)
+    cubic = np.stack(
+        [np.ones_like(u), u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], axis=2
+    )
     q, r = np.linalg.qr(cubic * weight[:, :, None])
     pivots = np.abs(np.diagonal(r, axis1=1, axis2=2))
     poor = pivots.min(axis=1) < 1e-6 * pivots.max(axis=1)
@@ -357,13 +443,18 @@ def _local_fit(tree: Any, points: Floats, data: Floats, at: Floats) -> tuple[Flo
     return found, int(poor.sum())
 
 
-# ----------------------------------------------------------------------------------------------------------- extremes
+# --------------------------------------------------------------------------------------------------
+# extremes
 
 
 def extremes(
-    source: WcsMap | HealpixMap, target: Any, tiles: NDArray[np.bool_] | None, per_area: bool = False
+    source: WcsMap | HealpixMap,
+    target: Any,
+    tiles: NDArray[np.bool_] | None,
+    per_area: bool = False,
 ) -> tuple[float, float]:
-    """Least and largest value of the map's pixels under a grid, from a thinned set of its points; (0, 0) where there are none.
+    """Least and largest value of the map's pixels under a grid, from a thinned set of its points;
+    (0, 0) where there are none.
 
     ``per_area``: of values divided by the solid angles of their pixels [sr].
     """
@@ -382,8 +473,13 @@ def extremes(
             if inside.any():
                 rows, columns = sky.around(x[inside], y[inside])
                 px, py = np.meshgrid(columns % source.values.shape[1], rows)
-                values, areas = sky.planes(px, py, None)[0], sky.areas(px, py) if per_area else np.ones(1)
+                values, areas = (
+                    sky.planes(px, py, None)[0],
+                    sky.areas(px, py) if per_area else np.ones(1),
+                )
                 found.append((values / areas)[np.isfinite(values / areas)])
     if not any(values.size for values in found):
         return 0.0, 0.0
-    return min(float(v.min()) for v in found if v.size), max(float(v.max()) for v in found if v.size)
+    return min(float(v.min()) for v in found if v.size), max(
+        float(v.max()) for v in found if v.size
+    )

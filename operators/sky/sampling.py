@@ -1,12 +1,14 @@
 """Sampling a convolved map at every detector and instant by cubic B-splines.
 
-A direction d has the working-grid pixel p = A d, x = p0 / p2, y = p1 / p2 (`core.numerics.projection`), a detector looks at
-R(t) (-eta, -xi, 1), so that one 3 x 3 matrix per instant, H = A R(t) with its columns sorted, takes (xi, eta, 1) to
-pixels: exact for a gnomonic grid.
+A direction d has the working-grid pixel p = A d, x = p0 / p2, y = p1 / p2
+(`core.numerics.projection`), a detector looks at R(t) (-eta, -xi, 1), so that one 3 x 3 matrix per
+instant, H = A R(t) with its columns sorted, takes (xi, eta, 1) to pixels: exact for a gnomonic
+grid.
 
-Precision: H is float64. The pixel of the chunk's boresight, rounded, is taken out of it before it is cast to the block's
-type, so that float32 coordinates carry only the offset of a detector from the boresight and of the boresight from its
-place within 256 samples: 3 roundings of 6e-8 of that offset, 5e-4 pixel (1e-4 of a beam of 4 pixels) at 3000 pixels.
+Precision: H is float64. The pixel of the chunk's boresight, rounded, is taken out of it before it
+is cast to the block's type, so that float32 coordinates carry only the offset of a detector from
+the boresight and of the boresight from its place within 256 samples: 3 roundings of 6e-8 of that
+offset, 5e-4 pixel (1e-4 of a beam of 4 pixels) at 3000 pixels.
 """
 
 from __future__ import annotations
@@ -51,7 +53,8 @@ def sample(
     out: AnyFloats,
     over: bool = False,
 ) -> tuple[int, int]:
-    """Add the map to ``out`` (n_det, n_samp) at its ``rows``; the numbers of samples (outside the input map, behind it).
+    """Add the map to ``out`` (n_det, n_samp) at its ``rows``; the numbers of samples (outside the
+    input map, behind it).
 
     Parameters
     ----------
@@ -60,25 +63,39 @@ def sample(
     chunks
         `pointing` for the samples of ``out``, of its type.
     coefficients
-        (ny, nx) of ``out``'s type, C order, fewer than 2^31: cubic B-spline coefficients, or values for `linear.add_lines`.
+        (ny, nx) of ``out``'s type, C order, fewer than 2^31: cubic B-spline coefficients, or values
+        for `linear.add_lines`.
     covered
         (ny, nx) 1 where the input map has data, or (0, 0): everywhere within its bounds.
     over
         Put the map into ``out``, whatever is there, and zeros where there is no map.
 
-    A sample whose 4 x 4 coefficients are not all on the grid is left as it is. Samples behind the tangent plane are counted
-    in both numbers.
+    A sample whose 4 x 4 coefficients are not all on the grid is left as it is. Samples behind the
+    tangent plane are counted in both numbers.
     """
     kind = out.dtype.type
-    of_map = rows.numbers, coefficients.reshape(-1), coefficients.shape[1], covered, CONSTANTS.astype(kind)
-    beyond, behind = kernel(*chunks, rows.xi.astype(kind), rows.eta.astype(kind), *of_map, over, out)
+    of_map = (
+        rows.numbers,
+        coefficients.reshape(-1),
+        coefficients.shape[1],
+        covered,
+        CONSTANTS.astype(kind),
+    )
+    beyond, behind = kernel(
+        *chunks, rows.xi.astype(kind), rows.eta.astype(kind), *of_map, over, out
+    )
     return int(beyond), int(behind)
 
 
 def pointing(
-    quaternions: NDArray[np.float64], matrix: NDArray[np.float64], shape: tuple[int, ...], bounds: NDArray[np.float64], kind: Any
+    quaternions: NDArray[np.float64],
+    matrix: NDArray[np.float64],
+    shape: tuple[int, ...],
+    bounds: NDArray[np.float64],
+    kind: Any,
 ) -> Chunks:
-    """Where the boresight is on a working grid, in m chunks of `CHUNK` samples, each counted from its own origin.
+    """Where the boresight is on a working grid, in m chunks of `CHUNK` samples, each counted from
+    its own origin.
 
     Parameters
     ----------
@@ -96,11 +113,13 @@ def pointing(
     Returns
     -------
     h
-        (m, 9, CHUNK) H row by row for (xi, eta, 1), of the type ``kind``; the last chunk is filled up with its last sample.
+        (m, 9, CHUNK) H row by row for (xi, eta, 1), of the type ``kind``; the last chunk is filled
+        up with its last sample.
     box
         (m, 9, 2) float64 least and largest of each element.
     limits
-        (m, 8) first and last place x, y of the first of a sample's 4 x 4 grid points, and the input map's edges.
+        (m, 8) first and last place x, y of the first of a sample's 4 x 4 grid points, and the input
+        map's edges.
     ones
         (m, 2) int32 the grid point (1, 1).
     """
@@ -111,19 +130,37 @@ def pointing(
     return h, box, limits, ones
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def _point(quaternions, matrix, ny, nx, bounds, h, box, limits, ones):  # type: ignore[no-untyped-def]
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
+def _point(  # type: ignore[no-untyped-def]
+    quaternions, matrix, ny, nx, bounds, h, box, limits, ones
+):
     turn, g, cast = np.empty((9, CHUNK)), np.empty((9, CHUNK)), h.dtype.type
     for k in range(len(h)):
         start = k * CHUNK
         count = min(CHUNK, len(quaternions) - start)
-        for t in range(count):  # H = A R, the columns of R sorted for (xi, eta, 1): second and first reversed, third
+        for t in range(
+            count
+        ):  # H = A R, the columns of R sorted for (xi, eta, 1): second and first reversed, third
             q = quaternions[start + t]
             x, y, z, w = q[0], q[1], q[2], q[3]
             s = 2.0 / (x * x + y * y + z * z + w * w)
-            turn[0, t], turn[1, t], turn[2, t] = s * (z * w - x * y), s * (x * x + z * z) - 1.0, s * (-x * w - y * z)
-            turn[3, t], turn[4, t], turn[5, t] = s * (y * y + z * z) - 1.0, s * (-z * w - x * y), s * (y * w - x * z)
-            turn[6, t], turn[7, t], turn[8, t] = s * (x * z + y * w), s * (y * z - x * w), 1.0 - s * (x * x + y * y)
+            turn[0, t], turn[1, t], turn[2, t] = (
+                s * (z * w - x * y),
+                s * (x * x + z * z) - 1.0,
+                s * (-x * w - y * z),
+            )
+            turn[3, t], turn[4, t], turn[5, t] = (
+                s * (y * y + z * z) - 1.0,
+                s * (-z * w - x * y),
+                s * (y * w - x * z),
+            )
+            turn[6, t], turn[7, t], turn[8, t] = (
+                s * (x * z + y * w),
+                s * (y * z - x * w),
+                1.0 - s * (x * x + y * y),
+            )
         for j in range(9):
             a, b, c, to = turn[j % 3 * 3], turn[j % 3 * 3 + 1], turn[j % 3 * 3 + 2], g[j]
             m = matrix[j // 3]
@@ -137,7 +174,12 @@ def _point(quaternions, matrix, ny, nx, bounds, h, box, limits, ones):  # type: 
         else:
             ox, oy = 0.0, 0.0
         for j in range(9):
-            origin, row, base, at = ox if j < 3 else oy if j < 6 else 0.0, g[j], g[6 + j % 3], h[k, j]
+            origin, row, base, at = (
+                ox if j < 3 else oy if j < 6 else 0.0,
+                g[j],
+                g[6 + j % 3],
+                h[k, j],
+            )
             for t in range(CHUNK):
                 at[t] = cast(row[t] - origin * base[t])
             low, high = at[0], at[0]
@@ -146,13 +188,25 @@ def _point(quaternions, matrix, ny, nx, bounds, h, box, limits, ones):  # type: 
             box[k, j, 0], box[k, j, 1] = low, high
         for j in range(2):
             origin = oy if j else ox
-            limits[k, 2 * j], limits[k, 2 * j + 1] = cast(1 - origin), cast((ny if j else nx) - 3 - origin)
-            limits[k, 4 + 2 * j], limits[k, 5 + 2 * j] = cast(bounds[2 * j] - origin), cast(bounds[2 * j + 1] - origin)
-            ones[k, j] = int32(1 - max(min(origin, 1e9), -1e9))  # far away no sample is on the grid and any number will do
+            limits[k, 2 * j], limits[k, 2 * j + 1] = (
+                cast(1 - origin),
+                cast((ny if j else nx) - 3 - origin),
+            )
+            limits[k, 4 + 2 * j], limits[k, 5 + 2 * j] = (
+                cast(bounds[2 * j] - origin),
+                cast(bounds[2 * j + 1] - origin),
+            )
+            ones[k, j] = int32(
+                1 - max(min(origin, 1e9), -1e9)
+            )  # far away no sample is on the grid and any number will do
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"})
-def add_splines(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out):  # type: ignore[no-untyped-def]
+@nb.njit(
+    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
+)
+def add_splines(  # type: ignore[no-untyped-def]
+    h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out
+):
     """The work of `sample`, from cubic B-spline coefficients."""
     place, at = np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int32)
     u, v, found = np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype)
@@ -169,7 +223,9 @@ def add_splines(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, 
             if misses(box[k], xi[d], eta[d], limits[k]):
                 beyond += count
                 continue
-            inside, front = locate(h[k], xi[d], eta[d], count, limits[k], constants, ones[k], int32(nx), place, u, v)
+            inside, front = locate(
+                h[k], xi[d], eta[d], count, limits[k], constants, ones[k], int32(nx), place, u, v
+            )
             if covered.size > 0:
                 inside = count_covered(place, u, v, count, nx, covered)
             beyond += count - inside
@@ -185,15 +241,24 @@ def add_splines(h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, 
     return beyond, behind
 
 
-# What follows is inlined, that is compiled with its caller only: half the time of functions that are compiled before, too.
+# What follows is inlined, that is compiled with its caller only: half the time of functions that
+# are compiled before, too.
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}, inline="always")
+@nb.njit(
+    nogil=True,
+    cache=True,
+    boundscheck=False,
+    error_model="numpy",
+    fastmath={"contract", "nsz"},
+    inline="always",
+)
 def misses(box, a, b, limits):  # type: ignore[no-untyped-def]
-    """Whether a detector at (a, b) = (xi, eta) is in front of the map and a pixel or more off it at every instant of a chunk.
+    """Whether a detector at (a, b) = (xi, eta) is in front of the map and a pixel or more off it at
+    every instant of a chunk.
 
-    By intervals: x = n / w with n and w between bounds, 0 < w, lies between the least and the largest quotient of bounds.
-    False where rounding might come to a pixel.
+    By intervals: x = n / w with n and w between bounds, 0 < w, lies between the least and the
+    largest quotient of bounds. False where rounding might come to a pixel.
     """
     w_low, w_high = _between(box, 6, a, b)
     if not w_low > 1e-3:
@@ -203,13 +268,23 @@ def misses(box, a, b, limits):  # type: ignore[no-untyped-def]
         low, high = min(low / w_low, low / w_high), max(high / w_low, high / w_high)
         if max(-low, high) > 1e6:
             return False
-        first, last = min(limits[2 * axis], limits[2 * axis + 4]), max(limits[2 * axis + 1] + 1, limits[2 * axis + 5])
+        first, last = (
+            min(limits[2 * axis], limits[2 * axis + 4]),
+            max(limits[2 * axis + 1] + 1, limits[2 * axis + 5]),
+        )
         if low > last + 1.0 or high < first - 1.0:
             return True
     return False
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}, inline="always")
+@nb.njit(
+    nogil=True,
+    cache=True,
+    boundscheck=False,
+    error_model="numpy",
+    fastmath={"contract", "nsz"},
+    inline="always",
+)
 def _between(box, k, a, b):  # type: ignore[no-untyped-def]
     """Bounds of h_k a + h_(k+1) b + h_(k+2)."""
     p, q = a * box[k, 0], a * box[k, 1]
@@ -217,9 +292,19 @@ def _between(box, k, a, b):  # type: ignore[no-untyped-def]
     return min(p, q) + min(r, s) + box[k + 2, 0], max(p, q) + max(r, s) + box[k + 2, 1]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}, inline="always")
-def locate(h, a, b, count, limits, constants, ones, width, place, u, v):  # type: ignore[no-untyped-def]
-    """Where a detector at (a, b) = (xi, eta) looks: the index of its first coefficient (-1: none) and the fractions u, v.
+@nb.njit(
+    nogil=True,
+    cache=True,
+    boundscheck=False,
+    error_model="numpy",
+    fastmath={"contract", "nsz"},
+    inline="always",
+)
+def locate(  # type: ignore[no-untyped-def]
+    h, a, b, count, limits, constants, ones, width, place, u, v
+):
+    """Where a detector at (a, b) = (xi, eta) looks: the index of its first coefficient (-1: none)
+    and the fractions u, v.
 
     Returns the numbers of samples inside the input map's edges and in front of the tangent plane.
     """
@@ -235,7 +320,9 @@ def locate(h, a, b, count, limits, constants, ones, width, place, u, v):  # type
         u[t], v[t] = x - fx, y - fy
         ahead = w > constants[6]
         within = ahead & (x >= edge[0]) & (x < edge[1]) & (y >= edge[2]) & (y < edge[3])
-        on_grid = ahead & (fx >= limits[0]) & (fx <= limits[1]) & (fy >= limits[2]) & (fy <= limits[3])
+        on_grid = (
+            ahead & (fx >= limits[0]) & (fx <= limits[1]) & (fy >= limits[2]) & (fy <= limits[3])
+        )
         index = int32(int32(int32(int32(fy) - y0) * width) + int32(int32(fx) - x0))
         place[t] = index if on_grid else int32(-1)
         inside = int32(inside + int32(within))
@@ -243,7 +330,14 @@ def locate(h, a, b, count, limits, constants, ones, width, place, u, v):  # type
     return inside, front
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}, inline="always")
+@nb.njit(
+    nogil=True,
+    cache=True,
+    boundscheck=False,
+    error_model="numpy",
+    fastmath={"contract", "nsz"},
+    inline="always",
+)
 def count_covered(place, u, v, count, width, covered):  # type: ignore[no-untyped-def]
     """The number of samples whose nearest grid point is covered."""
     total = int32(0)
@@ -254,9 +348,18 @@ def count_covered(place, u, v, count, width, covered):  # type: ignore[no-untype
     return total
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}, inline="always")
+@nb.njit(
+    nogil=True,
+    cache=True,
+    boundscheck=False,
+    error_model="numpy",
+    fastmath={"contract", "nsz"},
+    inline="always",
+)
 def span_on_grid(place, count):  # type: ignore[no-untyped-def]
-    """The multiples of four between which all samples on the grid lie; what is filled up behind ``count`` is off the grid."""
+    """The multiples of four between which all samples on the grid lie; what is filled up behind
+    ``count`` is off the grid.
+    """
     first, last = 0, count - 1
     while first < count and place[first] < 0:
         first += 1
@@ -270,12 +373,33 @@ def span_on_grid(place, count):  # type: ignore[no-untyped-def]
     return first, stop
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}, inline="always")
+@nb.njit(
+    nogil=True,
+    cache=True,
+    boundscheck=False,
+    error_model="numpy",
+    fastmath={"contract", "nsz"},
+    inline="always",
+)
 def _spline(place, u, v, first, stop, constants, at, weights):  # type: ignore[no-untyped-def]
-    """The cubic B-spline weights (8, CHUNK), four along x, four along y; ``at``: ``place``, 0 for samples off the grid."""
-    sixth, two_thirds, half, one, two = constants[0], constants[1], constants[2], constants[3], constants[4]
+    """The cubic B-spline weights (8, CHUNK), four along x, four along y; ``at``: ``place``, 0 for
+    samples off the grid.
+    """
+    sixth, two_thirds, half, one, two = (
+        constants[0],
+        constants[1],
+        constants[2],
+        constants[3],
+        constants[4],
+    )
     for k in range(2):
-        fractions, w0, w1, w2, w3 = (u, v)[k], weights[4 * k], weights[4 * k + 1], weights[4 * k + 2], weights[4 * k + 3]
+        fractions, w0, w1, w2, w3 = (
+            (u, v)[k],
+            weights[4 * k],
+            weights[4 * k + 1],
+            weights[4 * k + 2],
+            weights[4 * k + 3],
+        )
         for t in range(uint64(first), uint64(stop)):
             p = fractions[t]
             pm = one - p

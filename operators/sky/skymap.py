@@ -34,7 +34,11 @@ class InputImage(Product):
 
     def arrays(self) -> Mapping[str, Any]:
         """See `Product.arrays`."""
-        polarized = {} if self.image.polarization is None else {key: getattr(self.image, key) for key in POLARIZED}
+        polarized = (
+            {}
+            if self.image.polarization is None
+            else {key: getattr(self.image, key) for key in POLARIZED}
+        )
         return {"values": self.image.values, "header": dict(self.image.header.items()), **polarized}
 
     @classmethod
@@ -45,23 +49,29 @@ class InputImage(Product):
 
 
 class SkyMap(SkyParameters):
-    """Signal of the sky above the atmosphere (K_RJ), from a FITS or HEALPix map: averaged over the band, convolved with the beam.
+    """Signal of the sky above the atmosphere (K_RJ), from a FITS or HEALPix map: averaged over the
+    band, convolved with the beam.
 
-    Pixels are points, each with its own solid angle: a detector sees their sum under its beam. A TAN image is convolved on its
-    own pixels as far as they have one size; the pixels of other projections, wider TAN images and HEALPix maps are spread over a
-    TAN grid about the observation (without a beam, and with fewer than 2 pixels per FWHM: interpolated, third order). The
-    smoothing by the input's pixels is not undone. Sampling is by cubic B-splines on at least `pixels_per_fwhm` points per FWHM:
-    with 4 within 0.3 % of the peak of a point source; or linear (`interpolation`).
+    Pixels are points, each with its own solid angle: a detector sees their sum under its beam. A
+    TAN image is convolved on its own pixels as far as they have one size; the pixels of other
+    projections, wider TAN images and HEALPix maps are spread over a TAN grid about the observation
+    (without a beam, and with fewer than 2 pixels per FWHM: interpolated, third order). The
+    smoothing by the input's pixels is not undone. Sampling is by cubic B-splines on at least
+    `pixels_per_fwhm` points per FWHM: with 4 within 0.3 % of the peak of a point source; or linear
+    (`interpolation`).
 
-    Polarized detectors see I + p (Q cos 2 psi + U sin 2 psi) of maps of I, Q and U (`core.polarization`), whose Q and U are
-    turned to common axes before they are convolved and interpolated.
+    Polarized detectors see I + p (Q cos 2 psi + U sin 2 psi) of maps of I, Q and U
+    (`core.polarization`), whose Q and U are turned to common axes before they are convolved and
+    interpolated.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"sky"})
 
     def check(self, data: Data) -> list[str]:
-        """As `SkyParameters.check`, and what reading the map tells or refuses (`convolved.looked_at`)."""
+        """As `SkyParameters.check`, and what reading the map tells or refuses
+        (`convolved.looked_at`).
+        """
         return [*super().check(data), *looked_at(self, data)]
 
     def prepare(self, observation: Observation) -> SkyState:
@@ -70,11 +80,21 @@ class SkyMap(SkyParameters):
             observation.tally.state(self.label, "resolution", stated)
         sky = brightness_on(grid, self, observation.instrument.band)
         if not grid.reached(observation, float(widths.max(initial=0.0))):
-            observation.tally.state(self.label, f"{observation.name}: not convolved", "no detector reaches the input map")
+            observation.tally.state(
+                self.label,
+                f"{observation.name}: not convolved",
+                "no detector reaches the input map",
+            )
             return SkyState(grid, sky, [], index)
-        angles = None if sky.polarization is None else PolarizationAngles.of(observation, observation.sky_boresight, grid.axis)
+        angles = (
+            None
+            if sky.polarization is None
+            else PolarizationAngles.of(observation, observation.sky_boresight, grid.axis)
+        )
         band = observation.instrument.band
-        state = SkyState(grid, sky, [with_beam(grid, self, band, float(fwhm)) for fwhm in widths], index, angles)
+        state = SkyState(
+            grid, sky, [with_beam(grid, self, band, float(fwhm)) for fwhm in widths], index, angles
+        )
         state.tell(observation.tally, self.label)
         return state
 
@@ -94,7 +114,9 @@ class SkyMap(SkyParameters):
                 _show(self.label, data, image)
 
     def finalize(self, data: Data) -> None:
-        """Keep the input of the first observation as the product ``input``, or ``input.LABEL`` of a further map."""
+        """Keep the input of the first observation as the product ``input``, or ``input.LABEL`` of a
+        further map.
+        """
         show_input(self.label, data)
 
 
@@ -105,14 +127,20 @@ def _count(step: SkyMap, observation: Observation, state: SkyState) -> None:
     observation.tally.count(step.label, "samples outside the input map", beyond, total)
     if beyond == total:
         ra, dec = np.degrees(observation.centre)
-        cure = "" if isinstance(state.grid.source, HealpixMap) else "; `centre: target` moves the map there"
+        cure = (
+            ""
+            if isinstance(state.grid.source, HealpixMap)
+            else "; `centre: target` moves the map there"
+        )
         warnings.warn(
-            f"{step.label}: no sample of {observation.name} around RA {ra:.4f} deg, Dec {dec:.4f} deg falls on the input map "
-            f"{step.source}{cure}",
+            f"{step.label}: no sample of {observation.name} around RA {ra:.4f} deg, Dec {dec:.4f}"
+            f" deg falls on the input map {step.source}{cure}",
             stacklevel=3,
         )
     if behind:
-        observation.tally.count(step.label, "samples more than 90 deg from the input map's centre", behind, total)
+        observation.tally.count(
+            step.label, "samples more than 90 deg from the input map's centre", behind, total
+        )
 
 
 def show_input(label: str, data: Data) -> None:

@@ -1,7 +1,9 @@
-"""Files of CMB power spectra as theory codes write them: which columns, in which unit, with which factor.
+"""Files of CMB power spectra as theory codes write them: which columns, in which unit, with which
+factor.
 
-CAMB writes l, TT, EE, BB, TE as l (l + 1) C_l / (2 pi) in uK^2; CLASS l, TT, EE, TE, BB without dimension (of Delta T / T), or
-with ``format = camb`` as CAMB; Planck's likelihood l, TT, TE, EE, BB, PP. The comments above the numbers say which it is.
+CAMB writes l, TT, EE, BB, TE as l (l + 1) C_l / (2 pi) in uK^2; CLASS l, TT, EE, TE, BB without
+dimension (of Delta T / T), or with ``format = camb`` as CAMB; Planck's likelihood l, TT, TE, EE,
+BB, PP. The comments above the numbers say which it is.
 """
 
 from __future__ import annotations
@@ -31,10 +33,17 @@ BY_NUMBER: dict[int, tuple[str, ...]] = {1: ("TT",), 4: READ}
 FACTORS: dict[Unit, float] = {"uK^2": 1e-12, "K^2": 1.0, "dimensionless": T_CMB**2}
 """K^2 per unit."""
 PLAUSIBLE = 1.0, 3000.0
-"""uK: limits of the rms of a CMB sky, which is 110 uK for all multipoles and 30 uK for the first few."""
+"""uK: limits of the rms of a CMB sky, which is 110 uK for all multipoles and 30 uK for the first
+few.
+"""
 FALLS = 0.1
-"""Of l (l + 1) C_l about l = 200 over that about l = 15: it is 5 in the CMB; below, the column is C_l itself, with 0.03."""
-CURE = "give columns of text: l, TT or l, TT, EE, BB, TE, as l (l + 1) C_l / (2 pi) in uK^2 (as CAMB writes them)"
+"""Of l (l + 1) C_l about l = 200 over that about l = 15: it is 5 in the CMB; below, the column is
+C_l itself, with 0.03.
+"""
+CURE = (
+    "give columns of text: l, TT or l, TT, EE, BB, TE, as l (l + 1) C_l / (2 pi) in uK^2 (as CAMB"
+    " writes them)"
+)
 
 
 @dataclass(frozen=True)
@@ -59,14 +68,21 @@ class Spectrum:
         return float(np.sqrt(((2 * ell + 1) * self.values[0])[2:].sum() / (4 * np.pi)))
 
 
-def read(place: str, unit: Unit | None = None, scaling: Scaling | None = None, columns: Sequence[str] = ()) -> Spectrum:
-    """Read a file of spectra. ``unit``, ``scaling`` and ``columns`` (behind l) stand above what its comments say.
+def read(
+    place: str,
+    unit: Unit | None = None,
+    scaling: Scaling | None = None,
+    columns: Sequence[str] = (),
+) -> Spectrum:
+    """Read a file of spectra. ``unit``, ``scaling`` and ``columns`` (behind l) stand above what its
+    comments say.
 
     Raises
     ------
     InputError
-        It is no table of rising multipoles without gaps; columns that no heading names; no sky has these spectra; the rms of the
-        sky is not `PLAUSIBLE`, or the spectrum falls as C_l does, where no ``unit`` or ``scaling`` says so.
+        It is no table of rising multipoles without gaps; columns that no heading names; no sky has
+        these spectra; the rms of the sky is not `PLAUSIBLE`, or the spectrum falls as C_l does,
+        where no ``unit`` or ``scaling`` says so.
     """
     with reading(place, "a power spectrum", CURE):
         state = Path(place).stat()
@@ -74,7 +90,13 @@ def read(place: str, unit: Unit | None = None, scaling: Scaling | None = None, c
 
 
 @lru_cache(maxsize=4)
-def _read(place: str, changed: tuple[int, int], unit: Unit | None, scaling: Scaling | None, columns: tuple[str, ...]) -> Spectrum:
+def _read(
+    place: str,
+    changed: tuple[int, int],
+    unit: Unit | None,
+    scaling: Scaling | None,
+    columns: tuple[str, ...],
+) -> Spectrum:
     with reading(place, "a power spectrum", CURE):
         check_memory(4 * changed[1], "the table", place)
         try:
@@ -83,7 +105,9 @@ def _read(place: str, changed: tuple[int, int], unit: Unit | None, scaling: Scal
             raise ValueError(str(error).partition("; use `")[0]) from None
         with open(place, encoding="utf-8", errors="replace") as file:
             comments = [
-                line.strip("#! \n\t") for _, line in zip(range(100), file, strict=False) if line.lstrip().startswith(("#", "!"))
+                line.strip("#! \n\t")
+                for _, line in zip(range(100), file, strict=False)
+                if line.lstrip().startswith(("#", "!"))
             ]
     ell = table[:, 0]
     if not np.isfinite(table).all():
@@ -93,15 +117,27 @@ def _read(place: str, changed: tuple[int, int], unit: Unit | None, scaling: Scal
     if table.shape[1] < 2:
         raise InputError("has one column", place=place, cure=CURE)
     if (ell != np.round(ell)).any() or (np.diff(ell) <= 0).any() or ell[0] < 0 or ell[-1] > HIGHEST:
-        raise InputError(f"the first column is no rising series of multipoles up to {HIGHEST}", place=place, cure=CURE)
+        raise InputError(
+            f"the first column is no rising series of multipoles up to {HIGHEST}",
+            place=place,
+            cure=CURE,
+        )
     if (ell[-1] - max(ell[0], 2)) + 1 != np.count_nonzero(ell >= 2):
-        raise InputError("multipoles are missing between the first and the last", place=place, cure="give every l")
+        raise InputError(
+            "multipoles are missing between the first and the last",
+            place=place,
+            cure="give every l",
+        )
     names, named = _names(table.shape[1] - 1, comments, columns, place)
     stated = " ".join(comments).lower()
     said_unit, said_scaling = unit or _unit_of(stated), scaling or _scaling_of(stated)
     chosen_unit: Unit = said_unit or "uK^2"
     values, at = np.zeros((4, int(ell[-1]) + 1)), ell.astype(int)
-    flat = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0.0) if said_scaling != "none" else np.ones(len(ell))
+    flat = (
+        np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0.0)
+        if said_scaling != "none"
+        else np.ones(len(ell))
+    )
     for name, column in zip(names, table.T[1:], strict=True):
         if name in READ:
             values[READ.index(name), at] = column * flat * FACTORS[chosen_unit]
@@ -109,7 +145,11 @@ def _read(place: str, changed: tuple[int, int], unit: Unit | None, scaling: Scal
         values[:, :2] = 0.0  # monopole and dipole
     tt, ee, bb, te = values
     if min(tt.min(), ee.min(), bb.min()) < 0 or (te**2 > tt * ee * (1 + 1e-6)).any():
-        raise InputError("no sky has this spectrum: TT, EE or BB is negative, or TE^2 exceeds TT EE", place=place, cure=CURE)
+        raise InputError(
+            "no sky has this spectrum: TT, EE or BB is negative, or TE^2 exceeds TT EE",
+            place=place,
+            cure=CURE,
+        )
     which = ("C_l" if said_scaling == "none" else "l (l + 1) C_l / 2 pi") + f" in {chosen_unit}"
     unused = [name for name in names if name not in READ]
     text = f"{', '.join(n for n in names if n in READ)} ({named}) as {which}" + (
@@ -123,12 +163,20 @@ def _read(place: str, changed: tuple[int, int], unit: Unit | None, scaling: Scal
     return found
 
 
-def _names(number: int, comments: Sequence[str], given: Sequence[str], place: str) -> tuple[list[str], str]:
+def _names(
+    number: int, comments: Sequence[str], given: Sequence[str], place: str
+) -> tuple[list[str], str]:
     """Names of the columns behind l, and who says so."""
     names, who = [_plain(name) for name in given], "as given"
     if not names:
-        headings = [found for line in comments if (found := _heading(line)) and len(found) == number]
-        names, who = (headings[-1], "by the file's heading") if headings else (list(BY_NUMBER.get(number, ())), "by their number")
+        headings = [
+            found for line in comments if (found := _heading(line)) and len(found) == number
+        ]
+        names, who = (
+            (headings[-1], "by the file's heading")
+            if headings
+            else (list(BY_NUMBER.get(number, ())), "by their number")
+        )
     if len(names) != number or "TT" not in names or len(set(names)) < number:
         cure = f"set columns to the names of those behind l, e.g. columns: TT, EE, TE, BB; {CURE}"
         told = f"columns names {', '.join(names)}" if given else "no heading names them"
@@ -166,11 +214,20 @@ def _check_rms(found: Spectrum, unit: Unit, place: str) -> None:
     rms, (least, most) = 1e6 * found.rms, PLAUSIBLE
     if rms == 0.0 or least <= rms <= most:
         return
-    others = [(name, rms * (FACTORS[name] / FACTORS[unit]) ** 0.5) for name in FACTORS if name != unit]
+    others = [
+        (name, rms * (FACTORS[name] / FACTORS[unit]) ** 0.5) for name in FACTORS if name != unit
+    ]
     right = [f"{name} (rms {value:.3g} uK)" for name, value in others if least <= value <= most]
-    cure = f"set unit: {' or '.join(right)}" if right else "set unit to uK^2, K^2 or dimensionless, if that is what is meant"
+    cure = (
+        f"set unit: {' or '.join(right)}"
+        if right
+        else "set unit to uK^2, K^2 or dimensionless, if that is what is meant"
+    )
     raise InputError(
-        f"a sky of this spectrum, taken in {unit}, has an rms of {rms:.3g} uK, and the CMB about 100 uK", place=place, cure=cure
+        f"a sky of this spectrum, taken in {unit}, has an rms of {rms:.3g} uK, and the CMB about"
+        " 100 uK",
+        place=place,
+        cure=cure,
     )
 
 
@@ -183,7 +240,11 @@ def _check_shape(found: Spectrum, place: str) -> None:
     low, high = power[10:21].mean(), power[150:301].mean()
     if low > 0 and high < FALLS * low:
         raise InputError(
-            f"l (l + 1) C_l falls from l = 15 to 200 by a factor of {low / max(high, 1e-300):.3g}, where that of the CMB rises",
+            f"l (l + 1) C_l falls from l = 15 to 200 by a factor of {low / max(high, 1e-300):.3g},"
+            " where that of the CMB rises",
             place=place,
-            cure="set scaling: none where the columns are C_l, or scaling: l(l+1)/2pi where they are as stated",
+            cure=(
+                "set scaling: none where the columns are C_l, or scaling: l(l+1)/2pi where they are"
+                " as stated"
+            ),
         )

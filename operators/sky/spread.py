@@ -3,22 +3,24 @@ the pixels under it.
 
 A detector that looks along d sees, of pixels of brightness T_j and of their own solid angles W_j,
 
-    s(d) = sum_j T_j W_j / (2 pi sigma^2) exp(-r_j^2 / 2 sigma^2),   sigma = FWHM / sqrt(8 ln 2),  (1)
+    s(d) = sum_j T_j W_j / (2 pi sigma^2) exp(-r_j^2 / 2 sigma^2),   sigma = FWHM / sqrt(8 ln 2),
+    (1)
 
 r_j the angle between d and the pixel. On a plane that touches the sphere at x = 0, with delta the
 offset from a pixel on the sky and delta_r its part away from the tangent point, the Gaussian about
 x_j has the covariance and the skewness
 
-    C_j = sigma^2 (1 + x_j^2) (1 + x_j x_j^T),                                                     (2)
-    exp(-r^2 / 2 sigma^2) = exp(-delta^2 / 2 sigma^2) (1 + |x_j| delta_r delta^2 / sigma^2),       (3)
+    C_j = sigma^2 (1 + x_j^2) (1 + x_j x_j^T),   (2)
+    exp(-r^2 / 2 sigma^2) = exp(-delta^2 / 2 sigma^2) (1 + |x_j| delta_r delta^2 / sigma^2),
+    (3)
 
 up to terms of sigma^2 (2e-4 of a uniform sky for a beam of 1 deg). It is the convolution of a
 narrower Gaussian, of covariance C_j - (1 - f) sigma^2, with one that is the same everywhere, of
-(1 - f) sigma^2; (3) becomes Hermite polynomials of the narrower one. The narrower ones are summed up
-pixel by pixel (Greengard & Lee 2004), the other is one Fourier transform
-(`beam.convolve_evenly`). Nothing is interpolated: size, shape and place of pixels do not matter, and
-flux is conserved. A grid of step h errs by exp(-2 pi^2 f (1 - f) (sigma / h)^2), 1e-6 of a peak at 5
-points per FWHM and f = 1/5.
+(1 - f) sigma^2; (3) becomes Hermite polynomials of the narrower one. The narrower ones are summed
+up pixel by pixel (Greengard & Lee 2004), the other is one Fourier transform
+(`beam.convolve_evenly`). Nothing is interpolated: size, shape and place of pixels do not matter,
+and flux is conserved. A grid of step h errs by exp(-2 pi^2 f (1 - f) (sigma / h)^2), 1e-6 of a peak
+at 5 points per FWHM and f = 1/5.
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ from .resample import BLOCK, Block, ImageOnSky, Progress, blocks, no_progress, s
 LEAST, MOST = 0.2, 0.5
 """Of f."""
 PIXELS = 0.65
-"""Standard deviation of the narrower Gaussians, in pixels of the map, from which these do not show."""
+"""Standard deviation of the narrower Gaussians, in pixels of the map, from which these do not show.
+"""
 ALIAS = 9.0
 """Exponent of what a grid may err by, where some share attains that: 1e-4 of a peak."""
 CUT = 5.0
@@ -72,7 +75,9 @@ class Spread:
 
     @classmethod
     def of(cls, fwhm: float, pixel: float, step: float) -> Spread:
-        """The least share, in steps of 0.1, that hides pixels of a side ``pixel`` and serves a grid of ``step`` [rad]."""
+        """The least share, in steps of 0.1, that hides pixels of a side ``pixel`` and serves a grid
+        of ``step`` [rad].
+        """
         wanted = (PIXELS * pixel / (SIGMA * fwhm)) ** 2
         needed = (ALIAS * (step / (SIGMA * fwhm)) ** 2) / (2 * math.pi**2)  # f (1 - f)
         least = 0.5 - math.sqrt(max(0.25 - needed, 0.0))
@@ -87,8 +92,17 @@ class Spread:
         """Variance that is left to convolve with for a beam of ``fwhm`` [rad], rad^2."""
         return float(SIGMA**2 * (fwhm**2 - self.share * self.fwhm**2))
 
-    def add(self, out: Floats, x: Floats, y: Floats, powers: Floats, origin: tuple[float, float], step: float) -> None:
-        """Add pixels of ``powers`` (k, n) [K sr] at grid points ``x``, ``y`` (n,) to ``out`` (k, ny, nx) [K].
+    def add(
+        self,
+        out: Floats,
+        x: Floats,
+        y: Floats,
+        powers: Floats,
+        origin: tuple[float, float],
+        step: float,
+    ) -> None:
+        """Add pixels of ``powers`` (k, n) [K sr] at grid points ``x``, ``y`` (n,) to ``out`` (k,
+        ny, nx) [K].
 
         The grid touches the sphere at its point ``origin`` (x, y); its ``step`` is in rad.
         """
@@ -109,8 +123,8 @@ def spread_map(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """(values, covered) of a map on the TAN grid ``target``: K_RJ less ``outside``, spread.
 
-    Each pixel counts once: of an image that goes round the sky more than once, the first time. A grid
-    point is covered where the map has the pixel that it lies in.
+    Each pixel counts once: of an image that goes round the sky more than once, the first time. A
+    grid point is covered where the map has the pixel that it lies in.
 
     Parameters
     ----------
@@ -125,7 +139,11 @@ def spread_map(
     matrix, step = pixel_matrix(target), float(np.radians(target.wcs.cdelt[1]))
     origin = float(target.wcs.crpix[0]) - 1, float(target.wcs.crpix[1]) - 1
     found, covered = np.zeros((1 if axis is None else 3, ny, nx)), np.zeros((ny, nx), bool)
-    under = _of_healpix(source, axis) if isinstance(source, HealpixMap) else _of_image(source, target, axis)
+    under = (
+        _of_healpix(source, axis)
+        if isinstance(source, HealpixMap)
+        else _of_image(source, target, axis)
+    )
     for block in blocks(target, tiles, progress):
         left, low = int(block.x.min()) // BLOCK * BLOCK, int(block.y.min()) // BLOCK * BLOCK
 
@@ -133,9 +151,17 @@ def spread_map(
             """True if pixels are nearest to points of the block."""
             with np.errstate(invalid="ignore", divide="ignore"):
                 x, y = (np.rint(k) for k in _places(matrix, d))
-                inside = (x >= left) & (x < min(left + BLOCK, nx)) & (y >= low) & (y < min(low + BLOCK, ny)) & (d @ matrix[2] > 0)
+                inside = (
+                    (x >= left)
+                    & (x < min(left + BLOCK, nx))
+                    & (y >= low)
+                    & (y < min(low + BLOCK, ny))
+                    & (d @ matrix[2] > 0)
+                )
             if tiles is not None:
-                inside[inside] = tiles[(y[inside] // TILE).astype(int), (x[inside] // TILE).astype(int)]
+                inside[inside] = tiles[
+                    (y[inside] // TILE).astype(int), (x[inside] // TILE).astype(int)
+                ]
             return np.asarray(inside, np.bool_)
 
         there, parts = under(block, nearest)
@@ -157,7 +183,9 @@ def _of_image(image: WcsMap, target: Any, axis: Floats | None) -> Under:
     """Pixels of an image under blocks of ``target``."""
     sky, to_sky = ImageOnSky(image), np.linalg.inv(pixel_matrix(target)).T
 
-    def parts(rows: NDArray[np.int64], columns: NDArray[np.int64], chosen: Chosen) -> Iterator[Part]:
+    def parts(
+        rows: NDArray[np.int64], columns: NDArray[np.int64], chosen: Chosen
+    ) -> Iterator[Part]:
         some = max(AT_ONCE // max(len(columns), 1), 1)
         for first in range(0, len(rows), some):
             x, y = (k.ravel() for k in np.meshgrid(columns, rows[first : first + some]))
@@ -206,7 +234,9 @@ def _of_healpix(sky: HealpixMap, axis: Floats | None) -> Under:
         middle = d.mean(axis=0)
         middle /= np.linalg.norm(middle)
         radius = float(np.arccos(np.clip((d @ middle).min(), -1, 1))) + block.step
-        return there, parts(np.sort(healpy.query_disc(sky.nside, middle, min(radius, np.pi), nest=sky.nest)), chosen)
+        return there, parts(
+            np.sort(healpy.query_disc(sky.nside, middle, min(radius, np.pi), nest=sky.nest)), chosen
+        )
 
     return under
 
@@ -219,7 +249,11 @@ def _add(out, x, y, powers, x0, y0, step, sigma, share):  # type: ignore[no-unty
         u, v = (x[j] - x0) * step, (y[j] - y0) * step
         away = u * u + v * v
         q = 1.0 + away
-        xx, xy, yy = square * (q * (1.0 + u * u) - rest), square * q * u * v, square * (q * (1.0 + v * v) - rest)
+        xx, xy, yy = (
+            square * (q * (1.0 + u * u) - rest),
+            square * q * u * v,
+            square * (q * (1.0 + v * v) - rest),
+        )
         det = xx * yy - xy * xy
         a, b, c = yy / det * step * step, -xy / det * step * step, xx / det * step * step
         factor = q * math.sqrt(q) / (2.0 * math.pi * math.sqrt(det))
@@ -234,7 +268,11 @@ def _add(out, x, y, powers, x0, y0, step, sigma, share):  # type: ignore[no-unty
             root = math.sqrt(q)
             au, av = -v / t * step / root / sigma, u / t * step / root / sigma
             qr, qt = 1.0 / (1.0 - rest / (q * q)), 1.0 / (1.0 - rest / q)
-            k1, k3, k12 = sigma * t * qr * (3.0 * (1.0 - qr) + 1.0 - qt), sigma * t * qr * qr * qr, sigma * t * qr * qt * qt
+            k1, k3, k12 = (
+                sigma * t * qr * (3.0 * (1.0 - qr) + 1.0 - qt),
+                sigma * t * qr * qr * qr,
+                sigma * t * qr * qt * qt,
+            )
         ratio = math.exp(-a)
         for row in range(low, top + 1):
             dy, dx = row - y[j], left - x[j]

@@ -1,4 +1,6 @@
-"""What `SkyMap` keeps for an observation: the convolved maps, where the boresight is on them, what was counted."""
+"""What `SkyMap` keeps for an observation: the convolved maps, where the boresight is on them, what
+was counted.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,13 @@ class Beam:
     polarization: tuple[Coefficients, ...] = ()
 
     @classmethod
-    def of(cls, sky: Brightness, fwhm: float, convolved: Convolved, polarization: tuple[Coefficients, ...] = ()) -> Beam:
+    def of(
+        cls,
+        sky: Brightness,
+        fwhm: float,
+        convolved: Convolved,
+        polarization: tuple[Coefficients, ...] = (),
+    ) -> Beam:
         """``convolved``: ``sky`` with the beam of ``fwhm`` [rad]."""
         matrix = convolved.to_grid @ pixel_matrix(sky.wcs)
         return cls(fwhm, convolved, matrix, _on_grid(sky.covered, convolved), polarization)
@@ -57,16 +65,24 @@ class Beam:
     @property
     def nbytes(self) -> int:
         kept = (self.convolved.coefficients, *self.polarization)
-        return self.covered.nbytes + sum(c.nbytes for coefficients in kept for c in coefficients.values())
+        return self.covered.nbytes + sum(
+            c.nbytes for coefficients in kept for c in coefficients.values()
+        )
 
     def tell(self, tally: Tally, label: str) -> None:
         """State its width and how finely it is sampled."""
         if self.fwhm == 0.0:
             tally.state(label, "beam", "none")
             return
-        text = f"Gaussian, {' x '.join(str(q) for q in self.convolved.steps)} grid steps per input pixel"
+        text = (
+            f"Gaussian, {' x '.join(str(q) for q in self.convolved.steps)} grid steps per input"
+            " pixel"
+        )
         if self.convolved.coarse:
-            text += "; the input has fewer than 2 pixels per FWHM: it is taken as smooth between its pixels"
+            text += (
+                "; the input has fewer than 2 pixels per FWHM: it is taken as smooth between its"
+                " pixels"
+            )
         tally.state(label, f"beam of {np.degrees(self.fwhm) * 3600:.6g} arcsec", text)
 
 
@@ -76,7 +92,10 @@ def _on_grid(covered: NDArray[np.bool_], convolved: Convolved) -> NDArray[np.uin
     shape = convolved.coefficients["float64"].shape
     whole = np.zeros(shape, np.uint8)
     (qx, qy), (x0, _, y0, _) = convolved.steps, convolved.bounds
-    x, y = np.floor((np.arange(shape[1]) - x0) / qx).astype(int), np.floor((np.arange(shape[0]) - y0) / qy).astype(int)
+    x, y = (
+        np.floor((np.arange(shape[1]) - x0) / qx).astype(int),
+        np.floor((np.arange(shape[0]) - y0) / qy).astype(int),
+    )
     in_x, in_y = (x >= 0) & (x < covered.shape[1]), (y >= 0) & (y < covered.shape[0])
     whole[np.ix_(in_y, in_x)] = covered[np.ix_(y[in_y], x[in_x])]
     return whole
@@ -102,7 +121,8 @@ class SkyState:
     index
         (n_det,) number of each detector's beam.
     angles
-        Of the detectors on the sky, from the meridians of the grid's Q and U; None: there are no Q and U.
+        Of the detectors on the sky, from the meridians of the grid's Q and U; None: there are no Q
+        and U.
     """
 
     grid: Grid
@@ -124,12 +144,17 @@ class SkyState:
             beam.tell(tally, label)
 
     def sample(self, block: Block, out: AnyFloats, linear: bool, over: bool) -> None:
-        """Add the sky to a block's stream (`sampling.sample`), and count the samples that see none."""
+        """Add the sky to a block's stream (`sampling.sample`), and count the samples that see
+        none.
+        """
         plane, index = block.observation.focalplane, self.index[block.detectors]
         xi, eta = plane.xi[block.detectors], plane.eta[block.detectors]
         beyond = behind = 0
         if not self.beams:
-            beyond, behind = out.size, self.grid.behind(block.observation.sky_boresight[block.samples], xi, eta)
+            beyond, behind = (
+                out.size,
+                self.grid.behind(block.observation.sky_boresight[block.samples], xi, eta),
+            )
         kernel = add_lines if linear else add_splines
         for number, beam in enumerate(self.beams):
             rows = np.flatnonzero(index == number)
@@ -144,9 +169,15 @@ class SkyState:
         if not block.again:  # a block that is made again is counted once
             self._counts[block.detectors.start, block.samples.start] = (beyond, behind)
 
-    def _polarize(self, block: Block, kernel: Any, chunks: Chunks, beam: Beam, detectors: Rows, out: AnyFloats) -> None:
-        """Add p (Q cos 2 psi + U sin 2 psi) of the detectors that are polarized, equation (1) of `core.polarization`."""
-        efficiency = block.observation.focalplane.polarization_efficiency[block.detectors][detectors.numbers]
+    def _polarize(
+        self, block: Block, kernel: Any, chunks: Chunks, beam: Beam, detectors: Rows, out: AnyFloats
+    ) -> None:
+        """Add p (Q cos 2 psi + U sin 2 psi) of the detectors that are polarized, equation (1) of
+        `core.polarization`.
+        """
+        efficiency = block.observation.focalplane.polarization_efficiency[block.detectors][
+            detectors.numbers
+        ]
         seeing = efficiency > 0
         rows = Rows(detectors.numbers[seeing], detectors.xi[seeing], detectors.eta[seeing])
         if not rows.numbers.size or self.angles is None:
@@ -155,20 +186,33 @@ class SkyState:
         planes = []
         for name, coefficients in zip("QU", beam.polarization, strict=True):
             planes.append(block.buffer(f"sky {name}", (rows.numbers.size, out.shape[1])))
-            sample(kernel, chunks, own, coefficients[out.dtype.name], beam.covered, planes[-1], True)
+            sample(
+                kernel, chunks, own, coefficients[out.dtype.name], beam.covered, planes[-1], True
+            )
         which = rows.numbers + block.detectors.start
-        self.angles.add(which, block.samples.start, efficiency[seeing], (planes[0], planes[1]), rows.numbers, out)
+        self.angles.add(
+            which,
+            block.samples.start,
+            efficiency[seeing],
+            (planes[0], planes[1]),
+            rows.numbers,
+            out,
+        )
 
     def _pointing(self, block: Block, number: int, kind: Any) -> Chunks:
         """`pointing` of a block for a beam, which blocks of other detectors share."""
 
         def make() -> _Held:
-            quaternions = np.ascontiguousarray(block.observation.sky_boresight[block.samples], np.float64)
+            quaternions = np.ascontiguousarray(
+                block.observation.sky_boresight[block.samples], np.float64
+            )
             beam = self.beams[number]
             shape = beam.convolved.coefficients["float64"].shape
             return _Held(pointing(quaternions, beam.matrix, shape, beam.convolved.bounds, kind))
 
-        held: _Held = self._chunks.get((block.samples.start, block.samples.stop, number, kind), make)
+        held: _Held = self._chunks.get(
+            (block.samples.start, block.samples.stop, number, kind), make
+        )
         return held.chunks
 
     def totals(self) -> tuple[int, int]:

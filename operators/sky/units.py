@@ -21,7 +21,9 @@ DOUBT = "doubtful"
 """Key of the note about what is possible and not likely."""
 
 
-def unit_of(place: str, header: Any, key: str, given: str | None, notes: dict[str, str]) -> tuple[str, float]:
+def unit_of(
+    place: str, header: Any, key: str, given: str | None, notes: dict[str, str]
+) -> tuple[str, float]:
     """`parse_unit` of the unit ``given``, or of the header's ``key``."""
     written = text(header, key, place)
     wanted = given if given is not None else written
@@ -36,18 +38,29 @@ def unit_of(place: str, header: Any, key: str, given: str | None, notes: dict[st
     return parse_unit(wanted, place=place, temperature_scale=text(header, "TEMPSCAL", place))
 
 
-def beam_solid_angle(place: str, header: Any, unit: str, given: float | None, notes: dict[str, str]) -> float | None:
-    """sr, of the beam of a map in Jy/beam: ``given`` as its FWHM [rad], or the header's BMAJ and BMIN; None in other units."""
+def beam_solid_angle(
+    place: str, header: Any, unit: str, given: float | None, notes: dict[str, str]
+) -> float | None:
+    """sr, of the beam of a map in Jy/beam: ``given`` as its FWHM [rad], or the header's BMAJ and
+    BMIN; None in other units.
+    """
     if unit != "Jy/beam":
         if given is not None:
             raise InputError(
-                f"input_beam is for maps in Jy/beam, and this one is in {unit}", place=place, cure="remove input_beam"
+                f"input_beam is for maps in Jy/beam, and this one is in {unit}",
+                place=place,
+                cure="remove input_beam",
             )
         return None
-    degrees = "set the header keys BMAJ and BMIN (FWHM in degrees), or the operator's parameter input_beam"
+    degrees = (
+        "set the header keys BMAJ and BMIN (FWHM in degrees), or the operator's parameter"
+        " input_beam"
+    )
     if given is not None:
         if "BMAJ" in header:
-            notes["input beam"] = f"{np.degrees(given) * 3600:g} arcsec as given; BMAJ and BMIN are overridden"
+            notes["input beam"] = (
+                f"{np.degrees(given) * 3600:g} arcsec as given; BMAJ and BMIN are overridden"
+            )
         return float(np.pi / (4 * np.log(2)) * given**2)
     major = number(header, "BMAJ", place, degrees)
     minor = number(header, "BMIN", place, degrees) if major is not None else None
@@ -56,11 +69,16 @@ def beam_solid_angle(place: str, header: Any, unit: str, given: float | None, no
         raise InputError(
             "a map in Jy/beam needs the beam it was made with, and its header has no BMAJ",
             place=place,
-            cure="set the header keys BMAJ and BMIN (FWHM in degrees), or the operator's parameter input_beam: 18 arcsec, the "
-            "FWHM of the map's beam (not fwhm, which is that of the telescope simulated)",
+            cure=(
+                "set the header keys BMAJ and BMIN (FWHM in degrees), or the operator's parameter"
+                " input_beam: 18 arcsec, the FWHM of the map's beam (not fwhm, which is that of the"
+                " telescope simulated)"
+            ),
         )
     if min(major, minor) <= 0:
-        raise InputError(f"BMAJ = {major:g} and BMIN = {minor:g} are no widths", place=place, cure=degrees)
+        raise InputError(
+            f"BMAJ = {major:g} and BMIN = {minor:g} are no widths", place=place, cure=degrees
+        )
     check_sides((major, minor), place, degrees)
     return float(np.pi / (4 * np.log(2)) * np.radians(major) * np.radians(minor))
 
@@ -73,7 +91,8 @@ def check_beam(
     given: bool,
     notes: dict[str, str],
 ) -> None:
-    """Refuse a beam of ``area`` [sr] that the map cannot have: wider than all of it, or far smaller than its pixels.
+    """Refuse a beam of ``area`` [sr] that the map cannot have: wider than all of it, or far smaller
+    than its pixels.
 
     Parameters
     ----------
@@ -93,27 +112,41 @@ def check_beam(
         return
     fwhm, side = math.sqrt(area * 4 * math.log(2) / math.pi), math.sqrt(pixels[0] * pixels[1])
     text = f"the beam of the map is {size_text(fwhm)} wide"
-    cure = "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them, or set the operator's parameter input_beam: 18 arcsec"
+    cure = (
+        "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them, or set the operator's"
+        " parameter input_beam: 18 arcsec"
+    )
     across = max(shape[0] * pixels[1], shape[1] * pixels[0]) if len(shape) == 2 else math.pi
     if not given:
         check_width(fwhm, across, place, cure)
     if not given and fwhm < side / 5:
         raise InputError(f"{text}, and its pixels {size_text(side)}", place=place, cure=cure)
     if not side / 2 <= fwhm <= min(across, MANY * side):
-        notes[DOUBT] = f"{text}, its pixels {size_text(side)} and all of it {size_text(across)}: is that right? {cure}"
+        notes[DOUBT] = (
+            f"{text}, its pixels {size_text(side)} and all of it {size_text(across)}: is that"
+            f" right? {cure}"
+        )
 
 
 def filled(place: str, values: Floats, missing: str, first: str) -> int:
-    """Zero the non-finite values in place on request; their number. ``first``: how to name the first one, by its indices."""
+    """Zero the non-finite values in place on request; their number. ``first``: how to name the
+    first one, by its indices.
+    """
     bad = ~np.isfinite(values)
     count = int(bad.sum())
     if count and missing == "error":
         where = np.unravel_index(int(np.flatnonzero(bad)[0]), values.shape)
         raise InputError(
-            f"{count} of {values.size} pixels are NaN or infinite, the first at {first.format(*(int(k) + 1 for k in where))}",
+            f"{count} of {values.size} pixels are NaN or infinite, the first at"
+            f" {first.format(*(int(k) + 1 for k in where))}",
             place=place,
-            cure="mend the map, or set the operator's parameter missing: zero to take them as zero (they are counted)",
+            cure=(
+                "mend the map, or set the operator's parameter missing: zero to take them as zero"
+                " (they are counted)"
+            ),
         )
     values[bad] = 0.0
-    check_values(values, place, LARGEST, "in its unit", "check the map, and the header's BSCALE and BZERO")
+    check_values(
+        values, place, LARGEST, "in its unit", "check the map, and the header's BSCALE and BZERO"
+    )
     return count

@@ -1,1 +1,3 @@
-"""The built-in checks of `zonda doctor`: those that say something about the machine at hand, one module per family."""
+"""The built-in checks of `zonda doctor`: those that say something about the machine at hand, one
+module per family.
+"""

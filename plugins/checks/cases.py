@@ -6,12 +6,14 @@ from zonda.core.checks import Case
 
 DECADES = Case(
     "7 decades between atmosphere (30 K) and signal (1 uK)",
-    "noiseless transfer function with and without a 30 K atmospheric mean differ by < 1e-3; a common mode 1e7 "
-    "x the signal leaves < 1e-8 K in float64, and in float32 the run chooses float64 or refuses",
+    "noiseless transfer function with and without a 30 K atmospheric mean differ by < 1e-3; a"
+    " common mode 1e7 x the signal leaves < 1e-8 K in float64, and in float32 the run chooses"
+    " float64 or refuses",
 )
 PINK = Case(
     "1/f noise to f -> 0; hours to days",
-    "explicit f_min; PSD within the stated error over the whole band; variance of a week equals theory",
+    "explicit f_min; PSD within the stated error over the whole band; variance of a week equals"
+    " theory",
 )
 TIME = Case(
     "timestamps ~1.8e9 s; leap seconds; sampling jitter; gaps; NaN rows",

@@ -24,7 +24,9 @@ SCALE = 2.0**-20
 
 
 def small_map(place: str) -> None:
-    """Run a small scene with everything in it; write its map and the largest value of its streams."""
+    """Run a small scene with everything in it; write its map and the largest value of its
+    streams.
+    """
     with sky_file(1e-3 * np.random.default_rng(0).standard_normal((64, 64))) as path:
         steps = [
             zonda.PointingDaisy(radius="2 arcmin", speed="1 arcmin/s", scan_duration="40 s"),
@@ -39,7 +41,12 @@ def small_map(place: str) -> None:
         ]
         data = zonda.Pipeline(steps).run(scene(camera(37)), threads=1, keep=("atmosphere", "pink"))
     largest = max(float(np.abs(x).max()) for x in data.observations[0].detdata.values())
-    np.savez(Path(place) / "map.npz", signal=data.products["map"].signal, hits=data.products["map"].hits, largest=largest)
+    np.savez(
+        Path(place) / "map.npz",
+        signal=data.products["map"].signal,
+        hits=data.products["map"].hits,
+        largest=largest,
+    )
 
 
 def _in_a_process(folder: Path, environment: dict[str, str]) -> dict[str, np.ndarray]:
@@ -58,16 +65,32 @@ def _in_a_process(folder: Path, environment: dict[str, str]) -> dict[str, np.nda
 
 
 def baseline() -> dict[str, str]:
-    """Environment variables that restrict numba and numpy to the architecture's basic instruction set."""
+    """Environment variables that restrict numba and numpy to the architecture's basic instruction
+    set.
+    """
     numpy = str(arithmetic()["numpy instructions"])
-    return {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NPY_DISABLE_CPU_FEATURES": numpy}
+    return {
+        "NUMBA_CPU_NAME": "generic",
+        "NUMBA_CPU_FEATURES": "",
+        "NPY_DISABLE_CPU_FEATURES": numpy,
+    }
 
 
-@checks.add(DISPATCH, reference="the same scene without vector instructions", limit=10, unit="x 2^-20 of the largest value")
+@checks.add(
+    DISPATCH,
+    reference="the same scene without vector instructions",
+    limit=10,
+    unit="x 2^-20 of the largest value",
+)
 def another_instruction_set() -> Measured:
-    """largest difference of a filtered map, over float32's rounding of the streams it is made of; the same hits"""
+    """largest difference of a filtered map, over float32's rounding of the streams it is made of;
+    the same hits
+    """
     with TemporaryDirectory() as folder:
-        here, there = _in_a_process(Path(folder, "here"), {}), _in_a_process(Path(folder, "there"), baseline())
+        here, there = (
+            _in_a_process(Path(folder, "here"), {}),
+            _in_a_process(Path(folder, "there"), baseline()),
+        )
     change = float(np.nanmax(np.abs(here["signal"] - there["signal"])))
     same = np.array_equal(here["hits"], there["hits"])
     return change / (SCALE * float(here["largest"])) if same else np.inf, f"{change:.1e} K"

@@ -20,7 +20,8 @@ checks = Family("machine")
 
 ULP = 2.0**-52
 
-# arguments and correctly rounded values (mpmath, 60 digits; tests/test_hard_cases.py makes them again)
+# arguments and correctly rounded values (mpmath, 60 digits; tests/test_hard_cases.py makes them
+# again)
 FUNCTIONS = (
     ("exp", 1.0, 2.718281828459045),
     ("exp", -700.5, 5.980196118639791e-305),
@@ -45,7 +46,10 @@ def description() -> dict[str, str]:
     cpu, features = _cpu()
     found["cpu"] = cpu
     found["vector units"] = (
-        " ".join(f for f in ("sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve") if f in features) or "?"
+        " ".join(
+            f for f in ("sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve") if f in features
+        )
+        or "?"
     )
     found["long double"] = f"{np.finfo(np.longdouble).nmant + 1} bits"
     found["threads"] = f"{available_threads()} of {os.cpu_count()}"
@@ -59,12 +63,15 @@ def _cpu() -> tuple[str, set[str]]:
     """Name and features of the CPU as LLVM sees them: what compiled code is made for."""
     from llvmlite import binding
 
-    return binding.get_host_cpu_name(), {name for name, there in binding.get_host_cpu_features().items() if there}
+    return binding.get_host_cpu_name(), {
+        name for name, there in binding.get_host_cpu_features().items() if there
+    }
 
 
 @checks.add(MACHINE, reference="IEEE 754", limit=0, unit="operations")
 def denormals() -> Measured:
-    """denormal numbers flushed to zero, float32 and float64, in the main thread and in two others, after compiled code ran
+    """denormal numbers flushed to zero, float32 and float64, in the main thread and in two others,
+    after compiled code ran
 
     A library built with -ffast-math switches them off for the whole process.
     """
@@ -80,18 +87,34 @@ def denormals() -> Measured:
     return count, "flushed" if count else "kept"
 
 
-@checks.add(MACHINE, reference="IEEE 754, to nearest even, no excess precision", limit=0, unit="operations")
+@checks.add(
+    MACHINE, reference="IEEE 754, to nearest even, no excess precision", limit=0, unit="operations"
+)
 def rounding() -> int:
     """float64 sums, products and quotients that are rounded in another way"""
     one, half = np.float64(1.0), np.float64(ULP / 2)
     excess = (np.float64(1e16) + np.float64(2.9999)) - np.float64(1e16)
-    good = [one + half == one, one + half * 1.0001 != one, one + ULP + half == one + 2 * ULP, excess == 2.0 or excess == 4.0]
-    good += [np.float64(0.1) + np.float64(0.2) == 0.30000000000000004, np.float64(1) / np.float64(49) * np.float64(49) != 1.0]
-    good += [np.float64(5e-324) > 0, math.fsum([1e100, 1.0, -1e100]) == 1.0, np.float32(16777217) == np.float32(16777216)]
+    good = [
+        one + half == one,
+        one + half * 1.0001 != one,
+        one + ULP + half == one + 2 * ULP,
+        excess == 2.0 or excess == 4.0,
+    ]
+    good += [
+        np.float64(0.1) + np.float64(0.2) == 0.30000000000000004,
+        np.float64(1) / np.float64(49) * np.float64(49) != 1.0,
+    ]
+    good += [
+        np.float64(5e-324) > 0,
+        math.fsum([1e100, 1.0, -1e100]) == 1.0,
+        np.float32(16777217) == np.float32(16777216),
+    ]
     return sum(not g for g in good)
 
 
-@checks.add(MACHINE, reference="60-digit arithmetic (mpmath)", limit=4, unit="units in the last place")
+@checks.add(
+    MACHINE, reference="60-digit arithmetic (mpmath)", limit=4, unit="units in the last place"
+)
 def elementary_functions() -> Measured:
     """error of exp, log, sin and their like, of vectors as zonda calls them"""
     worst, which = 0.0, ""
@@ -138,12 +161,19 @@ def memory() -> Measured:
 
 @checks.add(MACHINE, reference="today", limit=0, unit="days short")
 def earth_orientation() -> Measured:
-    """how far the bundled IERS tables, predictions included, fall short of today; pip install -U astropy-iers-data renews them"""
+    """how far the bundled IERS tables, predictions included, fall short of today; pip install -U
+    astropy-iers-data renews them
+    """
     from zonda.core.numerics.earth_orientation import orientation
 
-    today = (datetime.datetime.now(datetime.UTC) - datetime.datetime(1858, 11, 17, tzinfo=datetime.UTC)).days
+    today = (
+        datetime.datetime.now(datetime.UTC) - datetime.datetime(1858, 11, 17, tzinfo=datetime.UTC)
+    ).days
     known = [day for day in range(0, 400, 10) if orientation(np.array([today + day + 0.5])).known]
     if known:
         return 0, f"known for {max(known)} days and more to come"
-    short = next((day for day in range(1, 20000, 30) if orientation(np.array([today - day + 0.5])).known), math.inf)
+    short = next(
+        (day for day in range(1, 20000, 30) if orientation(np.array([today - day + 0.5])).known),
+        math.inf,
+    )
     return float(short), "UT1 = UTC is assumed, within 0.9 s"

@@ -1,4 +1,6 @@
-"""Libraries and compiled loops against references of higher precision: LAPACK, FFT, filters, random numbers, ERFA, time."""
+"""Libraries and compiled loops against references of higher precision: LAPACK, FFT, filters, random
+numbers, ERFA, time.
+"""
 
 from __future__ import annotations
 
@@ -48,9 +50,13 @@ def common_mode_of_ten_million() -> float:
 
 
 def ten_million() -> Floats:
-    """A common mode of 10 K and, seven decades below, sources that cross the detectors one after the other."""
+    """A common mode of 10 K and, seven decades below, sources that cross the detectors one after
+    the other.
+    """
     t, rng = np.arange(N), np.random.default_rng(8)
-    signal = 1e-6 * np.array([np.exp(-0.5 * ((t - 1000 - 70 * d) / 20.0) ** 2) for d in range(N_DET)])
+    signal = 1e-6 * np.array(
+        [np.exp(-0.5 * ((t - 1000 - 70 * d) / 20.0) ** 2) for d in range(N_DET)]
+    )
     return np.asarray(10 * np.cumsum(rng.standard_normal(N)) / np.sqrt(N) + signal)
 
 
@@ -62,7 +68,9 @@ def without_modes(a: Floats, modes: int) -> Floats:
 
 @checks.add(DECADES, reference="nothing", limit=0.01)
 def elevation_drift() -> Measured:
-    """what a 15 K drift with curvature leaves anywhere in a scan, over the rms of the white noise"""
+    """what a 15 K drift with curvature leaves anywhere in a scan, over the rms of the white
+    noise
+    """
     u = np.linspace(0, 1, 51600)
     drift = 15 * (u + 0.1 * u**2 + 0.03 * u**3 + 0.005 * u**4)
     left = drift[None].copy()
@@ -77,7 +85,10 @@ def elevation_drift() -> Measured:
 def first_sample() -> Measured:
     """variance of the very first sample of 20000 detectors"""
     law, n = power_law_filter(1e-3, 1.0, 8), 20_000
-    streams, out = Streams(law, stream_key(5, "a"), stream_key(5, "b")), np.zeros((20_000, 1), np.float32)
+    streams, out = (
+        Streams(law, stream_key(5, "a"), stream_key(5, "b")),
+        np.zeros((20_000, 1), np.float32),
+    )
     streams.add(0, 0, out)
     ratio = float((out.astype(np.float64) ** 2).mean()) / law.variance
     return abs(ratio - 1) / math.sqrt(2 / n), f"{ratio:.4f} of theory"
@@ -99,7 +110,10 @@ def float32_states() -> float:
         for q, z, s in zip(law.poles, law.zeros, first[: law.poles.size], strict=True):
             exact, _ = lfilter([1, z - 1], [1, q - 1], exact, axis=1, zi=((z - q) * s)[:, None])
         pairs = zip(law.pairs, first[law.poles.size :].reshape(-1, 2, 16), strict=True)
-        for (real, imaginary, of_real, of_imaginary), (re, im) in pairs:  # equation (3) of `one_over_f`
+        for (real, imaginary, of_real, of_imaginary), (
+            re,
+            im,
+        ) in pairs:  # equation (3) of `one_over_f`
             q = complex(real, imaginary)
             inside, _ = lfilter([0, 1], [1, q - 1], exact, axis=1, zi=(re + 1j * im)[:, None])
             exact = exact + of_real * inside.real + of_imaginary * inside.imag
@@ -109,7 +123,9 @@ def float32_states() -> float:
 
 @checks.add(TIME, reference="ERFA eraAtco13 at each instant", limit=ERROR, unit="rad")
 def over_a_day() -> float:
-    """pointing error at 300 instants of a day in 1985, 2024 and 2027 (1.8e9 s), three sites, all over the sky"""
+    """pointing error at 300 instants of a day in 1985, 2024 and 2027 (1.8e9 s), three sites, all
+    over the sky
+    """
     rng, worst = np.random.default_rng(1), 0.0
     for site in SITES:
         for year in (1985, 2024, 2027):
@@ -117,7 +133,12 @@ def over_a_day() -> float:
             seconds = np.round(rng.uniform(0, 86400, 300), 6)
             sky = unit_vectors(rng.uniform(0, 2 * np.pi, 300), np.arcsin(rng.uniform(-1, 1, 300)))
             transform = CelestialTransform(site, start, 86400.0)
-            worst = largest(worst, angle(transform.horizontal(sky, seconds), erfa_horizontal(sky, start, seconds, site)))
+            worst = largest(
+                worst,
+                angle(
+                    transform.horizontal(sky, seconds), erfa_horizontal(sky, start, seconds, site)
+                ),
+            )
     return worst
 
 
@@ -129,26 +150,51 @@ def exact_start() -> Measured:
         early = Instant.parse("2027-01-15T03:04:05.678901234Z")
         late = Instant(early.nanoseconds + shift)
         one = CelestialTransform(SITES[0], early, 500.0).horizontal(sky, np.array([shift / 1e9]))
-        worst = largest(worst, angle(one, CelestialTransform(SITES[0], late, 0.0).horizontal(sky, np.zeros(1))))
+        worst = largest(
+            worst, angle(one, CelestialTransform(SITES[0], late, 0.0).horizontal(sky, np.zeros(1)))
+        )
     return worst, "0.24 us, the rounding of 1.8e9 s in float64, would be 1.7e-11 rad"
 
 
 def erfa_horizontal(sky: Floats, start: Instant, seconds: Floats, site: Site) -> Floats:
-    """Horizontal directions (n, 3) north, west, up of ICRS unit vectors (n, 3), from UTC calendar dates."""
+    """Horizontal directions (n, 3) north, west, up of ICRS unit vectors (n, 3), from UTC calendar
+    dates.
+    """
     import erfa
 
     when = [Instant(start.nanoseconds + round(s * 1e9)).datetime for s in seconds]
     below = np.array([(start.nanoseconds + round(s * 1e9)) % 1000 for s in seconds])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", erfa.ErfaWarning)  # leap seconds of dates to come are unknown
+        warnings.simplefilter(
+            "ignore", erfa.ErfaWarning
+        )  # leap seconds of dates to come are unknown
         second = np.array([t.second + t.microsecond / 1e6 for t in when]) + below / 1e9
-        fields = (np.array([getattr(t, name) for t in when]) for name in ("year", "month", "day", "hour", "minute"))
+        fields = (
+            np.array([getattr(t, name) for t in when])
+            for name in ("year", "month", "day", "hour", "minute")
+        )
         utc1, utc2 = erfa.dtf2d("UTC", *fields, second)
         earth = orientation(utc1 - 2400000.5 + utc2)
         azimuth, zenith, *_ = erfa.atco13(
-            np.arctan2(sky[:, 1], sky[:, 0]), np.arctan2(sky[:, 2], np.hypot(sky[:, 0], sky[:, 1])), 0.0, 0.0, 0.0, 0.0,
-            utc1, utc2, earth.ut1_utc, site.longitude, site.latitude, site.altitude, earth.x, earth.y, 0.0, 0.0, 0.0, 1.0,
-        )  # fmt: skip
+            np.arctan2(sky[:, 1], sky[:, 0]),
+            np.arctan2(sky[:, 2], np.hypot(sky[:, 0], sky[:, 1])),
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            utc1,
+            utc2,
+            earth.ut1_utc,
+            site.longitude,
+            site.latitude,
+            site.altitude,
+            earth.x,
+            earth.y,
+            0.0,
+            0.0,
+            0.0,
+            1.0,
+        )
     return unit_vectors(-azimuth, np.pi / 2 - zenith)
 
 

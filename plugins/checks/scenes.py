@@ -22,24 +22,46 @@ from zonda.core.scene import Scene
 from zonda.core.site import Site
 from zonda.core.types import AnyFloats
 
-SITE = Site(name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="825 m", climatology="green_bank")
+SITE = Site(
+    name="Green Bank",
+    latitude="38.4331 deg",
+    longitude="-79.8398 deg",
+    altitude="825 m",
+    climatology="green_bank",
+)
 START = Instant.parse("2024-11-25T07:00:00Z")
 TARGET = (75.0, 20.0)
 """RA, Dec, deg."""
 
 
-def camera(detectors: int = 37, *, field: str = "4.2 arcmin", low: str = "78 GHz", high: str = "108 GHz") -> Instrument:
+def camera(
+    detectors: int = 37, *, field: str = "4.2 arcmin", low: str = "78 GHz", high: str = "108 GHz"
+) -> Instrument:
     """A camera on a 100 m dish."""
     return Instrument(
-        name="check", telescope=Telescope(name="dish", diameter="100 m"), band=Band(name="band", low=low, high=high),
-        detectors=detectors, field_of_view=field, fwhm="8.5 arcsec", main_beam_efficiency=0.3, illumination_efficiency=0.8,
-        net="1.7 mK s(1/2)", knee="0.5 Hz", pink_minimum_frequency="10 mHz", sample_rate="100 Hz",
-    )  # fmt: skip
+        name="check",
+        telescope=Telescope(name="dish", diameter="100 m"),
+        band=Band(name="band", low=low, high=high),
+        detectors=detectors,
+        field_of_view=field,
+        fwhm="8.5 arcsec",
+        main_beam_efficiency=0.3,
+        illumination_efficiency=0.8,
+        net="1.7 mK s(1/2)",
+        knee="0.5 Hz",
+        pink_minimum_frequency="10 mHz",
+        sample_rate="100 Hz",
+    )
 
 
 def scene(instrument: Instrument | None = None, **more: Any) -> Scene:
     """Green Bank in a November night, the camera, a target that is up."""
-    given = {"site": SITE, "instrument": instrument or camera(), "time": START, "target": f"{TARGET[0]} deg {TARGET[1]} deg"}
+    given = {
+        "site": SITE,
+        "instrument": instrument or camera(),
+        "time": START,
+        "target": f"{TARGET[0]} deg {TARGET[1]} deg",
+    }
     return Scene(**{**given, "seed": 7, **more})
 
 
@@ -53,7 +75,9 @@ def scan(
     instrument: Instrument | None = None,
     offsets: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Observation:
-    """Circles of ``radius`` arcmin in 20 s at 100 Hz, around a direction [deg] and around `TARGET`; 0: a stare."""
+    """Circles of ``radius`` arcmin in 20 s at 100 Hz, around a direction [deg] and around `TARGET`;
+    0: a stare.
+    """
     instrument = instrument or camera(detectors)
     plane = instrument.focalplane()
     if offsets is not None:
@@ -63,9 +87,19 @@ def scan(
     (az, el), (ra, dec) = np.radians([azimuth, elevation]), np.radians(TARGET)
     x, y = reach * np.cos(turn), reach * np.sin(turn)
     return Observation(
-        "scan-000", 0, SITE, instrument, plane, START, t, 100.0, from_angles(-az - x / np.cos(el), el + y),
-        from_angles(ra + x / np.cos(dec), dec + y), (float(ra), float(dec)), 7,
-    )  # fmt: skip
+        "scan-000",
+        0,
+        SITE,
+        instrument,
+        plane,
+        START,
+        t,
+        100.0,
+        from_angles(-az - x / np.cos(el), el + y),
+        from_angles(ra + x / np.cos(dec), dec + y),
+        (float(ra), float(dec)),
+        7,
+    )
 
 
 class Points(Operator):
@@ -104,7 +138,9 @@ def run(
     points, gives = Points(), Gives()
     points._observation, gives._signal = observation, signal
     steps = [points, *([gives] if signal is not None else []), *operators]
-    return Pipeline(steps, precision=precision).run(scene(observation.instrument), keep=keep, **{"threads": 1, **settings})
+    return Pipeline(steps, precision=precision).run(
+        scene(observation.instrument), keep=keep, **{"threads": 1, **settings}
+    )
 
 
 @contextmanager
@@ -115,10 +151,20 @@ def sky_file(values: AnyFloats, pixel: float = 1.0) -> Iterator[Path]:
     image = fits.PrimaryHDU(np.asarray(values, np.float64))
     ny, nx = values.shape
     cards = {
-        "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg", "RADESYS": "ICRS", "BUNIT": "K",
-        "TEMPSCAL": "K_RJ", "CRPIX1": (nx + 1) / 2, "CRPIX2": (ny + 1) / 2, "CRVAL1": TARGET[0], "CRVAL2": TARGET[1],
-        "CDELT1": -pixel / 3600, "CDELT2": pixel / 3600,
-    }  # fmt: skip
+        "CTYPE1": "RA---TAN",
+        "CTYPE2": "DEC--TAN",
+        "CUNIT1": "deg",
+        "CUNIT2": "deg",
+        "RADESYS": "ICRS",
+        "BUNIT": "K",
+        "TEMPSCAL": "K_RJ",
+        "CRPIX1": (nx + 1) / 2,
+        "CRPIX2": (ny + 1) / 2,
+        "CRVAL1": TARGET[0],
+        "CRVAL2": TARGET[1],
+        "CDELT1": -pixel / 3600,
+        "CDELT2": pixel / 3600,
+    }
     image.header.update(cards)
     with TemporaryDirectory(prefix="zonda-check-") as folder:
         path = Path(folder) / "sky.fits"

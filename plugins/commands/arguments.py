@@ -22,7 +22,10 @@ def place_of(text: str) -> Site:
         return found
     parts = [part.strip() for part in text.split(",")]
     if len(parts) != 3:
-        raise click.BadParameter("a place is 'latitude, longitude, altitude', e.g. '46.5 deg, 8 deg, 3500 m'", param_hint="SITE")
+        raise click.BadParameter(
+            "a place is 'latitude, longitude, altitude', e.g. '46.5 deg, 8 deg, 3500 m'",
+            param_hint="SITE",
+        )
     latitude, longitude, altitude = parts
     given = {"name": "place", "latitude": latitude, "longitude": longitude, "altitude": altitude}
     made: Site = checked("SITE", lambda: Site.model_validate(given))
@@ -35,7 +38,9 @@ def instant_of(text: str | None) -> Instant:
 
     from zonda.core.configuration.time import Instant
 
-    made: Instant = checked("--time", lambda: Instant.parse(text or datetime.now(UTC).replace(second=0, microsecond=0)))
+    made: Instant = checked(
+        "--time", lambda: Instant.parse(text or datetime.now(UTC).replace(second=0, microsecond=0))
+    )
     return made
 
 
@@ -58,7 +63,11 @@ LIMITS = {"latitude": "-90 to 90 deg", "longitude": "-360 to 360 deg", "altitude
 
 
 def _fault(error: Any) -> str:
-    limits = LIMITS.get(str(error["loc"][-1])) if error["type"].startswith(("less_than", "greater_than")) else None
+    limits = (
+        LIMITS.get(str(error["loc"][-1]))
+        if error["type"].startswith(("less_than", "greater_than"))
+        else None
+    )
     if limits is None:
         return str(error["msg"])
     value = float(error["input"]) if limits.endswith(" m") else math.degrees(error["input"])

@@ -19,8 +19,8 @@ HOW = {
 def completion(context: click.Context, shell: str) -> None:
     """Print the script that makes Tab complete commands, options, pipelines, instruments and sites.
 
-    For bash: eval "$(zonda completion bash)", in ~/.bashrc for good; zsh likewise, in ~/.zshrc; for fish write the script to
-    ~/.config/fish/completions/zonda.fish.
+    For bash: eval "$(zonda completion bash)", in ~/.bashrc for good; zsh likewise, in ~/.zshrc; for
+    fish write the script to ~/.config/fish/completions/zonda.fish.
     """
     from click.shell_completion import get_completion_class
 

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
 def doctor(as_json: bool) -> None:
     """Self-test of numerical accuracy on this machine.
 
-    Checks the arithmetic, libraries and compiled code of this machine, in about half a minute, against references and limits; all
-    rows of the stability matrix are in docs/stability.md. Exit status 1 if a figure exceeds its limit. The first run after
-    installation also compiles, which takes a minute.
+    Checks the arithmetic, libraries and compiled code of this machine, in about half a minute,
+    against references and limits; all rows of the stability matrix are in docs/stability.md. Exit
+    status 1 if a figure exceeds its limit. The first run after installation also compiles, which
+    takes a minute.
     """
     from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
 
@@ -30,7 +31,9 @@ def doctor(as_json: bool) -> None:
     from zonda.plugins.checks.cases import MACHINE
     from zonda.plugins.checks.machine import description
 
-    chosen = sorted(registered(), key=lambda check: check.case is not MACHINE)  # the others depend on the machine: it comes first
+    chosen = sorted(
+        registered(), key=lambda check: check.case is not MACHINE
+    )  # the others depend on the machine: it comes first
     about = description()
     results: list[Result] = []
     if not as_json:
@@ -45,18 +48,30 @@ def doctor(as_json: bool) -> None:
     if as_json:
         import json
 
-        summary = {"machine": about, "passed": not failed, "seconds": round(seconds, 2), "checks": [_row(r) for r in results]}
+        summary = {
+            "machine": about,
+            "passed": not failed,
+            "seconds": round(seconds, 2),
+            "checks": [_row(r) for r in results],
+        }
         click.echo(json.dumps(summary, indent=2, allow_nan=False))
     else:
         click.echo(f"\n{len(results)} checks in {seconds:.0f} s, {len(failed)} beyond their limits")
         for r in failed:
-            click.echo(f"\n{r.check.name}: {r.check.what}\n  against {r.check.reference}\n  {r.reached}, accepted: {r.accepted}")
+            click.echo(
+                f"\n{r.check.name}: {r.check.what}\n  against {r.check.reference}\n  {r.reached},"
+                f" accepted: {r.accepted}"
+            )
     if failed:
         raise click.exceptions.Exit(1)
 
 
 def _line(result: Result, width: int) -> str:
-    mark = click.style("ok  ", fg="green") if result.passed else click.style("FAIL", fg="red", bold=True)
+    mark = (
+        click.style("ok  ", fg="green")
+        if result.passed
+        else click.style("FAIL", fg="red", bold=True)
+    )
     remark = f"  ({result.remark})" if result.remark else ""
     return f"{mark} {result.check.name.ljust(width)}  {result.reached} <= {result.accepted}{remark}"
 
@@ -66,7 +81,14 @@ def _row(result: Result) -> dict[str, Any]:
 
     check = result.check
     return {
-        "name": check.name, "case": check.case.text, "what": check.what, "reference": check.reference, "limit": check.limit,
-        "figure": result.figure if math.isfinite(result.figure) else None, "unit": check.unit, "passed": result.passed,
-        "remark": result.remark, "seconds": round(result.seconds, 3),
-    }  # fmt: skip
+        "name": check.name,
+        "case": check.case.text,
+        "what": check.what,
+        "reference": check.reference,
+        "limit": check.limit,
+        "figure": result.figure if math.isfinite(result.figure) else None,
+        "unit": check.unit,
+        "passed": result.passed,
+        "remark": result.remark,
+        "seconds": round(result.seconds, 3),
+    }

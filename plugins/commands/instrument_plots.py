@@ -1,4 +1,6 @@
-"""The picture of ``zonda show instrument``: the focal plane, and its middle with beams and polarization angles."""
+"""The picture of ``zonda show instrument``: the focal plane, and its middle with beams and
+polarization angles.
+"""
 
 from __future__ import annotations
 
@@ -22,26 +24,39 @@ PLACES = 14
 
 
 def focal_plane_figure(instrument: Instrument, plane: Focalplane) -> Figure:
-    """All detectors on the left, the middle on the right: circles are the FWHM to scale, ticks the polarization angles."""
+    """All detectors on the left, the middle on the right: circles are the FWHM to scale, ticks the
+    polarization angles.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12.0, 6.4), dpi=110, layout="constrained")
     title = instrument.name if len(instrument.name) < 60 else f"{instrument.name[:57]}..."
-    figure.suptitle(f"{title}: {len(plane)} detectors on {instrument.telescope.name}, {instrument.telescope.diameter:g} m")
+    figure.suptitle(
+        f"{title}: {len(plane)} detectors on {instrument.telescope.name},"
+        f" {instrument.telescope.diameter:g} m"
+    )
     whole, middle = figure.subplots(1, 2)
     largest = max(plane.radius + float(plane.fwhm.max()) / 2, 1e-9)
     _draw(whole, instrument, plane, largest, (0.0, 0.0))
     whole.legend(loc="upper right", frameon=True, fontsize=9, framealpha=0.8)
     centre, reach = _middle(plane)
     _draw(middle, instrument, plane, reach, centre, ticks=True)
-    whole.set_title("focal plane" + (", wafers outlined" if _outlines(whole, plane, largest) else ""), fontsize=10)
+    whole.set_title(
+        "focal plane" + (", wafers outlined" if _outlines(whole, plane, largest) else ""),
+        fontsize=10,
+    )
     inside = "inside a wafer" if len(np.unique(plane.wafer)) > 1 else "inside"
-    middle.set_title(f"{inside}: beams (FWHM) to scale" + (", polarization angles" if plane.polarized else ""), fontsize=10)
+    middle.set_title(
+        f"{inside}: beams (FWHM) to scale" + (", polarization angles" if plane.polarized else ""),
+        fontsize=10,
+    )
     return figure
 
 
 def _middle(plane: Focalplane) -> tuple[tuple[float, float], float]:
-    """Where the pixel in the middle of the innermost array or wafer looks; how far around it this one has `PLACES`."""
+    """Where the pixel in the middle of the innermost array or wafer looks; how far around it this
+    one has `PLACES`.
+    """
     first = int(np.argmin(np.hypot(plane.xi, plane.eta)))
     own = np.flatnonzero((plane.band == plane.band[first]) & (plane.wafer == plane.wafer[first]))
     x, y = plane.xi[own], plane.eta[own]
@@ -53,21 +68,36 @@ def _middle(plane: Focalplane) -> tuple[tuple[float, float], float]:
 
 
 def _draw(
-    ax: Any, instrument: Instrument, plane: Focalplane, reach: float, centre: tuple[float, float], ticks: bool = False
+    ax: Any,
+    instrument: Instrument,
+    plane: Focalplane,
+    reach: float,
+    centre: tuple[float, float],
+    ticks: bool = False,
 ) -> None:
     """What lies within ``reach`` of ``centre``, both in tangents."""
     from matplotlib.collections import EllipseCollection
 
     unit, name = _unit(reach)
-    near = (np.abs(plane.xi - centre[0]) <= 1.5 * reach) & (np.abs(plane.eta - centre[1]) <= 1.5 * reach)
+    near = (np.abs(plane.xi - centre[0]) <= 1.5 * reach) & (
+        np.abs(plane.eta - centre[1]) <= 1.5 * reach
+    )
     for k, band in enumerate(instrument.cameras):
         rows = np.flatnonzero(near & ((plane.band == k) if instrument.bands else True))
         colour, size = SEQUENCE[k % len(SEQUENCE)], plane.fwhm[rows] / unit
         at = np.stack([plane.xi[rows], plane.eta[rows]], axis=1) / unit
         beams = EllipseCollection(
-            size, size, np.zeros(len(rows)), units="xy", offsets=at, offset_transform=ax.transData, facecolors="none",
-            edgecolors=colour, linewidths=0.8 if ticks else 0.3, rasterized=True,
-        )  # fmt: skip
+            size,
+            size,
+            np.zeros(len(rows)),
+            units="xy",
+            offsets=at,
+            offset_transform=ax.transData,
+            facecolors="none",
+            edgecolors=colour,
+            linewidths=0.8 if ticks else 0.3,
+            rasterized=True,
+        )
         ax.add_collection(beams)
         count = int((plane.band == k).sum()) if instrument.bands else len(plane)
         ax.plot([], [], "o", markerfacecolor="none", color=colour, label=f"{band}: {count}")
@@ -75,7 +105,14 @@ def _draw(
             _ticks(ax, plane, rows, unit, colour)
     dead = np.flatnonzero(near & (plane.dead != 0))
     if dead.size:
-        ax.plot(plane.xi[dead] / unit, plane.eta[dead] / unit, "x", color="0.4", ms=5, label=f"dead: {int(plane.dead.sum())}")
+        ax.plot(
+            plane.xi[dead] / unit,
+            plane.eta[dead] / unit,
+            "x",
+            color="0.4",
+            ms=5,
+            label=f"dead: {int(plane.dead.sum())}",
+        )
     ax.set_xlim((centre[0] - 1.04 * reach) / unit, (centre[0] + 1.04 * reach) / unit)
     ax.set_ylim((centre[1] - 1.04 * reach) / unit, (centre[1] + 1.04 * reach) / unit)
     ax.set_aspect("equal")
@@ -86,14 +123,20 @@ def _draw(
 
 
 def _ticks(ax: Any, plane: Focalplane, rows: Any, unit: float, colour: str) -> None:
-    """Polarization axes: angles from TOAST's X axis, towards decreasing eta, to its Y axis, towards decreasing xi."""
+    """Polarization axes: angles from TOAST's X axis, towards decreasing eta, to its Y axis, towards
+    decreasing xi.
+    """
     from matplotlib.collections import LineCollection
 
     rows = rows[plane.polarization_efficiency[rows] > 0]
     angle, half = plane.polarization_angle[rows], 0.35 * plane.fwhm[rows] / unit
     axis = np.stack([np.sin(angle), np.cos(angle)], axis=1) * half[:, None]
     at = np.stack([plane.xi[rows], plane.eta[rows]], axis=1) / unit
-    ax.add_collection(LineCollection(list(np.stack([at - axis, at + axis], axis=1)), colors=colour, linewidths=1.2))
+    ax.add_collection(
+        LineCollection(
+            list(np.stack([at - axis, at + axis], axis=1)), colors=colour, linewidths=1.2
+        )
+    )
 
 
 def _outlines(ax: Any, plane: Focalplane, reach: float) -> bool:

@@ -12,7 +12,9 @@ from zonda.core.numerics.angles import angle_text
 from zonda.core.types import Floats
 
 STAND_IN = "stand-in: "
-"""What begins a part of `provenance` (parts end with a semicolon) that says which number is not published."""
+"""What begins a part of `provenance` (parts end with a semicolon) that says which number is not
+published.
+"""
 HEAD = ("band", "GHz", "detectors", "FWHM", "NET [mK_RJ s(1/2)]", "knee [Hz]", "slope")
 WIDTH = 100
 
@@ -21,28 +23,57 @@ def lines(instrument: Instrument, plane: Focalplane) -> list[str]:
     """The instrument, its bands, where its numbers come from and which are stand-ins."""
     telescope = instrument.telescope
     rows = [
-        ("telescope", f"{telescope.name}, {telescope.diameter:g} m" + (f", at {telescope.site}" if telescope.site else "")),
+        (
+            "telescope",
+            f"{telescope.name}, {telescope.diameter:g} m"
+            + (f", at {telescope.site}" if telescope.site else ""),
+        ),
         ("field of view", angle_text(instrument.field_of_view)),
         ("detectors", _detectors(instrument, plane)),
         ("sample rate", f"{instrument.sample_rate:g} Hz"),
-        ("efficiencies", f"main beam {instrument.main_beam_efficiency:g}, illumination {instrument.illumination_efficiency:g}"),
+        (
+            "efficiencies",
+            (
+                f"main beam {instrument.main_beam_efficiency:g}, illumination"
+                f" {instrument.illumination_efficiency:g}"
+            ),
+        ),
     ]
-    head = f"{instrument.name}: {instrument.description}" if instrument.description else instrument.name
-    found = [head, "", *(f"{key:<14}{value}" for key, value in rows), "", *_bands(instrument, plane)]
+    head = (
+        f"{instrument.name}: {instrument.description}"
+        if instrument.description
+        else instrument.name
+    )
+    found = [
+        head,
+        "",
+        *(f"{key:<14}{value}" for key, value in rows),
+        "",
+        *_bands(instrument, plane),
+    ]
     sources, stand_ins = split_provenance(instrument)
     for title, texts in (("source", sources), ("stand-ins", stand_ins)):
         if texts:
             found.append("")
-            found += [f"{title if not k else '':<14}{line}" for k, line in enumerate(_wrapped(texts))]
+            found += [
+                f"{title if not k else '':<14}{line}" for k, line in enumerate(_wrapped(texts))
+            ]
     return found
 
 
 def split_provenance(instrument: Instrument) -> tuple[list[str], list[str]]:
-    """Where the numbers of an instrument and its bands come from, and which of them are stand-ins."""
-    bands = [(f"{name}: " if instrument.bands else "band: ", camera.band) for name, camera in instrument.cameras.items()]
+    """Where the numbers of an instrument and its bands come from, and which of them are
+    stand-ins.
+    """
+    bands = [
+        (f"{name}: " if instrument.bands else "band: ", camera.band)
+        for name, camera in instrument.cameras.items()
+    ]
     parts = [part.strip() for part in instrument.provenance.split(";")]
     parts += [
-        (STAND_IN if part.strip().startswith(STAND_IN) else "") + who + part.strip().removeprefix(STAND_IN)
+        (STAND_IN if part.strip().startswith(STAND_IN) else "")
+        + who
+        + part.strip().removeprefix(STAND_IN)
         for who, band in bands
         for part in band.provenance.split(";")
     ]
@@ -56,7 +87,13 @@ def _detectors(instrument: Instrument, plane: Focalplane) -> str:
     if instrument.focalplane_table is not None:
         how = f"from {instrument.focalplane_table.name}"
     wafers = len(np.unique(plane.wafer))
-    each = " in each band" if instrument.bands and instrument.pixels != "shared" and instrument.focalplane_table is None else ""
+    each = (
+        " in each band"
+        if instrument.bands
+        and instrument.pixels != "shared"
+        and instrument.focalplane_table is None
+        else ""
+    )
     said = [
         f"{len(plane)}",
         how,
@@ -77,12 +114,20 @@ def _bands(instrument: Instrument, plane: Focalplane) -> list[str]:
         nu = camera.band.frequency / 1e9
         table.append(
             (
-                name, f"{nu[0]:.4g} to {nu[-1]:.4g}", f"{len(rows)}", _angles(rows.fwhm), _span(rows.net * 1e3),
-                _span(rows.knee), _span(rows.slope),
+                name,
+                f"{nu[0]:.4g} to {nu[-1]:.4g}",
+                f"{len(rows)}",
+                _angles(rows.fwhm),
+                _span(rows.net * 1e3),
+                _span(rows.knee),
+                _span(rows.slope),
             )
-        )  # fmt: skip
+        )
     widths = [max(len(row[k]) for row in table) for k in range(len(HEAD))]
-    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in table]
+    return [
+        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        for row in table
+    ]
 
 
 def _span(values: Floats) -> str:

@@ -1,4 +1,6 @@
-"""``zonda new pipeline`` and ``zonda new plugin``: files to begin with. Only click is imported with this module."""
+"""``zonda new pipeline`` and ``zonda new plugin``: files to begin with. Only click is imported with
+this module.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).parent / "templates"
 HOUR_ANGLES = (-1.5, 1.0, -0.5, -3.0, 0.0, 3.0, -5.0)
-"""Hours from the meridian at which a new pipeline may begin to observe; the first at which the telescope can."""
+"""Hours from the meridian at which a new pipeline may begin to observe; the first at which the
+telescope can.
+"""
 NIGHT = "2025-01-15"
 """Date of a new pipeline's observation."""
 J2000 = 946728000.0
@@ -37,22 +41,36 @@ def new() -> None:
 
 @new.command()
 @click.argument("name", default="pipeline", metavar="[NAME]")
-@click.option("--instrument", default="mustang2", show_default=True, metavar="NAME", shell_complete=complete.instruments)
-@click.option("--site", metavar="NAME", shell_complete=complete.sites, help="[default: the telescope's own]")
 @click.option(
-    "--target", metavar="POSITION", help="E.g. '13h47m30s -11d45m' or 'galactic 120 deg -30 deg'.  [default: one that rises]"
+    "--instrument",
+    default="mustang2",
+    show_default=True,
+    metavar="NAME",
+    shell_complete=complete.instruments,
+)
+@click.option(
+    "--site", metavar="NAME", shell_complete=complete.sites, help="[default: the telescope's own]"
+)
+@click.option(
+    "--target",
+    metavar="POSITION",
+    help="E.g. '13h47m30s -11d45m' or 'galactic 120 deg -30 deg'.  [default: one that rises]",
 )
 def pipeline(name: str, instrument: str, site: str | None, target: str | None) -> None:
-    """Write NAME.yaml, a pipeline file with comments, which `zonda check` accepts and `zonda run` runs.
+    """Write NAME.yaml, a pipeline file with comments, which `zonda check` accepts and `zonda run`
+    runs.
 
-    A file that is there is never replaced. The time is one at which the telescope can observe the target.
+    A file that is there is never replaced. The time is one at which the telescope can observe the
+    target.
     """
     from zonda.core.errors import OutputError
     from zonda.core.storage.files import write_text
 
     path = Path(name if name.endswith((".yaml", ".yml")) else f"{name}.yaml")
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", path.stem):
-        raise OutputError(f"{path.stem!r} cannot be the name of a pipeline", cure="use letters, digits, - and _")
+        raise OutputError(
+            f"{path.stem!r} cannot be the name of a pipeline", cure="use letters, digits, - and _"
+        )
     _check_free(path)
     text = pipeline_text(path, instrument, site, target)
     write_text(path, text)
@@ -65,24 +83,35 @@ def pipeline(name: str, instrument: str, site: str | None, target: str | None) -
 def plugin(name: str) -> None:
     """Make the folder NAME: a plugin with an operator, an instrument and tests, which pass at once.
 
-    Install it with `pip install -e ".[test]"` in that folder and run `pytest`. A folder that is there is never written to.
+    Install it with `pip install -e ".[test]"` in that folder and run `pytest`. A folder that is
+    there is never written to.
     """
     from zonda.core.errors import OutputError
 
     package = re.sub(r"[-.]", "_", name).lower()
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*([-_.][A-Za-z0-9]+)*", name) or keyword.iskeyword(package) or package == "zonda":
+    if (
+        not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*([-_.][A-Za-z0-9]+)*", name)
+        or keyword.iskeyword(package)
+        or package == "zonda"
+    ):
         cure = "use letters, digits and hyphens, e.g. zonda-mycamera"
-        raise OutputError(f"{name!r} cannot be the name of a plugin", place="zonda new plugin", cure=cure)
+        raise OutputError(
+            f"{name!r} cannot be the name of a plugin", place="zonda new plugin", cure=cure
+        )
     if importlib.util.find_spec(package):
         cure = f"choose another name, e.g. zonda-{name}"
-        raise OutputError(f"a Python module {package!r} is installed already", place="zonda new plugin", cure=cure)
+        raise OutputError(
+            f"a Python module {package!r} is installed already", place="zonda new plugin", cure=cure
+        )
     folder = Path(name)
     _check_free(folder)
     operator = "".join(word.capitalize() for word in package.split("_")) + "Drift"
     values = {"name": name, "package": package, "operator": operator}
     made = {}
     for template in sorted((TEMPLATES / "plugin").rglob("*.tmpl")):
-        inside = str(template.relative_to(TEMPLATES / "plugin").with_suffix("")).replace("package", package)
+        inside = str(template.relative_to(TEMPLATES / "plugin").with_suffix("")).replace(
+            "package", package
+        )
         made[inside] = Template(template.read_text(encoding="utf-8")).substitute(values)
     _write_folder(folder, made)
     click.echo(f"{folder}/")
@@ -95,7 +124,9 @@ def _check_free(path: Path) -> None:
     if path.exists() or path.is_symlink():
         raise OutputError("exists already", place=str(path), cure="choose another name")
     if not path.parent.is_dir():
-        raise OutputError("there is no such folder", place=str(path.parent), cure="make it, or choose another")
+        raise OutputError(
+            "there is no such folder", place=str(path.parent), cure="make it, or choose another"
+        )
 
 
 def _write_folder(folder: Path, texts: dict[str, str]) -> None:
@@ -117,7 +148,9 @@ def _write_folder(folder: Path, texts: dict[str, str]) -> None:
 
 
 def pipeline_text(path: Path, instrument: str, site: str | None, target: str | None) -> str:
-    """The pipeline file. Raises ZondaError for names that are unknown, and where the telescope cannot observe the target."""
+    """The pipeline file. Raises ZondaError for names that are unknown, and where the telescope
+    cannot observe the target.
+    """
     import numpy as np
 
     from zonda.core.configuration.pipeline_file import parse
@@ -134,7 +167,13 @@ def pipeline_text(path: Path, instrument: str, site: str | None, target: str | N
     target = target or (NORTH if where.latitude > 0 else SOUTH)
     beam = float(np.degrees(camera.focalplane().fwhm.min())) * 3600
     pixel = float(f"{beam / 4:.1g}")
-    values = {"file": path.name, "stem": path.stem, "site": site, "instrument": instrument, "target": target}
+    values = {
+        "file": path.name,
+        "stem": path.stem,
+        "site": site,
+        "instrument": instrument,
+        "target": target,
+    }
     template = Template((TEMPLATES / "pipeline.yaml.tmpl").read_text(encoding="utf-8"))
     values |= {"pixel": f"{pixel:g} arcsec", "pwv": "25 %" if where.climatology else "2 mm"}
     drafted = parse(template.substitute(values, time=NIGHT), name=path.name).scene().target
@@ -154,13 +193,17 @@ def pipeline_text(path: Path, instrument: str, site: str | None, target: str | N
 
 
 def _start(target: Target, longitude: float, hours: float) -> str:
-    """When the target is ``hours`` from the meridian, to the minute; any time of a horizontal one."""
+    """When the target is ``hours`` from the meridian, to the minute; any time of a horizontal
+    one.
+    """
     from zonda.core.configuration.time import Instant
 
     if target.frame == "horizontal":
         return f"{NIGHT}T06:00"
     begin = Instant.parse(NIGHT)
     days = (begin.posix - J2000) / 86400
-    sidereal = 18.697374558 + 24.06570982441908 * days + math.degrees(longitude) / 15  # mean sidereal time, h (IAU 1982)
+    sidereal = (
+        18.697374558 + 24.06570982441908 * days + math.degrees(longitude) / 15
+    )  # mean sidereal time, h (IAU 1982)
     wait = (math.degrees(target.icrs()[0]) / 15 + hours - sidereal) % 24 / 1.00273790935
     return begin.shifted(round(wait * 60) * 60.0).isoformat()[:16]

@@ -11,25 +11,88 @@ from zonda.core.cli import complete
 
 
 @click.command()
-@click.argument("pipeline", metavar="[FILE_OR_NAME]", required=False, shell_complete=complete.pipelines)
-@click.option("--instrument", metavar="NAME", shell_complete=complete.instruments, help="Without a pipeline: the camera.")
-@click.option("--site", metavar="NAME", shell_complete=complete.sites, help="Without a pipeline: where it stands.")
-@click.option("--pwv", metavar="PWV", help="Water at zenith, e.g. '1.2 mm'.  [default: the climatology's median]")
-@click.option("--month", type=click.IntRange(1, 12), metavar="1-12", help="Of the climatology.  [default: the present one]")
-@click.option("--quantile", type=float, metavar="SHARE", help="Of the PWV in that month, e.g. 0.25.")
-@click.option("--elevation", metavar="ANGLE", help="Of the target when it culminates at midnight.  [default: 60 deg]")
-@click.option("--target", metavar="POSITION", help="A position on the sky instead, observed when it culminates.")
-@click.option("--area", metavar="ANGLE", help="Diameter of the field that is scanned.  [default: two fields of view]")
-@click.option("--time", metavar="TIME", help="Integration time, e.g. '3 h'.  [default: 1 h; of a pipeline its scans]")
-@click.option(
-    "--radius", metavar="ANGLE", help="Of the circle that the depth is averaged over.  [default: 0.5 arcmin or two beams]"
+@click.argument(
+    "pipeline", metavar="[FILE_OR_NAME]", required=False, shell_complete=complete.pipelines
 )
-@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Change one value, as for `zonda run`.")
-@click.option("--reach", metavar="DEPTH", help="How long it takes to reach e.g. '10 uK', '10 uK_CMB' or '0.1 mJy/beam'.")
-@click.option("--audit", type=click.IntRange(min=2), metavar="N", help="Simulate the pipeline with N seeds beside the forecast.")
-@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads of --audit.  [default: all]")
+@click.option(
+    "--instrument",
+    metavar="NAME",
+    shell_complete=complete.instruments,
+    help="Without a pipeline: the camera.",
+)
+@click.option(
+    "--site",
+    metavar="NAME",
+    shell_complete=complete.sites,
+    help="Without a pipeline: where it stands.",
+)
+@click.option(
+    "--pwv",
+    metavar="PWV",
+    help="Water at zenith, e.g. '1.2 mm'.  [default: the climatology's median]",
+)
+@click.option(
+    "--month",
+    type=click.IntRange(1, 12),
+    metavar="1-12",
+    help="Of the climatology.  [default: the present one]",
+)
+@click.option(
+    "--quantile", type=float, metavar="SHARE", help="Of the PWV in that month, e.g. 0.25."
+)
+@click.option(
+    "--elevation",
+    metavar="ANGLE",
+    help="Of the target when it culminates at midnight.  [default: 60 deg]",
+)
+@click.option(
+    "--target",
+    metavar="POSITION",
+    help="A position on the sky instead, observed when it culminates.",
+)
+@click.option(
+    "--area",
+    metavar="ANGLE",
+    help="Diameter of the field that is scanned.  [default: two fields of view]",
+)
+@click.option(
+    "--time",
+    metavar="TIME",
+    help="Integration time, e.g. '3 h'.  [default: 1 h; of a pipeline its scans]",
+)
+@click.option(
+    "--radius",
+    metavar="ANGLE",
+    help="Of the circle that the depth is averaged over.  [default: 0.5 arcmin or two beams]",
+)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change one value, as for `zonda run`.",
+)
+@click.option(
+    "--reach",
+    metavar="DEPTH",
+    help="How long it takes to reach e.g. '10 uK', '10 uK_CMB' or '0.1 mJy/beam'.",
+)
+@click.option(
+    "--audit",
+    type=click.IntRange(min=2),
+    metavar="N",
+    help="Simulate the pipeline with N seeds beside the forecast.",
+)
+@click.option(
+    "--threads", type=click.IntRange(min=1), metavar="N", help="Threads of --audit.  [default: all]"
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-@click.option("--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder for a picture, a table and the pipeline.")
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder for a picture, a table and the pipeline.",
+)
 def sensitivity(
     pipeline: str | None,
     settings: tuple[str, ...],
@@ -42,12 +105,14 @@ def sensitivity(
 ) -> None:
     """Forecast how deep a map becomes, without a run: of a pipeline, or of an instrument at a site.
 
-    The depth is the rms of the noise behind the beam, split into white noise, 1/f noise and atmosphere. Without a pipeline one is
-    made: daisy scans of the area, a high-pass filter, the common mode; it is shown. A map of I, Q and U has a depth of each.
+    The depth is the rms of the noise behind the beam, split into white noise, 1/f noise and
+    atmosphere. Without a pipeline one is made: daisy scans of the area, a high-pass filter, the
+    common mode; it is shown. A map of I, Q and U has a depth of each.
 
       zonda sensitivity mustang2_cluster
 
-      zonda sensitivity --instrument mustang2 --site green_bank --pwv '7.7 mm' --area '8 arcmin' --reach '20 uK'
+      zonda sensitivity --instrument mustang2 --site green_bank --pwv '7.7 mm' --area '8 arcmin'
+      --reach '20 uK'
     """
     from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
 
@@ -73,7 +138,9 @@ def sensitivity(
         if reach is not None:
             text["reach"] = {"depth": reach, "seconds": max(needed)}
             if planes := each[0].polarization:
-                text["reach"]["stokes"] = {plane: max(one.reach(reach, plane) for one in each) for plane in planes}
+                text["reach"]["stokes"] = {
+                    plane: max(one.reach(reach, plane) for one in each) for plane in planes
+                }
         click.echo(json.dumps(text, indent=2))
         return
     if pipeline is None:

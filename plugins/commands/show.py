@@ -1,4 +1,5 @@
-"""``zonda show instrument``: the bands, detectors and focal plane of an instrument, printed and drawn.
+"""``zonda show instrument``: the bands, detectors and focal plane of an instrument, printed and
+drawn.
 
 Only click is imported with this module.
 """
@@ -23,7 +24,12 @@ def show() -> None:
 
 @show.command()
 @click.argument("name", shell_complete=complete.instruments)
-@click.option("--output", type=click.Path(path_type=Path), metavar="FILE.png", help="The picture.  [default: out/show/NAME.png]")
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="The picture.  [default: out/show/NAME.png]",
+)
 def instrument(name: str, output: Path | None) -> None:
     """Print what an instrument is, and draw its focal plane (also as PDF or SVG).
 

@@ -1,4 +1,6 @@
-"""``zonda validate``: what the paper that zonda follows states, measured again. Only click is imported with this module."""
+"""``zonda validate``: what the paper that zonda follows states, measured again. Only click is
+imported with this module.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +20,30 @@ UNDECIDED = 1
 
 @click.command()
 @click.argument("ids", metavar="[ID]...", nargs=-1)
-@click.option("--output", type=click.Path(path_type=Path), default=Path("out/validate"), show_default=True, metavar="DIR")
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("out/validate"),
+    show_default=True,
+    metavar="DIR",
+)
 @click.option("--quick", is_flag=True, help="Closed forms and short runs alone: a minute or two.")
 @click.option("--list", "listed", is_flag=True, help="List the claims and run nothing.")
-@click.option("--claims", "path", type=click.Path(path_type=Path), metavar="FILE", help="A claims file of your own.")
-def validate(ids: tuple[str, ...], output: Path, quick: bool, listed: bool, path: Path | None) -> int:
+@click.option(
+    "--claims",
+    "path",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A claims file of your own.",
+)
+def validate(
+    ids: tuple[str, ...], output: Path, quick: bool, listed: bool, path: Path | None
+) -> int:
     """Measure the claims of the paper that zonda follows, all of them or those named.
 
-    Writes claims.html and claims.ecsv to DIR, and a folder for each claim with its values and pictures. What DIR holds of the
-    same runs is not run again. Exit status 1 where a claim differs and no counter-experiment explains it.
+    Writes claims.html and claims.ecsv to DIR, and a folder for each claim with its values and
+    pictures. What DIR holds of the same runs is not run again. Exit status 1 where a claim differs
+    and no counter-experiment explains it.
     """
     from zonda.plugins.validation.claims import SHIPPED, read
 
@@ -65,7 +82,10 @@ def _chosen(claims: list[Claim], ids: tuple[str, ...]) -> list[Claim]:
     known = [claim.id for claim in claims]
     for name in ids:
         if name not in known:
-            raise click.UsageError(f"there is no claim '{name}'; {nearest(name, known, 'zonda validate --list shows them')}")
+            raise click.UsageError(
+                f"there is no claim '{name}';"
+                f" {nearest(name, known, 'zonda validate --list shows them')}"
+            )
     return [claim for claim in claims if not ids or claim.id in ids]
 
 

@@ -1,4 +1,6 @@
-"""When targets, the Sun, the Moon and planets are above an elevation at a site (`core.numerics.bodies`)."""
+"""When targets, the Sun, the Moon and planets are above an elevation at a site
+(`core.numerics.bodies`).
+"""
 
 from __future__ import annotations
 
@@ -20,23 +22,30 @@ if TYPE_CHECKING:
     from zonda.core.site import Site
 
 HORIZON = math.radians(-50 / 60)
-"""Elevation of the Sun's centre below which it is night: its radius, and the refraction that is usual at the horizon."""
+"""Elevation of the Sun's centre below which it is night: its radius, and the refraction that is
+usual at the horizon.
+"""
 MINUTE, HOUR, DAY = 60.0, 3600.0, 86400.0
 
 
 def spans_above(times: Floats, values: Floats) -> list[tuple[float | None, float | None]]:
-    """Where ``values`` (n,) at ``times`` (n,) are above 0, linear in between: (begin, end), None where it goes on beyond."""
+    """Where ``values`` (n,) at ``times`` (n,) are above 0, linear in between: (begin, end), None
+    where it goes on beyond.
+    """
     up = values > 0
     edges = np.flatnonzero(up[1:] != up[:-1])
     cross: list[float | None] = [
-        float(times[k] + (times[k + 1] - times[k]) * values[k] / (values[k] - values[k + 1])) for k in edges
+        float(times[k] + (times[k + 1] - times[k]) * values[k] / (values[k] - values[k + 1]))
+        for k in edges
     ]
     ends = ([None] if up[0] else []) + cross + ([None] if up[-1] else [])
     return list(zip(ends[::2], ends[1::2], strict=True))
 
 
 def share_above(*values: Floats) -> Floats:
-    """(..., n - 1) share of each step over which all of ``values`` (..., n) are above 0, linear within it."""
+    """(..., n - 1) share of each step over which all of ``values`` (..., n) are above 0, linear
+    within it.
+    """
     low, high = np.zeros_like(values[0][..., 1:]), np.ones_like(values[0][..., 1:])
     for value in values:
         a, b = value[..., :-1], value[..., 1:]
@@ -82,9 +91,14 @@ class Night:
         """When the target is highest and its elevation: the parabola through three minutes."""
         elevation = self.target.elevation
         k = int(elevation.argmax())
-        if 0 < k < len(elevation) - 1 and (bend := 2 * elevation[k] - elevation[k - 1] - elevation[k + 1]) > 1e-12:
+        if (
+            0 < k < len(elevation) - 1
+            and (bend := 2 * elevation[k] - elevation[k - 1] - elevation[k + 1]) > 1e-12
+        ):
             off = float(elevation[k + 1] - elevation[k - 1]) / (2 * float(bend))
-            return float(self.times[k]) + off * MINUTE, float(elevation[k]) + float(bend) * off * off / 2
+            return float(self.times[k]) + off * MINUTE, float(elevation[k]) + float(
+                bend
+            ) * off * off / 2
         return float(self.times[k]), float(elevation[k])
 
     @property
@@ -105,7 +119,9 @@ def solar_offset(site: Site) -> float:
 
 
 def night_of(site: Site, when: Instant, target: Target | str, above: float) -> Night:
-    """The night that ``when`` lies in, or the next one where it is a morning: from local mean solar noon to noon."""
+    """The night that ``when`` lies in, or the next one where it is a morning: from local mean solar
+    noon to noon.
+    """
     since_noon = (when.posix + solar_offset(site) - DAY / 2) % DAY
     begin = when.posix - since_noon
     (now,) = tracks(site, np.array([when.posix]), "sun")
@@ -127,7 +143,8 @@ class Month:
     hours, hours_at_night
         Above the limit in the whole month; and while it is night.
     by_hour
-        (24,) share of each hour of the day (UTC) above the limit at night; by day where it never is at night.
+        (24,) share of each hour of the day (UTC) above the limit at night; by day where it never is
+        at night.
     highest
         Elevation, rad.
     sun
@@ -152,7 +169,9 @@ class Month:
 
 
 EVERY, STEP = 3, 1800.0
-"""Of a month every third day is looked at, every half hour; elevations are linear in between (within 0.12 deg)."""
+"""Of a month every third day is looked at, every half hour; elevations are linear in between
+(within 0.12 deg).
+"""
 
 
 def months(site: Site, year: int, target: Target | str, above: float) -> Iterator[Month]:
@@ -162,10 +181,15 @@ def months(site: Site, year: int, target: Target | str, above: float) -> Iterato
     for month in range(1, 13):
         days = monthrange(year, month)[1]
         dates = np.arange(2, days + 1, EVERY)
-        starts = np.array([Instant.parse(f"{year:04d}-{month:02d}-{day:02d}").posix for day in dates])
+        starts = np.array(
+            [Instant.parse(f"{year:04d}-{month:02d}-{day:02d}").posix for day in dates]
+        )
         times = starts[:, None] + STEP * np.arange(round(DAY / STEP) + 1)
         at, sun = tracks(site, times.ravel(), target, "sun")
-        elevation, depth = at.elevation.reshape(times.shape), HORIZON - sun.elevation.reshape(times.shape)
+        elevation, depth = (
+            at.elevation.reshape(times.shape),
+            HORIZON - sun.elevation.reshape(times.shape),
+        )
         everything, night = share_above(elevation - above), share_above(elevation - above, depth)
         taken = (night if night.any() else everything).mean(axis=0).reshape(24, -1).mean(axis=1)
         distance = at.distance(sun)

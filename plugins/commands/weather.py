@@ -1,4 +1,5 @@
-"""``zonda weather``: the atmosphere above a site, printed and drawn; ``zonda weather fetch``: ERA5 from the Climate Data Store.
+"""``zonda weather``: the atmosphere above a site, printed and drawn; ``zonda weather fetch``: ERA5
+from the Climate Data Store.
 
 Only click is imported with this module; each command imports what it needs.
 """
@@ -21,20 +22,28 @@ class WithDefault(click.Group):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Put ``show`` before what names no command."""
-        if args and args[0] not in self.commands and not (len(args) == 1 and args[0] in ctx.help_option_names):
+        if (
+            args
+            and args[0] not in self.commands
+            and not (len(args) == 1 and args[0] in ctx.help_option_names)
+        ):
             args = ["show", *args]
         return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
         """Sites beside the commands."""
-        return [*super().shell_complete(ctx, incomplete), *complete.sites(ctx, self.commands["show"].params[0], incomplete)]
+        return [
+            *super().shell_complete(ctx, incomplete),
+            *complete.sites(ctx, self.commands["show"].params[0], incomplete),
+        ]
 
 
 @click.group(cls=WithDefault, subcommand_metavar="SITE [OPTIONS] | fetch SITE [OPTIONS]")
 def weather() -> None:
     """Show the atmosphere above a site: profile, PWV, and what instruments see; `fetch` gets ERA5.
 
-    SITE is a registered name (`zonda plugins`), or 'latitude, longitude, altitude', e.g. '46.5 deg, 8 deg, 3500 m'.
+    SITE is a registered name (`zonda plugins`), or 'latitude, longitude, altitude', e.g. '46.5 deg,
+    8 deg, 3500 m'.
     """
 
 
@@ -42,21 +51,50 @@ SIGNS = {"ignore_unknown_options": True}
 """A southern latitude begins with a minus."""
 
 _site = click.argument("site", metavar="SITE", shell_complete=complete.sites)
-_time = click.option("--time", metavar="TIME", help="UTC unless it carries an offset, e.g. 2024-11-25T07:00.  [default: now]")
+_time = click.option(
+    "--time",
+    metavar="TIME",
+    help="UTC unless it carries an offset, e.g. 2024-11-25T07:00.  [default: now]",
+)
 
 
 @weather.command(context_settings=SIGNS)
 @_site
 @_time
-@click.option("--instrument", "instruments", multiple=True, metavar="NAME", shell_complete=complete.instruments,
-              help="Whose bands to show; may be repeated.")  # fmt: skip
-@click.option("--pwv", metavar="PWV", help="Water: 1.2mm, 25%, or random.  [default: as the source has it]")
-@click.option("--file", metavar="FILE.nc", help="ERA5 file to take the weather from, instead of the climatology.")
-@click.option("--table", metavar="FILE.csv", help="Table to take the weather from, instead of the climatology.")
-@click.option("--elevation", default="90 deg", show_default=True, metavar="ANGLE", help="Of the line of sight.")
+@click.option(
+    "--instrument",
+    "instruments",
+    multiple=True,
+    metavar="NAME",
+    shell_complete=complete.instruments,
+    help="Whose bands to show; may be repeated.",
+)
+@click.option(
+    "--pwv", metavar="PWV", help="Water: 1.2mm, 25%, or random.  [default: as the source has it]"
+)
+@click.option(
+    "--file",
+    metavar="FILE.nc",
+    help="ERA5 file to take the weather from, instead of the climatology.",
+)
+@click.option(
+    "--table",
+    metavar="FILE.csv",
+    help="Table to take the weather from, instead of the climatology.",
+)
+@click.option(
+    "--elevation",
+    default="90 deg",
+    show_default=True,
+    metavar="ANGLE",
+    help="Of the line of sight.",
+)
 @click.option("--seed", default=0, show_default=True, help="Of a random PWV.")
 @click.option(
-    "--output", type=click.Path(path_type=Path), metavar="FILE.png", help="The figure.  [default: out/weather/SITE.png]"
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="The figure.  [default: out/weather/SITE.png]",
 )
 def show(
     site: str,
@@ -69,7 +107,9 @@ def show(
     seed: int,
     output: Path | None,
 ) -> None:
-    """Print the profile, the PWV by month and hour, and what bands see; draw them (also as PDF or SVG)."""
+    """Print the profile, the PWV by month and hour, and what bands see; draw them (also as PDF or
+    SVG).
+    """
     from zonda.core import registry, weather
     from zonda.core.configuration.units import Unit
     from zonda.core.storage.files import atomic_path, product_path
@@ -78,17 +118,29 @@ def show(
     from zonda.operators.atmosphere.weather.sources import profile_of
 
     place, when = place_of(site), instant_of(time)
-    given = {key: value for key, value in (("pwv", pwv), ("file", file), ("table", table)) if value is not None}
+    given = {
+        key: value
+        for key, value in (("pwv", pwv), ("file", file), ("table", table))
+        if value is not None
+    }
     cls, values = weather.resolve(given)
     source = checked("weather", lambda: cls.model_validate(values))
     angle = checked("--elevation", lambda: Unit("rad", "60 deg").parse(elevation))
     if not ELEVATION_MIN <= angle <= ELEVATION_MAX:
         limits = f"{math.degrees(ELEVATION_MIN):g} deg to 90 deg"
-        raise click.BadParameter(f"{elevation} is outside the limits, {limits}", param_hint="'--elevation'")
-    cameras = (camera for name in instruments for camera in registry.instruments.create(name).cameras.values())
+        raise click.BadParameter(
+            f"{elevation} is outside the limits, {limits}", param_hint="'--elevation'"
+        )
+    cameras = (
+        camera
+        for name in instruments
+        for camera in registry.instruments.create(name).cameras.values()
+    )
     bands = list(dict.fromkeys(camera.band for camera in cameras))
     air = profile_of(source, place, when, seed)
-    water = summary.pwv_by_month(place, when.datetime.year) if place.climatology is not None else None
+    water = (
+        summary.pwv_by_month(place, when.datetime.year) if place.climatology is not None else None
+    )
 
     parts = [summary.place_lines(place, when, air), summary.profile_lines(air)]
     if water is not None:
@@ -102,19 +154,34 @@ def show(
     path = product_path("out/weather", place.name, ".png") if output is None else output
     _check_suffix(path)
     with atomic_path(path) as temporary:
-        weather_figure(f"{place.name}, {when}, PWV {air.pwv * 1e3:.3g} mm", air, water, angle, bands).savefig(temporary)
+        weather_figure(
+            f"{place.name}, {when}, PWV {air.pwv * 1e3:.3g} mm", air, water, angle, bands
+        ).savefig(temporary)
     click.echo(f"\n{path}")
 
 
 @weather.command(context_settings=SIGNS)
 @_site
 @_time
-@click.option("--hours", default=6, show_default=True, type=click.IntRange(1, 240), help="How many hours from TIME on.")
-@click.option("--output", type=click.Path(path_type=Path), default=Path("era5.nc"), show_default=True, metavar="FILE.nc")
+@click.option(
+    "--hours",
+    default=6,
+    show_default=True,
+    type=click.IntRange(1, 240),
+    help="How many hours from TIME on.",
+)
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("era5.nc"),
+    show_default=True,
+    metavar="FILE.nc",
+)
 def fetch(site: str, time: str | None, hours: int, output: Path) -> None:
     """Get ERA5 for a site and time from the Climate Data Store, for `weather: {file: era5.nc}`.
 
-    Needs a (free) key and the package cdsapi: pip install 'zonda[weather]', then https://cds.climate.copernicus.eu/how-to-api.
+    Needs a (free) key and the package cdsapi: pip install 'zonda[weather]', then
+    https://cds.climate.copernicus.eu/how-to-api.
     """
     from zonda.core.storage.files import atomic_path
     from zonda.operators.atmosphere.weather.era5 import retrieve
@@ -127,4 +194,6 @@ def fetch(site: str, time: str | None, hours: int, output: Path) -> None:
 
 def _check_suffix(path: Path) -> None:
     if path.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise click.BadParameter(f"'{path}' does not end in .png, .pdf or .svg", param_hint="'--output'")
+        raise click.BadParameter(
+            f"'{path}' does not end in .png, .pdf or .svg", param_hint="'--output'"
+        )

@@ -1,4 +1,6 @@
-"""Pictures of the atmosphere above a site: profile, PWV by month and hour, spectra with the bands of instruments."""
+"""Pictures of the atmosphere above a site: profile, PWV by month and hour, spectra with the bands
+of instruments.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
-from zonda.operators.atmosphere.weather.summary import HOURS, MONTHS, QUANTILES, PwvByMonth, pwv_steps
+from zonda.operators.atmosphere.weather.summary import (
+    HOURS,
+    MONTHS,
+    QUANTILES,
+    PwvByMonth,
+    pwv_steps,
+)
 from zonda.operators.diagnostics.drawing.canvas import SEQUENCE
 
 if TYPE_CHECKING:
@@ -21,11 +29,26 @@ if TYPE_CHECKING:
 LOWEST, HIGHEST = 1e9, 1000e9
 """Hz: what the absorption table holds, and the spectra show."""
 LINES = {
-    "H₂O": (22.24, 183.31, 325.15, 380.20, 448.00, 474.69, 556.94, 620.70, 752.03, 916.17, 970.32, 987.93),
+    "H₂O": (
+        22.24,
+        183.31,
+        325.15,
+        380.20,
+        448.00,
+        474.69,
+        556.94,
+        620.70,
+        752.03,
+        916.17,
+        970.32,
+        987.93,
+    ),
     "O₂": (60.3, 118.75, 368.50, 424.76, 487.25, 715.39, 773.84, 834.15),
     "O₃": (110.84, 249.96, 301.81, 358.85, 655.29, 843.0),
 }
-"""GHz: the strong lines of water and oxygen (of 60 GHz, the middle of many), and what stands out of ozone's hundreds."""
+"""GHz: the strong lines of water and oxygen (of 60 GHz, the middle of many), and what stands out of
+ozone's hundreds.
+"""
 LINE_COLOURS = {"H₂O": "#0072B2", "O₂": "#D55E00", "O₃": "#009E73"}
 
 
@@ -39,7 +62,11 @@ def plot_profile(ax: Any, air: Profile) -> None:
     ax.set_ylim(0, 20)
     other = ax.twiny()
     other.plot(np.hypot(air.wind_east, air.wind_north)[low], km, color=SEQUENCE[0], label="wind")
-    scale = 10 ** math.floor(math.log10(20 / (air.vapour_density[0] * 1e3))) if air.vapour_density[0] > 0 else 1.0
+    scale = (
+        10 ** math.floor(math.log10(20 / (air.vapour_density[0] * 1e3)))
+        if air.vapour_density[0] > 0
+        else 1.0
+    )
     label = "vapour [g/m³]" if scale == 1 else f"vapour × {scale:g} [g/m³]"
     other.plot(air.vapour_density[low] * 1e3 * scale, km, color=SEQUENCE[2], label="vapour")
     other.set_xlim(left=0)
@@ -52,27 +79,52 @@ def plot_pwv(ax: Any, water: PwvByMonth) -> None:
     month = np.arange(12)
     low, lower, _, upper, high = water.quantiles.T * 1e3
     ax.fill_between(
-        month, low, high, color=SEQUENCE[5], alpha=0.3, lw=0, label=f"{100 * QUANTILES[0]:g} to {100 * QUANTILES[-1]:g} %"
+        month,
+        low,
+        high,
+        color=SEQUENCE[5],
+        alpha=0.3,
+        lw=0,
+        label=f"{100 * QUANTILES[0]:g} to {100 * QUANTILES[-1]:g} %",
     )
     ax.fill_between(
-        month, lower, upper, color=SEQUENCE[5], alpha=0.6, lw=0, label=f"{100 * QUANTILES[1]:g} to {100 * QUANTILES[3]:g} %"
+        month,
+        lower,
+        upper,
+        color=SEQUENCE[5],
+        alpha=0.6,
+        lw=0,
+        label=f"{100 * QUANTILES[1]:g} to {100 * QUANTILES[3]:g} %",
     )
     from matplotlib import colormaps
 
     for k, hour in enumerate(HOURS):
         colour = colormaps["viridis"](hour / 24)
-        ax.plot(month, water.median[:, k] * 1e3, color=colour, lw=1.2, label=f"median, {hour:02d} h UTC")
+        ax.plot(
+            month, water.median[:, k] * 1e3, color=colour, lw=1.2, label=f"median, {hour:02d} h UTC"
+        )
     ax.set_yscale("log")
     ax.set_xticks(month, [name[0] for name in MONTHS])
     ax.set_ylabel("PWV [mm]")
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter(_some_minor)
     ax.set_xlabel("month")
-    ax.legend(fontsize=6.5, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False, columnspacing=1.0)
+    ax.legend(
+        fontsize=6.5,
+        ncols=4,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.14),
+        frameon=False,
+        columnspacing=1.0,
+    )
 
 
-def plot_spectrum(ax: Any, air: Profile, elevation: float, bands: Sequence[Band], which: str) -> None:
-    """Emission (``brightness``) or ``transmission`` from 1 to 1000 GHz for several PWVs; bands are shaded, lines named above."""
+def plot_spectrum(
+    ax: Any, air: Profile, elevation: float, bands: Sequence[Band], which: str
+) -> None:
+    """Emission (``brightness``) or ``transmission`` from 1 to 1000 GHz for several PWVs; bands are
+    shaded, lines named above.
+    """
     low, high = LOWEST, HIGHEST
     for k, pwv in enumerate(pwv_steps(air)):
         seen = spectrum(air.scaled(pwv).layers, elevation, low=low, high=high)
@@ -91,9 +143,20 @@ def plot_spectrum(ax: Any, air: Profile, elevation: float, bands: Sequence[Band]
     centres = spread([band.centre / 1e9 for _, band in named], 1.4 * NAME, low / 1e9, high / 1e9)
     for (k, band), centre in zip(named, centres, strict=True):
         colour = SEQUENCE[(k + 3) % 7]
-        ax.fill_between(band.frequency / 1e9, band.transmission, color=colour, alpha=0.2, lw=0, transform=place)
+        ax.fill_between(
+            band.frequency / 1e9, band.transmission, color=colour, alpha=0.2, lw=0, transform=place
+        )
         box = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 0.5}
-        ax.annotate(band.name, (centre, at), xycoords=place, rotation=90, ha="center", va=side, fontsize=7, bbox=box)
+        ax.annotate(
+            band.name,
+            (centre, at),
+            xycoords=place,
+            rotation=90,
+            ha="center",
+            va=side,
+            fontsize=7,
+            bbox=box,
+        )
     _name_lines(ax)
     ax.set_xlim(low / 1e9, high / 1e9)
     if which == "brightness":
@@ -113,18 +176,42 @@ NAME = 21.0
 
 def _name_lines(ax: Any) -> None:
     """Names of the lines above the spectrum, each with a stroke to its place."""
-    rows = sorted((frequency, name) for name, frequencies in LINES.items() for frequency in frequencies)
+    rows = sorted(
+        (frequency, name) for name, frequencies in LINES.items() for frequency in frequencies
+    )
     place = ax.get_xaxis_transform()
-    for (frequency, name), at in zip(rows, spread([f for f, _ in rows], NAME, LOWEST / 1e9, HIGHEST / 1e9), strict=True):
+    for (frequency, name), at in zip(
+        rows, spread([f for f, _ in rows], NAME, LOWEST / 1e9, HIGHEST / 1e9), strict=True
+    ):
         colour = LINE_COLOURS[name]
-        ax.plot([frequency, frequency, at], [1.0, 1.015, 1.05], transform=place, color=colour, lw=0.6, clip_on=False)
+        ax.plot(
+            [frequency, frequency, at],
+            [1.0, 1.015, 1.05],
+            transform=place,
+            color=colour,
+            lw=0.6,
+            clip_on=False,
+        )
         text = f"{name} {frequency:.0f}"
-        ax.annotate(text, (at, 1.06), xycoords=place, rotation=90, ha="center", va="bottom", fontsize=6.5, color=colour)
+        ax.annotate(
+            text,
+            (at, 1.06),
+            xycoords=place,
+            rotation=90,
+            ha="center",
+            va="bottom",
+            fontsize=6.5,
+            color=colour,
+        )
 
 
 def spread(places: Sequence[float], least: float, low: float, high: float) -> list[float]:
-    """Sorted places moved as little as makes them ``least`` apart (least squares), within ``low`` and ``high``."""
-    groups: list[tuple[float, int]] = []  # places less what goes before, of names that touch: their mean and number
+    """Sorted places moved as little as makes them ``least`` apart (least squares), within ``low``
+    and ``high``.
+    """
+    groups: list[
+        tuple[float, int]
+    ] = []  # places less what goes before, of names that touch: their mean and number
     for k, place in enumerate(places):
         mean, count = place - k * least, 1
         while groups and groups[-1][0] >= mean:
@@ -137,9 +224,15 @@ def spread(places: Sequence[float], least: float, low: float, high: float) -> li
 
 
 def weather_figure(
-    title: str, air: Profile, water: PwvByMonth | None, elevation: float = math.pi / 2, bands: Sequence[Band] = ()
+    title: str,
+    air: Profile,
+    water: PwvByMonth | None,
+    elevation: float = math.pi / 2,
+    bands: Sequence[Band] = (),
 ) -> Figure:
-    """Profile, PWV by month and hour (where it is known), emission and transmission: one figure, not pyplot's."""
+    """Profile, PWV by month and hour (where it is known), emission and transmission: one figure,
+    not pyplot's.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 9.5), dpi=110, layout="constrained")
@@ -153,7 +246,13 @@ def weather_figure(
         axes[0, 1].text(0.5, 0.5, "no climatology here: no PWV by month", ha="center")
     plot_spectrum(axes[1, 0], air, elevation, bands, "brightness")
     plot_spectrum(axes[1, 1], air, elevation, bands, "transmission")
-    figure.legend(*axes[1, 1].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    figure.legend(
+        *axes[1, 1].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=6,
+        fontsize=8,
+        frameon=False,
+    )
     return figure
 
 

@@ -1,4 +1,6 @@
-"""The picture of ``zonda when``: elevation against time tonight, and month against hour with the PWV."""
+"""The picture of ``zonda when``: elevation against time tonight, and month against hour with the
+PWV.
+"""
 
 from __future__ import annotations
 
@@ -41,16 +43,37 @@ def plot_night(ax: Any, seen: Seen) -> None:
     utc = (night.times[0] % 86400) / HOUR
     for depth in TWILIGHT:
         ax.fill_between(
-            hours, 0, 1, where=night.sun.elevation < depth, transform=ax.get_xaxis_transform(), color="0.5", alpha=0.16, lw=0
+            hours,
+            0,
+            1,
+            where=night.sun.elevation < depth,
+            transform=ax.get_xaxis_transform(),
+            color="0.5",
+            alpha=0.16,
+            lw=0,
         )
     own = seen.name.lower()
-    for track, name, colour in ((night.sun, "Sun", SEQUENCE[4]), (night.moon, f"Moon, {100 * night.moon_lit:.0f} % lit", "0.45")):
+    for track, name, colour in (
+        (night.sun, "Sun", SEQUENCE[4]),
+        (night.moon, f"Moon, {100 * night.moon_lit:.0f} % lit", "0.45"),
+    ):
         if not name.lower().startswith(own):
             ax.plot(hours, np.degrees(track.elevation), color=colour, lw=1.0, ls="--", label=name)
     elevation = np.degrees(night.target.elevation)
     ax.plot(hours, elevation, color=SEQUENCE[0], lw=1.0)
-    ax.plot(hours, np.where(night.target.elevation >= night.above, elevation, np.nan), color=SEQUENCE[0], lw=2.8, label=seen.name)
-    ax.axhline(math.degrees(night.above), color=SEQUENCE[1], lw=0.8, label=f"{math.degrees(night.above):.4g} deg")
+    ax.plot(
+        hours,
+        np.where(night.target.elevation >= night.above, elevation, np.nan),
+        color=SEQUENCE[0],
+        lw=2.8,
+        label=seen.name,
+    )
+    ax.axhline(
+        math.degrees(night.above),
+        color=SEQUENCE[1],
+        lw=0.8,
+        label=f"{math.degrees(night.above):.4g} deg",
+    )
     ax.set_xlim(0, 24)
     ax.set_ylim(0, 90)
     first = math.ceil(utc / 2) * 2
@@ -69,23 +92,42 @@ def plot_night(ax: Any, seen: Seen) -> None:
 
 
 def plot_year(ax: Any, seen: Seen, year: Sequence[Month]) -> None:
-    """Month against hour (UTC): the median PWV, lines of equal elevation, and hatching where the Sun is up."""
+    """Month against hour (UTC): the median PWV, lines of equal elevation, and hatching where the
+    Sun is up.
+    """
     place = np.concatenate([number + month.place for number, month in enumerate(year)])
     elevation = np.degrees(np.concatenate([month.elevation for month in year]))
     day = np.concatenate([month.depth for month in year]) <= 0
     hours = np.linspace(0, 24, elevation.shape[1])
     if seen.known:
         _plot_pwv(ax, 1e3 * seen.pwv_by_month[:, :, 1])
-    ax.contourf(hours, place, day.astype(np.float64), levels=[0.5, 1.5], colors="none", hatches=["//"])
+    ax.contourf(
+        hours, place, day.astype(np.float64), levels=[0.5, 1.5], colors="none", hatches=["//"]
+    )
     limit = math.degrees(seen.night.above)
     low, high = elevation.min(), elevation.max()
     monthly = seen.name.lower() == "moon"  # too many lines for names
-    levels = [level for level in (15.0, 30.0, 45.0, 60.0, 75.0) if low < level < high and abs(level - limit) > 4]
+    levels = [
+        level
+        for level in (15.0, 30.0, 45.0, 60.0, 75.0)
+        if low < level < high and abs(level - limit) > 4
+    ]
     if levels and not monthly:
         colour = "white" if seen.known else "black"
-        ax.clabel(ax.contour(hours, place, elevation, levels=levels, colors=colour, linewidths=0.7), fmt="%g°", fontsize=8)
+        ax.clabel(
+            ax.contour(hours, place, elevation, levels=levels, colors=colour, linewidths=0.7),
+            fmt="%g°",
+            fontsize=8,
+        )
     if low < limit < high:
-        thick = ax.contour(hours, place, elevation, levels=[limit], colors=SEQUENCE[1], linewidths=1.2 if monthly else 2.2)
+        thick = ax.contour(
+            hours,
+            place,
+            elevation,
+            levels=[limit],
+            colors=SEQUENCE[1],
+            linewidths=1.2 if monthly else 2.2,
+        )
         if not monthly:
             ax.clabel(thick, fmt=f"{limit:.4g}°", fontsize=9)
     else:
@@ -106,7 +148,13 @@ def _plot_pwv(ax: Any, pwv: Floats) -> None:
     closed = np.concatenate([closed[-1:], closed, closed[:1]])
     norm = LogNorm(pwv.min(), pwv.max())
     image = ax.pcolormesh(
-        np.arange(25), np.arange(14) - 0.5, closed, norm=norm, cmap="viridis_r", shading="gouraud", rasterized=True
+        np.arange(25),
+        np.arange(14) - 0.5,
+        closed,
+        norm=norm,
+        cmap="viridis_r",
+        shading="gouraud",
+        rasterized=True,
     )
     bar = ax.figure.colorbar(image, ax=ax, pad=0.02)
     bar.set_label("median PWV [mm]")

@@ -1,4 +1,6 @@
-"""What ``zonda when`` prints: tonight hour by hour, the year month by month, and both as plain values."""
+"""What ``zonda when`` prints: tonight hour by hour, the year month by month, and both as plain
+values.
+"""
 
 from __future__ import annotations
 
@@ -67,14 +69,20 @@ class Seen:
         found = np.empty((12, 24 // CELL, 3))
         for month in range(12):
             for k in range(24 // CELL):
-                found[month, k] = pwv_at(self.site, Instant.parse(f"{year:04d}-{month + 1:02d}-15T{CELL * k:02d}:00Z"))
-        closed = np.concatenate([found, found[:, :1]], axis=1)  # periodic and smooth: two harmonics of the day
+                found[month, k] = pwv_at(
+                    self.site, Instant.parse(f"{year:04d}-{month + 1:02d}-15T{CELL * k:02d}:00Z")
+                )
+        closed = np.concatenate(
+            [found, found[:, :1]], axis=1
+        )  # periodic and smooth: two harmonics of the day
         cell, rest = np.divmod(np.arange(24), CELL)
         weight = (rest / CELL)[None, :, None]
         return np.asarray(closed[:, cell] * (1 - weight) + closed[:, cell + 1] * weight)
 
     def pwv_of_month(self, number: int, month: Month) -> Floats | None:
-        """(3,) quantiles of the PWV [m] in the hours in which the target is up at night; None where it never is up."""
+        """(3,) quantiles of the PWV [m] in the hours in which the target is up at night; None where
+        it never is up.
+        """
         if not self.known or not month.by_hour.any():
             return None
         return np.asarray(np.average(self.pwv_by_month[number], axis=0, weights=month.by_hour))
@@ -86,18 +94,26 @@ class Seen:
 
     @cached_property
     def _middle(self) -> Profile:
-        return climatology.profile(self.site, _instant(self.night.times[len(self.night.times) // 2]))
+        return climatology.profile(
+            self.site, _instant(self.night.times[len(self.night.times) // 2])
+        )
 
     @cached_property
     def hours(self) -> list[dict[str, Any]]:
-        """The night's full hours (UTC) in which the target is above the limit; every ten minutes where that is short."""
+        """The night's full hours (UTC) in which the target is above the limit; every ten minutes
+        where that is short.
+        """
         night = self.night
         first = night.times[0]
         every = HOUR if night.hours[0] >= 2 else HOUR / 6
         at = np.arange(math.ceil(first / every) * every, night.times[-1] + 1, every)
         index = np.rint((at - first) / 60).astype(int)
         elevation = night.target.elevation
-        return [self._hour(float(t), k) for t, k in zip(at, index, strict=True) if elevation[k] >= night.above]
+        return [
+            self._hour(float(t), k)
+            for t, k in zip(at, index, strict=True)
+            if elevation[k] >= night.above
+        ]
 
     def _hour(self, posix: float, k: int) -> dict[str, Any]:
         night = self.night
@@ -123,7 +139,9 @@ class Seen:
 
 
 def pwv_at(site: Site, when: Instant) -> Floats:
-    """(3,) quantiles of the climatology's PWV, m. Raises `InputError` for a year that it does not stand for."""
+    """(3,) quantiles of the climatology's PWV, m. Raises `InputError` for a year that it does not
+    stand for.
+    """
     law = climatology.profile(site, when).distribution
     assert law is not None  # the climatology has spreads
     return np.array([law.at(q) for q in QUANTILES])
@@ -136,12 +154,18 @@ def lines(seen: Seen, year: Sequence[Month]) -> list[str]:
 
 def _head(seen: Seen) -> list[str]:
     site, night = seen.site, seen.night
-    where = f"{math.degrees(site.latitude):.4f} deg, {math.degrees(site.longitude):.4f} deg, {site.altitude:g} m"
+    where = (
+        f"{math.degrees(site.latitude):.4f} deg, {math.degrees(site.longitude):.4f} deg,"
+        f" {site.altitude:g} m"
+    )
     begin, end = night.times[0], night.times[-1]
     offset = solar_offset(site)
     found = [
         f"{seen.name} from {site.name} ({where})",
-        f"night of {_iso(begin)} to {_iso(end)} (local noon to noon); local mean solar time is UTC {_shift(offset)}",
+        (
+            f"night of {_iso(begin)} to {_iso(end)} (local noon to noon); local mean solar time is"
+            f" UTC {_shift(offset)}"
+        ),
         f"above {_deg(night.above)}: {_when_up(seen)}",
         f"night (Sun below the horizon): {_spans(night.dark, offset, 'the whole day', 'never')}",
     ]
@@ -150,7 +174,9 @@ def _head(seen: Seen) -> list[str]:
     if seen.name.lower() != "sun":
         found.append(f"Sun: {sun.min():.0f} to {sun.max():.0f} deg away")
     if seen.name.lower() != "moon":
-        found.append(f"Moon: {100 * night.moon_lit:.0f} % lit, {moon.min():.0f} to {moon.max():.0f} deg away")
+        found.append(
+            f"Moon: {100 * night.moon_lit:.0f} % lit, {moon.min():.0f} to {moon.max():.0f} deg away"
+        )
     return found
 
 
@@ -167,7 +193,9 @@ def _when_up(seen: Seen) -> str:
     return f"{spans}; {top}; {total:.1f} h, of which {dark:.1f} h at night"
 
 
-def _spans(spans: Sequence[tuple[float | None, float | None]], offset: float, always: str, never: str) -> str:
+def _spans(
+    spans: Sequence[tuple[float | None, float | None]], offset: float, always: str, never: str
+) -> str:
     """Spans with their clock times in UTC and solar time."""
 
     def text(time: float) -> str:
@@ -193,15 +221,18 @@ def _table(seen: Seen) -> list[str]:
     widths = [max(len(name) + 2, 10) for name in names] if seen.known else []
     pwv = "   PWV 25, 50, 75 % [mm]" if seen.known else ""
     extra = "".join(f"{name:>{w}}" for name, w in zip(names, widths, strict=False))
-    above = f"{'':61}{'' if not seen.known else ' ' * 24}{'  transmission of the band' if extra else ''}"
+    above = " " * (85 if seen.known else 61) + ("  transmission of the band" if extra else "")
     found = [above.rstrip()] if extra else []
     found.append(f"  UTC  solar  elevation  azimuth  Sun el.  Sun dist.  Moon dist.{pwv}{extra}")
     for row in rows:
         mm = "".join(f"{value:8.2f}" for value in row["pwv_mm"]) if seen.known else ""
-        passed = "".join(f"{row[f'transmission {name}']:{w}.3f}" for name, w in zip(names, widths, strict=False))
+        passed = "".join(
+            f"{row[f'transmission {name}']:{w}.3f}" for name, w in zip(names, widths, strict=False)
+        )
         found.append(
-            f"{row['time'][11:16]}  {row['solar']}  {row['elevation']:9.1f}  {row['azimuth']:7.1f}  {row['sun elevation']:7.1f}  "
-            f"{row['sun distance']:9.1f}  {row['moon distance']:10.1f}{mm}{passed}"
+            f"{row['time'][11:16]}  {row['solar']}  {row['elevation']:9.1f}  {row['azimuth']:7.1f} "
+            f" {row['sun elevation']:7.1f}  {row['sun distance']:9.1f} "
+            f" {row['moon distance']:10.1f}{mm}{passed}"
         )
     if not seen.known:
         found.append(f"{seen.site.name} has no climatology: no PWV, no transmission")
@@ -211,15 +242,31 @@ def _table(seen: Seen) -> list[str]:
 def _year(seen: Seen, year: Sequence[Month]) -> list[str]:
     above = _deg(seen.night.above)
     head = f"  highest  h above {above}  of them at night  Sun dist."
-    found = [f"{seen.when.datetime.year:04d}{head}" + ("   PWV 25, 50, 75 % [mm]" if seen.known else "")]
+    found = [
+        f"{seen.when.datetime.year:04d}{head}" + ("   PWV 25, 50, 75 % [mm]" if seen.known else "")
+    ]
     for number, (name, month) in enumerate(zip(MONTHS, year, strict=True)):
         quantiles = seen.pwv_of_month(number, month)
-        mm = "" if not seen.known else f"{'-':>8}" * 3 if quantiles is None else "".join(f"{1e3 * q:8.2f}" for q in quantiles)
+        mm = (
+            ""
+            if not seen.known
+            else (
+                f"{'-':>8}" * 3
+                if quantiles is None
+                else "".join(f"{1e3 * q:8.2f}" for q in quantiles)
+            )
+        )
         sun = f"{math.degrees(month.sun[0]):.0f} to {math.degrees(month.sun[1]):.0f}"
         width = len(f"h above {above}")
         top = math.degrees(month.highest)
-        found.append(f"{name}   {top:7.1f}  {month.hours:{width}.0f}  {month.hours_at_night:16.0f}  {sun:>9}{mm}")
-    note = "hours in the month; PWV in the hours in which it is above the limit at night, or by day where it never is at night"
+        found.append(
+            f"{name}   {top:7.1f}  {month.hours:{width}.0f}  {month.hours_at_night:16.0f} "
+            f" {sun:>9}{mm}"
+        )
+    note = (
+        "hours in the month; PWV in the hours in which it is above the limit at night, or by day"
+        " where it never is at night"
+    )
     return [*found, note if seen.known else "hours in the month"]
 
 
@@ -237,12 +284,18 @@ def as_dict(seen: Seen, year: Sequence[Month]) -> dict[str, Any]:
                 "hours at night": round(month.hours_at_night, 2),
                 "highest": round(math.degrees(month.highest), 2),
                 "sun distance": [round(math.degrees(d), 1) for d in month.sun],
-                "pwv_mm": None if quantiles is None else [round(1e3 * float(q), 4) for q in quantiles],
+                "pwv_mm": (
+                    None if quantiles is None else [round(1e3 * float(q), 4) for q in quantiles]
+                ),
             }
         )
     return {
         "target": seen.name,
-        "site": {"name": site.name, "latitude": math.degrees(site.latitude), "longitude": math.degrees(site.longitude)},
+        "site": {
+            "name": site.name,
+            "latitude": math.degrees(site.latitude),
+            "longitude": math.degrees(site.longitude),
+        },
         "above": round(math.degrees(night.above), 6),
         "quantiles": list(QUANTILES),
         "solar minus utc": round(solar_offset(site), 1),

@@ -1,16 +1,20 @@
-"""What the filters leave of the atmosphere in a map: an indicative figure, without drawing any turbulence.
+"""What the filters leave of the atmosphere in a map: an indicative figure, without drawing any
+turbulence.
 
-Layer l of the frozen atmosphere is a sum of plane waves q with the spectrum P_l (behind the telescope's beam in that layer). The
-boresight crosses it along the path X(t), a detector at focal-plane offset d beside it, at X(t) + J d. With K the beam on the map
-about a point x, delta(t) the offset in the focal plane at which x is at time t, g(t) = sum_d K(x - x_dt) ~ the density of
+Layer l of the frozen atmosphere is a sum of plane waves q with the spectrum P_l (behind the
+telescope's beam in that layer). The boresight crosses it along the path X(t), a detector at
+focal-plane offset d beside it, at X(t) + J d. With K the beam on the map about a point x, delta(t)
+the offset in the focal plane at which x is at time t, g(t) = sum_d K(x - x_dt) ~ the density of
 detectors at delta(t), and A(q) = <exp(i q J d)>_d what the common mode removes,
 
-    variance = sum_l K_l^2 int d2q/(2 pi)^2 P_l(q) |sum_t g (exp(i q J delta) - A) (1 - P) exp(i q X)|^2 / (sum_t g)^2     (1)
+    variance = sum_l K_l^2 int d2q/(2 pi)^2 P_l(q)
+               |sum_t g (exp(i q J delta) - A) (1 - P) exp(i q X)|^2 / (sum_t g)^2       (1)
 
-with K_l the kelvin of calibrated signal per unit of the layer's field. Waves are drawn from what (1) leads to expect of them, so
-that few are needed; their scatter is part of the error that is stated. It holds for weak fluctuations and equal gains. Scans see
-different parts of the atmosphere, so their contributions add up in quadrature: the wind carries it farther between them than the
-size of what the filters leave.
+with K_l the kelvin of calibrated signal per unit of the layer's field. Waves are drawn from what
+(1) leads to expect of them, so that few are needed; their scatter is part of the error that is
+stated. It holds for weak fluctuations and equal gains. Scans see different parts of the atmosphere,
+so their contributions add up in quadrature: the wind carries it farther between them than the size
+of what the filters leave.
 """
 
 from __future__ import annotations
@@ -22,17 +26,25 @@ import numpy as np
 
 from zonda.core.types import Floats
 from zonda.operators.atmosphere.planning import Calibrated, calibrated
-from zonda.operators.atmosphere.turbulence.geometry import ScanPlane, axes, crossing, rays, scan_planes
+from zonda.operators.atmosphere.turbulence.geometry import (
+    ScanPlane,
+    axes,
+    crossing,
+    rays,
+    scan_planes,
+)
 
 from .survey import Noise, Survey, Track
 
 WAVES = 320
-"""Number of waves: with 96 the rms is wrong by half where the atmosphere is a small part of the noise (AtLAST); 1280 change it
-by 8 %."""
+"""Number of waves: with 96 the rms is wrong by half where the atmosphere is a small part of the
+noise (AtLAST); 1280 change it by 8 %."""
 POINTS, DETECTORS = 8, 64
 """Number of probes, and of the detectors that A is averaged over."""
 MOST = 12
-"""Number of scans that are followed, the first ones. The variance of later ones is taken to fall as 1 / time."""
+"""Number of scans that are followed, the first ones. The variance of later ones is taken to fall as
+1 / time.
+"""
 PER_CUT, LEAST, LARGEST = 4.0, 3.0, 30.0
 """Instants per cycle of the cut, and per second, at least and at most."""
 WAVE_NUMBERS = np.linspace(math.log(2e-4), math.log(3.0), 240)
@@ -46,15 +58,18 @@ NEGLIGIBLE = 1e-4
 
 @dataclass(frozen=True)
 class Mode:
-    """A singular mode of a scan that is found in the data, in place of the detectors' mean of equation (1).
+    """A singular mode of a scan that is found in the data, in place of the detectors' mean of
+    equation (1).
 
     Attributes
     ----------
     independent
-        Number of independent values of the common mode in a scan. Of few, the rest of the atmosphere varies with
-        it by chance, and goes with it: equation (1) is too high, by a half where there are nine.
+        Number of independent values of the common mode in a scan. Of few, the rest of the
+        atmosphere varies with it by chance, and goes with it: equation (1) is too high, by a half
+        where there are nine.
     turned
-        Variance [K^2] of the common mode that stays in a sample, in each detector by itself, because noise turns the mode.
+        Variance [K^2] of the common mode that stays in a sample, in each detector by itself,
+        because noise turns the mode.
     """
 
     independent: float
@@ -65,8 +80,8 @@ class Mode:
 
 @dataclass(frozen=True)
 class Left:
-    """Variance [K^2] after each scan, (n_scan,), and the relative standard error of its last value from the scatter of the
-    waves."""
+    """Variance [K^2] after each scan, (n_scan,), and the relative standard error of its last value
+    from the scatter of the waves."""
 
     variance: Floats
     error: float
@@ -74,13 +89,17 @@ class Left:
 
 
 def step_of_modes(survey: Survey) -> bool:
-    """Whether what detectors have in common is found in the data: equation (1), which takes their mean off, need not hold."""
+    """Whether what detectors have in common is found in the data: equation (1), which takes their
+    mean off, need not hold.
+    """
     return survey.common and survey.steps.common is not None and survey.steps.common.method == "svd"
 
 
 @dataclass(frozen=True)
 class _Scan:
-    """A scan as equation (1) needs it: instants at which some probe is seen, g (n_probe, n), delta (n_probe, n, 2)."""
+    """A scan as equation (1) needs it: instants at which some probe is seen, g (n_probe, n), delta
+    (n_probe, n, 2).
+    """
 
     track: Track
     plane: ScanPlane
@@ -92,7 +111,9 @@ class _Scan:
 
 
 def variance(survey: Survey, radius: float, waves: int = WAVES) -> Left:
-    """Equation (1) from about so many waves, averaged over probes in a circle of ``radius`` [rad] about the map's centre."""
+    """Equation (1) from about so many waves, averaged over probes in a circle of ``radius`` [rad]
+    about the map's centre.
+    """
     step, number = survey.atmosphere, len(survey.observations)
     if step is None or step.pwv_rms == 0:
         return Left(np.zeros(number), 0.0)
@@ -101,11 +122,16 @@ def variance(survey: Survey, radius: float, waves: int = WAVES) -> Left:
     shares = _expected(survey, found)
     total, spread = np.zeros(len(scans)), 0.0
     some = _some(survey)
-    covariance, spectrum = np.zeros((len(some), len(some))), np.zeros(len(scans[0].track.index) // 2 + 1)
+    covariance, spectrum = (
+        np.zeros((len(some), len(some))),
+        np.zeros(len(scans[0].track.index) // 2 + 1),
+    )
     share = np.array([s.sum() for s in shares]) * [k not in step.omit for k in range(len(shares))]
     rng = np.random.default_rng(3)
     for k in np.flatnonzero(share > NEGLIGIBLE * share.sum()).tolist():
-        drawn, weights = _drawn(found, k, shares[k], max(8, round(waves * share[k] / share.sum())), rng)
+        drawn, weights = _drawn(
+            found, k, shares[k], max(8, round(waves * share[k] / share.sum())), rng
+        )
         weights = weights * (found.kelvin * found.layers[k].amplitude) ** 2
         each = _of_waves(survey, scans, found, k, drawn) * weights
         if step_of_modes(survey):
@@ -116,45 +142,68 @@ def variance(survey: Survey, radius: float, waves: int = WAVES) -> Left:
     last = np.arange(len(scans), number)
     total = np.r_[total, total[-1] * survey.seconds[len(scans) - 1] / survey.seconds[last]]
     error = math.sqrt(spread) / total[-1] if total[-1] > 0 else 0.0
-    return Left(total, error, _mode(survey, covariance, spectrum) if total[-1] > 0 and step_of_modes(survey) else None)
+    return Left(
+        total,
+        error,
+        _mode(survey, covariance, spectrum) if total[-1] > 0 and step_of_modes(survey) else None,
+    )
 
 
 def _scans(survey: Survey, radius: float) -> list[_Scan]:
-    """The first scans, at instants that resolve the beam's passages over the probes where there is time for that."""
+    """The first scans, at instants that resolve the beam's passages over the probes where there is
+    time for that.
+    """
     rate = _rate(survey)
     width = max(survey.sigma, 1.5 * survey.speed / rate / survey.fwhm * survey.sigma)
     density, reach, cell = _footprint(survey.offsets, width)
     angle = 2 * np.pi * (GOLDEN * np.arange(POINTS) % 1)
-    probes = radius * np.sqrt((np.arange(POINTS) + 0.5) / POINTS)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    probes = (
+        radius
+        * np.sqrt((np.arange(POINTS) + 0.5) / POINTS)[:, None]
+        * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    )
     planes = scan_planes(survey.observations[:MOST])
     found = []
     for k, plane in enumerate(planes):
         track = survey.track(k, rate)
-        offsets = np.einsum("tij,ptj->pti", np.linalg.inv(track.turn), probes[:, None] - track.centre[None])
+        offsets = np.einsum(
+            "tij,ptj->pti", np.linalg.inv(track.turn), probes[:, None] - track.centre[None]
+        )
         seen = _interpolated(density, (offsets + reach) / cell - 0.5)
         frame = axes(track.observation.boresight_azel[track.index])
         own = plane.unroll(crossing(rays(frame, np.zeros(1), np.zeros(1))))[:, 0]
         middle, little = frame[len(frame) // 2 : len(frame) // 2 + 1], 1e-4
-        corners = plane.unroll(crossing(rays(middle, np.array([0.0, little, 0.0]), np.array([0.0, 0.0, little]))))[:, :, 0]
+        corners = plane.unroll(
+            crossing(rays(middle, np.array([0.0, little, 0.0]), np.array([0.0, 0.0, little])))
+        )[:, :, 0]
         jacobian = (corners[:, 1:] - corners[:, :1]) / little
-        found.append(_Scan(track, plane, own, jacobian, seen * track.step, offsets, float(survey.weights[k])))
+        found.append(
+            _Scan(track, plane, own, jacobian, seen * track.step, offsets, float(survey.weights[k]))
+        )
     return found
 
 
 def _rate(survey: Survey) -> float:
     """Instants per second at which scans are followed, Hz."""
-    return min(max(PER_CUT * survey.cut, min(survey.rate, LARGEST), LEAST), survey.observations[0].sample_rate)
+    return min(
+        max(PER_CUT * survey.cut, min(survey.rate, LARGEST), LEAST),
+        survey.observations[0].sample_rate,
+    )
 
 
 def _footprint(offsets: Floats, sigma: float) -> tuple[Floats, float, float]:
-    """(grid, reach, cell): detectors per solid angle of the focal plane, smoothed with a Gaussian of ``sigma`` [rad]."""
+    """(grid, reach, cell): detectors per solid angle of the focal plane, smoothed with a Gaussian
+    of ``sigma`` [rad].
+    """
     from scipy.ndimage import gaussian_filter
 
     reach = float(np.abs(offsets).max()) + 4 * sigma
     cell = max(sigma / 1.5, reach / 250)
     number = int(2 * reach / cell) + 2
     half = number * cell / 2
-    counts, _, _ = np.histogram2d(offsets[:, 0], offsets[:, 1], bins=number, range=[[-half, half]] * 2)
+    counts, _, _ = np.histogram2d(
+        offsets[:, 0], offsets[:, 1], bins=number, range=[[-half, half]] * 2
+    )
     return np.asarray(gaussian_filter(counts, sigma / cell)), half, cell
 
 
@@ -172,25 +221,36 @@ def _spectrum(found: Calibrated, layer: int, number: Floats) -> Floats:
 
 
 def _expected(survey: Survey, found: Calibrated) -> list[Floats]:
-    """For each layer what each of `WAVE_NUMBERS` is expected to add: spectrum x the array's response x share of time above the
-    cut, where fast waves average down over a passage."""
+    """For each layer what each of `WAVE_NUMBERS` is expected to add: spectrum x the array's
+    response x share of time above the cut, where fast waves average down over a passage."""
     number = np.exp(WAVE_NUMBERS)
     field = max(float(np.hypot(*survey.offsets.T).max()), survey.sigma)
     shares = []
     for k, layer in enumerate(found.layers):
         speed = np.hypot(*found.velocities[k])
         across = np.clip(number[:, None] * speed / (2 * np.pi * max(survey.cut, 1e-6)), 1e-9, None)
-        above = np.where(across > 1, 1 - 2 / np.pi * np.arcsin(1 / np.maximum(across, 1)), 0).mean(axis=1)
+        above = np.where(across > 1, 1 - 2 / np.pi * np.arcsin(1 / np.maximum(across, 1)), 0).mean(
+            axis=1
+        )
         above += ENDS * np.minimum(1, across.max(axis=1)) ** 2
         phase = number * field * layer.distance
         form = phase**2 / (phase**2 + 4) if survey.common else np.ones_like(number)
-        each = (found.kelvin * layer.amplitude) ** 2 * number**2 * _spectrum(found, k, number) / (2 * np.pi) * above * form
+        each = (
+            (found.kelvin * layer.amplitude) ** 2
+            * number**2
+            * _spectrum(found, k, number)
+            / (2 * np.pi)
+            * above
+            * form
+        )
         slow, fast = each / (1 + phase**2), each / (1 + phase)
         shares.append(slow / max(slow.sum(), 1e-300) * fast.sum() + fast)
     return shares
 
 
-def _drawn(found: Calibrated, layer: int, share: Floats, number: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+def _drawn(
+    found: Calibrated, layer: int, share: Floats, number: int, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
     """Waves (n, 2) [rad/m], and the weight of each in the integral of equation (1)."""
     chance = share / share.sum()
     at = (rng.permutation(number) + 0.5) / number
@@ -202,8 +262,12 @@ def _drawn(found: Calibrated, layer: int, share: Floats, number: int, rng: np.ra
     return waves, k**2 * _spectrum(found, layer, k) / (2 * np.pi) / density / number
 
 
-def _of_waves(survey: Survey, scans: list[_Scan], found: Calibrated, layer: int, waves: Floats) -> Floats:
-    """(n_scan, n_wave) the square in equation (1) over (sum g)^2, after each scan, averaged over probes."""
+def _of_waves(
+    survey: Survey, scans: list[_Scan], found: Calibrated, layer: int, waves: Floats
+) -> Floats:
+    """(n_scan, n_wave) the square in equation (1) over (sum g)^2, after each scan, averaged over
+    probes.
+    """
     model = found.layers[layer]
     squares, amount = np.zeros((POINTS, len(waves))), np.zeros(POINTS)
     some = _some(survey)
@@ -217,7 +281,9 @@ def _of_waves(survey: Survey, scans: list[_Scan], found: Calibrated, layer: int,
         survey.filter(scan.track, series)
         series = series[: len(waves)] + 1j * series[len(waves) :]
         across = waves @ (matrix @ scan.jacobian)
-        mean = np.exp(1j * (across @ some.T)).mean(axis=1) if survey.common else np.zeros(len(waves))
+        mean = (
+            np.exp(1j * (across @ some.T)).mean(axis=1) if survey.common else np.zeros(len(waves))
+        )
         for i, seen in enumerate(scan.density):
             near = np.flatnonzero(seen > 1e-2 * seen.max(initial=0.0))
             if near.size:
@@ -238,11 +304,15 @@ def _some(survey: Survey) -> Floats:
 def _covariance(
     survey: Survey, scan: _Scan, found: Calibrated, layer: int, waves: Floats, weights: Floats
 ) -> tuple[Floats, Floats]:
-    """(n, n) covariance [K^2] of a layer in the filtered samples of some detectors over a scan; spectrum of what they have in
-    common."""
+    """(n, n) covariance [K^2] of a layer in the filtered samples of some detectors over a scan;
+    spectrum of what they have in common."""
     model = found.layers[layer]
     matrix, start, velocity = scan.plane.affine(model.height, model.wind)
-    path = matrix @ scan.crossings + start[:, None] + velocity[:, None] * scan.track.observation.seconds[scan.track.index]
+    path = (
+        matrix @ scan.crossings
+        + start[:, None]
+        + velocity[:, None] * scan.track.observation.seconds[scan.track.index]
+    )
     phase = waves @ path
     series = np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
     survey.filter(scan.track, series)
@@ -250,25 +320,33 @@ def _covariance(
     power = (series.astype(np.float64) ** 2).reshape(2, len(waves), -1).sum(axis=0).mean(axis=1)
     seen = np.exp(1j * ((waves @ (matrix @ scan.jacobian)) @ _some(survey).T))
     shared = weights * abs(seen.mean(axis=1)) ** 2
-    return np.asarray(((seen.conj().T * (power * weights)) @ seen).real), np.asarray(shared @ energy)
+    return np.asarray(((seen.conj().T * (power * weights)) @ seen).real), np.asarray(
+        shared @ energy
+    )
 
 
 def _mode(survey: Survey, covariance: Floats, spectrum: Floats) -> Mode:
     """See `Mode`.
 
-    Noise of variance s^2, and of the spectrum R f_s / 2 at the frequencies of the common mode (on average over its power),
-    turns the mode of n detectors with the eigenvalue L in a scan of N samples by
+    Noise of variance s^2, and of the spectrum R f_s / 2 at the frequencies of the common mode (on
+    average over its power), turns the mode of n detectors with the eigenvalue L in a scan of N
+    samples by
 
-        <|du|^2> = (n - 1) R f_s / 2 (L + s^2) / L^2 / N                                                       (2)
+        <|du|^2> = (n - 1) R f_s / 2 (L + s^2) / L^2 / N                                         (2)
 
-    (Anderson 1963 where it is white); that share of the common mode, which is L / n a sample, stays.
+    (Anderson 1963 where it is white); that share of the common mode, which is L / n a sample,
+    stays.
     """
     independent = 2 * float(spectrum.sum()) ** 2 / max(float((spectrum**2).sum()), 1e-300)
     number, few, o = len(survey.offsets), len(covariance), survey.observations[0]
     f = np.linspace(max(survey.cut, 1 / o.duration), o.sample_rate / 2, 4000)
     own, shared = np.zeros_like(f), 0.0
     for noise in survey.levels[0]:
-        each = noise.sample**2 / (o.sample_rate / 2) * (np.ones_like(f) if noise.spectrum is None else noise.spectrum(f))
+        each = (
+            noise.sample**2
+            / (o.sample_rate / 2)
+            * (np.ones_like(f) if noise.spectrum is None else noise.spectrum(f))
+        )
         own += (1 - noise.shared) * each
         shared += noise.shared * float(np.trapezoid(each, f))
     variance = float(np.trapezoid(own, f))
@@ -279,13 +357,22 @@ def _mode(survey: Survey, covariance: Floats, spectrum: Floats) -> Mode:
     u, first = vectors[:, -1], max(float(eigenvalues[-1]), 1e-300) * number / few
     step, second = survey.steps.common, variance * (1 + math.sqrt(number / values)) ** 2
     if step is not None and step.on_undetermined == "mean" and second > first + variance:
-        return Mode(independent, 0.0, Noise(0.0))  # it is lost in the noise, far from determined: the detectors' mean is removed
+        return Mode(
+            independent, 0.0, Noise(0.0)
+        )  # it is lost in the noise, far from determined: the detectors' mean is removed
     track = survey.track(0, _rate(survey))
     frequency = np.maximum(np.fft.rfftfreq(len(track.index), 1 / track.rate), f[0])
     density = np.interp(frequency, f, own) * o.sample_rate / 2
     along = float(spectrum @ density / spectrum.sum())
     turned = (number - 1) * (first + variance) * along / first**2 / o.n_samples
     stays = turned * float(u @ covariance @ u) / few
-    power = stays * spectrum / spectrum.sum() / (frequency[1] - np.fft.rfftfreq(len(track.index), 1 / track.rate)[0])
+    power = (
+        stays
+        * spectrum
+        / spectrum.sum()
+        / (frequency[1] - np.fft.rfftfreq(len(track.index), 1 / track.rate)[0])
+    )
     density = power * o.sample_rate / 2
-    return Mode(independent, stays, Noise(1.0, lambda at: np.interp(at, frequency, density, right=0.0)))
+    return Mode(
+        independent, stays, Noise(1.0, lambda at: np.interp(at, frequency, density, right=0.0))
+    )

@@ -37,8 +37,9 @@ class Row:
     forecast
         Rms of the forecast.
     mean, error
-        Root of the mean square over ``seeds`` simulated maps, and its standard error: that from their scatter, or from the
-        scatter that white noise would have (`depth.scatter`) if that is more, since few seeds do not tell their own.
+        Root of the mean square over ``seeds`` simulated maps, and its standard error: that from
+        their scatter, or from the scatter that white noise would have (`depth.scatter`) if that is
+        more, since few seeds do not tell their own.
     """
 
     part: str
@@ -75,20 +76,31 @@ class Audited:
 
     def __str__(self) -> str:
         factor, unit = prefixed(max(r.mean for r in self.rows), "K_RJ")
-        table: list[tuple[str, ...]] = [("", f"forecast [{unit}]", "simulated", "standard error", "difference", "z")]
+        table: list[tuple[str, ...]] = [
+            ("", f"forecast [{unit}]", "simulated", "standard error", "difference", "z")
+        ]
         for r in self.rows:
             figures = (f"{v * factor:.4g}" for v in (r.forecast, r.mean, r.error))
             table.append((r.part, *figures, f"{100 * r.difference:+.1f} %", f"{r.z:+.1f}"))
         widths = [max(len(row[k]) for row in table) for k in range(len(table[0]))]
         lines = [f"audit: {self.rows[0].seeds} simulations of the whole pipeline"]
         for first, *others in table:
-            lines.append("  ".join([first.ljust(widths[0]), *(c.rjust(w) for c, w in zip(others, widths[1:], strict=True))]))
+            lines.append(
+                "  ".join(
+                    [
+                        first.ljust(widths[0]),
+                        *(c.rjust(w) for c, w in zip(others, widths[1:], strict=True)),
+                    ]
+                )
+            )
         return "\n".join(lines)
 
 
 @dataclass(frozen=True)
 class Forecasted:
-    """What is beside the simulations: the depths of a map's planes, the radius of its circle and its beam's FWHM, rad."""
+    """What is beside the simulations: the depths of a map's planes, the radius of its circle and
+    its beam's FWHM, rad.
+    """
 
     planes: Mapping[str, Depth]
     radius: float
@@ -99,16 +111,23 @@ class Forecasted:
         return [p for p in PARTS if self.planes[plane].variance[p][-1] > 0]
 
 
-def audit(file: PipelineFile, forecasts: Mapping[str, Forecasted], seeds: int, threads: int | None = None) -> dict[str, Audited]:
-    """Simulate a pipeline with ``seeds`` seeds, from its own on, and compare the noise of its maps with the ``forecasts``.
+def audit(
+    file: PipelineFile, forecasts: Mapping[str, Forecasted], seeds: int, threads: int | None = None
+) -> dict[str, Audited]:
+    """Simulate a pipeline with ``seeds`` seeds, from its own on, and compare the noise of its maps
+    with the ``forecasts``.
 
-    They are by the name of the band, "" where the camera has one. The parts are signals of one run, behind the modes of the
-    complete one, so that their maps add up to its map.
+    They are by the name of the band, "" where the camera has one. The parts are signals of one run,
+    behind the modes of the complete one, so that their maps add up to its map.
     """
     if seeds < 2:
-        raise InputError(f"{seeds} simulation has no standard error", place="--audit", cure="ask for 2 or more")
+        raise InputError(
+            f"{seeds} simulation has no standard error", place="--audit", cure="ask for 2 or more"
+        )
     every = list(dict.fromkeys(p for f in forecasts.values() for p in f.parts("I")))
-    made = [_maps(file, every, list(forecasts), file.scene().seed + k, threads) for k in range(seeds)]
+    made = [
+        _maps(file, every, list(forecasts), file.scene().seed + k, threads) for k in range(seeds)
+    ]
     return {band: _audited(of, [one[band] for one in made]) for band, of in forecasts.items()}
 
 
@@ -119,13 +138,26 @@ def _audited(of: Forecasted, made: list[dict[str, MapProduct]]) -> Audited:
         parts = of.parts(plane)
         together = [TOGETHER] if len(depth.known) == len(PARTS) else []
         for name in parts + together:
-            forecast = sum(float(depth.variance[p][-1]) for p in (parts if name == TOGETHER else [name]))
-            maps = [one[name] if one[name].polarization is None else one[name].stokes(plane) for one in made]
+            forecast = sum(
+                float(depth.variance[p][-1]) for p in (parts if name == TOGETHER else [name])
+            )
+            maps = [
+                one[name] if one[name].polarization is None else one[name].stokes(plane)
+                for one in made
+            ]
             squares = np.array([m.smoothed_rms(m.fwhm, of.radius) ** 2 for m in maps])
             mean = math.sqrt(squares.mean())
             own = float(squares.std(ddof=1)) / (2 * mean)
             error = max(own, scatter(of.fwhm / FWHM_PER_SIGMA, of.radius) * mean) / math.sqrt(seeds)
-            rows.append(Row(name if plane == "I" else f"{plane} {name}", math.sqrt(forecast), mean, error, seeds))
+            rows.append(
+                Row(
+                    name if plane == "I" else f"{plane} {name}",
+                    math.sqrt(forecast),
+                    mean,
+                    error,
+                    seeds,
+                )
+            )
     return Audited(tuple(rows))
 
 
@@ -134,17 +166,28 @@ def _maps(
 ) -> dict[str, dict[str, MapProduct]]:
     """By band the maps of each part, and of all noise."""
     operators = [
-        o.model_copy(update={"smooth": None, "half_difference": False}) if isinstance(o, BinMap) else o
+        o.model_copy(update={"smooth": None, "half_difference": False})
+        if isinstance(o, BinMap)
+        else o
         for o in steps_of(file).operators
     ]
-    runs = {f"only_{COMPONENTS[p]}": {"only": [COMPONENTS[p]], "modes": "full"} for p in parts} if len(parts) > 1 else {}
-    pipeline = Pipeline(operators, runs=runs, name=file.header.name, precision=file.header.precision)
+    runs = (
+        {f"only_{COMPONENTS[p]}": {"only": [COMPONENTS[p]], "modes": "full"} for p in parts}
+        if len(parts) > 1
+        else {}
+    )
+    pipeline = Pipeline(
+        operators, runs=runs, name=file.header.name, precision=file.header.precision
+    )
     scene = file.scene().model_copy(update={"seed": seed})
     products = pipeline.run(scene, threads=threads).products
     name = next(o.product for o in operators if isinstance(o, BinMap))
     found = {}
     for band in bands:
         plain = f"{name}_{band}" if band else name
-        found[band] = {p: products[product_name(stream_of(f"only_{COMPONENTS[p]}"), plain) if runs else plain] for p in parts}
+        found[band] = {
+            p: products[product_name(stream_of(f"only_{COMPONENTS[p]}"), plain) if runs else plain]
+            for p in parts
+        }
         found[band][TOGETHER] = products[plain]
     return found

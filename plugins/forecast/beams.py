@@ -42,7 +42,9 @@ class Comb:
 
 
 def combs(survey: Survey, radius: float, probes: int, most: int = 8) -> list[Comb]:
-    """Combs with about ``probes`` probes in a circle of ``radius`` [rad] together; the first has one at its centre."""
+    """Combs with about ``probes`` probes in a circle of ``radius`` [rad] together; the first has
+    one at its centre.
+    """
     spacing = max(NEAR * survey.sigma, radius / 4)
     number = 2 * int(radius / spacing) + 3
     found: list[Comb] = []
@@ -60,29 +62,54 @@ def combs(survey: Survey, radius: float, probes: int, most: int = 8) -> list[Com
     return found
 
 
-def kernel_sums(track: Track, comb: Comb, offsets: Floats, sizes: tuple[float, float], thin: int) -> Floats:
-    """(n, n, 2): for each probe the sums of K and K^2 over detectors at ``offsets`` (n_det, 2) and all samples of a scan, from
-    every ``thin``-th instant. ``sizes``: the beam's standard deviation and the radius of the focal plane, rad."""
+def kernel_sums(
+    track: Track, comb: Comb, offsets: Floats, sizes: tuple[float, float], thin: int
+) -> Floats:
+    """(n, n, 2): for each probe the sums of K and K^2 over detectors at ``offsets`` (n_det, 2) and
+    all samples of a scan, from every ``thin``-th instant. ``sizes``: the beam's standard deviation
+    and the radius of the focal plane, rad."""
     total = np.zeros((*comb.inside.shape, 2))
     sigma, radius = sizes
     far = 1.05 * radius + math.sqrt(2 * FAR) * sigma
-    _sums(track.matrices, track.centre, offsets, comb.origin, comb.spacing, comb.inside, sigma**2, far, thin, total)
+    _sums(
+        track.matrices,
+        track.centre,
+        offsets,
+        comb.origin,
+        comb.spacing,
+        comb.inside,
+        sigma**2,
+        far,
+        thin,
+        total,
+    )
     return total * (thin * track.step)
 
 
-def kernel_series(survey: Survey, track: Track, comb: Comb, factors: Floats, offsets: Floats) -> NDArray[np.float32]:
-    """(n_det, n_instant): factor K of the nearest probe, for detectors at ``offsets`` (n_det, 2)."""
+def kernel_series(
+    survey: Survey, track: Track, comb: Comb, factors: Floats, offsets: Floats
+) -> NDArray[np.float32]:
+    """(n_det, n_instant): factor K of the nearest probe, for detectors at ``offsets`` (n_det,
+    2).
+    """
     out = np.zeros((len(offsets), len(track.index)), np.float32)
     _series(track.matrices, offsets, comb.origin, comb.spacing, factors, survey.sigma**2, out)
     return out
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _sums(matrices, centre, offsets, origin, spacing, inside, variance, far, thin, total):  # type: ignore[no-untyped-def]
+def _sums(  # type: ignore[no-untyped-def]
+    matrices, centre, offsets, origin, spacing, inside, variance, far, thin, total
+):
     number = inside.shape[0]
     low, high = origin - far, origin + far + spacing * (number - 1)
     for t in range(thin // 2, len(matrices), thin):
-        if centre[t, 0] < low[0] or centre[t, 0] > high[0] or centre[t, 1] < low[1] or centre[t, 1] > high[1]:
+        if (
+            centre[t, 0] < low[0]
+            or centre[t, 0] > high[0]
+            or centre[t, 1] < low[1]
+            or centre[t, 1] > high[1]
+        ):
             continue
         h = matrices[t]
         for d in range(len(offsets)):
@@ -101,7 +128,9 @@ def _sums(matrices, centre, offsets, origin, spacing, inside, variance, far, thi
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _series(matrices, offsets, origin, spacing, factors, variance, out):  # type: ignore[no-untyped-def]
+def _series(  # type: ignore[no-untyped-def]
+    matrices, offsets, origin, spacing, factors, variance, out
+):
     number = factors.shape[0]
     for d in range(len(offsets)):
         a, b = offsets[d, 0], offsets[d, 1]

@@ -31,13 +31,26 @@ COVERED: dict[type[Operator], frozenset[str] | None] = {
     Efficiency: frozenset({"main_beam", "illumination"}),
     HighpassFilter: frozenset({"frequency", "degree", "oversampling"}),
     CommonModeFilter: frozenset({"method", "residual", "gap", "on_undetermined"}),
-    BinMap: frozenset({
-        "pixel", "width", "height", "centre", "projection", "frame", "weights", "noise", "half_difference", "smooth", "product",
-        "stokes", "condition_limit",
-    }),
+    BinMap: frozenset(
+        {
+            "pixel",
+            "width",
+            "height",
+            "centre",
+            "projection",
+            "frame",
+            "weights",
+            "noise",
+            "half_difference",
+            "smooth",
+            "product",
+            "stokes",
+            "condition_limit",
+        }
+    ),
     HalfWavePlate: None,
     SkyMap: None,
-}  # fmt: skip
+}
 """Parameters that may have any value; the others must have their defaults. None: all may."""
 
 CURE = "remove it, or find the noise with `zonda run` and several seeds"
@@ -90,7 +103,10 @@ def steps_of(file: PipelineFile) -> Steps:
         if "boresight" not in operator.provides:
             _check(operator, step.key)
         kept.append(operator)
-    maps, highpass, common = ([o for o in kept if isinstance(o, kind)] for kind in (BinMap, HighpassFilter, CommonModeFilter))
+    maps, highpass, common = (
+        [o for o in kept if isinstance(o, kind)]
+        for kind in (BinMap, HighpassFilter, CommonModeFilter)
+    )
     _check_numbers(file.header.name, maps, highpass, common)
     found = Steps.among(kept)
     _check_together(found, file.header.name)
@@ -110,33 +126,55 @@ def _check(operator: Operator, name: str) -> None:
         if parameter not in free | ANY and value != getattr(usual, parameter):
             text = f"the forecast does not cover {parameter}: {value}"
             raise PipelineError(
-                text, place=name, cure=f"leave {parameter} out, or find the noise with `zonda run` and several seeds"
+                text,
+                place=name,
+                cure=f"leave {parameter} out, or find the noise with `zonda run` and several seeds",
             )
 
 
 def _check_numbers(name: str, maps: Sequence[Operator], *filters: Sequence[Operator]) -> None:
     if len(maps) != 1:
-        text = "there is no map" if not maps else f"there are {len(maps)} maps, the forecast is of one"
+        text = (
+            "there is no map" if not maps else f"there are {len(maps)} maps, the forecast is of one"
+        )
         raise PipelineError(text, place=name, cure="have one BinMap")
     for each in filters:
         if len(each) > 1:
-            raise PipelineError(f"there are {len(each)} of them, the forecast covers one", place=each[0].label, cure=CURE)
+            raise PipelineError(
+                f"there are {len(each)} of them, the forecast covers one",
+                place=each[0].label,
+                cure=CURE,
+            )
 
 
 def _check_together(steps: Steps, name: str) -> None:
     if not any(steps.of(kind) for kind in (WhiteNoise, PinkNoise, AtmosphereLayers)):
-        raise PipelineError("nothing in this pipeline makes noise", place=name, cure="add WhiteNoise")
+        raise PipelineError(
+            "nothing in this pipeline makes noise", place=name, cure="add WhiteNoise"
+        )
     order = [o for o in steps.operators if isinstance(o, HighpassFilter | CommonModeFilter)]
     if len(order) == 2 and isinstance(order[0], CommonModeFilter):
         raise PipelineError(
-            "the forecast covers a CommonModeFilter only after the HighpassFilter", place=name, cure="exchange the two"
+            "the forecast covers a CommonModeFilter only after the HighpassFilter",
+            place=name,
+            cure="exchange the two",
         )
     if steps.of(AtmosphereLayers) and steps.highpass is None:
-        text = "without a HighpassFilter the mean emission of the atmosphere, tens of kelvin, is in the map"
-        raise PipelineError(text, place=name, cure="add HighpassFilter, or leave AtmosphereLayers out")
+        text = (
+            "without a HighpassFilter the mean emission of the atmosphere, tens of kelvin, is in"
+            " the map"
+        )
+        raise PipelineError(
+            text, place=name, cure="add HighpassFilter, or leave AtmosphereLayers out"
+        )
     if len(steps.of(AtmosphereLayers)) > 1:
         raise PipelineError("the forecast covers one AtmosphereLayers", place=name, cure=CURE)
     shared = any(o.shared > 0 for o in steps.of(PinkNoise))
     if shared and steps.common is None:
-        text = "noise that detectors share adds up coherently without a CommonModeFilter, which the forecast does not cover"
-        raise PipelineError(text, place=name, cure="add CommonModeFilter, or set PinkNoise.shared to 0")
+        text = (
+            "noise that detectors share adds up coherently without a CommonModeFilter, which the"
+            " forecast does not cover"
+        )
+        raise PipelineError(
+            text, place=name, cure="add CommonModeFilter, or set PinkNoise.shared to 0"
+        )

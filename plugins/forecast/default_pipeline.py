@@ -1,11 +1,14 @@
-"""A pipeline for an observer who names an instrument and a site: daisy scans, high-pass filter, common mode, one map.
+"""A pipeline for an observer who names an instrument and a site: daisy scans, high-pass filter,
+common mode, one map.
 
     radius r       half the area's diameter, of what the boresight covers
-    speed          the least of: 0.35 sqrt(a r), a the telescope's largest acceleration; half of its largest speed; r per second;
-                   a fifth of a beam per sample                                                                       (1)
-    cut            speed / (2.5 r)                                                                                    (2)
+    speed          the least of: 0.35 sqrt(a r), a the telescope's largest acceleration; half of its
+    largest speed; r per second;
+                   a fifth of a beam per sample                                                  (1)
+    cut            speed / (2.5 r)                                                               (2)
 
-For MUSTANG-2 on the GBT and r = 4 arcmin these are about 50 arcsec/s and 0.08 Hz, as its observers choose them.
+For MUSTANG-2 on the GBT and r = 4 arcmin these are about 50 arcsec/s and 0.08 Hz, as its observers
+choose them.
 """
 
 from __future__ import annotations
@@ -35,15 +38,21 @@ if TYPE_CHECKING:
 
 ELEVATION = math.radians(60)
 LONGEST, MOST = 600.0, 6
-"""Seconds of a scan, and number of scans that are followed, at most: a longer observation averages down as time^-1/2."""
+"""Seconds of a scan, and number of scans that are followed, at most: a longer observation averages
+down as time^-1/2.
+"""
 ACCELERATION, SPEED, PERIOD, SAMPLED, CUT = 0.35, 0.5, 1.0, 0.2, 2.5
 """Constants of equations (1) and (2)."""
 TURN, CYCLES = 20.0, 5.0
-"""A scan lasts at least this many radius / speed, one turn of the petals, and this many cycles of the cut."""
+"""A scan lasts at least this many radius / speed, one turn of the petals, and this many cycles of
+the cut.
+"""
 WIDEST = math.radians(20)
 """Largest area where none is given."""
 YEAR = 2024
-"""Year of the observation: the climatology does not depend on it, and the Earth's orientation is known."""
+"""Year of the observation: the climatology does not depend on it, and the Earth's orientation is
+known.
+"""
 DAY, GRID = 86400.0, 300.0
 """Seconds in which a target's culmination is looked for, and steps."""
 PLACE = "zonda sensitivity"
@@ -60,12 +69,14 @@ class Asked:
     instrument, site
         Registered names.
     pwv, month, quantile
-        PWV, or the month (1 to 12) and quantile (0 to 1) of the climatology; the median of the present month where nothing is
-        said.
+        PWV, or the month (1 to 12) and quantile (0 to 1) of the climatology; the median of the
+        present month where nothing is said.
     elevation, target
-        Elevation of a target that culminates in the middle of the night, or a target, observed when it culminates.
+        Elevation of a target that culminates in the middle of the night, or a target, observed when
+        it culminates.
     area
-        Diameter of the field that the boresight covers; twice the field of view where it is not said.
+        Diameter of the field that the boresight covers; twice the field of view where it is not
+        said.
     time
         Integration time.
     """
@@ -83,13 +94,26 @@ class Asked:
     def check(self) -> None:
         """Raise InputError for what contradicts itself or is beyond limits."""
         if self.pwv is not None and self.quantile is not None:
-            raise InputError("the PWV is given twice, as a value and as a quantile", place=PLACE, cure="give --pwv or --quantile")
+            raise InputError(
+                "the PWV is given twice, as a value and as a quantile",
+                place=PLACE,
+                cure="give --pwv or --quantile",
+            )
         if self.elevation is not None and self.target is not None:
-            raise InputError("a target has an elevation of its own", place=PLACE, cure="give --target or --elevation")
+            raise InputError(
+                "a target has an elevation of its own",
+                place=PLACE,
+                cure="give --target or --elevation",
+            )
         if self.month is not None and not 1 <= self.month <= 12:
-            raise InputError(f"there is no month {self.month}", place="--month", cure="give 1 to 12")
+            raise InputError(
+                f"there is no month {self.month}", place="--month", cure="give 1 to 12"
+            )
         if self.quantile is not None and not 0 < self.quantile < 1:
-            raise InputError(f"a quantile of {self.quantile:g} is outside the limits, above 0 and below 1", place="--quantile")
+            raise InputError(
+                f"a quantile of {self.quantile:g} is outside the limits, above 0 and below 1",
+                place="--quantile",
+            )
 
 
 @dataclass(frozen=True)
@@ -106,7 +130,8 @@ class Daisy:
 def make(asked: Asked, settings: Sequence[str] = ()) -> PipelineFile:
     """The pipeline, with changes as `zonda run --set` takes them.
 
-    Raises ZondaError for names that are not registered, contradictions, and targets that are not up.
+    Raises ZondaError for names that are not registered, contradictions, and targets that are not
+    up.
     """
     from zonda.core.configuration.pipeline_file import parse
 
@@ -116,10 +141,16 @@ def make(asked: Asked, settings: Sequence[str] = ()) -> PipelineFile:
 def text(asked: Asked) -> str:
     """The pipeline as YAML. Raises as `make`."""
     asked.check()
-    instrument, site = registry.instruments.create(asked.instrument), registry.sites.create(asked.site)
+    instrument, site = (
+        registry.instruments.create(asked.instrument),
+        registry.sites.create(asked.site),
+    )
     elevation = positive("--elevation", Unit("rad", "60 deg"), asked.elevation, ELEVATION)
     if elevation > math.pi / 2:
-        raise InputError(f"an elevation of {asked.elevation} is outside the limits, 0 to 90 deg", place="--elevation")
+        raise InputError(
+            f"an elevation of {asked.elevation} is outside the limits, 0 to 90 deg",
+            place="--elevation",
+        )
     wanted = positive("--time", Unit("s", "3 h"), asked.time, 3600.0)
     usual = min(2 * max(instrument.field_of_view, 10 * instrument.beam_fwhm), WIDEST)
     scan = daisy(instrument, elevation, positive("--area", Unit("rad"), asked.area, usual), wanted)
@@ -130,14 +161,20 @@ def text(asked: Asked) -> str:
     else:
         target = parsed("--target", Target.parse, asked.target)
         start = _culmination(site, middle, target).shifted(-span / 2)
-    pwv = asked.pwv if asked.pwv is not None else None if asked.quantile is None else f"{100 * asked.quantile:.12g} %"
+    pwv = (
+        asked.pwv
+        if asked.pwv is not None
+        else None
+        if asked.quantile is None
+        else f"{100 * asked.quantile:.12g} %"
+    )
     water = None if pwv is None else str(parsed("--pwv", Pwv.parse, pwv))
     return _yaml(asked, instrument, scan, (str(start), str(target), water))
 
 
 def daisy(instrument: Instrument, elevation: float, area: float, seconds: float) -> Daisy:
-    """Equations (1) and (2) for an area of diameter ``area`` [rad] at an ``elevation`` [rad], and the scans that fill
-    ``seconds``."""
+    """Equations (1) and (2) for an area of diameter ``area`` [rad] at an ``elevation`` [rad], and
+    the scans that fill ``seconds``."""
     radius, telescope = area / 2, instrument.telescope
     acceleration, fastest = _limits(telescope, elevation)
     speed = min(
@@ -153,14 +190,18 @@ def daisy(instrument: Instrument, elevation: float, area: float, seconds: float)
 
 
 def _limits(telescope: Telescope, elevation: float) -> tuple[float, float]:
-    """Largest acceleration and speed on the sky in any direction, rad/s2 and rad/s; infinite where none is known."""
+    """Largest acceleration and speed on the sky in any direction, rad/s2 and rad/s; infinite where
+    none is known.
+    """
     across = math.cos(elevation)
 
     def least(*values: float | None) -> float:
         return min((v for v in values if v is not None), default=math.inf)
 
     t = telescope
-    turned = [None if v is None else v * across for v in (t.azimuth_acceleration_max, t.azimuth_speed_max)]
+    turned = [
+        None if v is None else v * across for v in (t.azimuth_acceleration_max, t.azimuth_speed_max)
+    ]
     return (
         least(t.acceleration_max, turned[0], t.elevation_acceleration_max),
         least(t.speed_max, turned[1], t.elevation_speed_max),
@@ -168,30 +209,41 @@ def _limits(telescope: Telescope, elevation: float) -> tuple[float, float]:
 
 
 def _midnight(site: Site, month: int | None) -> Instant:
-    """Local mean midnight on the 15th of a month of `YEAR`; of the present month where none is given."""
+    """Local mean midnight on the 15th of a month of `YEAR`; of the present month where none is
+    given.
+    """
     day = datetime(YEAR, month or datetime.now(UTC).month, 15, tzinfo=UTC)
     hours = (-site.longitude / (2 * math.pi) * 24) % 24
     return Instant.parse(day).shifted(round(hours * 3600))
 
 
 def _culminating(site: Site, middle: Instant, elevation: float) -> Target:
-    """The ICRS position that is highest at ``middle``, at an elevation: south of a northern site, north of a southern one."""
+    """The ICRS position that is highest at ``middle``, at an elevation: south of a northern site,
+    north of a southern one.
+    """
     from zonda.core.numerics.celestial import CelestialTransform
 
     azimuth = math.pi if site.latitude >= 0 else 0.0
     transform = CelestialTransform(site, middle, 1.0)
     x, y, z = transform.icrs(unit_vectors(-azimuth, elevation), np.zeros(1))[0]
-    right_ascension, declination = math.degrees(math.atan2(y, x)) % 360, math.degrees(math.atan2(z, math.hypot(x, y)))
+    right_ascension, declination = (
+        math.degrees(math.atan2(y, x)) % 360,
+        math.degrees(math.atan2(z, math.hypot(x, y))),
+    )
     return Target.parse(f"{right_ascension:.4f} deg {declination:.4f} deg")
 
 
 def _culmination(site: Site, middle: Instant, target: Target) -> Instant:
-    """When a target is highest within half a day of ``middle``. Raises PointingError where it never rises."""
+    """When a target is highest within half a day of ``middle``. Raises PointingError where it never
+    rises.
+    """
     from zonda.core.numerics.celestial import CelestialTransform
 
     if target.frame == "horizontal":
         cure = "give --elevation, or a position on the sky"
-        raise InputError("a target in azimuth and elevation moves over the sky", place="--target", cure=cure)
+        raise InputError(
+            "a target in azimuth and elevation moves over the sky", place="--target", cure=cure
+        )
     start = middle.shifted(-DAY / 2)
     transform = CelestialTransform(site, start, DAY, 1e-6)
     right_ascension, declination = target.icrs()
@@ -199,11 +251,15 @@ def _culmination(site: Site, middle: Instant, target: Target) -> Instant:
     height = transform.horizontal(unit_vectors(right_ascension, declination), seconds)[:, 2]
     best = int(np.argmax(height))
     if height[best] <= 0:
-        raise PointingError(f"{target} never rises at {site.name}", place="--target", cure="choose another site")
+        raise PointingError(
+            f"{target} never rises at {site.name}", place="--target", cure="choose another site"
+        )
     return start.shifted(float(seconds[best]))
 
 
-def _yaml(asked: Asked, instrument: Instrument, scan: Daisy, scene: tuple[str, str, str | None]) -> str:
+def _yaml(
+    asked: Asked, instrument: Instrument, scan: Daisy, scene: tuple[str, str, str | None]
+) -> str:
     angle, rate = Unit("rad"), Unit("rad / s")
     start, target, pwv = scene
     lines = [
@@ -232,14 +288,18 @@ def _yaml(asked: Asked, instrument: Instrument, scan: Daisy, scene: tuple[str, s
 
 
 def _in(unit: Unit, value: float, *names: str) -> str:
-    """A quantity [SI] with three digits, in the first of some units of rising size in which it is below 100."""
+    """A quantity [SI] with three digits, in the first of some units of rising size in which it is
+    below 100.
+    """
     texts = [(value / unit.parse(f"1 {name}"), name) for name in names]
     number, name = next((t for t in texts if t[0] < 100), texts[-1])
     return f"{number:.3g} {name}"
 
 
 def positive(place: str, unit: Unit, given: str | None, usual: float) -> float:
-    """A quantity above 0 in SI; ``usual`` where none is given. Raises InputError about ``place``."""
+    """A quantity above 0 in SI; ``usual`` where none is given. Raises InputError about
+    ``place``.
+    """
     value = usual if given is None else parsed(place, unit.parse, given)
     if not value > 0:
         raise InputError(f"{given} is not positive", place=place, cure=f"write e.g. {unit.example}")

@@ -1,4 +1,6 @@
-"""The depth of a map against time: variances of its noise, their errors, and the units that observers use."""
+"""The depth of a map against time: variances of its noise, their errors, and the units that
+observers use.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +25,12 @@ if TYPE_CHECKING:
 PARTS = ("white", "1/f", "atmosphere")
 """What the noise is split into."""
 WITHIN = {"white": 0.05, "1/f": 0.05, "atmosphere": 0.25}
-"""Relative error of each part's rms that audits found at most (docs/sensitivity.md); the atmosphere is indicative."""
+"""Relative error of each part's rms that audits found at most (docs/sensitivity.md); the atmosphere
+is indicative.
+"""
 TURNED = 0.1
-"""Share of the atmosphere's variance from which what a turned mode leaves of it is not forecast: it is known to a
-factor of some in the rms only."""
+"""Share of the atmosphere's variance from which what a turned mode leaves of it is not forecast: it
+is known to a factor of some in the rms only."""
 UNITS = ("K_RJ", "K_CMB", "Jy/beam", "MJy/sr", "Jy")
 """Units of a depth: ``Jy`` is the flux density of a point source, see `factors`."""
 PER_DECADE = (1.0, 2.0, 5.0)
@@ -35,10 +39,12 @@ PER_DECADE = (1.0, 2.0, 5.0)
 def factors(band: Band, fwhm: float) -> dict[str, float]:
     """Factors by which a depth in K_RJ (after smoothing with the beam) is multiplied, by unit.
 
-    The spectrum of the source is flat over the band in S_nu, and that of CMB anisotropy for K_CMB (`core.numerics.radiation`).
-    ``Jy/beam`` and ``MJy/sr`` are surface brightness, for the solid angle Omega = pi FWHM^2 / (4 ln 2) of the beam. ``Jy`` is the
-    standard deviation of the flux density of a point source: the map behind the beam K is the matched filter, whose peak for a
-    source of flux density S is S / (2 Omega) in surface brightness, because int K^2 / int K = 1/2. Hence Jy = 2 Jy/beam.
+    The spectrum of the source is flat over the band in S_nu, and that of CMB anisotropy for K_CMB
+    (`core.numerics.radiation`). ``Jy/beam`` and ``MJy/sr`` are surface brightness, for the solid
+    angle Omega = pi FWHM^2 / (4 ln 2) of the beam. ``Jy`` is the standard deviation of the flux
+    density of a point source: the map behind the beam K is the matched filter, whose peak for a
+    source of flux density S is S / (2 Omega) in surface brightness, because int K^2 / int K = 1/2.
+    Hence Jy = 2 Jy/beam.
     """
     omega = math.pi * fwhm**2 / math.log(16)
     found = {unit: 1 / to_kelvin_rj(unit, band, beam_solid_angle=omega) for unit in UNITS[:-1]}
@@ -52,7 +58,8 @@ class Depth:
     Attributes
     ----------
     seconds
-        (n_scan,) integration time after each scan, from the first on after which a pixel of the circle has a value.
+        (n_scan,) integration time after each scan, from the first on after which a pixel of the
+        circle has a value.
     variance
         By part (`PARTS`), (n_scan,) K^2; NaN of a part that is not forecast.
     error
@@ -71,8 +78,8 @@ class Depth:
         return tuple(name for name in PARTS if not np.isnan(self.variance[name][-1]))
 
     def part(self, name: str, seconds: Floats | float) -> Floats:
-        """The rms of a part of the noise, K_RJ, after ``seconds``: as forecast up to the end of the scans, then as time^-1/2;
-        before the end of the first scan likewise."""
+        """The rms of a part of the noise, K_RJ, after ``seconds``: as forecast up to the end of the
+        scans, then as time^-1/2; before the end of the first scan likewise."""
         wanted = np.asarray(seconds, np.float64)
         inside = np.clip(wanted, self.seconds[0], self.seconds[-1])
         variance = np.interp(inside, self.seconds, self.seconds * self.variance[name])
@@ -88,12 +95,17 @@ class Depth:
         return math.hypot(*parts) / max(float(self.total(seconds)) ** 2, 1e-300)
 
     def reach(self, rms: float) -> float:
-        """Integration time [s] after which all parts together are ``rms`` [K_RJ]; all of them fall as time^-1/2 after the scans.
+        """Integration time [s] after which all parts together are ``rms`` [K_RJ]; all of them fall
+        as time^-1/2 after the scans.
 
         Raises InputError for what is not positive.
         """
         if not rms > 0:
-            raise InputError(f"no observation reaches a depth of {rms:g} K", place="--reach", cure="give a positive depth")
+            raise InputError(
+                f"no observation reaches a depth of {rms:g} K",
+                place="--reach",
+                cure="give a positive depth",
+            )
         end = float(self.seconds[-1])
         if float(self.total(end)) >= rms:
             return end * (float(self.total(end)) / rms) ** 2
@@ -105,21 +117,30 @@ class Depth:
 
 
 def depths_of(survey: Survey, radius: float) -> dict[str, Depth]:
-    """Forecast the noise after smoothing with the beam, averaged over a circle of ``radius`` [rad] about the map's centre: by the
-    plane of the map, ``I`` alone or ``I``, ``Q`` and ``U``.
+    """Forecast the noise after smoothing with the beam, averaged over a circle of ``radius`` [rad]
+    about the map's centre: by the plane of the map, ``I`` alone or ``I``, ``Q`` and ``U``.
 
-    The atmosphere is not polarized. Where detectors cancel it (`Survey.cancels`) Q and U have none of it; else what of it is in
-    I, Q and U is not forecast.
+    The atmosphere is not polarized. Where detectors cancel it (`Survey.cancels`) Q and U have none
+    of it; else what of it is in I, Q and U is not forecast.
 
     Raises PipelineError where the circle is not on the map, or not observed.
     """
     survey.check_radius(radius)
-    variances = stokes_noise.variances(survey, radius) if survey.polarized else {"I": detector_noise.variances(survey, radius)}
-    known = np.all([np.isfinite(each["white"] + each["1/f"]) for each in variances.values()], axis=0)
+    variances = (
+        stokes_noise.variances(survey, radius)
+        if survey.polarized
+        else {"I": detector_noise.variances(survey, radius)}
+    )
+    known = np.all(
+        [np.isfinite(each["white"] + each["1/f"]) for each in variances.values()], axis=0
+    )
     if not known[-1]:
         text, cure = "nothing is observed in the circle", "choose a larger --radius"
         if survey.polarized:
-            text, cure = "the samples in the circle determine I, Q and U in no pixel", f"{cure}, or larger pixels"
+            text, cure = (
+                "the samples in the circle determine I, Q and U in no pixel",
+                f"{cure}, or larger pixels",
+            )
         raise InputError(text, place="zonda sensitivity", cure=cure)
     left = atmosphere_noise.variance(survey, radius)
     # an error of a variance is half as large of its root
@@ -127,7 +148,11 @@ def depths_of(survey: Survey, radius: float) -> dict[str, Depth]:
     error = WITHIN | {"atmosphere": math.hypot(WITHIN["atmosphere"], left.error / 2, chance)}
     nothing, reason = np.zeros_like(left.variance), ""
     atmosphere = {"I": left.variance, "Q": nothing, "U": nothing}
-    if left.mode and left.mode.turned and _stays(survey, left.mode, radius) > TURNED * left.variance[-1]:
+    if (
+        left.mode
+        and left.mode.turned
+        and _stays(survey, left.mode, radius) > TURNED * left.variance[-1]
+    ):
         atmosphere = dict.fromkeys(atmosphere, np.full_like(left.variance, np.nan))
         reason = "noise turns the singular mode, which then leaves some of what all detectors see"
     if survey.polarized and left.variance.any() and not survey.cancels:
@@ -136,29 +161,46 @@ def depths_of(survey: Survey, radius: float) -> dict[str, Depth]:
     after = slice(int(known.argmax()), None)
     parts = {plane: each | {"atmosphere": atmosphere[plane]} for plane, each in variances.items()}
     return {
-        plane: Depth(survey.seconds[after], {part: values[after] for part, values in each.items()}, error, reason)
+        plane: Depth(
+            survey.seconds[after],
+            {part: values[after] for part, values in each.items()},
+            error,
+            reason,
+        )
         for plane, each in parts.items()
     }
 
 
 def _stays(survey: Survey, mode: atmosphere_noise.Mode, radius: float) -> float:
-    """Variance [K^2] in the map of what a turned mode leaves of the common mode: noise of each detector, of its spectrum."""
-    alone = replace(survey, levels=[(mode.noise,)] * len(survey.observations), steps=replace(survey.steps, common=None))
+    """Variance [K^2] in the map of what a turned mode leaves of the common mode: noise of each
+    detector, of its spectrum.
+    """
+    alone = replace(
+        survey,
+        levels=[(mode.noise,)] * len(survey.observations),
+        steps=replace(survey.steps, common=None),
+    )
     return float(detector_noise.variances(alone, radius)["1/f"][-1])
 
 
 def scatter(sigma: float, radius: float) -> float:
-    """Relative standard deviation of the rms of one map of white noise behind a beam of standard deviation ``sigma`` in a circle
-    of ``radius``: sigma / radius, because pi radius^2 / (2 pi sigma^2) areas in it are independent."""
+    """Relative standard deviation of the rms of one map of white noise behind a beam of standard
+    deviation ``sigma`` in a circle of ``radius``: sigma / radius, because pi radius^2 / (2 pi
+    sigma^2) areas in it are independent."""
     return sigma / max(radius, math.sqrt(2) * sigma)
 
 
 def times(depth: Depth, wanted: float | None) -> Floats:
-    """Round times [s] about the length of the scans (or ``wanted``) for a table: 1, 2 and 5 of each decade of hours, and the
-    length."""
+    """Round times [s] about the length of the scans (or ``wanted``) for a table: 1, 2 and 5 of each
+    decade of hours, and the length."""
     end = float(depth.seconds[-1])
     chosen = {end, wanted or end}
     low, high = min(chosen) / 5, max(chosen) * 20
     decades = range(math.floor(math.log10(low / 3600)), math.ceil(math.log10(high / 3600)) + 1)
-    chosen |= {3600 * step * 10.0**d for d in decades for step in PER_DECADE if low <= 3600 * step * 10.0**d <= high}
+    chosen |= {
+        3600 * step * 10.0**d
+        for d in decades
+        for step in PER_DECADE
+        if low <= 3600 * step * 10.0**d <= high
+    }
     return np.array(sorted(chosen))

@@ -1,19 +1,23 @@
 """White and 1/f noise of a filtered, binned and beam-smoothed map, without its time streams.
 
-Samples i = (detector d, time t) at x_i have weights a_i in the map and noise of rms sigma_i; K is the beam. At a point x of the
-map that is smoothed with K, the sample i has the weight
+Samples i = (detector d, time t) at x_i have weights a_i in the map and noise of rms sigma_i; K is
+the beam. At a point x of the map that is smoothed with K, the sample i has the weight
 
-    w_i = a_i K(x - x_i) / sum_j a_j K(x - x_j)                                                                   (1)
+    w_i = a_i K(x - x_i) / sum_j a_j K(x - x_j)                                                  (1)
 
-The filters are F = (1 - u u^T) (1 - P), P the low part that the high-pass filter removes and u = n_det^(-1/2) what the common
-mode takes. With W_d(f) the spectrum of the series (1 - P) w_d, and R(f) the power of the noise over that of white noise,
+The filters are F = (1 - u u^T) (1 - P), P the low part that the high-pass filter removes and u =
+n_det^(-1/2) what the common mode takes. With W_d(f) the spectrum of the series (1 - P) w_d, and
+R(f) the power of the noise over that of white noise,
 
-    variance = (1 - 1 / n_det) (1 - shared) sum_i sigma_i^2 w_i^2  <sum_df sigma^2 |W_d|^2 R> / <sum_dt sigma^2 w_d^2>     (2)
+    variance = (1 - 1 / n_det) (1 - shared) sum_i sigma_i^2 w_i^2
+               <sum_df sigma^2 |W_d|^2 R> / <sum_dt sigma^2 w_d^2>     (2)
 
-R = 1 of white noise. What detectors share is gone behind the common mode. The factor <> / <> needs few detectors, which stand for
-all; w and the sum before it need all of them (few would bias it). Where the few are all, the common mode is taken from their
-series, and 1 - 1 / n_det is left out. The variance is averaged over probes in a circle about the map's centre, weighted like the
-samples of the map; in the factor all probes of a comb are in one series, with random signs. Maps of I, Q and U: `stokes_noise`.
+R = 1 of white noise. What detectors share is gone behind the common mode. The factor <> / <> needs
+few detectors, which stand for all; w and the sum before it need all of them (few would bias it).
+Where the few are all, the common mode is taken from their series, and 1 - 1 / n_det is left out.
+The variance is averaged over probes in a circle about the map's centre, weighted like the samples
+of the map; in the factor all probes of a comb are in one series, with random signs. Maps of I, Q
+and U: `stokes_noise`.
 """
 
 from __future__ import annotations
@@ -33,12 +37,16 @@ from .survey import Noise, Survey, Track
 PROBES, DETECTORS = 16, 24
 """Number of probes in the circle, and of the detectors whose series represent all."""
 ALL = 64
-"""Detectors up to which the series of all are made, and what they have in common is taken from them."""
+"""Detectors up to which the series of all are made, and what they have in common is taken from
+them.
+"""
 SIGNS = 16
-"""How often the signs are drawn, all combs together: probes that a detector passes one after the other have noise in common."""
+"""How often the signs are drawn, all combs together: probes that a detector passes one after the
+other have noise in common.
+"""
 SAMPLES, INSTANTS = 3e7, 4000
-"""Samples (of all scans and combs) of which kernels are summed up: where there are more, instants are left out, and of so few
-instants detectors."""
+"""Samples (of all scans and combs) of which kernels are summed up: where there are more, instants
+are left out, and of so few instants detectors."""
 STEEP = 8
 """Lowest frequencies whose bins are integrated over."""
 FILTERED = 12
@@ -49,7 +57,9 @@ Series = Callable[[Track, NDArray[np.intp]], AnyFloats]
 
 
 def variances(survey: Survey, radius: float) -> dict[str, Floats]:
-    """``white`` and ``1/f``: (n_scan,) variance [K^2] after each scan, averaged over a circle of ``radius`` [rad]."""
+    """``white`` and ``1/f``: (n_scan,) variance [K^2] after each scan, averaged over a circle of
+    ``radius`` [rad].
+    """
     chosen = combs(survey, radius, PROBES)
     sums, some = _sums(survey, chosen)
     weighted = sums[..., 0] * survey.weights[:, None]
@@ -67,8 +77,9 @@ def variances(survey: Survey, radius: float) -> dict[str, Floats]:
 
 
 def _averaged(squares: Floats, total: Floats, some: bool) -> Floats:
-    """(n_scan,) sum a^2 sigma^2 K^2 / (sum a K)^2, averaged over probes with the weights sum a K. Of ``some`` detectors only, the
-    sums of the numerator and of one factor of the denominator are averaged first: the ratio of few samples is biased."""
+    """(n_scan,) sum a^2 sigma^2 K^2 / (sum a K)^2, averaged over probes with the weights sum a K.
+    Of ``some`` detectors only, the sums of the numerator and of one factor of the denominator are
+    averaged first: the ratio of few samples is biased."""
     if some:
         seen = np.count_nonzero(total, axis=1)
         return np.asarray(seen * squares.sum(axis=1) / total.sum(axis=1) ** 2)
@@ -77,7 +88,9 @@ def _averaged(squares: Floats, total: Floats, some: bool) -> Floats:
 
 
 def _sums(survey: Survey, chosen: list[Comb]) -> tuple[Floats, bool]:
-    """(n_scan, n_probe, 2) sums of K and K^2 at the probes of all combs; whether they are from some of the detectors."""
+    """(n_scan, n_probe, 2) sums of K and K^2 at the probes of all combs; whether they are from some
+    of the detectors.
+    """
     rate, offsets = survey.rate, survey.offsets
     tracks = [survey.track(k, rate) for k in range(len(survey.observations))]
     instants = sum(len(t.index) for t in tracks)
@@ -85,14 +98,23 @@ def _sums(survey: Survey, chosen: list[Comb]) -> tuple[Floats, bool]:
     thin = min(max(1, round(number / SAMPLES)), max(1, instants // INSTANTS))
     fewer = min(len(offsets), max(1, round(thin * SAMPLES / number * len(offsets))))
     if fewer < len(offsets):
-        offsets = np.ascontiguousarray(offsets[np.sort(np.random.default_rng(4).permutation(len(offsets))[:fewer])])
+        offsets = np.ascontiguousarray(
+            offsets[np.sort(np.random.default_rng(4).permutation(len(offsets))[:fewer])]
+        )
     far = float(np.hypot(*survey.offsets.T).max())
-    rows = [np.concatenate([kernel_sums(t, c, offsets, (survey.sigma, far), thin)[c.inside] for c in chosen]) for t in tracks]
+    rows = [
+        np.concatenate(
+            [kernel_sums(t, c, offsets, (survey.sigma, far), thin)[c.inside] for c in chosen]
+        )
+        for t in tracks
+    ]
     return np.array(rows) * (len(survey.offsets) / fewer), fewer < len(survey.offsets)
 
 
 def _signed(survey: Survey, chosen: list[Comb], total: Floats) -> list[Series]:
-    """Series of the kernels of all probes of a comb with random signs, for the factor of equation (2). ``total``: sum a K."""
+    """Series of the kernels of all probes of a comb with random signs, for the factor of equation
+    (2). ``total``: sum a K.
+    """
     rng = np.random.default_rng(2)
     begin = 0
     draws: list[Series] = []
@@ -101,12 +123,16 @@ def _signed(survey: Survey, chosen: list[Comb], total: Floats) -> list[Series]:
         begin += len(there)
         for _ in range(max(1, SIGNS // len(chosen))):
             factors, signs = np.zeros(comb.inside.shape), rng.choice([-1.0, 1.0], len(there))
-            factors[comb.inside] = np.where(there > 0, signs / np.sqrt(np.where(there > 0, there, 1.0)), 0.0)
+            factors[comb.inside] = np.where(
+                there > 0, signs / np.sqrt(np.where(there > 0, there, 1.0)), 0.0
+            )
             draws.append(partial(_kernels, survey, comb, factors))
     return draws
 
 
-def _kernels(survey: Survey, comb: Comb, factors: Floats, track: Track, few: NDArray[np.intp]) -> AnyFloats:
+def _kernels(
+    survey: Survey, comb: Comb, factors: Floats, track: Track, few: NDArray[np.intp]
+) -> AnyFloats:
     return kernel_series(survey, track, comb, factors, survey.offsets[few])
 
 
@@ -171,12 +197,16 @@ def _spectrum(noise: Noise, frequency: Floats) -> Floats:
     for k in range(min(STEEP, len(found))):
         fine = np.geomspace(max(k - 0.5, 1e-5), k + 0.5, 200) * step
         below = fine[0] * noise.spectrum(fine[:1])[0] if k == 0 else 0.0
-        found[k] = (float(np.trapezoid(noise.spectrum(fine), fine)) + below) / (step * (0.5 if k == 0 else 1.0))
+        found[k] = (float(np.trapezoid(noise.spectrum(fine), fine)) + below) / (
+            step * (0.5 if k == 0 else 1.0)
+        )
     return found
 
 
 def _power(rows: AnyFloats, rate: float) -> tuple[Floats, Floats]:
-    """(f, sum over rows of |W(f)|^2), one-sided, by transforms of twice the length: their sum over f is that of the squares."""
+    """(f, sum over rows of |W(f)|^2), one-sided, by transforms of twice the length: their sum over
+    f is that of the squares.
+    """
     n = next_fast_len(2 * rows.shape[-1], real=True)
     spectrum = rfft(rows, n, axis=-1)
     energy = (spectrum.real**2 + spectrum.imag**2).sum(axis=0, dtype=np.float64) / n

@@ -28,7 +28,8 @@ class Forecast:
     file, survey
         The pipeline, and its scans.
     depth
-        White noise, 1/f noise and atmosphere behind the beam, K_RJ; of I where the map is one of I, Q and U.
+        White noise, 1/f noise and atmosphere behind the beam, K_RJ; of I where the map is one of I,
+        Q and U.
     radius
         Of the circle that they are averaged over, rad.
     seconds
@@ -67,15 +68,21 @@ class Forecast:
         name = self.survey.scene.instrument.name
         return f"{name}, band {self.band}" if self.band else name
 
-    def rms(self, seconds: float | None = None, unit: str = "K_RJ", part: str = "", stokes: str = "I") -> float:
-        """The depth after an integration time [s] in a unit (`depth.UNITS`): of a part (`depth.PARTS`), or of all; ``stokes``: of
-        which plane of the map. NaN of a part that is not forecast, and of all without it.
+    def rms(
+        self, seconds: float | None = None, unit: str = "K_RJ", part: str = "", stokes: str = "I"
+    ) -> float:
+        """The depth after an integration time [s] in a unit (`depth.UNITS`): of a part
+        (`depth.PARTS`), or of all; ``stokes``: of which plane of the map. NaN of a part that is not
+        forecast, and of all without it.
 
         Raises InputError for an unknown unit, part or plane, and a time that is not positive.
         """
         wanted = self.seconds if seconds is None else seconds
         if unit not in self.factors or part not in ("", *PARTS):
-            cure = f"units are {', '.join(self.factors)}; parts are {', '.join(PARTS)}, or none for all"
+            cure = (
+                f"units are {', '.join(self.factors)}; parts are {', '.join(PARTS)}, or none"
+                " for all"
+            )
             raise InputError(f"no depth in {unit!r} of {part!r}", place="sensitivity", cure=cure)
         if not wanted > 0:
             raise InputError(f"a time of {wanted:g} s is not positive", place="sensitivity")
@@ -84,13 +91,15 @@ class Forecast:
         return float(found) * self.factors[unit]
 
     def reach(self, rms: str | float, stokes: str = "I") -> float:
-        """Integration time [s] after which the map is as deep as ``rms``: text with a unit of `depth.UNITS` (``10 uK``, which is
-        K_RJ; ``10 uK_CMB``, ``0.1 mJy/beam``), or K_RJ. Beyond the scans of the pipeline all parts fall as time^-1/2. ``stokes``:
-        which plane of the map.
+        """Integration time [s] after which the map is as deep as ``rms``: text with a unit of
+        `depth.UNITS` (``10 uK``, which is K_RJ; ``10 uK_CMB``, ``0.1 mJy/beam``), or K_RJ. Beyond
+        the scans of the pipeline all parts fall as time^-1/2. ``stokes``: which plane of the map.
 
         Raises InputError for what cannot be read or reached.
         """
-        return self._plane(stokes).reach(lines.read_depth(rms, self.factors) if isinstance(rms, str) else rms)
+        return self._plane(stokes).reach(
+            lines.read_depth(rms, self.factors) if isinstance(rms, str) else rms
+        )
 
     def _plane(self, stokes: str) -> Depth:
         if stokes not in self.planes:

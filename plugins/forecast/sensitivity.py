@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from zonda.core.configuration.loaded import PipelineFile
 
 RADIUS, BEAMS = 0.5 * ARCMIN, 2.0
-"""Radius of the circle that the depth is averaged over where none is given: the central arcmin, or this many FWHM if that is
-more."""
+"""Radius of the circle that the depth is averaged over where none is given: the central arcmin, or
+this many FWHM if that is more."""
 
 
 class Sensitivity(Forecast):
@@ -40,7 +40,9 @@ class Sensitivity(Forecast):
         return as_dict(self)
 
     def write(self, folder: str | Path) -> list[Path]:
-        """Write ``sensitivity.ecsv``, ``sensitivity.png`` and ``pipeline.yaml`` to a folder; their paths."""
+        """Write ``sensitivity.ecsv``, ``sensitivity.png`` and ``pipeline.yaml`` to a folder; their
+        paths.
+        """
         from .report import write
 
         return write(self, Path(folder))
@@ -57,13 +59,18 @@ class Sensitivity(Forecast):
         return text(self)
 
     def _repr_html_(self) -> str:
-        rows = [(lines.duration(t), lines.in_unit(float(self.depth.total(t)), "K_RJ")) for t in self.times.tolist()]
+        rows = [
+            (lines.duration(t), lines.in_unit(float(self.depth.total(t)), "K_RJ"))
+            for t in self.times.tolist()
+        ]
         return html_table(f"Depth of {self.file.header.name}, behind the beam", rows)
 
 
 @dataclass(frozen=True)
 class SensitivityOfBands:
-    """The depths of the maps of a camera with several bands, by their names; what is written and said is each band's."""
+    """The depths of the maps of a camera with several bands, by their names; what is written and
+    said is each band's.
+    """
 
     file: PipelineFile
     bands: Mapping[str, Sensitivity]
@@ -71,11 +78,17 @@ class SensitivityOfBands:
     def __getitem__(self, band: str) -> Sensitivity:
         """The depth of a band's map. Raises InputError for a band that the camera has not."""
         if band not in self.bands:
-            raise InputError(f"there is no band {band!r}", place="sensitivity", cure=f"choose from: {', '.join(self.bands)}")
+            raise InputError(
+                f"there is no band {band!r}",
+                place="sensitivity",
+                cure=f"choose from: {', '.join(self.bands)}",
+            )
         return self.bands[band]
 
     def reach(self, rms: str | float) -> float:
-        """Integration time [s] after which the maps of all bands are as deep, see `Forecast.reach`."""
+        """Integration time [s] after which the maps of all bands are as deep, see
+        `Forecast.reach`.
+        """
         return max(found.reach(rms) for found in self.bands.values())
 
     def audited(self, seeds: int, threads: int | None = None) -> SensitivityOfBands:
@@ -87,7 +100,9 @@ class SensitivityOfBands:
         return {"bands": {name: found.as_dict() for name, found in self.bands.items()}}
 
     def write(self, folder: str | Path) -> list[Path]:
-        """Write ``sensitivity_BAND.ecsv`` and ``sensitivity_BAND.png`` of all bands, and ``pipeline.yaml``; their paths."""
+        """Write ``sensitivity_BAND.ecsv`` and ``sensitivity_BAND.png`` of all bands, and
+        ``pipeline.yaml``; their paths.
+        """
         from .report import write_bands
 
         return write_bands(self.file, self.bands, Path(folder))
@@ -106,37 +121,47 @@ def sensitivity(
     settings: Sequence[str] = (),
     **asked: Any,
 ) -> Sensitivity | SensitivityOfBands:
-    """Forecast the depth of a map without a run, of a camera with several bands that of each band's map.
+    """Forecast the depth of a map without a run, of a camera with several bands that of each band's
+    map.
 
-    >>> zonda.sensitivity("mustang2_cluster")                                            # doctest: +SKIP
-    >>> zonda.sensitivity(instrument="mustang2", site="green_bank", pwv="7.7 mm", time="1 h").reach("20 uK")    # doctest: +SKIP
+    >>> zonda.sensitivity("mustang2_cluster")                                            # doctest:
+    +SKIP
+    >>> zonda.sensitivity(instrument="mustang2", site="green_bank", pwv="7.7 mm", time="1
+    h").reach("20 uK")    # doctest: +SKIP
 
     Parameters
     ----------
     pipeline
-        A pipeline file (`zonda.load`), its path or name; None: one is made for an instrument and a site.
+        A pipeline file (`zonda.load`), its path or name; None: one is made for an instrument and a
+        site.
     radius
-        Of the circle about the map's centre that the depth is averaged over, with a unit or in rad; the central arcmin or two
-        beams where it is not given.
+        Of the circle about the map's centre that the depth is averaged over, with a unit or in rad;
+        the central arcmin or two beams where it is not given.
     settings
-        Changes to the pipeline as `zonda run --set` takes them; of a path or name, or of the pipeline that is made.
+        Changes to the pipeline as `zonda run --set` takes them; of a path or name, or of the
+        pipeline that is made.
     asked
-        ``time``, and without a pipeline ``instrument``, ``site``, ``pwv``, ``month``, ``quantile``, ``elevation``, ``target``,
-        ``area`` (`default_pipeline.Asked`).
+        ``time``, and without a pipeline ``instrument``, ``site``, ``pwv``, ``month``, ``quantile``,
+        ``elevation``, ``target``, ``area`` (`default_pipeline.Asked`).
 
     Raises
     ------
     ZondaError
-        For a pipeline that the forecast does not cover, with the step's name; and what loading and pointing raise.
+        For a pipeline that the forecast does not cover, with the step's name; and what loading and
+        pointing raise.
     """
     file = _file(pipeline, settings, asked)
     bands = [band.name for band in file.scene().instrument.bands]
     if bands:
-        return SensitivityOfBands(file, {band: _forecast(file, radius, asked, band) for band in bands})
+        return SensitivityOfBands(
+            file, {band: _forecast(file, radius, asked, band) for band in bands}
+        )
     return _forecast(file, radius, asked)
 
 
-def _forecast(file: PipelineFile, radius: str | float | None, asked: Mapping[str, Any], band: str = "") -> Sensitivity:
+def _forecast(
+    file: PipelineFile, radius: str | float | None, asked: Mapping[str, Any], band: str = ""
+) -> Sensitivity:
     """The depth of one band's map."""
     survey = survey_of(file, band)
     size = max(RADIUS, BEAMS * survey.fwhm)
@@ -146,17 +171,34 @@ def _forecast(file: PipelineFile, radius: str | float | None, asked: Mapping[str
         size = float(radius)
     planes = depths_of(survey, size)
     depth = planes.pop("I")
-    seconds = default_pipeline.positive("--time", Unit("s", "3 h"), asked.get("time"), float(depth.seconds[-1]))
+    seconds = default_pipeline.positive(
+        "--time", Unit("s", "3 h"), asked.get("time"), float(depth.seconds[-1])
+    )
     instrument = survey.scene.instrument
     units = factors(instrument.band, survey.fwhm)
-    return Sensitivity(file, survey, depth, size, seconds, units, calculator.of_survey(survey, seconds), None, band, planes)
+    return Sensitivity(
+        file,
+        survey,
+        depth,
+        size,
+        seconds,
+        units,
+        calculator.of_survey(survey, seconds),
+        None,
+        band,
+        planes,
+    )
 
 
-def _audited(found: Mapping[str, Sensitivity], file: PipelineFile, seeds: int, threads: int | None) -> dict[str, Sensitivity]:
+def _audited(
+    found: Mapping[str, Sensitivity], file: PipelineFile, seeds: int, threads: int | None
+) -> dict[str, Sensitivity]:
     """The forecasts, by band, with what simulations find."""
     from .audit import Forecasted, audit
 
-    forecasts = {band: Forecasted(one.planes, one.radius, one.survey.fwhm) for band, one in found.items()}
+    forecasts = {
+        band: Forecasted(one.planes, one.radius, one.survey.fwhm) for band, one in found.items()
+    }
     audits = audit(file, forecasts, seeds, threads)
     return {band: replace(one, audit=audits[band]) for band, one in found.items()}
 
@@ -171,7 +213,11 @@ def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> P
     if pipeline is None:
         if missing := [key for key in ("instrument", "site") if key not in given]:
             cure = "name a pipeline, or --instrument and --site (`zonda plugins` lists them)"
-            raise InputError(f"neither a pipeline nor --{missing[0]} is given", place=default_pipeline.PLACE, cure=cure)
+            raise InputError(
+                f"neither a pipeline nor --{missing[0]} is given",
+                place=default_pipeline.PLACE,
+                cure=cure,
+            )
         return default_pipeline.make(default_pipeline.Asked(**given), settings)
     if beside := sorted(given.keys() - {"time"}):
         cure = f"change the pipeline with --set, or leave it or --{beside[0]} out"
@@ -182,6 +228,10 @@ def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> P
     if isinstance(pipeline, PipelineFile):
         if settings:
             cure = "give them to zonda.load"
-            raise InputError("settings change a pipeline when it is loaded", place=default_pipeline.PLACE, cure=cure)
+            raise InputError(
+                "settings change a pipeline when it is loaded",
+                place=default_pipeline.PLACE,
+                cure=cure,
+            )
         return pipeline
     return load(pipeline, settings)

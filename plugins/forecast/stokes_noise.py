@@ -1,16 +1,20 @@
-"""White and 1/f noise of a filtered map of I, Q and U that is smoothed with the beam, without its time streams.
+"""White and 1/f noise of a filtered map of I, Q and U that is smoothed with the beam, without its
+time streams.
 
-A sample i of weight a_i and noise of rms sigma_i sees r_i = (1, p cos 2 psi, p sin 2 psi) of (I, Q, U). The map solves in each
-pixel (`operators.maps.stokes_sums`) for what has the covariance
+A sample i of weight a_i and noise of rms sigma_i sees r_i = (1, p cos 2 psi, p sin 2 psi) of (I, Q,
+U). The map solves in each pixel (`operators.maps.stokes_sums`) for what has the covariance
 
-    C = A^-1 N A^-1,   A = sum_i a_i r_i r_i^T,   N = sum_i a_i^2 sigma_i^2 r_i r_i^T.                              (1)
+    C = A^-1 N A^-1,   A = sum_i a_i r_i r_i^T,
+    N = sum_i a_i^2 sigma_i^2 r_i r_i^T.                              (1)
 
-The plane S of the map, smoothed with the beam K and the weights w = 1 / (A^-1)_SS of its pixels, has at a pixel the variance
+The plane S of the map, smoothed with the beam K and the weights w = 1 / (A^-1)_SS of its pixels,
+has at a pixel the variance
 
-    sum_pixels K^2 w^2 C_SS / (sum_pixels K w)^2,                                                                  (2)
+    sum_pixels K^2 w^2 C_SS / (sum_pixels K w)^2,   (2)
 
-which is averaged over the pixels in a circle with the weights w. A is added up by the map's own kernel in the map's own pixels.
-What the filters leave of it is the factor of `detector_noise`, equation (2), of the weights K w a (A^-1)_S r of the samples.
+which is averaged over the pixels in a circle with the weights w. A is added up by the map's own
+kernel in the map's own pixels. What the filters leave of it is the factor of `detector_noise`,
+equation (2), of the weights K w a (A^-1)_S r of the samples.
 """
 
 from __future__ import annotations
@@ -38,12 +42,15 @@ from .survey import Survey, Track, polarization_angles
 
 PLANES = "IQU"
 PROBES = 64
-"""Number of probes in the circle: angles differ more from place to place than numbers of samples."""
+"""Number of probes in the circle: angles differ more from place to place than numbers of samples.
+"""
 PER_PIXEL, PER_TURN = 2.0, 3.0
-"""Instants per pixel that is crossed, and per cycle of the polarization's modulation by a half-wave plate, of filtered series."""
+"""Instants per pixel that is crossed, and per cycle of the polarization's modulation by a half-wave
+plate, of filtered series.
+"""
 SAMPLES = 1e9
-"""Samples of all scans that are added up: of more, some instants are drawn, each of which stands for several. A pixel then has so
-many that the few determine A as well."""
+"""Samples of all scans that are added up: of more, some instants are drawn, each of which stands
+for several. A pixel then has so many that the few determine A as well."""
 DETECTORS, INSTANTS = 256, 1 << 14
 """Detectors and instants that are added up at a time."""
 FOLLOWED = 24
@@ -51,8 +58,8 @@ FOLLOWED = 24
 
 
 def variances(survey: Survey, radius: float) -> dict[str, dict[str, Floats]]:
-    """By plane of the map, ``white`` and ``1/f``: (n_scan,) variance [K^2] after each scan, averaged over a circle of ``radius``
-    [rad]; NaN where no pixel there is solved."""
+    """By plane of the map, ``white`` and ``1/f``: (n_scan,) variance [K^2] after each scan,
+    averaged over a circle of ``radius`` [rad]; NaN where no pixel there is solved."""
     grid = _window(survey, radius)
     number, taps = len(survey.observations), gaussian_taps(survey.sigma / grid.pixel)
     after = np.unique(np.geomspace(1, number, min(number, FOLLOWED)).round().astype(int)) - 1
@@ -75,7 +82,9 @@ def variances(survey: Survey, radius: float) -> dict[str, dict[str, Floats]]:
         for k, level in enumerate(levels[0]):
             known = survey.seconds[after] * found[s, k, after]
             planes[plane][level.part] += (
-                filtered.share(k) * np.interp(survey.seconds, survey.seconds[after], known) / survey.seconds
+                filtered.share(k)
+                * np.interp(survey.seconds, survey.seconds[after], known)
+                / survey.seconds
             )
     return planes
 
@@ -127,8 +136,12 @@ def _scans(survey: Survey, grid: TangentGrid) -> Iterator[Floats]:
         yield total
 
 
-def _smoothed(solved: Floats, noise: Floats, grid: TangentGrid, taps: Floats, radius: float) -> Floats:
-    """(3, n_noise) equation (2) in the circle; ``solved``: A^-1, ``noise`` (n_noise, n_pixels, 6): N."""
+def _smoothed(
+    solved: Floats, noise: Floats, grid: TangentGrid, taps: Floats, radius: float
+) -> Floats:
+    """(3, n_noise) equation (2) in the circle; ``solved``: A^-1, ``noise`` (n_noise, n_pixels, 6):
+    N.
+    """
     found = np.full((len(PLANES), len(noise)), np.nan)
     inside = _distance(grid) <= radius
     for s in range(len(PLANES)):
@@ -139,27 +152,35 @@ def _smoothed(solved: Floats, noise: Floats, grid: TangentGrid, taps: Floats, ra
         total = convolved(weight, taps)[near]
         row = np.nan_to_num(solved[:, s])
         for k, each in enumerate(noise):
-            own = np.einsum("ni,nij,nj->n", row, each[:, PLACES_OF_SIX].reshape(-1, 3, 3), row).reshape(grid.shape)
+            own = np.einsum(
+                "ni,nij,nj->n", row, each[:, PLACES_OF_SIX].reshape(-1, 3, 3), row
+            ).reshape(grid.shape)
             squares = convolved(weight**2 * own, taps**2)[near]
             found[s, k] = np.average(squares / total**2, weights=weight[near])
     return found
 
 
 class _Looks:
-    """Series of detectors by the pixels that they look at, and by their angles: those of the latest track are kept."""
+    """Series of detectors by the pixels that they look at, and by their angles: those of the latest
+    track are kept.
+    """
 
     def __init__(self, survey: Survey, grid: TangentGrid) -> None:
         self._survey, self._grid = survey, grid
         self._track: Track | None = None
 
     def series(self, rows: NDArray[np.float32], track: Track, few: NDArray[np.intp]) -> AnyFloats:
-        """(n_det, n_instant) r times the row (n_pixels + 1, 3) of the pixel of a detector's sample; the last: outside."""
+        """(n_det, n_instant) r times the row (n_pixels + 1, 3) of the pixel of a detector's sample;
+        the last: outside.
+        """
         if track is not self._track:
             o, grid = track.observation, self._grid
             cosine, sine = np.empty((2, len(few), len(track.index)))
             polarization_angles(self._survey, o, track.index).fill(few, 0, cosine, sine)
             efficiency = o.focalplane.polarization_efficiency[few, None]
-            self._cosine, self._sine = ((efficiency * each).astype(np.float32) for each in (cosine, sine))
+            self._cosine, self._sine = (
+                (efficiency * each).astype(np.float32) for each in (cosine, sine)
+            )
             pointing = np.ascontiguousarray(grid.pointing(o)[:, track.index])
             self._pixels = Looking(o, grid, pointing).pixels(few, 0, len(track.index))
             self._track = track
@@ -169,21 +190,30 @@ class _Looks:
         return found
 
 
-def _signed(looks: _Looks, grid: TangentGrid, row: Floats, weight: Floats, taps: Floats, chosen: list[Comb]) -> list[Series]:
-    """As `detector_noise._signed`, from ``row`` (n_pixels, 3), (A^-1)_S, and ``weight`` (ny, nx), w."""
+def _signed(
+    looks: _Looks, grid: TangentGrid, row: Floats, weight: Floats, taps: Floats, chosen: list[Comb]
+) -> list[Series]:
+    """As `detector_noise._signed`, from ``row`` (n_pixels, 3), (A^-1)_S, and ``weight`` (ny, nx),
+    w.
+    """
     rng = np.random.default_rng(2)
     draws: list[Series] = []
     total = convolved(weight, taps)
     for comb in chosen:
         at = (comb.origin + comb.spacing * np.argwhere(comb.inside)) / grid.pixel  # columns, rows
-        columns, rows = (np.clip(np.rint(at[:, k] + (n - 1) / 2).astype(int), 0, n - 1) for k, n in enumerate(grid.shape[::-1]))
+        columns, rows = (
+            np.clip(np.rint(at[:, k] + (n - 1) / 2).astype(int), 0, n - 1)
+            for k, n in enumerate(grid.shape[::-1])
+        )
         with np.errstate(divide="ignore"):
             size = np.where(total[rows, columns] > 0, total[rows, columns] ** -0.5, 0.0)
         for _ in range(max(1, SIGNS // len(chosen))):
             probes = np.zeros(grid.shape)
             probes[rows, columns] = rng.choice([-1.0, 1.0], len(size)) * size
             each = (convolved(probes, taps) * weight).reshape(-1, 1) * np.nan_to_num(row)
-            draws.append(partial(looks.series, np.append(each, np.zeros((1, 3)), axis=0).astype(np.float32)))
+            draws.append(
+                partial(looks.series, np.append(each, np.zeros((1, 3)), axis=0).astype(np.float32))
+            )
     return draws
 
 

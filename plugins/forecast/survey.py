@@ -1,6 +1,8 @@
-"""The scans of a pipeline as the forecast needs them: where detectors look on the map, how noisy they are, what the filters cut.
+"""The scans of a pipeline as the forecast needs them: where detectors look on the map, how noisy
+they are, what the filters cut.
 
-The telescope is pointed and levels of noise are resolved by the pipeline's own steps (`Operator.observe`, `Operator.configure`).
+The telescope is pointed and levels of noise are resolved by the pipeline's own steps
+(`Operator.observe`, `Operator.configure`).
 """
 
 from __future__ import annotations
@@ -41,10 +43,13 @@ if TYPE_CHECKING:
     from zonda.core.scene import Scene
 
 CONFIGURED = 9
-"""Scans whose atmosphere and levels of noise are looked at; the others have those of the nearest."""
+"""Scans whose atmosphere and levels of noise are looked at; the others have those of the nearest.
+"""
 
 PER_BEAM, PER_CUT = 2.5, 8.0
-"""Instants per beam that is crossed, and per cycle of the high-pass filter's cut, at which scans are followed."""
+"""Instants per beam that is crossed, and per cycle of the high-pass filter's cut, at which scans
+are followed.
+"""
 
 UNEVEN = 0.05
 """Largest relative scatter of NET between detectors that is taken as none."""
@@ -89,12 +94,13 @@ class Track:
     observation
         The scan.
     index
-        (n,) sample numbers of the instants, each in the middle of the ``step`` samples that it stands for.
+        (n,) sample numbers of the instants, each in the middle of the ``step`` samples that it
+        stands for.
     rate
         Of the instants, Hz.
     matrices
-        (n, 9): from (xi, eta, 1) to the map's tangent plane, rad from its centre towards west and north (`projection`, equation
-        1).
+        (n, 9): from (xi, eta, 1) to the map's tangent plane, rad from its centre towards west and
+        north (`projection`, equation 1).
     """
 
     observation: Observation
@@ -153,7 +159,9 @@ class Survey:
 
     @cached_property
     def fwhm(self) -> float:
-        """Of the map's beam [rad], `core.maps.beams`: by the weights of the detectors of the first scan."""
+        """Of the map's beam [rad], `core.maps.beams`: by the weights of the detectors of the first
+        scan.
+        """
         good = self.observations[0].good_detectors
         fwhm, net = self.focalplane.fwhm[good], self.focalplane.net[good]
         net = net if self.steps.binning.weights == "inverse_variance" else np.ones(len(net))
@@ -181,16 +189,28 @@ class Survey:
 
     @cached_property
     def modulation(self) -> float:
-        """Frequency at which a half-wave plate modulates polarization, Hz; 0: there is none that turns."""
+        """Frequency at which a half-wave plate modulates polarization, Hz; 0: there is none that
+        turns.
+        """
         plates: list[HalfWavePlate] = self.steps.of(HalfWavePlate)
         return 4 * abs(plates[-1].frequency) if plates else 0.0
 
     @property
     def cancels(self) -> bool:
-        """Whether what is not polarized and the same for detectors that look at one place, such as the atmosphere, is in I alone:
-        alike detectors there have angles of which cos 2 psi and sin 2 psi add up to zero."""
+        """Whether what is not polarized and the same for detectors that look at one place, such as
+        the atmosphere, is in I alone: alike detectors there have angles of which cos 2 psi and sin
+        2 psi add up to zero."""
         plane, good = self.focalplane, self.observations[0].good_detectors
-        seen = np.stack([plane.xi, plane.eta, plane.fwhm, plane.main_beam_efficiency, plane.illumination_efficiency], axis=1)
+        seen = np.stack(
+            [
+                plane.xi,
+                plane.eta,
+                plane.fwhm,
+                plane.main_beam_efficiency,
+                plane.illumination_efficiency,
+            ],
+            axis=1,
+        )
         places, which = np.unique(seen[good], axis=0, return_inverse=True)
         angles = (plane.polarization_efficiency * np.exp(2j * plane.polarization_angle))[good]
         sums = np.zeros(len(places), complex)
@@ -213,9 +233,13 @@ class Survey:
         """Median speed of the boresight on the sky, rad/s."""
         speeds = []
         for o in self.observations[:3]:
-            at = np.unique(np.linspace(0, o.n_samples - 2, min(2000, max(o.n_samples - 1, 1))).astype(int))
+            at = np.unique(
+                np.linspace(0, o.n_samples - 2, min(2000, max(o.n_samples - 1, 1))).astype(int)
+            )
             if o.n_samples > 1:
-                ends = boresights(o.boresight_radec[np.stack([at, at + 1], 1).ravel()]).reshape(3, -1, 2)
+                ends = boresights(o.boresight_radec[np.stack([at, at + 1], 1).ravel()]).reshape(
+                    3, -1, 2
+                )
                 speeds.append(np.linalg.norm(ends[..., 1] - ends[..., 0], axis=0) * o.sample_rate)
         return float(np.median(np.concatenate(speeds))) if speeds else 0.0
 
@@ -237,11 +261,15 @@ class Survey:
         return self._tracks[scan, step]
 
     def filter(self, track: Track, rows: AnyFloats) -> None:
-        """The pipeline's high-pass filter on series (n_row, n) at the instants of a track, in place."""
+        """The pipeline's high-pass filter on series (n_row, n) at the instants of a track, in
+        place.
+        """
         step = self.steps.highpass
         if step is None:
             return
-        plan = plan_highpass(len(track.index), step.frequency / track.rate, step.degree, step.oversampling)
+        plan = plan_highpass(
+            len(track.index), step.frequency / track.rate, step.degree, step.oversampling
+        )
         if plan.knots:
             plan.apply(rows)
             return
@@ -257,7 +285,10 @@ class Survey:
         """The map's pixels. Raises PipelineError where it is not a TAN map."""
         grid = self.steps.binning.grid
         if not isinstance(grid, TangentGrid):
-            text, cure = "the forecast is made for TAN maps", "leave nside and projection of BinMap out"
+            text, cure = (
+                "the forecast is made for TAN maps",
+                "leave nside and projection of BinMap out",
+            )
             raise PipelineError(text, place="zonda sensitivity", cure=cure)
         return grid
 
@@ -267,7 +298,10 @@ class Survey:
         half = min(grid.shape) * grid.pixel / 2
         if radius > half:
             wide, reach = (math.degrees(angle) * 60 for angle in (radius, half))
-            text = f"a circle of radius {wide:.3g} arcmin is not on the map, which reaches {reach:.3g} arcmin from its centre"
+            text = (
+                f"a circle of radius {wide:.3g} arcmin is not on the map, which reaches {reach:.3g}"
+                " arcmin from its centre"
+            )
             raise PipelineError(text, place="zonda sensitivity", cure="choose a smaller --radius")
 
 
@@ -286,7 +320,12 @@ def survey_of(file: PipelineFile, band: str = "") -> Survey:
     if observations:
         check_polarized(steps.binning, observations[0])
     note_signals(observations, pipeline.signals.components, pipeline.signals.formed)
-    chosen_scans = sorted({round(k) for k in np.linspace(0, len(observations) - 1, min(CONFIGURED, len(observations)))})
+    chosen_scans = sorted(
+        {
+            round(k)
+            for k in np.linspace(0, len(observations) - 1, min(CONFIGURED, len(observations)))
+        }
+    )
     for k in chosen_scans:
         for operator in pipeline.operators:
             operator.configure(observations[k])
@@ -307,27 +346,47 @@ def polarization_angles(survey: Survey, observation: Observation, index: Any) ->
         plate.configure(observation)
     pole = frame_rotation(survey.steps.binning.frame)[2]
     found = PolarizationAngles.of(observation, observation.boresight_radec[index], pole)
-    return replace(found, plate=np.ascontiguousarray(found.plate[:, index])) if found.plate.size else found
+    return (
+        replace(found, plate=np.ascontiguousarray(found.plate[:, index]))
+        if found.plate.size
+        else found
+    )
 
 
 def _check_scans(observations: Sequence[Observation], name: str) -> None:
     if not observations:
-        raise PipelineError("the pointing steps made no observation", place=name, cure="ask for at least one scan")
+        raise PipelineError(
+            "the pointing steps made no observation", place=name, cure="ask for at least one scan"
+        )
     first = observations[0].focalplane.names
     for o in observations:
         if o.focalplane.names != first:
-            raise PipelineError("scans with other detectors", place=o.name, cure="forecast them one by one")
+            raise PipelineError(
+                "scans with other detectors", place=o.name, cure="forecast them one by one"
+            )
         unused = 1 - o.good_samples.mean() * o.good_detectors.mean()
         if unused > FLAGGED:
-            text = f"{100 * unused:.3g} % of the samples are flagged, which the forecast does not cover"
-            raise PipelineError(text, place=o.name, cure="find the noise with `zonda run` and several seeds")
+            text = (
+                f"{100 * unused:.3g} % of the samples are flagged, which the forecast does not"
+                " cover"
+            )
+            raise PipelineError(
+                text, place=o.name, cure="find the noise with `zonda run` and several seeds"
+            )
 
 
 def _noises(steps: Steps, observation: Observation) -> tuple[Noise, ...]:
     """The noises of a configured scan's calibrated samples."""
     found = []
     for white in steps.of(WhiteNoise):
-        found.append(Noise(_even(calibrated_level(observation.noise_levels[white.label], observation), white.label)))
+        found.append(
+            Noise(
+                _even(
+                    calibrated_level(observation.noise_levels[white.label], observation),
+                    white.label,
+                )
+            )
+        )
     for pink in steps.of(PinkNoise):
         spectrum = PinkSpectrum.of(pink, observation)
         if spectrum is not None:
@@ -350,7 +409,11 @@ def _even(samples: Floats, place: str) -> float:
     level = _rms(samples)
     if level > 0 and float(np.std(samples)) > UNEVEN * level:
         text = "the detectors' NETs differ, which the forecast does not cover"
-        raise PipelineError(text, place=place, cure="leave the scatter out, or find the noise with `zonda run` and several seeds")
+        raise PipelineError(
+            text,
+            place=place,
+            cure="leave the scatter out, or find the noise with `zonda run` and several seeds",
+        )
     return level
 
 
@@ -360,5 +423,8 @@ def _rms(values: Floats) -> float:
 
 def elevations(survey: Survey) -> tuple[float, float]:
     """Lowest and highest elevation of the boresight, rad."""
-    ends = [(float(e.min()), float(e.max())) for e in (o.elevation for o in (survey.observations[0], survey.observations[-1]))]
+    ends = [
+        (float(e.min()), float(e.max()))
+        for e in (o.elevation for o in (survey.observations[0], survey.observations[-1]))
+    ]
     return min(np.array(ends)[:, 0]), max(np.array(ends)[:, 1])

@@ -25,24 +25,39 @@ UNFILTERED = Signal(only=["sky"], filters="none")
 
 
 def map_of(data: Data, metric: str, signal: str = "", name: str = "map") -> MapProduct:
-    """The map ``name`` of a signal (empty: the complete one); else an InputError about ``metric``."""
+    """The map ``name`` of a signal (empty: the complete one); else an InputError about
+    ``metric``.
+    """
     product = data.products.get(product_name(stream_of(signal), name))
     if not isinstance(product, MapProduct):
-        there = ", ".join(sorted(key for key, p in data.products.items() if isinstance(p, MapProduct))) or "none"
+        there = (
+            ", ".join(sorted(key for key, p in data.products.items() if isinstance(p, MapProduct)))
+            or "none"
+        )
         wanted = product_name(stream_of(signal), name)
-        raise InputError(f"there is no map {wanted!r}", place=metric, cure=f"the maps of this run: {there}")
+        raise InputError(
+            f"there is no map {wanted!r}", place=metric, cure=f"the maps of this run: {there}"
+        )
     needs_signal({name: product.contents}, metric, name)
     return product
 
 
 def needs_signal(kinds: Mapping[str, str], metric: str, name: str) -> None:
-    """InputError about ``metric`` where the map ``name`` will count samples alone. ``kinds``: as in `FigureMetric.look`."""
+    """InputError about ``metric`` where the map ``name`` will count samples alone. ``kinds``: as in
+    `FigureMetric.look`.
+    """
     if kinds.get(name) == "hits":
-        raise InputError(f"the map {name!r} counts samples and has no signal", place=metric, cure="leave contents: hits out")
+        raise InputError(
+            f"the map {name!r} counts samples and has no signal",
+            place=metric,
+            cure="leave contents: hits out",
+        )
 
 
 def at_beam(product: MapProduct, fwhm: float | None = None) -> MapProduct:
-    """A map smoothed with its beam, or with ``fwhm`` [rad] where that is given; one that was smoothed when it was made stays."""
+    """A map smoothed with its beam, or with ``fwhm`` [rad] where that is given; one that was
+    smoothed when it was made stays.
+    """
     width = product.fwhm if fwhm is None else fwhm
     return product if product.smoothed_by or not width else product.smoothed(width)
 
@@ -55,12 +70,16 @@ def covered(product: MapProduct) -> NDArray[np.bool_]:
 
 
 def as_seen(image: Image, product: MapProduct, fwhm: float | None = None) -> Floats:
-    """The input map, the mean under a Gaussian (``fwhm`` [rad]; the beam), at the centres of the map's pixels; 0 beside it."""
+    """The input map, the mean under a Gaussian (``fwhm`` [rad]; the beam), at the centres of the
+    map's pixels; 0 beside it.
+    """
     from scipy.ndimage import map_coordinates
 
     own = wcs_grid(image.wcs, (image.values.shape[0], image.values.shape[1]))
     width = product.fwhm if fwhm is None else fwhm
-    smooth, _ = own.smoothed(np.nan_to_num(image.values), math.sqrt(max(width**2 - image.fwhm**2, 0.0)))
+    smooth, _ = own.smoothed(
+        np.nan_to_num(image.values), math.sqrt(max(width**2 - image.fwhm**2, 0.0))
+    )
     grid = product.grid
     x, y = own.coordinates(grid.directions() @ grid.turn @ own.turn.T)  # either may be galactic
     at = np.where(np.isfinite(x) & np.isfinite(y), [y, x], -2.0)
@@ -68,7 +87,9 @@ def as_seen(image: Image, product: MapProduct, fwhm: float | None = None) -> Flo
 
 
 def extreme(values: Floats, where: NDArray[np.bool_], metric: str) -> tuple[int, float]:
-    """(flat index, value) of the largest absolute value; InputError about ``metric`` where there is none."""
+    """(flat index, value) of the largest absolute value; InputError about ``metric`` where there is
+    none.
+    """
     if not where.any():
         cure = "map a larger field, or choose a larger radius"
         raise InputError("no pixel has enough samples", place=metric, cure=cure)
@@ -77,24 +98,32 @@ def extreme(values: Floats, where: NDArray[np.bool_], metric: str) -> tuple[int,
 
 
 def relative_error_of_rms(product: MapProduct, where: NDArray[np.bool_]) -> float:
-    """Standard error of a weighted rms over pixels, relative, of white noise behind the smoothing of the map:
+    """Standard error of a weighted rms over pixels, relative, of white noise behind the smoothing
+    of the map:
 
         (2 N)^(-1/2),   N = (sum w)^2 / sum_ij w_i w_j rho_ij^2,   rho = exp(-d^2 / 4 sigma^2)
 
-    sigma that of the smoothing, d the angle between pixels. HEALPix: N is the area divided by 2 pi sigma^2. NaN without pixels.
+    sigma that of the smoothing, d the angle between pixels. HEALPix: N is the area divided by 2 pi
+    sigma^2. NaN without pixels.
     """
     w = np.where(where & np.isfinite(product.signal), product.weights, 0.0)
     if not w.any():
         return math.nan
     cell, grid = 2 * math.pi * (product.smoothed_by / FWHM_PER_SIGMA) ** 2, product.grid
     if not isinstance(grid, ImagePixels):
-        independent = min(grid.solid_angle(w != 0) / cell if cell else np.inf, float(np.count_nonzero(w)))
+        independent = min(
+            grid.solid_angle(w != 0) / cell if cell else np.inf, float(np.count_nonzero(w))
+        )
         return 1 / math.sqrt(2 * independent)
     rows, columns = (np.flatnonzero(w.any(axis=axis)) for axis in (1, 0))
     window = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
     w, grid = w[window], grid.window(*window)
     smoothed = cell > float(np.nanmin(grid.areas))
-    pairs = float((w * grid.smoother(product.smoothed_by)(w) * cell / grid.areas).sum()) if smoothed else float((w * w).sum())
+    pairs = (
+        float((w * grid.smoother(product.smoothed_by)(w) * cell / grid.areas).sum())
+        if smoothed
+        else float((w * w).sum())
+    )
     return 1 / math.sqrt(2 * float(w.sum()) ** 2 / pairs)
 
 
@@ -107,7 +136,9 @@ def flat(product: MapProduct, metric: str) -> MapProduct:
 def needs_tan(kind: str, metric: str) -> None:
     """PipelineError about ``metric`` for a map that is not TAN."""
     if kind != "TAN":
-        raise PipelineError(f"{metric} needs a TAN map", place=metric, cure="leave BinMap.nside and projection out")
+        raise PipelineError(
+            f"{metric} needs a TAN map", place=metric, cure="leave BinMap.nside and projection out"
+        )
 
 
 def input_of(data: Data, metric: str) -> Image:

@@ -2,13 +2,16 @@
 
 With a reference A, a map B and the threshold t of `CompareMaps`,
 
-    fidelity    median of F = |A| / max(|B - A|, t rms(B - A)),   |A| >= least max |A|                        (1)
+    fidelity    median of F = |A| / max(|B - A|, t rms(B - A)),
+    |A| >= least max |A|                        (1)
 
-With the power P_i of a map's rings i, their independent modes N_i, and the level W_i of white noise in independent pixels,
+With the power P_i of a map's rings i, their independent modes N_i, and the level W_i of white noise
+in independent pixels,
 
     map_power   sum N_i P_i / sum N_i W_i,   smallest <= 1/k_i <= largest      (2)
 
-    relative error   (sum N_i W_i^2)^1/2 / sum N_i W_i,  of smoothed maps from draws of noise (radial)         (3)
+    relative error   (sum N_i W_i^2)^1/2 / sum N_i W_i,
+    of smoothed maps from draws of noise (radial)         (3)
 """
 
 from __future__ import annotations
@@ -33,8 +36,8 @@ from zonda.operators.diagnostics.map_spectra import MapSpectra
 class Fidelity(FigureMetric):
     """Median fidelity of a map where its reference is bright, equation (1).
 
-    It is measured by a `CompareMaps`. Of a map that is g times its reference everywhere it is 1 / |1 - g|, below the limit
-    that the threshold sets.
+    It is measured by a `CompareMaps`. Of a map that is g times its reference everywhere it is 1 /
+    |1 - g|, below the limit that the threshold sets.
     """
 
     reads: ClassVar[frozenset[str]] = frozenset({"comparison"})
@@ -45,34 +48,50 @@ class Fidelity(FigureMetric):
     """Share of the reference's peak from which a pixel counts; 100 %: the peak alone."""
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
-        """Equation (1). Raises InputError where there is no comparison, or the reference is empty."""
+        """Equation (1). Raises InputError where there is no comparison, or the reference is
+        empty.
+        """
         found = data.products.get(self.comparison)
         if not isinstance(found, Comparison):
-            there = ", ".join(k for k, p in data.products.items() if isinstance(p, Comparison)) or "none; add a CompareMaps"
+            there = (
+                ", ".join(k for k, p in data.products.items() if isinstance(p, Comparison))
+                or "none; add a CompareMaps"
+            )
             cure = f"the comparisons of this run: {there}"
-            raise InputError(f"there is no comparison {self.comparison!r}", place="fidelity", cure=cure)
+            raise InputError(
+                f"there is no comparison {self.comparison!r}", place="fidelity", cure=cure
+            )
         size = np.abs(found.planes["reference"])
         peak = float(np.nanmax(size, initial=0.0))
         if peak == 0:
-            raise InputError("the reference is empty", place="fidelity", cure="compare with a sky with a source")
+            raise InputError(
+                "the reference is empty", place="fidelity", cure="compare with a sky with a source"
+            )
         return float(np.median(found.planes["fidelity"][size >= self.least * peak])), math.nan
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """What was measured."""
-        where = "at the reference's peak" if self.least == 1 else f"where the reference has {100 * self.least:g} % of its peak"
+        where = (
+            "at the reference's peak"
+            if self.least == 1
+            else f"where the reference has {100 * self.least:g} % of its peak"
+        )
         return f"median of |reference| / max(|difference|, threshold) {where}"
 
 
 class MapPower(FigureMetric):
-    """Power spectral density of a map over that of white noise in its pixels, in a range of angular scales, equation (2).
+    """Power spectral density of a map over that of white noise in its pixels, in a range of angular
+    scales, equation (2).
 
-    It is measured by a `MapSpectrum`. White noise has 1 on all scales; 1/f noise and the atmosphere add on large ones.
+    It is measured by a `MapSpectrum`. White noise has 1 on all scales; 1/f noise and the atmosphere
+    add on large ones.
     """
 
     reads: ClassVar[frozenset[str]] = frozenset({"map_spectra"})
 
     spectra: str = Field("map_spectra", pattern=r"^[A-Za-z0-9_.]+$")
-    """Which ones, by their name among the products: that of a `MapSpectrum` with a name of its own."""
+    """Which ones, by their name among the products: that of a `MapSpectrum` with a name of its own.
+    """
     of: str = Field("source_free/map", pattern=r"^[A-Za-z0-9_/]+$")
     """Which map."""
     smallest: Angle = quantity("10 arcsec", gt=0)
@@ -87,22 +106,41 @@ class MapPower(FigureMetric):
         return self
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
-        """Equation (2). Raises InputError where the map, its white level or modes of these scales are missing."""
+        """Equation (2). Raises InputError where the map, its white level or modes of these scales
+        are missing.
+        """
         found = data.products.get(self.spectra)
         if not isinstance(found, MapSpectra):
-            there = ", ".join(k for k, p in data.products.items() if isinstance(p, MapSpectra)) or "none; add a MapSpectrum"
-            raise InputError(f"there are no spectra {self.spectra!r}", place="map_power", cure=f"those of this run: {there}")
+            there = (
+                ", ".join(k for k, p in data.products.items() if isinstance(p, MapSpectra))
+                or "none; add a MapSpectrum"
+            )
+            raise InputError(
+                f"there are no spectra {self.spectra!r}",
+                place="map_power",
+                cure=f"those of this run: {there}",
+            )
         rings = found.spectra
         if self.of not in rings.power or self.of not in rings.white:
             there = ", ".join(sorted(rings.power.keys() & rings.white.keys())) or "none"
             cure = f"maps with a known level: {there}; name others in MapSpectrum.maps"
-            raise InputError(f"no spectrum and white level of the map {self.of!r} are known", place="map_power", cure=cure)
-        used = (rings.scale >= self.smallest) & (rings.scale <= self.largest) & np.isfinite(rings.power[self.of])
+            raise InputError(
+                f"no spectrum and white level of the map {self.of!r} are known",
+                place="map_power",
+                cure=cure,
+            )
+        used = (
+            (rings.scale >= self.smallest)
+            & (rings.scale <= self.largest)
+            & np.isfinite(rings.power[self.of])
+        )
         number = rings.modes[used]
         if not number.sum() > 0:
             cure = "choose scales between two pixels and the map's size, or a wider range"
             raise InputError(f"no ring lies {self._range()}", place="map_power", cure=cure)
-        value = float(number @ rings.power[self.of][used]) / float(number @ rings.white[self.of][used])
+        value = float(number @ rings.power[self.of][used]) / float(
+            number @ rings.white[self.of][used]
+        )
         level = rings.white[self.of][used]
         if rings.draws is not None:
             together = rings.draws[:, used] @ (number * level)
@@ -111,7 +149,10 @@ class MapPower(FigureMetric):
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """What was measured."""
-        return f"power of {self.of} over that of white noise by NET and samples, scales {self._range()}"
+        return (
+            f"power of {self.of} over that of white noise by NET and samples, scales"
+            f" {self._range()}"
+        )
 
     def _range(self) -> str:
         return f"from {angle_text(self.smallest)} to {angle_text(self.largest)}"

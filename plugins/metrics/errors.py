@@ -1,39 +1,47 @@
 """The built-in metrics of `zonda accuracy`: equations (1) to (5).
 
-m is a run's, m0 that of the tightest setting with the same random numbers. Of a map of I, Q and U, (1) to (3) are taken of each
-plane, and the largest counts.
+m is a run's, m0 that of the tightest setting with the same random numbers. Of a map of I, Q and U,
+(1) to (3) are taken of each plane, and the largest counts.
 
-``map_rms``, the rms of the difference map in units of the map's own noise (pixels with hits in both; weights w and instrument
-noise n of the reference; the rms of m0 itself where the noise is not known):
+``map_rms``, the rms of the difference map in units of the map's own noise (pixels with hits in
+both; weights w and instrument noise n of the reference; the rms of m0 itself where the noise is not
+known):
 
-    E = sqrt( sum w (m - m0)^2 / sum w n^2 )                                                              (1)
+    E = sqrt( sum w (m - m0)^2 / sum w n^2 )                                                     (1)
 
 It bounds the change of the map's rms, because | |m| - |m0| | <= |m - m0| for every norm.
 
-``peak``, the extreme value p of the beam-smoothed map, of the sky alone where a signal keeps only that, among pixels with at
-least `COVERED` of the usual coverage (of Q and U its absolute value, where it is more than `POLARIZED` of that of I):
+``peak``, the extreme value p of the beam-smoothed map, of the sky alone where a signal keeps only
+that, among pixels with at least `COVERED` of the usual coverage (of Q and U its absolute value,
+where it is more than `POLARIZED` of that of I):
 
-    E = |p - p0| / |p0|                                                                                   (2)
+    E = |p - p0| / |p0|                                                                          (2)
 
-``transfer``, the share T of each angular scale of the input map a (convolved with the beam, under the window of the coverage)
-that is left in the map b of the sky alone, as `TransferFunction` measures it; rings i of equal width in log k, from the map's
-extent to the beam, that hold power (of Q and U where the input map has them):
+``transfer``, the share T of each angular scale of the input map a (convolved with the beam, under
+the window of the coverage) that is left in the map b of the sky alone, as `TransferFunction`
+measures it; rings i of equal width in log k, from the map's extent to the beam, that hold power (of
+Q and U where the input map has them):
 
-    T_i = Re sum_ring b a* / sum_ring |a|^2,    E = sqrt( mean_i (T_i - T0_i)^2 )                         (3)
+    T_i = Re sum_ring b a* / sum_ring |a|^2,
+    E = sqrt( mean_i (T_i - T0_i)^2 )                         (3)
 
-``psd``, the mean power spectrum P of the signal as `PowerSpectrum` measures it, in `BINS` bins j of equal width in log f:
+``psd``, the mean power spectrum P of the signal as `PowerSpectrum` measures it, in `BINS` bins j of
+equal width in log f:
 
-    E = sqrt( mean_j (P_j / P0_j - 1)^2 )                                                                 (4)
+    E = sqrt( mean_j (P_j / P0_j - 1)^2 )                                                        (4)
 
-``structure``, the structure functions of the atmosphere's fluctuation s at `TRACED` detectors of the first scan, in time (lags)
-and between detectors (bins of separation), all in one list of values D:
+``structure``, the structure functions of the atmosphere's fluctuation s at `TRACED` detectors of
+the first scan, in time (lags) and between detectors (bins of separation), all in one list of values
+D:
 
-    D = < (s(t + lag) - s(t))^2 >  and  < (s_i(t) - s_j(t))^2 >,    E = sqrt( mean (D / D0 - 1)^2 )       (5)
+    D = < (s(t + lag) - s(t))^2 >  and  < (s_i(t) - s_j(t))^2 >,
+    E = sqrt( mean (D / D0 - 1)^2 )       (5)
 
-Each of N differences d measured through white noise of rms n per sample has the square (d + sqrt(2) n g)^2, g a standard normal,
-of variance 8 n^4 + 8 n^2 D where d is given, so that D, its 2 n^2 taken off, is known to within
+Each of N differences d measured through white noise of rms n per sample has the square (d + sqrt(2)
+n g)^2, g a standard normal, of variance 8 n^4 + 8 n^2 D where d is given, so that D, its 2 n^2
+taken off, is known to within
 
-    sqrt( (8 n^4 + 8 n^2 D) / N )                                                                        (6)
+    sqrt( (8 n^4 + 8 n^2 D) / N )                                                                (6)
 """
 
 from __future__ import annotations
@@ -63,7 +71,8 @@ from .planes import OfPlanes, planes_of
 
 RINGS, BINS, LAGS, SEPARATIONS = 8, 24, 12, 6
 POLARIZED = 1e-3
-"""Of the extreme value of I: below it that of Q or U is taken as zero, which has no relative error."""
+"""Of the extreme value of I: below it that of Q or U is taken as zero, which has no relative error.
+"""
 TRACED = 64
 """Detectors whose atmosphere is kept for the structure functions."""
 INSTANTS = 4096
@@ -75,7 +84,9 @@ class MapRms(OfPlanes):
     """Equation (1)."""
 
     says: ClassVar[str] = "rms of the difference map / the map's instrument noise"
-    instead: ClassVar[str | None] = "measure central_rms, or name map_rms in zonda accuracy --metric"
+    instead: ClassVar[str | None] = (
+        "measure central_rms, or name map_rms in zonda accuracy --metric"
+    )
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("map_rms", operators)
@@ -91,13 +102,17 @@ class MapRms(OfPlanes):
             cure = "fix the map: set BinMap.width and BinMap.centre"
             raise InputError("the map's size depends on the knobs", place="map_rms", cure=cure)
         known = np.isfinite(found["signal"]) & np.isfinite(reference["signal"])
-        difference = _mean_square(found["signal"] - reference["signal"], reference["weights"], known)
+        difference = _mean_square(
+            found["signal"] - reference["signal"], reference["weights"], known
+        )
         return math.sqrt(difference / self._unit(reference)) if difference else 0.0
 
     def summary(self, found: dict[str, Floats]) -> Floats:
         """The map's rms in units of its noise."""
         known = np.isfinite(found["signal"])
-        return np.array([math.sqrt(_mean_square(found["signal"], found["weights"], known) / self._unit(found))])
+        return np.array(
+            [math.sqrt(_mean_square(found["signal"], found["weights"], known) / self._unit(found))]
+        )
 
     def floor_of(self, reference: dict[str, Floats]) -> float | None:
         """1, where the map knows its noise."""
@@ -113,7 +128,9 @@ class Peak(OfPlanes):
     """Equation (2)."""
 
     says: ClassVar[str] = "relative change of the beam-smoothed map's extreme value"
-    instead: ClassVar[str | None] = "measure peak_ratio or peak_snr, or name peak in zonda accuracy --metric"
+    instead: ClassVar[str | None] = (
+        "measure peak_ratio or peak_snr, or name peak in zonda accuracy --metric"
+    )
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("peak", operators)
@@ -128,8 +145,14 @@ class Peak(OfPlanes):
         return found
 
     def counted(self, reference: Mapping[str, Floats]) -> list[str]:
-        """I, and Q and U that are more than next to nothing in the reference, whatever is left of them."""
-        return [plane for plane, one in reference.items() if plane == "I" or one[0] > POLARIZED * abs(reference["I"][0])]
+        """I, and Q and U that are more than next to nothing in the reference, whatever is left of
+        them.
+        """
+        return [
+            plane
+            for plane, one in reference.items()
+            if plane == "I" or one[0] > POLARIZED * abs(reference["I"][0])
+        ]
 
     def between(self, found: Floats, reference: Floats) -> float:
         return Metric.error(self, found, reference)
@@ -146,24 +169,41 @@ class Peak(OfPlanes):
 class Transfer(OfPlanes):
     """Equation (3)."""
 
-    says: ClassVar[str] = "rms error of the transfer function over angular scales (absolute; it is 1 where nothing is lost)"
-    instead: ClassVar[str | None] = "measure transfer_at, or name transfer in zonda accuracy --metric"
+    says: ClassVar[str] = (
+        "rms error of the transfer function over angular scales (absolute; it is 1 where nothing is"
+        " lost)"
+    )
+    instead: ClassVar[str | None] = (
+        "measure transfer_at, or name transfer in zonda accuracy --metric"
+    )
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("transfer", operators)
         if not any("sky" in made_by(o) for o in operators):
-            raise PipelineError("the metric transfer needs a sky, and no step makes one", place="--metric", cure="add a SkyMap")
+            raise PipelineError(
+                "the metric transfer needs a sky, and no step makes one",
+                place="--metric",
+                cure="add a SkyMap",
+            )
 
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
         """The sky alone, where the pipeline has no such signal."""
-        return {} if any(run.only == ["sky"] for run in runs.values()) else {"sky_alone": Signal(only=["sky"])}
+        return (
+            {}
+            if any(run.only == ["sky"] for run in runs.values())
+            else {"sky_alone": Signal(only=["sky"])}
+        )
 
     def measure(self, data: Data) -> dict[str, Floats]:
-        """By plane (2, n): T_i, and its standard deviation from the instrument's noise in the main map."""
+        """By plane (2, n): T_i, and its standard deviation from the instrument's noise in the main
+        map.
+        """
         sky, main = _map(data, _sky_alone(data.provenance.get("runs", {}))), _map(data)
         if sky.projection != "TAN":
             raise InputError(
-                "the metric transfer needs a TAN map", place="transfer", cure="leave BinMap.nside and projection out"
+                "the metric transfer needs a TAN map",
+                place="transfer",
+                cure="leave BinMap.nside and projection out",
             )
         image = input_of(data, "transfer")
         window = sky.known_hits / np.percentile(sky.hits[sky.known], 99)
@@ -172,15 +212,25 @@ class Transfer(OfPlanes):
         edges = np.geomspace(1 / side.min(), 1 / max(sky.fwhm, 2 * sky.pixel), RINGS + 1)
         noises, found, pole = planes_of(main), {}, wcs_frame_rotation(sky.wcs)[2]
         for plane, one in planes_of(sky).items():
-            given = image if plane == "I" else None if image.polarization is None else image.stokes(plane, pole)
+            given = (
+                image
+                if plane == "I"
+                else None
+                if image.polarization is None
+                else image.stokes(plane, pole)
+            )
             if given is None or not np.nan_to_num(given.values).any():
                 continue
-            noise = float((window**2 * np.nan_to_num(noises[plane].noise) ** 2).sum())  # variance of each mode
+            noise = float(
+                (window**2 * np.nan_to_num(noises[plane].noise) ** 2).sum()
+            )  # variance of each mode
             rings = compare(as_seen(given, one), one.signal, window, sky.pixel, edges)
             use = rings.power > 1e-6 * rings.power.max()
             found[plane] = np.array([rings.transfer[use], np.sqrt(noise / 2 / rings.power[use])])
         if not found:
-            raise InputError("the input map is zero everywhere", place="transfer", cure="use a sky with a source")
+            raise InputError(
+                "the input map is zero everywhere", place="transfer", cure="use a sky with a source"
+            )
         return found
 
     def between(self, found: Floats, reference: Floats) -> float:
@@ -204,7 +254,9 @@ class _Binned(Metric):
         return np.asarray(np.log(np.maximum(found[0], 1e-300)), np.float64)
 
     def floor(self, reference: Floats) -> float | None:
-        """The standard errors, from periodograms averaged or from white noise; None where they are not known."""
+        """The standard errors, from periodograms averaged or from white noise; None where they are
+        not known.
+        """
         value = float(np.sqrt(np.mean(reference[1] ** 2)))
         return value if math.isfinite(value) else None
 
@@ -212,20 +264,33 @@ class _Binned(Metric):
 class Psd(_Binned):
     """Equation (4)."""
 
-    says: ClassVar[str] = "rms over log-frequency bins of the relative error of the signal's power spectrum"
-    instead: ClassVar[str | None] = "measure psd_slope or crossing, or name psd in zonda accuracy --metric"
+    says: ClassVar[str] = (
+        "rms over log-frequency bins of the relative error of the signal's power spectrum"
+    )
+    instead: ClassVar[str | None] = (
+        "measure psd_slope or crossing, or name psd in zonda accuracy --metric"
+    )
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         if not any("spectrum" in o.provides for o in operators):
             cure = "add a PowerSpectrum where the spectrum matters, e.g. after Efficiency"
-            raise PipelineError("the metric psd needs a spectrum, and no step measures one", place="--metric", cure=cure)
+            raise PipelineError(
+                "the metric psd needs a spectrum, and no step measures one",
+                place="--metric",
+                cure=cure,
+            )
 
     def measure(self, data: Data) -> Floats:
         """(2, n): P_j, and its relative standard error."""
-        spectrum = next((p for p in data.products.values() if isinstance(p, Spectrum) and "signal" in p.psd), None)
+        spectrum = next(
+            (p for p in data.products.values() if isinstance(p, Spectrum) and "signal" in p.psd),
+            None,
+        )
         if spectrum is None:
             raise InputError(
-                "no spectrum of the signal was measured", place="psd", cure="let PowerSpectrum.streams include signal"
+                "no spectrum of the signal was measured",
+                place="psd",
+                cure="let PowerSpectrum.streams include signal",
             )
         f = spectrum.frequency
         number = np.clip((BINS * np.log(f / f[0]) / np.log(f[-1] / f[0])).astype(int), 0, BINS - 1)
@@ -235,25 +300,43 @@ class Psd(_Binned):
 
 
 class Structure(_Binned):
-    """Equation (5). It keeps the atmosphere's stream, and the white noise, at some detectors by a step of its own."""
+    """Equation (5). It keeps the atmosphere's stream, and the white noise, at some detectors by a
+    step of its own.
+    """
 
-    says: ClassVar[str] = "rms relative error of the atmosphere's structure functions in time and across the field"
+    says: ClassVar[str] = (
+        "rms relative error of the atmosphere's structure functions in time and across the field"
+    )
     instead: ClassVar[str | None] = "name structure in zonda accuracy --metric"
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        if not any("atmosphere" in o.provides for o in operators) or not any("signal" in o.provides for o in operators):
+        if not any("atmosphere" in o.provides for o in operators) or not any(
+            "signal" in o.provides for o in operators
+        ):
             cure = "add AtmosphereLayers and Efficiency"
-            raise PipelineError("the metric structure needs an atmosphere, and no step makes one", place="--metric", cure=cure)
+            raise PipelineError(
+                "the metric structure needs an atmosphere, and no step makes one",
+                place="--metric",
+                cure=cure,
+            )
 
     def steps(self, operators: list[Operator]) -> list[Operator]:
-        """With a `TimeStreams` of the atmosphere, and of the noise, behind the step that forms the signal."""
+        """With a `TimeStreams` of the atmosphere, and of the noise, behind the step that forms the
+        signal.
+        """
         at = next(k for k, o in enumerate(operators) if "signal" in o.provides) + 1
         noisy = any("white" in o.provides for o in operators[:at])
-        trace = TimeStreams(name=TRACE, streams=["atmosphere", "white"] if noisy else ["atmosphere"], detectors=TRACED)
+        trace = TimeStreams(
+            name=TRACE,
+            streams=["atmosphere", "white"] if noisy else ["atmosphere"],
+            detectors=TRACED,
+        )
         return [*operators[:at], trace, *operators[at:]]
 
     def measure(self, data: Data) -> Floats:
-        """(2, n): D, and its relative standard error from the white noise of those detectors (NaN where there is none)."""
+        """(2, n): D, and its relative standard error from the white noise of those detectors (NaN
+        where there is none).
+        """
         trace, observation = data.products[TRACE], data.observations[0]
         s: Floats = trace.streams["atmosphere"]
         n = s.shape[1]
@@ -264,7 +347,9 @@ class Structure(_Binned):
         plane = observation.focalplane
         noise = math.nan  # of one sample, in kelvins of the atmosphere
         if "white" in trace.streams:
-            noise = float(trace.streams["white"].std() / plane.illumination_efficiency[index].mean())
+            noise = float(
+                trace.streams["white"].std() / plane.illumination_efficiency[index].mean()
+            )
         pairs = len(index) * (n - lags) / 2  # increments that overlap share a sample
         xi, eta = plane.xi[index], plane.eta[index]
         i, j = np.triu_indices(len(index), 1)
@@ -278,14 +363,20 @@ class Structure(_Binned):
         count = np.bincount(number, minlength=SEPARATIONS)
         across = np.bincount(number, squares, SEPARATIONS)[count > 0] / count[count > 0]
         # a bin's pairs share detectors: no more of them are independent than there are detectors
-        pairs = np.concatenate([pairs, np.minimum(count[count > 0], len(index) / 2) * seen.shape[1]])
+        pairs = np.concatenate(
+            [pairs, np.minimum(count[count > 0], len(index) / 2) * seen.shape[1]]
+        )
         d = np.concatenate([in_time, across])
         return np.array([d, _uncertain(d, noise, pairs)])
 
 
 def _uncertain(d: Floats, noise: float, pairs: Floats) -> Floats:
-    """Relative standard error of D from N differences that carry white noise of the given rms, equation (6)."""
-    return np.asarray(np.sqrt((8 * noise**4 + 8 * noise**2 * d) / pairs) / np.maximum(d, 1e-300), np.float64)
+    """Relative standard error of D from N differences that carry white noise of the given rms,
+    equation (6).
+    """
+    return np.asarray(
+        np.sqrt((8 * noise**4 + 8 * noise**2 * d) / pairs) / np.maximum(d, 1e-300), np.float64
+    )
 
 
 def _mean_square(values: Floats, weights: Floats, use: NDArray[np.bool_]) -> float:
@@ -297,7 +388,9 @@ def _needs_map(metric: str, operators: Sequence[Operator]) -> None:
     if not any("map" in o.provides for o in operators):
         cure = "add `- BinMap` to the operators, or choose another metric: psd, structure"
         raise PipelineError(
-            f"the metric {metric} needs a map, and no step of this pipeline makes one", place="--metric", cure=cure
+            f"the metric {metric} needs a map, and no step of this pipeline makes one",
+            place="--metric",
+            cure=cure,
         )
 
 
@@ -306,7 +399,11 @@ def _map(data: Data, run: str = "") -> MapProduct:
     for name, product in data.products.items():
         if isinstance(product, MapProduct) and name.rpartition("/")[0] == run:
             return product
-    raise InputError(f"the run {run or 'itself'} made no map", place="--metric", cure="add `- BinMap` to the operators")
+    raise InputError(
+        f"the run {run or 'itself'} made no map",
+        place="--metric",
+        cure="add `- BinMap` to the operators",
+    )
 
 
 def _sky_alone(runs: Mapping[str, Any]) -> str:

@@ -1,16 +1,21 @@
 """Figures of maps: equations (1) to (5).
 
-With the map m, its weights w and the angle r of a pixel from the map's centre, after smoothing with the beam:
+With the map m, its weights w and the angle r of a pixel from the map's centre, after smoothing with
+the beam:
 
-    central_rms      sqrt( sum w m^2 / sum w ),   r <= radius                                             (1)
-    peak_ratio       p(b) / p(a)                                                                          (2)
-    peak_snr         max |m| / s,   s = n f,   f = rms(noise map) / rms(n) within the radius              (3)
-    coverage         median of hits x (seconds per sample and beam),   r <= radius                        (4)
-                     or the solid angle of the pixels with at least a share of it                         (5)
+    central_rms      sqrt( sum w m^2 / sum w ),
+    r <= radius                                             (1)
+    peak_ratio       p(b) / p(a)                                                                 (2)
+    peak_snr         max |m| / s,   s = n f,
+    f = rms(noise map) / rms(n) within the radius              (3)
+    coverage         median of hits x (seconds per sample and beam),
+    r <= radius                        (4)
+                     or the solid angle of the pixels with at least a share of it                (5)
 
-p is the extreme value over pixels with at least `COVERED` of the usual samples: of a, the sky alone without filters, the one of
-largest absolute value; of b, the sky alone behind the filters, the one of the same sign. n is the standard deviation by NET and
-samples; a noise map with the factor f takes what 1/f noise and the atmosphere add into account.
+p is the extreme value over pixels with at least `COVERED` of the usual samples: of a, the sky alone
+without filters, the one of largest absolute value; of b, the sky alone behind the filters, the one
+of the same sign. n is the standard deviation by NET and samples; a noise map with the factor f
+takes what 1/f noise and the atmosphere add into account.
 """
 
 from __future__ import annotations
@@ -64,7 +69,8 @@ class _OfSmoothMap(_OfMap):
     """A figure of one smoothed map."""
 
     smooth: Smoothing = "beam"
-    """Smooth a map that is not smoothed yet: with the beam, with a Gaussian of this FWHM, or not."""
+    """Smooth a map that is not smoothed yet: with the beam, with a Gaussian of this FWHM, or not.
+    """
 
     def look(self, kinds: Mapping[str, str]) -> None:
         """A map of the signal."""
@@ -72,12 +78,25 @@ class _OfSmoothMap(_OfMap):
 
     def smoothed(self, product: MapProduct) -> MapProduct:
         """The map as it is judged."""
-        return at_beam(product, {"beam": None, "none": 0.0}[self.smooth] if isinstance(self.smooth, str) else self.smooth)
+        return at_beam(
+            product,
+            (
+                {"beam": None, "none": 0.0}[self.smooth]
+                if isinstance(self.smooth, str)
+                else self.smooth
+            ),
+        )
 
     def how(self) -> str:
         """The smoothing in words."""
-        given = self.smooth if isinstance(self.smooth, str) else f"a Gaussian of FWHM {angle_text(self.smooth)}"
-        return {"beam": "smoothed with the beam", "none": "not smoothed"}.get(given, f"smoothed with {given}")
+        given = (
+            self.smooth
+            if isinstance(self.smooth, str)
+            else f"a Gaussian of FWHM {angle_text(self.smooth)}"
+        )
+        return {"beam": "smoothed with the beam", "none": "not smoothed"}.get(
+            given, f"smoothed with {given}"
+        )
 
 
 class CentralRms(_OfSmoothMap):
@@ -87,11 +106,15 @@ class CentralRms(_OfSmoothMap):
     """
 
     radius: Angle = quantity("1 arcmin", gt=0)
-    """Pixels whose centres are this near to the map's centre count. (`Report` and `Plots` state a diameter.)"""
+    """Pixels whose centres are this near to the map's centre count. (`Report` and `Plots` state a
+    diameter.)
+    """
     signal: str = Field("", pattern=r"^[A-Za-z0-9_]*$")
     """Of which signal of the pipeline, e.g. source_free; empty: the complete one."""
     of: Literal["signal", "half_difference"] = "signal"
-    """The map itself, or half the difference of two halves of its samples (`BinMap.half_difference`)."""
+    """The map itself, or half the difference of two halves of its samples
+    (`BinMap.half_difference`).
+    """
 
     @property
     def unit(self) -> str:
@@ -104,30 +127,45 @@ class CentralRms(_OfSmoothMap):
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
         """Equation (1)."""
-        return central_rms(self.smoothed(map_of(data, "central_rms", self.signal, self.map)), self.radius, self.of)
+        return central_rms(
+            self.smoothed(map_of(data, "central_rms", self.signal, self.map)), self.radius, self.of
+        )
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """What was measured."""
         what = self.signal or "the map"
         if self.of == "half_difference":
-            what = f"half the difference, {map_of(data, 'central_rms', self.signal, self.map).difference},"
+            what = (
+                "half the difference,"
+                f" {map_of(data, 'central_rms', self.signal, self.map).difference},"
+            )
         return f"rms of {what} within {angle_text(self.radius)} of the centre, {self.how()}"
 
 
-def central_rms(product: MapProduct, radius: float, of: Literal["signal", "half_difference"] = "signal") -> tuple[float, float]:
-    """Equation (1) of a map as it is, within ``radius`` [rad], and its standard error. InputError where no pixel is there."""
+def central_rms(
+    product: MapProduct, radius: float, of: Literal["signal", "half_difference"] = "signal"
+) -> tuple[float, float]:
+    """Equation (1) of a map as it is, within ``radius`` [rad], and its standard error. InputError
+    where no pixel is there.
+    """
     value, near = product.rms(radius, of), product.distance() <= radius
     if not math.isfinite(value):
         cure = "choose a larger radius"
-        raise InputError(f"no pixel has a value within {angle_text(radius)} of the centre", place="central_rms", cure=cure)
+        raise InputError(
+            f"no pixel has a value within {angle_text(radius)} of the centre",
+            place="central_rms",
+            cure=cure,
+        )
     return value, value * relative_error_of_rms(product, near)
 
 
 class PeakRatio(_OfSmoothMap):
-    """Extreme value of the sky alone behind the filters, divided by that without filters, equation (2).
+    """Extreme value of the sky alone behind the filters, divided by that without filters, equation
+    (2).
 
-    Without filters is the map of the same samples (beam, pixels and coverage are in both), or the input map convolved with the
-    beam. It depends on the size of the source: a larger one loses more.
+    Without filters is the map of the same samples (beam, pixels and coverage are in both), or the
+    input map convolved with the beam. It depends on the size of the source: a larger one loses
+    more.
     """
 
     against: Literal["unfiltered", "input"] = "unfiltered"
@@ -138,7 +176,11 @@ class PeakRatio(_OfSmoothMap):
     def needs(self) -> tuple[Signal, ...]:
         """The sky alone, with filters and without."""
         kept = SKY_ALONE if self.modes == "sky" else Signal(only=["sky"], modes="full")
-        bare = UNFILTERED if self.modes == "sky" else Signal(only=["sky"], modes="full", filters="none")
+        bare = (
+            UNFILTERED
+            if self.modes == "sky"
+            else Signal(only=["sky"], modes="full", filters="none")
+        )
         return (kept, bare) if self.against == "unfiltered" else (kept,)
 
     def named_signals(self) -> tuple[str, ...]:
@@ -157,12 +199,21 @@ class PeakRatio(_OfSmoothMap):
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """What was measured."""
-        other = "the map without filters" if self.against == "unfiltered" else "the input convolved with the beam"
-        return f"extreme value of the filtered sky / that of {other}, both {self.how()}, modes: {self.modes}"
+        other = (
+            "the map without filters"
+            if self.against == "unfiltered"
+            else "the input convolved with the beam"
+        )
+        return (
+            f"extreme value of the filtered sky / that of {other}, both {self.how()}, modes:"
+            f" {self.modes}"
+        )
 
 
 def without_filters(image: Image, product: MapProduct, smoothing: float) -> Floats:
-    """The input behind the beam in the pixels of a map, smoothed (FWHM [rad]) with the map's own weights, as the map is."""
+    """The input behind the beam in the pixels of a map, smoothed (FWHM [rad]) with the map's own
+    weights, as the map is.
+    """
     plain = product if product.polarization is None else product.stokes("I")
     seen = replace(plain, signal=as_seen(image, plain), half_difference=None, smoothed_by=0.0)
     return (seen.smoothed(smoothing) if smoothing > 0 else seen).signal
@@ -179,14 +230,16 @@ def peak_ratio(before: Floats, after: MapProduct) -> float:
 
 
 class PeakSnr(_OfSmoothMap):
-    """Largest ratio of the smoothed map to its noise, over pixels with enough samples, equation (3)."""
+    """Largest ratio of the smoothed map to its noise, over pixels with enough samples, equation
+    (3).
+    """
 
     noise: Literal["source_free", "half_difference", "white"] = "source_free"
-    """What scales the noise: the map of everything but the sky (with the modes of the complete data), half the difference of even
-    and odd scans, or nothing: white noise by NET and samples."""
+    """What scales the noise: the map of everything but the sky (with the modes of the complete
+    data), half the difference of even and odd scans, or nothing: white noise by NET and samples."""
     radius: Angle | None = Field(None, gt=0)
-    """Where the noise map is compared with the white noise: this near to the map's centre. Default: 1 arcmin, or 2.5 beams or
-    pixels where these are wider."""
+    """Where the noise map is compared with the white noise: this near to the map's centre. Default:
+    1 arcmin, or 2.5 beams or pixels where these are wider."""
     within: Angle | None = Field(None, gt=0)
     """Look for the peak only this near to the map's centre."""
 
@@ -198,7 +251,11 @@ class PeakSnr(_OfSmoothMap):
         """Equation (3); the noise itself scatters the ratio by 1."""
         product = self.smoothed(map_of(data, "peak_snr", "", self.map))
         factor, error = 1.0, 0.0
-        radius = max(ARCMIN, central_diameter(product.fwhm, product.pixel) / 2) if self.radius is None else self.radius
+        radius = (
+            max(ARCMIN, central_diameter(product.fwhm, product.pixel) / 2)
+            if self.radius is None
+            else self.radius
+        )
         if self.noise != "white":
             of: Any = "half_difference" if self.noise == "half_difference" else "signal"
             free = self.smoothed(map_of(data, "peak_snr", names[0], self.map)) if names else product
@@ -206,10 +263,14 @@ class PeakSnr(_OfSmoothMap):
             near = (product.distance() <= radius) & np.isfinite(product.noise)
             if not near.any():
                 cure = "add a WhiteNoise and leave BinMap.noise at its default"
-                raise InputError("the white noise of the map is not known", place="peak_snr", cure=cure)
+                raise InputError(
+                    "the white noise of the map is not known", place="peak_snr", cure=cure
+                )
             if not found > 0:
                 cure = "add a step that makes noise, or choose noise: white"
-                raise InputError("the noise map is zero: the ratio is infinite", place="peak_snr", cure=cure)
+                raise InputError(
+                    "the noise map is zero: the ratio is infinite", place="peak_snr", cure=cure
+                )
             w = product.weights[near]
             factor = found / math.sqrt(float((w * product.noise[near] ** 2).sum() / w.sum()))
             error /= found
@@ -223,14 +284,21 @@ class PeakSnr(_OfSmoothMap):
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """What was measured."""
-        return f"largest |map| / noise ({WHITE if self.noise == 'white' else self.noise}), {self.how()}"
+        return (
+            f"largest |map| / noise ({WHITE if self.noise == 'white' else self.noise}),"
+            f" {self.how()}"
+        )
 
 
 class Coverage(_OfMap):
-    """How long the centre of the map was observed, per beam, equation (4), or how large the field is, equation (5)."""
+    """How long the centre of the map was observed, per beam, equation (4), or how large the field
+    is, equation (5).
+    """
 
     of: Literal["time", "area"] = "time"
-    """Seconds of all detectors per beam near the centre, or the solid angle in arcmin2 with at least `least` of that."""
+    """Seconds of all detectors per beam near the centre, or the solid angle in arcmin2 with at
+    least `least` of that.
+    """
     radius: Angle = quantity("1 arcmin", gt=0)
     """What the centre is."""
     least: Fraction = quantity("50 %", gt=0, le=1)

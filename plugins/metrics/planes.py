@@ -11,9 +11,11 @@ from zonda.core.maps.stokes import IQU
 
 
 class OfPlanes(Metric):
-    """Base of metrics whose `measure` finds something of each plane: by its name, ``I`` alone or ``I``, ``Q`` and ``U``.
+    """Base of metrics whose `measure` finds something of each plane: by its name, ``I`` alone or
+    ``I``, ``Q`` and ``U``.
 
-    A subclass has `between` and `summary` of one plane, and `floor_of`; `counted`, where not all planes of a reference count.
+    A subclass has `between` and `summary` of one plane, and `floor_of`; `counted`, where not all
+    planes of a reference count.
     """
 
     def error(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> float:
@@ -24,8 +26,17 @@ class OfPlanes(Metric):
         return each if len(each) > 1 else {}
 
     def mean_error(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:
-        planes = [p for p in IQU if all(p in self.counted(one) for one in reference) and all(p in one for one in found)]
-        return max(super(OfPlanes, self).mean_error([one[p] for one in found], [one[p] for one in reference]) for p in planes)
+        planes = [
+            p
+            for p in IQU
+            if all(p in self.counted(one) for one in reference) and all(p in one for one in found)
+        ]
+        return max(
+            super(OfPlanes, self).mean_error(
+                [one[p] for one in found], [one[p] for one in reference]
+            )
+            for p in planes
+        )
 
     def floor(self, reference: Mapping[str, Any]) -> float | None:
         """The lowest of all planes; None where one has none."""
@@ -46,9 +57,17 @@ class OfPlanes(Metric):
         raise NotImplementedError
 
     def _each(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> dict[str, float]:
-        return {plane: self.between(found[plane], reference[plane]) for plane in self.counted(reference) if plane in found}
+        return {
+            plane: self.between(found[plane], reference[plane])
+            for plane in self.counted(reference)
+            if plane in found
+        }
 
 
 def planes_of(product: MapProduct) -> dict[str, MapProduct]:
     """I, or I, Q and U of a map as maps of their own."""
-    return {"I": product} if product.polarization is None else {plane: product.stokes(plane) for plane in IQU}
+    return (
+        {"I": product}
+        if product.polarization is None
+        else {plane: product.stokes(plane) for plane in IQU}
+    )

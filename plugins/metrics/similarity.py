@@ -1,9 +1,10 @@
 """Whether two parts of a time stream have the same distribution: the Anderson-Darling test.
 
-The p-value is that of the k-sample test (Scholz & Stephens 1987, JASA 82, 918) between the first and the second half of one
-detector's stream, as scipy tabulates it: from 0.001 to 0.25. A small p *rejects* that both halves have one distribution. The test
-takes samples as independent; those of red noise are not, so that two halves of one law fail it. High-passed, and thinned to
-samples that are independent, they pass it.
+The p-value is that of the k-sample test (Scholz & Stephens 1987, JASA 82, 918) between the first
+and the second half of one detector's stream, as scipy tabulates it: from 0.001 to 0.25. A small p
+*rejects* that both halves have one distribution. The test takes samples as independent; those of
+red noise are not, so that two halves of one law fail it. High-passed, and thinned to samples that
+are independent, they pass it.
 """
 
 from __future__ import annotations
@@ -28,9 +29,11 @@ LEAST = 10
 
 
 class AndersonDarling(FigureMetric):
-    """p-value of the Anderson-Darling test between the two halves of the first detector's stream; 0.001 to 0.25.
+    """p-value of the Anderson-Darling test between the two halves of the first detector's stream;
+    0.001 to 0.25.
 
-    It is measured on a `TimeStreams`. A small value rejects that the halves have the same distribution.
+    It is measured on a `TimeStreams`. A small value rejects that the halves have the same
+    distribution.
     """
 
     reads: ClassVar[frozenset[str]] = frozenset({"time_streams"})
@@ -46,16 +49,24 @@ class AndersonDarling(FigureMetric):
         """The p-value."""
         found = data.products.get("time_streams")
         if not isinstance(found, TimeStream) or self.stream not in found.streams:
-            there = ", ".join(found.streams) if isinstance(found, TimeStream) else "none; add a TimeStreams"
+            there = (
+                ", ".join(found.streams)
+                if isinstance(found, TimeStream)
+                else "none; add a TimeStreams"
+            )
             raise InputError(
-                f"there is no stream {self.stream!r}", place="anderson_darling", cure=f"streams of this run: {there}"
+                f"there is no stream {self.stream!r}",
+                place="anderson_darling",
+                cure=f"streams of this run: {there}",
             )
         rate = (found.seconds.size - 1) / (found.seconds[-1] - found.seconds[0])
         return p_value(found.streams[self.stream][0], rate, self.above, self.every), math.nan
 
 
 def p_value(stream: Floats, rate: float, above: float | None, every: int) -> float:
-    """The test between the halves of a stream (n_samp,), high-passed ``above`` a frequency, thinned to ``every`` samples."""
+    """The test between the halves of a stream (n_samp,), high-passed ``above`` a frequency, thinned
+    to ``every`` samples.
+    """
     from scipy.stats import anderson_ksamp
 
     values = stream - stream.mean()
@@ -67,7 +78,9 @@ def p_value(stream: Floats, rate: float, above: float | None, every: int) -> flo
     half = values.size // 2
     if half < LEAST or not np.ptp(values) > 0:
         cure = "lengthen the scan, or make `every` smaller; the stream must not be constant"
-        raise InputError(f"the halves of the stream have {half} samples", place="anderson_darling", cure=cure)
+        raise InputError(
+            f"the halves of the stream have {half} samples", place="anderson_darling", cure=cure
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that p lies beyond the table
         return float(anderson_ksamp([values[:half], values[half:]]).pvalue)

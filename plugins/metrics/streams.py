@@ -2,21 +2,24 @@
 
 ``psd_slope``, the least-squares slope of ln P over ln f between two frequencies, x = ln f:
 
-    b = sum (x - <x>) (ln P - <ln P>) / sum (x - <x>)^2,     sigma_b^2 = c s^2 / sum (x - <x>)^2             (1)
+    b = sum (x - <x>) (ln P - <ln P>) / sum (x - <x>)^2,
+    sigma_b^2 = c s^2 / sum (x - <x>)^2             (1)
 
-s^2 is the variance of the residuals, c = 1 + 2 (4/9 + 1/36) = 35/18 for the correlation of neighbouring frequencies through
-Welch's Hann window. ``crossing``, the highest frequency f_x at which one spectrum exceeds another, or a level 2 NET^2, between
-neighbouring bins of `BINS` equal ones in ln f, with the residuals s and the slope d of ln(P_1 / P_2) within a factor `NEAR`:
+s^2 is the variance of the residuals, c = 1 + 2 (4/9 + 1/36) = 35/18 for the correlation of
+neighbouring frequencies through Welch's Hann window. ``crossing``, the highest frequency f_x at
+which one spectrum exceeds another, or a level 2 NET^2, between neighbouring bins of `BINS` equal
+ones in ln f, with the residuals s and the slope d of ln(P_1 / P_2) within a factor `NEAR`:
 
-    ln f_x: zero of the line through both bins,     sigma_ln f = (c / n)^(1/2) s / |d|                        (2)
+    ln f_x: zero of the line through both bins,
+    sigma_ln f = (c / n)^(1/2) s / |d|                        (2)
 
 ``first_component``, the largest share of the variance that `ModeSpectrum` found,
 
-    sigma_1^2 / sum sigma_i^2,                                                                               (3)
+    sigma_1^2 / sum sigma_i^2,   (3)
 
 ``mean_t_scan``, from the levels that the run resolved, mean over detectors, instants and scans,
 
-    T_scan = < epsilon T_atm / (zeta e^-tau) >.                                                              (4)
+    T_scan = < epsilon T_atm / (zeta e^-tau) >.                                                  (4)
 """
 
 from __future__ import annotations
@@ -47,14 +50,22 @@ class _OfSpectrum(FigureMetric):
     reads: ClassVar[frozenset[str]] = frozenset({"spectrum"})
 
     spectrum: str = Field("spectrum", pattern=r"^[A-Za-z0-9_.]+$")
-    """Which one, by its name among the products: that of a `PowerSpectrum` with a name of its own."""
+    """Which one, by its name among the products: that of a `PowerSpectrum` with a name of its own.
+    """
 
     def spectrum_of(self, data: Data, metric: str) -> Spectrum:
         """The product. Raises InputError where there is none."""
         found = data.products.get(self.spectrum)
         if not isinstance(found, Spectrum):
-            there = ", ".join(k for k, p in data.products.items() if isinstance(p, Spectrum)) or "none; add a PowerSpectrum"
-            raise InputError(f"there is no spectrum {self.spectrum!r}", place=metric, cure=f"the spectra of this run: {there}")
+            there = (
+                ", ".join(k for k, p in data.products.items() if isinstance(p, Spectrum))
+                or "none; add a PowerSpectrum"
+            )
+            raise InputError(
+                f"there is no spectrum {self.spectrum!r}",
+                place=metric,
+                cure=f"the spectra of this run: {there}",
+            )
         return found
 
 
@@ -88,8 +99,15 @@ class PsdSlope(_OfSpectrum):
         psd = stream_in(spectrum, self.stream, "psd_slope")
         use = (spectrum.frequency >= self.low) & (spectrum.frequency <= self.high) & (psd > 0)
         if np.count_nonzero(use) < 3:
-            cure = "widen low and high, or lengthen PowerSpectrum.segment: its inverse is the distance of frequencies"
-            raise InputError(f"fewer than 3 frequencies lie from {self.low:g} to {self.high:g} Hz", place="psd_slope", cure=cure)
+            cure = (
+                "widen low and high, or lengthen PowerSpectrum.segment: its inverse is the distance"
+                " of frequencies"
+            )
+            raise InputError(
+                f"fewer than 3 frequencies lie from {self.low:g} to {self.high:g} Hz",
+                place="psd_slope",
+                cure=cure,
+            )
         return slope(np.log(spectrum.frequency[use]), np.log(psd[use]))
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
@@ -107,7 +125,9 @@ def slope(x: Floats, y: Floats) -> tuple[float, float]:
 
 
 class Crossing(_OfSpectrum):
-    """Highest frequency at which a stream's spectrum exceeds another's, or a level, equation (2), Hz."""
+    """Highest frequency at which a stream's spectrum exceeds another's, or a level, equation (2),
+    Hz.
+    """
 
     @property
     def unit(self) -> str:
@@ -125,7 +145,11 @@ class Crossing(_OfSpectrum):
         """Equation (2)."""
         spectrum = self.spectrum_of(data, "crossing")
         psd = stream_in(spectrum, self.stream, "crossing")
-        level = np.full(psd.shape, 2 * self.net**2) if self.net else stream_in(spectrum, self.other, "crossing")
+        level = (
+            np.full(psd.shape, 2 * self.net**2)
+            if self.net
+            else stream_in(spectrum, self.other, "crossing")
+        )
         return crossing(spectrum.frequency, psd, level)
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
@@ -135,10 +159,16 @@ class Crossing(_OfSpectrum):
 
 
 def crossing(frequency: Floats, upper: Floats, lower: Floats) -> tuple[float, float]:
-    """Equation (2): f_x and its standard error, Hz. Raises InputError where the two do not cross."""
+    """Equation (2): f_x and its standard error, Hz. Raises InputError where the two do not
+    cross.
+    """
     good = (upper > 0) & (lower > 0)
     f, ratio = np.log(frequency[good]), np.log(upper[good] / lower[good])
-    number = np.clip((BINS * (f - f[0]) / (f[-1] - f[0])).astype(int), 0, BINS - 1) if f.size > 1 else np.zeros(f.size, int)
+    number = (
+        np.clip((BINS * (f - f[0]) / (f[-1] - f[0])).astype(int), 0, BINS - 1)
+        if f.size > 1
+        else np.zeros(f.size, int)
+    )
     count = np.bincount(number, minlength=BINS)
     used = count > 0
     middle = np.bincount(number, f, BINS)[used] / count[used]
@@ -147,7 +177,11 @@ def crossing(frequency: Floats, upper: Floats, lower: Floats) -> tuple[float, fl
     above = np.flatnonzero(mean > 0)
     if not above.size or above[-1] + 1 == mean.size:
         which = "nowhere exceeds" if not above.size else "exceeds everywhere"
-        raise InputError(f"the first spectrum {which} the second", place="crossing", cure="choose other streams or another level")
+        raise InputError(
+            f"the first spectrum {which} the second",
+            place="crossing",
+            cure="choose other streams or another level",
+        )
     k = int(above[-1])
     at = float(np.interp(0.0, [-mean[k], -mean[k + 1]], middle[[k, k + 1]]))
     near = abs(f - at) <= math.log(NEAR)
@@ -159,7 +193,8 @@ def crossing(frequency: Floats, upper: Floats, lower: Floats) -> tuple[float, fl
 
 
 class FirstComponent(FigureMetric):
-    """Share of the variance in the first principal component of the detectors' streams, equation (3).
+    """Share of the variance in the first principal component of the detectors' streams, equation
+    (3).
 
     It is measured by a `ModeSpectrum`; with delays there, it is the time-lagged one.
     """
@@ -178,20 +213,29 @@ class FirstComponent(FigureMetric):
         """What was measured."""
         found = self._product(data)
         if found.delays == 0:
-            return f"share of the variance of {found.detectors} detectors in the first component, instantaneous"
+            return (
+                f"share of the variance of {found.detectors} detectors in the first component,"
+                " instantaneous"
+            )
         lags = f"with {found.delays} delays of {found.delay:g} s"
-        return f"share of the variance of {found.detectors} detectors in the first component, {lags}"
+        return (
+            f"share of the variance of {found.detectors} detectors in the first component, {lags}"
+        )
 
     def _product(self, data: Data) -> Modes:
         found = data.products.get(self.modes)
         if not isinstance(found, Modes):
             cure = "add a ModeSpectrum, or name the one that there is"
-            raise InputError(f"there is no mode spectrum {self.modes!r}", place="first_component", cure=cure)
+            raise InputError(
+                f"there is no mode spectrum {self.modes!r}", place="first_component", cure=cure
+            )
         return found
 
 
 class MeanTScan(FigureMetric):
-    """Mean emission of the atmosphere on the calibrated scale, T_scan, equation (4), or as it is, T_atm."""
+    """Mean emission of the atmosphere on the calibrated scale, T_scan, equation (4), or as it is,
+    T_atm.
+    """
 
     @property
     def unit(self) -> str:
@@ -201,7 +245,9 @@ class MeanTScan(FigureMetric):
     reads: ClassVar[frozenset[str]] = frozenset({"atmosphere", "signal"})
 
     of: Literal["scan", "atmosphere"] = "scan"
-    """T_scan: the atmosphere's share of the calibrated stream; or T_atm: its brightness, before any efficiency."""
+    """T_scan: the atmosphere's share of the calibrated stream; or T_atm: its brightness, before any
+    efficiency.
+    """
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
         """Equation (4), every scan weighted by its duration."""
@@ -209,7 +255,14 @@ class MeanTScan(FigureMetric):
         if not means or not all(means):
             text = "the levels of the atmosphere are not known here"
             raise InputError(text, place="mean_t_scan", cure="add AtmosphereLayers and Efficiency")
-        return float(np.average([m[self.of] for m in means], weights=[o.duration for o in data.observations])), math.nan
+        return (
+            float(
+                np.average(
+                    [m[self.of] for m in means], weights=[o.duration for o in data.observations]
+                )
+            ),
+            math.nan,
+        )
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """What was measured."""

@@ -44,7 +44,9 @@ class Amount(TextValue):
         factor = FURTHER.get(unit) or getattr(read_unit(unit), "factor", None)
         if factor is None:
             known = ", ".join(filter(None, FURTHER))
-            raise mistake(f"unknown unit '{unit}'", help=f"a unit of pipeline files, or one of: {known}")
+            raise mistake(
+                f"unknown unit '{unit}'", help=f"a unit of pipeline files, or one of: {known}"
+            )
         return cls(float(match[1]) * factor, unit, factor)
 
     def write(self, value: float, digits: int = 4) -> str:

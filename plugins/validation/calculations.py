@@ -1,6 +1,8 @@
-"""Claims that need no run: closed forms and conversions, each a function of quantities with units. SI throughout.
+"""Claims that need no run: closed forms and conversions, each a function of quantities with units.
+SI throughout.
 
-Constants are those of the SI (exact). A claims file names them: ``calculate: {rayleigh_distance: {aperture: 42 cm, ...}}``.
+Constants are those of the SI (exact). A claims file names them: ``calculate: {rayleigh_distance:
+{aperture: 42 cm, ...}}``.
 """
 
 from __future__ import annotations
@@ -12,7 +14,16 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError, validate_call
 
-from zonda.core.configuration.units import Angle, AngularSpeed, Fraction, Hertz, Kelvin, KelvinRootSecond, Metres, Seconds
+from zonda.core.configuration.units import (
+    Angle,
+    AngularSpeed,
+    Fraction,
+    Hertz,
+    Kelvin,
+    KelvinRootSecond,
+    Metres,
+    Seconds,
+)
 from zonda.core.configuration.values import TextValue, mistake
 from zonda.core.types import Floats
 
@@ -22,7 +33,9 @@ LIGHT = 299792458.0
 BOLTZMANN = 1.380649e-23
 
 CALCULATIONS: dict[str, Callable[..., float]] = {}
-"""By name: functions that take texts with units. Called from Python, by their own names, they take SI numbers."""
+"""By name: functions that take texts with units. Called from Python, by their own names, they take
+SI numbers.
+"""
 
 
 def _register(function: Callable[..., float]) -> Callable[..., float]:
@@ -49,7 +62,11 @@ class Calculation(TextValue):
         if name not in CALCULATIONS:
             from zonda.core.configuration.diagnostics import nearest
 
-            raise mistake(f"there is no calculation '{name}'", nearest(name, CALCULATIONS), ", ".join(sorted(CALCULATIONS)))
+            raise mistake(
+                f"there is no calculation '{name}'",
+                nearest(name, CALCULATIONS),
+                ", ".join(sorted(CALCULATIONS)),
+            )
         if not isinstance(arguments, Mapping):
             raise mistake(f"the arguments of {name} are a mapping, {{argument: value}}")
         try:
@@ -94,7 +111,9 @@ def rayleigh_height(aperture: Metres, frequency: Hertz, elevation: Angle) -> flo
 
 @_register
 def beam_width(aperture: Metres, frequency: Hertz, distance: Metres) -> float:
-    """FWHM of the paper's beam at a distance along the line of sight, D sqrt(1 + (z / z_r)^2), m."""
+    """FWHM of the paper's beam at a distance along the line of sight, D sqrt(1 + (z / z_r)^2),
+    m.
+    """
     return aperture * math.sqrt(1 + (distance / rayleigh_distance(aperture, frequency)) ** 2)
 
 
@@ -111,45 +130,73 @@ def diffraction_fwhm(aperture: Metres, frequency: Hertz, factor: Fraction = 1.22
 
 
 @_register
-def beam_shift(aperture: Metres, frequency: Hertz, distance: Metres, factor: Fraction = 1.0) -> float:
-    """Separation of the lines of sight of detectors that are factor lambda / D apart, at a distance, m."""
+def beam_shift(
+    aperture: Metres, frequency: Hertz, distance: Metres, factor: Fraction = 1.0
+) -> float:
+    """Separation of the lines of sight of detectors that are factor lambda / D apart, at a
+    distance, m.
+    """
     return diffraction_fwhm(aperture, frequency, factor) * distance
 
 
 @_register
-def disc_overlap(aperture: Metres, frequency: Hertz, distance: Metres, factor: Fraction = 1.0) -> float:
-    """Share of area that two discs of the beam's FWHM have in common, their centres `beam_shift` apart."""
-    x = beam_shift(aperture, frequency, distance, factor) / beam_width(aperture, frequency, distance)
+def disc_overlap(
+    aperture: Metres, frequency: Hertz, distance: Metres, factor: Fraction = 1.0
+) -> float:
+    """Share of area that two discs of the beam's FWHM have in common, their centres `beam_shift`
+    apart.
+    """
+    x = beam_shift(aperture, frequency, distance, factor) / beam_width(
+        aperture, frequency, distance
+    )
     return (2 / math.pi) * (math.acos(x) - x * math.sqrt(1 - x * x)) if x < 1 else 0.0
 
 
 @_register
-def gaussian_overlap(aperture: Metres, frequency: Hertz, distance: Metres, factor: Fraction = 1.0) -> float:
-    """Common volume of two Gaussian beams of unit volume, erfc(d / (sqrt(8) sigma)), d the `beam_shift`."""
+def gaussian_overlap(
+    aperture: Metres, frequency: Hertz, distance: Metres, factor: Fraction = 1.0
+) -> float:
+    """Common volume of two Gaussian beams of unit volume, erfc(d / (sqrt(8) sigma)), d the
+    `beam_shift`.
+    """
     sigma = beam_width(aperture, frequency, distance) / math.sqrt(8 * math.log(2))
     return math.erfc(beam_shift(aperture, frequency, distance, factor) / math.sqrt(8) / sigma)
 
 
 @_register
 def overlap_of_smaller(shared: Fraction, large: Metres, small: Metres) -> float:
-    """Largest share that beams of a smaller aperture can have in common where those of a larger one share ``shared``.
+    """Largest share that beams of a smaller aperture can have in common where those of a larger one
+    share ``shared``.
 
-    Separation over width, lambda z / D^2, is (large / small)^2 times as much; the area that two equal shapes lose when they are
-    moved apart grows at least in proportion to it as long as it is small. Beams far inside their Rayleigh distance.
+    Separation over width, lambda z / D^2, is (large / small)^2 times as much; the area that two
+    equal shapes lose when they are moved apart grows at least in proportion to it as long as it is
+    small. Beams far inside their Rayleigh distance.
     """
     return max(0.0, 1 - (1 - shared) * (large / small) ** 2)
 
 
 @_register
-def atmosphere_in_scan(atmosphere: Kelvin, illumination: Fraction, efficiency: Fraction, transmission: Fraction = 1.0) -> float:
+def atmosphere_in_scan(
+    atmosphere: Kelvin, illumination: Fraction, efficiency: Fraction, transmission: Fraction = 1.0
+) -> float:
     """Atmosphere alone in the paper's T_scan, eps T_atm / (zeta e^-tau), K_RJ."""
     return illumination * atmosphere / (efficiency * transmission)
 
 
 @_register
 def flux_per_beam(temperature: Kelvin, fwhm: Angle, frequency: Hertz) -> float:
-    """Flux of a Rayleigh-Jeans temperature that fills a Gaussian beam, 2 k T nu^2 / c^2 x pi fwhm^2 / (4 ln 2), W m^-2 Hz^-1."""
-    return 2 * BOLTZMANN * temperature * (frequency / LIGHT) ** 2 * math.pi * fwhm**2 / (4 * math.log(2))
+    """Flux of a Rayleigh-Jeans temperature that fills a Gaussian beam, 2 k T nu^2 / c^2 x pi fwhm^2
+    / (4 ln 2), W m^-2 Hz^-1.
+    """
+    return (
+        2
+        * BOLTZMANN
+        * temperature
+        * (frequency / LIGHT) ** 2
+        * math.pi
+        * fwhm**2
+        / (4 * math.log(2))
+    )
 
 
 @_register
@@ -160,14 +207,16 @@ def noise_of_detectors(noise: Kelvin, detectors: int, instead_of: int) -> float:
 
 @_register
 def hexagonal_diameter(detectors: int, pitch: Angle) -> float:
-    """Diameter of a disc that holds detectors on a hexagonal grid, pitch sqrt(2 sqrt(3) n / pi), rad."""
+    """Diameter of a disc that holds detectors on a hexagonal grid, pitch sqrt(2 sqrt(3) n / pi),
+    rad.
+    """
     return pitch * math.sqrt(2 * math.sqrt(3) * detectors / math.pi)
 
 
 @_register
 def daisy_speed(radius: Angle, speed: AngularSpeed, which: str = "mean") -> float:
-    """Speed of the boresight on the paper's daisy, rad/s: mean, least, most, or at the centre of the outer term (centre_least,
-    centre_most)."""
+    """Speed of the boresight on the paper's daisy, rad/s: mean, least, most, or at the centre of
+    the outer term (centre_least, centre_most)."""
     phi = np.linspace(0, 2000 * math.pi, 2_000_001)
     around = np.linspace(-1e-4, 1e-4, 3)
     if which.startswith("centre"):
@@ -190,27 +239,40 @@ def daisy_reach(radius: Angle) -> float:
 def _daisy(phi: Floats) -> Any:
     """The paper's daisy in units of its radius, (n,) complex."""
     n = 10 / math.pi
-    return np.sin(phi) * np.exp(1j * phi / n) + 0.15 * np.cos(phi) * np.exp(1j * math.sqrt(2) * phi / n)
+    return np.sin(phi) * np.exp(1j * phi / n) + 0.15 * np.cos(phi) * np.exp(
+        1j * math.sqrt(2) * phi / n
+    )
 
 
 @_register
 def white_noise_of_daisy(
-    noise: KelvinRootSecond, detectors: int, field: Angle, radius: Angle, duration: Seconds, fwhm: Angle
+    noise: KelvinRootSecond,
+    detectors: int,
+    field: Angle,
+    radius: Angle,
+    duration: Seconds,
+    fwhm: Angle,
 ) -> float:
     """White noise in the centre of a beam-smoothed map of the paper's daisy, K.
 
-    ``noise`` of one detector in K sqrt(s), divided by the root of the detector-seconds that a Gaussian of 4 pi sigma^2 holds.
-    Detectors fill a disc of the diameter ``field``; the centre is seen where the boresight is within that disc of it.
+    ``noise`` of one detector in K sqrt(s), divided by the root of the detector-seconds that a
+    Gaussian of 4 pi sigma^2 holds. Detectors fill a disc of the diameter ``field``; the centre is
+    seen where the boresight is within that disc of it.
     """
-    seen = float((abs(_daisy(np.linspace(0, 2000 * math.pi, 2_000_001))) * radius <= field / 2).mean())
+    seen = float(
+        (abs(_daisy(np.linspace(0, 2000 * math.pi, 2_000_001))) * radius <= field / 2).mean()
+    )
     density = detectors * duration * seen / (math.pi * (field / 2) ** 2)
     return noise / math.sqrt(density * math.pi * fwhm**2 / (2 * math.log(2)))
 
 
 @_register
-def calculator_of_atlast(pwv: Metres, elevation: Angle, seconds: Seconds, at: str = "centre") -> float:
-    """Point-source sensitivity of AtLAST's camera by the formula of the sensitivity calculator, with zonda's atmosphere
-    (2022-08-01T23:00, Llano de Chajnantor): ``at`` the band's centre, or over the band, W m^-2 Hz^-1."""
+def calculator_of_atlast(
+    pwv: Metres, elevation: Angle, seconds: Seconds, at: str = "centre"
+) -> float:
+    """Point-source sensitivity of AtLAST's camera by the formula of the sensitivity calculator,
+    with zonda's atmosphere (2022-08-01T23:00, Llano de Chajnantor): ``at`` the band's centre, or
+    over the band, W m^-2 Hz^-1."""
     from zonda.core.configuration.time import Instant
     from zonda.operators.atmosphere.weather.sources import profile_of
     from zonda.plugins import instruments, sites
@@ -219,7 +281,9 @@ def calculator_of_atlast(pwv: Metres, elevation: Angle, seconds: Seconds, at: st
     if at not in ("centre", "band"):
         raise ValueError("at is centre or band")
     camera = instruments.atlast
-    air = profile_of(None, sites.llano_de_chajnantor, Instant.parse("2022-08-01T23:00"), 0).scaled(pwv)
+    air = profile_of(None, sites.llano_de_chajnantor, Instant.parse("2022-08-01T23:00"), 0).scaled(
+        pwv
+    )
     found = calculate(air.layers, camera.band, camera.telescope.diameter, elevation, seconds)
     return (found.centre if at == "centre" else found.band) * 1e-26
 
@@ -232,10 +296,11 @@ def total_time(scans: int, duration: Seconds, gap: Seconds = 0.0) -> float:
 
 @_register
 def spectral_slope(width: Metres, wind: float, low: Hertz, high: Hertz) -> float:
-    """Slope d log P / d log f, between two frequencies, of a Kolmogorov screen (f^-8/3) seen through a Gaussian beam.
+    """Slope d log P / d log f, between two frequencies, of a Kolmogorov screen (f^-8/3) seen
+    through a Gaussian beam.
 
-    P = f^(-8/3) exp(-(2 pi f sigma / v)^2) along the wind: the integral over the other direction smooths both and is left out.
-    ``width``: FWHM in m; ``wind`` in m/s.
+    P = f^(-8/3) exp(-(2 pi f sigma / v)^2) along the wind: the integral over the other direction
+    smooths both and is left out. ``width``: FWHM in m; ``wind`` in m/s.
     """
     sigma = width / math.sqrt(8 * math.log(2))
 

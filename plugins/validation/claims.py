@@ -1,5 +1,5 @@
-"""A claims file: what the paper states, how zonda measures it, what explains a difference. Its keys are described at the top of
-``pipelines/validation/claims.yaml``."""
+"""A claims file: what the paper states, how zonda measures it, what explains a difference. Its keys
+are described at the top of ``pipelines/validation/claims.yaml``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ class Experiment(Parameters):
     """How a value is found: measured on runs of a pipeline, or calculated."""
 
     pipeline: str | None = Field(None, min_length=1)
-    """File in pipelines/validation (without suffix), shipped pipeline, or path beside the claims file."""
+    """File in pipelines/validation (without suffix), shipped pipeline, or path beside the claims
+    file.
+    """
     change: dict[str, Any] = Field(default_factory=dict)
     """Values that differ from the pipeline's, with keys as for `--set`."""
     metric: Any = None
@@ -46,26 +48,37 @@ class Experiment(Parameters):
     versus: dict[str, Any] | None = None
     """Values that differ in a second run of each seed; compared by `statistic`."""
     statistic: Literal["ratio", "difference", "significance", "paired", "paired_mean"] | None = None
-    """Of the first run's value a and the second's b: a / b; a - b; mean(a - b) over the scatter of one a and one b
-    (significance), over the scatter of one a - b (paired), or over the standard error of its mean (paired_mean)."""
+    """Of the first run's value a and the second's b: a / b; a - b; mean(a - b) over the scatter of
+    one a and one b (significance), over the scatter of one a - b (paired), or over the standard
+    error of its mean (paired_mean)."""
 
     @model_validator(mode="after")
     def _one_way(self) -> Experiment:
-        if self.calculate is not None and (self.pipeline or self.metric or self.change or self.versus or (self.seeds or 1) > 1):
+        if self.calculate is not None and (
+            self.pipeline or self.metric or self.change or self.versus or (self.seeds or 1) > 1
+        ):
             raise ValueError("calculate stands alone: it runs no pipeline")
         if (self.versus is None) != (self.statistic is None):
             raise ValueError("versus and statistic belong together")
         return self
 
     def differs_from(self, other: Experiment) -> bool:
-        """Whether it finds another value than ``other`` apart from random numbers: not where seeds alone differ."""
+        """Whether it finds another value than ``other`` apart from random numbers: not where seeds
+        alone differ.
+        """
         if self.calculate is not None or other.calculate is not None:
             return str(self.calculate) != str(other.calculate)
-        return any(getattr(self, key) != getattr(other, key) for key in Experiment.model_fields if key != "seeds")
+        return any(
+            getattr(self, key) != getattr(other, key)
+            for key in Experiment.model_fields
+            if key != "seeds"
+        )
 
 
 class Expected(Parameters):
-    """What the result of a counter-experiment must satisfy: limits hold by two standard errors of the mean."""
+    """What the result of a counter-experiment must satisfy: limits hold by two standard errors of
+    the mean.
+    """
 
     agrees: bool = False
     """It agrees with the paper's value, by the rule of the claim itself."""
@@ -82,7 +95,9 @@ class Expected(Parameters):
 
 
 class Counter(Experiment):
-    """A counter-experiment. What it does not state is as in its claim; `change` is added to the claim's."""
+    """A counter-experiment. What it does not state is as in its claim; `change` is added to the
+    claim's.
+    """
 
     name: Name
     """Short name, unique in the claim."""
@@ -117,7 +132,9 @@ class Claim(Experiment):
     error: Amount = Field(default_factory=lambda: Amount.parse(0))
     """Its standard error as the paper states it."""
     rounding: Amount = Field(default_factory=lambda: Amount.parse(0))
-    """Half width of the value as stated: half a unit of its last digit, or what 'about' leaves open."""
+    """Half width of the value as stated: half a unit of its last digit, or what 'about' leaves
+    open.
+    """
     relation: Relation = "equal"
     """The value is equal to the paper's, at least or at most it."""
     of: Of = "realization"
@@ -155,8 +172,15 @@ class Claim(Experiment):
         if self.because and not self.counter:
             raise ValueError("an explanation needs a counter-experiment")
         for name, experiment in self.experiments():
-            if name and experiment.calculate is None and not (experiment.pipeline and experiment.metric):
-                raise ValueError(f"the counter-experiment {name} runs nothing: give calculate, or pipeline and metric")
+            if (
+                name
+                and experiment.calculate is None
+                and not (experiment.pipeline and experiment.metric)
+            ):
+                raise ValueError(
+                    f"the counter-experiment {name} runs nothing: give calculate, or pipeline and"
+                    " metric"
+                )
             if name and not experiment.differs_from(self):
                 raise ValueError(f"the counter-experiment {name} is the claim's own experiment")
         return self
@@ -164,21 +188,34 @@ class Claim(Experiment):
     @property
     def is_quick(self) -> bool:
         """Whether `--quick` includes it."""
-        return self.quick or (self.pipeline is None and all(c.pipeline is None for c in self.counter))
+        return self.quick or (
+            self.pipeline is None and all(c.pipeline is None for c in self.counter)
+        )
 
     def experiments(self) -> Iterator[tuple[str, Experiment]]:
-        """Its own experiment, under an empty name, and the counter-experiments by name, each with all that it takes over."""
+        """Its own experiment, under an empty name, and the counter-experiments by name, each with
+        all that it takes over.
+        """
         if self.needs:
             return
         own = {key: getattr(self, key) for key in Experiment.model_fields}
         yield "", Experiment.model_validate(own)
         for counter in self.counter:
-            stated = {key: getattr(counter, key) for key in Experiment.model_fields if key in counter.model_fields_set}
+            stated = {
+                key: getattr(counter, key)
+                for key in Experiment.model_fields
+                if key in counter.model_fields_set
+            }
             if counter.calculate is not None:
                 yield counter.name, Experiment.model_validate(stated)
                 continue
             base = {} if self.calculate is not None else own
-            yield counter.name, Experiment.model_validate({**base, **stated, "change": {**self.change, **counter.change}})
+            yield (
+                counter.name,
+                Experiment.model_validate(
+                    {**base, **stated, "change": {**self.change, **counter.change}}
+                ),
+            )
 
 
 class ClaimsFile(Parameters):
@@ -201,10 +238,14 @@ def read(path: Path = SHIPPED) -> ClaimsFile:
         Where there is no such file.
     """
     document = yaml_places.load(Source(str(path), read_text(path)))
-    found = Mistakes(document, path.parent, [Diagnostic(f.message, f.span, f.label) for f in document.faults])
+    found = Mistakes(
+        document, path.parent, [Diagnostic(f.message, f.span, f.label) for f in document.faults]
+    )
     file = None
     if not isinstance(document.value, dict):
-        found.wrong("a claims file is a mapping of the keys paper and claims", Span(Source(str(path), "")))
+        found.wrong(
+            "a claims file is a mapping of the keys paper and claims", Span(Source(str(path), ""))
+        )
     else:
         tree = {k: v for k, v in document.value.items() if not str(k).startswith("x-")}
         file = found.validate(ClaimsFile, tree, (), "the claims file")
@@ -212,7 +253,11 @@ def read(path: Path = SHIPPED) -> ClaimsFile:
     for number, claim in enumerate(file.claims if file else []):
         at = document.mark(("claims", number, "id")).value
         if claim.id in seen:
-            found.wrong(f"two claims are called '{claim.id}'", at, f"the first is number {seen[claim.id] + 1}")
+            found.wrong(
+                f"two claims are called '{claim.id}'",
+                at,
+                f"the first is number {seen[claim.id] + 1}",
+            )
         seen.setdefault(claim.id, number)
     if found.found or file is None:
         raise ConfigurationError(found.found, str(path))

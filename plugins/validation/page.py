@@ -1,4 +1,6 @@
-"""The table of claims: ``claims.html`` and ``claims.ecsv``, and for each claim a folder with its values and a picture of them."""
+"""The table of claims: ``claims.html`` and ``claims.ecsv``, and for each claim a folder with its
+values and a picture of them.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,22 @@ from .verdict import LIMIT, Values
 
 COLOURS = {"agrees": "#1a7f4b", "differs, explained": "#0b5c8f", "differs": "#b3261e"}
 
-HEAD = ("claim", "paper", "zonda", "scatter", "of the mean", "distance of one", "of the mean", "verdict")
+HEAD = (
+    "claim",
+    "paper",
+    "zonda",
+    "scatter",
+    "of the mean",
+    "distance of one",
+    "of the mean",
+    "verdict",
+)
 
 RULE = (
-    f"Distances are in standard deviations: of one realization, and of the mean over seeds; the paper's own error is included. "
-    f"A dash: they differ, and no error is stated or found. "
-    f"A claim agrees within {LIMIT:g}. A difference is explained where every counter-experiment satisfies its criterion."
+    "Distances are in standard deviations: of one realization, and of the mean over seeds; the"
+    " paper's own error is included. A dash: they differ, and no error is stated or found. A claim"
+    f" agrees within {LIMIT:g}. A difference is explained where every counter-experiment satisfies"
+    " its criterion."
 )
 
 
@@ -46,7 +58,10 @@ def write(file: ClaimsFile, rows: Sequence[Row], folder: Path) -> None:
 
 def summary(rows: Sequence[Row]) -> str:
     """How many claims have which verdict: ``12 agree, 1 differs``."""
-    return ", ".join(f"{verdict}: {number}" for verdict, number in Count(row.verdict.value for row in rows).most_common())
+    return ", ".join(
+        f"{verdict}: {number}"
+        for verdict, number in Count(row.verdict.value for row in rows).most_common()
+    )
 
 
 def _columns(rows: Sequence[Row]) -> Iterator[Column]:
@@ -57,10 +72,20 @@ def _columns(rows: Sequence[Row]) -> Iterator[Column]:
 
     yield Column("id", [row.claim.id for row in rows], "", "name of the claim, and of its folder")
     yield Column("section", [row.claim.section for row in rows], "", "where it stands in the paper")
-    yield Column("claim", [row.claim.claim for row in rows], "", "what the paper states, in our words")
-    yield Column("unit", [row.claim.paper.unit for row in rows], "", "of all numbers but distances; empty: a pure number")
     yield Column(
-        "relation", [row.claim.relation for row in rows], "", "the value is equal to the paper's, or at least or at most it"
+        "claim", [row.claim.claim for row in rows], "", "what the paper states, in our words"
+    )
+    yield Column(
+        "unit",
+        [row.claim.paper.unit for row in rows],
+        "",
+        "of all numbers but distances; empty: a pure number",
+    )
+    yield Column(
+        "relation",
+        [row.claim.relation for row in rows],
+        "",
+        "the value is equal to the paper's, or at least or at most it",
     )
     yield number("paper", "paper", "the paper's value")
     yield number("paper_error", "paper_error", "its standard error")
@@ -68,7 +93,9 @@ def _columns(rows: Sequence[Row]) -> Iterator[Column]:
     yield number("zonda", "zonda", "mean over realizations; nan: none was run")
     yield number("scatter", "scatter", "standard deviation of one realization")
     yield number("standard_error", "standard_error", "of the mean")
-    yield Column("realizations", [len(row.values.values) for row in rows], "", "number of realizations")
+    yield Column(
+        "realizations", [len(row.values.values) for row in rows], "", "number of realizations"
+    )
     yield number("distance_one", "distance_one", "in standard deviations of one realization")
     yield number("distance_mean", "distance_mean", "in standard deviations of the mean")
     yield Column("verdict", [row.verdict.value for row in rows], "", "computed from the numbers")
@@ -91,16 +118,25 @@ def _numbers(row: Row) -> dict[str, float]:
 
 
 def remark(row: Row) -> str:
-    """Why, what data are missing or stand in, what contradicts, and what the counter-experiments found: sentences."""
+    """Why, what data are missing or stand in, what contradicts, and what the counter-experiments
+    found: sentences.
+    """
     claim = row.claim
-    parts = [claim.note, f"Needs {claim.needs}." if claim.needs else "", f"Stand-in: {claim.stand_in}." if claim.stand_in else ""]
+    parts = [
+        claim.note,
+        f"Needs {claim.needs}." if claim.needs else "",
+        f"Stand-in: {claim.stand_in}." if claim.stand_in else "",
+    ]
     if claim.contradiction is not None:
         other = claim.paper.write(claim.contradiction.calculate.value)
         parts.append(f"{claim.contradiction.says} ({other} {claim.paper.unit})".rstrip(" )") + ").")
     parts.append(claim.because)
     for counter in row.counters:
         found = stated(counter.values, counter.unit.factor, counter.unit.unit)
-        parts.append(f"{counter.shows} ({found}{'' if counter.satisfied else ': its criterion is not satisfied'}).")
+        parts.append(
+            f"{counter.shows}"
+            f" ({found}{'' if counter.satisfied else ': its criterion is not satisfied'})."
+        )
     return " ".join(filter(None, parts))
 
 
@@ -113,7 +149,10 @@ def stated(values: Values, factor: float, unit: str) -> str:
 
 def _write_values(row: Row, path: Path) -> None:
     """Each value of the claim and of its counter-experiments."""
-    experiments = [("", row.values, row.claim.paper), *((c.name, c.values, c.unit) for c in row.counters)]
+    experiments = [
+        ("", row.values, row.claim.paper),
+        *((c.name, c.values, c.unit) for c in row.counters),
+    ]
     names = [name for name, values, _ in experiments for _ in values.values]
     numbers = [float(k) for _, values, _ in experiments for k in range(len(values.values))]
     values = [v / unit.factor for _, found, unit in experiments for v in found.values]
@@ -128,7 +167,11 @@ def _write_values(row: Row, path: Path) -> None:
 
 
 def _html(file: ClaimsFile, rows: Sequence[Row], folder: Path) -> str:
-    style = resources.files("zonda.operators.diagnostics").joinpath("data/report.css").read_text(encoding="utf-8")
+    style = (
+        resources.files("zonda.operators.diagnostics")
+        .joinpath("data/report.css")
+        .read_text(encoding="utf-8")
+    )
     cells = [_cells(row) for row in rows]
     details = "\n".join(_section(row, folder) for row in rows)
     return f"""<!DOCTYPE html>
@@ -143,9 +186,11 @@ def _html(file: ClaimsFile, rows: Sequence[Row], folder: Path) -> str:
 </style>
 </head>
 <body>
-<header><h1>{escape(file.paper)}</h1><p>What the paper states, and what zonda {escape(__version__)} finds.</p></header>
+<header><h1>{escape(file.paper)}</h1>
+<p>What the paper states, and what zonda {escape(__version__)} finds.</p></header>
 <main>
-<section><h2>{escape(summary(rows))}</h2><p class="note">{escape(RULE)}</p>{table(cells, HEAD, (1, 2, 3, 4, 5, 6))}</section>
+<section><h2>{escape(summary(rows))}</h2><p class="note">{escape(RULE)}</p>
+{table(cells, HEAD, (1, 2, 3, 4, 5, 6))}</section>
 {details}
 </main>
 </body>
@@ -157,12 +202,26 @@ def _cells(row: Row) -> list[str]:
     claim, n = row.claim, _numbers(row)
     sign = {"equal": "", "at_least": "≥ ", "at_most": "≤ "}[claim.relation]
     error = n["paper_error"] or n["paper_rounding"]
-    paper = f"{sign}{n['paper']:.4g}" + (f" ± {error:.2g}" if error else "") + f" {claim.paper.unit}".rstrip()
-    found = [f"{n[key]:.{digits}g}" for key, digits in (("zonda", 4), ("scatter", 2), ("standard_error", 2))]
+    paper = (
+        f"{sign}{n['paper']:.4g}"
+        + (f" ± {error:.2g}" if error else "")
+        + f" {claim.paper.unit}".rstrip()
+    )
+    found = [
+        f"{n[key]:.{digits}g}"
+        for key, digits in (("zonda", 4), ("scatter", 2), ("standard_error", 2))
+    ]
     if not n["scatter"]:
         found[1:] = ["", ""]
-    shown = [*found, *(distance_text(n[key]) for key in ("distance_one", "distance_mean"))] if row.values.values else [""] * 5
-    name = Html(f'<a href="#{claim.id}">{escape(claim.id)}</a><br>{escape(claim.claim)} <small>({escape(claim.section)})</small>')
+    shown = (
+        [*found, *(distance_text(n[key]) for key in ("distance_one", "distance_mean"))]
+        if row.values.values
+        else [""] * 5
+    )
+    name = Html(
+        f'<a href="#{claim.id}">{escape(claim.id)}</a><br>{escape(claim.claim)}'
+        f" <small>({escape(claim.section)})</small>"
+    )
     return [name, paper, *shown, _pill(row)]
 
 
@@ -173,20 +232,34 @@ def distance_text(distance: float) -> str:
 
 def _pill(row: Row) -> Html:
     verdict = row.verdict.value
-    return Html(f'<span class="pill" style="background: {COLOURS.get(verdict, "#6b5b95")}">{escape(verdict)}</span>')
+    return Html(
+        '<span class="pill" style="background:'
+        f' {COLOURS.get(verdict, "#6b5b95")}">{escape(verdict)}</span>'
+    )
 
 
 def _section(row: Row, folder: Path) -> str:
     """What is known of one claim: sentences, experiments, pictures."""
     claim = row.claim
-    parts = [f"<h3>{escape(claim.id)}</h3><p>{escape(claim.claim)} ({escape(claim.section)}) {_pill(row)}</p>"]
+    parts = [
+        f"<h3>{escape(claim.id)}</h3><p>{escape(claim.claim)} ({escape(claim.section)})"
+        f" {_pill(row)}</p>"
+    ]
     parts.append(f"<p>{escape(remark(row))}</p>")
-    lines = [(name or "the claim", ", ".join(described(experiment))) for name, experiment in claim.experiments()]
+    lines = [
+        (name or "the claim", ", ".join(described(experiment)))
+        for name, experiment in claim.experiments()
+    ]
     parts.append(table(lines))
     own = folder / claim.id
-    images = sorted(own.glob("*.png"), key=lambda path: path.name != "values.png") if own.is_dir() else []
+    images = (
+        sorted(own.glob("*.png"), key=lambda path: path.name != "values.png")
+        if own.is_dir()
+        else []
+    )
     shown = "".join(
-        f'<figure><img src="{claim.id}/{escape(image.name)}" alt="{escape(claim.id)}: {escape(image.stem)}" loading="lazy">'
+        f'<figure><img src="{claim.id}/{escape(image.name)}" alt="{escape(claim.id)}:'
+        f' {escape(image.stem)}" loading="lazy">'
         f"<figcaption>{escape(image.stem.replace('_', ' '))}</figcaption></figure>"
         for image in images
     )

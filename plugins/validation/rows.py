@@ -11,8 +11,9 @@ from .verdict import Comparison, Values, Verdict
 
 @dataclass(frozen=True)
 class CounterResult:
-    """A counter-experiment: its name, what it shows, its values, whether its criterion is satisfied; the unit that its values
-    are stated in (of its criterion, which need not be that of the claim), and whether they are of the claim's quantity."""
+    """A counter-experiment: its name, what it shows, its values, whether its criterion is
+    satisfied; the unit that its values are stated in (of its criterion, which need not be that of
+    the claim), and whether they are of the claim's quantity."""
 
     name: str
     shows: str

@@ -1,4 +1,6 @@
-"""Runs of pipelines for claims: each (pipeline, seed) is run once for all metrics that are measured on it, and kept."""
+"""Runs of pipelines for claims: each (pipeline, seed) is run once for all metrics that are measured
+on it, and kept.
+"""
 
 from __future__ import annotations
 
@@ -63,8 +65,9 @@ class Simulation:
         return found.hexdigest()
 
     def run(self, number: int, choices: Mapping[str, Choice], output: Path | None = None) -> Data:
-        """Realization ``number``, counted from 0, with the signals that metrics need. Outputs act, and pictures are drawn, where
-        there is ``output``; else only those act that make what metrics read."""
+        """Realization ``number``, counted from 0, with the signals that metrics need. Outputs act,
+        and pictures are drawn, where there is ``output``; else only those act that make what
+        metrics read."""
         from zonda.core.output import Output
         from zonda.core.pipeline import Pipeline
         from zonda.core.registry import operators
@@ -72,13 +75,29 @@ class Simulation:
         file, runs = self.file, dict(self.file.runs)
         for k, choice in enumerate(choices.values()):
             runs |= {f"{name}_{k}": signal for name, signal in choice.metric.signals(runs).items()}
-        read = {product for choice in choices.values() for product in getattr(choice.metric, "reads", ())}
-        steps = [o for o in file.operators if output is not None or not isinstance(o, Output) or o.provides & read]
+        read = {
+            product
+            for choice in choices.values()
+            for product in getattr(choice.metric, "reads", ())
+        }
+        steps = [
+            o
+            for o in file.operators
+            if output is not None or not isinstance(o, Output) or o.provides & read
+        ]
         if output is not None and not any("pictures" in o.provides for o in steps):
             steps.append(operators.get("Plots")())
-        pipeline = Pipeline(steps, runs=runs, only=file.header.only, name=file.header.name, precision=file.header.precision)
+        pipeline = Pipeline(
+            steps,
+            runs=runs,
+            only=file.header.only,
+            name=file.header.name,
+            precision=file.header.precision,
+        )
         scene = file.scene()
-        return pipeline.run(scene.model_copy(update={"seed": separate(scene.seed, number)}), output=output)
+        return pipeline.run(
+            scene.model_copy(update={"seed": separate(scene.seed, number)}), output=output
+        )
 
 
 @dataclass
@@ -96,12 +115,19 @@ class Stored:
         found = cls(folder / "runs" / f"{simulation.key}.json", about)
         with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
             values = json.loads(found.path.read_text(encoding="utf-8"))["values"]
-            found.values = {str(n): {str(m): (float(v), float(e)) for m, (v, e) in row.items()} for n, row in values.items()}
+            found.values = {
+                str(n): {str(m): (float(v), float(e)) for m, (v, e) in row.items()}
+                for n, row in values.items()
+            }
         return found
 
     def lacks(self, number: int, metrics: Mapping[str, int]) -> list[str]:
         """Metrics wanted of this realization (``metrics``: of how many) that are not there."""
-        return [m for m, seeds in metrics.items() if number < seeds and m not in self.values.get(str(number), {})]
+        return [
+            m
+            for m, seeds in metrics.items()
+            if number < seeds and m not in self.values.get(str(number), {})
+        ]
 
     def add(self, number: int, values: Mapping[str, tuple[float, float]]) -> None:
         """Keep values, on disk at once."""
@@ -134,7 +160,9 @@ class Runs:
         self._stored: dict[Simulation, Stored] = {}
 
     def want(self, experiment: Experiment) -> None:
-        """Note what an experiment needs. Raises `ZondaError` for a pipeline, key or metric that there is not."""
+        """Note what an experiment needs. Raises `ZondaError` for a pipeline, key or metric that
+        there is not.
+        """
         if experiment.calculate is not None:
             return
         name = self._metric(experiment)
@@ -167,12 +195,18 @@ class Runs:
         return Values(*combined(experiment.statistic, single, error if error == error else 0.0))
 
     def pictured(self, claim: Claim) -> Simulation:
-        """What a claim's pictures are of: its own first run, or the pipeline that `pictures` names. Raises `ZondaError`."""
-        named = {"pipeline": claim.pictures, "versus": None} if isinstance(claim.pictures, str) else {}
+        """What a claim's pictures are of: its own first run, or the pipeline that `pictures` names.
+        Raises `ZondaError`.
+        """
+        named = (
+            {"pipeline": claim.pictures, "versus": None} if isinstance(claim.pictures, str) else {}
+        )
         return self._simulations(claim.model_copy(update=named))[0]
 
     def draw(self, simulation: Simulation, folder: Path) -> None:
-        """The PNG files of a simulation's first realization in a folder, unless they are there; those of one run are copied."""
+        """The PNG files of a simulation's first realization in a folder, unless they are there;
+        those of one run are copied.
+        """
         drawn = {_text_of(mark): mark.parent for mark in sorted(self.folder.glob(f"*/{DRAWN}"))}
         if _text_of(folder / DRAWN) == simulation.key:
             return
@@ -198,7 +232,9 @@ class Runs:
         with atomic_path(folder / "atmosphere.png") as temporary:
             figure.savefig(temporary)
 
-    def _measure(self, simulation: Simulation, number: int, metrics: list[str]) -> dict[str, tuple[float, float]]:
+    def _measure(
+        self, simulation: Simulation, number: int, metrics: list[str]
+    ) -> dict[str, tuple[float, float]]:
         choices = {m: self._choices[m] for m in metrics if m != SECONDS}
         begin = time.perf_counter()
         data = simulation.run(number, choices)
@@ -216,16 +252,30 @@ class Runs:
         try:
             choice = Choice.parse(experiment.metric)
         except PydanticCustomError as err:
-            raise InputError(err.message(), place="metric", cure=str((err.context or {}).get("help", ""))) from None
+            raise InputError(
+                err.message(), place="metric", cure=str((err.context or {}).get("help", ""))
+            ) from None
         self._choices.setdefault(choice.name, choice)
         return choice.name
 
     def _simulations(self, experiment: Experiment) -> list[Simulation]:
         assert experiment.pipeline is not None
         path = self._path(experiment.pipeline)
-        changes = [experiment.change, *([{**experiment.change, **experiment.versus}] if experiment.versus is not None else [])]
-        made = [Simulation(path, tuple(setting(key, value) for key, value in change.items())) for change in changes]
-        return [next((s for s in self._wanted if s == new), new) for new in made]  # the one whose file is read already
+        changes = [
+            experiment.change,
+            *(
+                [{**experiment.change, **experiment.versus}]
+                if experiment.versus is not None
+                else []
+            ),
+        ]
+        made = [
+            Simulation(path, tuple(setting(key, value) for key, value in change.items()))
+            for change in changes
+        ]
+        return [
+            next((s for s in self._wanted if s == new), new) for new in made
+        ]  # the one whose file is read already
 
     def _path(self, name: str) -> Path:
         from zonda.core.configuration.locate import locate
@@ -238,7 +288,11 @@ class Runs:
 
 def _pictures(folder: Path) -> list[Path]:
     """The pictures of a run, without the claim's own."""
-    return [path for path in sorted(folder.glob("*.png")) if path.name not in ("values.png", "atmosphere.png")]
+    return [
+        path
+        for path in sorted(folder.glob("*.png"))
+        if path.name not in ("values.png", "atmosphere.png")
+    ]
 
 
 def _text_of(path: Path) -> str:
@@ -248,8 +302,12 @@ def _text_of(path: Path) -> str:
     return ""
 
 
-def combined(statistic: str | None, columns: list[list[float]], error: float) -> tuple[tuple[float, ...], float]:
-    """Values and the error of a single one; that of a paired significance S of n pairs is ((1 + S^2 / 2) / n)^(1/2)."""
+def combined(
+    statistic: str | None, columns: list[list[float]], error: float
+) -> tuple[tuple[float, ...], float]:
+    """Values and the error of a single one; that of a paired significance S of n pairs is ((1 + S^2
+    / 2) / n)^(1/2).
+    """
     if statistic is None:
         return tuple(columns[0]), error
     pairs = list(zip(*columns, strict=True))
@@ -262,9 +320,17 @@ def combined(statistic: str | None, columns: list[list[float]], error: float) ->
     paired = statistic.startswith("paired")
     scatter = differences.scatter if paired else apart
     if not scatter:
-        raise ZondaError("a significance needs seeds that scatter", place="statistic", cure="set seeds to 3 or more")
+        raise ZondaError(
+            "a significance needs seeds that scatter",
+            place="statistic",
+            cure="set seeds to 3 or more",
+        )
     found = differences.mean / scatter
-    error = math.hypot(1.0, found / math.sqrt(2)) / math.sqrt(len(pairs)) if paired else differences.standard_error / scatter
+    error = (
+        math.hypot(1.0, found / math.sqrt(2)) / math.sqrt(len(pairs))
+        if paired
+        else differences.standard_error / scatter
+    )
     root = math.sqrt(len(pairs)) if statistic == "paired_mean" else 1.0
     return (root * found,), root * error
 
@@ -277,7 +343,14 @@ def described(experiment: Experiment) -> Iterator[str]:
     yield f"{experiment.pipeline}"
     yield from (f"{key}={value}" for key, value in experiment.change.items())
     if experiment.versus is not None:
-        yield f"{experiment.statistic} to {', '.join(f'{k}={v}' for k, v in experiment.versus.items())}"
+        yield (
+            f"{experiment.statistic} to"
+            f" {', '.join(f'{k}={v}' for k, v in experiment.versus.items())}"
+        )
     metric = experiment.metric
-    yield metric if isinstance(metric, str) else ", ".join(f"{name}({given or ''})" for name, given in metric.items())
+    yield (
+        metric
+        if isinstance(metric, str)
+        else ", ".join(f"{name}({given or ''})" for name, given in metric.items())
+    )
     yield f"{experiment.seeds or 1} seed{'s' if (experiment.seeds or 1) > 1 else ''}"

@@ -1,13 +1,16 @@
 """Verdicts on a claim, computed from numbers alone.
 
-With the paper's value p, its standard error e and the half width r to which it is stated, and n values of zonda's of mean m and
-scatter s (one realization; s / sqrt(n) is the standard error of the mean),
+With the paper's value p, its standard error e and the half width r to which it is stated, and n
+values of zonda's of mean m and scatter s (one realization; s / sqrt(n) is the standard error of the
+mean),
 
-    gap = max(0, |m - p| - r)                                                                             (1)
-    distance of one realization = gap / sqrt(e^2 + s^2),    of the mean = gap / sqrt(e^2 + s^2 / n)        (2)
+    gap = max(0, |m - p| - r)                                                                    (1)
+    distance of one realization = gap / sqrt(e^2 + s^2),
+    of the mean = gap / sqrt(e^2 + s^2 / n)        (2)
 
-For a lower limit p, |m - p| is replaced by p - m, for an upper one by m - p. The claim holds where the distance is at most
-`LIMIT`: that of one realization, where the paper's figure is one realization; else that of the mean.
+For a lower limit p, |m - p| is replaced by p - m, for an upper one by m - p. The claim holds where
+the distance is at most `LIMIT`: that of one realization, where the paper's figure is one
+realization; else that of the mean.
 """
 
 from __future__ import annotations
@@ -42,7 +45,9 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Values:
-    """Values over seeds (n,), SI; ``error``: standard error that a metric states for a single one, 0 where it states none."""
+    """Values over seeds (n,), SI; ``error``: standard error that a metric states for a single one,
+    0 where it states none.
+    """
 
     values: tuple[float, ...]
     error: float = 0.0
@@ -54,10 +59,14 @@ class Values:
 
     @property
     def scatter(self) -> float:
-        """Standard deviation of one realization; of a single one the error that its metric states."""
+        """Standard deviation of one realization; of a single one the error that its metric
+        states.
+        """
         if len(self.values) < 2:
             return self.error
-        return math.sqrt(math.fsum((v - self.mean) ** 2 for v in self.values) / (len(self.values) - 1))
+        return math.sqrt(
+            math.fsum((v - self.mean) ** 2 for v in self.values) / (len(self.values) - 1)
+        )
 
     @property
     def standard_error(self) -> float:
@@ -67,8 +76,8 @@ class Values:
 
 @dataclass(frozen=True)
 class Stated:
-    """What the paper states: value, standard error, half width of rounding, all SI; how it is meant; of one realization or of
-    the mean."""
+    """What the paper states: value, standard error, half width of rounding, all SI; how it is
+    meant; of one realization or of the mean."""
 
     value: float
     error: float = 0.0
@@ -80,8 +89,14 @@ class Stated:
         """Equation (1); NaN for no value."""
         if math.isnan(mean):
             return math.nan
-        away = {"equal": abs(mean - self.value), "at_least": self.value - mean, "at_most": mean - self.value}[self.relation]
-        return max(0.0, away - self.rounding - 1e-9 * abs(self.value))  # a limit itself is inside, whatever its last bit
+        away = {
+            "equal": abs(mean - self.value),
+            "at_least": self.value - mean,
+            "at_most": mean - self.value,
+        }[self.relation]
+        return max(
+            0.0, away - self.rounding - 1e-9 * abs(self.value)
+        )  # a limit itself is inside, whatever its last bit
 
 
 def distance(gap: float, sigma: float) -> float:
@@ -113,16 +128,26 @@ def clears(found: Values, above: float | None, below: float | None) -> bool:
     margin = LIMIT * found.standard_error
     if math.isnan(found.mean):
         return False
-    return (above is None or found.mean - margin >= above) and (below is None or found.mean + margin <= below)
+    return (above is None or found.mean - margin >= above) and (
+        below is None or found.mean + margin <= below
+    )
 
 
 def contradicted(stated: Stated, other: float, relation: Relation) -> bool:
-    """Whether what the paper states cannot stand beside ``other``, which follows from other numbers of the paper."""
+    """Whether what the paper states cannot stand beside ``other``, which follows from other numbers
+    of the paper.
+    """
     beside = Stated(other, 0.0, stated.rounding, relation)
     return distance(beside.gap(stated.value), stated.error) > LIMIT
 
 
-def decide(holds: bool | None, explanations: Sequence[bool], *, contradicted: bool = False, needs_data: bool = False) -> Verdict:
+def decide(
+    holds: bool | None,
+    explanations: Sequence[bool],
+    *,
+    contradicted: bool = False,
+    needs_data: bool = False,
+) -> Verdict:
     """The verdict.
 
     Parameters
@@ -130,8 +155,8 @@ def decide(holds: bool | None, explanations: Sequence[bool], *, contradicted: bo
     holds
         Whether zonda's value agrees; None where there is none.
     explanations
-        For each counter-experiment whether its result satisfies its criterion. A difference is explained where there is at least
-        one and all do.
+        For each counter-experiment whether its result satisfies its criterion. A difference is
+        explained where there is at least one and all do.
     contradicted
         Whether other numbers of the paper exclude the claim.
     needs_data

@@ -1,11 +1,37 @@
-"""The slow half of the stability matrix: checks that say something about the code rather than about the machine."""
+"""The slow half of the stability matrix: checks that say something about the code rather than about
+the machine.
+"""
 
 from zonda.core.checks import Check, registered
 
-from . import covariance, determinism, filters, geometry, lattice, maps, means, noise, opacity, pointing, timing
+from . import (
+    covariance,
+    determinism,
+    filters,
+    geometry,
+    lattice,
+    maps,
+    means,
+    noise,
+    opacity,
+    pointing,
+    timing,
+)
 from .cases import MATRIX
 
-FAMILIES = (covariance, lattice, geometry, filters, maps, opacity, noise, pointing, timing, determinism, means)
+FAMILIES = (
+    covariance,
+    lattice,
+    geometry,
+    filters,
+    maps,
+    opacity,
+    noise,
+    pointing,
+    timing,
+    determinism,
+    means,
+)
 
 
 def matrix() -> list[Check]:

@@ -11,7 +11,8 @@ NEAR = Case(
 )
 FAR = Case(
     "r -> infinity, r0 -> infinity, r0 << cell, r0 >> strip",
-    "finite; implied covariance within the stated error for r0/cell from 1e-1 to 1e6; a clear refusal beyond",
+    "finite; implied covariance within the stated error for r0/cell from 1e-1 to 1e6; a clear"
+    " refusal beyond",
 )
 OVERLAP = Case(
     "beams that overlap almost completely (D = 100 m, detectors 0.2 m apart)",
@@ -23,7 +24,8 @@ STRIP = Case(
 )
 WIND = Case(
     "zero wind; wind along, across, against the scan; stare",
-    "a frozen field seen by a stare gives identical samples; rotating scan, wind and field together changes nothing",
+    "a frozen field seen by a stare gives identical samples; rotating scan, wind and field together"
+    " changes nothing",
 )
 OPAQUE = Case(
     "opacity to infinity (bands on 557 GHz, 183 GHz), 1/(zeta e^-tau)",
@@ -39,8 +41,9 @@ WATER = Case(
 )
 SPHERE = Case(
     "zenith crossing; poles; RA 0/360; Dec +-90; azimuth wrap; elevation 5 deg",
-    "against erfa/longdouble < 1e-9 rad; shifting RA by 360 deg moves nothing (bits where the value is exactly"
-    " representable, else 1e-12 rad); bundled IERS table, no download, a warning outside its range",
+    "against erfa/longdouble < 1e-9 rad; shifting RA by 360 deg moves nothing (bits where the value"
+    " is exactly representable, else 1e-12 rad); bundled IERS table, no download, a warning outside"
+    " its range",
 )
 DEAD = Case(
     "dead, constant, identical, NaN detectors in the common mode",
@@ -48,7 +51,8 @@ DEAD = Case(
 )
 PIXELS = Case(
     "empty pixels; NaN or inf in the input map; 1x1 map; map smaller than the scan; huge map",
-    "NaN stays local and hits = 0; outside the map is a stated value; predicted memory before the run",
+    "NaN stays local and hits = 0; outside the map is a stated value; predicted memory before"
+    " the run",
 )
 PARTIAL = Case(
     "one detector dead in one block only; a scan of zero length",
@@ -56,19 +60,21 @@ PARTIAL = Case(
 )
 LEVEL = Case(
     "noise whose level is known only from the load (background-limited, quoted at the detector)",
-    "std(signal / NOISE) = 1 within its error for every reference and model; the plan's depth is the run's",
+    "std(signal / NOISE) = 1 within its error for every reference and model; the plan's depth is"
+    " the run's",
 )
 BANDS = Case(
     "two bands, two cameras, one seed",
-    "atmosphere correlates > 0.999 (equal beams, or dishes of 6 m and more), noise 0 within its error",
+    "atmosphere correlates > 0.999 (equal beams, or dishes of 6 m and more), noise 0 within its"
+    " error",
 )
 MEAN = Case(
     "a step that multiplies a stream with tens of kelvin of mean",
     "the result is the same whether the mean stands beside the stream or in it",
 )
 SIZES = Case(
-    "pixels of another size than at the reference point (CAR, CEA, MER at high declination), oblong pixels, HEALPix near the"
-    " beam's size",
+    "pixels of another size than at the reference point (CAR, CEA, MER at high declination), oblong"
+    " pixels, HEALPix near the beam's size",
     "a delta pixel keeps its flux within 0.5 % at any sub-pixel offset, declination and projection",
 )
 EDGES = Case(
@@ -89,7 +95,31 @@ AT_ONCE = Case(
 )
 
 MATRIX = (
-    NEAR, FAR, OVERLAP, STRIP, WIND, DECADES, OPAQUE, BAND, WATER, PINK, TIME, SPHERE, DEAD, PIXELS, BLOCKS, TWICE, PARTIAL,
-    LEVEL, BANDS, MEAN, DISPATCH, SIZES, EDGES, SLOW, RED, AT_ONCE,
-)  # fmt: skip
+    NEAR,
+    FAR,
+    OVERLAP,
+    STRIP,
+    WIND,
+    DECADES,
+    OPAQUE,
+    BAND,
+    WATER,
+    PINK,
+    TIME,
+    SPHERE,
+    DEAD,
+    PIXELS,
+    BLOCKS,
+    TWICE,
+    PARTIAL,
+    LEVEL,
+    BANDS,
+    MEAN,
+    DISPATCH,
+    SIZES,
+    EDGES,
+    SLOW,
+    RED,
+    AT_ONCE,
+)
 """Every row, in order."""

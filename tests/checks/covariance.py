@@ -1,4 +1,6 @@
-"""The von Karman covariance and what it becomes behind a beam, against constants of 50-digit arithmetic."""
+"""The von Karman covariance and what it becomes behind a beam, against constants of 50-digit
+arithmetic.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,8 @@ from .cases import FAR, NEAR, OVERLAP
 
 checks = Family("covariance")
 
-# mpmath, 60 digits, printed to 20: 1 - 2^(1-nu)/Gamma(nu) x^nu K_nu(x), nu = 5/6, at the float64 nearest to x
-# (tests/test_hard_cases.py makes them again)
+# mpmath, 60 digits, printed to 20: 1 - 2^(1-nu)/Gamma(nu) x^nu K_nu(x), nu = 5/6, at the float64
+# nearest to x (tests/test_hard_cases.py makes them again)
 STRUCTURE = (
     (1e-12, 1.8637406672006313535e-20),
     (1e-10, 4.0141307118437135276e-17),
@@ -49,7 +51,8 @@ CORRELATION = (
     (400.0, 1.75962910513944556e-173),
     (600.0, 2.7870296221622310336e-260),
 )
-# mpmath quadrature, 30 digits, of the mixture: r [m] and S behind a beam of sigma 42.5 m, r0 = 500 m
+# mpmath quadrature, 30 digits, of the mixture: r [m] and S behind a beam of sigma 42.5 m, r0 = 500
+# m
 BEHIND_A_BEAM = (
     (1e-06, 4.64380890107764815e-18),
     (0.001, 4.6438089010191057e-12),
@@ -80,12 +83,17 @@ def far_tail() -> float:
 
 @checks.add(FAR, reference="0 <= C <= 1, S >= 0 and not falling", limit=0, unit="values")
 def extreme_scales() -> int:
-    """values that are not finite or out of order, r from 0 to 1e12 m, r0 from 1e-6 to 1e9 m, beams from 1 mm to 1 km"""
+    """values that are not finite or out of order, r from 0 to 1e12 m, r0 from 1e-6 to 1e9 m, beams
+    from 1 mm to 1 km
+    """
     r = np.r_[0.0, np.geomspace(1e-12, 1e12, 25)]
     wrong = 0
     for outer_scale in (1e-6, 1.0, 1e9):
         for sigma in (1e-3, 1.0, 1e3):
-            c, s = covariance.beam_correlation(r, outer_scale, sigma), covariance.beam_structure(r, outer_scale, sigma)
+            c, s = (
+                covariance.beam_correlation(r, outer_scale, sigma),
+                covariance.beam_structure(r, outer_scale, sigma),
+            )
             good = (c >= 0) & (c <= 1 + 1e-12) & (s >= 0) & np.isfinite(c) & np.isfinite(s)
             wrong += int((~good).sum() + (np.diff(s) < -1e-15 * s[-1]).sum())
     return wrong
@@ -93,6 +101,8 @@ def extreme_scales() -> int:
 
 @checks.add(OVERLAP, reference="30-digit quadrature (mpmath)", limit=1e-12)
 def behind_a_beam() -> float:
-    """relative error of the structure function behind a beam of sigma 42.5 m, r from 1 um to 1 km"""
+    """relative error of the structure function behind a beam of sigma 42.5 m, r from 1 um to 1
+    km
+    """
     r, expected = np.array(BEHIND_A_BEAM).T
     return _worst(covariance.beam_structure(r, 500.0, 42.5), expected)

@@ -50,7 +50,9 @@ def interrupted() -> Measured:
         Pipeline([*steps(), save]).run(scene(camera(37)), threads=2, output=whole)
         chain = steps()
         try:
-            Pipeline([*chain[:-1], Stops(), chain[-1], save]).run(scene(camera(37)), threads=2, output=again)
+            Pipeline([*chain[:-1], Stops(), chain[-1], save]).run(
+                scene(camera(37)), threads=2, output=again
+            )
             return math.inf, "was not interrupted"
         except KeyboardInterrupt:
             left = [p for p in again.rglob("*") if p.is_file()]
@@ -61,7 +63,13 @@ def interrupted() -> Measured:
             one, other = ((root / path).read_bytes() for root in (whole, again))
             a, b = (np.frombuffer(x, np.uint8)[: min(len(one), len(other))] for x in (one, other))
             wrong += differing(a, b) + abs(len(one) - len(other))
-        return wrong, f"{len(files)} file{'s' if len(files) > 1 else ''} compared, none to resume from: runs start again"
+        return (
+            wrong,
+            (
+                f"{len(files)} file{'s' if len(files) > 1 else ''} compared, none to resume from:"
+                " runs start again"
+            ),
+        )
 
 
 CAMPAIGN = """
@@ -85,7 +93,9 @@ operators:
   - BinMap: {pixel: 4 arcsec}
   - SaveMap
 """
-"""Sixteen tasks of a second or less; its spectra are means of floats, which a sum in another order would change."""
+"""Sixteen tasks of a second or less; its spectra are means of floats, which a sum in another order
+would change.
+"""
 
 
 class Killed(BaseException):
@@ -93,7 +103,9 @@ class Killed(BaseException):
 
 
 class Backwards(Executor):
-    """Completes what was asked for last first, as an engine may; after ``stop`` calls it breaks the campaign off."""
+    """Completes what was asked for last first, as an engine may; after ``stop`` calls it breaks the
+    campaign off.
+    """
 
     def __init__(self, stop: int = 10**9) -> None:
         self.left, self.stop = 0, stop
@@ -113,7 +125,9 @@ class Backwards(Executor):
         return future
 
 
-def _campaign(folder: Path, executor: Executor, workers: int, *, again: bool = False) -> dict[str, bytes]:
+def _campaign(
+    folder: Path, executor: Executor, workers: int, *, again: bool = False
+) -> dict[str, bytes]:
     """Run or resume the campaign; its map."""
     from zonda.core.campaign.engines import Pool
     from zonda.core.campaign.prepare import CampaignFile
@@ -148,19 +162,25 @@ def _campaign_once() -> dict[str, bytes]:
 
 @checks.add(BLOCKS, reference="one worker, in order", limit=0, unit="bytes")
 def workers() -> float:
-    """bytes of a campaign's map that differ with 2 and 7 workers, and when tasks are completed in the opposite order"""
+    """bytes of a campaign's map that differ with 2 and 7 workers, and when tasks are completed in
+    the opposite order
+    """
     wrong = 0.0
     with TemporaryDirectory(prefix="zonda-check-") as folder:
         for number in (2, 7):
             with ThreadPoolExecutor(number) as executor:
                 found = _campaign(Path(folder) / f"out-{number}", executor, number)
             wrong += _bytes_that_differ(_campaign_once(), found)
-        return wrong + _bytes_that_differ(_campaign_once(), _campaign(Path(folder) / "backwards", Backwards(), 4))
+        return wrong + _bytes_that_differ(
+            _campaign_once(), _campaign(Path(folder) / "backwards", Backwards(), 4)
+        )
 
 
 @checks.add(TWICE, reference="a campaign that was not interrupted", limit=0, unit="bytes")
 def resumed() -> Measured:
-    """bytes of a campaign's map that differ when it is broken off after 7 of 16 tasks, a product cut short, and resumed"""
+    """bytes of a campaign's map that differ when it is broken off after 7 of 16 tasks, a product
+    cut short, and resumed
+    """
     from zonda.core.campaign.engines import SerialExecutor
 
     with TemporaryDirectory(prefix="zonda-check-") as folder:
@@ -198,19 +218,32 @@ print(*(float(module.total(np.arange(10, dtype=kind))) for kind in sys.argv[2:])
 
 @checks.add(AT_ONCE, reference="sum of the squares of 0 to 9", limit=0, unit="values")
 def compiled_at_once() -> Measured:
-    """wrong values of a kernel that four processes compile at once for four types, and of each type in four later processes"""
+    """wrong values of a kernel that four processes compile at once for four types, and of each type
+    in four later processes
+    """
     kinds = ("float64", "float32", "int64", "int32")
     with TemporaryDirectory(prefix="zonda-check-") as folder:
         path = Path(folder) / "toy_at_once.py"
         path.write_text(KERNEL)
-        settings = {**os.environ, "ZONDA_CACHE_DIR": f"{folder}/cache", "PYTHONDONTWRITEBYTECODE": "1"}
+        settings = {
+            **os.environ,
+            "ZONDA_CACHE_DIR": f"{folder}/cache",
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
 
         def values(*types: Sequence[str]) -> list[float]:
             command = [sys.executable, "-c", COMPILING, str(path)]
-            started = [subprocess.Popen([*command, *some], env=settings, stdout=subprocess.PIPE, text=True) for some in types]
-            return [float(value) for process in started for value in process.communicate()[0].split()]
+            started = [
+                subprocess.Popen([*command, *some], env=settings, stdout=subprocess.PIPE, text=True)
+                for some in types
+            ]
+            return [
+                float(value) for process in started for value in process.communicate()[0].split()
+            ]
 
         first = values(*([kind] for kind in kinds))
         later = values(*(kinds[k:] + kinds[:k] for k in range(len(kinds))))
-    wrong = sum(value != 285.0 for value in first + later) + abs(len(first) - 4) + abs(len(later) - 16)
+    wrong = (
+        sum(value != 285.0 for value in first + later) + abs(len(first) - 4) + abs(len(later) - 16)
+    )
     return wrong, f"{len(first)} values at once, {len(later)} later"

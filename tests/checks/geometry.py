@@ -23,7 +23,9 @@ RMS = 0.005
 def _atmosphere(observation: Observation, **parameters: Any) -> NDArray[np.float64]:
     """The stream ``atmosphere`` (n_det, n_samp), K_RJ, float64."""
     layers = AtmosphereLayers(**{"pwv": "7.7 mm", "pwv_rms": RMS, "layers": 2, **parameters})
-    return np.asarray(run([layers], observation, keep=("atmosphere",)).observations[0].detdata["atmosphere"])
+    return np.asarray(
+        run([layers], observation, keep=("atmosphere",)).observations[0].detdata["atmosphere"]
+    )
 
 
 @checks.add(WIND, reference="the first sample", limit=1e-12)
@@ -39,7 +41,10 @@ def turned_together() -> float:
     worst = 0.0
     for angle in (37.0, 180.0, 271.0):
         one, other = (
-            _atmosphere(scan(azimuth=40 + by), wind={"speed": "12 m/s", "direction": f"{200 + by} deg"}) for by in (0.0, angle)
+            _atmosphere(
+                scan(azimuth=40 + by), wind={"speed": "12 m/s", "direction": f"{200 + by} deg"}
+            )
+            for by in (0.0, angle)
         )
         worst = largest(worst, float(abs(one - other).max()))
     return worst
@@ -47,10 +52,12 @@ def turned_together() -> float:
 
 @checks.add(WIND, reference="the detector upwind, r / v earlier", limit=2e-3)
 def frozen_flow() -> float:
-    """what a detector 20 m downwind sees, winds along, against, across and oblique to the azimuth, over the field's rms
+    """what a detector 20 m downwind sees, winds along, against, across and oblique to the azimuth,
+    over the field's rms
 
-    Looking north at 50 deg. xi grows to the right; a wind from the south drifts down, at v sin(elevation) across the line
-    of sight. The water along a line of sight is divided by its airmass.
+    Looking north at 50 deg. xi grows to the right; a wind from the south drifts down, at v
+    sin(elevation) across the line of sight. The water along a line of sight is divided by its
+    airmass.
     """
     elevation, speed, late = np.radians(50.0), 20.0, 100
     c, s = np.cos(elevation), np.sin(elevation)
@@ -61,20 +68,35 @@ def frozen_flow() -> float:
         o = scan(2, 2000, azimuth=0, elevation=50, radius=0, offsets=([0.0, xi], [0.0, eta]))
         wind = {"speed": f"{speed} m/s", "direction": f"{direction} deg"}
         steps = [
-            AtmosphereLayers(pwv="1 mm", pwv_rms=RMS, layers=1, lowest="2000 m", wind=wind, tolerance="0.1 %", outputs=["pwv"])
+            AtmosphereLayers(
+                pwv="1 mm",
+                pwv_rms=RMS,
+                layers=1,
+                lowest="2000 m",
+                wind=wind,
+                tolerance="0.1 %",
+                outputs=["pwv"],
+            )
         ]
         water = run(list(steps), o, keep=("pwv",)).observations[0].detdata["pwv"] / 1e-3
-        up, down = water[0, :-late] * s, water[1, late:] * (s + eta * c) / np.sqrt(1 + xi * xi + eta * eta)
+        up, down = (
+            water[0, :-late] * s,
+            water[1, late:] * (s + eta * c) / np.sqrt(1 + xi * xi + eta * eta),
+        )
         worst = largest(worst, float(abs(up - down).max()) / RMS)
     return worst
 
 
 @checks.add(STRIP, reference="finite, and there", limit=0, unit="values")
 def one_detector_one_sample() -> int:
-    """values missing, zero or not finite for one detector and 1, 2 and 50 samples, with and without wind"""
+    """values missing, zero or not finite for one detector and 1, 2 and 50 samples, with and without
+    wind
+    """
     wrong = 0
     for samples in (1, 2, 50):
         for speed in (0, 10):
             values = _atmosphere(scan(1, samples, radius=0), wind={"speed": f"{speed} m/s"})
-            wrong += int(values.shape != (1, samples)) + int((~np.isfinite(values) | (values == 0)).sum())
+            wrong += int(values.shape != (1, samples)) + int(
+                (~np.isfinite(values) | (values == 0)).sum()
+            )
     return wrong

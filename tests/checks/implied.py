@@ -1,4 +1,6 @@
-"""The covariance that the pyramid of a turbulent layer implies, exactly: tests and benchmarks compare it with the one wanted."""
+"""The covariance that the pyramid of a turbulent layer implies, exactly: tests and benchmarks
+compare it with the one wanted.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 
 
 def implied_covariance(field: Turbulence, a: NDArray[np.integer], b: NDArray[np.integer]) -> Floats:
-    """(n,) covariance of the algorithm, but for rounding to float32, between lattice points ``a`` and ``b``, each (n, 2)."""
+    """(n,) covariance of the algorithm, but for rounding to float32, between lattice points ``a``
+    and ``b``, each (n, 2).
+    """
     a, b = np.atleast_2d(a), np.atleast_2d(b)
     out = np.zeros(len(a))
     for k, level in enumerate(field.levels):
@@ -33,7 +37,9 @@ def implied_covariance(field: Turbulence, a: NDArray[np.integer], b: NDArray[np.
 
 
 def _lags(field: Turbulence, a: int, b: int, k: int) -> tuple[NDArray[np.int64], Floats]:
-    """Lags on level k between the lattice points that a and b of level 0 are interpolated from (one axis), and weights."""
+    """Lags on level k between the lattice points that a and b of level 0 are interpolated from (one
+    axis), and weights.
+    """
     (xa, wa), (xb, wb) = _sources(field, a, k), _sources(field, b, k)
     lag, inverse = np.unique(np.subtract.outer(xa, xb), return_inverse=True)
     weight = np.bincount(inverse.ravel(), np.multiply.outer(wa, wb).ravel())

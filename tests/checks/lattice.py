@@ -1,4 +1,6 @@
-"""The turbulence's lattice: its implied covariance over the whole range of outer scales, its limits, narrow strips, regions."""
+"""The turbulence's lattice: its implied covariance over the whole range of outer scales, its
+limits, narrow strips, regions.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ RATIOS = (1e-3, 0.06, 1.0, 30.0, 400.0, 2e4, 1e6)
 
 @cache
 def implied_error(ratio: float, fidelity: str, sigma: float = SIGMA) -> tuple[float, float]:
-    """Largest error of the covariance (of the variance) and of the structure function (of itself), 0 to 400 cells apart."""
+    """Largest error of the covariance (of the variance) and of the structure function (of itself),
+    0 to 400 cells apart.
+    """
     layer = Turbulence(0, outer_scale=ratio * sigma, sigma=sigma, fidelity=fidelity)
     start = np.array([(0, 0), (1, 0), (1, 1), (22, 41)])
     lags, ways = np.array([0, 1, 2, 5, 20, 130, 400]), np.array([(0, 1), (1, 0), (1, 1)])
@@ -38,7 +42,10 @@ def implied_error(ratio: float, fidelity: str, sigma: float = SIGMA) -> tuple[fl
     b = a + np.tile(step, (len(start), 1))
     here, there, between = (implied_covariance(layer, p, q) for p, q in ((a, a), (b, b), (a, b)))
     r = np.hypot(*(b - a).T) * layer.spacing
-    c, s = beam_correlation(r, layer.outer_scale, sigma), beam_structure(r, layer.outer_scale, sigma)
+    c, s = (
+        beam_correlation(r, layer.outer_scale, sigma),
+        beam_structure(r, layer.outer_scale, sigma),
+    )
     apart = r > 0
     worst_c = largest(abs(between - c).max(), abs(there - layer.variance).max()) / layer.variance
     return float(worst_c), float(abs(((here + there) / 2 - between)[apart] / s[apart] - 1).max())
@@ -46,11 +53,15 @@ def implied_error(ratio: float, fidelity: str, sigma: float = SIGMA) -> tuple[fl
 
 @checks.add(FAR, reference="analytic covariance behind the beam", limit=FIDELITIES["default"].error)
 def covariance() -> float:
-    """error of the implied covariance over the variance, r0 / sigma = 30, along, across and oblique"""
+    """error of the implied covariance over the variance, r0 / sigma = 30, along, across and
+    oblique
+    """
     return implied_error(30.0, "default")[0]
 
 
-@checks.add(FAR, reference="analytic structure function", limit=FIDELITIES["default"].structure_error)
+@checks.add(
+    FAR, reference="analytic structure function", limit=FIDELITIES["default"].structure_error
+)
 def structure_function() -> float:
     """relative error of the implied structure function from one cell up, r0 / sigma = 30"""
     return implied_error(30.0, "default")[1]
@@ -71,11 +82,15 @@ def any_region() -> int:
 
 @checks.add(FAR, reference="analytic covariance", limit=FIDELITIES["default"].error)
 def covariance_over_the_range() -> float:
-    """error of the implied covariance over the variance, r0 / sigma from 1e-3 to 1e6, fidelity default"""
+    """error of the implied covariance over the variance, r0 / sigma from 1e-3 to 1e6, fidelity
+    default
+    """
     return largest(*(implied_error(ratio, "default")[0] for ratio in RATIOS))
 
 
-@checks.add(FAR, reference="analytic structure function", limit=FIDELITIES["default"].structure_error)
+@checks.add(
+    FAR, reference="analytic structure function", limit=FIDELITIES["default"].structure_error
+)
 def structure_function_over_the_range() -> float:
     """error of the implied structure function, r0 / sigma from 1e-3 to 1e6, fidelity default"""
     return largest(*(implied_error(ratio, "default")[1] for ratio in RATIOS))
@@ -83,7 +98,9 @@ def structure_function_over_the_range() -> float:
 
 @checks.add(FAR, reference="analytic covariance", limit=FIDELITIES["fine"].error)
 def fine_covariance_over_the_range() -> float:
-    """error of the implied covariance over the variance, r0 / sigma from 1e-3 to 1e6, fidelity fine"""
+    """error of the implied covariance over the variance, r0 / sigma from 1e-3 to 1e6, fidelity
+    fine
+    """
     return largest(*(implied_error(ratio, "fine")[0] for ratio in RATIOS))
 
 
@@ -96,13 +113,25 @@ def fine_structure_function_over_the_range() -> float:
 @checks.add(FAR, reference="an error that names the outer scale", limit=0, unit="not refused")
 def refusals() -> Measured:
     """outer scales and beams that the stated error does not cover"""
-    beyond = ((1e9, 21.0), (0.01, 21.0), (np.inf, 21.0), (np.nan, 21.0), (0.0, 21.0), (-500.0, 21.0), (500.0, 0.0))
-    return unrefused([(lambda r=r, s=s: Turbulence(0, outer_scale=r, sigma=s), "outer scale") for r, s in beyond])  # type: ignore[misc]
+    beyond = (
+        (1e9, 21.0),
+        (0.01, 21.0),
+        (np.inf, 21.0),
+        (np.nan, 21.0),
+        (0.0, 21.0),
+        (-500.0, 21.0),
+        (500.0, 0.0),
+    )
+    return unrefused(
+        [(lambda r=r, s=s: Turbulence(0, outer_scale=r, sigma=s), "outer scale") for r, s in beyond]
+    )  # type: ignore[misc]
 
 
 @checks.add(OVERLAP, reference="analytic structure function", limit=1e-2)
 def neighbours() -> float:
-    """relative error of the implied structure function of lines of sight 0.2 m apart behind D = 100 m, anywhere in a cell"""
+    """relative error of the implied structure function of lines of sight 0.2 m apart behind D = 100
+    m, anywhere in a cell
+    """
     sigma, r, n = 42.5, 0.2, 18
     layer = Turbulence(0, outer_scale=500.0, sigma=sigma)
     i, j = (v.ravel() for v in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
@@ -138,13 +167,16 @@ def narrow_strip() -> int:
 def across_a_narrow_strip() -> float:
     """mean squared difference across that strip, whose relative standard error is 0.5 %
 
-    The mean of d^2 over n cells has the relative variance 2 / n_eff, 1 / n_eff = sum of rho^2 over lags, rho that of d.
+    The mean of d^2 over n cells has the relative variance 2 / n_eff, 1 / n_eff = sum of rho^2 over
+    lags, rho that of d.
     """
     strip = _strip()
     spacing = Turbulence(2, outer_scale=500.0, sigma=SIGMA).spacing
     lag = spacing * np.arange(2000)
     s = beam_structure(spacing, 500.0, SIGMA)[0]
-    rho = (beam_structure(np.hypot(lag, spacing), 500.0, SIGMA) - beam_structure(lag, 500.0, SIGMA)) / s
+    rho = (
+        beam_structure(np.hypot(lag, spacing), 500.0, SIGMA) - beam_structure(lag, 500.0, SIGMA)
+    ) / s
     error = math.sqrt(2 * (2 * float((rho**2).sum()) - 1) / strip.shape[1])
     return float(abs(np.mean(np.diff(strip.astype(np.float64), axis=0) ** 2) / (2 * s) - 1) / error)
 
@@ -158,5 +190,8 @@ def _strip() -> NDArray[np.float32]:
 def one_point() -> int:
     """a region of one lattice point, 1e12 cells away"""
     layer, far = Turbulence(1, outer_scale=500.0, sigma=21.0), 10**12
-    alone, among = layer.region(far, far + 1, -far, -far + 1), layer.region(far - 9, far + 40, -far - 3, -far + 70)
+    alone, among = (
+        layer.region(far, far + 1, -far, -far + 1),
+        layer.region(far - 9, far + 40, -far - 3, -far + 70),
+    )
     return differing(alone, among[9:10, 3:4])

@@ -24,7 +24,9 @@ from .scenes import unrefused
 checks = Family("maps")
 
 
-def _sampled(values: Floats, samples: int = 2000, radius: float = 1.0, **options: Any) -> tuple[Floats, Data]:
+def _sampled(
+    values: Floats, samples: int = 2000, radius: float = 1.0, **options: Any
+) -> tuple[Floats, Data]:
     """The stream ``sky`` of a map, 19 detectors on circles of ``radius`` arcmin."""
     with sky_file(values) as path:
         data = run([SkyMap(file=path, **options)], scan(19, samples, radius=radius), keep=("sky",))
@@ -43,7 +45,9 @@ def empty_pixels() -> int:
     product = run([BinMap(width="20 arcmin", pixel="5 arcsec")], scan(7, 3000), a).products["map"]
     empty = product.hits == 0
     wrong = int((~np.isnan(product.signal[empty])).sum() + (~np.isnan(product.noise[empty])).sum())
-    return wrong + int((~np.isfinite(product.signal[~empty])).sum() + (product.weights[empty] != 0).sum())
+    return wrong + int(
+        (~np.isfinite(product.signal[~empty])).sum() + (product.weights[empty] != 0).sum()
+    )
 
 
 @checks.add(PIXELS, reference="the map without these samples", limit=0, unit="pixels")
@@ -56,13 +60,17 @@ def nan_in_the_signal() -> Measured:
     whole = run([BinMap(pixel="5 arcsec")], scan(7, 3000), a).products["map"]
     product, counted = data.products["map"], data.tally.get("BinMap", "samples dropped: not finite")
     same = whole.hits == product.hits
-    wrong = differing(product.signal[same], whole.signal[same]) + abs(int((whole.hits - product.hits).sum()) - 21)
+    wrong = differing(product.signal[same], whole.signal[same]) + abs(
+        int((whole.hits - product.hits).sum()) - 21
+    )
     return wrong + abs(counted - 21), f"{counted} counted, {int((~same).sum())} pixels lack some"
 
 
 @checks.add(PIXELS, reference="the same map with 0 there", limit=1e-7)
 def nan_in_the_input_map() -> Measured:
-    """largest change, over the peak, by 9 NaN and inf pixels taken as zero, and where they are no neighbours of a sample"""
+    """largest change, over the peak, by 9 NaN and inf pixels taken as zero, and where they are no
+    neighbours of a sample
+    """
     values = _hills()
     spoilt, zeroed, far = values.copy(), values.copy(), values.copy()
     for y, x, bad in ((400, 400, np.nan), (401, 460, np.inf), (350, 390, -np.inf)):
@@ -71,7 +79,9 @@ def nan_in_the_input_map() -> Measured:
     spoilt[30:33, 40] = np.nan
     found, data = _sampled(spoilt, missing="zero")
     expected, _ = _sampled(zeroed)
-    counted = data.tally.get("SkyMap", "pixels of the input map that are NaN or infinite, taken as zero")
+    counted = data.tally.get(
+        "SkyMap", "pixels of the input map that are NaN or infinite, taken as zero"
+    )
     corner, clean = _sampled(far)[0], _sampled(values)[0]
     error = largest(float(abs(found - expected).max()), float(abs(corner - clean).max())) / 1e-3
     return error if counted == 9 else np.inf, f"{counted} pixels counted"
@@ -93,32 +103,50 @@ def refusals() -> Measured:
 
 @checks.add(PIXELS, reference="the stated value outside", limit=1e-12, unit="K")
 def beyond_the_map() -> Measured:
-    """error of samples far outside a map of 21 x 21 pixels, and count of all outside, outside: 3 mK"""
+    """error of samples far outside a map of 21 x 21 pixels, and count of all outside, outside:
+    3 mK
+    """
     found, data = _sampled(np.full((21, 21), 1e-3), outside="3 mK")
     counted = data.tally.get("SkyMap", "samples outside the input map")
     o = data.observations[0]
     plane = o.focalplane
-    with_reach = np.hypot(plane.xi, plane.eta) < np.radians(10 / 3600)  # circles of 60 arcsec: 50 from a map of 10
+    with_reach = np.hypot(plane.xi, plane.eta) < np.radians(
+        10 / 3600
+    )  # circles of 60 arcsec: 50 from a map of 10
     return float(abs(found[with_reach] - 3e-3).max()), f"{counted} of {found.size} samples counted"
 
 
 @checks.add(PIXELS, reference="finite, counted", limit=0, unit="samples")
 def tiny_maps() -> int:
-    """samples not finite, or outside and not counted, of input maps of 1 x 1, 1 x 5 and 2 x 2 pixels; output of 1 x 1"""
+    """samples not finite, or outside and not counted, of input maps of 1 x 1, 1 x 5 and 2 x 2
+    pixels; output of 1 x 1
+    """
     wrong = 0
     for shape in ((1, 1), (1, 5), (2, 2)):
         found, data = _sampled(np.full(shape, 1e-3), 500, radius=0.005)
-        wrong += int((~np.isfinite(found)).sum() + (data.tally.get("SkyMap", "samples outside the input map") == 0))
+        wrong += int(
+            (~np.isfinite(found)).sum()
+            + (data.tally.get("SkyMap", "samples outside the input map") == 0)
+        )
     a = np.ones((7, 3000))
     data = run([BinMap(pixel="10 arcmin", width="10 arcmin")], scan(7, 3000), a)
-    product, outside = data.products["map"], data.tally.get("BinMap", "samples dropped: outside the map")
-    return wrong + abs(int(product.hits.sum()) + outside - a.size) + int(product.signal.shape != (1, 1))
+    product, outside = (
+        data.products["map"],
+        data.tally.get("BinMap", "samples dropped: outside the map"),
+    )
+    return (
+        wrong
+        + abs(int(product.hits.sum()) + outside - a.size)
+        + int(product.signal.shape != (1, 1))
+    )
 
 
 @checks.add(DECADES, reference="the value itself", limit=1e-10, unit="K")
 def fixed_point_sums() -> float:
     """error of a map of 65.500001 K, summed in fixed point"""
-    product = run([BinMap(pixel="5 arcsec")], scan(7, 3000), np.full((7, 3000), 65.500001)).products["map"]
+    product = run(
+        [BinMap(pixel="5 arcsec")], scan(7, 3000), np.full((7, 3000), 65.500001)
+    ).products["map"]
     return float(abs(product.signal[product.hits > 0] - 65.500001).max())
 
 
@@ -128,7 +156,11 @@ def linearity() -> float:
     one, two = np.random.default_rng(3).standard_normal((2, 7, 3000))
 
     def mapped(signal: Floats) -> Floats:
-        return np.asarray(run([HighpassFilter(), BinMap(pixel="5 arcsec")], scan(7, 3000), signal).products["map"].signal)
+        return np.asarray(
+            run([HighpassFilter(), BinMap(pixel="5 arcsec")], scan(7, 3000), signal)
+            .products["map"]
+            .signal
+        )
 
     a, b, both = mapped(one), mapped(two), mapped(1.7 * one - 0.3 * two)
     hit = ~np.isnan(a)
@@ -140,9 +172,11 @@ SIDE, BEAM = 200.0, 480.0
 
 
 def _seen_of_one_pixel(path: Path, pixel: Floats, area: float, dec: float) -> float:
-    """Largest error of the stream of a map in which one pixel has 1 K, over its peak: every offset within 1.5 beams.
+    """Largest error of the stream of a map in which one pixel has 1 K, over its peak: every offset
+    within 1.5 beams.
 
-    The beam is a Gaussian, so the stream is the pixel's solid angle times the Gaussian at its distance.
+    The beam is a Gaussian, so the stream is the pixel's solid angle times the Gaussian at its
+    distance.
     """
     beam = camera(1, field="0 deg").model_copy(update={"fwhm": np.radians(BEAM / 3600)})
     observation = scan(1, 2000, radius=0.0, instrument=beam)
@@ -161,7 +195,9 @@ def _seen_of_one_pixel(path: Path, pixel: Floats, area: float, dec: float) -> fl
 
 @checks.add(SIZES, reference="solid angle x Gaussian at the pixel's centre", limit=5e-3)
 def one_bright_pixel() -> Measured:
-    """error of one pixel's stream over its peak: 2.4 pixels per FWHM and 0.4 as wide, six projections, Dec 0, 30, 60, 80"""
+    """error of one pixel's stream over its peak: 2.4 pixels per FWHM and 0.4 as wide, six
+    projections, Dec 0, 30, 60, 80
+    """
     from astropy.io import fits
     from astropy.wcs import WCS
 
@@ -172,15 +208,24 @@ def one_bright_pixel() -> Measured:
                 cylinder = kind in ("CAR", "CEA", "MER")
                 wcs = WCS(naxis=2)
                 wcs.wcs.ctype = [f"RA---{kind}", f"DEC--{kind}"]
-                rows = np.cos(np.radians(dec)) if kind == "CEA" else 1.0  # whose rows are 1 / cos as high on the sky
+                rows = (
+                    np.cos(np.radians(dec)) if kind == "CEA" else 1.0
+                )  # whose rows are 1 / cos as high on the sky
                 wcs.wcs.cdelt = [-wide * SIDE / 3600, rows * SIDE / 3600]
                 wcs.wcs.crval = [TARGET[0], 0.0 if cylinder else dec]
                 wcs.wcs.crpix = [101.0, 31.0]
                 if cylinder:
-                    wcs.wcs.crpix = [101.0, 31.0 - float(wcs.wcs_world2pix(TARGET[0], dec, 0)[1]) + 30.0]
+                    wcs.wcs.crpix = [
+                        101.0,
+                        31.0 - float(wcs.wcs_world2pix(TARGET[0], dec, 0)[1]) + 30.0,
+                    ]
                 values = np.zeros((61, 201))
                 values[30, 100] = 1.0
-                corners = np.radians(wcs.wcs_pix2world([100.25, 99.75, 100.0, 100.0, 100.0], [30.0, 30.0, 30.25, 29.75, 30.0], 0))
+                corners = np.radians(
+                    wcs.wcs_pix2world(
+                        [100.25, 99.75, 100.0, 100.0, 100.0], [30.0, 30.0, 30.25, 29.75, 30.0], 0
+                    )
+                )
                 east, west, north, south, pixel = unit_vectors(*corners)
                 area = 4 * float(np.linalg.norm(np.cross(east - west, north - south)))
                 with TemporaryDirectory(prefix="zonda-check-") as folder:
@@ -195,7 +240,9 @@ def one_bright_pixel() -> Measured:
 
 @checks.add(SIZES, reference="solid angle x Gaussian at the pixel's centre", limit=5e-3)
 def one_bright_healpix_pixel() -> float:
-    """error of one HEALPix pixel's stream over its peak, nside 1024 at 2.3 pixels per FWHM, Dec 0, 41.8, -60, 80"""
+    """error of one HEALPix pixel's stream over its peak, nside 1024 at 2.3 pixels per FWHM, Dec 0,
+    41.8, -60, 80
+    """
     import healpy
 
     nside, found = 1024, []
@@ -207,7 +254,9 @@ def one_bright_healpix_pixel() -> float:
         values[number] = 1.0
         with TemporaryDirectory(prefix="zonda-check-") as folder:
             path = Path(folder) / "one.fits"
-            healpy.write_map(path, values, coord="C", column_units="K_RJ", partial=True, dtype=values.dtype)
+            healpy.write_map(
+                path, values, coord="C", column_units="K_RJ", partial=True, dtype=values.dtype
+            )
             pixel = unit_vectors(*np.radians([lon, lat]))
             found.append(_seen_of_one_pixel(path, pixel, healpy.nside2pixarea(nside), lat))
     return largest(*found)

@@ -26,7 +26,9 @@ class Gain(Operator):
 
     def exec(self, block: Block, state: Any) -> None:
         """Multiply."""
-        block.detdata["signal"] *= gain(block.detectors)[:, None].astype(block.detdata["signal"].dtype)
+        block.detdata["signal"] *= gain(block.detectors)[:, None].astype(
+            block.detdata["signal"].dtype
+        )
 
 
 class GainOfFluctuation(Gain):
@@ -55,15 +57,30 @@ def _signal(*steps: Operator) -> np.ndarray[Any, np.dtype[np.float64]]:
             *steps,
         ]
     )
-    return np.asarray(pipeline.run(scene(camera(19)), threads=1, keep=("signal",)).observations[0].detdata["signal"])
+    return np.asarray(
+        pipeline.run(scene(camera(19)), threads=1, keep=("signal",))
+        .observations[0]
+        .detdata["signal"]
+    )
 
 
-@checks.add(MEAN, reference="the whole stream, multiplied in float64", limit=2, unit="x 2^-24 of the largest fluctuation")
+@checks.add(
+    MEAN,
+    reference="the whole stream, multiplied in float64",
+    limit=2,
+    unit="x 2^-24 of the largest fluctuation",
+)
 def gain_of_the_whole() -> Measured:
-    """largest error of a stream of tens of kelvin that a step without knowledge of means has multiplied"""
+    """largest error of a stream of tens of kelvin that a step without knowledge of means has
+    multiplied
+    """
     plain, multiplied = _signal(), _signal(Gain())
     wanted = plain * gain(slice(0, len(plain)))[:, None]
-    fluctuation = float(np.abs(wanted - plain).max()) + float(np.abs(plain - plain.mean(axis=1, keepdims=True)).max())
+    fluctuation = float(np.abs(wanted - plain).max()) + float(
+        np.abs(plain - plain.mean(axis=1, keepdims=True)).max()
+    )
     missed = float(np.abs(_signal(GainOfFluctuation()) - wanted).max())
     error = float(np.abs(multiplied - wanted).max())
-    return error / (2.0**-24 * fluctuation), f"{error:.1e} K of {np.abs(plain).max():.3g} K; without the mean {missed:.2g} K"
+    return error / (
+        2.0**-24 * fluctuation
+    ), f"{error:.1e} K of {np.abs(plain).max():.3g} K; without the mean {missed:.2g} K"

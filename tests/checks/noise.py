@@ -1,4 +1,6 @@
-"""Pink noise from f_min on, for any length; the noise that a map states, for every noise model; two bands of one seed."""
+"""Pink noise from f_min on, for any length; the noise that a map states, for every noise model; two
+bands of one seed.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,8 @@ def spectrum_to_lower_frequencies() -> float:
 def a_week() -> Measured:
     """variance of the last day of a week at 10 Hz, f_min 1 mHz, 16 detectors
 
-    Var(sample variance) = 2 int C^2 dt / T for each series, and int C^2 dt = int P^2 df (two-sided).
+    Var(sample variance) = 2 int C^2 dt / T for each series, and int C^2 dt = int P^2 df
+    (two-sided).
     """
     law, n_det, day = power_law_filter(1e-4, 1.0, 8), 16, 864_000
     streams = Streams(law, stream_key(6, "a"), stream_key(6, "b"))
@@ -63,12 +66,16 @@ def a_week() -> Measured:
     f = np.r_[np.linspace(0, 1e-4, 2000, endpoint=False), np.geomspace(1e-4, 0.5, 20_000)]
     power = law.response(f) / law.gain
     error = math.sqrt(2 * 2 * float(np.trapezoid(power**2, f)) / (day * n_det)) / law.variance
-    return abs(total / law.variance - 1) / error, f"{total / law.variance:.4f} of theory, standard error {error:.4f}"
+    return abs(
+        total / law.variance - 1
+    ) / error, f"{total / law.variance:.4f} of theory, standard error {error:.4f}"
 
 
 @checks.add(PINK, reference="no correlation", limit=5, unit="standard errors")
 def no_period() -> float:
-    """correlation of a first stretch of 200000 samples with the second, and with the seventh: no period, no wrap"""
+    """correlation of a first stretch of 200000 samples with the second, and with the seventh: no
+    period, no wrap
+    """
     law, n_det, day = power_law_filter(1e-2, 1.0, 8), 16, 200_000
     streams = Streams(law, stream_key(6, "a"), stream_key(6, "b"))
     days = []
@@ -78,7 +85,9 @@ def no_period() -> float:
         days.append(out.astype(np.float64) / math.sqrt(law.variance))
     f = np.r_[np.linspace(0, 1e-2, 2000, endpoint=False), np.geomspace(1e-2, 0.5, 20_000)]
     power = law.response(f) / law.gain / law.variance
-    error = math.sqrt(2 * float(np.trapezoid(power**2, f)) / (day * n_det))  # Bartlett: sum of rho^2 over lags
+    error = math.sqrt(
+        2 * float(np.trapezoid(power**2, f)) / (day * n_det)
+    )  # Bartlett: sum of rho^2 over lags
     return largest(*(float(abs((days[0] * other).mean())) / error for other in days[1:]))
 
 
@@ -94,12 +103,19 @@ def refusals() -> Measured:
 
 
 def over_stated(*white: WhiteNoise, seed: int = 1, **optics: Any) -> tuple[float, float]:
-    """std(signal / NOISE) of a map of white noise through 1.5 mm of water at 800 to 900 GHz, and its standard error.
+    """std(signal / NOISE) of a map of white noise through 1.5 mm of water at 800 to 900 GHz, and
+    its standard error.
 
     The map less that of the same run without the noise, so that the mean emission is not in it.
     """
     instrument = camera(low="800 GHz", high="900 GHz").model_copy(update={"knee": 0.0})
-    scene = zonda.Scene(site="chajnantor", instrument=instrument, time="2024-07-25T03:00", target="17h -20d", seed=seed)
+    scene = zonda.Scene(
+        site="chajnantor",
+        instrument=instrument,
+        time="2024-07-25T03:00",
+        target="17h -20d",
+        seed=seed,
+    )
     steps = [
         zonda.PointingDaisy(radius="4 arcmin", speed="1 arcmin/s", scan_duration="10 s"),
         zonda.AtmosphereLayers(pwv="1.5 mm", pwv_rms="0 %"),
@@ -129,7 +145,9 @@ def levels() -> dict[str, WhiteNoise]:
 
 @checks.add(LEVEL, reference="1", limit=4.5, unit="standard errors")
 def stated() -> Measured:
-    """std(signal / NOISE) of maps of white noise, NET on the sky, at the detector, every noise model, 850 GHz, 1.5 mm of PWV"""
+    """std(signal / NOISE) of maps of white noise, NET on the sky, at the detector, every noise
+    model, 850 GHz, 1.5 mm of PWV
+    """
     found = {name: over_stated(level, scatter="10 %") for name, level in levels().items()}
     text = ", ".join(f"{name} {ratio:.3f}" for name, (ratio, _) in found.items())
     return largest(*(abs(ratio - 1) / error for ratio, error in found.values())), text
@@ -147,9 +165,17 @@ def _two_bands() -> tuple[Observation, Observation]:
             zonda.Efficiency(),
         ]
         scene = zonda.Scene(
-            site="chajnantor", instrument=camera(low=low, high=high), time="2024-07-25T03:00", target="17h -20d", seed=1
+            site="chajnantor",
+            instrument=camera(low=low, high=high),
+            time="2024-07-25T03:00",
+            target="17h -20d",
+            seed=1,
         )
-        found += zonda.Pipeline(steps).run(scene, threads=1, keep=("white", "pink", "atmosphere")).observations
+        found += (
+            zonda.Pipeline(steps)
+            .run(scene, threads=1, keep=("white", "pink", "atmosphere"))
+            .observations
+        )
     return found[0], found[1]
 
 
@@ -160,11 +186,14 @@ def _correlation(a: Any, b: Any) -> float:
 
 @checks.add(BANDS, reference="no correlation", limit=4.5, unit="standard errors")
 def two_bands() -> Measured:
-    """correlation of the white noise, and of pink noise's second differences, of two bands of one seed"""
+    """correlation of the white noise, and of pink noise's second differences, of two bands of one
+    seed
+    """
     one, two = (o.detdata for o in _two_bands())
     white = _correlation(one["white"], two["white"]) * math.sqrt(one["white"].size)
     a, b = (np.diff(o["pink"].astype(np.float64), 2, axis=1) for o in (one, two))
-    # of nearly white noise, twice differenced: the sum over lags of rho^2 is 1 + 2 (4/9 + 1/36) = 35/18 (Bartlett)
+    # of nearly white noise, twice differenced: the sum over lags of rho^2 is 1 + 2 (4/9 + 1/36) =
+    # 35/18 (Bartlett)
     pink = _correlation(a, b) / math.sqrt(35 / 18 / a.size)
     return largest(abs(white), abs(pink)), f"white {white:+.2f}, pink {pink:+.2f}"
 
@@ -201,7 +230,9 @@ operators:
 
 @checks.add(LEVEL, reference="the NET of the run, which is simulated", limit=0.02)
 def planned() -> float:
-    """largest relative difference of the noise of a sample that a plan states, at the detector and background-limited, 850 GHz"""
+    """largest relative difference of the noise of a sample that a plan states, at the detector and
+    background-limited, 850 GHz
+    """
     worst = 0.0
     for white in ("{net: 1 mK s(1/2), reference: detector}", "{model: background_limited}"):
         with TemporaryDirectory(prefix="zonda-check-") as folder:
@@ -217,15 +248,23 @@ def planned() -> float:
 
 @checks.add(RED, reference="integral of a spectrum that is flat below f_min", limit=0.1)
 def variance_below_its_lowest_frequency() -> Measured:
-    """largest relative error of the variance, 8 poles, f_min 1e-5 to 1e-2 f_s, slopes 1 to 3: that stated, and of the response"""
+    """largest relative error of the variance, 8 poles, f_min 1e-5 to 1e-2 f_s, slopes 1 to 3: that
+    stated, and of the response
+    """
     errors = {}
     for f_min in (1e-5, 1e-4, 1e-3, 1e-2):
         for slope in (1.0, 1.5, 2.0, 2.5, 3.0):
             law = power_law_filter(f_min, slope, 8)
-            above = math.log(0.5 / f_min) if slope == 1 else (1 - (0.5 / f_min) ** (1 - slope)) / (slope - 1)
+            above = (
+                math.log(0.5 / f_min)
+                if slope == 1
+                else (1 - (0.5 / f_min) ** (1 - slope)) / (slope - 1)
+            )
             expected = 2 * f_min * (1 + above)
             f = np.r_[0.0, np.geomspace(1e-6 * f_min, 0.5, 400_000)]
             measured = 2 * float(np.trapezoid(law.response(f), f))
-            errors[slope, f_min] = largest(abs(law.gain * law.variance / expected - 1), abs(measured / expected - 1))
+            errors[slope, f_min] = largest(
+                abs(law.gain * law.variance / expected - 1), abs(measured / expected - 1)
+            )
     slope, f_min = max(errors, key=lambda key: errors[key])
     return largest(*errors.values()), f"largest: slope {slope:g}, f_min {f_min:g} f_s"

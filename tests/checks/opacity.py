@@ -48,7 +48,9 @@ def _band(low: float, high: float, pwv: float = PWV) -> BandAtmosphere:
 
 @checks.add(BAND, reference="sum of e^-tau over the spectrum", limit=1e-4)
 def band_average() -> Measured:
-    """relative error of the transmission at 175.25 to 194.75 GHz (whole cells) through 5 mm of water at the zenith"""
+    """relative error of the transmission at 175.25 to 194.75 GHz (whole cells) through 5 mm of
+    water at the zenith
+    """
     pwv = 5e-3
     layers, cells = _air(pwv).layers, absorption_table().cells(175.5e9, 194.5e9)
     parts, cell, share = layers.in_parts(layers.cross_sections(cells))
@@ -73,17 +75,26 @@ def saturated_line() -> Measured:
 
 @checks.add(OPAQUE, reference="finite", limit=0, unit="values")
 def underflow() -> int:
-    """values not finite of emission, log transmission and their differences at 556 to 558 GHz, where e^-tau underflows"""
+    """values not finite of emission, log transmission and their differences at 556 to 558 GHz,
+    where e^-tau underflows
+    """
     table = _band(556, 558)
     pwv = np.linspace(0, 0.99 * table.pwv_max, 30)
-    found = [f(pwv, LOWEST) for f in (table.emission, table.transmission, table.log_transmission, table.background)]
-    found += [f(pwv, 1e-9, LOWEST) for f in (table.emission_difference, table.log_transmission_difference)]
+    found = [
+        f(pwv, LOWEST)
+        for f in (table.emission, table.transmission, table.log_transmission, table.background)
+    ]
+    found += [
+        f(pwv, 1e-9, LOWEST) for f in (table.emission_difference, table.log_transmission_difference)
+    ]
     return int(sum((~np.isfinite(f)).sum() for f in found))
 
 
 @checks.add(OPAQUE, reference="40-digit decimal arithmetic", limit=1e-11)
 def small_differences() -> float:
-    """relative error of the change of emission and of ln <e^-tau> with the water, changes from 0.3 down to 1e-14 of it"""
+    """relative error of the change of emission and of ln <e^-tau> with the water, changes from 0.3
+    down to 1e-14 of it
+    """
     table, elevation, worst = _band(78, 108), 0.9, 0.0
     for which, method in ((0, table.emission_difference), (1, table.log_transmission_difference)):
         for relative in (0.3, 1e-2, -5e-3, 1e-6, 1e-10, -1e-14):
@@ -92,18 +103,25 @@ def small_differences() -> float:
     return worst
 
 
-def _difference(table: BandAtmosphere, which: int, pwv: float, dpwv: float, elevation: float) -> float:
+def _difference(
+    table: BandAtmosphere, which: int, pwv: float, dpwv: float, elevation: float
+) -> float:
     """The table's polynomial at pwv + dpwv less that at pwv, term by term in 40 digits."""
     coefficients = table._coefficients[which]
     y = float(table._y(np.array([elevation]))[0])
     with localcontext() as context:
         context.prec = 40
         across = _chebyshev(Decimal(y), coefficients.shape[1])
-        line = [sum((Decimal(float(c)) * t for c, t in zip(row, across, strict=True)), Decimal(0)) for row in coefficients]
+        line = [
+            sum((Decimal(float(c)) * t for c, t in zip(row, across, strict=True)), Decimal(0))
+            for row in coefficients
+        ]
 
         def value(water: Decimal) -> Decimal:
             x = 2 * (1 + water / Decimal(table._scale)).ln() / Decimal(table._u_max) - 1
-            return sum((c * t for c, t in zip(line, _chebyshev(x, len(line)), strict=True)), Decimal(0))
+            return sum(
+                (c * t for c, t in zip(line, _chebyshev(x, len(line)), strict=True)), Decimal(0)
+            )
 
         return float(value(Decimal(pwv) + Decimal(dpwv)) - value(Decimal(pwv)))
 
@@ -117,17 +135,33 @@ def _chebyshev(x: Decimal, n: int) -> list[Decimal]:
 
 @checks.add(OPAQUE, reference="flagged and counted, the rest finite", limit=0, unit="samples")
 def map_of_an_opaque_band() -> Measured:
-    """samples neither flagged nor finite in maps at 556 to 558 GHz and on the 183 GHz line at 5 and 60 deg of elevation"""
+    """samples neither flagged nor finite in maps at 556 to 558 GHz and on the 183 GHz line at 5 and
+    60 deg of elevation
+    """
     wrong, flagged = 0, []
     for low, high, elevation in ((556, 558, 60.0), (182.5, 184, 5.1), (182.5, 184, 60.0)):
         instrument = camera(7, low=f"{low} GHz", high=f"{high} GHz")
         o = scan(samples=3000, elevation=elevation, instrument=instrument)
-        steps = [AtmosphereLayers(pwv="7.7 mm", layers=2), WhiteNoise(), Efficiency(), HighpassFilter(), BinMap(pixel="5 arcsec")]
+        steps = [
+            AtmosphereLayers(pwv="7.7 mm", layers=2),
+            WhiteNoise(),
+            Efficiency(),
+            HighpassFilter(),
+            BinMap(pixel="5 arcsec"),
+        ]
         data = run(list(steps), o)
         product = data.products["map"]
         dropped = data.tally.get("BinMap", "samples dropped: flagged")
-        flagged.append(f"{data.tally.get('Efficiency', 'detectors flagged: band transmission below 1e-06')} of 7 detectors")
-        wrong += int((~np.isfinite(product.signal[product.hits > 0])).sum()) + 7 * 3000 - dropped - int(product.hits.sum())
+        flagged.append(
+            f"{data.tally.get('Efficiency', 'detectors flagged: band transmission below 1e-06')} of"
+            " 7 detectors"
+        )
+        wrong += (
+            int((~np.isfinite(product.signal[product.hits > 0])).sum())
+            + 7 * 3000
+            - dropped
+            - int(product.hits.sum())
+        )
     return wrong, f"flagged {', '.join(flagged)}"
 
 
@@ -137,24 +171,36 @@ def positive_water() -> Measured:
     wrong, clipped = 0, 0
     for rms in (0.8, 1.0):
         o = scan(7, 20000, radius=0)
-        data = run([AtmosphereLayers(pwv="1 mm", pwv_rms=rms, wind={"speed": "200 m/s"}, outputs=["pwv"])], o, keep=("pwv",))
+        data = run(
+            [AtmosphereLayers(pwv="1 mm", pwv_rms=rms, wind={"speed": "200 m/s"}, outputs=["pwv"])],
+            o,
+            keep=("pwv",),
+        )
         water = 1e-3 / np.sin(o.elevation.max()) + data.observations[0].detdata["pwv"]
         wrong += int((~(water > -1e-9)).sum())
         clipped += data.tally.get("AtmosphereLayers", "values of the PWV clipped to the table")
     return wrong, f"{clipped} values clipped, as the tally counts"
 
 
-@checks.add(WATER, reference="an error that names the limit and the value", limit=0, unit="not refused")
+@checks.add(
+    WATER, reference="an error that names the limit and the value", limit=0, unit="not refused"
+)
 def ranges() -> Measured:
     """water, elevations, bands and humidities beyond the tables"""
     table = _band(78, 108)
     return unrefused(
         [
-            (lambda: table.emission([PWV, 30e-3], 1.0), "PWV of 30 mm (value 1 of 2) is outside the table"),
+            (
+                lambda: table.emission([PWV, 30e-3], 1.0),
+                "PWV of 30 mm (value 1 of 2) is outside the table",
+            ),
             (lambda: table.transmission(-1e-3, 1.0), "PWV of -1 mm"),
             (lambda: table.transmission(np.nan, 1.0), "PWV of nan mm"),
             (lambda: table.emission_difference(PWV, 20e-3, 1.0), "PWV of 27.7 mm"),
-            (lambda: table.emission(PWV, np.radians(4)), "elevations of 4.00 to 4.00 deg leave the limits"),
+            (
+                lambda: table.emission(PWV, np.radians(4)),
+                "elevations of 4.00 to 4.00 deg leave the limits",
+            ),
             (lambda: _band(990, 1010), "990 to 1010 GHz is not inside"),
             (lambda: profile(SITE, START, 0.1), "outside the limits, 0 to 60 mm"),
             (lambda: _read_humidity(130), "the relative humidity is above 120 %"),
@@ -170,16 +216,28 @@ def _read_humidity(percent: float) -> None:
     ]
     with TemporaryDirectory(prefix="zonda-check-") as folder:
         path = Path(folder) / "air.csv"
-        path.write_text("height [m], pressure [hPa], temperature [K], relative humidity [%]\n" + "\n".join(rows) + "\n")
+        path.write_text(
+            "height [m], pressure [hPa], temperature [K], relative humidity [%]\n"
+            + "\n".join(rows)
+            + "\n"
+        )
         read_table(path, SITE)
 
 
 @checks.add(EDGES, reference="NEP^2 summed over the cells of the spectrum", limit=0.01)
 def steep_band() -> Measured:
-    """relative error of a background-limited NET at 66 to 118 GHz, oxygen at both edges, one polarization, elevation 50 deg"""
+    """relative error of a background-limited NET at 66 to 118 GHz, oxygen at both edges, one
+    polarization, elevation 50 deg
+    """
     low, high, efficiency = 66e9, 118e9, 0.3
-    pairs = camera(2, field="0 deg", low="66 GHz", high="118 GHz").model_copy(update={"polarization": "pairs"})
-    model = {"name": "background_limited", "telescope_temperature": "13 K", "optical_efficiency": efficiency}
+    pairs = camera(2, field="0 deg", low="66 GHz", high="118 GHz").model_copy(
+        update={"polarization": "pairs"}
+    )
+    model = {
+        "name": "background_limited",
+        "telescope_temperature": "13 K",
+        "optical_efficiency": efficiency,
+    }
     steps = [
         PointingStare(scan_duration="2 s"),
         AtmosphereLayers(pwv="5 mm", pwv_rms="0 %"),
@@ -195,6 +253,13 @@ def steep_band() -> Measured:
     squared = 2 * (PLANCK * nu * power * width).sum() + 2 * (power**2 * width).sum()
     expected = np.sqrt(squared / 2) / (efficiency * BOLTZMANN * width.sum())
     flat = float(np.average(load, weights=width)) * efficiency * BOLTZMANN
-    mean = np.sqrt((2 * PLANCK * np.average(nu, weights=width) * flat + 2 * flat**2) / 2 / width.sum()) / (efficiency * BOLTZMANN)
-    on_sky = o.focalplane.main_beam_efficiency * float(_band(66, 118, 5e-3).transmission(5e-3, np.radians(50.0)))
-    return largest(*abs(o.focalplane.net * on_sky / expected - 1)), f"the mean load gives {mean / expected:.3f} of it"
+    mean = np.sqrt(
+        (2 * PLANCK * np.average(nu, weights=width) * flat + 2 * flat**2) / 2 / width.sum()
+    ) / (efficiency * BOLTZMANN)
+    on_sky = o.focalplane.main_beam_efficiency * float(
+        _band(66, 118, 5e-3).transmission(5e-3, np.radians(50.0))
+    )
+    return (
+        largest(*abs(o.focalplane.net * on_sky / expected - 1)),
+        f"the mean load gives {mean / expected:.3f} of it",
+    )

@@ -1,4 +1,6 @@
-"""Time and the sphere, against ERFA's own transformation of catalogue positions (`eraAtco13`), epoch by epoch."""
+"""Time and the sphere, against ERFA's own transformation of catalogue positions (`eraAtco13`),
+epoch by epoch.
+"""
 
 from __future__ import annotations
 
@@ -51,19 +53,45 @@ def leap_second() -> float:
             utc1, utc2 = erfa.dtf2d("UTC", 2017, 1, 1, 0, 0, elapsed - 11)
         earth = orientation(np.atleast_1d(utc1 - 2400000.5 + utc2))
         azimuth, zenith, *_ = erfa.atco13(
-            0.5, 0.2, 0.0, 0.0, 0.0, 0.0, utc1, utc2, earth.ut1_utc, site.longitude, site.latitude, site.altitude,
-            earth.x, earth.y, 0.0, 0.0, 0.0, 1.0,
-        )  # fmt: skip
-        worst = largest(worst, angle(transform.horizontal(sky, np.array([elapsed])), unit_vectors(-azimuth, np.pi / 2 - zenith)))
+            0.5,
+            0.2,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            utc1,
+            utc2,
+            earth.ut1_utc,
+            site.longitude,
+            site.latitude,
+            site.altitude,
+            earth.x,
+            earth.y,
+            0.0,
+            0.0,
+            0.0,
+            1.0,
+        )
+        worst = largest(
+            worst,
+            angle(
+                transform.horizontal(sky, np.array([elapsed])),
+                unit_vectors(-azimuth, np.pi / 2 - zenith),
+            ),
+        )
     return worst
 
 
 @checks.add(TIME, reference="rational arithmetic", limit=1e-9, unit="s")
 def sample_times() -> float:
     """error of the time of any sample of a day at 0.9 Hz"""
-    o, _ = _observe(PointingStare(scan_duration="86400 s", sample_rate="0.9 Hz", target="az 0 deg el 45 deg"))
+    o, _ = _observe(
+        PointingStare(scan_duration="86400 s", sample_rate="0.9 Hz", target="az 0 deg el 45 deg")
+    )
     some = np.unique(np.linspace(0, o.n_samples - 1, 1000).astype(int))
-    return largest(*(float(abs(Fraction(float(o.seconds[k])) - Fraction(int(k) * 10, 9))) for k in some))
+    return largest(
+        *(float(abs(Fraction(float(o.seconds[k])) - Fraction(int(k) * 10, 9))) for k in some)
+    )
 
 
 @checks.add(SPHERE, reference="ERFA eraAtco13", limit=ERROR, unit="rad")
@@ -76,39 +104,61 @@ def poles_of_the_sky() -> float:
         up = transform.horizontal(sky, seconds)
         *_, radec = transform.boresight(up, seconds)
         worst = largest(
-            worst, angle(up, erfa_horizontal(sky, WHEN, seconds, SITES[0])), angle(rotation_matrices(radec)[:, :, 2], sky)
+            worst,
+            angle(up, erfa_horizontal(sky, WHEN, seconds, SITES[0])),
+            angle(rotation_matrices(radec)[:, :, 2], sky),
         )
     return worst
 
 
 @checks.add(SPHERE, reference="ERFA eraAtco13", limit=ERROR, unit="rad")
 def zenith_crossing() -> float:
-    """pointing error of a star that culminates 1 arcsec from the zenith, while its azimuth turns by 180 deg"""
-    overhead = CelestialTransform(SITES[0], WHEN, 0.0).icrs(np.array([0.0, 0.0, 1.0]), np.zeros(1))[0]
+    """pointing error of a star that culminates 1 arcsec from the zenith, while its azimuth turns by
+    180 deg
+    """
+    overhead = CelestialTransform(SITES[0], WHEN, 0.0).icrs(np.array([0.0, 0.0, 1.0]), np.zeros(1))[
+        0
+    ]
     ra, dec = math.atan2(overhead[1], overhead[0]), math.asin(overhead[2]) + math.radians(1 / 3600)
-    o, _ = _observe(PointingStare(scan_duration="60 s", target=f"{ra!r} rad {dec!r} rad"), time=WHEN.shifted(-30))
+    o, _ = _observe(
+        PointingStare(scan_duration="60 s", target=f"{ra!r} rad {dec!r} rad"),
+        time=WHEN.shifted(-30),
+    )
     sky = unit_vectors(np.full(o.n_samples, ra), np.full(o.n_samples, dec))
     some = slice(None, None, 50)
     up = erfa_horizontal(sky[some], o.start, o.seconds[some], SITES[0])
     return largest(
-        angle(rotation_matrices(o.boresight_azel)[some, :, 2], up), angle(rotation_matrices(o.boresight_radec)[:, :, 2], sky)
+        angle(rotation_matrices(o.boresight_azel)[some, :, 2], up),
+        angle(rotation_matrices(o.boresight_radec)[:, :, 2], sky),
     )
 
 
 @checks.add(SPHERE, reference="ERFA eraAtco13", limit=ERROR, unit="rad")
 def low_and_wrapping() -> float:
-    """pointing error of scans at 5 deg of elevation, due north and due south, through azimuth 0 and RA 0"""
+    """pointing error of scans at 5 deg of elevation, due north and due south, through azimuth 0 and
+    RA 0
+    """
     worst = 0.0
     for operator, target in (
         (PointingStare(scan_duration="60 s"), "az 123 deg el 5 deg"),
-        (PointingBackAndForth(scan_duration="60 s", throw="4 deg", speed="0.5 deg/s"), "az 0 deg el 40 deg"),
-        (PointingBackAndForth(scan_duration="60 s", throw="4 deg", speed="0.5 deg/s"), "az 180 deg el 40 deg"),
+        (
+            PointingBackAndForth(scan_duration="60 s", throw="4 deg", speed="0.5 deg/s"),
+            "az 0 deg el 40 deg",
+        ),
+        (
+            PointingBackAndForth(scan_duration="60 s", throw="4 deg", speed="0.5 deg/s"),
+            "az 180 deg el 40 deg",
+        ),
         (PointingDaisy(scan_duration="60 s", speed="1 arcmin/s"), "0 deg 20 deg"),
     ):
         o, _ = _observe(operator, target=target, time="2024-11-25T00:30Z")
         some = slice(None, None, 60)
-        azel, radec = (rotation_matrices(q)[some, :, 2] for q in (o.boresight_azel, o.boresight_radec))
-        worst = largest(worst, angle(azel, erfa_horizontal(radec, o.start, o.seconds[some], SITES[0])))
+        azel, radec = (
+            rotation_matrices(q)[some, :, 2] for q in (o.boresight_azel, o.boresight_radec)
+        )
+        worst = largest(
+            worst, angle(azel, erfa_horizontal(radec, o.start, o.seconds[some], SITES[0]))
+        )
     return worst
 
 
@@ -119,20 +169,31 @@ def right_ascension_wrap() -> int:
     one, _ = _observe(daisy, target="75 deg 20 deg")
     for target in ("435 deg 20 deg", "-285 deg 20 deg"):
         other, _ = _observe(daisy, target=target)
-        wrong += differing(one.boresight_azel, other.boresight_azel) + differing(one.boresight_radec, other.boresight_radec)
+        wrong += differing(one.boresight_azel, other.boresight_azel) + differing(
+            one.boresight_radec, other.boresight_radec
+        )
     return wrong
 
 
-@checks.add(SPHERE, reference="a warning, a line in the tally, finite directions", limit=0, unit="dates")
+@checks.add(
+    SPHERE, reference="a warning, a line in the tally, finite directions", limit=0, unit="dates"
+)
 def beyond_the_tables() -> int:
-    """dates beyond the bundled IERS tables that pass without a word, 1950 and 2090; dates inside that warn"""
+    """dates beyond the bundled IERS tables that pass without a word, 1950 and 2090; dates inside
+    that warn
+    """
     wrong = 0
     for year, known in ((1950, False), (2090, False), (2024, True)):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            o, _ = _observe(PointingStare(scan_duration="1 s", target="az 0 deg el 45 deg"), time=f"{year}-11-25T12:00Z")
+            o, _ = _observe(
+                PointingStare(scan_duration="1 s", target="az 0 deg el 45 deg"),
+                time=f"{year}-11-25T12:00Z",
+            )
         said = {what: text for _, what, text in o.tally}["Earth orientation"]
         warned = any("Earth orientation" in str(w.message) for w in caught)
         told = "none for this date" in said
-        wrong += int(not (warned != known and told != known and np.isfinite(o.boresight_radec).all()))
+        wrong += int(
+            not (warned != known and told != known and np.isfinite(o.boresight_radec).all())
+        )
     return wrong

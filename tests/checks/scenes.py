@@ -9,7 +9,9 @@ from zonda.core.errors import ZondaError
 
 
 def unrefused(attempts: list[tuple[Callable[[], Any], str]]) -> tuple[int, str]:
-    """How many of the attempts do not end in an error a user can mend whose text has the words; what they were."""
+    """How many of the attempts do not end in an error a user can mend whose text has the words;
+    what they were.
+    """
     missed = []
     for attempt, words in attempts:
         try:

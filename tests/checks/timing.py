@@ -37,32 +37,50 @@ def jittered_pointing() -> Measured:
     sky = np.tile(unit_vectors(*np.radians(TARGET)), (o.n_samples, 1))[some]
     looking = unit_vectors(-o.azimuth, o.elevation)[some]
     moved = 7.3e-5 * float(abs(o.departures).max())
-    return angle(looking, erfa_horizontal(sky, o.start, o.seconds[some], SITES[0])), f"a comb would be wrong by {moved:.0e} rad"
+    return angle(
+        looking, erfa_horizontal(sky, o.start, o.seconds[some], SITES[0])
+    ), f"a comb would be wrong by {moved:.0e} rad"
 
 
 @checks.add(TIME, reference="the same air 8 times as often, on a comb", limit=0.05)
 def jittered_atmosphere() -> Measured:
-    """error of the atmosphere at samples 1 ms rms early or late, over what these delays change: a stare, wind 30 m/s"""
+    """error of the atmosphere at samples 1 ms rms early or late, over what these delays change: a
+    stare, wind 30 m/s
+    """
     where = scene(camera(1, field="0 deg"), target="az 150 deg el 50 deg")
-    air = AtmosphereLayers(pwv="5 mm", layers=1, lowest="500 m", wind={"speed": "30 m/s"}, tolerance="0.01 %")
+    air = AtmosphereLayers(
+        pwv="5 mm", layers=1, lowest="500 m", wind={"speed": "30 m/s"}, tolerance="0.01 %"
+    )
 
     def seen(**pointing: str) -> tuple[np.ndarray, np.ndarray]:
         steps = [PointingStare(scan_duration="4 s", **pointing), air]
-        (o,) = Pipeline(steps, precision="float64").run(where, keep=("atmosphere",), threads=1).observations
+        (o,) = (
+            Pipeline(steps, precision="float64")
+            .run(where, keep=("atmosphere",), threads=1)
+            .observations
+        )
         return o.seconds, np.asarray(o.detdata["atmosphere"][0])
 
     from scipy.interpolate import CubicSpline
 
-    truth, (t, jittered), (_, comb) = CubicSpline(*seen(sample_rate="800 Hz")), seen(jitter="1 ms"), seen()
+    truth, (t, jittered), (_, comb) = (
+        CubicSpline(*seen(sample_rate="800 Hz")),
+        seen(jitter="1 ms"),
+        seen(),
+    )
     inside = slice(20, -20)
     wrong = np.sqrt(np.mean((jittered - truth(t))[inside] ** 2))
     change = np.sqrt(np.mean((comb - truth(t))[inside] ** 2))
-    return float(wrong / change), f"the delays change {change * 1e6:.2g} uK of {comb.std() * 1e6:.2g} uK"
+    return float(
+        wrong / change
+    ), f"the delays change {change * 1e6:.2g} uK of {comb.std() * 1e6:.2g} uK"
 
 
 @checks.add(TIME, reference="flags, counts and hits of what was recorded", limit=0, unit="samples")
 def recorded_gaps_and_nan() -> Measured:
-    """samples of a recorded scan with a gap, NaN rows and times out of order that are used, lost or not counted"""
+    """samples of a recorded scan with a gap, NaN rows and times out of order that are used, lost or
+    not counted
+    """
     t = np.arange(6000) / 100.0
     az, el = 150 + 0.05 * np.sin(t), 50 + 0.03 * np.cos(0.9 * t)
     az[1000:1010], el[2000], time = np.nan, np.nan, 1732518000 + t
@@ -80,10 +98,14 @@ def recorded_gaps_and_nan() -> Measured:
             BinMap(pixel="10 arcsec"),
         ]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is out of order is said, and that is counted below
+            warnings.simplefilter(
+                "ignore"
+            )  # what is out of order is said, and that is counted below
             data = Pipeline(steps).run(scene(camera(7), target="az 150 deg el 50 deg"), threads=1)
     (o,) = data.observations
-    expected = np.isin(np.arange(6000), [*range(1000, 1010), 2000, 3000, 3500, 5000, *range(4000, 4200)])
+    expected = np.isin(
+        np.arange(6000), [*range(1000, 1010), 2000, 3000, 3500, 5000, *range(4000, 4200)]
+    )
     wrong = abs(o.n_samples - 6000) + int(np.count_nonzero((o.flags != 0) != expected))
     wrong += abs(int(np.nansum(data.products["map"].hits)) - 7 * int((~expected).sum()))
     wrong += int(np.count_nonzero(abs(o.seconds - t) > 1e-6))
@@ -93,6 +115,8 @@ def recorded_gaps_and_nan() -> Measured:
         "samples in gaps, flagged": 203,
         "samples whose row is not a number, flagged": 11,
     }
-    wrong += sum(abs(o.tally.get("PointingRecorded", what) - number) for what, number in counts.items())
+    wrong += sum(
+        abs(o.tally.get("PointingRecorded", what) - number) for what, number in counts.items()
+    )
     bridged = o.tally.get("HighpassFilter", "flagged samples bridged before filtering")
     return wrong + abs(bridged - 214), f"{bridged} flagged, bridged by the filter, without hits"

@@ -35,8 +35,12 @@ def fresh_registries(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture
-def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fresh_registries: None) -> Iterator[Callable[..., Path]]:
-    """``plugin("zonda-toltec", "1.2", {"zonda.sites": {"name": "module:attr"}}, module="source")`` fakes a distribution."""
+def plugin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fresh_registries: None
+) -> Iterator[Callable[..., Path]]:
+    """``plugin("zonda-toltec", "1.2", {"zonda.sites": {"name": "module:attr"}}, module="source")``
+    fakes a distribution.
+    """
     folder = tmp_path / "site-packages"
     folder.mkdir()
     monkeypatch.syspath_prepend(str(folder))
@@ -46,7 +50,10 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fresh_registries: No
         info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
         info.mkdir()
         (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-        lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in points.items()) for group, points in groups.items()]
+        lines = [
+            f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in points.items())
+            for group, points in groups.items()
+        ]
         (info / "entry_points.txt").write_text("\n".join(lines))
         for module, text in modules.items():
             (folder / f"{module}.py").write_text(text)
@@ -146,13 +153,21 @@ def toy_camera() -> Instrument:
 @pytest.fixture
 def toys(fresh_registries: None) -> Any:
     """Toy operators, site, band and instrument, registered as a script would."""
-    registry.sites.register(Site(name="toy_site", latitude="38 deg", longitude="-79 deg", altitude="800 m"))
+    registry.sites.register(
+        Site(name="toy_site", latitude="38 deg", longitude="-79 deg", altitude="800 m")
+    )
     registry.bands.register(Band(name="toy_band", low="78 GHz", high="108 GHz"))
     registry.instruments.register(toy_camera)
     for operator in (ToyPointing, ToySky, ToyNoise, ToySum):
         registry.operators.register(operator)
     registry.operators.register(ToyMap)
     return SimpleNamespace(
-        head="site: toy_site\ninstrument: toy_camera\ntime: 2024-11-25T07:00\ntarget: 05h00m00s +20d00m00s\nseed: 3\n",
-        steps="operators:\n  - ToyPointing: {duration: 45 min}\n  - ToySky\n  - ToyNoise\n  - ToySum:\n  - ToyMap\n",
+        head=(
+            "site: toy_site\ninstrument: toy_camera\ntime: 2024-11-25T07:00\ntarget: 05h00m00s"
+            " +20d00m00s\nseed: 3\n"
+        ),
+        steps=(
+            "operators:\n  - ToyPointing: {duration: 45 min}\n  - ToySky\n  - ToyNoise\n  -"
+            " ToySum:\n  - ToyMap\n"
+        ),
     )

@@ -1,4 +1,6 @@
-"""Processes that zonda starts find no modules in the folder they run in, and all that this one finds."""
+"""Processes that zonda starts find no modules in the folder they run in, and all that this one
+finds.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,14 @@ NAMES = (
 )
 """Of modules that children import; a folder of the user may hold files of these names."""
 
-SHORT = ("--set", "PointingDaisy.scan_duration=4 s", "--set", "PointingDaisy.scans=2", "--threads", "1")
+SHORT = (
+    "--set",
+    "PointingDaisy.scan_duration=4 s",
+    "--set",
+    "PointingDaisy.scans=2",
+    "--threads",
+    "1",
+)
 
 CAMPAIGN = f"""\
 {camera(7)}campaign: {{nights: 2}}
@@ -43,7 +52,10 @@ operators:
   - SaveMap
 """
 
-START = "import sys\nfrom zonda.core.cli import main\nif __name__ == '__main__':\n    sys.exit(main(sys.argv[1:]))\n"
+START = (
+    "import sys\nfrom zonda.core.cli import main\nif __name__ == '__main__':\n   "
+    " sys.exit(main(sys.argv[1:]))\n"
+)
 
 
 @pytest.fixture
@@ -52,7 +64,10 @@ def hostile(tmp_path: Path) -> Path:
     folder = tmp_path / "here"
     folder.mkdir()
     for name in NAMES:
-        trap = f"open({str(tmp_path / 'sprung')!r}, 'a').write({name!r} + '\\n')\nraise ImportError('{name}.py of this folder')\n"
+        trap = (
+            f"open({str(tmp_path / 'sprung')!r}, 'a').write({name!r} + '\\n')\nraise"
+            f" ImportError('{name}.py of this folder')\n"
+        )
         (folder / f"{name}.py").write_text(trap)
     return folder
 
@@ -65,12 +80,16 @@ def environment(folder: Path, **more: str) -> dict[str, str]:
 
 
 def zonda(hostile: Path, *arguments: Any) -> subprocess.CompletedProcess[str]:
-    """The command in the hostile folder. It is started by a script of another one, as an installed `zonda` is."""
+    """The command in the hostile folder. It is started by a script of another one, as an installed
+    `zonda` is.
+    """
     start = hostile.parent / "bin" / "start.py"
     start.parent.mkdir(exist_ok=True)
     start.write_text(START)
     command = [sys.executable, str(start), *map(str, arguments)]
-    return subprocess.run(command, cwd=hostile, env=environment(hostile.parent), capture_output=True, text=True)
+    return subprocess.run(
+        command, cwd=hostile, env=environment(hostile.parent), capture_output=True, text=True
+    )
 
 
 def unsprung(hostile: Path, done: subprocess.CompletedProcess[str]) -> None:
@@ -81,7 +100,10 @@ def unsprung(hostile: Path, done: subprocess.CompletedProcess[str]) -> None:
 
 def test_the_traps_work(hostile: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", "import h5py"], cwd=hostile, env=environment(hostile.parent), capture_output=True
+        [sys.executable, "-c", "import h5py"],
+        cwd=hostile,
+        env=environment(hostile.parent),
+        capture_output=True,
     )
     assert done.returncode == 1
     assert "h5py" in (hostile.parent / "sprung").read_text().split()
@@ -89,7 +111,10 @@ def test_the_traps_work(hostile: Path) -> None:
 
 def test_a_run_with_its_pictures(hostile: Path) -> None:
     """A first run: beside it one process compiles and one draws."""
-    unsprung(hostile, zonda(hostile, "run", "mustang2_cluster", *SHORT, "--output", hostile.parent / "out"))
+    unsprung(
+        hostile,
+        zonda(hostile, "run", "mustang2_cluster", *SHORT, "--output", hostile.parent / "out"),
+    )
 
 
 def test_a_plan(hostile: Path) -> None:
@@ -108,7 +133,13 @@ def test_a_study_of_accuracy(hostile: Path, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize("engine", ["serial", "processes"])
 def test_a_campaign(hostile: Path, engine: str) -> None:
     (hostile.parent / "c.yaml").write_text(CAMPAIGN)
-    options = ("--engine", engine, "--output", hostile.parent / "out", *(("--workers", "2") if engine == "processes" else ()))
+    options = (
+        "--engine",
+        engine,
+        "--output",
+        hostile.parent / "out",
+        *(("--workers", "2") if engine == "processes" else ()),
+    )
     unsprung(hostile, zonda(hostile, "run", hostile.parent / "c.yaml", *options))
 
 
@@ -126,10 +157,14 @@ def test_the_first_look_at_a_file(hostile: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_modules_of_pythonpath_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also those of a folder that was put into the path later, and arguments arrive as they are."""
-    (tmp_path / "za_child.py").write_text("def main(*given):\n    print(*map(repr, given))\n    return len(given)\n")
+    (tmp_path / "za_child.py").write_text(
+        "def main(*given):\n    print(*map(repr, given))\n    return len(given)\n"
+    )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir("/")
-    done = subprocess.run(children.command("za_child", "main", 3, 'it\'s \\ "so"'), capture_output=True, text=True)
+    done = subprocess.run(
+        children.command("za_child", "main", 3, 'it\'s \\ "so"'), capture_output=True, text=True
+    )
     assert done.returncode == 2, done.stderr
     assert done.stdout == "3 " + repr('it\'s \\ "so"') + "\n"
 

@@ -18,7 +18,11 @@ from zonda.core import cli
 from zonda.core.command_types import Bytes
 
 HEAVY = ("numpy", "astropy", "numba", "healpy", "scipy", "matplotlib", "h5py", "pydantic")
-RUN = [sys.executable, "-c", "import sys; from zonda.core.cli import main; sys.exit(main(sys.argv[1:]))"]
+RUN = [
+    sys.executable,
+    "-c",
+    "import sys; from zonda.core.cli import main; sys.exit(main(sys.argv[1:]))",
+]
 
 TOYS = '''
 import errno, os, time
@@ -99,12 +103,17 @@ POINTS = {
     "zonda.instruments": {"zc_camera": "zc_toys:camera"},
     "zonda.hooks": {"zc": "zc_toys"},
 }
-PIPELINE = "site: zc_site\ninstrument: zc_camera\ntime: 2024-11-25T07:00\noperators: [Stare, Ones, Total]\n"
+PIPELINE = (
+    "site: zc_site\ninstrument: zc_camera\ntime: 2024-11-25T07:00\noperators: [Stare, Ones,"
+    " Total]\n"
+)
 
 
 @pytest.fixture
 def here(plugin: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a pipeline file ``p.yaml``, whose operators come from a fake plugin; its site-packages are beside it."""
+    """A folder with a pipeline file ``p.yaml``, whose operators come from a fake plugin; its
+    site-packages are beside it.
+    """
     plugin("zonda-zc", "3.1", POINTS, zc_toys=TOYS)
     folder = tmp_path / "work"
     folder.mkdir()
@@ -125,10 +134,16 @@ def test_help_and_import_are_light() -> None:
             f"import sys, zonda; from zonda.core.cli import main; main({arguments});"
             f"print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
         )
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        )
         assert done.stderr.strip() == "[]"
     done = subprocess.run(
-        [sys.executable, "-c", f"import sys, zonda; print([m for m in {HEAVY} if m in sys.modules])"],
+        [
+            sys.executable,
+            "-c",
+            f"import sys, zonda; print([m for m in {HEAVY} if m in sys.modules])",
+        ],
         capture_output=True,
         text=True,
         check=True,
@@ -141,7 +156,9 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.strip() == f"zonda {__version__}"
 
 
-def test_help_lists_commands_of_plugins(here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_lists_commands_of_plugins(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cli.zonda, "_extended", False)
     monkeypatch.setattr(cli.zonda, "commands", dict(cli.zonda.commands))
     assert cli.main(["--help"]) == 0
@@ -154,7 +171,10 @@ def test_help_lists_commands_of_plugins(here: Path, capsys: pytest.CaptureFixtur
 
 
 def test_run(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["run", "p.yaml", "--set", "Ones.value=2", "--threads", "2", "--memory", "4GB"]) == 0
+    assert (
+        cli.main(["run", "p.yaml", "--set", "Ones.value=2", "--threads", "2", "--memory", "4GB"])
+        == 0
+    )
     out, err = capsys.readouterr()
     assert out == "out/p/\n"
     assert f"Ones: samples: {7 * 4096}" in err
@@ -168,7 +188,12 @@ def test_run(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_check(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", "p.yaml"]) == 0
-    assert capsys.readouterr().out.splitlines() == ["p.yaml: no mistakes, 3 steps", "  Stare", "  Ones", "  Total"]
+    assert capsys.readouterr().out.splitlines() == [
+        "p.yaml: no mistakes, 3 steps",
+        "  Stare",
+        "  Ones",
+        "  Total",
+    ]
     assert cli.main(["check", "p.yaml", "--set", "Ones.valu=2", "--set", "sed=1"]) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -191,7 +216,9 @@ def test_check_points_the_telescope(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", "mustang2_cluster"]) == 0
     out = capsys.readouterr().out
     assert "    5 scans from 2024-11-25T07:00:00Z\n    elevation: 61.1" in out
-    assert re.search(r"largest speed of the axes: azimuth 16\d\.?\d* arcsec/s \([\d.]+ % of 0.6 deg/s\)", out)
+    assert re.search(
+        r"largest speed of the axes: azimuth 16\d\.?\d* arcsec/s \([\d.]+ % of 0.6 deg/s\)", out
+    )
     assert re.search(r"samples per FWHM of 8.5 arcsec: 15\.\d", out)
     assert cli.main(["check", "mustang2_cluster", "--set", "time=2024-11-25T18:00"]) == 2
     assert "GBT reaches 5 deg to 88 deg" in capsys.readouterr().err
@@ -199,13 +226,25 @@ def test_check_points_the_telescope(capsys: pytest.CaptureFixture[str]) -> None:
     assert "this would fit: speed" in capsys.readouterr().err
 
 
-def test_plugins(here: Path, plugin: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_plugins(
+    here: Path, plugin: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["plugins"]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["site", "zc_site", "zonda-zc", "3.1", "zc_toys:site"] in rows
     assert ["hook", "zc", "zonda-zc", "3.1", "zc_toys"] in rows
-    plugin("zonda-broken", "0.9", {"zonda.sites": {"cliff": "zc_broken:cliff"}}, zc_broken="import not_to_be_found\n")
-    plugin("zonda-typo", "0.8", {"zonda.hooks": {"x": "zc_typo"}}, zc_typo="def zonda_progress(done): ...\n")
+    plugin(
+        "zonda-broken",
+        "0.9",
+        {"zonda.sites": {"cliff": "zc_broken:cliff"}},
+        zc_broken="import not_to_be_found\n",
+    )
+    plugin(
+        "zonda-typo",
+        "0.8",
+        {"zonda.hooks": {"x": "zc_typo"}},
+        zc_typo="def zonda_progress(done): ...\n",
+    )
     plugin("zonda-twin", "0.7", {"zonda.sites": {"zc_site": "zc_toys:site"}})
     assert cli.main(["plugins", "--check"]) == 1
     out, err = capsys.readouterr()
@@ -216,17 +255,23 @@ def test_plugins(here: Path, plugin: Callable[..., Path], capsys: pytest.Capture
     assert "zonda-typo 0.8" in err
 
 
-def test_pipelines(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_pipelines(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     from zonda.core.configuration import locate
 
     (tmp_path / "one.yaml").write_text("description: The first\n")
     (tmp_path / "two.yaml").write_text("name: two\n")
-    monkeypatch.setattr(locate, "shipped", lambda: {p.stem: p for p in sorted(tmp_path.glob("*.yaml"))})
+    monkeypatch.setattr(
+        locate, "shipped", lambda: {p.stem: p for p in sorted(tmp_path.glob("*.yaml"))}
+    )
     assert cli.main(["pipelines"]) == 0
     assert capsys.readouterr().out == "one  The first\ntwo  \n"
 
 
-def test_shipped_pipelines_go_by_name(here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_shipped_pipelines_go_by_name(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     from zonda.core.configuration import locate
 
     monkeypatch.setattr(locate, "shipped", lambda: {"toy_cluster": here / "p.yaml"})
@@ -248,11 +293,20 @@ def test_schema(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (["run", "."], ".: is a folder, not a pipeline file"),
         (["run", "empty.yaml"], "this pipeline file is empty"),
         (["run", "latin.yaml"], "is not UTF-8 text"),
-        (["run", "p.yaml", "--set", "Total.after=full"], "total.txt: cannot be written: no space left on the disk"),
+        (
+            ["run", "p.yaml", "--set", "Total.after=full"],
+            "total.txt: cannot be written: no space left on the disk",
+        ),
         (["run", "p.yaml", "--output", "p.yaml"], "p.yaml"),
-        (["run", "p.yaml", "--memory", "4 apples"], "'4 apples' is not a size; write e.g. 4GB or 500MiB"),
+        (
+            ["run", "p.yaml", "--memory", "4 apples"],
+            "'4 apples' is not a size; write e.g. 4GB or 500MiB",
+        ),
         (["run", "p.yaml", "--memory", "1kB"], "memory budget"),
-        (["run", "p.yaml", "--memory", "1000"], "'1000' has no unit and would be bytes; write e.g. 1GB or 500MiB"),
+        (
+            ["run", "p.yaml", "--memory", "1000"],
+            "'1000' has no unit and would be bytes; write e.g. 1GB or 500MiB",
+        ),
         (["run", "p.yaml", "--threads", "0"], "0 is not in the range"),
         (["run"], "Missing argument"),
         (["rnu", "p.yaml"], "there is no command 'rnu'; did you mean 'run'?"),
@@ -273,14 +327,19 @@ def test_a_users_mistake_is_exit_status_2_without_traceback(
     assert not list(here.rglob("total.txt"))
 
 
-def test_operating_system_errors(here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_operating_system_errors(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(error: OSError) -> Any:
         def load(*arguments: Any) -> Any:
             raise error
 
         return load
 
-    monkeypatch.setattr("zonda.core.cli.check.load", fail(PermissionError(errno.EACCES, "Permission denied", "secret.fits")))
+    monkeypatch.setattr(
+        "zonda.core.cli.check.load",
+        fail(PermissionError(errno.EACCES, "Permission denied", "secret.fits")),
+    )
     assert cli.main(["check", "p.yaml"]) == 2
     assert capsys.readouterr().err == "error: secret.fits: Permission denied\n"
     monkeypatch.setattr(
@@ -290,7 +349,9 @@ def test_operating_system_errors(here: Path, capsys: pytest.CaptureFixture[str],
         cli.main(["check", "p.yaml"])
 
 
-def test_a_fault_of_the_program_shows_its_traceback(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_of_the_program_shows_its_traceback(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from zonda.core.pipeline import Pipeline
 
     def broken(*_: Any) -> None:
@@ -303,17 +364,24 @@ def test_a_fault_of_the_program_shows_its_traceback(here: Path, monkeypatch: pyt
 
 def test_a_fault_of_a_plugin_is_told(here: Path, capsys: Any) -> None:
     assert cli.main(["run", "p.yaml", "--set", "Total.after=fault"]) == 2
-    assert "Total: zc_toys.Total.finalize of zonda-zc 3.1 raised RuntimeError: a fault of the program" in capsys.readouterr().err
+    assert (
+        "Total: zc_toys.Total.finalize of zonda-zc 3.1 raised RuntimeError: a fault of the program"
+        in capsys.readouterr().err
+    )
     assert not [p for p in here.rglob("*") if "total" in p.name]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent as POSIX does")
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_interrupted(here: Path, number: str) -> None:
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(here.parent / "site-packages"), *sys.path])}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(here.parent / "site-packages"), *sys.path])
+    }
     command = [*RUN, "run", "p.yaml", "--set", "Total.after=sleep"]
 
-    def listen() -> None:  # a shell starts background jobs with Ctrl-C ignored, which children inherit
+    def listen() -> (
+        None
+    ):  # a shell starts background jobs with Ctrl-C ignored, which children inherit
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
@@ -329,7 +397,9 @@ def test_interrupted(here: Path, number: str) -> None:
     assert [p for p in here.rglob("*") if p.is_file()] == [here / "p.yaml"]
 
 
-def test_too_little_memory(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_little_memory(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def command(*arguments: object, **options: object) -> None:
         raise MemoryError("Unable to allocate 8 EB")
 
@@ -341,7 +411,9 @@ def test_too_little_memory(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent as POSIX does")
-def test_signals_that_are_ignored_or_handled_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signals_that_are_ignored_or_handled_are_left_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     seen = {}
 
@@ -377,11 +449,22 @@ def test_sizes(text: str, size: int) -> None:
 
 
 def test_warnings_are_one_line(here: Path, plugin: Callable[..., Path]) -> None:
-    plugin("zonda-typo", "0.8", {"zonda.hooks": {"x": "zc_typo"}}, zc_typo="def zonda_progress(done): ...\n")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(here.parent / "site-packages"), *sys.path])}
-    done = subprocess.run([*RUN, "--help"], capture_output=True, text=True, env=environment, check=True)
+    plugin(
+        "zonda-typo",
+        "0.8",
+        {"zonda.hooks": {"x": "zc_typo"}},
+        zc_typo="def zonda_progress(done): ...\n",
+    )
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(here.parent / "site-packages"), *sys.path])
+    }
+    done = subprocess.run(
+        [*RUN, "--help"], capture_output=True, text=True, env=environment, check=True
+    )
     (line,) = done.stderr.splitlines()
-    assert line.startswith("warning: plugin zonda-typo 0.8 (zc_typo): 'zonda_progress' is not called")
+    assert line.startswith(
+        "warning: plugin zonda-typo 0.8 (zc_typo): 'zonda_progress' is not called"
+    )
 
 
 def test_a_shipped_pipeline_given_as_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -391,7 +474,9 @@ def test_a_shipped_pipeline_given_as_command(capsys: pytest.CaptureFixture[str])
 
 def test_python_m_zonda_is_the_command() -> None:
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run([sys.executable, "-m", "zonda", *arguments], capture_output=True, text=True, check=False)
+        return subprocess.run(
+            [sys.executable, "-m", "zonda", *arguments], capture_output=True, text=True, check=False
+        )
 
     assert __version__ in run("--version").stdout
     wrong = run("check", "nowhere.yaml")

@@ -1,6 +1,8 @@
-"""Plans, audits, forecasts and accuracies of cameras with several bands: every number is that of its band.
+"""Plans, audits, forecasts and accuracies of cameras with several bands: every number is that of
+its band.
 
-The two bands share nothing that a default could hide: NET, beam, knee, efficiencies and passband differ.
+The two bands share nothing that a default could hide: NET, beam, knee, efficiencies and passband
+differ.
 """
 
 import json
@@ -61,20 +63,33 @@ def test_a_band_is_planned_as_in_a_camera_that_has_no_other(path: Path) -> None:
         alone = zonda.plan(zonda.load(path, [f"instrument.band={name}"]), threads=1)
         one = both.plans[name]
         assert one.noise == alone.noise
-        assert [(d.name, d.choice) for d in one.decided] == [(d.name, d.choice) for d in alone.decided]
+        assert [(d.name, d.choice) for d in one.decided] == [
+            (d.name, d.choice) for d in alone.decided
+        ]
     samples = [both.plans[name].noise[0] for name in NAMES]
-    assert samples[1] / samples[0] == pytest.approx(700 / 300, rel=0.05)  # the load of the atmosphere raises both a little
-    beams = [d.name for name in NAMES for d in both.plans[name].decided if "samples per FWHM" in d.name]
-    assert beams == ["PointingDaisy.samples per FWHM of 137 arcsec", "PointingDaisy.samples per FWHM of 84 arcsec"]
+    assert samples[1] / samples[0] == pytest.approx(
+        700 / 300, rel=0.05
+    )  # the load of the atmosphere raises both a little
+    beams = [
+        d.name for name in NAMES for d in both.plans[name].decided if "samples per FWHM" in d.name
+    ]
+    assert beams == [
+        "PointingDaisy.samples per FWHM of 137 arcsec",
+        "PointingDaisy.samples per FWHM of 84 arcsec",
+    ]
 
 
 @pytest.mark.parametrize("pixels", ["shared", "separate"])
 def test_a_forecast_counts_once_what_bands_in_step_do_once(pixels: str) -> None:
-    """Of maps of I, Q and U 0.4, of a turbulence that each detector looks through by itself as much; of the rest nothing.
+    """Of maps of I, Q and U 0.4, of a turbulence that each detector looks through by itself as
+    much; of the rest nothing.
 
-    This machine's speed is measured by each plan: the ratio to another step of the same kind of kernel is compared.
+    This machine's speed is measured by each plan: the ratio to another step of the same kind of
+    kernel is compared.
     """
-    text = PIPELINE.replace("PIXELS", pixels).replace("  detectors: 38", "  polarization: pairs\n  detectors: 380")
+    text = PIPELINE.replace("PIXELS", pixels).replace(
+        "  detectors: 38", "  polarization: pairs\n  detectors: 380"
+    )
     changes = (
         ("30 arcmin", "6 deg"),
         ("30 s", "20 min"),
@@ -88,16 +103,23 @@ def test_a_forecast_counts_once_what_bands_in_step_do_once(pixels: str) -> None:
         file = parse(text, overrides=[] if name == "both" else [f"instrument.band={name}"])
         forecast = zonda.plan(file, threads=1, prune_all=False).summary.prediction
         stream = forecast.seconds["HighpassFilter"]
-        seconds[name] = {label: forecast.seconds[label] / stream for label in ("AtmosphereLayers", "BinMap", "CommonModeFilter")}
+        seconds[name] = {
+            label: forecast.seconds[label] / stream
+            for label in ("AtmosphereLayers", "BinMap", "CommonModeFilter")
+        }
     for label, ratio in seconds["both"].items():
         alone = sum(seconds[name][label] for name in NAMES) / 2
         shared = pixels == "shared" and label != "CommonModeFilter"
-        assert ratio / alone == pytest.approx(0.8 if shared else 1.0, rel=0.05), label  # (2 - 0.4) / 2
+        assert ratio / alone == pytest.approx(0.8 if shared else 1.0, rel=0.05), (
+            label
+        )  # (2 - 0.4) / 2
 
 
 @pytest.mark.parametrize("path", ["separate"], indirect=True)
 def test_arrays_side_by_side_are_planned_where_they_are(path: Path) -> None:
-    """Effects that grow with the distance from the boresight are those of the whole camera, not of an array about it."""
+    """Effects that grow with the distance from the boresight are those of the whole camera, not of
+    an array about it.
+    """
     both = zonda.plan(zonda.load(path), threads=1)
     alone = zonda.plan(zonda.load(path, ["instrument.band=low"]), threads=1)
     plane = zonda.load(path).scene().instrument.focalplane()
@@ -110,13 +132,22 @@ def test_arrays_side_by_side_are_planned_where_they_are(path: Path) -> None:
 
 
 def test_audit_of_each_band(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["plan", str(path), "--audit", "--threads", "1", "--drop", "poles", "--json"]) == 0
+    assert (
+        cli.main(["plan", str(path), "--audit", "--threads", "1", "--drop", "poles", "--json"]) == 0
+    )
     found = json.loads(capsys.readouterr().out)["bands"]
     assert [*found] == NAMES
-    actual = {name: {(r["effect"], r["metric"]): r["actual"] for r in found[name]["rows"]} for name in NAMES}
+    actual = {
+        name: {(r["effect"], r["metric"]): r["actual"] for r in found[name]["rows"]}
+        for name in NAMES
+    }
     for metric, ratio in (("white noise", 700 / 300), ("PinkNoise.poles", 700 / 300)):
-        low, high = (next(v for (effect, _), v in actual[name].items() if effect == metric) for name in NAMES)
-        assert high > 0.9 * ratio * low > 0  # a knee ten times higher makes the poles' error larger still
+        low, high = (
+            next(v for (effect, _), v in actual[name].items() if effect == metric) for name in NAMES
+        )
+        assert (
+            high > 0.9 * ratio * low > 0
+        )  # a knee ten times higher makes the poles' error larger still
 
 
 def test_the_verdict_of_an_audit_is_that_of_the_worst_band() -> None:
@@ -136,15 +167,23 @@ def test_sensitivity_of_each_band(path: Path, tmp_path: Path) -> None:
     for name in NAMES:
         alone = zonda.sensitivity(str(path), settings=[f"instrument.band={name}"])
         for part in ("white", "1/f", "atmosphere"):
-            assert found[name].rms(part=part) == pytest.approx(alone.rms(part=part), rel=0, abs=0, nan_ok=True)
-            assert part == "atmosphere" or found[name].rms(part=part) > 0  # behind a singular mode there is no forecast of it
+            assert found[name].rms(part=part) == pytest.approx(
+                alone.rms(part=part), rel=0, abs=0, nan_ok=True
+            )
+            assert (
+                part == "atmosphere" or found[name].rms(part=part) > 0
+            )  # behind a singular mode there is no forecast of it
         assert found[name].factors == alone.factors
         assert found[name].radius == alone.radius
     assert found.reach("1 mK") == max(found[name].reach("1 mK") for name in NAMES)
     paths = found.write(tmp_path / "depths")
     assert [p.name for p in paths] == [
-        "sensitivity_low.ecsv", "sensitivity_low.png", "sensitivity_high.ecsv", "sensitivity_high.png", "pipeline.yaml",
-    ]  # fmt: skip
+        "sensitivity_low.ecsv",
+        "sensitivity_low.png",
+        "sensitivity_high.ecsv",
+        "sensitivity_high.png",
+        "pipeline.yaml",
+    ]
     assert Table.read(tmp_path / "depths" / "sensitivity_high.ecsv").meta["BAND"] == "high"
     with pytest.raises(ZondaError, match="there is no band 'f150'"):
         found["f150"]
@@ -152,11 +191,15 @@ def test_sensitivity_of_each_band(path: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", ["separate"], indirect=True)
 def test_depths_of_arrays_side_by_side_are_as_simulated(path: Path) -> None:
-    """Within 4 standard errors; the array is 7.5 arcmin beside the boresight, which is where the circle is.
+    """Within 4 standard errors; the array is 7.5 arcmin beside the boresight, which is where the
+    circle is.
 
-    Behind the detectors' mean: noise would turn a singular mode, and of what that leaves there is no forecast.
+    Behind the detectors' mean: noise would turn a singular mode, and of what that leaves there is
+    no forecast.
     """
-    path.write_text(path.read_text().replace("CommonModeFilter", "CommonModeFilter: {method: mean}"))
+    path.write_text(
+        path.read_text().replace("CommonModeFilter", "CommonModeFilter: {method: mean}")
+    )
     found = zonda.sensitivity(str(path), radius="8 arcmin").audited(6, threads=1)
     for name in NAMES:
         rows = found[name].audit.rows
@@ -176,11 +219,22 @@ def test_sensitivity_on_the_command_line(path: Path, capsys: pytest.CaptureFixtu
     assert table["reach"]["seconds"] == zonda.sensitivity(str(path)).reach("1 mK")
 
 
-def test_error_of_a_run_is_the_worst_bands(path: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert cli.main(["run", str(path), "--output", str(tmp_path / "out"), "--verify", "--threads", "1"]) == 0
-    line = next(row for row in capsys.readouterr().err.splitlines() if row.startswith("error of map_rms"))
+def test_error_of_a_run_is_the_worst_bands(
+    path: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert (
+        cli.main(
+            ["run", str(path), "--output", str(tmp_path / "out"), "--verify", "--threads", "1"]
+        )
+        == 0
+    )
+    line = next(
+        row for row in capsys.readouterr().err.splitlines() if row.startswith("error of map_rms")
+    )
     total, each = line.split(": ")[1].split(" (the largest of ")
-    errors = {part.split()[0]: float(part.split()[1]) for part in each.removesuffix(")").split(", ")}
+    errors = {
+        part.split()[0]: float(part.split()[1]) for part in each.removesuffix(")").split(", ")
+    }
     assert [*errors] == NAMES
     assert float(total.split()[0]) == max(errors.values()) > 0
 
@@ -216,24 +270,51 @@ def test_a_name_that_ends_like_another_bands() -> None:
     """Products of the band ``b_a`` are not taken for those of ``a``."""
     bands = [{"name": name, "low": "77 GHz", "high": "106 GHz"} for name in ("a", "b_a")]
     camera = zonda.Instrument(
-        name="c", telescope={"name": "d", "diameter": "6 m"}, bands=bands, detectors=1, field_of_view="1 arcmin",
-        main_beam_efficiency=0.8, illumination_efficiency=0.9, net="1 mK s(1/2)", sample_rate="10 Hz",
-    )  # fmt: skip
-    scene = zonda.Scene(site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d")
-    own = each_band(zonda.Data(scene, products={"map_a": 1, "map_b_a": 2, "sky/map_b_a": 3, "other": 4}))
+        name="c",
+        telescope={"name": "d", "diameter": "6 m"},
+        bands=bands,
+        detectors=1,
+        field_of_view="1 arcmin",
+        main_beam_efficiency=0.8,
+        illumination_efficiency=0.9,
+        net="1 mK s(1/2)",
+        sample_rate="10 Hz",
+    )
+    scene = zonda.Scene(
+        site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d"
+    )
+    own = each_band(
+        zonda.Data(scene, products={"map_a": 1, "map_b_a": 2, "sky/map_b_a": 3, "other": 4})
+    )
     assert own["a"].products == {"map": 1}
     assert own["b_a"].products == {"map": 2, "sky/map": 3}
 
 
-def test_accuracy_on_the_command_line(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_accuracy_on_the_command_line(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     command = [
-        "accuracy", str(path), "--knob", "precision", "--repeats", "2", "--seeds", "1", "--output", str(tmp_path / "accuracy"),
-        "--duration", "10 s", "--json",
-    ]  # fmt: skip
+        "accuracy",
+        str(path),
+        "--knob",
+        "precision",
+        "--repeats",
+        "2",
+        "--seeds",
+        "1",
+        "--output",
+        str(tmp_path / "accuracy"),
+        "--duration",
+        "10 s",
+        "--json",
+    ]
     assert cli.main(command) == 0
     found = json.loads(capsys.readouterr().out)
     present = found["present"]
     assert [*present["bands"]] == NAMES
     assert present["error"] == max(present["bands"].values()) > 0
     assert found["says"].endswith("the largest of all bands")
-    assert "error of each band, of which the largest counts" in (tmp_path / "accuracy" / "accuracy.txt").read_text()
+    assert (
+        "error of each band, of which the largest counts"
+        in (tmp_path / "accuracy" / "accuracy.txt").read_text()
+    )

@@ -8,7 +8,9 @@ from zonda.core.data import Tally, percent
 
 
 def test_counts_are_told_with_their_share():
-    """Parts and wholes are added up over scans; what happened to none has no share, nor what was counted among nothing."""
+    """Parts and wholes are added up over scans; what happened to none has no share, nor what was
+    counted among nothing.
+    """
     tally, other = Tally(), Tally()
     tally.count("SkyMap", "samples outside", 30, 1000)
     other.count("SkyMap", "samples outside", 173, 0)
@@ -29,7 +31,14 @@ def test_counts_are_told_with_their_share():
 
 
 @pytest.mark.parametrize(
-    ("share", "text"), [(0.20345, "20.3 %"), (1.0, "100 %"), (0.99999, "more than 99.9 %"), (1e-9, "1e-07 %"), (0.5, "50 %")]
+    ("share", "text"),
+    [
+        (0.20345, "20.3 %"),
+        (1.0, "100 %"),
+        (0.99999, "more than 99.9 %"),
+        (1e-9, "1e-07 %"),
+        (0.5, "50 %"),
+    ],
 )
 def test_shares_are_readable(share, text):
     assert percent(share) == text

@@ -19,7 +19,9 @@ STEPS = (
 
 @pytest.fixture(scope="module")
 def data():
-    pipeline = zonda.Pipeline([*STEPS, zonda.BinMap(pixel="6 arcsec")], runs={"quiet": {"without": ["white"]}})
+    pipeline = zonda.Pipeline(
+        [*STEPS, zonda.BinMap(pixel="6 arcsec")], runs={"quiet": {"without": ["white"]}}
+    )
     return pipeline.run(scene(camera(19)), keep=["signal", "atmosphere", "white"], threads=1)
 
 
@@ -35,7 +37,10 @@ def test_products_by_name(data):
     assert "map" in data
     assert "maps" not in data
     assert set(data) == set(data.products)
-    with pytest.raises(InputError, match=r"no product 'mpa'(.|\n)*did you mean 'map'(.|\n)*there are: map, quiet/map"):
+    with pytest.raises(
+        InputError,
+        match=r"no product 'mpa'(.|\n)*did you mean 'map'(.|\n)*there are: map, quiet/map",
+    ):
         data["mpa"]
 
 
@@ -49,7 +54,9 @@ def test_time_streams_of_a_scan(data):
 
 
 def test_they_are_complete(data):
-    """The signal is the sum of the components over the efficiency and the transmission, tens of kelvin of emission included."""
+    """The signal is the sum of the components over the efficiency and the transmission, tens of
+    kelvin of emission included.
+    """
     atmosphere, white = data.tod("atmosphere", 0), data.tod("white", 0)
     assert atmosphere.mean() > 5
     fluctuation = data.observations[0].detdata["atmosphere"]
@@ -59,7 +66,9 @@ def test_they_are_complete(data):
     zeta, epsilon = plane.main_beam_efficiency[:, None], plane.illumination_efficiency[:, None]
     transmission = observation.smooth["transmission"].evaluate(slice(0, 19), slice(0, 400))
     # float32: 2^-24 of what stands beside the mean, below 1 K of 70 K
-    np.testing.assert_allclose(data.tod("signal", 0), (epsilon * atmosphere + white) / (zeta * transmission), rtol=1e-6)
+    np.testing.assert_allclose(
+        data.tod("signal", 0), (epsilon * atmosphere + white) / (zeta * transmission), rtol=1e-6
+    )
 
 
 def test_block_by_block_is_the_same(data):
@@ -81,19 +90,26 @@ def test_what_is_not_there_is_said(data):
         data.tod("signal", "scan-01")
     with pytest.raises(InputError, match="no scan 2"):
         data.tod("signal", 2)
-    with pytest.raises(InputError, match=r"'pink' was not kept, only atmosphere and signal and white(.|\n)*keep=\["):
+    with pytest.raises(
+        InputError, match=r"'pink' was not kept, only atmosphere and signal and white(.|\n)*keep=\["
+    ):
         data.tod("pink", 0)
 
 
 def test_a_stream_that_nobody_makes_is_refused_at_once(monkeypatch):
     pipeline = zonda.Pipeline(STEPS)
     monkeypatch.setattr(zonda.PointingDaisy, "observe", lambda *args: pytest.fail("it began"))
-    with pytest.raises(PipelineError, match=r"'atmosphre' cannot be kept: no step makes it(.|\n)*did you mean 'atmosphere'"):
+    with pytest.raises(
+        PipelineError,
+        match=r"'atmosphre' cannot be kept: no step makes it(.|\n)*did you mean 'atmosphere'",
+    ):
         pipeline.run(scene(camera(3)), keep=["atmosphre"])
 
 
 def test_kept_streams_count_in_the_budget(monkeypatch):
-    """Two streams of two scans of 200 detectors, 30000 samples: 192 MB, refused where there is room for all but them."""
+    """Two streams of two scans of 200 detectors, 30000 samples: 192 MB, refused where there is room
+    for all but them.
+    """
     from zonda.core.machine import resident_memory
     from zonda.core.run import in_turn as module
 

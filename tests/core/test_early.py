@@ -38,7 +38,12 @@ operators: [PointingDaisy: {radius: 4 arcmin, speed: 50 arcsec/s, scan_duration:
 
 @pytest.fixture
 def started(plugin: Callable[..., Path]):
-    plugin("zonda-ze", "1", {early.GROUP: {"Draws": "ze_toys:Started", "Fails": "ze_toys:broken"}}, ze_toys=SOURCE)
+    plugin(
+        "zonda-ze",
+        "1",
+        {early.GROUP: {"Draws": "ze_toys:Started", "Fails": "ze_toys:broken"}},
+        ze_toys=SOURCE,
+    )
     yield lambda: sys.modules["ze_toys"].calls if "ze_toys" in sys.modules else []
     early.end()
 
@@ -48,7 +53,10 @@ def begin(tmp_path: Path, text: str) -> None:
     early.begin(str(tmp_path / "p.yaml"))
 
 
-@pytest.mark.parametrize("step", ["- Draws", "  - Draws: {a: 1}", "  - 'Draws': {}", '-  "Draws"', "- Draws # all", "- Draws :"])
+@pytest.mark.parametrize(
+    "step",
+    ["- Draws", "  - Draws: {a: 1}", "  - 'Draws': {}", '-  "Draws"', "- Draws # all", "- Draws :"],
+)
 def test_a_step_has_its_process(started, tmp_path, step):
     begin(tmp_path, f"name: x\noperators:\n{step}\n- Fails\n")
     (process,) = started()
@@ -58,7 +66,14 @@ def test_a_step_has_its_process(started, tmp_path, step):
 
 
 @pytest.mark.parametrize(
-    "step", ["- DrawsNot", "# - Draws", "description: - Draws it", "- Draws: {}\ncampaign: {}", "- Draws it"]
+    "step",
+    [
+        "- DrawsNot",
+        "# - Draws",
+        "description: - Draws it",
+        "- Draws: {}\ncampaign: {}",
+        "- Draws it",
+    ],
 )
 def test_other_text_has_none(started, tmp_path, step):
     begin(tmp_path, f"operators:\n{step}\n")
@@ -89,7 +104,9 @@ def test_a_pipe_is_left_to_who_reads_the_file(monkeypatch, tmp_path):
     assert opened == []
 
 
-def test_a_campaign_that_the_text_does_not_show_closes_it_before_it_begins(started, tmp_path, monkeypatch):
+def test_a_campaign_that_the_text_does_not_show_closes_it_before_it_begins(
+    started, tmp_path, monkeypatch
+):
     """Its tasks run for hours."""
     from click.testing import CliRunner
 
@@ -106,7 +123,9 @@ def test_a_campaign_that_the_text_does_not_show_closes_it_before_it_begins(start
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="looks for processes in /proc")
-@pytest.mark.parametrize(("more", "count"), [([], 1), (["--threads", "1"], 0), (["--engine", "serial"], 0)])
+@pytest.mark.parametrize(
+    ("more", "count"), [([], 1), (["--threads", "1"], 0), (["--engine", "serial"], 0)]
+)
 def test_a_mistake_in_the_file_is_told_as_ever_and_nothing_is_left(started, tmp_path, more, count):
     """The child of a run that ends at once ends with it."""
     log = tmp_path / "log"

@@ -118,13 +118,20 @@ def metric(data):
     act()
 '''
 GROUPS = {
-    "zonda.operators": {"Breaks": "zf_breaks:Breaks", "Measures": "zf_breaks:Measures", "Ends": "zf_breaks:Ends"},
+    "zonda.operators": {
+        "Breaks": "zf_breaks:Breaks",
+        "Measures": "zf_breaks:Measures",
+        "Ends": "zf_breaks:Ends",
+    },
     "zonda.planning": {"Breaks": "zf_breaks:Plans"},
     "zonda.noise_models": {"zf_noise": "zf_breaks:Noise"},
     "zonda.sites": {"zf_hill": "zf_breaks:hill"},
     "zonda.metrics": {"zf_metric": "zf_breaks:metric"},
 }
-HEAD = "version: 1\nname: faults\nseed: 5\nsite: {site}\ninstrument: mustang2\ntime: 2024-11-25T07:00\ntarget: 05h +20d\n"
+HEAD = (
+    "version: 1\nname: faults\nseed: 5\nsite: {site}\ninstrument: mustang2\ntime:"
+    " 2024-11-25T07:00\ntarget: 05h +20d\n"
+)
 STEPS = """operators:
   - PointingStare: {{scan_duration: 2 s}}
   - WhiteNoise: {noise}
@@ -134,23 +141,38 @@ STEPS = """operators:
 
 
 @pytest.fixture
-def breaks(plugin: Plugin, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str]]:
-    """Runs a command in this process, with a pipeline that holds a step that does ``how``; the exit status and what was said."""
+def breaks(
+    plugin: Plugin, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[int, str]]:
+    """Runs a command in this process, with a pipeline that holds a step that does ``how``; the exit
+    status and what was said.
+    """
     monkeypatch.chdir(tmp_path)
     for each in registry.registries:  # classes of the same name, of the test before
         monkeypatch.setattr(each, "_loaded", {})
 
     def run(
-        how: str, step: str = "", *command: str, site: str = "green_bank", noise: str = "{}", more: str = ""
+        how: str,
+        step: str = "",
+        *command: str,
+        site: str = "green_bank",
+        noise: str = "{}",
+        more: str = "",
     ) -> tuple[int, str]:
         if not (tmp_path / "site-packages" / "zf_breaks.py").exists():
             plugin("zf-breaks", "1.5", GROUPS, zf_breaks=BREAKS)
         import zf_breaks
 
         zf_breaks.HOW = how
-        text = HEAD.format(site=site) + STEPS.format(noise=noise, step=f"  - {step}\n" if step else "") + more
+        text = (
+            HEAD.format(site=site)
+            + STEPS.format(noise=noise, step=f"  - {step}\n" if step else "")
+            + more
+        )
         (tmp_path / "faults.yaml").write_text(text)
-        status = cli.main([*(command or ("run", "--threads", "2", "--output", "out")), "faults.yaml"])
+        status = cli.main(
+            [*(command or ("run", "--threads", "2", "--output", "out")), "faults.yaml"]
+        )
         return status, ""
 
     return run
@@ -178,13 +200,23 @@ def told(status: int, err: str, words: str, place: str) -> None:
 @pytest.mark.parametrize("where", PLACES)
 def test_whatever_method_ends_the_program(breaks: Any, capsys: Any, where: str) -> None:
     status, _ = breaks("sys.exit(0)", f"Breaks: {{where: {where}}}")
-    told(status, capsys.readouterr().err, WAYS["sys.exit(0)"], f"Breaks: zf_breaks.Breaks.{where} of zf-breaks 1.5 ")
+    told(
+        status,
+        capsys.readouterr().err,
+        WAYS["sys.exit(0)"],
+        f"Breaks: zf_breaks.Breaks.{where} of zf-breaks 1.5 ",
+    )
 
 
 @pytest.mark.parametrize("where", ["in_time_order", "memory", "traits", "estimate"])
 def test_planning_too(breaks: Any, capsys: Any, where: str) -> None:
     status, _ = breaks("sys.exit(0)", f"Breaks: {{where: {where}}}")
-    told(status, capsys.readouterr().err, WAYS["sys.exit(0)"], f"Breaks: zf_breaks.Plans.{where} of zf-breaks 1.5 ")
+    told(
+        status,
+        capsys.readouterr().err,
+        WAYS["sys.exit(0)"],
+        f"Breaks: zf_breaks.Plans.{where} of zf-breaks 1.5 ",
+    )
 
 
 @pytest.mark.parametrize("how", list(WAYS))
@@ -196,7 +228,9 @@ def test_whatever_is_raised_on_any_thread(breaks: Any, capsys: Any, how: str) ->
 @pytest.mark.parametrize("where", ["measure", "sweep"])
 def test_measuring(breaks: Any, capsys: Any, where: str) -> None:
     status, _ = breaks("sys.exit(0)", f"Measures: {{where: {where}}}")
-    told(status, capsys.readouterr().err, WAYS["sys.exit(0)"], "Measures: zf_breaks.Measures.measure")
+    told(
+        status, capsys.readouterr().err, WAYS["sys.exit(0)"], "Measures: zf_breaks.Measures.measure"
+    )
 
 
 @pytest.mark.parametrize("where", ["pointing", "scan", "maps", "end"])
@@ -214,7 +248,12 @@ def test_checking_a_pipeline(breaks: Any, capsys: Any, where: str) -> None:
 @pytest.mark.parametrize("how", ["sys.exit(0)", "KeyError"])
 def test_other_components(breaks: Any, capsys: Any, how: str) -> None:
     status, _ = breaks(how, "", noise="{model: zf_noise}")
-    told(status, capsys.readouterr().err, WAYS.get(how, "raised KeyError: 'x'"), ": zf_breaks.Noise.net of zf-breaks 1.5")
+    told(
+        status,
+        capsys.readouterr().err,
+        WAYS.get(how, "raised KeyError: 'x'"),
+        ": zf_breaks.Noise.net of zf-breaks 1.5",
+    )
     status, _ = breaks(how, "", "check", site="zf_hill")
     err = capsys.readouterr().err
     assert status == 2, err
@@ -235,12 +274,26 @@ def test_ctrl_c_stays_ctrl_c(breaks: Any, capsys: Any) -> None:
 
 
 def test_a_campaign_s_tasks(breaks: Any, capsys: Any) -> None:
-    """In worker processes, too: a task that ends its process would be taken for one that was killed, or for done."""
+    """In worker processes, too: a task that ends its process would be taken for one that was
+    killed, or for done.
+    """
     campaign = "campaign: {realizations: 2}\n"
-    status, _ = breaks("sys.exit(0)", "Breaks: {where: exec}", "run", "--engine", "serial", "--output", "out", more=campaign)
+    status, _ = breaks(
+        "sys.exit(0)",
+        "Breaks: {where: exec}",
+        "run",
+        "--engine",
+        "serial",
+        "--output",
+        "out",
+        more=campaign,
+    )
     err = capsys.readouterr().err
     assert status == 2, err
-    assert "tasks failed; the first is 0: Breaks: zf_breaks.Breaks.exec of zf-breaks 1.5 asked for the end" in err
+    assert (
+        "tasks failed; the first is 0: Breaks: zf_breaks.Breaks.exec of zf-breaks 1.5 asked for"
+        " the end" in err
+    )
 
 
 BAD = "import sys\nsys.exit(0)\n"
@@ -248,11 +301,17 @@ BAD = "import sys\nsys.exit(0)\n"
 
 def test_a_module_that_ends_the_program_at_import(plugin: Plugin, capsys: Any) -> None:
     plugin(
-        "zf-ends", "0.1", {"zonda.operators": {"Leaves": "zf_ends:Leaves"}, "zonda.sites": {"away": "zf_ends:away"}}, zf_ends=BAD
+        "zf-ends",
+        "0.1",
+        {"zonda.operators": {"Leaves": "zf_ends:Leaves"}, "zonda.sites": {"away": "zf_ends:away"}},
+        zf_ends=BAD,
     )
     assert cli.main(["plugins", "--check"]) == 1
     out, err = capsys.readouterr()
-    assert [line.split()[-1] for line in out.splitlines() if "zf-ends" in line] == ["FAILED", "FAILED"]
+    assert [line.split()[-1] for line in out.splitlines() if "zf-ends" in line] == [
+        "FAILED",
+        "FAILED",
+    ]
     assert "operator 'Leaves' could not be loaded from the plugin zf-ends 0.1; SystemExit: 0" in err
     assert "2 faults" in err
 
@@ -275,9 +334,13 @@ def zonda_commands(group):
 """
 
 
-def test_a_plugin_s_own_command_ends_as_it_likes(plugin: Plugin, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plugin_s_own_command_ends_as_it_likes(
+    plugin: Plugin, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cli.zonda, "commands", dict(cli.zonda.commands))
-    monkeypatch.setattr(cli.zonda, "_extended", False)  # another test may have asked for the plugins' commands
+    monkeypatch.setattr(
+        cli.zonda, "_extended", False
+    )  # another test may have asked for the plugins' commands
     plugin("zf-command", "0.1", {"zonda.hooks": {"x": "zf_command"}}, zf_command=COMMAND)
     with pytest.raises(SystemExit) as caught:
         cli.main(["leave"])
@@ -294,7 +357,10 @@ def test_in_python_an_exception_is_what_it_was(breaks: Any, capsys: Any) -> None
     with pytest.raises(ValueError, match="not so") as caught:
         file.pipeline().run(file.scene(), threads=1)
     assert len(caught.value.__notes__) == 1
-    assert "Breaks: zf_breaks.Breaks.exec of zf-breaks 1.5 raised ValueError: not so" in caught.value.__notes__[0]
+    assert (
+        "Breaks: zf_breaks.Breaks.exec of zf-breaks 1.5 raised ValueError: not so"
+        in caught.value.__notes__[0]
+    )
     sys.modules["zf_breaks"].HOW = "sys.exit(0)"  # type: ignore[attr-defined]
     with pytest.raises(PluginError, match="asked for the end"):
         file.pipeline().run(file.scene(), threads=1)

@@ -62,7 +62,12 @@ def test_in_place_and_as_a_lambda_and_as_a_decorator():
     expected = signal(zonda.operator(double)).tod()
     for step in (in_place, returned):
         np.testing.assert_array_equal(signal(step).tod(), expected)
-    assert (in_place.label, returned.label, in_place.linear, returned.linear) == ("in_place", "function", True, False)
+    assert (in_place.label, returned.label, in_place.linear, returned.linear) == (
+        "in_place",
+        "function",
+        True,
+        False,
+    )
 
 
 def test_it_keeps_the_contract():
@@ -72,12 +77,17 @@ def test_it_keeps_the_contract():
 
 def test_the_conformance_kit_finds_a_function_that_is_not_linear():
     with pytest.raises(AssertionError, match="linear"):
-        zonda.testing.check_operator(zonda.operator(lambda block: block.detdata["signal"] + 1.0, linear=True))
+        zonda.testing.check_operator(
+            zonda.operator(lambda block: block.detdata["signal"] + 1.0, linear=True)
+        )
 
 
 def test_a_component_of_its_own():
     offset = zonda.operator(
-        lambda block: np.full(block.shape, 0.5), name="offset", requires=(), provides=[zonda.Component("offset", "calibrated")]
+        lambda block: np.full(block.shape, 0.5),
+        name="offset",
+        requires=(),
+        provides=[zonda.Component("offset", "calibrated")],
     )
     steps = [STEPS[0], STEPS[2], offset, STEPS[3]]
     data = zonda.Pipeline(steps, runs={"alone": {"only": ["offset"]}}).run(
@@ -106,21 +116,31 @@ def test_a_function_of_the_whole_scan_is_called_once():
     seen = []
 
     def looks(block):
-        seen.append((block.shape, block.detdata["signal"].dtype, block.detdata["signal"].mean() > 10))
+        seen.append(
+            (block.shape, block.detdata["signal"].dtype, block.detdata["signal"].mean() > 10)
+        )
 
     step = zonda.operator(looks, couples="all", provides=())
-    small = zonda.Pipeline([*STEPS, step]).run(scene(camera(19)), keep=["signal"], threads=1, memory=300_000).tod()
+    small = (
+        zonda.Pipeline([*STEPS, step])
+        .run(scene(camera(19)), keep=["signal"], threads=1, memory=300_000)
+        .tod()
+    )
     assert seen == [((19, 400), np.dtype(np.float64), True)]
     np.testing.assert_array_equal(small, signal().tod())
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_ones_own_pca_is_that_of_the_scan(precision):
-    """As numpy's of the stream that a run keeps; by blocks it is another one. Where it takes the mean away, no mean is left."""
+    """As numpy's of the stream that a run keeps; by blocks it is another one. Where it takes the
+    mean away, no mean is left.
+    """
 
     def run(*steps, **how):
         return (
-            zonda.Pipeline([*STEPS, *steps], precision=precision).run(scene(camera(19)), keep=["signal"], threads=1, **how).tod()
+            zonda.Pipeline([*STEPS, *steps], precision=precision)
+            .run(scene(camera(19)), keep=["signal"], threads=1, **how)
+            .tod()
         )
 
     expected = modes_removed(np.asarray(run(), np.float64))
@@ -129,7 +149,9 @@ def test_ones_own_pca_is_that_of_the_scan(precision):
     tolerance = {"float32": 20 * 2.0**-23, "float64": 1e-12}[precision]
     np.testing.assert_allclose(run(whole), expected, rtol=0, atol=tolerance)
     np.testing.assert_array_equal(run(whole, memory=500_000), run(whole))
-    in_place = zonda.operator(lambda block: np.copyto(block.detdata["signal"], pca(block)), couples="all")
+    in_place = zonda.operator(
+        lambda block: np.copyto(block.detdata["signal"], pca(block)), couples="all"
+    )
     np.testing.assert_array_equal(run(in_place), run(whole))
 
 
@@ -142,7 +164,9 @@ def test_it_acts_on_each_signal_by_itself():
         seen.append({str(one) for one in block.components})
         return block.detdata["signal"] - block.detdata["signal"].mean()
 
-    data = zonda.Pipeline([*STEPS, demean], runs=runs).run(scene(camera(19)), keep=["signal", "signal/quiet"], threads=1)
+    data = zonda.Pipeline([*STEPS, demean], runs=runs).run(
+        scene(camera(19)), keep=["signal", "signal/quiet"], threads=1
+    )
     assert [one >= {"white"} for one in seen] == [True, False]
     for name in ("signal", "signal/quiet"):
         assert abs(data.tod(name).mean()) < 30 * 2.0**-24
@@ -157,7 +181,10 @@ def test_a_function_that_does_nothing_is_told(couples):
         signal(zonda.operator(forgets, couples=couples))
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*left signal as it was")
-        for step in (zonda.operator(double, couples=couples), zonda.operator(forgets, provides=(), couples=couples)):
+        for step in (
+            zonda.operator(double, couples=couples),
+            zonda.operator(forgets, provides=(), couples=couples),
+        ):
             signal(step)
 
 
@@ -174,7 +201,9 @@ def test_its_memory_is_planned_and_refused_beyond_the_ceiling():
 
 
 def test_provenance_names_the_source():
-    (label, kind, said), *_ = [row for row in signal(zonda.operator(double)).provenance["operators"] if row[0] == "double"]
+    (label, kind, said), *_ = [
+        row for row in signal(zonda.operator(double)).provenance["operators"] if row[0] == "double"
+    ]
     assert (label, kind) == ("double", "double")
     assert said["function"].endswith("test_function_operator.double")
     assert said["source"] == f"{__file__}, line {double.__code__.co_firstlineno}"
@@ -185,17 +214,41 @@ def test_provenance_names_the_source():
     [
         (lambda: zonda.operator(3), "expected a function of a block, got 3"),
         (lambda: zonda.operator(zonda.BinMap), "expected a function"),
-        (lambda: zonda.operator(double, requires="signal"), r"requires is a list of names(.|\n)*requires=\['signal'\]"),
+        (
+            lambda: zonda.operator(double, requires="signal"),
+            r"requires is a list of names(.|\n)*requires=\['signal'\]",
+        ),
         (lambda: zonda.operator(double, couples="most"), "cannot couple 'most'"),
-        (lambda: zonda.operator(double, couples="all", requires=("sky", "signal")), "reads one stream"),
+        (
+            lambda: zonda.operator(double, couples="all", requires=("sky", "signal")),
+            "reads one stream",
+        ),
         (lambda: zonda.operator(double, couples="all", provides=("other",)), "reads one stream"),
-        (lambda: signal(zonda.operator(drops, couples="all")), r"left no stream signal of shape \(19, 400\)"),
-        (lambda: zonda.Pipeline([*STEPS, double]), r"step 5 is the function double(.|\n)*zonda.operator\(double\) at step 5"),
-        (lambda: signal(zonda.operator(lambda block: 3)), r"returned an array of shape \(\)(.|\n)*the stream signal"),
+        (
+            lambda: signal(zonda.operator(drops, couples="all")),
+            r"left no stream signal of shape \(19, 400\)",
+        ),
+        (
+            lambda: zonda.Pipeline([*STEPS, double]),
+            r"step 5 is the function double(.|\n)*zonda.operator\(double\) at step 5",
+        ),
+        (
+            lambda: signal(zonda.operator(lambda block: 3)),
+            r"returned an array of shape \(\)(.|\n)*the stream signal",
+        ),
         (lambda: signal(zonda.operator(lambda block: "no")), "returned 'no'"),
-        (lambda: signal(zonda.operator(double, provides=())), "return nothing: it provides no streams"),
-        (lambda: signal(zonda.operator(double, provides=("signal", "more"))), "return nothing: it provides 2 streams"),
-        (lambda: zonda.Pipeline([STEPS[0], zonda.operator(double)]), "double needs signal, which no step provides"),
+        (
+            lambda: signal(zonda.operator(double, provides=())),
+            "return nothing: it provides no streams",
+        ),
+        (
+            lambda: signal(zonda.operator(double, provides=("signal", "more"))),
+            "return nothing: it provides 2 streams",
+        ),
+        (
+            lambda: zonda.Pipeline([STEPS[0], zonda.operator(double)]),
+            "double needs signal, which no step provides",
+        ),
     ],
 )
 def test_mistakes(make, said):
@@ -207,7 +260,9 @@ def test_what_the_function_raises_is_named_with_the_step_and_chained():
     def deep(block):
         return block.detdata["signal"].reshape(-1, 7, 11)  # numpy raises
 
-    with pytest.raises(PipelineError, match=r"calibrate: the function .*deep raised ValueError: cannot reshape") as caught:
+    with pytest.raises(
+        PipelineError, match=r"calibrate: the function .*deep raised ValueError: cannot reshape"
+    ) as caught:
         signal(zonda.operator(deep, name="calibrate"), threads=2)
     assert isinstance(caught.value.__cause__, ValueError)
     line = deep.__code__.co_firstlineno + 1

@@ -46,7 +46,9 @@ operators:
         (registry.metrics, "Map-RMS", "map_rms"),
     ],
 )
-def test_capitals_hyphens_and_spaces_make_no_difference(names: Any, written: str, meant: str) -> None:
+def test_capitals_hyphens_and_spaces_make_no_difference(
+    names: Any, written: str, meant: str
+) -> None:
     assert names.registered(written) == meant
     assert names.get(written) is names.get(meant) or names.create(written) == names.create(meant)
 
@@ -63,21 +65,31 @@ def test_a_pipeline_takes_them(tmp_path: Path) -> None:
 
 def test_operators_are_classes_and_keep_their_spelling() -> None:
     for written in ("binmap", "bin_map", "Bin-Map"):
-        with pytest.raises(RegistryError, match=f"unknown operator '{written}'; did you mean 'BinMap'"):
+        with pytest.raises(
+            RegistryError, match=f"unknown operator '{written}'; did you mean 'BinMap'"
+        ):
             registry.operators.get(written)
 
 
 def test_two_names_that_differ_by_capitals_alone_are_told_apart(fresh_registries: None) -> None:
     for name, altitude in (("Far_Hill", "1 km"), ("farhill", "2 km")):
-        registry.sites.register(Site(name=name, latitude="1 deg", longitude="1 deg", altitude=altitude))
+        registry.sites.register(
+            Site(name=name, latitude="1 deg", longitude="1 deg", altitude=altitude)
+        )
     assert registry.sites.create("Far_Hill").altitude == 1000.0
     assert registry.sites.create("farhill").altitude == 2000.0
-    with pytest.raises(RegistryError, match="site 'far hill' may be 'Far_Hill' and 'farhill'; write one of them"):
+    with pytest.raises(
+        RegistryError, match="site 'far hill' may be 'Far_Hill' and 'farhill'; write one of them"
+    ):
         registry.sites.create("far hill")
 
 
 def test_an_alias_of_the_same_site_is_no_other_name() -> None:
-    assert registry.sites.create("Mauna-Kea") == registry.sites.create("mauna_kea") == registry.sites.create("maunakea")
+    assert (
+        registry.sites.create("Mauna-Kea")
+        == registry.sites.create("mauna_kea")
+        == registry.sites.create("maunakea")
+    )
 
 
 @pytest.mark.parametrize(
@@ -104,12 +116,18 @@ def test_a_site_called_by_its_telescope(written: str, site: str, words: str) -> 
         ("Green Bank", "'green_bank' is a site", "instruments that stand there: gbt, mustang2"),
         ("sierra_negra", "'sierra_negra' is a site", "lmt, "),
         ("teide", "'teide' is a site", ""),
-        ("CMB-S4 LAT", "did you mean 'cmb_s4'?", "CMB-S4 LAT is a telescope; instruments on it: cmb_s4"),
+        (
+            "CMB-S4 LAT",
+            "did you mean 'cmb_s4'?",
+            "CMB-S4 LAT is a telescope; instruments on it: cmb_s4",
+        ),
         ("Prime-Cam", "did you mean 'ccat'?", "a Prime-Cam module"),
         ("mustng2", "did you mean 'mustang2'?", ""),
     ],
 )
-def test_an_instrument_called_by_its_site_or_telescope(written: str, label: str, words: str) -> None:
+def test_an_instrument_called_by_its_site_or_telescope(
+    written: str, label: str, words: str
+) -> None:
     with pytest.raises(RegistryError, match=f"unknown instrument '{written}'") as caught:
         registry.instruments.create(written)
     assert caught.value.label == label
@@ -127,11 +145,16 @@ def test_the_site_of_a_telescope_is_no_part_of_what_a_run_is_known_by() -> None:
     assert "site" not in scene.model_dump(mode="json")["instrument"]["telescope"]
 
 
-def test_check_warns_of_a_telescope_on_another_site(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_warns_of_a_telescope_on_another_site(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "p.yaml").write_text(PIPELINE.format(site="mauna_kea", instrument="mustang2"))
     assert main(["check", str(tmp_path / "p.yaml")]) == 0
     error = capsys.readouterr().err
-    assert "warning: GBT stands at green_bank, 7430 km away: here it looks through the atmosphere of mauna_kea" in error
+    assert (
+        "warning: GBT stands at green_bank, 7430 km away: here it looks through the atmosphere of"
+        " mauna_kea" in error
+    )
     assert "write 'site: green_bank' for its own" in error
     (tmp_path / "p.yaml").write_text(PIPELINE.format(site="GreenBank", instrument="mustang2"))
     assert main(["check", str(tmp_path / "p.yaml")]) == 0

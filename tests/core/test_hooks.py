@@ -13,19 +13,31 @@ from zonda.core.hooks import Hooks, manager
 from zonda.plugins.progress import Progress, line
 
 Plugin = Callable[..., Path]
-IMPL = "from zonda.core.hooks import hookimpl\nseen = []\n@hookimpl\ndef {hook}({arguments}):\n    {body}\n"
+IMPL = (
+    "from zonda.core.hooks import hookimpl\nseen = []\n@hookimpl\ndef {hook}({arguments}):\n   "
+    " {body}\n"
+)
 
 
 def hook(
-    plugin: Plugin, name: str, module: str, hook: str = "zonda_pipeline_start", arguments: str = "pipeline", body: str = "pass"
+    plugin: Plugin,
+    name: str,
+    module: str,
+    hook: str = "zonda_pipeline_start",
+    arguments: str = "pipeline",
+    body: str = "pass",
 ) -> None:
     source = IMPL.format(hook=hook, arguments=arguments, body=body)
     plugin(name, "1.0", {"zonda.hooks": {"same": module}}, **{module: source})
 
 
 def test_every_plugin_is_called_with_what_it_asks_for(plugin: Plugin) -> None:
-    hook(plugin, "z-one", "zh_one", arguments="data, pipeline", body="data.append(('one', pipeline))")
-    hook(plugin, "z-two", "zh_two", arguments="data", body="data.append('two')")  # same entry-point name, other distribution
+    hook(
+        plugin, "z-one", "zh_one", arguments="data, pipeline", body="data.append(('one', pipeline))"
+    )
+    hook(
+        plugin, "z-two", "zh_two", arguments="data", body="data.append('two')"
+    )  # same entry-point name, other distribution
     data: list[Any] = []
     manager().hook.zonda_pipeline_start(pipeline="p", data=data)
     assert sorted(data, key=str) == [("one", "p"), "two"]
@@ -33,13 +45,21 @@ def test_every_plugin_is_called_with_what_it_asks_for(plugin: Plugin) -> None:
 
 
 def test_a_broken_plugin_is_left_out_by_name(plugin: Plugin) -> None:
-    plugin("z-broken", "1.0", {"zonda.hooks": {"x": "zh_broken"}}, zh_broken="import not_there_at_all\n")
+    plugin(
+        "z-broken",
+        "1.0",
+        {"zonda.hooks": {"x": "zh_broken"}},
+        zh_broken="import not_there_at_all\n",
+    )
     hook(plugin, "z-arguments", "zh_arguments", arguments="pipeline, wind")
     hook(plugin, "z-good", "zh_good", arguments="data", body="data.append('good')")
     with pytest.warns(PluginWarning) as caught:
         plugins = manager()
     text = "\n".join(str(w.message) for w in caught)
-    assert "plugin z-broken 1.0 (zh_broken): left out: ModuleNotFoundError: No module named 'not_there_at_all'" in text
+    assert (
+        "plugin z-broken 1.0 (zh_broken): left out: ModuleNotFoundError: No module named"
+        " 'not_there_at_all'" in text
+    )
     assert "z-arguments 1.0" in text
     assert "wind" in text
     data: list[str] = []
@@ -50,29 +70,52 @@ def test_a_broken_plugin_is_left_out_by_name(plugin: Plugin) -> None:
 def test_a_misspelt_hook_is_a_warning(plugin: Plugin) -> None:
     hook(plugin, "z-typo", "zh_typo", hook="zonda_pipline_start")
     with pytest.warns(
-        PluginWarning, match=r"plugin z-typo 1.0 .*no hook 'zonda_pipline_start'; did you mean 'zonda_pipeline_start'\?"
+        PluginWarning,
+        match=(
+            r"plugin z-typo 1.0 .*no hook 'zonda_pipline_start'; did you mean"
+            r" 'zonda_pipeline_start'\?"
+        ),
     ):
         manager()
 
 
 def test_a_forgotten_decorator_is_a_warning(plugin: Plugin) -> None:
-    plugin("z-bare", "1.0", {"zonda.hooks": {"x": "zh_bare"}}, zh_bare="def zonda_progress(done): ...\n")
+    plugin(
+        "z-bare",
+        "1.0",
+        {"zonda.hooks": {"x": "zh_bare"}},
+        zh_bare="def zonda_progress(done): ...\n",
+    )
     with pytest.warns(PluginWarning, match="z-bare 1.0 .*'zonda_progress' is not called"):
         manager()
 
 
 def test_a_hook_that_fails_is_reported_once_and_left_alone(plugin: Plugin) -> None:
-    hook(plugin, "z-faint", "zh_faint", arguments="data", body="data.append('faint'); raise RuntimeError('dizzy')")
+    hook(
+        plugin,
+        "z-faint",
+        "zh_faint",
+        arguments="data",
+        body="data.append('faint'); raise RuntimeError('dizzy')",
+    )
     hook(plugin, "z-good", "zh_good", arguments="data", body="data.append('good')")
     data: list[str] = []
-    with pytest.warns(PluginWarning, match="plugin z-faint 1.0 .*zonda_pipeline_start failed .*RuntimeError: dizzy"):
+    with pytest.warns(
+        PluginWarning,
+        match="plugin z-faint 1.0 .*zonda_pipeline_start failed .*RuntimeError: dizzy",
+    ):
         manager().hook.zonda_pipeline_start(pipeline=None, data=data)
     manager().hook.zonda_pipeline_start(pipeline=None, data=data)
     assert sorted(data) == ["faint", "good", "good"]
 
 
 def test_a_hook_may_stop_the_run_with_a_message(plugin: Plugin) -> None:
-    hook(plugin, "z-stop", "zh_stop", body="from zonda.core.errors import ZondaError; raise ZondaError('no')")
+    hook(
+        plugin,
+        "z-stop",
+        "zh_stop",
+        body="from zonda.core.errors import ZondaError; raise ZondaError('no')",
+    )
     with pytest.raises(ZondaError, match="no"):
         manager().hook.zonda_pipeline_start(pipeline=None, data=None)
 

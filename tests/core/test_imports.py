@@ -1,4 +1,6 @@
-"""What a run of the shipped MUSTANG-2 pipeline imports before its first block: each of these takes 0.1 s or more."""
+"""What a run of the shipped MUSTANG-2 pipeline imports before its first block: each of these takes
+0.1 s or more.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +10,30 @@ import sys
 from pathlib import Path
 
 HEAVY = {
-    "astropy", "astropy.coordinates", "astropy.io.fits", "astropy.table", "astropy.time", "astropy.units",
-    "astropy.visualization", "astropy.wcs",
-    "h5py", "healpy", "matplotlib", "numba.np.linalg", "numba.np.arrayobj", "numpy.testing",
-    "scipy.fft", "scipy.interpolate", "scipy.linalg", "scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.spatial",
-    "scipy.special", "scipy.stats",
-}  # fmt: skip
+    "astropy",
+    "astropy.coordinates",
+    "astropy.io.fits",
+    "astropy.table",
+    "astropy.time",
+    "astropy.units",
+    "astropy.visualization",
+    "astropy.wcs",
+    "h5py",
+    "healpy",
+    "matplotlib",
+    "numba.np.linalg",
+    "numba.np.arrayobj",
+    "numpy.testing",
+    "scipy.fft",
+    "scipy.interpolate",
+    "scipy.linalg",
+    "scipy.ndimage",
+    "scipy.optimize",
+    "scipy.sparse",
+    "scipy.spatial",
+    "scipy.special",
+    "scipy.stats",
+}
 
 RUN = """
 import os, sys
@@ -32,9 +52,19 @@ cli.main(["run", "mustang2_cluster", "--output", sys.argv[1], "--threads", "1",
 
 
 def test_a_run_imports_nothing_heavy_before_its_first_block(tmp_path: Path) -> None:
-    own = {**os.environ, "ZONDA_CACHE_DIR": str(tmp_path / "cache")}  # whatever other runs of this user remember meanwhile
-    for _ in range(2):  # the first compiles, makes the plan and measures the processor, where nothing is remembered
-        done = subprocess.run([sys.executable, "-c", RUN, str(tmp_path / "out")], capture_output=True, text=True, env=own)
+    own = {
+        **os.environ,
+        "ZONDA_CACHE_DIR": str(tmp_path / "cache"),
+    }  # whatever other runs of this user remember meanwhile
+    for _ in range(
+        2
+    ):  # the first compiles, makes the plan and measures the processor, where nothing is remembered
+        done = subprocess.run(
+            [sys.executable, "-c", RUN, str(tmp_path / "out")],
+            capture_output=True,
+            text=True,
+            env=own,
+        )
         assert done.returncode == 0, done.stderr
     found = set(done.stdout.split())
     assert "zonda.operators.maps.bin_map" in found

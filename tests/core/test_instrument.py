@@ -11,11 +11,16 @@ from zonda.core.registry import instruments, sites
 ARCMIN = np.radians(1 / 60)
 
 CAMERA = {
-    "name": "camera", "telescope": {"name": "dish", "diameter": "6 m"},
+    "name": "camera",
+    "telescope": {"name": "dish", "diameter": "6 m"},
     "band": {"name": "b150", "low": "140 GHz", "high": "160 GHz"},
-    "detectors": 7, "field_of_view": "10 arcmin", "main_beam_efficiency": 0.6, "illumination_efficiency": 0.9,
-    "net": "500 uK s(1/2)", "sample_rate": "50 Hz",
-}  # fmt: skip
+    "detectors": 7,
+    "field_of_view": "10 arcmin",
+    "main_beam_efficiency": 0.6,
+    "illumination_efficiency": 0.9,
+    "net": "500 uK s(1/2)",
+    "sample_rate": "50 Hz",
+}
 
 
 def test_mustang2_is_the_papers():
@@ -27,7 +32,9 @@ def test_mustang2_is_the_papers():
     assert np.isclose(m2.band.centre, 93e9, rtol=1e-12)
     assert (m2.net, m2.sample_rate, m2.telescope.diameter) == (1.7e-3, 100.0, 100.0)
     gaps = np.hypot(plane.xi[:, None] - plane.xi, plane.eta[:, None] - plane.eta) + 10 * np.eye(223)
-    assert 15 < np.degrees(gaps.min()) * 3600 < 17  # the pitch that fills the field, see the docstring
+    assert (
+        15 < np.degrees(gaps.min()) * 3600 < 17
+    )  # the pitch that fills the field, see the docstring
 
 
 def test_diffraction_limit_where_no_beam_is_given():
@@ -81,7 +88,13 @@ def test_missing_passband_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "edges", [{}, {"low": "90 GHz"}, {"low": "90 GHz", "high": "80 GHz"}, {"low": "0 GHz", "high": "80 GHz"}]
+    "edges",
+    [
+        {},
+        {"low": "90 GHz"},
+        {"low": "90 GHz", "high": "80 GHz"},
+        {"low": "0 GHz", "high": "80 GHz"},
+    ],
 )
 def test_band_edges(edges):
     with pytest.raises(ZondaError, match="0 < low < high"):
@@ -132,7 +145,9 @@ def test_pairs_of_polarized_detectors():
 
 
 def test_pairs_need_an_even_number():
-    with pytest.raises(ZondaError, match="even number of detectors, two in each pixel; detectors is 7"):
+    with pytest.raises(
+        ZondaError, match="even number of detectors, two in each pixel; detectors is 7"
+    ):
         zonda.Instrument(**dict(CAMERA, detectors=7, polarization="pairs"))
 
 
@@ -146,5 +161,7 @@ def test_a_band_is_not_needed_where_there_are_several():
 def test_a_polarization_efficiency_beyond_one_is_refused():
     plane = zonda.Instrument(**CAMERA).focalplane()
     plane.polarization_efficiency[2] = 1.2
-    with pytest.raises(InputError, match="polarization_efficiency of detector d2 is not between 0 and 1"):
+    with pytest.raises(
+        InputError, match="polarization_efficiency of detector d2 is not between 0 and 1"
+    ):
         plane.copy()

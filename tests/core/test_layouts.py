@@ -14,10 +14,15 @@ from zonda.core.layouts import Layout, hexagon, hexagonal_packing, rings, wafers
 from zonda.core.registry import instruments
 
 CAMERA: dict[str, Any] = {
-    "name": "camera", "telescope": {"name": "dish", "diameter": "6 m"},
-    "band": {"name": "b150", "low": "140 GHz", "high": "160 GHz"}, "field_of_view": "1 deg",
-    "main_beam_efficiency": 0.6, "illumination_efficiency": 0.9, "net": "500 uK s(1/2)", "sample_rate": "20 Hz",
-}  # fmt: skip
+    "name": "camera",
+    "telescope": {"name": "dish", "diameter": "6 m"},
+    "band": {"name": "b150", "low": "140 GHz", "high": "160 GHz"},
+    "field_of_view": "1 deg",
+    "main_beam_efficiency": 0.6,
+    "illumination_efficiency": 0.9,
+    "net": "500 uK s(1/2)",
+    "sample_rate": "20 Hz",
+}
 
 
 def nearest(x: Any, y: Any) -> Any:
@@ -52,7 +57,8 @@ def test_wafers_do_not_overlap_and_are_alike(number: int, shells: int) -> None:
     np.testing.assert_allclose(nearest(x, y), 1)  # the pitch; between wafers there is more
     if number > 1:
         apart = [
-            np.hypot(x[wafer == 0][:, None] - x[wafer == k], y[wafer == 0][:, None] - y[wafer == k]) for k in range(1, number)
+            np.hypot(x[wafer == 0][:, None] - x[wafer == k], y[wafer == 0][:, None] - y[wafer == k])
+            for k in range(1, number)
         ]
         assert 1 < min(a.min() for a in apart) < 1.5
     assert abs(x.mean()) < 1e-9 * number * each
@@ -62,15 +68,25 @@ def test_wafers_do_not_overlap_and_are_alike(number: int, shells: int) -> None:
 @pytest.mark.parametrize("layout", ["hexagon", "rings", "wafers"])
 def test_all_layouts_fill_the_field(layout: str) -> None:
     many = {"wafers": 3} if layout == "wafers" else {}
-    plane = zonda.Instrument(**CAMERA, detectors=114, layout=layout, polarization="pairs", **many).focalplane()
+    plane = zonda.Instrument(
+        **CAMERA, detectors=114, layout=layout, polarization="pairs", **many
+    ).focalplane()
     assert len(plane) == 114
     assert 2 * np.arctan(plane.radius) == pytest.approx(np.radians(1))
     np.testing.assert_array_equal(np.bincount(plane.wafer), [38, 38, 38] if many else [114])
 
 
 def test_wafers_of_two_bands_lie_upon_each_other() -> None:
-    bands = [{"name": "f090", "low": "80 GHz", "high": "100 GHz"}, {"name": "f150", "low": "140 GHz", "high": "160 GHz"}]
-    given = {k: v for k, v in CAMERA.items() if k != "band"} | {"bands": bands, "detectors": 21, "layout": "wafers", "wafers": 3}
+    bands = [
+        {"name": "f090", "low": "80 GHz", "high": "100 GHz"},
+        {"name": "f150", "low": "140 GHz", "high": "160 GHz"},
+    ]
+    given = {k: v for k, v in CAMERA.items() if k != "band"} | {
+        "bands": bands,
+        "detectors": 21,
+        "layout": "wafers",
+        "wafers": 3,
+    }
     plane = zonda.Instrument(**given).focalplane()
     one, other = plane.of_band(0), plane.of_band(1)
     np.testing.assert_array_equal(one.xi, other.xi)
@@ -82,7 +98,10 @@ def test_overlaid_bands_fill_the_same_field_each_by_itself() -> None:
         {"name": "f090", "low": "80 GHz", "high": "100 GHz", "detectors": 19},
         {"name": "f150", "low": "140 GHz", "high": "160 GHz", "detectors": 61},
     ]
-    given = {k: v for k, v in CAMERA.items() if k != "band"} | {"bands": bands, "pixels": "overlaid"}
+    given = {k: v for k, v in CAMERA.items() if k != "band"} | {
+        "bands": bands,
+        "pixels": "overlaid",
+    }
     camera = zonda.Instrument(**given)
     plane = camera.focalplane()
     for k, (name, count) in enumerate({"f090": 19, "f150": 61}.items()):
@@ -94,16 +113,26 @@ def test_overlaid_bands_fill_the_same_field_each_by_itself() -> None:
 
 def test_a_layout_of_a_plugin_has_places_angles_and_wafers() -> None:
     def cross(number: int) -> Layout:
-        return Layout(np.arange(number) - 1.5, np.zeros(number), np.arange(number) // 2, np.full(number, 0.3), radius=3.0)
+        return Layout(
+            np.arange(number) - 1.5,
+            np.zeros(number),
+            np.arange(number) // 2,
+            np.full(number, 0.3),
+            radius=3.0,
+        )
 
     cross.wafers = 2  # type: ignore[attr-defined]
     registry.layouts.register(cross)
-    plane = zonda.Instrument(**CAMERA, detectors=8, layout="cross", polarization="pairs").focalplane()
+    plane = zonda.Instrument(
+        **CAMERA, detectors=8, layout="cross", polarization="pairs"
+    ).focalplane()
     scale = np.tan(np.radians(0.5)) / 3
     np.testing.assert_allclose(plane.xi, np.repeat([-1.5, -0.5, 0.5, 1.5], 2) * scale)
     np.testing.assert_allclose(plane.polarization_angle, np.tile([0.3, 0.3 + np.pi / 2], 4))
     np.testing.assert_array_equal(plane.wafer, [0, 0, 0, 0, 1, 1, 1, 1])
-    with pytest.raises(ZondaError, match="2 wafers share their pixels equally; detectors is 6, no multiple of 4"):
+    with pytest.raises(
+        ZondaError, match="2 wafers share their pixels equally; detectors is 6, no multiple of 4"
+    ):
         zonda.Instrument(**CAMERA, detectors=6, layout="cross", polarization="pairs")
     registry.layouts.register(lambda number: cross(number + 1), name="cross")
     with pytest.raises(ZondaError, match="the layout cross gives 9 places for 8 pixels"):
@@ -118,16 +147,26 @@ def test_an_unknown_layout() -> None:
 
 
 def test_a_published_layout_with_fewer_pixels_keeps_its_wafers() -> None:
-    whole, part = (instruments.create("so_lat_mf").varied(detectors=n).cameras["f090"].focalplane() for n in (10_320, 288))
+    whole, part = (
+        instruments.create("so_lat_mf").varied(detectors=n).cameras["f090"].focalplane()
+        for n in (10_320, 288)
+    )
     for k in range(12):
-        one, other = (np.stack([p.xi[p.wafer == k], p.eta[p.wafer == k]]).mean(axis=1) for p in (whole, part))
-        assert np.degrees(np.abs(one - other)).max() < 0.05  # of 2 deg: both fill the field, by 2 % of stretch
+        one, other = (
+            np.stack([p.xi[p.wafer == k], p.eta[p.wafer == k]]).mean(axis=1) for p in (whole, part)
+        )
+        assert (
+            np.degrees(np.abs(one - other)).max() < 0.05
+        )  # of 2 deg: both fill the field, by 2 % of stretch
 
 
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"detectors": 22, "layout": "wafers", "wafers": 3}, "3 wafers share their pixels equally; detectors is 22"),
+        (
+            {"detectors": 22, "layout": "wafers", "wafers": 3},
+            "3 wafers share their pixels equally; detectors is 22",
+        ),
         ({"detectors": 21, "wafers": 3}, "3 wafers go with layout: wafers, not hexagon"),
     ],
 )

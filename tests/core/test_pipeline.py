@@ -57,7 +57,9 @@ class Component(Operator):
         (name,) = self.provides
         for d in range(block.detectors.start, block.detectors.stop):
             key = block.observation.key(self.label, d)
-            block.new(name)[d - block.detectors.start] += normals(key, block.samples.start, block.samples.stop)
+            block.new(name)[d - block.detectors.start] += normals(
+                key, block.samples.start, block.samples.stop
+            )
 
 
 class Sky(Component):
@@ -129,23 +131,31 @@ class Late(Output):
 
 @pytest.fixture(scope="module")
 def scene():
-    return zonda.Scene(site="green_bank", instrument="hexagonal_array", time="2024-11-25T07:00", seed=3)
+    return zonda.Scene(
+        site="green_bank", instrument="hexagonal_array", time="2024-11-25T07:00", seed=3
+    )
 
 
 RUNS = {"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}
 
 
 def test_signals_are_made_of_the_same_random_numbers(scene):
-    data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs=RUNS).run(scene, threads=1)
+    data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs=RUNS).run(
+        scene, threads=1
+    )
     assert data.products["seen"] == ["noiseless/total", "source_free/total", "total"]
     for k in range(2):
-        whole, sky, noise = (data.products[n][k] for n in ("total", "noiseless/total", "source_free/total"))
+        whole, sky, noise = (
+            data.products[n][k] for n in ("total", "noiseless/total", "source_free/total")
+        )
         assert np.array_equal(whole, sky + noise)
         assert 0.9 < sky.std() < 1.1
 
 
 def test_outputs_hear_of_what_is_done(scene):
-    data = Pipeline([Point(), Sky(), White(), Sum(), Total(), Late()], runs={"again": {"only": ["sky"]}}).run(scene, threads=1)
+    data = Pipeline(
+        [Point(), Sky(), White(), Sum(), Total(), Late()], runs={"again": {"only": ["sky"]}}
+    ).run(scene, threads=1)
     assert data.products["heard"] == [("pointing", 0), ("scan", 1), ("scan", 2), ("maps", 2)]
 
 
@@ -158,7 +168,9 @@ class Flag(Operator):
 
     def prepare(self, observation):
         observation.tally.state(self.label, "prepared before", f"{self._prepared} times")
-        observation.smooth["transmission"] = SmoothField.constant(np.full(1, self._prepared), observation.n_samples)
+        observation.smooth["transmission"] = SmoothField.constant(
+            np.full(1, self._prepared), observation.n_samples
+        )
         self._prepared += 1
 
     def exec(self, block, state):
@@ -169,8 +181,12 @@ class Flag(Operator):
 def test_a_scan_is_prepared_and_told_of_once(scene):
     """Whatever the signals: only what a step tells of the complete one stays."""
     runs = {"noiseless": {"only": ["sky"]}}
-    data = Pipeline([Point(), Sky(), White(), Sum(), Flag(), Total()], runs=runs).run(scene, threads=1, memory=1 << 30)
-    alone = Pipeline([Point(), Sky(), White(), Sum(), Flag(), Total()]).run(scene, threads=1, memory=1 << 30)
+    data = Pipeline([Point(), Sky(), White(), Sum(), Flag(), Total()], runs=runs).run(
+        scene, threads=1, memory=1 << 30
+    )
+    alone = Pipeline([Point(), Sky(), White(), Sum(), Flag(), Total()]).run(
+        scene, threads=1, memory=1 << 30
+    )
     for number, observation in enumerate(data.observations):
         assert observation.flags[0] == 1
         assert observation.smooth["transmission"].weights[0, 0] == number
@@ -196,12 +212,16 @@ def test_observations_do_not_end_with_every_detectors_lines(scene):
     steps = [Point(), Sky(), White(), Sum(), Flag(), Uses(), Total()]
     data = Pipeline(steps, runs={"noiseless": {"only": ["sky"]}}).run(scene, threads=1)
     assert set(Uses.kept) == {1}
-    assert [len(o.smooth["transmission"]._kept) for o in data.observations] == [0] * len(data.observations)
+    assert [len(o.smooth["transmission"]._kept) for o in data.observations] == [0] * len(
+        data.observations
+    )
 
 
 def test_same_seed_same_bits_two_seeds_incoherent(scene):
     def total(seed, **settings):
-        out = Pipeline([Point(scans=1), White(), Sum(), Total()]).run(scene.model_copy(update={"seed": seed}), **settings)
+        out = Pipeline([Point(scans=1), White(), Sum(), Total()]).run(
+            scene.model_copy(update={"seed": seed}), **settings
+        )
         return out.products["total"][0]
 
     one = total(1, threads=1)
@@ -234,7 +254,10 @@ class Glitches(Component):
 
 
 def test_a_component_enters_at_a_place_that_there_is():
-    with pytest.raises(ValueError, match=r"component 'glitches' cannot enter 'at detector': choose from .*'at the detector'"):
+    with pytest.raises(
+        ValueError,
+        match=r"component 'glitches' cannot enter 'at detector': choose from .*'at the detector'",
+    ):
         zonda.Component("glitches", "at detector")
 
 
@@ -246,7 +269,10 @@ def test_a_component_enters_at_a_place_that_there_is():
         ([Point(), Total()], "Total needs signal, which no step provides"),
         ([Point(), White(), Filter(), Filter()], "Filter needs signal, which no step provides"),
         ([Point(), Sum(), Sky()], "Sky provides sky only after Sum has used it"),
-        ([Point(), Sky(), Sum(), Glitches()], "Glitches provides glitches only after Sum has used it"),
+        (
+            [Point(), Sky(), Sum(), Glitches()],
+            "Glitches provides glitches only after Sum has used it",
+        ),
         ([Sum()], "no step points the telescope"),
     ],
 )
@@ -285,7 +311,9 @@ def test_all_mistakes_of_order_at_once():
 
 
 def test_unknown_component_of_a_run():
-    with pytest.raises(PipelineError, match=r"(?s)signal quiet names 'noise'.*choose from: sky, white"):
+    with pytest.raises(
+        PipelineError, match=r"(?s)signal quiet names 'noise'.*choose from: sky, white"
+    ):
         Pipeline([Point(), Sky(), White(), Sum()], runs={"quiet": {"without": ["noise"]}})
 
 

@@ -1,4 +1,6 @@
-"""Numbers of a scene in a wrong unit, too large and too small, are warned of; those of known instruments are not."""
+"""Numbers of a scene in a wrong unit, too large and too small, are warned of; those of known
+instruments are not.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,9 @@ def test_a_camera_in_a_wrong_unit(camera: dict[str, str], words: str) -> None:
 def test_steps_in_a_wrong_unit(step: zonda.Operator, words: str) -> None:
     steps = [zonda.PointingDaisy(scan_duration="2 s"), step]
     steps += [zonda.WhiteNoise()] if isinstance(step, zonda.PinkNoise) else []
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d")
+    scene = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d"
+    )
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         assert not looks(steps, scene)[1]
@@ -89,5 +93,7 @@ def test_a_catalogue_that_cannot_be(tmp_path: Path, head: str, row: str, words: 
 
 
 def _data() -> zonda.Data:
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d")
+    scene = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d"
+    )
     return zonda.Data(scene=scene)

@@ -1,4 +1,6 @@
-"""Angles of detectors on the sky against the textbook's vectors, and meridians against each other."""
+"""Angles of detectors on the sky against the textbook's vectors, and meridians against each
+other.
+"""
 
 from itertools import pairwise
 
@@ -31,7 +33,9 @@ def angles(o, pole=NORTH):
 
 
 def psi(o):
-    """(n_det, n_samp) by `StokesWeights`'s formula (TOAST 3, ops_stokes_weights.cpp): from the meridian's south towards east."""
+    """(n_det, n_samp) by `StokesWeights`'s formula (TOAST 3, ops_stokes_weights.cpp): from the
+    meridian's south towards east.
+    """
     plane, found = o.focalplane, []
     for q in detector_quaternions(plane.xi, plane.eta, plane.polarization_angle):
         whole = multiply(o.boresight_radec, np.broadcast_to(q, (o.n_samples, 4)))
@@ -45,7 +49,9 @@ def psi(o):
 def test_angles_are_toasts():
     o = an_observation()
     cosine, sine = angles(o)
-    np.testing.assert_allclose(cosine, np.cos(2 * psi(o)), rtol=0, atol=1e-14)  # rounding of a few products
+    np.testing.assert_allclose(
+        cosine, np.cos(2 * psi(o)), rtol=0, atol=1e-14
+    )  # rounding of a few products
     np.testing.assert_allclose(sine, np.sin(2 * psi(o)), rtol=0, atol=1e-14)
 
 
@@ -56,7 +62,9 @@ def test_a_half_wave_plate_turns_by_four_times_its_angle():
 
 
 def test_an_axis_to_the_south_sees_q_and_one_to_the_south_east_u():
-    """COSMO: from south to east. On the meridian the focal plane of an upright boresight has +X towards the south."""
+    """COSMO: from south to east. On the meridian the focal plane of an upright boresight has +X
+    towards the south.
+    """
     o = scan(1, 1, radius=0.0)
     for angle, expected in ((0.0, (1, 0)), (np.pi / 4, (0, 1)), (np.pi / 2, (-1, 0))):
         o.focalplane.polarization_angle[:] = angle
@@ -75,7 +83,9 @@ def test_bits_depend_neither_on_blocks_nor_on_which_detectors(cuts):
 
 
 directions_of = st.tuples(st.floats(-1, 1), st.floats(-3.1, 3.1)).map(
-    lambda v: np.array([np.sqrt(1 - v[0] ** 2) * np.cos(v[1]), np.sqrt(1 - v[0] ** 2) * np.sin(v[1]), v[0]])
+    lambda v: np.array(
+        [np.sqrt(1 - v[0] ** 2) * np.cos(v[1]), np.sqrt(1 - v[0] ** 2) * np.sin(v[1]), v[0]]
+    )
 )
 
 

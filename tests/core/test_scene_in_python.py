@@ -16,7 +16,12 @@ import zonda
 from zonda.core.configuration.calls import ParameterError
 from zonda.plugins.checks.scenes import TARGET, camera, scene
 
-BASE = {"site": "green_bank", "instrument": "mustang2", "time": "2024-11-25T07:00", "target": "75 deg 20 deg"}
+BASE = {
+    "site": "green_bank",
+    "instrument": "mustang2",
+    "time": "2024-11-25T07:00",
+    "target": "75 deg 20 deg",
+}
 
 
 def test_targets_and_times_of_astropy():
@@ -24,11 +29,18 @@ def test_targets_and_times_of_astropy():
     assert zonda.Scene(**BASE | {"target": SkyCoord(75 * u.deg, 20 * u.deg)}) == plain
     assert zonda.Scene(**BASE | {"time": Time("2024-11-25T07:00:00")}) == plain
     assert zonda.Scene(**BASE | {"time": Time("2024-11-25T07:00:00").tai}) == plain
-    for moment in (datetime(2024, 11, 25, 7, tzinfo=UTC), datetime(2024, 11, 25, 2, tzinfo=timezone(timedelta(hours=-5)))):
+    for moment in (
+        datetime(2024, 11, 25, 7, tzinfo=UTC),
+        datetime(2024, 11, 25, 2, tzinfo=timezone(timedelta(hours=-5))),
+    ):
         assert zonda.Scene(**BASE | {"time": moment}) == plain
-    galactic = zonda.Scene(**BASE | {"target": SkyCoord(75 * u.deg, 20 * u.deg).galactic}).target.icrs()
+    galactic = zonda.Scene(
+        **BASE | {"target": SkyCoord(75 * u.deg, 20 * u.deg).galactic}
+    ).target.icrs()
     np.testing.assert_allclose(np.degrees(galactic), (75, 20), rtol=1e-12)
-    horizontal = zonda.Scene(**BASE | {"target": SkyCoord(AltAz(az=180 * u.deg, alt=60 * u.deg))}).target
+    horizontal = zonda.Scene(
+        **BASE | {"target": SkyCoord(AltAz(az=180 * u.deg, alt=60 * u.deg))}
+    ).target
     assert str(horizontal) == "az 180 deg el 60 deg"
 
 
@@ -36,14 +48,18 @@ def test_what_they_mean_comes_back_from_its_text():
     from zonda.core.configuration.target import Target
     from zonda.core.configuration.time import Instant
 
-    made = zonda.Scene(**BASE | {"target": SkyCoord(75.123456789 * u.deg, 20 * u.deg), "time": Time.now()})
+    made = zonda.Scene(
+        **BASE | {"target": SkyCoord(75.123456789 * u.deg, 20 * u.deg), "time": Time.now()}
+    )
     assert Target.parse(str(made.target)) == made.target
     assert Instant.parse(str(made.time)) == made.time
 
 
 def test_a_place_on_the_earth():
     home = zonda.Scene(**BASE).site
-    near = EarthLocation.from_geodetic(np.degrees(home.longitude) * u.deg, np.degrees(home.latitude) * u.deg, home.altitude * u.m)
+    near = EarthLocation.from_geodetic(
+        np.degrees(home.longitude) * u.deg, np.degrees(home.latitude) * u.deg, home.altitude * u.m
+    )
     made = zonda.Scene(**BASE | {"site": near}).site
     assert made.latitude == pytest.approx(home.latitude, abs=1e-12)
     assert made.longitude == pytest.approx(home.longitude, abs=1e-12)
@@ -54,7 +70,12 @@ def test_a_place_on_the_earth():
     assert again == made
     higher = EarthLocation.from_geodetic(near.lon, near.lat, near.height + 300 * u.m)
     assert zonda.Scene(**BASE | {"site": higher}).site.climatology is None
-    assert zonda.Scene(**BASE | {"site": EarthLocation.from_geodetic(10 * u.deg, 46 * u.deg)}).site.climatology is None
+    assert (
+        zonda.Scene(
+            **BASE | {"site": EarthLocation.from_geodetic(10 * u.deg, 46 * u.deg)}
+        ).site.climatology
+        is None
+    )
     with pytest.raises(ParameterError, match="expected one place, got 2"):
         zonda.Scene(**BASE | {"site": EarthLocation.from_geodetic([1, 2] * u.deg, [3, 4] * u.deg)})
 
@@ -71,14 +92,25 @@ def test_another_scene_is_checked():
 
 
 def test_a_loop_over_seeds_reads_convolves_and_compiles_once(tmp_path, monkeypatch):
-    """Counted: calls that read or convolve the map or integrate the atmosphere's spectrum, compilations, and files opened."""
+    """Counted: calls that read or convolve the map or integrate the atmosphere's spectrum,
+    compilations, and files opened.
+    """
     from numba.core import event
 
     from zonda.operators.sky import convolved
 
     path = tmp_path / "sky.fits"
-    cards = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 32.5, "CRPIX2": 32.5, "CRVAL1": TARGET[0], "CRVAL2": TARGET[1]}
-    header = fits.Header(cards | {"CDELT1": -2 / 3600, "CDELT2": 2 / 3600, "BUNIT": "K", "TEMPSCAL": "K_RJ"})
+    cards = {
+        "CTYPE1": "RA---TAN",
+        "CTYPE2": "DEC--TAN",
+        "CRPIX1": 32.5,
+        "CRPIX2": 32.5,
+        "CRVAL1": TARGET[0],
+        "CRVAL2": TARGET[1],
+    }
+    header = fits.Header(
+        cards | {"CDELT1": -2 / 3600, "CDELT2": 2 / 3600, "BUNIT": "K", "TEMPSCAL": "K_RJ"}
+    )
     fits.PrimaryHDU(np.random.default_rng(3).normal(0, 1e-3, (64, 64)), header).writeto(path)
     calls = {"read_map": 0, "convolve": 0, "on_own_pixels": 0}
 
@@ -101,22 +133,35 @@ def test_a_loop_over_seeds_reads_convolves_and_compiles_once(tmp_path, monkeypat
 
     sys.addaudithook(hook)  # for good: it can only be silenced
     steps = [
-        zonda.PointingDaisy(scan_duration="4 s", scans=2), zonda.SkyMap(file=path), zonda.AtmosphereLayers(pwv="5 mm"),
-        zonda.WhiteNoise(), zonda.PinkNoise(), zonda.Efficiency(), zonda.HighpassFilter(frequency="1 Hz"),
-        zonda.CommonModeFilter(), zonda.BinMap(pixel="4 arcsec"),
-    ]  # fmt: skip
-    pipeline, where = zonda.Pipeline(steps, runs={"noiseless": {"only": ["sky"]}}), scene(camera(19))
+        zonda.PointingDaisy(scan_duration="4 s", scans=2),
+        zonda.SkyMap(file=path),
+        zonda.AtmosphereLayers(pwv="5 mm"),
+        zonda.WhiteNoise(),
+        zonda.PinkNoise(),
+        zonda.Efficiency(),
+        zonda.HighpassFilter(frequency="1 Hz"),
+        zonda.CommonModeFilter(),
+        zonda.BinMap(pixel="4 arcsec"),
+    ]
+    pipeline, where = (
+        zonda.Pipeline(steps, runs={"noiseless": {"only": ["sky"]}}),
+        scene(camera(19)),
+    )
     maps = [pipeline.run(where.replace(seed=0), threads=1)["map"].signal]
     assert calls == {"read_map": 1, "convolve": 1, "on_own_pixels": 1}
     event.register("numba:compile", compiled)
     listening.append(True)
     try:
-        maps += [pipeline.run(where.replace(seed=seed), threads=1)["map"].signal for seed in (1, 2, 0)]
+        maps += [
+            pipeline.run(where.replace(seed=seed), threads=1)["map"].signal for seed in (1, 2, 0)
+        ]
     finally:
         listening.clear()
         event.unregister("numba:compile", compiled)
     assert calls == {"read_map": 1, "convolve": 1, "on_own_pixels": 1}
     assert compiled.buffer == []
-    assert [name for name in opened if "iers" not in name.lower()] == []  # the Earth's orientation is looked up for each scan
+    assert [
+        name for name in opened if "iers" not in name.lower()
+    ] == []  # the Earth's orientation is looked up for each scan
     np.testing.assert_array_equal(maps[3], maps[0])
     assert not np.array_equal(maps[1], maps[0], equal_nan=True)

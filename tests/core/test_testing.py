@@ -72,14 +72,24 @@ def test_sky_map_keeps_the_contract():
 def test_recorded_pointing_keeps_the_contract(tmp_path):
     t = np.arange(400) / 20
     columns = [1732518000 + t, 10 + 0.01 * np.sin(t), 45 + 0.01 * np.cos(t)]
-    np.savetxt(tmp_path / "scan.csv", np.transpose(columns), fmt="%.9f", delimiter=",", header="time [s], az [deg], el [deg]")
+    np.savetxt(
+        tmp_path / "scan.csv",
+        np.transpose(columns),
+        fmt="%.9f",
+        delimiter=",",
+        header="time [s], az [deg], el [deg]",
+    )
     check_operator(operators.get("PointingRecorded")(file=tmp_path / "scan.csv"))
 
 
 def test_schedules_keep_the_contract(tmp_path):
     row = "2024-11-25 07:00:00 | 2024-11-25 07:00:30 | 0 | patch | 120 | 124 | 50 | 0 | 0"
     (tmp_path / "night.txt").write_text(f"green_bank | dish | 38.4 | -79.8 | 818\n{row}\n")
-    check_operator(operators.get("PointingSchedule")(schedule=tmp_path / "night.txt", speed="0.5 deg/s", check_limits="warn"))
+    check_operator(
+        operators.get("PointingSchedule")(
+            schedule=tmp_path / "night.txt", speed="0.5 deg/s", check_limits="warn"
+        )
+    )
 
 
 def test_point_sources_keep_the_contract(tmp_path):
@@ -93,9 +103,13 @@ def test_the_cmb_keeps_the_contract(tmp_path):
 
 
 OF_OTHER_SCANS = {"LoadTOD", "Mispointing"}
-"""The kit has no scan for them: one brings its own, the other changes where those of another step point."""
+"""The kit has no scan for them: one brings its own, the other changes where those of another step
+point.
+"""
 NEED_OTHERS = {"ToastOperator", "PySMSky"}
-"""They need packages that are not installed with the tests; tests/interop and sky/test_pysm.py have them."""
+"""They need packages that are not installed with the tests; tests/interop and sky/test_pysm.py have
+them.
+"""
 
 
 def test_none_is_forgotten():
@@ -296,7 +310,9 @@ def test_an_operator_that_is_not_linear():
         (Rectifies(), "does not add up"),
         (Offsets(), "something of nothing"),
     ):
-        with pytest.raises(AssertionError, match=f"check_linear: says that it is linear, but .*{words}"):
+        with pytest.raises(
+            AssertionError, match=f"check_linear: says that it is linear, but .*{words}"
+        ):
             check_operator(broken)
 
 
@@ -395,8 +411,17 @@ def test_the_mean_is_no_trap():
 @pytest.mark.parametrize(
     ("broken", "words"),
     [
-        (GainThatKnows(), "check_means: scan-000 signal is another where the mean of signal stands beside the stream"),
-        (GainOfAtmosphereThatKnows(), "check_means: scan-000 atmosphere is another where the mean of atmosphere"),
+        (
+            GainThatKnows(),
+            (
+                "check_means: scan-000 signal is another where the mean of signal stands beside the"
+                " stream"
+            ),
+        ),
+        (
+            GainOfAtmosphereThatKnows(),
+            "check_means: scan-000 atmosphere is another where the mean of atmosphere",
+        ),
         (CountsThatKnows(), "check_means: total is another"),
         (MeasuresThatKnows(), "check_means: scan-000 signal is another"),
     ],

@@ -35,7 +35,9 @@ def base() -> Instrument:
 
 
 def scene(**instrument: Any) -> zonda.Scene:
-    return zonda.Scene(site="green_bank", instrument=instrument, time="2024-11-25T07:00", target="05h +20d")
+    return zonda.Scene(
+        site="green_bank", instrument=instrument, time="2024-11-25T07:00", target="05h +20d"
+    )
 
 
 def test_it_differs_in_what_was_changed_alone(base: Instrument) -> None:
@@ -45,7 +47,9 @@ def test_it_differs_in_what_was_changed_alone(base: Instrument) -> None:
     assert made.model_dump(exclude=texts) == base.model_dump(exclude=texts)
     assert made.telescope.site == "green_bank"
     assert made.name == "mustang2 (detectors 170)"
-    assert made.provenance.startswith("mustang2 with detectors 170 instead of detectors 223; van Marrewijk")
+    assert made.provenance.startswith(
+        "mustang2 with detectors 170 instead of detectors 223; van Marrewijk"
+    )
     assert made == base.varied(detectors=170)
 
 
@@ -55,9 +59,13 @@ def test_a_variant_that_changes_nothing_is_the_instrument_itself(base: Instrumen
 
 
 def test_its_name_does_not_depend_on_how_units_are_written() -> None:
-    one, other = (scene(like="mustang2", net=net).instrument for net in ("1 mK s(1/2)", "1000 uK s(1/2)"))
+    one, other = (
+        scene(like="mustang2", net=net).instrument for net in ("1 mK s(1/2)", "1000 uK s(1/2)")
+    )
     assert one.name == other.name == "mustang2 (net 1 mK s(1/2))"
-    many = scene(like="mustang2", net="1 mK s(1/2)", knee="1 Hz", slope=2, sample_rate="50 Hz", detectors=7).instrument
+    many = scene(
+        like="mustang2", net="1 mK s(1/2)", knee="1 Hz", slope=2, sample_rate="50 Hz", detectors=7
+    ).instrument
     assert many.name.startswith("mustang2 (variant ")
     assert "sample_rate 50 Hz" in many.description
 
@@ -69,12 +77,24 @@ def test_it_has_random_numbers_of_its_own_unless_it_keeps_the_name(base: Instrum
 
 def test_the_beam_follows_aperture_and_band(base: Instrument) -> None:
     """lambda / D: half the dish, twice the beam; the ratio to the diffraction limit stays."""
-    assert np.isclose(base.varied(telescope={"diameter": "50 m"}).beam_fwhm, 2 * base.beam_fwhm, rtol=1e-12)
-    band = {"name": "low", "low": "39 GHz", "high": "54 GHz"}  # centre: half of that of 78 to 108 GHz
+    assert np.isclose(
+        base.varied(telescope={"diameter": "50 m"}).beam_fwhm, 2 * base.beam_fwhm, rtol=1e-12
+    )
+    band = {
+        "name": "low",
+        "low": "39 GHz",
+        "high": "54 GHz",
+    }  # centre: half of that of 78 to 108 GHz
     assert np.isclose(base.varied(band=band).beam_fwhm, 2 * base.beam_fwhm, rtol=1e-12)
-    assert np.isclose(base.varied(telescope={"diameter": "50 m"}, fwhm="9 arcsec").beam_fwhm, np.radians(9 / 3600), rtol=1e-12)
+    assert np.isclose(
+        base.varied(telescope={"diameter": "50 m"}, fwhm="9 arcsec").beam_fwhm,
+        np.radians(9 / 3600),
+        rtol=1e-12,
+    )
     limited = instruments.create("ccat")  # states no fwhm
-    assert np.isclose(limited.varied(telescope={"diameter": "3 m"}).beam_fwhm, 2 * limited.beam_fwhm, rtol=1e-12)
+    assert np.isclose(
+        limited.varied(telescope={"diameter": "3 m"}).beam_fwhm, 2 * limited.beam_fwhm, rtol=1e-12
+    )
 
 
 def test_a_telescope_keeps_what_is_not_named(base: Instrument) -> None:
@@ -88,7 +108,10 @@ def test_resolved_yaml_says_what_it_is_and_loads_again(how: str) -> None:
     if how == "set":
         settings = ("instrument.detectors=30",)
     if how == "set on a name":
-        text, settings = TEXT.replace("{like: mustang2, detectors: 170}", "mustang2"), ("instrument.knee=1 Hz",)
+        text, settings = (
+            TEXT.replace("{like: mustang2, detectors: 170}", "mustang2"),
+            ("instrument.knee=1 Hz",),
+        )
     if how == "telescope":
         settings = ("instrument.telescope.elevation_min=20 deg",)
     file = parse(text, overrides=settings)
@@ -103,12 +126,32 @@ def test_resolved_yaml_says_what_it_is_and_loads_again(how: str) -> None:
 @pytest.mark.parametrize(
     ("setting", "message", "label"),
     [
-        ("instrument.detectrs=3", "unknown key 'detectrs' for the pipeline, instrument", "did you mean 'detectors'?"),
-        ("instrument.telescope.diamter=3 m", "unknown key 'diamter' for the pipeline, instrument.telescope", "'diameter'?"),
+        (
+            "instrument.detectrs=3",
+            "unknown key 'detectrs' for the pipeline, instrument",
+            "did you mean 'detectors'?",
+        ),
+        (
+            "instrument.telescope.diamter=3 m",
+            "unknown key 'diamter' for the pipeline, instrument.telescope",
+            "'diameter'?",
+        ),
         ("instrument.like=mustng2", "unknown instrument 'mustng2'", "did you mean 'mustang2'?"),
-        ("instrument.band=mustang_90ghz", "unknown band 'mustang_90ghz'", "did you mean 'mustang2_90ghz'?"),
-        ("instrument.detectors=0", "the pipeline, instrument.detectors: must be at least 1, got 0", ""),
-        ("instrument.like=7", "the pipeline, instrument: like takes the name of an instrument, not 7", ""),
+        (
+            "instrument.band=mustang_90ghz",
+            "unknown band 'mustang_90ghz'",
+            "did you mean 'mustang2_90ghz'?",
+        ),
+        (
+            "instrument.detectors=0",
+            "the pipeline, instrument.detectors: must be at least 1, got 0",
+            "",
+        ),
+        (
+            "instrument.like=7",
+            "the pipeline, instrument: like takes the name of an instrument, not 7",
+            "",
+        ),
     ],
 )
 def test_mistakes_name_the_field_and_what_exists(setting: str, message: str, label: str) -> None:
@@ -125,7 +168,15 @@ def test_the_schema_knows_variants() -> None:
     header = {"site": "green_bank", "time": "2024-11-25", "operators": ["PointingDaisy"]}
     validator = jsonschema.Draft202012Validator(json_schema())
     for instrument, valid in (
-        ({"like": "mustang2", "detectors": 170, "telescope": {"diameter": "50 m"}, "band": "atlast_92ghz"}, True),
+        (
+            {
+                "like": "mustang2",
+                "detectors": 170,
+                "telescope": {"diameter": "50 m"},
+                "band": "atlast_92ghz",
+            },
+            True,
+        ),
         ({"like": "mustang2", "detectrs": 170}, False),
     ):
         assert validator.is_valid({**header, "instrument": instrument}) is valid
@@ -158,7 +209,17 @@ def test_bands_by_the_names_of_the_instruments() -> None:
     assert made.cameras["f090"].band == base.cameras["f090"].band
     assert made.cameras["f150"].net == base.cameras["f150"].net
     assert list(base.varied(bands=["f150"]).cameras) == ["f150"]
-    own = base.varied(bands=[{"name": "f090", "low": "80 GHz", "high": "90 GHz", "net": "1 mK s(1/2)", "detectors": 24}])
+    own = base.varied(
+        bands=[
+            {
+                "name": "f090",
+                "low": "80 GHz",
+                "high": "90 GHz",
+                "net": "1 mK s(1/2)",
+                "detectors": 24,
+            }
+        ]
+    )
     assert own.cameras["f090"].band.low == 80e9
 
 
@@ -170,12 +231,37 @@ def test_a_layout_without_wafers_has_none() -> None:
 @pytest.mark.parametrize(
     ("changes", "at", "message", "cure"),
     [
-        ("detectors: 170", "170", "12 wafers share their pixels equally; detectors of f090 is 170", "write 168 or 192"),
-        ("detectors: 2", "2", "12 wafers share their pixels equally; detectors of f090 is 2", "write 24,"),
-        ("detectors: 171, layout: hexagon", "171", "needs an even number of detectors", "write 170 or 172"),
+        (
+            "detectors: 170",
+            "170",
+            "12 wafers share their pixels equally; detectors of f090 is 170",
+            "write 168 or 192",
+        ),
+        (
+            "detectors: 2",
+            "2",
+            "12 wafers share their pixels equally; detectors of f090 is 2",
+            "write 24,",
+        ),
+        (
+            "detectors: 171, layout: hexagon",
+            "171",
+            "needs an even number of detectors",
+            "write 170 or 172",
+        ),
         ("band: f091", "f091", "so_lat_mf has no band 'f091'", "its bands: f090, f150"),
-        ("bands: [f150, {name: f091, net: 1 mK s(1/2)}]", "f091", "so_lat_mf has no band 'f091'", "low, high or file"),
-        ("layout: rings, wafers: 3", "3", "3 wafers go with layout: wafers, not rings", "write layout: wafers"),
+        (
+            "bands: [f150, {name: f091, net: 1 mK s(1/2)}]",
+            "f091",
+            "so_lat_mf has no band 'f091'",
+            "low, high or file",
+        ),
+        (
+            "layout: rings, wafers: 3",
+            "3",
+            "3 wafers go with layout: wafers, not rings",
+            "write layout: wafers",
+        ),
     ],
 )
 def test_mistakes_stand_at_what_is_wrong(changes: str, at: str, message: str, cure: str) -> None:

@@ -1,11 +1,13 @@
-"""What the fuzzers share: coverage-guided mutation by atheris (libFuzzer), findings kept, each kind told once.
+"""What the fuzzers share: coverage-guided mutation by atheris (libFuzzer), findings kept, each kind
+told once.
 
     pip install atheris
     python tests/fuzz/fuzz_yaml.py --seconds 600
 
-Every finding is written to ``--artifacts`` and the run goes on; exit status 1 when there was one. Inputs that take longer than
-20 s or more than 2 GB stop the run (libFuzzer writes them to the same folder). ``tests/fuzz/corpus`` holds what was found
-interesting or wrong; `tests/fuzz/test_corpus.py` replays it.
+Every finding is written to ``--artifacts`` and the run goes on; exit status 1 when there was one.
+Inputs that take longer than 20 s or more than 2 GB stop the run (libFuzzer writes them to the same
+folder). ``tests/fuzz/corpus`` holds what was found interesting or wrong;
+`tests/fuzz/test_corpus.py` replays it.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ Target = Callable[[bytes], None]
 
 
 def guided_by(*modules: str) -> contextlib.AbstractContextManager[Any]:
-    """Around the imports of what is fuzzed: coverage of these modules guides the search, where a fuzzer runs."""
+    """Around the imports of what is fuzzed: coverage of these modules guides the search, where a
+    fuzzer runs.
+    """
     if "--seconds" not in sys.argv:  # a replay
         return contextlib.nullcontext()
     import atheris
@@ -42,7 +46,9 @@ def guided_by(*modules: str) -> contextlib.AbstractContextManager[Any]:
 
 
 def little_memory() -> None:
-    """Let readers believe that 256 MB are free: what would ask for more is refused, and libFuzzer's own limit is a finding."""
+    """Let readers believe that 256 MB are free: what would ask for more is refused, and libFuzzer's
+    own limit is a finding.
+    """
     from zonda.core import machine
 
     machine.available_memory = lambda: 256 << 20  # type: ignore[assignment]
@@ -72,12 +78,24 @@ def fuzz(
     longest: int = 4096,
     words: Iterable[str] = (),
 ) -> None:
-    """The command line of a fuzzer. ``seeds``: whole inputs to begin with; ``words``: what is put in here and there."""
+    """The command line of a fuzzer. ``seeds``: whole inputs to begin with; ``words``: what is put
+    in here and there.
+    """
     options = argparse.ArgumentParser(description=f"Fuzz {name}.")
     options.add_argument("--seconds", type=int, required=True)
     options.add_argument("--seed", type=int, default=1)
-    options.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / f"zonda-fuzz-{name}", help="growing corpus")
-    options.add_argument("--artifacts", type=Path, default=None, help="folder for findings [default: beside the corpus]")
+    options.add_argument(
+        "--work",
+        type=Path,
+        default=Path(tempfile.gettempdir()) / f"zonda-fuzz-{name}",
+        help="growing corpus",
+    )
+    options.add_argument(
+        "--artifacts",
+        type=Path,
+        default=None,
+        help="folder for findings [default: beside the corpus]",
+    )
     given = options.parse_args()
     try:
         import atheris
@@ -114,19 +132,35 @@ def fuzz(
                 told.add(kind)
                 path = artifacts / f"{type(err).__name__}-{hashlib.sha1(data).hexdigest()[:12]}"
                 path.write_bytes(data)
-                print(f"\nFOUND {path}: {type(err).__name__}: {err}"[:600], *frames[-3:], sep="\n  ", flush=True)
+                print(
+                    f"\nFOUND {path}: {type(err).__name__}: {err}"[:600],
+                    *frames[-3:],
+                    sep="\n  ",
+                    flush=True,
+                )
         if time.monotonic() - began > given.seconds:
-            print(f"\n{name}: {count} inputs in {time.monotonic() - began:.0f} s, {len(told)} kinds of findings", flush=True)
+            print(
+                f"\n{name}: {count} inputs in {time.monotonic() - began:.0f} s, {len(told)} kinds"
+                " of findings",
+                flush=True,
+            )
             os._exit(1 if told else 0)
 
     for found in (CORPUS / name).glob("*"):
         if not found.name.startswith("hang"):  # what a library hangs on would end the run at once
             shutil.copy(found, given.work)
     arguments = [
-        sys.argv[0], str(given.work),
-        f"-seed={given.seed}", f"-timeout={SECONDS_EACH}", f"-rss_limit_mb={MEGABYTES}", f"-max_len={longest}",
-        f"-artifact_prefix={artifacts}/", *([f"-dict={dictionary}"] if words else []), "-verbosity=0", "-print_final_stats=0",
-    ]  # fmt: skip
+        sys.argv[0],
+        str(given.work),
+        f"-seed={given.seed}",
+        f"-timeout={SECONDS_EACH}",
+        f"-rss_limit_mb={MEGABYTES}",
+        f"-max_len={longest}",
+        f"-artifact_prefix={artifacts}/",
+        *([f"-dict={dictionary}"] if words else []),
+        "-verbosity=0",
+        "-print_final_stats=0",
+    ]
     extra = {"custom_mutator": mutate} if mutate is not None else {}
     atheris.Setup(arguments, one, **extra)
     atheris.Fuzz()

@@ -1,4 +1,6 @@
-"""FITS files of any bytes, as sky maps and as time-ordered data: finite values in the promised form, or an `InputError`."""
+"""FITS files of any bytes, as sky maps and as time-ordered data: finite values in the promised
+form, or an `InputError`.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,12 @@ def target(data: bytes) -> None:
         return
     plain_as_astropy_reads_it()
     by_header = {"header_alone": True}
-    for options in ({}, {"centred": True, "unit": "K_RJ", "pixel_size": 1e-5, "missing": "zero"}, {"polarized": True}, by_header):
+    for options in (
+        {},
+        {"centred": True, "unit": "K_RJ", "pixel_size": 1e-5, "missing": "zero"},
+        {"polarized": True},
+        by_header,
+    ):
         try:
             found = read_map(FILE, **options)  # type: ignore[arg-type]
         except ZondaError as err:
@@ -54,7 +61,9 @@ def target(data: bytes) -> None:
         if options is by_header:
             continue
         if isinstance(found, HealpixMap):
-            pixels = np.arange(12 * found.nside**2) if found.pixels is None else found.pixels  # None: of all the sky
+            pixels = (
+                np.arange(12 * found.nside**2) if found.pixels is None else found.pixels
+            )  # None: of all the sky
             assert len(pixels) == len(found.values)
             assert not len(pixels) or (pixels.min() >= 0 and pixels.max() < 12 * found.nside**2)
         else:
@@ -66,27 +75,135 @@ def plain_as_astropy_reads_it() -> None:
     """What our own reader takes for a plain image is the same for astropy: keys, values, pixels."""
     if (found := read_image(FILE)) is not None:
         with fits.open(FILE, memmap=False) as hdus:
-            header = {k: v for k, v in hdus[0].header.items() if k not in ("", "COMMENT", "HISTORY")}
+            header = {
+                k: v for k, v in hdus[0].header.items() if k not in ("", "COMMENT", "HISTORY")
+            }
             assert list(found[0].items()) == list(header.items())
             assert found[1].dtype == hdus[0].data.dtype
             assert np.array_equal(found[1], hdus[0].data, equal_nan=found[1].dtype.kind == "f")
 
 
 VALUES = [
-    "T", "F", "0", "-1", "1", "2", "3", "8", "-32", "-64", "10**9", "1000000000", "999999999999999999999", "1E308", "NaN",
-    "'x'", "'deg'", "'RA---TAN'", "'DEC--TAN'", "'GLON-CAR'", "'RA---ZPN'", "'HPX'", "''", "' '", "90.0", "-91.0",
-    "1E-300", "'K_CMB'", "'Jy/beam'", "'P()'", "'PE(9)'", "'1PD(9)'", "'999999999D'", "'0D'", "'L'", "'5X'", "'I'",
-    "'nested'", "'J2000'", "'HITS'", "'I_STOKES'", "'STOKES'", "'COSMO'", "-1.6375E+30",
-]  # fmt: skip
+    "T",
+    "F",
+    "0",
+    "-1",
+    "1",
+    "2",
+    "3",
+    "8",
+    "-32",
+    "-64",
+    "10**9",
+    "1000000000",
+    "999999999999999999999",
+    "1E308",
+    "NaN",
+    "'x'",
+    "'deg'",
+    "'RA---TAN'",
+    "'DEC--TAN'",
+    "'GLON-CAR'",
+    "'RA---ZPN'",
+    "'HPX'",
+    "''",
+    "' '",
+    "90.0",
+    "-91.0",
+    "1E-300",
+    "'K_CMB'",
+    "'Jy/beam'",
+    "'P()'",
+    "'PE(9)'",
+    "'1PD(9)'",
+    "'999999999D'",
+    "'0D'",
+    "'L'",
+    "'5X'",
+    "'I'",
+    "'nested'",
+    "'J2000'",
+    "'HITS'",
+    "'I_STOKES'",
+    "'STOKES'",
+    "'COSMO'",
+    "-1.6375E+30",
+]
 KEYS = [
-    "SIMPLE", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "NAXIS3", "EXTEND", "PCOUNT", "GCOUNT", "GROUPS", "XTENSION",
-    "TFIELDS", "TFORM1", "TTYPE1", "TFORM2", "TDIM1", "TSCAL1", "TZERO1", "TNULL1", "THEAP", "BSCALE", "BZERO", "BLANK",
-    "BUNIT", "TUNIT1", "TEMPSCAL", "CTYPE1", "CTYPE2", "CUNIT1", "CRVAL1", "CRVAL2", "CRPIX1", "CDELT1", "CDELT2",
-    "CD1_1", "CD1_2", "PC1_1", "PV2_1", "LONPOLE", "EQUINOX", "RADESYS", "NSIDE", "ORDERING", "PIXTYPE", "COORDSYS",
-    "INDXSCHM", "BMAJ", "BMIN", "CONTINUE", "END", "ZIMAGE", "ZCMPTYPE", "ZBITPIX", "ZNAXIS", "ZNAXIS1", "ZTILE1",
-    "BAD_DATA", "TTYPE1", "TTYPE2", "TUNIT2", "POLCCONV", "CTYPE3", "CRVAL3", "CRPIX3", "CDELT3", "LONPOLE", "CD2_2", "PC2_2",
-    "A_ORDER", "A_0_2", "CPDIS1", "D2IM1", "CHECKSUM",
-]  # fmt: skip
+    "SIMPLE",
+    "BITPIX",
+    "NAXIS",
+    "NAXIS1",
+    "NAXIS2",
+    "NAXIS3",
+    "EXTEND",
+    "PCOUNT",
+    "GCOUNT",
+    "GROUPS",
+    "XTENSION",
+    "TFIELDS",
+    "TFORM1",
+    "TTYPE1",
+    "TFORM2",
+    "TDIM1",
+    "TSCAL1",
+    "TZERO1",
+    "TNULL1",
+    "THEAP",
+    "BSCALE",
+    "BZERO",
+    "BLANK",
+    "BUNIT",
+    "TUNIT1",
+    "TEMPSCAL",
+    "CTYPE1",
+    "CTYPE2",
+    "CUNIT1",
+    "CRVAL1",
+    "CRVAL2",
+    "CRPIX1",
+    "CDELT1",
+    "CDELT2",
+    "CD1_1",
+    "CD1_2",
+    "PC1_1",
+    "PV2_1",
+    "LONPOLE",
+    "EQUINOX",
+    "RADESYS",
+    "NSIDE",
+    "ORDERING",
+    "PIXTYPE",
+    "COORDSYS",
+    "INDXSCHM",
+    "BMAJ",
+    "BMIN",
+    "CONTINUE",
+    "END",
+    "ZIMAGE",
+    "ZCMPTYPE",
+    "ZBITPIX",
+    "ZNAXIS",
+    "ZNAXIS1",
+    "ZTILE1",
+    "BAD_DATA",
+    "TTYPE1",
+    "TTYPE2",
+    "TUNIT2",
+    "POLCCONV",
+    "CTYPE3",
+    "CRVAL3",
+    "CRPIX3",
+    "CDELT3",
+    "LONPOLE",
+    "CD2_2",
+    "PC2_2",
+    "A_ORDER",
+    "A_0_2",
+    "CPDIS1",
+    "D2IM1",
+    "CHECKSUM",
+]
 
 
 def mutate(data: bytes, longest: int, seed: int) -> bytes:
@@ -102,7 +219,9 @@ def mutate(data: bytes, longest: int, seed: int) -> bytes:
     same = [k for k in range(0, len(data), CARD) if data[k : k + 8] == card[:8]]
     if same and rng.random() < 0.8:
         at = rng.choice(same)
-    elif data[end + CARD : end + 2 * CARD].strip(b" ") == b"" and rng.random() < 0.8:  # a free card behind END
+    elif (
+        data[end + CARD : end + 2 * CARD].strip(b" ") == b"" and rng.random() < 0.8
+    ):  # a free card behind END
         return (data[:end] + card + data[end : end + CARD] + data[end + 2 * CARD :])[:longest]
     else:
         at = CARD * rng.randrange(max(1, min(end, len(data)) // CARD))
@@ -121,15 +240,43 @@ def seeds() -> Iterator[bytes]:
         "CRVAL2": 20.0,
         "CUNIT1": "deg",
     }
-    image.header.update({**world, "CDELT1": -1 / 60, "CDELT2": 1 / 60, "CUNIT2": "deg", "BUNIT": "K", "TEMPSCAL": "K_RJ"})
-    table = fits.BinTableHDU.from_columns([fits.Column("T", "D", unit="K_CMB", array=np.arange(12.0))])
+    image.header.update(
+        {
+            **world,
+            "CDELT1": -1 / 60,
+            "CDELT2": 1 / 60,
+            "CUNIT2": "deg",
+            "BUNIT": "K",
+            "TEMPSCAL": "K_RJ",
+        }
+    )
+    table = fits.BinTableHDU.from_columns(
+        [fits.Column("T", "D", unit="K_CMB", array=np.arange(12.0))]
+    )
     table.header.update({"PIXTYPE": "HEALPIX", "ORDERING": "RING", "NSIDE": 1, "COORDSYS": "C"})
-    columns = [fits.Column("PIXEL", "J", array=np.arange(4)), fits.Column("T", "E", unit="y", array=np.arange(4.0))]
+    columns = [
+        fits.Column("PIXEL", "J", array=np.arange(4)),
+        fits.Column("T", "E", unit="y", array=np.arange(4.0)),
+    ]
     partial = fits.BinTableHDU.from_columns(columns)
-    partial.header.update({"PIXTYPE": "HEALPIX", "ORDERING": "NESTED", "NSIDE": 2, "COORDSYS": "G", "INDXSCHM": "EXPLICIT"})
-    packed = fits.ImageHDU((rng.standard_normal((4, 5)) * 100).astype(np.int16), header=image.header)
+    partial.header.update(
+        {
+            "PIXTYPE": "HEALPIX",
+            "ORDERING": "NESTED",
+            "NSIDE": 2,
+            "COORDSYS": "G",
+            "INDXSCHM": "EXPLICIT",
+        }
+    )
+    packed = fits.ImageHDU(
+        (rng.standard_normal((4, 5)) * 100).astype(np.int16), header=image.header
+    )
     packed.header.update({"BSCALE": 0.1, "BZERO": 3.0, "BLANK": -32768})
-    squeezed = fits.CompImageHDU(rng.integers(0, 100, (8, 8)).astype(np.int32), header=image.header, compression_type="RICE_1")
+    squeezed = fits.CompImageHDU(
+        rng.integers(0, 100, (8, 8)).astype(np.int32),
+        header=image.header,
+        compression_type="RICE_1",
+    )
     for hdus in (
         [image],
         [fits.PrimaryHDU(), table],

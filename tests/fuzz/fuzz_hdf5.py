@@ -1,4 +1,5 @@
-"""HDF5 and NetCDF files of any bytes, as TOAST's time-ordered data and as ERA5: whole and finite, or an `InputError`.
+"""HDF5 and NetCDF files of any bytes, as TOAST's time-ordered data and as ERA5: whole and finite,
+or an `InputError`.
 
 Inputs begin with one byte: 1 is time-ordered data, anything else is an ERA5 file.
 """
@@ -36,7 +37,9 @@ def whole(tod: TimeOrderedData) -> None:
     assert tod.quats.shape == (d, 4)
     assert tod.detector_flags.shape == (d,)
     assert all(column.shape == (d,) for column in tod.columns.values())
-    assert all(stream.shape[:2] == (d, n) and stream.dtype.kind in "fiu" for stream in tod.streams.values())
+    assert all(
+        stream.shape[:2] == (d, n) and stream.dtype.kind in "fiu" for stream in tod.streams.values()
+    )
     for values in (
         tod.times,
         tod.seconds,
@@ -57,7 +60,10 @@ def target(data: bytes) -> None:
             whole(toast_reading.read(FILE))
         else:
             column = read_era5(FILE, SITE, TIME)
-            assert all(np.isfinite(values).all() for values in (column.pressure, column.height, column.temperature, column.h2o))
+            assert all(
+                np.isfinite(values).all()
+                for values in (column.pressure, column.height, column.temperature, column.h2o)
+            )
             assert (column.pressure > 0).all()
             assert (column.h2o >= 0).all()
     except ZondaError as err:
@@ -69,15 +75,30 @@ def tiny_scan(detectors: int = 2, samples: int = 5) -> TimeOrderedData:
     rng = np.random.default_rng(0)
     unit = np.tile([0.0, 0.0, 0.0, 1.0], (max(detectors, samples), 1))
     seconds = np.arange(samples) / 10
-    columns = {"fwhm": np.full(detectors, 1e-4), "net": np.full(detectors, 1e-3), "band_centre": np.full(detectors, 9e10)}
+    columns = {
+        "fwhm": np.full(detectors, 1e-4),
+        "net": np.full(detectors, 1e-3),
+        "band_centre": np.full(detectors, 9e10),
+    }
     return TimeOrderedData(
-        name="scan", start="2024-11-25T07:00:00", seconds=seconds, times=1.7e9 + seconds, sample_rate=10.0, telescope="t",
-        field_of_view=1e-3, site=("here", 0.7, -1.4, 800.0), boresight_azel=unit[:samples], boresight_radec=unit[:samples],
-        flags=np.zeros(samples, np.uint8), detector_flags=np.zeros(detectors, np.uint8),
+        name="scan",
+        start="2024-11-25T07:00:00",
+        seconds=seconds,
+        times=1.7e9 + seconds,
+        sample_rate=10.0,
+        telescope="t",
+        field_of_view=1e-3,
+        site=("here", 0.7, -1.4, 800.0),
+        boresight_azel=unit[:samples],
+        boresight_radec=unit[:samples],
+        flags=np.zeros(samples, np.uint8),
+        detector_flags=np.zeros(detectors, np.uint8),
         names=[f"d{k}" for k in range(detectors)],
-        quats=unit[:detectors], columns=columns, streams={"signal": rng.standard_normal((detectors, samples))},
+        quats=unit[:detectors],
+        columns=columns,
+        streams={"signal": rng.standard_normal((detectors, samples))},
         metadata={"seed": 1},
-    )  # fmt: skip
+    )
 
 
 def seeds() -> Iterator[bytes]:
@@ -91,13 +112,35 @@ def seeds() -> Iterator[bytes]:
     era5_files = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(era5_files)
     for layout in (era5_files.new_layout, era5_files.old_layout):
-        yield b"\0" + layout(FILE, latitude=(41.0, 40.5), longitude=(10.0, 10.25), hours=(0, 3)).read_bytes()
+        yield (
+            b"\0"
+            + layout(
+                FILE, latitude=(41.0, 40.5), longitude=(10.0, 10.25), hours=(0, 3)
+            ).read_bytes()
+        )
 
 
 WORDS = (
-    "valid_time", "time", "pressure_level", "level", "latitude", "longitude", "hours since 1900-01-01", "scale_factor",
-    "hPa", "_FillValue", "toast_format_version", "CDF\1", "CDF\2", "\x89HDF", "TREE", "SNOD", "HEAP", "OHDR", "GCOL",
-)  # fmt: skip
+    "valid_time",
+    "time",
+    "pressure_level",
+    "level",
+    "latitude",
+    "longitude",
+    "hours since 1900-01-01",
+    "scale_factor",
+    "hPa",
+    "_FillValue",
+    "toast_format_version",
+    "CDF\1",
+    "CDF\2",
+    "\x89HDF",
+    "TREE",
+    "SNOD",
+    "HEAP",
+    "OHDR",
+    "GCOL",
+)
 
 if __name__ == "__main__":
     from zonda.core.storage import hdf5_files

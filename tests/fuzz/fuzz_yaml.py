@@ -1,4 +1,6 @@
-"""Pipeline files of any bytes: a `PipelineFile` that writes itself down and reads back the same, or a `ZondaError`."""
+"""Pipeline files of any bytes: a `PipelineFile` that writes itself down and reads back the same, or
+a `ZondaError`.
+"""
 
 from __future__ import annotations
 
@@ -121,7 +123,9 @@ def words() -> list[str]:
         "[",
         "  - ",
     ]
-    return sorted(word for word in found | set(notation) | {f"1 {unit}" for unit in UNITS} if len(word) < 60)
+    return sorted(
+        word for word in found | set(notation) | {f"1 {unit}" for unit in UNITS} if len(word) < 60
+    )
 
 
 if __name__ == "__main__":

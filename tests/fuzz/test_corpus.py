@@ -1,4 +1,6 @@
-"""What the fuzzers found stays mended, and files damaged at random places are read right or refused with a clean error."""
+"""What the fuzzers found stays mended, and files damaged at random places are read right or refused
+with a clean error.
+"""
 
 from __future__ import annotations
 
@@ -76,13 +78,19 @@ def damaged(data: bytes, seed: int, how: str) -> bytes:
         made[at : at + 512] = bytes(len(made[at : at + 512]))
     else:
         for _ in range(rng.choice((1, 3, 30))):
-            made[rng.randrange(1, len(made))] = rng.randrange(256) if how == "bytes" else rng.choice(b"0123456789-'.ETN")
+            made[rng.randrange(1, len(made))] = (
+                rng.randrange(256) if how == "bytes" else rng.choice(b"0123456789-'.ETN")
+            )
     return bytes(made)
 
 
 def many(examples: int) -> settings:
     return settings(
-        max_examples=examples, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck)
+        max_examples=examples,
+        derandomize=True,
+        deadline=None,
+        database=None,
+        suppress_health_check=list(HealthCheck),
     )
 
 
@@ -130,7 +138,18 @@ def test_an_input_on_which_libhdf5_hangs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", FUZZERS)
 @pytest.mark.parametrize(
-    "data", [b"", b"\0", b"\1", b"\xff" * 5000, b"SIMPLE  =", b"\x89HDF\r\n\x1a\n", b"CDF\1", b"PK\3\4", b"\x1f\x8b\x08"]
+    "data",
+    [
+        b"",
+        b"\0",
+        b"\1",
+        b"\xff" * 5000,
+        b"SIMPLE  =",
+        b"\x89HDF\r\n\x1a\n",
+        b"CDF\1",
+        b"PK\3\4",
+        b"\x1f\x8b\x08",
+    ],
 )
 def test_stumps(name: str, data: bytes) -> None:
     for first in (b"", b"\0", b"\1", b"T", b"P", b"F"):

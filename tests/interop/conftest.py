@@ -1,4 +1,6 @@
-"""A survey-like scan of two bands: turnarounds, trimmed ends, a dead and an opaque detector, kept in Python and in files."""
+"""A survey-like scan of two bands: turnarounds, trimmed ends, a dead and an opaque detector, kept
+in Python and in files.
+"""
 
 import re
 from pathlib import Path
@@ -24,8 +26,20 @@ INSTRUMENT = {
     "illumination_efficiency": 0.9,
     "sample_rate": "100 Hz",
 }
-SCENE = {"site": "atacama", "instrument": INSTRUMENT, "time": "2024-06-25T07:00", "target": "az 180 deg el 50 deg", "seed": 1}
-SCAN = {"throw": "4 deg", "speed": "0.8 deg/s", "acceleration": "1 deg/s2", "scan_duration": "41.3 s", "check_limits": "warn"}
+SCENE = {
+    "site": "atacama",
+    "instrument": INSTRUMENT,
+    "time": "2024-06-25T07:00",
+    "target": "az 180 deg el 50 deg",
+    "seed": 1,
+}
+SCAN = {
+    "throw": "4 deg",
+    "speed": "0.8 deg/s",
+    "acceleration": "1 deg/s2",
+    "scan_duration": "41.3 s",
+    "check_limits": "warn",
+}
 
 
 @pytest.fixture(scope="session")
@@ -41,16 +55,21 @@ def survey(tmp_path_factory):
         zonda.SaveTOD(),
     ]
     folder = tmp_path_factory.mktemp("survey")
-    return zonda.Pipeline(steps).run(zonda.Scene(**SCENE), output=folder, keep=["signal"], threads=1)
+    return zonda.Pipeline(steps).run(
+        zonda.Scene(**SCENE), output=folder, keep=["signal"], threads=1
+    )
 
 
-SECTIONS = re.split(r"^## ", (Path(__file__).parents[2] / "docs" / "interop.md").read_text(), flags=re.MULTILINE)
+SECTIONS = re.split(
+    r"^## ", (Path(__file__).parents[2] / "docs" / "interop.md").read_text(), flags=re.MULTILINE
+)
 
 
 @pytest.fixture
 def examples(tmp_path, monkeypatch):
-    """Run all Python of a section of docs/interop.md, one block after the other, beside the my.yaml that it speaks of (and
-    data of two bands where it names them). Returns the names that it defines."""
+    """Run all Python of a section of docs/interop.md, one block after the other, beside the my.yaml
+    that it speaks of (and data of two bands where it names them). Returns the names that it
+    defines."""
     monkeypatch.chdir(tmp_path)
 
     def run(section, pixels):

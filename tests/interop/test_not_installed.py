@@ -1,4 +1,6 @@
-"""Steps that need a package which is not installed say so, with the cure, before anything is simulated."""
+"""Steps that need a package which is not installed say so, with the cure, before anything is
+simulated.
+"""
 
 from importlib.util import find_spec
 
@@ -7,9 +9,22 @@ import yaml
 
 from zonda.core.cli import main
 
-SCENE = {"site": "atacama", "instrument": "act_150ghz", "time": "2024-06-25T07:00", "target": "az 180 deg el 50 deg", "seed": 1}
+SCENE = {
+    "site": "atacama",
+    "instrument": "act_150ghz",
+    "time": "2024-06-25T07:00",
+    "target": "az 180 deg el 50 deg",
+    "seed": 1,
+}
 STEPS = {
-    "toast": ("toast", ["WhiteNoise", "Efficiency", {"ToastOperator": {"operator": "PolyFilter", "traits": {"order": 3}}}]),
+    "toast": (
+        "toast",
+        [
+            "WhiteNoise",
+            "Efficiency",
+            {"ToastOperator": {"operator": "PolyFilter", "traits": {"order": 3}}},
+        ],
+    ),
     "pysm3": ("pysm", [{"PySMSky": {"models": ["d1", "s1"]}}, "WhiteNoise", "Efficiency"]),
 }
 """Of each package its extra and steps that need it."""

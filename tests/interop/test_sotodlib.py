@@ -1,7 +1,7 @@
 """sotodlib and so3g on our scans: names, flags, pointing, and so3g's map beside ours.
 
-`.ci/sotodlib` runs these in an environment with sotodlib (the extra ``sotodlib``), where none may be skipped
-(ZONDA_SOTODLIB=required).
+`.ci/sotodlib` runs these in an environment with sotodlib (the extra ``sotodlib``), where none may
+be skipped (ZONDA_SOTODLIB=required).
 """
 
 import numpy as np
@@ -14,7 +14,10 @@ from zonda.operators.io.save_tod import load_tod
 
 from ..scenes import skip_without
 
-pytestmark = [pytest.mark.sotodlib, pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning")]
+pytestmark = [
+    pytest.mark.sotodlib,
+    pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning"),
+]
 
 skip_without("sotodlib")
 
@@ -34,7 +37,9 @@ def observation(survey):
 
 
 def own_directions(o):
-    """(n_det, n_samp, 4): the direction (3) and the polarization's angle psi of each detector, of the observation itself."""
+    """(n_det, n_samp, 4): the direction (3) and the polarization's angle psi of each detector, of
+    the observation itself.
+    """
     f = o.focalplane
     found = []
     for detector in detector_quaternions(f.xi, f.eta, f.polarization_angle):
@@ -46,15 +51,21 @@ def own_directions(o):
 
 def directions(sight, aman):
     """The same by so3g, from sotodlib's names."""
-    plane = so3g.proj.FocalPlane.from_xieta(aman.focal_plane.xi, aman.focal_plane.eta, aman.focal_plane.gamma)
+    plane = so3g.proj.FocalPlane.from_xieta(
+        aman.focal_plane.xi, aman.focal_plane.eta, aman.focal_plane.gamma
+    )
     found = []
     for lon, lat, c, s in (np.array(each).T for each in sight.coords(plane)):
-        found.append([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat), np.arctan2(s, c)])
+        found.append(
+            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat), np.arctan2(s, c)]
+        )
     return np.array(found)
 
 
 def apart(a, b):
-    """Largest separation [arcsec], and largest difference of polarization angles modulo 180 deg [arcsec]."""
+    """Largest separation [arcsec], and largest difference of polarization angles modulo 180 deg
+    [arcsec].
+    """
     psi = np.abs((a[:, 3] - b[:, 3] + np.pi / 2) % np.pi - np.pi / 2)
     chord = np.sqrt(((a[:, :3] - b[:, :3]) ** 2).sum(axis=1))
     return np.degrees([2 * np.arcsin(chord.max() / 2), psi.max()]) * 3600
@@ -71,8 +82,13 @@ def test_names_and_values(aman, observation):
     np.testing.assert_allclose(aman.boresight.el, o.elevation, rtol=0, atol=1e-14)
     np.testing.assert_allclose(aman.boresight.roll, 0, rtol=0, atol=1e-14)
     tangent = np.hypot(o.focalplane.xi, o.focalplane.eta)
-    np.testing.assert_allclose(np.hypot(aman.focal_plane.xi, aman.focal_plane.eta), np.sin(np.arctan(tangent)), rtol=1e-12)
-    assert np.degrees(tangent.max() - np.hypot(aman.focal_plane.xi, aman.focal_plane.eta).max()) * 3600 > 20  # at almost 4 deg
+    np.testing.assert_allclose(
+        np.hypot(aman.focal_plane.xi, aman.focal_plane.eta), np.sin(np.arctan(tangent)), rtol=1e-12
+    )
+    assert (
+        np.degrees(tangent.max() - np.hypot(aman.focal_plane.xi, aman.focal_plane.eta).max()) * 3600
+        > 20
+    )  # at almost 4 deg
     assert set(aman.det_info.band) == set(aman.det_info.wafer.bandpass) == {"f150"}
     assert aman.det_info.wafer_slot.tolist() == [f"ws{number}" for number in o.focalplane.wafer]
     assert aman.obs_info.obs_id == "scan-000-f150"
@@ -80,10 +96,20 @@ def test_names_and_values(aman, observation):
 
 def test_flags_are_ranges_matrices(aman, observation):
     o, flags = observation, aman.flags
-    for name in ("invalid", "processing", "irregular", "sun_up", "detectors", "samples", "excluded"):
+    for name in (
+        "invalid",
+        "processing",
+        "irregular",
+        "sun_up",
+        "detectors",
+        "samples",
+        "excluded",
+    ):
         assert isinstance(flags[name], so3g.proj.RangesMatrix)
         assert flags[name].shape == (o.n_detectors, o.n_samples)
-    np.testing.assert_array_equal(~flags.excluded.mask(), o.good_detectors[:, None] & o.good_samples)
+    np.testing.assert_array_equal(
+        ~flags.excluded.mask(), o.good_detectors[:, None] & o.good_samples
+    )
     np.testing.assert_array_equal(flags.turnarounds.mask(), (o.flags & 4) != 0)
     assert flags.sun_up.mask()[3, 420:600].all()
     assert flags.detectors.mask().all(axis=1).nonzero()[0].tolist() == [1, 5]
@@ -95,7 +121,9 @@ def test_flags_are_ranges_matrices(aman, observation):
 
 
 def test_sotodlibs_own_steps_take_it(observation):
-    """Subscans by the directions of the throws, preprocessing, and the detectors that are not dark."""
+    """Subscans by the directions of the throws, preprocessing, and the detectors that are not
+    dark.
+    """
     from sotodlib.preprocess import Pipeline
     from sotodlib.tod_ops import flags
 
@@ -115,18 +143,32 @@ def test_sotodlibs_own_steps_take_it(observation):
 
 def test_a_file_gives_what_the_run_gives(survey, aman):
     path = survey.products["tod_file"][1]
-    for other in (to_axismanager(path), to_axismanager(load_tod(path)), to_axismanager(survey.observations[1])):
-        for name in ("timestamps", "signal", "boresight.az", "boresight_equ.psi", "focal_plane.xi", "det_info.band"):
+    for other in (
+        to_axismanager(path),
+        to_axismanager(load_tod(path)),
+        to_axismanager(survey.observations[1]),
+    ):
+        for name in (
+            "timestamps",
+            "signal",
+            "boresight.az",
+            "boresight_equ.psi",
+            "focal_plane.xi",
+            "det_info.band",
+        ):
             np.testing.assert_array_equal(other[name], aman[name])
         np.testing.assert_array_equal(other.flags.excluded.mask(), aman.flags.excluded.mask())
         assert (other.det_info.wafer_slot == aman.det_info.wafer_slot).all()
 
 
 def test_so3g_points_where_zonda_points(survey, aman, observation):
-    """Both transform above the atmosphere by IAU models with the Earth's orientation of the IERS, and agree to 0.001 arcsec.
-    Polar motion, which so3g leaves out by itself, is 0.48 arcsec on this day; with the wrong sign it would be twice that."""
+    """Both transform above the atmosphere by IAU models with the Earth's orientation of the IERS,
+    and agree to 0.001 arcsec. Polar motion, which so3g leaves out by itself, is 0.48 arcsec on this
+    day; with the wrong sign it would be twice that."""
     ours = own_directions(observation)
-    recorded = so3g.proj.CelestialSightLine.for_lonlat(aman.boresight_equ.ra, aman.boresight_equ.dec, aman.boresight_equ.psi)
+    recorded = so3g.proj.CelestialSightLine.for_lonlat(
+        aman.boresight_equ.ra, aman.boresight_equ.dec, aman.boresight_equ.psi
+    )
     assert apart(directions(recorded, aman), ours)[0] < 0.01
     separation, angle = apart(directions(sight_line(survey, scan=1), aman), ours)
     print(f"\nso3g's pointing: {separation:.3f} arcsec, polarization angle {angle:.2f} arcsec")
@@ -135,14 +177,18 @@ def test_so3g_points_where_zonda_points(survey, aman, observation):
 
 
 def test_so3g_maps_what_zonda_maps(survey, aman, observation):
-    """so3g's projection of our pointing onto pixell's pixels: what lies on an edge of pixels may fall to either side."""
+    """so3g's projection of our pointing onto pixell's pixels: what lies on an edge of pixels may
+    fall to either side.
+    """
     from pixell import enmap
 
     ours = survey.products["map_f150"]
     header = ours.wcs.to_header()
     geometry = enmap.zeros(ours.hits.shape, ours.wcs)
     assert header["CTYPE1"].endswith("CAR")
-    matrix = sotodlib.coords.P.for_tod(aman, geom=geometry.geometry, comps="T", cuts=aman.flags.excluded)
+    matrix = sotodlib.coords.P.for_tod(
+        aman, geom=geometry.geometry, comps="T", cuts=aman.flags.excluded
+    )
     hits = np.asarray(matrix.to_weights()[0, 0])
     total = np.asarray(matrix.to_map(tod=aman)[0])
     moved = np.abs(hits - ours.hits).sum() / ours.hits.sum()
@@ -152,7 +198,9 @@ def test_so3g_maps_what_zonda_maps(survey, aman, observation):
     same = (hits == ours.hits) & (hits > 0)
     # all detectors weigh the same; float32 signals of 1e-2 K
     found = total[same] / hits[same]
-    np.testing.assert_allclose(found, ours.signal[same], rtol=0, atol=1e-6 * np.abs(ours.signal[same]).max())
+    np.testing.assert_allclose(
+        found, ours.signal[same], rtol=0, atol=1e-6 * np.abs(ours.signal[same]).max()
+    )
 
 
 def test_bands_are_joined_by_sotodlib(survey):
@@ -178,7 +226,9 @@ def test_errors_name_cause_and_cure(survey, tmp_path):
 
 
 def test_the_page_does_what_it_says(examples):
-    """All code of docs/interop.md on sotodlib; its map is zonda's where so3g counts the same hits."""
+    """All code of docs/interop.md on sotodlib; its map is zonda's where so3g counts the same
+    hits.
+    """
     names = examples("sotodlib", {"projection": "CAR", "pixel": "2 arcmin"})
     assert sorted(set(names["whole"].det_info.band)) == ["f090", "f150"]
     ours, hits = names["data"]["map"], np.asarray(names["matrix"].to_weights()[0, 0])
@@ -186,4 +236,6 @@ def test_the_page_does_what_it_says(examples):
     assert np.abs(hits - ours.hits).sum() < 2e-4 * ours.hits.sum()
     largest = np.nanmax(np.abs(ours.signal))
     # the file's signal, rounded to float32, of the same samples
-    np.testing.assert_allclose(names["signal"][same], ours.signal[same], rtol=0, atol=1e-6 * largest)
+    np.testing.assert_allclose(
+        names["signal"][same], ours.signal[same], rtol=0, atol=1e-6 * largest
+    )

@@ -1,6 +1,8 @@
-"""Our scans as TOAST's Observations and back, TOAST's map-makers on them, and our operators in a pipeline of TOAST.
+"""Our scans as TOAST's Observations and back, TOAST's map-makers on them, and our operators in a
+pipeline of TOAST.
 
-`.ci/toast` runs these in an environment with TOAST (the extra ``toast``), where none may be skipped (ZONDA_TOAST=required).
+`.ci/toast` runs these in an environment with TOAST (the extra ``toast``), where none may be skipped
+(ZONDA_TOAST=required).
 """
 
 import dataclasses
@@ -16,7 +18,10 @@ from zonda.operators.io.save_tod import load_tod
 
 from ..scenes import skip_without
 
-pytestmark = [pytest.mark.toast, pytest.mark.filterwarnings("ignore:Pointing", "ignore:LoadTOD", "ignore::DeprecationWarning")]
+pytestmark = [
+    pytest.mark.toast,
+    pytest.mark.filterwarnings("ignore:Pointing", "ignore:LoadTOD", "ignore::DeprecationWarning"),
+]
 
 skip_without("toast")
 
@@ -36,14 +41,18 @@ def data(survey):
 
 
 def same(one, other):
-    """Two scans agree: what TOAST keeps in degrees and GHz to rounding, all else to the last bit."""
+    """Two scans agree: what TOAST keeps in degrees and GHz to rounding, all else to the last
+    bit.
+    """
     for field in dataclasses.fields(one):
         a, b = (getattr(tod, field.name) for tod in (one, other))
         if field.name == "site":
             assert a[0] == b[0]
             np.testing.assert_allclose(a[1:], b[1:], rtol=1e-9)
         elif field.name == "intervals":
-            assert {name: len(spans) for name, spans in a.items()} == {name: len(spans) for name, spans in b.items()}
+            assert {name: len(spans) for name, spans in a.items()} == {
+                name: len(spans) for name, spans in b.items()
+            }
             for name, spans in a.items():  # times are POSIX in TOAST: 0.24 us
                 np.testing.assert_allclose(spans, b[name], rtol=0, atol=1e-6)
         elif field.name in ("columns", "streams"):
@@ -56,7 +65,9 @@ def same(one, other):
         elif field.name == "weather":
             assert (a is None) == (b is None)
             if a is not None:
-                np.testing.assert_allclose(dataclasses.astuple(a), dataclasses.astuple(b), rtol=1e-12)
+                np.testing.assert_allclose(
+                    dataclasses.astuple(a), dataclasses.astuple(b), rtol=1e-12
+                )
         elif isinstance(a, np.ndarray):
             np.testing.assert_allclose(a, b, rtol=0)
         elif isinstance(a, float):
@@ -83,14 +94,23 @@ def test_it_is_what_toast_reads_from_our_file(survey, data):
         for name in read.shared:
             np.testing.assert_array_equal(ours.shared[name].data, read.shared[name].data)
         for name in survey.observations[number].intervals:
-            assert [(i.first, i.last) for i in ours.intervals[name]] == [(i.first, i.last) for i in read.intervals[name]]
-        one, other = ours.telescope.focalplane.detector_data, read.telescope.focalplane.detector_data
+            assert [(i.first, i.last) for i in ours.intervals[name]] == [
+                (i.first, i.last) for i in read.intervals[name]
+            ]
+        one, other = (
+            ours.telescope.focalplane.detector_data,
+            read.telescope.focalplane.detector_data,
+        )
         assert one.colnames == other.colnames
         for detector in ours.local_detectors:  # float32 in the file
             np.testing.assert_allclose(
-                ours["noise_model"].psd(detector).value, read["noise_model"].psd(detector).value, rtol=1e-6
+                ours["noise_model"].psd(detector).value,
+                read["noise_model"].psd(detector).value,
+                rtol=1e-6,
             )
-            weights = [ob["noise_model"].detector_weight(detector).to_value("K-2") for ob in (ours, read)]
+            weights = [
+                ob["noise_model"].detector_weight(detector).to_value("K-2") for ob in (ours, read)
+            ]
             np.testing.assert_allclose(*weights, rtol=1e-6)
 
 
@@ -106,18 +126,34 @@ def full_sky(local):
 
 
 def test_toasts_mapmaker_beside_ours(survey, data):
-    """MapMaker without templates is a binned map; ours of the same scan, whose stream was read back by `from_toast`."""
+    """MapMaker without templates is a binned map; ours of the same scan, whose stream was read back
+    by `from_toast`.
+    """
     from zonda.operators.io.save_tod import save_tod
 
     chosen = toast.Data(toast.Comm())
     chosen.obs.append(data.obs[1])
-    pixels = toast.ops.PixelsHealpix(nside=NSIDE, nest=False, detector_pointing=toast.ops.PointingDetectorSimple())
+    pixels = toast.ops.PixelsHealpix(
+        nside=NSIDE, nest=False, detector_pointing=toast.ops.PointingDetectorSimple()
+    )
     weights = toast.ops.StokesWeights(mode="I", detector_pointing=pixels.detector_pointing)
-    binning = toast.ops.BinMap(pixel_dist="dist", pixel_pointing=pixels, stokes_weights=weights, noise_model="noise_model")
+    binning = toast.ops.BinMap(
+        pixel_dist="dist", pixel_pointing=pixels, stokes_weights=weights, noise_model="noise_model"
+    )
     maker = toast.ops.MapMaker(
-        name="theirs", det_data="signal", binning=binning, template_matrix=None, keep_final_products=True, write_binmap=False,
-        write_map=False, write_hits=False, write_cov=False, write_rcond=False, write_invcov=False, save_cleaned=False,
-    )  # fmt: skip
+        name="theirs",
+        det_data="signal",
+        binning=binning,
+        template_matrix=None,
+        keep_final_products=True,
+        write_binmap=False,
+        write_map=False,
+        write_hits=False,
+        write_cov=False,
+        write_rcond=False,
+        write_invcov=False,
+        save_cleaned=False,
+    )
     maker.apply(chosen)
     product = next(key for key in ("theirs_map", "theirs_binmap") if key in chosen)
     hits, signal = full_sky(chosen["theirs_hits"]), full_sky(chosen[product])
@@ -133,7 +169,8 @@ def test_toasts_mapmaker_beside_ours(survey, data):
     np.testing.assert_array_equal(hits, counted)
     difference = np.abs(signal - brightness).max()
     print(f"\nTOAST's map minus ours: {difference:.1e} K of {np.abs(brightness).max():.1e} K")
-    # both add the same float64 numbers, and ours rounds each to float32 about a level that is the filtered stream's (about 0)
+    # both add the same float64 numbers, and ours rounds each to float32 about a level that is the
+    # filtered stream's (about 0)
     assert difference < 2e-7 * np.abs(o.detdata["signal"]).max()
 
 
@@ -146,21 +183,31 @@ def pointed(data):
 
 def test_our_atmosphere_in_a_pipeline_of_toast(survey, data):
     ops = [zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="3 %"), zonda.Efficiency()]
-    simulate, noise = Simulate(ops, seed=3), toast.ops.SimNoise(noise_model="noise_model", det_data="signal")
+    simulate, noise = (
+        Simulate(ops, seed=3),
+        toast.ops.SimNoise(noise_model="noise_model", det_data="signal"),
+    )
     toast.ops.Pipeline(operators=[simulate, noise]).apply(pointed(data))
     made = [ob.detdata["signal"].data.copy() for ob in data.obs]
     assert all(np.isfinite(each).all() for each in made)
-    assert all(5 < each.mean() < 100 for each in made)  # emission at 90 and 150 GHz, elevation 50 deg and 1 mm: kelvins
+    assert all(
+        5 < each.mean() < 100 for each in made
+    )  # emission at 90 and 150 GHz, elevation 50 deg and 1 mm: kelvins
     for ob in data.obs:
         ob.detdata["signal"][:] = 0.0
     simulate.apply(data)
     alone = [ob.detdata["signal"].data.copy() for ob in data.obs]
     for ob, both, without, net in zip(data.obs, made, alone, (300e-6, 360e-6), strict=True):
-        noise = both - without  # what SimNoise added; its law has NET^2 at all frequencies, two-sided
+        noise = (
+            both - without
+        )  # what SimNoise added; its law has NET^2 at all frequencies, two-sided
         assert ob.detdata["signal"].units == u.K
-        # zonda's atmosphere holds float32 about its mean: the same bits in both. Standard error of an rms of n samples 1/sqrt(2n)
+        # zonda's atmosphere holds float32 about its mean: the same bits in both. Standard error of
+        # an rms of n samples 1/sqrt(2n)
         expected = net * np.sqrt(100.0)
-        assert np.median(noise.std(axis=1)) == pytest.approx(expected, rel=5 / np.sqrt(2 * noise.shape[1]) + 0.01)
+        assert np.median(noise.std(axis=1)) == pytest.approx(
+            expected, rel=5 / np.sqrt(2 * noise.shape[1]) + 0.01
+        )
     # two bands of one session see one turbulence; 6 m beams at 90 and 150 GHz differ a little
     waves = [each - each.mean(axis=1, keepdims=True) for each in alone]
     for detector in (0, 3):
@@ -171,14 +218,20 @@ def test_simulate_is_what_zonda_makes_on_the_same_file(survey, data, tmp_path):
     pointing = zonda.LoadTOD(file=survey.products["tod_file"][0], signal=None)
     step = zonda.GroundPickup()
     scene = pointing.scene(seed=5)
-    expected = zonda.Pipeline([pointing, step, zonda.Efficiency()]).run(scene, keep=["signal"]).tod("signal")
+    expected = (
+        zonda.Pipeline([pointing, step, zonda.Efficiency()])
+        .run(scene, keep=["signal"])
+        .tod("signal")
+    )
     simulate = Simulate([zonda.GroundPickup(), zonda.Efficiency()], seed=7, scene={"seed": 5})
     before = data.obs[0].detdata["signal"].data.copy()
     simulate.apply(data)
     found = data.obs[0].detdata["signal"].data - before
     good = survey.observations[0].good_detectors
     assert np.abs(expected[good]).max() > 0
-    np.testing.assert_allclose(found[good], expected[good], rtol=0, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        found[good], expected[good], rtol=0, atol=1e-6 * np.abs(expected).max()
+    )
 
 
 def test_errors_name_cause_and_cure(survey, data):
@@ -194,7 +247,9 @@ def test_errors_name_cause_and_cure(survey, data):
 
 
 def test_the_page_does_what_it_says(examples, tmp_path):
-    """All code of docs/interop.md on TOAST; its map, in a file, is that of the data that were read back."""
+    """All code of docs/interop.md on TOAST; its map, in a file, is that of the data that were read
+    back.
+    """
     names = examples("TOAST", {"nside": 1024})
     theirs = healpy.read_map(tmp_path / "theirs_hits.fits", dtype=None)
     assert theirs.sum() == names["data"]["map"].hits.sum() > 0
@@ -203,7 +258,9 @@ def test_the_page_does_what_it_says(examples, tmp_path):
 
 
 def of_toast(made, centre):
-    """xi and eta as tangents and gamma of a layout that TOAST made, moved to a quaternion ``centre``."""
+    """xi and eta as tangents and gamma of a layout that TOAST made, moved to a quaternion
+    ``centre``.
+    """
     from toast import qarray
     from toast.instrument_coords import quat_to_xieta
 
@@ -214,7 +271,9 @@ def of_toast(made, centre):
 
 
 def test_published_layouts_are_those_that_toast_makes():
-    """As sotodlib/toast/sim_focalplane.py composes the wafers of an SO SAT: seven in hexagons, each of three rhombi, turned."""
+    """As sotodlib/toast/sim_focalplane.py composes the wafers of an SO SAT: seven in hexagons, each
+    of three rhombi, turned.
+    """
     from toast import qarray
     from toast.instrument_sim import hex_layout, rhomb_xieta_row_col, rhombus_hex_layout
 
@@ -223,14 +282,25 @@ def test_published_layouts_are_those_that_toast_makes():
     scale, axis = np.radians(0.09668), np.array([0.0, 0.0, 1.0])
     found = LAYOUTS["so_sat"](7 * 430)
     places = hex_layout(
-        7, 2 * 128.4 * scale * u.rad, "", "", np.zeros(7) * u.rad, center=qarray.from_axisangle(axis, np.radians(150))
+        7,
+        2 * 128.4 * scale * u.rad,
+        "",
+        "",
+        np.zeros(7) * u.rad,
+        center=qarray.from_axisangle(axis, np.radians(150)),
     )
     angles = [22.5 + 45 * (rhomb_xieta_row_col(144, p)[0] % 2) for p in range(144)] * u.deg
     for wafer, turn in enumerate((240, 0, 300, 180, 120, 60, 60)):
-        centre = qarray.mult(places[f"{wafer}"]["quat"], qarray.from_axisangle(axis, np.radians(turn)))
-        xi, eta, gamma = of_toast(rhombus_hex_layout(144, 11 * 5.3 * scale * u.rad, "", "", pol=angles), centre)
+        centre = qarray.mult(
+            places[f"{wafer}"]["quat"], qarray.from_axisangle(axis, np.radians(turn))
+        )
+        xi, eta, gamma = of_toast(
+            rhombus_hex_layout(144, 11 * 5.3 * scale * u.rad, "", "", pol=angles), centre
+        )
         pins = [144 + 66, 144 + 66 + 10]
         own = found.wafer == wafer
         np.testing.assert_allclose(found.x[own], np.delete(xi, pins), atol=1e-12)
         np.testing.assert_allclose(found.y[own], np.delete(eta, pins), atol=1e-12)
-        np.testing.assert_allclose(np.sin(found.angle[own] - np.delete(gamma, pins)), 0, atol=1e-12)  # an axis, not a direction
+        np.testing.assert_allclose(
+            np.sin(found.angle[own] - np.delete(gamma, pins)), 0, atol=1e-12
+        )  # an axis, not a direction

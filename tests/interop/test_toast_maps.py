@@ -1,7 +1,9 @@
-"""TOAST's MapMaker on our scans, handed over without a file: maps of I, Q and U beside ours, and destriped ones.
+"""TOAST's MapMaker on our scans, handed over without a file: maps of I, Q and U beside ours, and
+destriped ones.
 
-The scans are recorded ones with gaps, turnarounds, a dead and an opaque detector, opaque samples, two bands. `.ci/toast` runs
-these in an environment with TOAST (the extra ``toast``), where none may be skipped (ZONDA_TOAST=required).
+The scans are recorded ones with gaps, turnarounds, a dead and an opaque detector, opaque samples,
+two bands. `.ci/toast` runs these in an environment with TOAST (the extra ``toast``), where none may
+be skipped (ZONDA_TOAST=required).
 """
 
 import numpy as np
@@ -12,7 +14,10 @@ import zonda
 from ..scenes import Marks, skip_without
 from .conftest import INSTRUMENT, SCAN, SCENE
 
-pytestmark = [pytest.mark.toast, pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning", "ignore:SkyMap")]
+pytestmark = [
+    pytest.mark.toast,
+    pytest.mark.filterwarnings("ignore:Pointing", "ignore::DeprecationWarning", "ignore:SkyMap"),
+]
 
 skip_without("toast")
 
@@ -24,15 +29,26 @@ import toast.templates
 from zonda.interop.toast import to_toast
 
 NSIDE = 128
-SKY = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg", "CDELT1": -0.05, "CDELT2": 0.05}
+SKY = {
+    "CTYPE1": "RA---TAN",
+    "CTYPE2": "DEC--TAN",
+    "CUNIT1": "deg",
+    "CUNIT2": "deg",
+    "CDELT1": -0.05,
+    "CDELT2": 0.05,
+}
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A table of two minutes of pointing with turnarounds (flag 4) and two gaps, one of them of 3 s."""
+    """A table of two minutes of pointing with turnarounds (flag 4) and two gaps, one of them of 3
+    s.
+    """
     scan = zonda.PointingBackAndForth(**SCAN | {"scan_duration": "120 s"}, flag_turnarounds=True)
-    (o, *_) = (
-        zonda.Pipeline([scan, zonda.WhiteNoise(), zonda.Efficiency()]).run(zonda.Scene(**SCENE), keep=["signal"]).observations
+    o, *_ = (
+        zonda.Pipeline([scan, zonda.WhiteNoise(), zonda.Efficiency()])
+        .run(zonda.Scene(**SCENE), keep=["signal"])
+        .observations
     )
     time, kept = o.start.posix + o.seconds, np.ones(o.n_samples, bool)
     kept[2000:2300] = kept[7000:7060] = False
@@ -49,27 +65,67 @@ def run(recorded, *noise, level=1.0):
     values = np.array([0.02 * np.cos(9 * x + 7 * y), 0.01 * np.sin(8 * x), 0.01 * np.cos(6 * y)])
     scene = zonda.Scene(**SCENE | {"instrument": INSTRUMENT | {"detectors": 56}})
     pointing = zonda.PointingRecorded(file=recorded, split="10 s", flag_mask=15)
-    (o, *_) = zonda.Pipeline([pointing, zonda.WhiteNoise(), zonda.Efficiency()]).run(scene, keep=["signal"]).observations
+    o, *_ = (
+        zonda.Pipeline([pointing, zonda.WhiteNoise(), zonda.Efficiency()])
+        .run(scene, keep=["signal"])
+        .observations
+    )
     ra, dec = np.degrees(o.centre)
-    header = SKY | {"RADESYS": "ICRS", "CRPIX1": 200.5, "CRPIX2": 200.5, "CRVAL1": ra, "CRVAL2": dec}
-    sky = zonda.SkyMap(map=values, wcs=header, unit="K_RJ", polarization_convention="cosmo", scale=level)
-    steps = [pointing, sky, *noise, zonda.Efficiency(), Marks(), zonda.BinMap(stokes="IQU", nside=NSIDE)]
-    return zonda.Pipeline(steps, precision="float64", runs={"noiseless": {"only": ["sky"]}}).run(scene, keep=["signal"])
+    header = SKY | {
+        "RADESYS": "ICRS",
+        "CRPIX1": 200.5,
+        "CRPIX2": 200.5,
+        "CRVAL1": ra,
+        "CRVAL2": dec,
+    }
+    sky = zonda.SkyMap(
+        map=values, wcs=header, unit="K_RJ", polarization_convention="cosmo", scale=level
+    )
+    steps = [
+        pointing,
+        sky,
+        *noise,
+        zonda.Efficiency(),
+        Marks(),
+        zonda.BinMap(stokes="IQU", nside=NSIDE),
+    ]
+    return zonda.Pipeline(steps, precision="float64", runs={"noiseless": {"only": ["sky"]}}).run(
+        scene, keep=["signal"]
+    )
 
 
 def theirs(data, band, *templates):
     """Hits (n_pix,) and I, Q, U (3, n_pix) of a band by TOAST's MapMaker."""
     chosen = toast.Data(toast.Comm())
-    chosen.obs.extend(to_toast(o, comm=chosen.comm) for o in data.observations if o.name.endswith(band))
-    pixels = toast.ops.PixelsHealpix(nside=NSIDE, nest=False, detector_pointing=toast.ops.PointingDetectorSimple())
+    chosen.obs.extend(
+        to_toast(o, comm=chosen.comm) for o in data.observations if o.name.endswith(band)
+    )
+    pixels = toast.ops.PixelsHealpix(
+        nside=NSIDE, nest=False, detector_pointing=toast.ops.PointingDetectorSimple()
+    )
     weights = toast.ops.StokesWeights(mode="IQU", detector_pointing=pixels.detector_pointing)
-    binning = toast.ops.BinMap(pixel_dist="dist", pixel_pointing=pixels, stokes_weights=weights, noise_model="noise_model")
+    binning = toast.ops.BinMap(
+        pixel_dist="dist", pixel_pointing=pixels, stokes_weights=weights, noise_model="noise_model"
+    )
     matrix = toast.ops.TemplateMatrix(templates=list(templates)) if templates else None
     toast.ops.MapMaker(
-        name="maker", det_data="signal", binning=binning, template_matrix=matrix, keep_final_products=True, write_binmap=False,
-        write_map=False, write_hits=False, write_cov=False, write_rcond=False, write_invcov=False, save_cleaned=False,
-        map_rcond_threshold=1e-3, solve_rcond_threshold=1e-3, iter_max=15, convergence=1e-10,
-    ).apply(chosen)  # fmt: skip
+        name="maker",
+        det_data="signal",
+        binning=binning,
+        template_matrix=matrix,
+        keep_final_products=True,
+        write_binmap=False,
+        write_map=False,
+        write_hits=False,
+        write_cov=False,
+        write_rcond=False,
+        write_invcov=False,
+        save_cleaned=False,
+        map_rcond_threshold=1e-3,
+        solve_rcond_threshold=1e-3,
+        iter_max=15,
+        convergence=1e-10,
+    ).apply(chosen)
     product = next(key for key in ("maker_map", "maker_binmap") if key in chosen)
     found = np.zeros((4, 12 * NSIDE**2))
     for name, rows in (("maker_hits", found[:1]), (product, found[1:])):
@@ -101,16 +157,22 @@ def test_iqu_of_scans_with_gaps(recorded, band):
     assert solved.sum() > 100
     difference = np.abs(planes(ours) - maps[:, ours.pixels])[:, solved].max(axis=1)
     largest = np.abs(maps[:, ours.pixels][:, solved]).max()
-    print(f"\nTOAST's I, Q, U minus ours, {band}: {difference} K of {largest:.1e} K in {solved.sum()} pixels")
+    print(
+        f"\nTOAST's I, Q, U minus ours, {band}: {difference} K of {largest:.1e} K in {solved.sum()}"
+        " pixels"
+    )
     # ours rounds cosines and weights to 2^-31, times condition numbers of some tens
     assert (difference < 1e-7 * largest).all()
 
 
 def test_its_destriper_takes_1_over_f_noise_out_of_our_scans(recorded):
-    """Offsets of 1 s against pink noise with a knee of 1 Hz, without a sky, whose slope within a pixel would count as noise.
-    I, which many detectors average and whose large scales no crossing scan determines, stays as it is."""
+    """Offsets of 1 s against pink noise with a knee of 1 Hz, without a sky, whose slope within a
+    pixel would count as noise. I, which many detectors average and whose large scales no crossing
+    scan determines, stays as it is."""
     data = run(recorded, zonda.WhiteNoise(), zonda.PinkNoise(knee="1 Hz"), level=0.0)
-    step = toast.templates.Offset(step_time=1 * u.s, noise_model="noise_model", use_noise_prior=False, times="times")
+    step = toast.templates.Offset(
+        step_time=1 * u.s, noise_model="noise_model", use_noise_prior=False, times="times"
+    )
     ours = data["map_f150"]
     (_, binned), (_, destriped) = (theirs(data, "f150", *t) for t in ((), (step,)))
     well = (ours.hits > np.median(ours.hits)) & (ours.known)

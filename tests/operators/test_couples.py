@@ -1,8 +1,9 @@
-"""What an operator says its output depends on is what it depends on: one input sample is changed, and the outputs are compared.
+"""What an operator says its output depends on is what it depends on: one input sample is changed,
+and the outputs are compared.
 
-``sample``: only the same detector at the same instant changes; ``time``: only the same detector; ``detectors``: only the same
-instant; ``all``: anything may.
-Operators that claim more than they use are reported too: ``time`` and ``all`` must spread.
+``sample``: only the same detector at the same instant changes; ``time``: only the same detector;
+``detectors``: only the same instant; ``all``: anything may. Operators that claim more than they use
+are reported too: ``time`` and ``all`` must spread.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ class Streams(Operator):
         rng = np.random.default_rng(4)
         t = np.arange(N_SAMPLES) / 100
         slow = np.sin(t / 2) + 0.3 * np.sin(t * 1.7)
-        made = {s: SIZE * (slow + 0.2 * rng.standard_normal((N_DETECTORS, N_SAMPLES))) for s in STREAMS}
+        made = {
+            s: SIZE * (slow + 0.2 * rng.standard_normal((N_DETECTORS, N_SAMPLES))) for s in STREAMS
+        }
         if self._changed:
             made[self._changed][DETECTOR, SAMPLE] += SIZE
         return made
@@ -78,7 +81,9 @@ ACTING = {
     "Despline": {},
     "Taper": {"share": "1"},
 }
-"""Operators that make streams of streams. All others make theirs of nothing (tested by the conformance kit) or none."""
+"""Operators that make streams of streams. All others make theirs of nothing (tested by the
+conformance kit) or none.
+"""
 NEED_OTHERS = {"ToastOperator"}
 """They need packages that are not installed with the tests; tests/interop has them."""
 
@@ -126,7 +131,9 @@ def test_observers_leave_the_streams_as_they_are(bench: Any, name: str, tmp_path
     scan, streams = Scan(), Streams()
     scan._observation = bench.observation(N_DETECTORS, N_SAMPLES)
     scene = Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00")
-    data = Pipeline([scan, streams, operator], precision="float64").run(scene, keep=STREAMS, threads=1, output=tmp_path)
+    data = Pipeline([scan, streams, operator], precision="float64").run(
+        scene, keep=STREAMS, threads=1, output=tmp_path
+    )
     given = streams.prepare(data.observations[0])
     for stream in STREAMS:
         assert np.array_equal(data.observations[0].detdata[stream], given[stream]), stream

@@ -12,26 +12,50 @@ from zonda.core.plan.planning import planning_of
 from zonda.core.plan.structure import Structure
 
 CAMERA = {
-    "name": "camera", "telescope": {"name": "dish", "diameter": "6 m"},
+    "name": "camera",
+    "telescope": {"name": "dish", "diameter": "6 m"},
     "band": {"name": "b", "low": "130 GHz", "high": "170 GHz"},
-    "polarization": "pairs", "detectors": 38, "field_of_view": "20 arcmin", "main_beam_efficiency": 0.8,
-    "illumination_efficiency": 0.9, "net": "300 uK s(1/2)", "knee": "0.2 Hz", "sample_rate": "50 Hz",
-}  # fmt: skip
+    "polarization": "pairs",
+    "detectors": 38,
+    "field_of_view": "20 arcmin",
+    "main_beam_efficiency": 0.8,
+    "illumination_efficiency": 0.9,
+    "net": "300 uK s(1/2)",
+    "knee": "0.2 Hz",
+    "sample_rate": "50 Hz",
+}
 SKY = np.zeros((3, 60, 60))
 SKY[:, 28:32, 28:32] = np.array([2e-3, 1e-3, -5e-4])[:, None, None]
 
 
 def scene():
-    return zonda.Scene(site="llano_de_chajnantor", instrument=CAMERA, time="2022-08-01T11:00", target="75d -30d", seed=2)
+    return zonda.Scene(
+        site="llano_de_chajnantor",
+        instrument=CAMERA,
+        time="2022-08-01T11:00",
+        target="75d -30d",
+        seed=2,
+    )
 
 
 def sizes(step: zonda.Operator) -> dict[str, dict[str, float]]:
-    """By effect of a step, the bound on what leaving it out costs, in a pipeline with sky, atmosphere and noise."""
-    places: dict[type, int] = {zonda.HalfWavePlate: 0, zonda.Leakage: 1}  # the others act on the calibrated signal
+    """By effect of a step, the bound on what leaving it out costs, in a pipeline with sky,
+    atmosphere and noise.
+    """
+    places: dict[type, int] = {
+        zonda.HalfWavePlate: 0,
+        zonda.Leakage: 1,
+    }  # the others act on the calibrated signal
     front, middle, behind = ([step] if places.get(type(step), 2) == k else [] for k in range(3))
     steps = [
         zonda.PointingDaisy(radius="20 arcmin", speed="10 arcmin/s", scan_duration="20 s"),
-        zonda.SkyMap(map=SKY, unit="K_RJ", pixel_size="1 arcmin", centre="target", polarization_convention="cosmo"),
+        zonda.SkyMap(
+            map=SKY,
+            unit="K_RJ",
+            pixel_size="1 arcmin",
+            centre="target",
+            polarization_convention="cosmo",
+        ),
         *front,
         zonda.AtmosphereLayers(pwv="1 mm"),
         *middle,
@@ -87,19 +111,24 @@ def test_crosstalk_of_a_table_is_bounded_by_the_detector_with_most(tmp_path):
     """Two sources of 1 % and -2 % for one detector: 3 %, though the sum is -1 %."""
     names = zonda.Instrument(**CAMERA).focalplane().names
     rows = [(names[0], names[3], 0.01), (names[0], names[7], -0.02), (names[5], names[6], 0.005)]
-    (tmp_path / "shares.csv").write_text("detector, source, share\n" + "\n".join(f"{a}, {b}, {c}" for a, b, c in rows) + "\n")
+    (tmp_path / "shares.csv").write_text(
+        "detector, source, share\n" + "\n".join(f"{a}, {b}, {c}" for a, b, c in rows) + "\n"
+    )
     table = sizes(zonda.Crosstalk(file=tmp_path / "shares.csv"))["crosstalk"]
     level = sizes(zonda.Crosstalk(level="0.5 %"))["crosstalk"]
     assert table["transfer"] == pytest.approx(0.03)
-    assert level["transfer"] == pytest.approx(0.06)  # pairs: six neighbouring pixels have twelve detectors
+    assert level["transfer"] == pytest.approx(
+        0.06
+    )  # pairs: six neighbouring pixels have twelve detectors
     assert table["tod"] == pytest.approx(level["tod"] / 2)
 
 
 def test_bound_of_leakage_holds(tmp_path):
-    """With and without it, a slice simulated: the stream, and the map of I, change by less than stated."""
+    """With and without it, a slice simulated: the stream, and the map of I, change by less than
+    stated.
+    """
     path = tmp_path / "leak.yaml"
-    path.write_text(
-        """
+    path.write_text("""
 site: llano_de_chajnantor
 instrument: {name: c, telescope: {name: dish, diameter: 6 m}, band: {name: b, low: 130 GHz, high: 170 GHz}, polarization: pairs,
   detectors: 38, field_of_view: 20 arcmin, main_beam_efficiency: 0.8, illumination_efficiency: 0.9, net: 300 uK s(1/2),
@@ -115,8 +144,7 @@ operators:
   - HighpassFilter: {frequency: 0.2 Hz}
   - BinMap: {pixel: 1 arcmin, stokes: IQU}
   - SaveMap
-"""
-    )
+""")
     file = zonda.load(path)
     made = zonda.plan(file, prune_all=False, drop=["Leakage"], threads=1)
     found = audit(file, made, threads=1)

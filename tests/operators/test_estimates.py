@@ -1,4 +1,6 @@
-"""Bounds of effects that have no coarser form in the pipeline, against the effect itself computed directly."""
+"""Bounds of effects that have no coarser form in the pipeline, against the effect itself computed
+directly.
+"""
 
 import math
 
@@ -71,12 +73,16 @@ def test_sky_rotation_and_reach(context):
 
 
 def test_differential_refraction(context):
-    """Bennett's formula, which the bound does not use, over the elevations of the scan and the field."""
+    """Bennett's formula, which the bound does not use, over the elevations of the scan and the
+    field.
+    """
     rows = {e.name: e for e in planning_of(zonda.PointingDaisy()).estimate(context).effects}
 
     def bennett(elevation):
         h = np.degrees(elevation)
-        return np.radians(1 / np.tan(np.radians(h + 7.31 / (h + 4.4))) / 60) * math.exp(-context.scene.site.altitude / 8000)
+        return np.radians(1 / np.tan(np.radians(h + 7.31 / (h + 4.4))) / 60) * math.exp(
+            -context.scene.site.altitude / 8000
+        )
 
     low = context.first.elevation.min() - context.first.focalplane.radius
     high = context.first.elevation.max() + context.first.focalplane.radius
@@ -86,7 +92,9 @@ def test_differential_refraction(context):
 
 
 def test_aberration_across_the_field():
-    """Two directions 1 deg apart seen from a moving Earth: their separation changes by less than v / c of it."""
+    """Two directions 1 deg apart seen from a moving Earth: their separation changes by less than v
+    / c of it.
+    """
     beta = 1.0e-4
     for theta in np.linspace(0.1, 3.0, 30):
         pair = theta + np.array([0.0, math.radians(1)])
@@ -111,7 +119,9 @@ def test_cubic_sampling():
 
 @pytest.mark.parametrize("name", ["mustang2_90ghz", "so_145ghz", "laboca_345ghz"])
 def test_chromaticity(name):
-    """A point source through beams of FWHM ~ 1 / nu, each of unit integral, against the one of the centre: at the peak."""
+    """A point source through beams of FWHM ~ 1 / nu, each of unit integral, against the one of the
+    centre: at the peak.
+    """
     from zonda.core.registry import bands
 
     band = bands.create(name)
@@ -137,7 +147,9 @@ class Filters:
 
 @pytest.mark.parametrize("poles", [4, 6])
 def test_pink_noise_of_two_filters(poles):
-    """Both filters driven by the same white noise, sample by sample, with the first states at zero; brick wall; variance."""
+    """Both filters driven by the same white noise, sample by sample, with the first states at zero;
+    brick wall; variance.
+    """
     from scipy.signal import lfilter
 
     rate, n = 100.0, 1 << 18
@@ -168,7 +180,9 @@ def test_error_of_the_spectrum():
 
 @pytest.mark.parametrize("knots", [8, 12, 16])
 def test_the_low_part_of_the_high_pass_filter(knots):
-    """Slow noise through coarse and fine knots: (f / f_cut)^4 q^-4 below the cut, at most q^-4 of the rms."""
+    """Slow noise through coarse and fine knots: (f / f_cut)^4 q^-4 below the cut, at most q^-4 of
+    the rms.
+    """
     n, frequency = 1 << 16, 0.1 / 100
     rng = np.random.default_rng(5)
     amplitude = rng.standard_normal((4, n // 2 + 1)) * (np.fft.rfftfreq(n) < 0.9 * frequency)
@@ -185,7 +199,9 @@ def test_the_low_part_of_the_high_pass_filter(knots):
 
 @pytest.fixture(scope="module")
 def sky():
-    file = zonda.load("mustang2_cluster", overrides=["PointingDaisy.scan_duration=20 s", "PointingDaisy.scans=1"])
+    file = zonda.load(
+        "mustang2_cluster", overrides=["PointingDaisy.scan_duration=20 s", "PointingDaisy.scans=1"]
+    )
     operator, data = file.operators[2], Data(file.scene())
     file.operators[0].observe(data)
     operator.observe(data)
@@ -217,18 +233,30 @@ def test_one_frequency_and_no_ozone(sky):
     band, elevation = o.instrument.band, a.elevations[0]
     right = _slope(BandTransfer(band, m.profile.layers), m.pwv, elevation)
     step = 1e-3 * m.pwv
-    table = float(m.band.emission_difference(m.pwv, step, elevation)) / step / float(m.band.transmission(m.pwv, elevation))
+    table = (
+        float(m.band.emission_difference(m.pwv, step, elevation))
+        / step
+        / float(m.band.transmission(m.pwv, elevation))
+    )
     assert right == pytest.approx(table, rel=2e-3)
-    narrow = Band(name="middle", low=f"{band.centre - 0.25e9!r} Hz", high=f"{band.centre + 0.25e9!r} Hz")
+    narrow = Band(
+        name="middle", low=f"{band.centre - 0.25e9!r} Hz", high=f"{band.centre + 0.25e9!r} Hz"
+    )
     one = BandAtmosphere(narrow, m.profile, 2 * m.pwv)
-    alone = float(one.emission_difference(m.pwv, step, elevation)) / step / float(one.transmission(m.pwv, elevation))
+    alone = (
+        float(one.emission_difference(m.pwv, step, elevation))
+        / step
+        / float(one.transmission(m.pwv, elevation))
+    )
     bound = _slope(BandTransfer(narrow, m.profile.layers), m.pwv, elevation)
     assert alone == pytest.approx(bound, rel=2e-3)
 
 
 @pytest.mark.parametrize("speed", [3.0, 30.0])
 def test_what_of_the_air_is_faster_than_a_frequency(speed):
-    """The spectrum of exp(-(v t)^2 / 4 e), by a numerical transform, against the share erfc(2 pi f sqrt(e) / v)."""
+    """The spectrum of exp(-(v t)^2 / 4 e), by a numerical transform, against the share erfc(2 pi f
+    sqrt(e) / v).
+    """
     from zonda.operators.atmosphere.turbulence.nodes import Layer
 
     model = Layer(1.0, 1000.0, 1000.0, 500.0, 40.0)
@@ -239,8 +267,9 @@ def test_what_of_the_air_is_faster_than_a_frequency(speed):
     spectrum = 2 * (np.fft.rfft(np.r_[covariance, covariance[-2:0:-1]]).real) * 0.05  # one-sided
     f = np.fft.rfftfreq(2 * len(t) - 2, 0.05)
     for frequency in (0.02, 0.1, 0.3):
-        # trapezoids from the frequency on, which lies between two bins. The steepest end is at 3 m/s and 0.02 Hz, where
-        # ln erfc falls by 3.8 x 2 pi df 40 m / v = 0.05 from bin to bin: trapezoids err by 0.05^2 / 12 = 2e-4
+        # trapezoids from the frequency on, which lies between two bins. The steepest end is at 3
+        # m/s and 0.02 Hz, where ln erfc falls by 3.8 x 2 pi df 40 m / v = 0.05 from bin to bin:
+        # trapezoids err by 0.05^2 / 12 = 2e-4
         bins = np.r_[frequency, f[f > frequency]]
         share = np.trapezoid(np.interp(bins, f, spectrum), bins)
         assert a.faster(0, frequency) ** 2 == pytest.approx(share, rel=1e-3, abs=1e-9)

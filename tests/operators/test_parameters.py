@@ -1,8 +1,8 @@
 """No parameter is accepted and then ignored.
 
-Every field of every operator, noise model, instrument, telescope, band, site and scene is changed alone: the streams, pointing
-or products of a short run change with it, or the run is refused with a message. What is only said about a run (tally, labels)
-does not count as a change.
+Every field of every operator, noise model, instrument, telescope, band, site and scene is changed
+alone: the streams, pointing or products of a short run change with it, or the run is refused with a
+message. What is only said about a run (tally, labels) does not count as a change.
 """
 
 from __future__ import annotations
@@ -33,8 +33,19 @@ from zonda.core.site import Site
 from zonda.operators.io.save_tod import load_tod
 
 STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "ground", "glitches", "signal")
-SCAN = {"scan_duration": "12 s", "scans": 2, "radius": "1 arcmin", "sample_rate": "50 Hz", "offsets": "box"}
-TURN = {"scan_duration": "40 s", "throw": "4 arcmin", "speed": "30 arcsec/s", "acceleration": "20 arcsec/s2"}
+SCAN = {
+    "scan_duration": "12 s",
+    "scans": 2,
+    "radius": "1 arcmin",
+    "sample_rate": "50 Hz",
+    "offsets": "box",
+}
+TURN = {
+    "scan_duration": "40 s",
+    "throw": "4 arcmin",
+    "speed": "30 arcsec/s",
+    "acceleration": "20 arcsec/s2",
+}
 REFUSED = "refused"
 
 
@@ -43,7 +54,14 @@ REFUSED = "refused"
 
 def scene(**more: Any) -> Any:
     return zonda.Scene(
-        **{"site": "green_bank", "instrument": instrument(), "time": "2024-11-25T07:00", "target": "05h +20d", "seed": 3} | more
+        **{
+            "site": "green_bank",
+            "instrument": instrument(),
+            "time": "2024-11-25T07:00",
+            "target": "05h +20d",
+            "seed": 3,
+        }
+        | more
     )
 
 
@@ -56,12 +74,18 @@ class OfTwoWafers(zonda.Instrument):
         return plane
 
 
-def instrument(band: Any = None, telescope: Any = None, kind: Any = zonda.Instrument, **more: Any) -> Any:
+def instrument(
+    band: Any = None, telescope: Any = None, kind: Any = zonda.Instrument, **more: Any
+) -> Any:
     dish = {"name": "dish", "diameter": "100 m", "elevation_max": "88 deg"} | (telescope or {})
     values = {
         "name": "camera",
         "telescope": zonda.Telescope(**dish),
-        "band": None if "bands" in more else zonda.Band(**({"name": "b", "low": "78 GHz", "high": "108 GHz"} | (band or {}))),
+        "band": (
+            None
+            if "bands" in more
+            else zonda.Band(**({"name": "b", "low": "78 GHz", "high": "108 GHz"} | (band or {})))
+        ),
         "detectors": 19,
         "field_of_view": "2 arcmin",
         "fwhm": "8.5 arcsec",
@@ -72,19 +96,38 @@ def instrument(band: Any = None, telescope: Any = None, kind: Any = zonda.Instru
         "sample_rate": "50 Hz",
     }
     values |= more
-    return kind(**{k: v for k, v in values.items() if v is not None or k not in ("detectors", "field_of_view")})
+    return kind(
+        **{
+            k: v
+            for k, v in values.items()
+            if v is not None or k not in ("detectors", "field_of_view")
+        }
+    )
 
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A source and a slope, 6 arcmin wide: ``map.fits`` in K_RJ, ``flux.fits`` in Jy/pixel, ``hole.fits`` with a NaN."""
+    """A source and a slope, 6 arcmin wide: ``map.fits`` in K_RJ, ``flux.fits`` in Jy/pixel,
+    ``hole.fits`` with a NaN.
+    """
     folder = tmp_path_factory.mktemp("maps")
     y, x = np.indices((121, 121)) - 60.0
     values = 0.1 * np.exp(-(x**2 + y**2) / 50) + 1e-4 * x
     for name, unit in (("map", "K"), ("flux", "Jy/pixel"), ("hole", "K")):
-        image = fits.PrimaryHDU(np.where((x == 3) & (y == 5), np.nan, values) if name == "hole" else values)
-        image.header.update(CTYPE1="RA---TAN", CTYPE2="DEC--TAN", CRPIX1=61, CRPIX2=61, CRVAL1=75.0, CRVAL2=20.0)
-        image.header.update(CDELT1=-3 / 3600, CDELT2=3 / 3600, CUNIT1="deg", CUNIT2="deg", RADESYS="ICRS", BUNIT=unit)
+        image = fits.PrimaryHDU(
+            np.where((x == 3) & (y == 5), np.nan, values) if name == "hole" else values
+        )
+        image.header.update(
+            CTYPE1="RA---TAN", CTYPE2="DEC--TAN", CRPIX1=61, CRPIX2=61, CRVAL1=75.0, CRVAL2=20.0
+        )
+        image.header.update(
+            CDELT1=-3 / 3600,
+            CDELT2=3 / 3600,
+            CUNIT1="deg",
+            CUNIT2="deg",
+            RADESYS="ICRS",
+            BUNIT=unit,
+        )
         if unit == "K":
             image.header["TEMPSCAL"] = "K_RJ"
         image.writeto(folder / f"{name}.fits")
@@ -93,39 +136,74 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     stokes = header.copy()
     stokes.update(CTYPE3="STOKES", CRPIX3=1, CRVAL3=1, CDELT3=1)
     fits.PrimaryHDU(np.array([values, values**2, values / 2]), stokes).writeto(folder / "iqu.fits")
-    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(values, header), fits.ImageHDU(values**2, header, "SECOND")]).writeto(
-        folder / "two.fits"
-    )
+    fits.HDUList(
+        [
+            fits.PrimaryHDU(),
+            fits.ImageHDU(values, header),
+            fits.ImageHDU(values**2, header, "SECOND"),
+        ]
+    ).writeto(folder / "two.fits")
     header["BUNIT"] = "Jy/beam"
     fits.PrimaryHDU(values, header).writeto(folder / "beam.fits")
-    healpy.write_map(folder / "sphere.fits", np.arange(12.0 * 64**2), coord="C", column_units="uK_CMB", dtype=np.float64)
+    healpy.write_map(
+        folder / "sphere.fits",
+        np.arange(12.0 * 64**2),
+        coord="C",
+        column_units="uK_CMB",
+        dtype=np.float64,
+    )
     middle = SkyCoord(75, 20, unit="deg")
-    near = [  # where the target is, if these are equatorial coordinates and if they are galactic ones
+    # where the target is, if these are equatorial coordinates and if they are galactic ones
+    near = [
         healpy.query_disc(8192, healpy.ang2vec(lon.deg, lat.deg, lonlat=True), np.radians(0.15))
         for lon, lat in ((middle.ra, middle.dec), (middle.galactic.l, middle.galactic.b))
     ]
     columns = [fits.Column("PIXEL", "K", array=np.concatenate(near))]
     for name, power in (("SIGNAL", 1), ("OTHER", 2)):
-        columns.append(fits.Column(name, "D", unit="K_RJ", array=np.linspace(0.1, 1, sum(map(len, near))) ** power))
+        columns.append(
+            fits.Column(
+                name, "D", unit="K_RJ", array=np.linspace(0.1, 1, sum(map(len, near))) ** power
+            )
+        )
     fine = fits.BinTableHDU.from_columns(columns)
-    fine.header.update(PIXTYPE="HEALPIX", ORDERING="RING", NSIDE=8192, COORDSYS="C", INDXSCHM="EXPLICIT", OBJECT="PARTIAL")
+    fine.header.update(
+        PIXTYPE="HEALPIX",
+        ORDERING="RING",
+        NSIDE=8192,
+        COORDSYS="C",
+        INDXSCHM="EXPLICIT",
+        OBJECT="PARTIAL",
+    )
     fits.HDUList([fits.PrimaryHDU(), fine]).writeto(folder / "fine.fits")
     for name, minute in (("night", "00"), ("later", "05")):
-        row = f"2024-11-25 07:{minute}:00 | 2024-11-25 07:{minute}:30 | 0 | patch | 120 | 124 | 50 | 0 | 0"
+        row = (
+            f"2024-11-25 07:{minute}:00 | 2024-11-25 07:{minute}:30 | 0 | patch | 120 | 124 | 50 |"
+            " 0 | 0"
+        )
         (folder / f"{name}.txt").write_text(f"green_bank | dish | 38.4 | -79.8 | 818\n{row}\n")
     multipoles = np.arange(2, 1500)
     np.savetxt(folder / "theory.txt", np.stack([multipoles, 1e6 / multipoles], axis=1))
-    np.savetxt(folder / "two.txt", np.stack([multipoles, np.full(len(multipoles), 2e3), np.full(len(multipoles), 1e3)], axis=1))
+    np.savetxt(
+        folder / "two.txt",
+        np.stack(
+            [multipoles, np.full(len(multipoles), 2e3), np.full(len(multipoles), 1e3)], axis=1
+        ),
+    )
     np.savetxt(folder / "flat.txt", np.stack([multipoles, np.full(len(multipoles), 1e3)], axis=1))
     for name, flux in (("sources", 1.0), ("others", 2.0)):
-        (folder / f"{name}.csv").write_text(f"ra [deg],dec [deg],flux [Jy],spectral_index\n75,20,{flux},-0.7\n")
+        (folder / f"{name}.csv").write_text(
+            f"ra [deg],dec [deg],flux [Jy],spectral_index\n75,20,{flux},-0.7\n"
+        )
     (folder / "array.csv").write_text("name,xi [arcsec],eta [arcsec]\na,0,0\nb,10,0\nc,0,20\n")
     a, b, *_ = instrument().focalplane().names
     (folder / "shares.csv").write_text(f"detector,source,share\n{a},{b},0.01\n")
     np.savetxt(folder / "band.txt", [[78, 0.2], [93, 1.0], [108, 0.5]])
     seen = Data(scene())
     operators.get("PointingStare")(scan_duration="1 s").observe(seen)
-    az, el = (float(np.degrees(v[0])) for v in (seen.observations[0].azimuth, seen.observations[0].elevation))
+    az, el = (
+        float(np.degrees(v[0]))
+        for v in (seen.observations[0].azimuth, seen.observations[0].elevation)
+    )
     for name, seconds in (
         ("scan", 12),
         ("other", 13),
@@ -135,16 +213,26 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
         t = t[(t < 3) | (t > 7)]
         columns = [1732518000 + t, az + 0.02 * np.sin(t), el + 0.01 * np.cos(t)]
         head = "time [s], az [deg], el [deg]"
-        np.savetxt(folder / f"{name}.csv", np.transpose(columns), fmt="%.9f", delimiter=",", header=head)
+        np.savetxt(
+            folder / f"{name}.csv", np.transpose(columns), fmt="%.9f", delimiter=",", header=head
+        )
         if name == "scan":
             columns.append(np.arange(t.size) // 10 % 4)  # in turn no flag, 1, 2 and both
-            np.savetxt(folder / "flagged.csv", np.transpose(columns), fmt="%.9f", delimiter=",", header=f"{head}, flags")
+            np.savetxt(
+                folder / "flagged.csv",
+                np.transpose(columns),
+                fmt="%.9f",
+                delimiter=",",
+                header=f"{head}, flags",
+            )
     recorded(folder)
     return folder
 
 
 def recorded(folder: Path) -> None:
-    """Two saved scans, one with flags of samples and of a detector, a longer one, and a table of noise."""
+    """Two saved scans, one with flags of samples and of a detector, a longer one, and a table of
+    noise.
+    """
     for name, seconds, seed in (("recorded", 12, 3), ("again", 12, 4), ("long", 30, 3)):
         pointing = make("PointingDaisy", **(SCAN | {"scan_duration": f"{seconds} s", "scans": 1}))
         steps = [pointing, make("WhiteNoise"), make("Efficiency"), make("SaveTOD")]
@@ -156,7 +244,10 @@ def recorded(folder: Path) -> None:
         file["detdata/flags"][3] = 4
     names = instrument().focalplane().names
     nets = np.linspace(1e-3, 3e-3, len(names))
-    table = Table([names, nets, np.ones(len(names)), np.ones(len(names))], names=["name", "net", "knee", "slope"])
+    table = Table(
+        [names, nets, np.ones(len(names)), np.ones(len(names))],
+        names=["name", "net", "knee", "slope"],
+    )
     table.write(folder / "noise.ecsv", format="ascii.ecsv")
 
 
@@ -166,12 +257,19 @@ def make(which: str, /, **parameters: Any) -> Any:
 
 def outcome(steps: list[Any], where: Any, folder: Path, runs: Any = None) -> dict[str, Any]:
     """Everything that a run makes, by name."""
-    keep = [s for s in (*STREAMS, "pwv", "opacity", "path_delay") if any(s in step.provides for step in steps)]
+    keep = [
+        s
+        for s in (*STREAMS, "pwv", "opacity", "path_delay")
+        if any(s in step.provides for step in steps)
+    ]
     data = zonda.Pipeline(steps, runs=runs).run(where, keep=keep, output=folder, threads=1)
     found: dict[str, Any] = {"scans": len(data.observations)}
     for o in data.observations:
         found |= {f"{o.name} {k}": v for k, v in o.detdata.items()}
-        found |= {f"{o.name} {k}": getattr(o, k) for k in ("boresight_azel", "boresight_radec", "flags", "detector_flags")}
+        found |= {
+            f"{o.name} {k}": getattr(o, k)
+            for k in ("boresight_azel", "boresight_radec", "flags", "detector_flags")
+        }
         found[f"{o.name} start"] = str(o.start)
     for name, product in data.products.items():
         found[name] = contents(product)
@@ -179,17 +277,25 @@ def outcome(steps: list[Any], where: Any, folder: Path, runs: Any = None) -> dic
         if path.name.startswith("tod_"):
             found[path.name] = {k: (v, v.dtype.name) for k, v in load_tod(path).streams.items()}
         elif path.suffix == ".html":
-            found[path.name] = re.findall(r"<section id=\"results\">.*?</section>", path.read_text(), re.S)
+            found[path.name] = re.findall(
+                r"<section id=\"results\">.*?</section>", path.read_text(), re.S
+            )
         elif path.suffix == ".fits":
             with fits.open(path) as file:
-                found[path.name] = [(h.name, h.data, h.header.get("RMSHALF")) for h in file if h.is_image]
+                found[path.name] = [
+                    (h.name, h.data, h.header.get("RMSHALF")) for h in file if h.is_image
+                ]
     return found
 
 
 def contents(product: Any) -> Any:
     """Numbers and bytes inside a product; labels and paths are left out."""
     if dataclasses.is_dataclass(product) and not isinstance(product, type):
-        fields = [f.name for f in dataclasses.fields(product) if f.name not in ("lock", "label", "caption", "title")]
+        fields = [
+            f.name
+            for f in dataclasses.fields(product)
+            if f.name not in ("lock", "label", "caption", "title")
+        ]
         return {f: contents(getattr(product, f)) for f in fields}
     if isinstance(product, Mapping):
         return {k: contents(v) for k, v in product.items()}
@@ -221,12 +327,21 @@ def same(a: Any, b: Any) -> bool:
 def tangent(pixel: float) -> WCS:
     """About the scene's target, pixels in arcsec."""
     wcs = WCS(naxis=2)
-    wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix = ["RA---TAN", "DEC--TAN"], [75.0, 20.0], [32.5, 32.5]
+    wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix = (
+        ["RA---TAN", "DEC--TAN"],
+        [75.0, 20.0],
+        [32.5, 32.5],
+    )
     wcs.wcs.cdelt = [-pixel / 3600, pixel / 3600]
     return wcs
 
 
-ARRAY: dict[str, Any] = {"file": None, "map": np.hypot(*np.indices((64, 64)) - 31.5) / 1e3, "wcs": tangent(3.0), "unit": "K_RJ"}
+ARRAY: dict[str, Any] = {
+    "file": None,
+    "map": np.hypot(*np.indices((64, 64)) - 31.5) / 1e3,
+    "wcs": tangent(3.0),
+    "unit": "K_RJ",
+}
 """A map that is no file."""
 
 POINTING = {
@@ -244,7 +359,8 @@ POINTING = {
 }
 
 CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
-    "PointingDaisy": POINTING | {
+    "PointingDaisy": POINTING
+    | {
         "radius": ({}, {"radius": "70 arcsec"}),
         "speed": ({}, {"speed": "40 arcsec/s"}),
         "petals": ({}, {"petals": 4.0}),
@@ -252,13 +368,15 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "phase": ({}, {"phase": "1 rad"}),
     },
     "PointingStare": POINTING,
-    "PointingBackAndForth": POINTING | {
+    "PointingBackAndForth": POINTING
+    | {
         "throw": ({}, {"throw": "5 arcmin"}),
         "speed": ({}, {"speed": "20 arcsec/s"}),
         "acceleration": ({}, {"acceleration": "30 arcsec/s2"}),
         "flag_turnarounds": ({}, {"flag_turnarounds": True}),
     },
-    "PointingRaster": POINTING | {
+    "PointingRaster": POINTING
+    | {
         "width": ({}, {"width": "3 arcmin"}),
         "height": ({}, {"height": "1 arcmin"}),
         "spacing": ({}, {"spacing": "15 arcsec"}),
@@ -297,8 +415,14 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "flag_turnarounds": ({}, {"flag_turnarounds": False}),
         "sun_close": ({}, {"sun_close": "180 deg"}),
         "elevation_nods": ({}, {"elevation_nods": ["1 deg", "0 deg"]}),
-        "elevation_speed": ({"elevation_nods": ["1 deg", "0 deg"]}, {"elevation_speed": "0.5 deg/s"}),
-        "elevation_acceleration": ({"elevation_nods": ["1 deg", "0 deg"]}, {"elevation_acceleration": "0.5 deg/s2"}),
+        "elevation_speed": (
+            {"elevation_nods": ["1 deg", "0 deg"]},
+            {"elevation_speed": "0.5 deg/s"},
+        ),
+        "elevation_acceleration": (
+            {"elevation_nods": ["1 deg", "0 deg"]},
+            {"elevation_acceleration": "0.5 deg/s2"},
+        ),
         "sample_rate": ({}, {"sample_rate": "40 Hz"}),
         "check_limits": ({}, {"check_limits": "error"}),
         "interpolation_error": ({}, {"interpolation_error": 1e-9}),
@@ -322,7 +446,10 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "flag_mask": ({"file": "flagged.h5"}, {"flag_mask": 1}),
         "detector_mask": ({"file": "flagged.h5"}, {"detector_mask": 1}),
         "target": ({}, {"target": "05h00m10s +20d00m00s"}),
-        "interpolation_error": ({"file": "long.h5", "celestial": "recomputed"}, {"interpolation_error": 1e-9}),
+        "interpolation_error": (
+            {"file": "long.h5", "celestial": "recomputed"},
+            {"interpolation_error": 1e-9},
+        ),
     },
     "SkyMap": {
         "file": ({}, {"file": "flux.fits"}),
@@ -331,10 +458,16 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "unit": ({}, {"unit": "mK_CMB"}),
         "pixel_size": ({}, {"pixel_size": "4 arcsec"}),
         "centre": ({}, {"centre": "05h00m01s +20d00m00s"}),
-        "input_beam": ({"file": "beam.fits", "input_beam": "9 arcsec"}, {"input_beam": "12 arcsec"}),
+        "input_beam": (
+            {"file": "beam.fits", "input_beam": "9 arcsec"},
+            {"input_beam": "12 arcsec"},
+        ),
         "coordsys": ({"file": "sphere.fits"}, {"coordsys": "galactic"}),
         "plane": ({"file": "cube.fits", "plane": 1}, {"plane": 2}),
-        "polarization_convention": ({"file": "iqu.fits", "polarization_convention": "cosmo"}, {"polarization_convention": "iau"}),
+        "polarization_convention": (
+            {"file": "iqu.fits", "polarization_convention": "cosmo"},
+            {"polarization_convention": "iau"},
+        ),
         "hdu": ({"file": "two.fits"}, {"hdu": "second"}),
         "column": ({"file": "fine.fits"}, {"column": "other"}),
         "beam": ({}, {"beam": "none"}),
@@ -438,7 +571,11 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "interval": ({}, {"interval": "throw"}),
         "mask": ({}, {"mask": {"radius": "20 arcsec"}}),
     },
-    "GroundFilter": {"bin": ({}, {"bin": "0.02 deg"}), "split": ({}, {"split": True}), "trend": ({}, {"trend": 3})},
+    "GroundFilter": {
+        "bin": ({}, {"bin": "0.02 deg"}),
+        "split": ({}, {"split": True}),
+        "trend": ({}, {"trend": 3}),
+    },
     "Taper": {"share": ({}, {"share": "20 %"})},
     "CommonModeFilter": {
         "modes": ({}, {"modes": 2}),
@@ -542,10 +679,12 @@ CASES: dict[str, dict[str, tuple[dict[str, Any], dict[str, Any]]]] = {
         "dpi": ({}, {"dpi": 60.0}),
     },
     "Report": {"central_diameter": ({}, {"central_diameter": "30 arcsec"})},
-}  # fmt: skip
+}
 
 NEED_OTHERS = {"ToastOperator", "PySMSky"}
-"""Steps that need packages which are not installed with the tests; tests/interop and sky/test_pysm.py have them."""
+"""Steps that need packages which are not installed with the tests; tests/interop and
+sky/test_pysm.py have them.
+"""
 
 CHAINS = {
     "PointingRecorded": ["WhiteNoise", "Efficiency", "BinMap"],
@@ -611,7 +750,12 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "PointingDaisy": SCAN,
     "PointingStare": {"scan_duration": "12 s"},
     "PointingBackAndForth": TURN,
-    "PointingRaster": {"scan_duration": "32 s", "scans": 2, "width": "2 arcmin", "speed": "30 arcsec/s"},
+    "PointingRaster": {
+        "scan_duration": "32 s",
+        "scans": 2,
+        "width": "2 arcmin",
+        "speed": "30 arcsec/s",
+    },
     "CompareStreams": {"reference": "white"},
     "MeasureFigures": {"metrics": ["coverage", "central_rms"]},
     "PointingRecorded": {"file": "scan.csv"},
@@ -625,7 +769,13 @@ def chain(which: str, maps: Path, /, **parameters: Any) -> list[Any]:
 
     def step(other: str) -> Any:
         values = DEFAULTS.get(other, {}) | (parameters if other == which else {})
-        files = ("file", "schedule", "catalogue", "spectrum", *(("noise",) if other == "LoadTOD" else ()))
+        files = (
+            "file",
+            "schedule",
+            "catalogue",
+            "spectrum",
+            *(("noise",) if other == "LoadTOD" else ()),
+        )
         values = values | {key: maps / values[key] for key in files if values.get(key) is not None}
         if which == "BinMap" == other and "nside" in values:
             values.pop("pixel", None)
@@ -658,17 +808,31 @@ REFUSALS = {
 }
 """What a changed parameter is answered with, where it is not another result."""
 
-POLARIZED = {"SkyMap.polarization_convention", "BinMap.stokes", "BinMap.condition_limit", "HalfWavePlate", "Leakage"}
+POLARIZED = {
+    "SkyMap.polarization_convention",
+    "BinMap.stokes",
+    "BinMap.condition_limit",
+    "HalfWavePlate",
+    "Leakage",
+}
 """Steps and parameters that act on polarized detectors alone."""
 
-ALL = [pytest.param(name, field, id=f"{name}.{field}") for name, cases in CASES.items() for field in cases]
+ALL = [
+    pytest.param(name, field, id=f"{name}.{field}")
+    for name, cases in CASES.items()
+    for field in cases
+]
 
 
 @pytest.mark.parametrize(("name", "field"), ALL)
-def test_every_parameter_of_every_operator(name: str, field: str, maps: Path, tmp_path: Path, known: dict[str, Any]) -> None:
+def test_every_parameter_of_every_operator(
+    name: str, field: str, maps: Path, tmp_path: Path, known: dict[str, Any]
+) -> None:
     needs, change = CASES[name][field]
     case = f"{name} {needs}"
-    camera: dict[str, Any] = {"telescope": {"azimuth_speed_max": "1 arcsec/s"}} if field == "check_limits" else {}
+    camera: dict[str, Any] = (
+        {"telescope": {"azimuth_speed_max": "1 arcsec/s"}} if field == "check_limits" else {}
+    )
     if field == "group":
         case, camera = f"{case} wafers", {"kind": OfTwoWafers}
     if f"{name}.{field}" in POLARIZED or name in POLARIZED:
@@ -730,7 +894,9 @@ def test_the_name_of_a_step_is_its_label(name: str, maps: Path) -> None:
         ("AtmosphereLayers", {"layers": 1, "weights": "equal"}),
     ],
 )
-def test_what_would_be_ignored_is_refused(name: str, parameters: dict[str, Any], maps: Path) -> None:
+def test_what_would_be_ignored_is_refused(
+    name: str, parameters: dict[str, Any], maps: Path
+) -> None:
     values = {"file": maps / "map.fits"} if name == "SkyMap" else {}
     with pytest.raises(ZondaError):
         make(name, **values, **parameters)
@@ -746,7 +912,13 @@ def test_a_scan_that_is_not_there_cannot_be_shown(maps: Path, tmp_path: Path) ->
 WHOLE = ["AtmosphereLayers", "WhiteNoise", "PinkNoise", "Efficiency", "BinMap"]
 SAID = {"name", "description", "provenance"}
 """Texts that name and explain: shown by `zonda plugins` and in products."""
-SITE = {"name": "s", "latitude": "38.4 deg", "longitude": "-79.8 deg", "altitude": "825 m", "climatology": "green_bank"}
+SITE = {
+    "name": "s",
+    "latitude": "38.4 deg",
+    "longitude": "-79.8 deg",
+    "altitude": "825 m",
+    "climatology": "green_bank",
+}
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "scene": {
@@ -767,11 +939,17 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "telescope": {"telescope": {"diameter": "50 m"}},
         "band": {"band": {"high": "112 GHz"}},
         "bands": {
-            "bands": [{"name": "b", "low": "78 GHz", "high": "108 GHz"}, {"name": "c", "low": "130 GHz", "high": "170 GHz"}]
+            "bands": [
+                {"name": "b", "low": "78 GHz", "high": "108 GHz"},
+                {"name": "c", "low": "130 GHz", "high": "170 GHz"},
+            ]
         },
         "pixels": {
             "pixels": "separate",
-            "bands": [{"name": "b", "low": "78 GHz", "high": "108 GHz", "detectors": 7}, "so_93ghz"],
+            "bands": [
+                {"name": "b", "low": "78 GHz", "high": "108 GHz", "detectors": 7},
+                "so_93ghz",
+            ],
         },
         "polarization": {"polarization": "pairs", "detectors": 20},
         "detectors": {"detectors": 7},
@@ -801,7 +979,11 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "elevation_acceleration_max": {"elevation_acceleration_max": "1 arcsec/s2"},
         "elevation_jerk_max": {"elevation_jerk_max": "1 arcsec/s3"},
     },
-    "band": {"low": {"low": "80 GHz"}, "high": {"high": "112 GHz"}, "file": {"low": None, "high": None, "file": "band.txt"}},
+    "band": {
+        "low": {"low": "80 GHz"},
+        "high": {"high": "112 GHz"},
+        "file": {"low": None, "high": None, "file": "band.txt"},
+    },
     "background_limited": {
         "reference": {"reference": REFUSED},
         "optical_efficiency": {"optical_efficiency": 0.5},
@@ -810,7 +992,10 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "telescope_temperature": {"telescope_temperature": "20 K"},
         "receiver_temperature": {"receiver_temperature": "20 K"},
     },
-    "fixed_net": {"reference": {"reference": "detector", "level": "1 mK s(1/2)"}, "level": {"level": "1 mK s(1/2)"}},
+    "fixed_net": {
+        "reference": {"reference": "detector", "level": "1 mK s(1/2)"},
+        "level": {"level": "1 mK s(1/2)"},
+    },
 }
 
 
@@ -820,10 +1005,16 @@ LIMITS = {
     ("telescope", "speed_max"): "largest speed on the sky is 10 arcsec/s",
     ("telescope", "acceleration_max"): "largest acceleration on the sky is 1 arcsec/s2",
     ("telescope", "azimuth_speed_max"): "largest speed of the azimuth axis is 10 arcsec/s",
-    ("telescope", "azimuth_acceleration_max"): "largest acceleration of the azimuth axis is 1 arcsec/s2",
+    (
+        "telescope",
+        "azimuth_acceleration_max",
+    ): "largest acceleration of the azimuth axis is 1 arcsec/s2",
     ("telescope", "azimuth_jerk_max"): "largest jerk of the azimuth axis is 1 arcsec/s3",
     ("telescope", "elevation_speed_max"): "largest speed of the elevation axis is 10 arcsec/s",
-    ("telescope", "elevation_acceleration_max"): "largest acceleration of the elevation axis is 1 arcsec/s2",
+    (
+        "telescope",
+        "elevation_acceleration_max",
+    ): "largest acceleration of the elevation axis is 1 arcsec/s2",
     ("telescope", "elevation_jerk_max"): "largest jerk of the elevation axis is 1 arcsec/s3",
     ("background_limited", "reference"): "'detector'",
 }
@@ -842,14 +1033,23 @@ def described(what: str, change: dict[str, Any], maps: Path) -> tuple[Any, dict[
     if what == "telescope":
         return scene(instrument=instrument(telescope=change)), {}
     if what == "band":
-        return scene(instrument=instrument(band=change | ({"file": maps / change["file"]} if "file" in change else {}))), {}
+        return (
+            scene(
+                instrument=instrument(
+                    band=change | ({"file": maps / change["file"]} if "file" in change else {})
+                )
+            ),
+            {},
+        )
     return scene(), {"model": {"name": what, **change}}
 
 
 def whole(noise: dict[str, Any], maps: Path) -> list[Any]:
     pointing = {k: v for k, v in SCAN.items() if k != "sample_rate"} | {"scans": 1}
     steps = [make("PointingDaisy", **pointing), make("SkyMap", file=maps / "map.fits")]
-    return steps + [make(n, **(DEFAULTS.get(n, {}) | (noise if n == "WhiteNoise" else {}))) for n in WHOLE]
+    return steps + [
+        make(n, **(DEFAULTS.get(n, {}) | (noise if n == "WhiteNoise" else {}))) for n in WHOLE
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -862,8 +1062,12 @@ def unchanged(maps: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
     return found
 
 
-@pytest.mark.parametrize(("what", "field"), [(w, f) for w, fields in SETTINGS.items() for f in fields])
-def test_every_parameter_of_the_scene(what: str, field: str, maps: Path, tmp_path: Path, unchanged: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("what", "field"), [(w, f) for w, fields in SETTINGS.items() for f in fields]
+)
+def test_every_parameter_of_the_scene(
+    what: str, field: str, maps: Path, tmp_path: Path, unchanged: dict[str, Any]
+) -> None:
     def run() -> dict[str, Any]:
         where, noise = described(what, SETTINGS[what][field], maps)
         return outcome(whole(noise, maps), where, tmp_path)
@@ -877,10 +1081,19 @@ def test_every_parameter_of_the_scene(what: str, field: str, maps: Path, tmp_pat
 
 def test_no_parameter_of_the_scene_is_left_out() -> None:
     classes = {
-        "scene": zonda.Scene, "site": Site, "instrument": zonda.Instrument, "telescope": zonda.Telescope, "band": zonda.Band,
-        "background_limited": noise_models.get("background_limited"), "fixed_net": noise_models.get("fixed_net"),
-    }  # fmt: skip
+        "scene": zonda.Scene,
+        "site": Site,
+        "instrument": zonda.Instrument,
+        "telescope": zonda.Telescope,
+        "band": zonda.Band,
+        "background_limited": noise_models.get("background_limited"),
+        "fixed_net": noise_models.get("fixed_net"),
+    }
     assert set(classes) == set(SETTINGS)
     for what, cls in classes.items():
-        said = SAID | ({"site"} if what == "telescope" else set())  # where it stands: `zonda check` compares, nothing is computed
-        assert {field.alias or name for name, field in cls.model_fields.items()} - said == set(SETTINGS[what]), what
+        said = SAID | (
+            {"site"} if what == "telescope" else set()
+        )  # where it stands: `zonda check` compares, nothing is computed
+        assert {field.alias or name for name, field in cls.model_fields.items()} - said == set(
+            SETTINGS[what]
+        ), what

@@ -19,7 +19,11 @@ def test_processes_of_a_campaign_find_every_class_of_partial_products():
     for found in operators.candidates():
         if found.distribution == "zonda":
             operators.get(found.qualified)  # imports what it adds up
-    own = {kind.__name__: kind for kind in kinds(Product) if kind is not Record and kind.__module__.startswith("zonda.operators")}
+    own = {
+        kind.__name__: kind
+        for kind in kinds(Product)
+        if kind is not Record and kind.__module__.startswith("zonda.operators")
+    }
     assert {"MapSums", "Spectrum", "StreamComparison"} <= set(own)
     for name, kind in own.items():
         if kind.__subclasses__():  # a base class

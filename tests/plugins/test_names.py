@@ -18,14 +18,21 @@ from zonda.plugins import sites as site_table
 ROOT = Path(__file__).resolve().parents[2]
 POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
 ALL = {
-    "zonda.sites": site_table, "zonda.instruments": instrument_table, "zonda.bands": band_table, "zonda.layouts": layout_table,
-}  # fmt: skip
+    "zonda.sites": site_table,
+    "zonda.instruments": instrument_table,
+    "zonda.bands": band_table,
+    "zonda.layouts": layout_table,
+}
 
 
 @pytest.mark.parametrize("group", ALL)
 def test_every_name_has_its_entry_point(group):
     module = ALL[group]
-    survey = {name: f"{cameras.__name__}:{name}" for name in dir(cameras)} if group == "zonda.instruments" else {}
+    survey = (
+        {name: f"{cameras.__name__}:{name}" for name in dir(cameras)}
+        if group == "zonda.instruments"
+        else {}
+    )
     assert POINTS[group] == {name: f"{module.__name__}:{name}" for name in dir(module)} | survey
     with pytest.raises(AttributeError, match="no attribute 'nowhere'"):
         _ = module.nowhere
@@ -63,7 +70,9 @@ def test_every_instrument(name):
     assert made.provenance
     assert made.band == bands.create(made.band.name)
     limit = 1.22 * 299792458 / made.band.centre / made.telescope.diameter
-    assert 0.8 * limit < made.beam_fwhm < 1.8 * limit  # measured beams: dishes are not evenly illuminated
+    assert (
+        0.8 * limit < made.beam_fwhm < 1.8 * limit
+    )  # measured beams: dishes are not evenly illuminated
     plane = made.focalplane()
     assert len(plane) == made.detectors
     assert 2 * np.arctan(plane.radius) == pytest.approx(made.field_of_view, rel=1e-9)
@@ -74,17 +83,24 @@ def test_every_camera_of_several_bands(name):
     made, table = instruments.create(name), cameras.CAMERAS[name]
     assert made.telescope.site in sites
     plane, pixels = made.focalplane(), {}
-    for k, (channel, (band, camera)) in enumerate(zip(table.channels, made.cameras.items(), strict=True)):
+    for k, (channel, (band, camera)) in enumerate(
+        zip(table.channels, made.cameras.items(), strict=True)
+    ):
         rows = plane.of_band(k)
         assert (band, len(rows)) == (channel.name, channel.detectors)
         assert len(set(np.bincount(rows.wafer))) == 1
         limit = 1.22 * 299792458 / camera.band.centre / made.telescope.diameter
-        assert 0.73 * limit < camera.beam_fwhm < 1.8 * limit  # published ones; of so_sat_lf 0.78, of Prime-Cam at 280 GHz 1.06
+        assert (
+            0.73 * limit < camera.beam_fwhm < 1.8 * limit
+        )  # published ones; of so_sat_lf 0.78, of Prime-Cam at 280 GHz 1.06
         pixels[band] = {*zip(rows.xi.tolist(), rows.eta.tolist(), strict=True)}
     alike = len({frozenset(places) for places in pixels.values()}) == 1
     assert alike == (made.pixels == "shared")
-    # modules side by side stand about the middle of all with room between, so that the farthest detector is not at the edge
-    assert 2 * np.arctan(plane.radius) == pytest.approx(made.field_of_view, rel=0.15 if made.pixels == "separate" else 1e-9)
+    # modules side by side stand about the middle of all with room between, so that the farthest
+    # detector is not at the edge
+    assert 2 * np.arctan(plane.radius) == pytest.approx(
+        made.field_of_view, rel=0.15 if made.pixels == "separate" else 1e-9
+    )
     assert plane.polarized
 
 
@@ -96,52 +112,72 @@ def test_every_number_has_a_source_or_is_a_stand_in(name):
     assert sorted(number for number, _, _ in told) == sorted(cameras.NUMBERS)
     assert all(len(text) > 5 for _, _, text in told)
     for part in parts:
-        assert not ("not verified" in part.partition("(")[0] and not part.startswith(cameras.STAND_IN)), part
+        assert not (
+            "not verified" in part.partition("(")[0] and not part.startswith(cameras.STAND_IN)
+        ), part
     assert set(cameras.CAMERAS[name].sources) == set(cameras.NUMBERS)
 
 
 def test_counts_and_scales_of_the_hardware_models():
-    """sotodlib/sim_hardware.py: 430 of 432 horns or 37 pixels a wafer, 5.3 and 18 mm apart, 0.00495 and 0.09668 deg/mm, wafers
-    128.4 mm and tubes 359.6 mm apart. s4sim/hardware/config.py: 48, 430 and 467 pixels a wafer, 16.1, 5.3 and 5.2 mm apart,
-    0.003964 deg/mm, tubes 0.87 deg apart."""
+    """sotodlib/sim_hardware.py: 430 of 432 horns or 37 pixels a wafer, 5.3 and 18 mm apart, 0.00495
+    and 0.09668 deg/mm, wafers 128.4 mm and tubes 359.6 mm apart. s4sim/hardware/config.py: 48, 430
+    and 467 pixels a wafer, 16.1, 5.3 and 5.2 mm apart, 0.003964 deg/mm, tubes 0.87 deg apart."""
     cases = [
-        ("so_lat_lf", 3, 37, 18 * 0.00495, 128.4 * 0.00495), ("so_lat_mf", 12, 430, 5.3 * 0.00495, 128.4 * 0.00495),
-        ("so_lat_uhf", 6, 430, 5.3 * 0.00495, 128.4 * 0.00495), ("so_sat_lf", 7, 37, 18 * 0.09668, 128.4 * 0.09668),
-        ("so_sat_mf", 7, 430, 5.3 * 0.09668, 128.4 * 0.09668), ("cmb_s4_lat_lf", 8, 48, 16.1 * 0.003964, None),
-        ("cmb_s4_lat_mf", 54, 430, 5.3 * 0.003964, 0.87), ("cmb_s4_lat_hf", 19, 467, 5.2 * 0.003964, 0.87),
-    ]  # fmt: skip
+        ("so_lat_lf", 3, 37, 18 * 0.00495, 128.4 * 0.00495),
+        ("so_lat_mf", 12, 430, 5.3 * 0.00495, 128.4 * 0.00495),
+        ("so_lat_uhf", 6, 430, 5.3 * 0.00495, 128.4 * 0.00495),
+        ("so_sat_lf", 7, 37, 18 * 0.09668, 128.4 * 0.09668),
+        ("so_sat_mf", 7, 430, 5.3 * 0.09668, 128.4 * 0.09668),
+        ("cmb_s4_lat_lf", 8, 48, 16.1 * 0.003964, None),
+        ("cmb_s4_lat_mf", 54, 430, 5.3 * 0.003964, 0.87),
+        ("cmb_s4_lat_hf", 19, 467, 5.2 * 0.003964, 0.87),
+    ]
     for name, number, pixels, pitch, between in cases:
         rows = instruments.create(name).focalplane().of_band(0)
         assert len(rows) == 2 * number * pixels, name
         z = 1 / np.sqrt(1 + rows.xi**2 + rows.eta**2)
         places = np.stack([rows.xi * z, rows.eta * z, z], axis=1)[::2]
         first = places[:pixels]
-        away = np.degrees(2 * np.arcsin(np.linalg.norm(first[:, None] - first, axis=2) / 2)) + 1e3 * np.eye(pixels)
-        # places within a rhombus are sines of a plane, not arcs: 4 % at the rim of the SAT's wafers, 1e-4 of the LAT's
+        away = np.degrees(
+            2 * np.arcsin(np.linalg.norm(first[:, None] - first, axis=2) / 2)
+        ) + 1e3 * np.eye(pixels)
+        # places within a rhombus are sines of a plane, not arcs: 4 % at the rim of the SAT's
+        # wafers, 1e-4 of the LAT's
         assert away.min(axis=1) == pytest.approx(pitch, rel=0.04 if "sat" in name else 1e-3), name
-        middles = np.stack([m / np.linalg.norm(m) for m in places.reshape(number, pixels, 3).mean(axis=1)])
+        middles = np.stack(
+            [m / np.linalg.norm(m) for m in places.reshape(number, pixels, 3).mean(axis=1)]
+        )
         apart = np.degrees(np.arccos(np.clip(middles @ middles.T, -1, 1))) + 1e3 * np.eye(number)
-        if (
-            between is not None
-        ):  # two lost of 430 pixels, up to 20 pitches from the middle together, move it by 0.05, two wafers by 0.1
+        if between is not None:
+            # two lost of 430 pixels, up to 20 pitches from the middle together, move it by 0.05,
+            # two wafers by 0.1
             assert apart.min() == pytest.approx(between, abs=0.2 * pitch), name
 
 
 def test_toltecs_nets_are_those_of_its_mapping_speed():
-    """toltec_noise.py (TolTEC-Camera/MappingSpeedModel): speed = N 3600 / (NEFD^2 N_beams) [deg2 / mJy2 / h], N_beams the beams
-    (pi FWHM^2 / 4 ln 2) in a square degree. toltec.astro.umass.edu/using_toltec.php: detectors, beams and largest speeds."""
+    """toltec_noise.py (TolTEC-Camera/MappingSpeedModel): speed = N 3600 / (NEFD^2 N_beams) [deg2 /
+    mJy2 / h], N_beams the beams (pi FWHM^2 / 4 ln 2) in a square degree.
+    toltec.astro.umass.edu/using_toltec.php: detectors, beams and largest speeds."""
     made = instruments.create("toltec_3band")
-    for name, number, arcsec, speed in (("a2000", 1172, 9.5, 69), ("a1400", 2532, 6.3, 20), ("a1100", 4012, 5.0, 12)):
+    for name, number, arcsec, speed in (
+        ("a2000", 1172, 9.5, 69),
+        ("a1400", 2532, 6.3, 20),
+        ("a1100", 4012, 5.0, 12),
+    ):
         camera = made.cameras[name]
         solid_angle = np.pi * np.radians(arcsec / 3600) ** 2 / (4 * np.log(2))
-        jansky = 1e-29 * np.sqrt(number * 3600 * solid_angle / (np.radians(1) ** 2 * speed))  # of one mJy
+        jansky = 1e-29 * np.sqrt(
+            number * 3600 * solid_angle / (np.radians(1) ** 2 * speed)
+        )  # of one mJy
         net = jansky / (2 * 1.380649e-23 * (camera.band.centre / 299792458) ** 2 * solid_angle)
         assert camera.net == pytest.approx(net, rel=1e-3)  # of four digits
         assert np.degrees(camera.beam_fwhm) * 3600 == pytest.approx(arcsec)
 
 
 def test_toltecs_pitch_is_that_of_the_design():
-    """a*_prop.ecsv of tolteca: 2.75, 3.364 and 4.9 mm in an array of 127.049 mm, 4 arcmin (toltec_info)."""
+    """a*_prop.ecsv of tolteca: 2.75, 3.364 and 4.9 mm in an array of 127.049 mm, 4 arcmin
+    (toltec_info).
+    """
     made = instruments.create("toltec_3band")
     for name, mm in (("a1100", 2.75), ("a1400", 3.364), ("a2000", 4.9)):
         plane = made.cameras[name].focalplane()
@@ -151,8 +187,12 @@ def test_toltecs_pitch_is_that_of_the_design():
 
 
 def test_prime_cams_nets_are_those_of_its_modules():
-    """ccat_noise_200831.py, CcatLatv2b: uK_CMB s(1/2) of a module; input.yaml: its detectors, and a yield of 0.8."""
-    for channel, module in zip(cameras.CAMERAS["ccat_primecam"].channels, (12.7, 47.7, 305400.7), strict=True):
+    """ccat_noise_200831.py, CcatLatv2b: uK_CMB s(1/2) of a module; input.yaml: its detectors, and a
+    yield of 0.8.
+    """
+    for channel, module in zip(
+        cameras.CAMERAS["ccat_primecam"].channels, (12.7, 47.7, 305400.7), strict=True
+    ):
         assert channel.net == pytest.approx(module * np.sqrt(0.8 * channel.detectors), rel=1e-4)
 
 
@@ -163,15 +203,21 @@ def test_modules_of_prime_cam():
     planes = [whole.of_band(k) for k in range(3)]
     middles = np.degrees([(p.xi[0::2].mean(), p.eta[0::2].mean()) for p in planes])
     for k in range(3):
-        assert np.hypot(*(middles[k] - middles[k - 1])) == pytest.approx(461.3 * 13.89 / 3600, rel=2e-3)
+        assert np.hypot(*(middles[k] - middles[k - 1])) == pytest.approx(
+            461.3 * 13.89 / 3600, rel=2e-3
+        )
         own = made.cameras[made.bands[k].name].focalplane()
         assert np.degrees(2 * np.arctan(own.radius)) == pytest.approx(1.3, rel=1e-4)
 
 
 def test_the_lattice_of_laboca():
-    """Beam maps (crush/config/laboca/laboca-2017-09.rcp): neighbours 38 arcsec (median of the nearest) to 39.5 (mean) apart."""
+    """Beam maps (crush/config/laboca/laboca-2017-09.rcp): neighbours 38 arcsec (median of the
+    nearest) to 39.5 (mean) apart.
+    """
     plane = instruments.create("apex").focalplane()
-    pitch = np.degrees(np.hypot(plane.xi[1:] - plane.xi[0], plane.eta[1:] - plane.eta[0]).min()) * 3600
+    pitch = (
+        np.degrees(np.hypot(plane.xi[1:] - plane.xi[0], plane.eta[1:] - plane.eta[0]).min()) * 3600
+    )
     assert pitch == pytest.approx(38.7, rel=0.06)
 
 
@@ -179,15 +225,24 @@ def test_nets_of_the_cmb_are_turned_into_rayleigh_jeans():
     # dT_RJ / dT_CMB = x^2 e^x / (e^x - 1)^2 with x = h nu / k T_CMB
     x = 6.62607015e-34 * 92e9 / (1.380649e-23 * 2.72548)
     factor = x**2 * np.exp(x) / np.expm1(x) ** 2
-    assert instruments.create("so_lat_mf").cameras["f090"].net == pytest.approx(361e-6 * factor, rel=1e-3)  # of 4 digits
+    assert instruments.create("so_lat_mf").cameras["f090"].net == pytest.approx(
+        361e-6 * factor, rel=1e-3
+    )  # of 4 digits
 
 
 def test_atlast_is_the_papers():
     made = instruments.create("atlast")
-    assert (made.detectors, made.net, made.sample_rate, made.telescope.diameter) == (3000, 0.266e-3, 225.0, 50.0)
+    assert (made.detectors, made.net, made.sample_rate, made.telescope.diameter) == (
+        3000,
+        0.266e-3,
+        225.0,
+        50.0,
+    )
     assert (made.main_beam_efficiency, made.illumination_efficiency) == (0.3, 0.8)
     assert np.degrees([made.field_of_view, made.beam_fwhm * 3600]) == pytest.approx([0.25, 16])
-    assert np.degrees([made.telescope.speed_max, made.telescope.acceleration_max]) == pytest.approx([3, 1])
+    assert np.degrees([made.telescope.speed_max, made.telescope.acceleration_max]) == pytest.approx(
+        [3, 1]
+    )
     assert made.band.centre == pytest.approx(92e9)
     assert instruments.create("atlast_full").detectors == 200_000
 

@@ -1,20 +1,25 @@
 """Near-field footprints of a telescope in a layer: the paper's Gaussian, and apertures with a rim.
 
-Within the Rayleigh distance a telescope collects from a column as wide as its aperture, weighted by the power illumination
+Within the Rayleigh distance a telescope collects from a column as wide as its aperture, weighted by
+the power illumination
 
-    A(r) = exp(-beta (r / a)^2),   r <= a,      beta = edge taper [dB] ln(10) / 10                               (1)
+    A(r) = exp(-beta (r / a)^2),   r <= a,
+    beta = edge taper [dB] ln(10) / 10                               (1)
 
-(a top hat where the taper is 0). The column widens with distance as the paper's Gaussian does, D(z) = D sqrt(1 + (z / z_r)^2).
-With B(k) the transform of A, normalized to B(0) = 1, a layer of spectrum P (`covariance`, equation 2) is seen as P B^2:
+(a top hat where the taper is 0). The column widens with distance as the paper's Gaussian does, D(z)
+= D sqrt(1 + (z / z_r)^2). With B(k) the transform of A, normalized to B(0) = 1, a layer of spectrum
+P (`covariance`, equation 2) is seen as P B^2:
 
-    S(r) = int P(k) B(k)^2 (1 - J_0(k r)) k dk / 2 pi                                                            (2)
+    S(r) = int P(k) B(k)^2 (1 - J_0(k r)) k dk / 2 pi                                            (2)
 
 The pyramid (`turbulence`) sees large scales through two Gaussians that match B^2 up to k^4,
 
-    B^2 = 2 exp(-u k^2) - exp(-(2 u - m) k^2) + O(k^6),    u = m + sqrt((m^2 - m2) / 2)                          (3)
+    B^2 = 2 exp(-u k^2) - exp(-(2 u - m) k^2) + O(k^6),
+    u = m + sqrt((m^2 - m2) / 2)                          (3)
 
-with m and m2 the first two moments: B^2 = 1 - m k^2 + m2 k^4 / 2 + ... What is left goes into the finest level.
-Interpolation errors are bounded with (1 + 2 m k^2 / 3)^(-3/2) >= B^2, which is a mixture of Gaussians (`bound`).
+with m and m2 the first two moments: B^2 = 1 - m k^2 + m2 k^4 / 2 + ... What is left goes into the
+finest level. Interpolation errors are bounded with (1 + 2 m k^2 / 3)^(-3/2) >= B^2, which is a
+mixture of Gaussians (`bound`).
 """
 
 from __future__ import annotations
@@ -32,7 +37,9 @@ from .covariance import NU
 
 
 def widened(diameter: float, wavelength: float, distance: float) -> float:
-    """D sqrt(1 + (z / z_r)^2), z_r = pi (D / 2)^2 / lambda: width [m] of the column at ``distance`` along the line of sight."""
+    """D sqrt(1 + (z / z_r)^2), z_r = pi (D / 2)^2 / lambda: width [m] of the column at ``distance``
+    along the line of sight.
+    """
     return diameter * math.hypot(1.0, distance / rayleigh_distance(diameter, wavelength))
 
 
@@ -43,7 +50,9 @@ def rayleigh_distance(diameter: float, wavelength: float) -> float:
 
 @dataclass(frozen=True)
 class Aperture:
-    """A footprint of equation (1): ``diameter`` in m, ``taper`` of the power at its rim in dB (0: top hat)."""
+    """A footprint of equation (1): ``diameter`` in m, ``taper`` of the power at its rim in dB (0:
+    top hat).
+    """
 
     diameter: float
     taper: float = 0.0
@@ -68,7 +77,9 @@ class Aperture:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the Gaussian footprint of equal second moment, m (D / 4 for the top hat)."""
+        """Standard deviation of the Gaussian footprint of equal second moment, m (D / 4 for the top
+        hat).
+        """
         return math.sqrt(self.moments[0])
 
     @property
@@ -79,16 +90,21 @@ class Aperture:
         return (2.0, u), (-1.0, 2 * u - first)
 
     def bound(self) -> tuple[Floats, Floats]:
-        """(sigma^2 [m2], weights): sum weight exp(-sigma^2 k^2) = (1 + 2 m k^2 / 3)^(-3/2), nowhere below B^2 up to k a = 40.
+        """(sigma^2 [m2], weights): sum weight exp(-sigma^2 k^2) = (1 + 2 m k^2 / 3)^(-3/2), nowhere
+        below B^2 up to k a = 40.
 
         (1 + q)^(-3/2) = int t^(3/2) exp(-t (1 + q)) d ln t / Gamma(3/2), by the trapezoidal rule.
         """
         t = np.exp(np.arange(-7.0, 3.6, 1.0))
         w = t**1.5 * np.exp(-t)
-        return np.asarray(2 / 3 * self.moments[0] * t, np.float64), np.asarray(w / w.sum(), np.float64)
+        return np.asarray(2 / 3 * self.moments[0] * t, np.float64), np.asarray(
+            w / w.sum(), np.float64
+        )
 
     def structure(self, r: ArrayLike, outer_scale: float) -> Floats:
-        """Equation (2): half the mean squared difference of two lines of sight ``r`` metres apart. Relative error < 1e-6."""
+        """Equation (2): half the mean squared difference of two lines of sight ``r`` metres apart.
+        Relative error < 1e-6.
+        """
         from scipy.special import j0
 
         r = np.atleast_1d(np.asarray(r, np.float64))
@@ -101,18 +117,32 @@ class Aperture:
         return float(self._power(outer_scale)[0].sum())
 
     def _power(self, outer_scale: float, r: float = 0.0) -> tuple[Floats, Floats]:
-        """P B^2 k dk / 2 pi at nodes k, close enough for J_0(k r): panels even in ln x below x = k a = 0.5, in x to 200."""
+        """P B^2 k dk / 2 pi at nodes k, close enough for J_0(k r): panels even in ln x below x = k
+        a = 0.5, in x to 200.
+        """
         a = self.diameter / 2
         x, weight = np.polynomial.legendre.leggauss(24)
         low = math.log(1e-4 * min(1.0, a / outer_scale))
         panel = min(2.0, 12 * a / max(r, a))
         edges = np.concatenate(
-            [np.exp(np.arange(low, math.log(0.5), 0.25)), np.arange(0.5, 30.0, panel), np.arange(30.0, 201.0, 2.0)]
+            [
+                np.exp(np.arange(low, math.log(0.5), 0.25)),
+                np.arange(0.5, 30.0, panel),
+                np.arange(30.0, 201.0, 2.0),
+            ]
         )
         middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
         k = (middle[:, None] + half[:, None] * x).ravel() / a
         dk = (half[:, None] * weight).ravel() / a
-        power = 2 * NU * outer_scale ** (-2 * NU) * (k**2 + outer_scale**-2) ** (-NU - 1) * self.transform(k) ** 2 * k * dk
+        power = (
+            2
+            * NU
+            * outer_scale ** (-2 * NU)
+            * (k**2 + outer_scale**-2) ** (-NU - 1)
+            * self.transform(k) ** 2
+            * k
+            * dk
+        )
         return power, k
 
 

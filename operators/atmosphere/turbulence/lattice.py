@@ -1,17 +1,19 @@
 """A turbulent layer at random access on an unlimited plane: a pyramid of Gaussian scale mixtures.
 
-The beam-convolved von Karman spectrum is a mixture of Gaussians exp(-e k^2) (`covariance`, equation 4). Level j of the
-pyramid takes those with e up to (2 d_j / c)^2 on a lattice of spacing d_j = 2^j metres: white noise, addressed by absolute
-lattice index, convolved with a compact kernel of radius R cells. Levels are summed from coarse to fine with x2 kriging
-interpolation of L taps:
+The beam-convolved von Karman spectrum is a mixture of Gaussians exp(-e k^2) (`covariance`, equation
+4). Level j of the pyramid takes those with e up to (2 d_j / c)^2 on a lattice of spacing d_j = 2^j
+metres: white noise, addressed by absolute lattice index, convolved with a compact kernel of radius
+R cells. Levels are summed from coarse to fine with x2 kriging interpolation of L taps:
 
-    f_j = noise_j * h_j + up2(f_(j+1)),            |FFT h_j|^2 = aliased spectrum of the level                     (1)
+    f_j = noise_j * h_j + up2(f_(j+1)),
+    |FFT h_j|^2 = aliased spectrum of the level                     (1)
 
-Every sum runs over a fixed list of taps in a fixed order, so a lattice point has the same bits in whatever region it is
-evaluated. The beam costs nothing and is exact; no matrix is inverted and nothing is periodic.
+Every sum runs over a fixed list of taps in a fixed order, so a lattice point has the same bits in
+whatever region it is evaluated. The beam costs nothing and is exact; no matrix is inverted and
+nothing is periodic.
 
-Behind an aperture with a rim (`beams`) the finest level takes what two Gaussians leave of the footprint's spectrum. What the
-kernels are, and how well the covariance holds: `levels`.
+Behind an aperture with a rim (`beams`) the finest level takes what two Gaussians leave of the
+footprint's spectrum. What the kernels are, and how well the covariance holds: `levels`.
 """
 
 from __future__ import annotations
@@ -28,7 +30,15 @@ from zonda.core.numerics.random import lattice_normals, stream_key
 
 from .beams import Aperture
 from .covariance import beam_correlation
-from .levels import FIDELITIES, PREFILTER, Field, aperture_levels, gaussian_levels, kriging, prefilter_taps
+from .levels import (
+    FIDELITIES,
+    PREFILTER,
+    Field,
+    aperture_levels,
+    gaussian_levels,
+    kriging,
+    prefilter_taps,
+)
 
 SMALLEST_RATIO, LARGEST_RATIO = 1e-3, 1e6
 """Outer scale / sigma of the beam: the range over which the error was measured."""
@@ -37,20 +47,23 @@ _stream_key = lru_cache(maxsize=1024)(stream_key)
 
 
 class Turbulence:
-    """One layer: a Gaussian field of covariance `covariance.beam_correlation`, on a lattice of `spacing` metres.
+    """One layer: a Gaussian field of covariance `covariance.beam_correlation`, on a lattice of
+    `spacing` metres.
 
     Parameters
     ----------
     seed, names
-        What the random stream belongs to (`core.numerics.random.stream_key`). Lattices are powers of two metres whatever the
-        beam, so two beams that look through the same stream see the same air.
+        What the random stream belongs to (`core.numerics.random.stream_key`). Lattices are powers
+        of two metres whatever the beam, so two beams that look through the same stream see the same
+        air.
     outer_scale, sigma
         r0 and the Gaussian beam's standard deviation, m.
     aperture
         A footprint with a rim instead of the Gaussian (`beams`).
     lattice
-        Largest spacing, in units of sigma; that of the fidelity where absent. At most 0.5 of the sigma of the Gaussian of equal
-        second moment behind an aperture, whose rim leaves finer structure.
+        Largest spacing, in units of sigma; that of the fidelity where absent. At most 0.5 of the
+        sigma of the Gaussian of equal second moment behind an aperture, whose rim leaves finer
+        structure.
     fidelity
         ``default`` or ``fine``, see the table above.
 
@@ -71,19 +84,29 @@ class Turbulence:
         fidelity: str = "default",
     ) -> None:
         sigma = aperture.sigma if aperture else sigma
-        self.outer_scale, self.sigma, self.aperture, self.fidelity = outer_scale, sigma, aperture, FIDELITIES[fidelity]
+        self.outer_scale, self.sigma, self.aperture, self.fidelity = (
+            outer_scale,
+            sigma,
+            aperture,
+            FIDELITIES[fidelity],
+        )
         if not (np.isfinite([outer_scale, sigma]).all() and outer_scale > 0 and sigma > 0):
             raise InputError(
-                f"outer scale {outer_scale:g} m and beam {sigma:g} m must be finite and positive", place="turbulence"
+                f"outer scale {outer_scale:g} m and beam {sigma:g} m must be finite and positive",
+                place="turbulence",
             )
         lattice = lattice or self.fidelity.lattice
         ratio = outer_scale / sigma
         if not SMALLEST_RATIO <= ratio <= LARGEST_RATIO:
             raise InputError(
-                f"outer scale {outer_scale:g} m is {ratio:.3g} times the beam's sigma of {sigma:.3g} m; the error of the "
-                f"turbulence is known from {SMALLEST_RATIO:g} to {LARGEST_RATIO:g}",
+                f"outer scale {outer_scale:g} m is {ratio:.3g} times the beam's sigma of"
+                f" {sigma:.3g} m; the error of the turbulence is known from {SMALLEST_RATIO:g} to"
+                f" {LARGEST_RATIO:g}",
                 place="turbulence",
-                cure=f"choose an outer_scale from {SMALLEST_RATIO * sigma:.2g} m to {LARGEST_RATIO * sigma:.2g} m",
+                cure=(
+                    f"choose an outer_scale from {SMALLEST_RATIO * sigma:.2g} m to"
+                    f" {LARGEST_RATIO * sigma:.2g} m"
+                ),
             )
         if aperture:
             self.levels = aperture_levels(outer_scale, aperture, lattice, fidelity)
@@ -101,19 +124,27 @@ class Turbulence:
         return float(beam_correlation(0.0, self.outer_scale, self.sigma)[0])
 
     def alike(self, other: Turbulence) -> bool:
-        """Whether another field is a convolution of the same random numbers with kernels of the same shapes."""
+        """Whether another field is a convolution of the same random numbers with kernels of the
+        same shapes.
+        """
         if len(self.levels) != len(other.levels) or not np.array_equal(self._keys, other._keys):
             return False
         pairs = zip(self.levels, other.levels, strict=True)
-        return self.fidelity is other.fidelity and all(_same_taps(a.kernel, b.kernel) for a, b in pairs)
+        return self.fidelity is other.fidelity and all(
+            _same_taps(a.kernel, b.kernel) for a, b in pairs
+        )
 
     def region(self, i0: int, i1: int, j0: int, j1: int) -> Field:
-        """The field at lattice points i0 <= i < i1, j0 <= j < j1 (any integers). Shape (i1 - i0, j1 - j0), float32."""
+        """The field at lattice points i0 <= i < i1, j0 <= j < j1 (any integers). Shape (i1 - i0, j1
+        - j0), float32.
+        """
         found: Field = _regions([self], i0, i1, j0, j1)[0]
         return found
 
     def coefficients(self, i0: int, i1: int, j0: int, j1: int) -> Field:
-        """Cubic B-spline coefficients at lattice points, so that the spline passes through the field. As `region`."""
+        """Cubic B-spline coefficients at lattice points, so that the spline passes through the
+        field. As `region`.
+        """
         return coefficients([self], i0, i1, j0, j1)[0]
 
 
@@ -127,13 +158,22 @@ def coefficients(fields: Sequence[Turbulence], i0: int, i1: int, j0: int, j1: in
 
 
 def _regions(fields: Sequence[Turbulence], i0: int, i1: int, j0: int, j1: int) -> Field:
-    """`Turbulence.region` of fields that are `alike`, (n_field, i1 - i0, j1 - j0): their random numbers are drawn once."""
+    """`Turbulence.region` of fields that are `alike`, (n_field, i1 - i0, j1 - j0): their random
+    numbers are drawn once.
+    """
     first = fields[0]
     pad = first.fidelity.taps // 2
     boxes = [(i0, i1, j0, j1)]
     for _ in first.levels[1:]:
         a, b, c, d = boxes[-1]
-        boxes.append(((a >> 1) - pad + 1, ((b - 1) >> 1) + pad + 1, (c >> 1) - pad + 1, ((d - 1) >> 1) + pad + 1))
+        boxes.append(
+            (
+                (a >> 1) - pad + 1,
+                ((b - 1) >> 1) + pad + 1,
+                (c >> 1) - pad + 1,
+                ((d - 1) >> 1) + pad + 1,
+            )
+        )
     coarse: Field | None = None
     for k in range(len(boxes) - 1, -1, -1):
         a, b, c, d = boxes[k]
@@ -152,19 +192,23 @@ def _regions(fields: Sequence[Turbulence], i0: int, i1: int, j0: int, j1: int) -
 
 
 def _same_taps(one: Field | None, other: Field | None) -> bool:
-    """Whether two kernels have the same taps, whatever they weigh: sums are then made in the same order."""
+    """Whether two kernels have the same taps, whatever they weigh: sums are then made in the same
+    order.
+    """
     if one is None or other is None:
         return one is other
     return one.shape == other.shape and np.array_equal(one == 0, other == 0)
 
 
-# No fastmath in the kernels: a compiler that may fuse or reorder could give a point other bits at the end of a row. What is
-# fused is fused by name.
+# No fastmath in the kernels: a compiler that may fuse or reorder could give a point other bits at
+# the end of a row. What is fused is fused by name.
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
 def _add_symmetric(row, taps, out):  # type: ignore[no-untyped-def]
-    """out[j] += taps[0] row[j + R] + sum_k taps[k] (row[j + R - k] + row[j + R + k]); R = taps.size - 1. Four taps at a time."""
+    """out[j] += taps[0] row[j + R] + sum_k taps[k] (row[j + R - k] + row[j + R + k]); R = taps.size
+    - 1. Four taps at a time.
+    """
     radius, n = taps.size - 1, nb.uint64(out.size)
     middle, weight = row[radius:], taps[0]
     for j in range(n):
@@ -172,8 +216,18 @@ def _add_symmetric(row, taps, out):  # type: ignore[no-untyped-def]
     k = 1
     while k + 3 <= radius:
         a, b, c, d = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
-        a0, b0, c0, d0 = row[radius - k :], row[radius - k - 1 :], row[radius - k - 2 :], row[radius - k - 3 :]
-        a1, b1, c1, d1 = row[radius + k :], row[radius + k + 1 :], row[radius + k + 2 :], row[radius + k + 3 :]
+        a0, b0, c0, d0 = (
+            row[radius - k :],
+            row[radius - k - 1 :],
+            row[radius - k - 2 :],
+            row[radius - k - 3 :],
+        )
+        a1, b1, c1, d1 = (
+            row[radius + k :],
+            row[radius + k + 1 :],
+            row[radius + k + 2 :],
+            row[radius + k + 3 :],
+        )
         for j in range(n):
             near = fused(a, a0[j] + a1[j], fused(b, b0[j] + b1[j], out[j]))
             out[j] = fused(c, c0[j] + c1[j], fused(d, d0[j] + d1[j], near))
@@ -187,7 +241,9 @@ def _add_symmetric(row, taps, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
 def _add_two_symmetric(row, taps, others, out, other):  # type: ignore[no-untyped-def]
-    """`_add_symmetric` with two sets of taps: to ``out`` and to ``other`` at once, each in the same order."""
+    """`_add_symmetric` with two sets of taps: to ``out`` and to ``other`` at once, each in the same
+    order.
+    """
     radius, n = taps.size - 1, nb.uint64(out.size)
     middle, one, two = row[radius:], taps[0], others[0]
     for j in range(n):
@@ -197,8 +253,18 @@ def _add_two_symmetric(row, taps, others, out, other):  # type: ignore[no-untype
     while k + 3 <= radius:
         a, b, c, d = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
         e, f, g, h = others[k], others[k + 1], others[k + 2], others[k + 3]
-        a0, b0, c0, d0 = row[radius - k :], row[radius - k - 1 :], row[radius - k - 2 :], row[radius - k - 3 :]
-        a1, b1, c1, d1 = row[radius + k :], row[radius + k + 1 :], row[radius + k + 2 :], row[radius + k + 3 :]
+        a0, b0, c0, d0 = (
+            row[radius - k :],
+            row[radius - k - 1 :],
+            row[radius - k - 2 :],
+            row[radius - k - 3 :],
+        )
+        a1, b1, c1, d1 = (
+            row[radius + k :],
+            row[radius + k + 1 :],
+            row[radius + k + 2 :],
+            row[radius + k + 3 :],
+        )
         for j in range(n):
             p, q, r, s = a0[j] + a1[j], b0[j] + b1[j], c0[j] + c1[j], d0[j] + d1[j]
             out[j] = fused(c, r, fused(d, s, fused(a, p, fused(b, q, out[j]))))
@@ -214,8 +280,8 @@ def _add_two_symmetric(row, taps, others, out, other):  # type: ignore[no-untype
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
 def _convolve(noise, kernels, out):  # type: ignore[no-untyped-def]
-    """out[b] += noise * kernels[b]; ``noise`` has R more cells on every side, the kernels are symmetric quadrants (R + 1, R + 1)
-    whose taps are zero in the same places."""
+    """out[b] += noise * kernels[b]; ``noise`` has R more cells on every side, the kernels are
+    symmetric quadrants (R + 1, R + 1) whose taps are zero in the same places."""
     number, radius = kernels.shape[0], kernels.shape[1] - 1
     rows = np.empty(noise.shape[1], np.float32)
     m = nb.uint64(rows.size)
@@ -233,14 +299,18 @@ def _convolve(noise, kernels, out):  # type: ignore[no-untyped-def]
                 size -= 1
             row = rows[radius + 1 - size :]
             for b in range(0, number - 1, 2):
-                _add_two_symmetric(row, kernels[b, di, :size], kernels[b + 1, di, :size], out[b, i], out[b + 1, i])
+                _add_two_symmetric(
+                    row, kernels[b, di, :size], kernels[b + 1, di, :size], out[b, i], out[b + 1, i]
+                )
             if number % 2:
                 _add_symmetric(row, kernels[number - 1, di, :size], out[number - 1, i])
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
 def _upsample(coarse, ci, cj, weights, out, fi, fj):  # type: ignore[no-untyped-def]
-    """out += x2 kriging interpolation; (ci, cj) and (fi, fj) are the absolute indices of the arrays' first points."""
+    """out += x2 kriging interpolation; (ci, cj) and (fi, fj) are the absolute indices of the
+    arrays' first points.
+    """
     half = weights.size // 2
     n_i, n_j = out.shape
     row = np.empty(coarse.shape[1], np.float32)
@@ -281,7 +351,9 @@ def _upsample(coarse, ci, cj, weights, out, fi, fj):  # type: ignore[no-untyped-
 
 @nb.njit(nogil=True, cache=True, boundscheck=False)
 def _prefilter(field, taps, out):  # type: ignore[no-untyped-def]
-    """Separable symmetric filter; ``field`` has taps.size - 1 more cells on every side than ``out``."""
+    """Separable symmetric filter; ``field`` has taps.size - 1 more cells on every side than
+    ``out``.
+    """
     half = taps.size - 1
     row = np.empty(field.shape[1], np.float32)
     m = nb.uint64(row.size)
@@ -291,7 +363,12 @@ def _prefilter(field, taps, out):  # type: ignore[no-untyped-def]
             row[j] = weight * source[j]
         for tap in range(1, half, 2):
             a, b = taps[tap], taps[tap + 1]
-            a0, a1, b0, b1 = field[i + half - tap], field[i + half + tap], field[i + half - tap - 1], field[i + half + tap + 1]
+            a0, a1, b0, b1 = (
+                field[i + half - tap],
+                field[i + half + tap],
+                field[i + half - tap - 1],
+                field[i + half + tap + 1],
+            )
             for j in range(m):
                 row[j] = fused(a, a0[j] + a1[j], fused(b, b0[j] + b1[j], row[j]))
         target = out[i]

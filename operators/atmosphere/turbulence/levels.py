@@ -1,7 +1,9 @@
-"""The levels of a turbulent layer: kernels and interpolation weights of the pyramid (`lattice`), and how well they hold.
+"""The levels of a turbulent layer: kernels and interpolation weights of the pyramid (`lattice`),
+and how well they hold.
 
-Largest error of the implied covariance C, relative to the variance, and of the implied structure function S, relative to
-itself and from one cell up (computed exactly, not sampled; `benchmarks/atmosphere.py`), against r0 / sigma:
+Largest error of the implied covariance C, relative to the variance, and of the implied structure
+function S, relative to itself and from one cell up (computed exactly, not sampled;
+`benchmarks/atmosphere.py`), against r0 / sigma:
 
 =========================  ======  ======  ======  ======  ======  ======  ======
 R, L, c                    0.001   1       30      100     1e3     1e4     1e6
@@ -33,7 +35,9 @@ LARGEST_SCALE = 20.0
 """The mixture is cut at s = 20 r0^2: 2e-9 of the variance lies beyond."""
 
 PREFILTER = 10
-"""Half-length of the finite cubic-spline prefilter: its truncation is 3e-6 at the shortest wavelength, less elsewhere."""
+"""Half-length of the finite cubic-spline prefilter: its truncation is 3e-6 at the shortest
+wavelength, less elsewhere.
+"""
 
 _GRID = 96
 
@@ -43,7 +47,9 @@ _NEGLIGIBLE = 40.0
 
 @dataclass(frozen=True)
 class Fidelity:
-    """Kernel radius R [cells], interpolation taps L and resolution c of the pyramid, and its measured error."""
+    """Kernel radius R [cells], interpolation taps L and resolution c of the pyramid, and its
+    measured error.
+    """
 
     name: str
     radius: int
@@ -65,7 +71,9 @@ FIDELITIES = {
 
 @dataclass(frozen=True)
 class Level:
-    """One lattice: spacing 2^exponent m; kernel (R + 1, R + 1), quadrant of the symmetric h_j; None: nothing at this scale."""
+    """One lattice: spacing 2^exponent m; kernel (R + 1, R + 1), quadrant of the symmetric h_j;
+    None: nothing at this scale.
+    """
 
     exponent: int
     kernel: Field | None
@@ -76,7 +84,9 @@ class Level:
 
 
 @lru_cache(maxsize=256)
-def gaussian_levels(outer_scale: float, sigma: float, lattice: float, fidelity: str) -> tuple[Level, ...]:
+def gaussian_levels(
+    outer_scale: float, sigma: float, lattice: float, fidelity: str
+) -> tuple[Level, ...]:
     """The finest first, behind a Gaussian beam."""
     f = FIDELITIES[fidelity]
     exponent = math.floor(math.log2(lattice * sigma))
@@ -94,12 +104,18 @@ def gaussian_levels(outer_scale: float, sigma: float, lattice: float, fidelity: 
 
 
 @lru_cache(maxsize=64)
-def aperture_levels(outer_scale: float, aperture: Aperture, lattice: float, fidelity: str) -> tuple[Level, ...]:
-    """As `gaussian_levels`: `Aperture.gaussians` see the mixture beyond s_0 = sigma^2, the finest level all else."""
+def aperture_levels(
+    outer_scale: float, aperture: Aperture, lattice: float, fidelity: str
+) -> tuple[Level, ...]:
+    """As `gaussian_levels`: `Aperture.gaussians` see the mixture beyond s_0 = sigma^2, the finest
+    level all else.
+    """
     f = FIDELITIES[fidelity]
     exponent = math.floor(math.log2(aperture.sigma * min(lattice, 0.5)))
     low, top = aperture.sigma**2, LARGEST_SCALE * outer_scale**2
-    levels = [Level(exponent, _aperture_kernel(outer_scale, aperture, low, math.ldexp(1.0, exponent), f))]
+    levels = [
+        Level(exponent, _aperture_kernel(outer_scale, aperture, low, math.ldexp(1.0, exponent), f))
+    ]
     while low < top:
         exponent += 1
         spacing, kernel = math.ldexp(1.0, exponent), None
@@ -107,14 +123,20 @@ def aperture_levels(outer_scale: float, aperture: Aperture, lattice: float, fide
         if high > low:
             s, w = mixture_between(outer_scale, 0.0, low, high)
             e = np.concatenate([s + square for _, square in aperture.gaussians])
-            kernel = _separable_kernel(e, np.concatenate([c * w for c, _ in aperture.gaussians]), spacing, f.radius)
+            kernel = _separable_kernel(
+                e, np.concatenate([c * w for c, _ in aperture.gaussians]), spacing, f.radius
+            )
             low = high
         levels.append(Level(exponent, kernel))
     return tuple(levels)
 
 
-def _aperture_kernel(outer_scale: float, aperture: Aperture, split: float, spacing: float, f: Fidelity) -> Field:
-    """The finest level behind an aperture: B^2 P for s < split, and what equation (3) of `beams` leaves for s > split."""
+def _aperture_kernel(
+    outer_scale: float, aperture: Aperture, split: float, spacing: float, f: Fidelity
+) -> Field:
+    """The finest level behind an aperture: B^2 P for s < split, and what equation (3) of `beams`
+    leaves for s > split.
+    """
     radius = math.ceil((aperture.diameter / 2 + 0.4 * f.radius * math.sqrt(split)) / spacing)
     grid = 4 * (radius + 8)
     k = 2 * np.pi * np.fft.fftfreq(grid, spacing)[: grid // 2 + 1]
@@ -124,8 +146,9 @@ def _aperture_kernel(outer_scale: float, aperture: Aperture, split: float, spaci
     beam = aperture.transform(np.sqrt(k2))
     left = beam**2 - sum(c * np.exp(-s * k2) for c, s in aperture.gaussians)
     below, above = spectrum_between(k2, outer_scale, split)
-    # Where the beam of `gaussians` exceeds the aperture's own, at its zeros, there is a little too much to take away: what is cut
-    # is below 2e-4 of this level's power for a top hat, 2e-6 for tapers of 10 dB (3 to 100 m, outer scales of 10 to 1000 m).
+    # Where the beam of `gaussians` exceeds the aperture's own, at its zeros, there is a little too
+    # much to take away: what is cut is below 2e-4 of this level's power for a top hat, 2e-6 for
+    # tapers of 10 dB (3 to 100 m, outer scales of 10 to 1000 m).
     power = np.maximum(beam**2 * below + left * above, 0.0).sum((0, 2)) / spacing**2
     quarter = np.sqrt(power) * np.sign(beam[2, :, 2])
     index = np.minimum(np.arange(grid), grid - np.arange(grid))
@@ -133,8 +156,12 @@ def _aperture_kernel(outer_scale: float, aperture: Aperture, split: float, spaci
     return _cut(h, float(power[np.ix_(index, index)].mean()))
 
 
-def _kernel(outer_scale: float, sigma: float, low: float, high: float, spacing: float, radius: int) -> Field:
-    """Quadrant (R + 1, R + 1) of the kernel whose power is the aliased spectrum of low <= e < high, cut at R cells."""
+def _kernel(
+    outer_scale: float, sigma: float, low: float, high: float, spacing: float, radius: int
+) -> Field:
+    """Quadrant (R + 1, R + 1) of the kernel whose power is the aliased spectrum of low <= e < high,
+    cut at R cells.
+    """
     return _separable_kernel(*mixture_between(outer_scale, sigma, low, high), spacing, radius)
 
 
@@ -144,9 +171,13 @@ def _separable_kernel(e: Floats, w: Floats, spacing: float, radius: int) -> Fiel
     alias = 2 * np.pi / spacing * np.arange(-2, 3)
     square = np.add.outer(alias, k) ** 2
     own, others = square[2].max(), square.min(1)
-    heard = others <= own + _NEGLIGIBLE / e.min()  # of the images, those that are not lost beside the wave itself
+    heard = (
+        others <= own + _NEGLIGIBLE / e.min()
+    )  # of the images, those that are not lost beside the wave itself
     gauss = np.exp(-np.multiply.outer(e, square[heard])).sum(1)
-    power = np.einsum("ka,kb->ab", gauss * w[:, None], gauss) / spacing**2  # not BLAS: the same bits for any number of threads
+    power = (
+        np.einsum("ka,kb->ab", gauss * w[:, None], gauss) / spacing**2
+    )  # not BLAS: the same bits for any number of threads
     turns = _cosines(radius)
     h = np.einsum("ra,ac->rc", turns, np.einsum("ab,cb->ac", np.sqrt(power), turns))
     return _cut(h, float((w / (4 * np.pi * e)).sum()))
@@ -154,10 +185,15 @@ def _separable_kernel(e: Floats, w: Floats, spacing: float, radius: int) -> Fiel
 
 @lru_cache(maxsize=8)
 def _cosines(radius: int) -> Floats:
-    """The inverse transform (radius + 1, _GRID / 2 + 1) of an even spectrum of which half is given."""
+    """The inverse transform (radius + 1, _GRID / 2 + 1) of an even spectrum of which half is
+    given.
+    """
     index = np.arange(_GRID // 2 + 1)
     times = np.where((index == 0) | (index == index[-1]), 1.0, 2.0) / _GRID
-    return np.asarray(np.cos(2 * np.pi / _GRID * np.multiply.outer(np.arange(radius + 1), index)) * times, np.float64)
+    return np.asarray(
+        np.cos(2 * np.pi / _GRID * np.multiply.outer(np.arange(radius + 1), index)) * times,
+        np.float64,
+    )
 
 
 def _cut(h: Floats, variance: float) -> Field:
@@ -171,17 +207,22 @@ def _cut(h: Floats, variance: float) -> Field:
 
 @lru_cache(maxsize=8)
 def kriging(taps: int, resolution: float) -> Field:
-    """Weights that predict the middle of two lattice points from ``taps`` neighbours: best for the sum of coarser levels.
+    """Weights that predict the middle of two lattice points from ``taps`` neighbours: best for the
+    sum of coarser levels.
 
-    Ordinary kriging: the weights sum to 1. A field that hardly varies between lattice points (an outer scale of many cells)
-    passes through twenty levels unharmed; weights off by 1e-4 would swamp the structure function at one cell.
+    Ordinary kriging: the weights sum to 1. A field that hardly varies between lattice points (an
+    outer scale of many cells) passes through twenty levels unharmed; weights off by 1e-4 would
+    swamp the structure function at one cell.
     """
     x: Floats = np.arange(taps, dtype=np.float64) - (taps - 1) / 2
     octaves = np.arange(4)
 
     def model(r: Floats) -> Floats:
         scale, weight = 2 ** (-octaves / 2), 2 ** (NU * octaves)
-        return np.asarray((np.exp(-((np.multiply.outer(r, scale) * resolution / 2) ** 2)) * weight).sum(-1), np.float64)
+        return np.asarray(
+            (np.exp(-((np.multiply.outer(r, scale) * resolution / 2) ** 2)) * weight).sum(-1),
+            np.float64,
+        )
 
     between = model(np.asarray(x[:, None] - x, np.float64))
     system = np.ones((taps + 1, taps + 1))
@@ -192,6 +233,8 @@ def kriging(taps: int, resolution: float) -> Field:
 
 @lru_cache(maxsize=1)
 def prefilter_taps() -> Field:
-    """One-sided inverse of (1, 4, 1) / 6, cut at `PREFILTER` and normalized to unit sum. Shape (PREFILTER + 1,)."""
+    """One-sided inverse of (1, 4, 1) / 6, cut at `PREFILTER` and normalized to unit sum. Shape
+    (PREFILTER + 1,).
+    """
     taps = np.sqrt(3.0) * (np.sqrt(3.0) - 2.0) ** np.arange(PREFILTER + 1)
     return np.asarray(taps / (taps[0] + 2 * taps[1:].sum()), np.float32)

@@ -1,15 +1,18 @@
-"""Where many lines of sight cross the plane of the turbulence, compiled: `geometry` for every detector and coarse time.
+"""Where many lines of sight cross the plane of the turbulence, compiled: `geometry` for every
+detector and coarse time.
 
-A focal-plane point (xi, eta) looks at u = (z - eta x - xi y) / sqrt(1 + xi^2 + eta^2), with x, y, z the axes of the focal
-plane. On one plane (equation 2 of `geometry`) its position is a quotient of linear functions of (xi, eta). On the unrolled
-cone (equation 4 there) it is
+A focal-plane point (xi, eta) looks at u = (z - eta x - xi y) / sqrt(1 + xi^2 + eta^2), with x, y, z
+the axes of the focal plane. On one plane (equation 2 of `geometry`) its position is a quotient of
+linear functions of (xi, eta). On the unrolled cone (equation 4 there) it is
 
-    P = q(|u_h|) (c(t^2) + i t s(t^2)) exp(i k phi_b) a,     t = u_side / (|u_h| + u_ahead),     k = 1 / sin e_0    (1)
+    P = q(|u_h|) (c(t^2) + i t s(t^2)) exp(i k phi_b) a,   t = u_side / (|u_h| + u_ahead),
+    k = 1 / sin e_0    (1)
 
-as a complex number, with phi_b the azimuth of the boresight about the cone's axis a, (ahead, side) the horizontal
-components along and across the boresight's azimuth, so that t = tan(dphi / 2), and q, c = cos(2 k atan t), s = sin(2 k atan
-t) / t polynomials of one variable, as long as they need to be over the field and scan (`_ERROR`). Towards the horizon, where q
-is singular in |u_h|, it is a polynomial of u_up instead.
+as a complex number, with phi_b the azimuth of the boresight about the cone's axis a, (ahead, side)
+the horizontal components along and across the boresight's azimuth, so that t = tan(dphi / 2), and
+q, c = cos(2 k atan t), s = sin(2 k atan t) / t polynomials of one variable, as long as they need to
+be over the field and scan (`_ERROR`). Towards the horizon, where q is singular in |u_h|, it is a
+polynomial of u_up instead.
 """
 
 from __future__ import annotations
@@ -30,7 +33,9 @@ _ERROR = 1e-9
 """Error of a polynomial in equation (1): micrometres at a layer kilometres away."""
 
 _WORST = 1e-4
-"""What such a polynomial may err by in wide fields near the horizon, where none reaches `_ERROR`; beyond, a scan is refused."""
+"""What such a polynomial may err by in wide fields near the horizon, where none reaches `_ERROR`;
+beyond, a scan is refused.
+"""
 
 _DEGREES = (4, 6, 8, 11, 15, 20, 28, 40)
 
@@ -39,7 +44,8 @@ _WIDER = 0.05
 
 
 class LinesOfSight:
-    """Positions at samples first x step, (first + 1) x step .. of one scan; beyond its ends the path is extrapolated.
+    """Positions at samples first x step, (first + 1) x step .. of one scan; beyond its ends the
+    path is extrapolated.
 
     Parameters
     ----------
@@ -61,7 +67,9 @@ class LinesOfSight:
         Where a line of sight is at or below the horizon.
     """
 
-    def __init__(self, observation: Observation, plane: ScanPlane, step: int, first: int, count: int) -> None:
+    def __init__(
+        self, observation: Observation, plane: ScanPlane, step: int, first: int, count: int
+    ) -> None:
         self.step, self.first, self.count = step, first, count
         index = step * (first + np.arange(count, dtype=np.int64))
         self.seconds = observation.seconds_at(index)
@@ -72,7 +80,9 @@ class LinesOfSight:
         self.low, self.high = self._sines(linear[:, 2], np.r_[0.0, xi], np.r_[0.0, eta])
         self._cone = plane.cone
         if plane.cone is None:
-            rows = np.concatenate([np.einsum("ab,nbc->nac", plane.matrix, linear[:, :2]), linear[:, 2:]], axis=1)
+            rows = np.concatenate(
+                [np.einsum("ab,nbc->nac", plane.matrix, linear[:, :2]), linear[:, 2:]], axis=1
+            )
             self._shift = plane.matrix @ plane.centre
             self._turn = np.zeros((2, 0))
             self._series: tuple[Floats, ...] = ()
@@ -82,16 +92,24 @@ class LinesOfSight:
             self._series = self._polynomials(plane.cone, rows, np.r_[0.0, xi], np.r_[0.0, eta])
         self._linear = np.ascontiguousarray(np.moveaxis(rows.reshape(count, 9), 0, 1))  # (9, n)
 
-    def __call__(self, xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats, Floats]:
-        """(x, y) on the plane per metre of height, and sines of the elevation, each (len(xi), count), from time ``first``."""
+    def __call__(
+        self, xi: Floats, eta: Floats, first: int, count: int
+    ) -> tuple[Floats, Floats, Floats]:
+        """(x, y) on the plane per metre of height, and sines of the elevation, each (len(xi),
+        count), from time ``first``.
+        """
         start = first - self.first
         if not 0 <= start <= start + count <= self.count:
-            raise ValueError(f"times {first}:{first + count} outside {self.first}:{self.first + self.count}")
+            raise ValueError(
+                f"times {first}:{first + count} outside {self.first}:{self.first + self.count}"
+            )
         x, y, sine = (np.empty((len(xi), count)) for _ in range(3))
         if self._cone is None:
             _on_plane(self._linear, start, xi, eta, self._shift, x, y, sine)
         else:
-            _on_cone(self._linear, self._turn, start, xi, eta, self._shift, *self._series, x, y, sine)
+            _on_cone(
+                self._linear, self._turn, start, xi, eta, self._shift, *self._series, x, y, sine
+            )
         return x, y, sine
 
     def same_as(self, other: LinesOfSight) -> bool:
@@ -108,16 +126,23 @@ class LinesOfSight:
             low, high = min(low, float(sine.min())), max(high, float(sine.max()))
         check_above_horizon(low)
         radius = math.atan(float(np.hypot(xi, eta).max()))
-        if math.asin(min(float(up[:, 0].max()), 1.0)) + radius > math.pi / 2:  # the zenith may lie inside the field
+        if (
+            math.asin(min(float(up[:, 0].max()), 1.0)) + radius > math.pi / 2
+        ):  # the zenith may lie inside the field
             high = 1.0
         wider = _WIDER * (high - low)
         return max(low - wider, low / 2), min(high + wider, 1.0)
 
     def _polynomials(self, cone: Cone, rows: Floats, xi: Floats, eta: Floats) -> tuple[Floats, ...]:
-        ahead, side = (np.stack([r[:, 0] + a * r[:, 1] + b * r[:, 2] for a, b in zip(xi, eta, strict=True)]) for r in
-                       (rows[:, 0], rows[:, 1]))  # fmt: skip
+        ahead, side = (
+            np.stack([r[:, 0] + a * r[:, 1] + b * r[:, 2] for a, b in zip(xi, eta, strict=True)])
+            for r in (rows[:, 0], rows[:, 1])
+        )
         largest = float(abs(side / (np.hypot(ahead, side) + ahead)).max()) * (1 + _WIDER)
-        k, offset = 1 / math.sin(cone.elevation), math.cos(cone.elevation) - math.asinh(1 / math.tan(cone.elevation))
+        k, offset = (
+            1 / math.sin(cone.elevation),
+            math.cos(cone.elevation) - math.asinh(1 / math.tan(cone.elevation)),
+        )
 
         def of_up(sine: Floats) -> Floats:
             return np.asarray(offset + np.arctanh(np.sqrt(1 - sine * sine)), np.float64)
@@ -137,7 +162,8 @@ class LinesOfSight:
         q, at_q, error = min(ways, key=lambda way: (max(way[2], _ERROR), len(way[0])))
         if not error <= _WORST:
             raise PointingError(
-                f"lines of sight so close to the horizon or the zenith are laid out to {error:.0e} of the height at best",
+                f"lines of sight so close to the horizon or the zenith are laid out to {error:.0e}"
+                " of the height at best",
                 place="atmosphere",
                 cure="raise or lower the target, or choose a smaller field of view",
             )
@@ -156,14 +182,20 @@ def _about_the_boresight(linear: Floats, cone: Cone) -> tuple[Floats, Floats]:
     rows[:, 1] = ahead[:, :1] * linear[:, 1] - ahead[:, 1:] * linear[:, 0]
     rows[:, 2] = linear[:, 2]
     one, two = cone.axis
-    azimuth = np.arctan2(one * ahead[:, 1] - two * ahead[:, 0], one * ahead[:, 0] + two * ahead[:, 1])
+    azimuth = np.arctan2(
+        one * ahead[:, 1] - two * ahead[:, 0], one * ahead[:, 0] + two * ahead[:, 1]
+    )
     turn = azimuth / math.sin(cone.elevation)
     c, s = np.cos(turn), np.sin(turn)
     return rows, np.stack([one * c - two * s, one * s + two * c])
 
 
-def _polynomial(function: Callable[[Floats], Floats], low: float, high: float) -> tuple[Floats, tuple[float, float], float]:
-    """Coefficients, highest first, in z = (x - m) w, (m, w), and the error: `_ERROR` over [low, high], or more."""
+def _polynomial(
+    function: Callable[[Floats], Floats], low: float, high: float
+) -> tuple[Floats, tuple[float, float], float]:
+    """Coefficients, highest first, in z = (x - m) w, (m, w), and the error: `_ERROR` over [low,
+    high], or more.
+    """
     middle, half = (low + high) / 2, max((high - low) / 2, 1e-12)
     for degree in _DEGREES:
         series = np.polynomial.Chebyshev.interpolate(lambda z: function(middle + half * z), degree)
@@ -172,7 +204,11 @@ def _polynomial(function: Callable[[Floats], Floats], low: float, high: float) -
         error = float(abs(series(z) - truth).max())
         if error <= _ERROR:
             break
-    return np.asarray(np.polynomial.chebyshev.cheb2poly(series.coef)[::-1], np.float64).copy(), (middle, 1 / half), error
+    return (
+        np.asarray(np.polynomial.chebyshev.cheb2poly(series.coef)[::-1], np.float64).copy(),
+        (middle, 1 / half),
+        error,
+    )
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
@@ -193,7 +229,9 @@ def _on_plane(linear, start, xi, eta, shift, x, y, sine):  # type: ignore[no-unt
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
-def _on_cone(linear, turn, start, xi, eta, shift, q, c, s, scales, x, y, sine):  # type: ignore[no-untyped-def]
+def _on_cone(  # type: ignore[no-untyped-def]
+    linear, turn, start, xi, eta, shift, q, c, s, scales, x, y, sine
+):
     n = nb.uint64(x.shape[1])
     x0, x1, x2 = linear[0][start:], linear[1][start:], linear[2][start:]
     y0, y1, y2 = linear[3][start:], linear[4][start:], linear[5][start:]

@@ -1,7 +1,8 @@
-"""Evaluation of the layers along lines of sight, at a step in time of each layer's own, from tiles of their lattices.
+"""Evaluation of the layers along lines of sight, at a step in time of each layer's own, from tiles
+of their lattices.
 
-A layer's spline coefficients come in tiles (`tiles`). A point has the same bits whichever points it is evaluated with, and
-whichever bands look through the same lattices.
+A layer's spline coefficients come in tiles (`tiles`). A point has the same bits whichever points it
+is evaluated with, and whichever bands look through the same lattices.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ TIMES_AT_ONCE = 2048
 
 @dataclass(frozen=True)
 class Drifting:
-    """A layer to evaluate: its turbulence, height [m], share, wind [m/s], and step in time [samples]."""
+    """A layer to evaluate: its turbulence, height [m], share, wind [m/s], and step in time
+    [samples].
+    """
 
     field: Turbulence
     height: float
@@ -43,10 +46,11 @@ class Drifting:
 
 
 class DriftingLayers:
-    """The sum of drifting layers at any focal-plane points and times of one scan, in units of the PWV's rms.
+    """The sum of drifting layers at any focal-plane points and times of one scan, in units of the
+    PWV's rms.
 
-    Times are numbered in units of ``step``: time k is sample k step. Layers that take a coarser step of their own are
-    interpolated in time to the common one (cubic spline).
+    Times are numbered in units of ``step``: time k is sample k step. Layers that take a coarser
+    step of their own are interpolated in time to the common one (cubic spline).
 
     Parameters
     ----------
@@ -84,7 +88,9 @@ class DriftingLayers:
         first, stop = span
         self._drifting, self._step, self._band = list(drifting), step, 0
         self.weights = np.zeros((0, len(self._drifting)))
-        """(k, n_layer) weights of further sums over the layers, which `sums` makes beside the plain one."""
+        """(k, n_layer) weights of further sums over the layers, which `sums` makes beside the plain
+        one.
+        """
         self.paths: dict[int, LinesOfSight] = {}
         for own in sorted({step, *(layer.step for layer in drifting)}):
             low, high = (first, stop) if own == step else _coarse(first, stop, own // step)
@@ -96,28 +102,35 @@ class DriftingLayers:
         self._swept = self._sweep(*rim(*points))
         tiles = Tiles()
         self._tilings = [
-            Tiling(tiles, n, {0: layer.field}, swept) for n, (layer, swept) in enumerate(zip(drifting, self._swept, strict=True))
+            Tiling(tiles, n, {0: layer.field}, swept)
+            for n, (layer, swept) in enumerate(zip(drifting, self._swept, strict=True))
         ]
         self.cells = sum(swept.cells for swept in self._swept)
         """Lattice points swept over, about."""
         if self.cells > CELLS_IN_ALL:
-            field = max(zip(self._swept, drifting, strict=True), key=lambda pair: pair[0].cells)[1].field
+            field = max(zip(self._swept, drifting, strict=True), key=lambda pair: pair[0].cells)[
+                1
+            ].field
             raise InputError(
-                f"the lines of sight sweep over {self.cells:.1e} lattice points of the turbulence "
-                f"({field.spacing:g} m for a beam of {field.sigma:.3g} m), the limit is {CELLS_IN_ALL:.0e}",
+                f"the lines of sight sweep over {self.cells:.1e} lattice points of the turbulence"
+                f" ({field.spacing:g} m for a beam of {field.sigma:.3g} m), the limit is"
+                f" {CELLS_IN_ALL:.0e}",
                 place="atmosphere",
                 cure="shorten the scans, narrow the field of view, or raise the lowest layer",
             )
 
     def __call__(self, xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, Floats]:
-        """The sum of the layers and the sine of the elevation, each (len(xi), count), from time ``first``."""
+        """The sum of the layers and the sine of the elevation, each (len(xi), count), from time
+        ``first``.
+        """
         total, sine = self.with_others([], xi, eta, first, count)
         return total[0], sine
 
     def with_others(
         self, others: Sequence[DriftingLayers], xi: Floats, eta: Floats, first: int, count: int
     ) -> tuple[Floats, Floats]:
-        """As a call, of this band and of ``others`` that look as it does: where they look is found once.
+        """As a call, of this band and of ``others`` that look as it does: where they look is found
+        once.
 
         The sum of the layers is (1 + len(others), len(xi), count).
         """
@@ -127,7 +140,8 @@ class DriftingLayers:
     def sums(
         self, others: Sequence[DriftingLayers], xi: Floats, eta: Floats, first: int, count: int
     ) -> tuple[Floats, list[Floats], Floats]:
-        """As `with_others`, and for each band its weighted sums, (k, len(xi), count) in the order of its ``weights``.
+        """As `with_others`, and for each band its weighted sums, (k, len(xi), count) in the order
+        of its ``weights``.
 
         The plain sums have the same bits with such weights and without.
         """
@@ -139,7 +153,11 @@ class DriftingLayers:
             ratio, groups = own // self._step, _groups(bands, own)
             low, high = (first, stop) if ratio == 1 else _coarse(first, stop, ratio)
             values = total if ratio == 1 else np.empty((len(bands), n_xi, high - low))
-            others_of = weighted if ratio == 1 else [np.empty((len(band.weights), n_xi, high - low)) for band in bands]
+            others_of = (
+                weighted
+                if ratio == 1
+                else [np.empty((len(band.weights), n_xi, high - low)) for band in bands]
+            )
             for start in range(low, high, TIMES_AT_ONCE):
                 end = min(start + TIMES_AT_ONCE, high)
                 x, y, up = path(xi, eta, start, end - start)
@@ -148,14 +166,21 @@ class DriftingLayers:
                 for n, which in groups:
                     one = bands[which[0]]
                     matrix, i, j = one._places[n]
-                    i, j = i[start - path.first : end - path.first], j[start - path.first : end - path.first]
-                    cover = one._tilings[n].cover(tuple(bands[k]._band for k in which), matrix, boxes, i, j)
+                    i, j = (
+                        i[start - path.first : end - path.first],
+                        j[start - path.first : end - path.first],
+                    )
+                    cover = one._tilings[n].cover(
+                        tuple(bands[k]._band for k in which), matrix, boxes, i, j
+                    )
                     where = *cover.sides, *cover.origin, cover.width, cover.addresses
                     alone = np.zeros_like(part) if any(len(parts[k]) for k in which) else part
                     interpolate(matrix, x, y, i, j, *where, one._constants[n], which, alone)
                     for k in which if alone is not part else ():
                         part[k] += alone[k]
-                        for row, weight in zip(parts[k], bands[k].weights[:, n].tolist(), strict=True):
+                        for row, weight in zip(
+                            parts[k], bands[k].weights[:, n].tolist(), strict=True
+                        ):
                             row += weight * alone[k]
                 values[:, :, start - low : end - low] = part
                 for whole, piece in zip(others_of, parts, strict=True):
@@ -163,21 +188,34 @@ class DriftingLayers:
                 if ratio == 1:
                     sine[:, start - low : end - low] = up
             for k in sorted({k for _, which in groups for k in which}) if ratio > 1 else ():
-                # Coefficient 0 stands at coarse time low + SPLINE_MARGIN, where DetectorField has its time -PAD.
+                # Coefficient 0 stands at coarse time low + SPLINE_MARGIN, where DetectorField has
+                # its time -PAD.
                 offset = first - (low + SPLINE_MARGIN + PAD) * ratio
-                for coarse, into in ((values[k], total[k]), *zip(others_of[k], weighted[k], strict=True)):
+                for coarse, into in (
+                    (values[k], total[k]),
+                    *zip(others_of[k], weighted[k], strict=True),
+                ):
                     fine = DetectorField(spline_coefficients(coarse), ratio, (high - low) * ratio)
                     into += fine.evaluate(slice(0, n_xi), slice(offset, offset + count))
         return total, weighted, sine
 
     def looks_as(self, other: DriftingLayers) -> bool:
-        """Whether another band looks along the same lines at the same times, and at layers that drift alike."""
+        """Whether another band looks along the same lines at the same times, and at layers that
+        drift alike.
+        """
         if self._step != other._step or len(self._drifting) != len(other._drifting):
             return False
-        if not all(path.same_as(other.paths[step]) for step, path in self.paths.items() if step in other.paths):
+        if not all(
+            path.same_as(other.paths[step])
+            for step, path in self.paths.items()
+            if step in other.paths
+        ):
             return False
         for n, (layer, theirs) in enumerate(zip(self._drifting, other._drifting, strict=True)):
-            own, others = (*self._places[n], self._constants[n]), (*other._places[n], other._constants[n])
+            own, others = (
+                (*self._places[n], self._constants[n]),
+                (*other._places[n], other._constants[n]),
+            )
             if layer.step == theirs.step and not all(map(np.array_equal, own, others)):
                 return False
         return self._constants[0].dtype == other._constants[0].dtype
@@ -194,15 +232,22 @@ class DriftingLayers:
                 for n, layer in enumerate(self._drifting):
                     if layer.step == own:
                         matrix, i, j = self._places[n]
-                        a, b, c, d = extent(matrix, boxes, i[start : start + count], j[start : start + count])
+                        a, b, c, d = extent(
+                            matrix, boxes, i[start : start + count], j[start : start + count]
+                        )
                         cells[n] += points_of((a, b, c, d))
                         k, m, p, q = whole[n]
                         whole[n] = min(k, a), max(m, b), min(p, c), max(q, d)
-        return [Swept(box, min(number, points_of(box))) for box, number in zip(whole, cells, strict=True)]
+        return [
+            Swept(box, min(number, points_of(box)))
+            for box, number in zip(whole, cells, strict=True)
+        ]
 
 
 def _groups(bands: Sequence[DriftingLayers], step: int) -> list[tuple[int, tuple[int, ...]]]:
-    """(layer, numbers of bands) of the layers that take a step in time: bands that see one tiling are together."""
+    """(layer, numbers of bands) of the layers that take a step in time: bands that see one tiling
+    are together.
+    """
     found: dict[tuple[int, int], tuple[int, ...]] = {}
     for n in range(len(bands[0]._drifting)):
         for k, band in enumerate(bands):
@@ -213,21 +258,31 @@ def _groups(bands: Sequence[DriftingLayers], step: int) -> list[tuple[int, tuple
 
 
 def share_tiles(bands: Sequence[DriftingLayers]) -> list[Counter[int]]:
-    """Let bands of one camera, in the order in which they observe, make tiles for each other where they look through one lattice.
+    """Let bands of one camera, in the order in which they observe, make tiles for each other where
+    they look through one lattice.
 
-    For each band, the number of layers of each other band that are on the lattices it looks through.
+    For each band, the number of layers of each other band that are on the lattices it looks
+    through.
     """
     tiles, number, found = Tiles(), 0, [Counter[int]() for _ in bands]
     for layer in range(len(bands[0]._drifting)):
         left = list(range(len(bands)))
         while left:
-            field, swept, here = bands[left[0]]._drifting[layer].field, bands[left[0]]._swept[layer], []
+            field, swept, here = (
+                bands[left[0]]._drifting[layer].field,
+                bands[left[0]]._swept[layer],
+                [],
+            )
             for other in left:
                 one = bands[other]
-                if one._drifting[layer].field.alike(field) and (joined := swept.joined(one._swept[layer])):
+                if one._drifting[layer].field.alike(field) and (
+                    joined := swept.joined(one._swept[layer])
+                ):
                     swept = joined
                     here.append(other)
-            tiling = Tiling(tiles, number, {k: bands[k]._drifting[layer].field for k in here}, swept)
+            tiling = Tiling(
+                tiles, number, {k: bands[k]._drifting[layer].field for k in here}, swept
+            )
             for k in here:
                 bands[k]._band, bands[k]._tilings[layer] = k, tiling
                 found[k].update(other for other in here if other != k)
@@ -236,16 +291,22 @@ def share_tiles(bands: Sequence[DriftingLayers]) -> list[Counter[int]]:
 
 
 def _coarse(first: int, stop: int, ratio: int) -> tuple[int, int]:
-    """Coarse times whose values make times first .. stop - 1: cells, spline neighbours and the prefilter's margin."""
+    """Coarse times whose values make times first .. stop - 1: cells, spline neighbours and the
+    prefilter's margin.
+    """
     return first // ratio - PAD - SPLINE_MARGIN, (stop - 1) // ratio + 3 + SPLINE_MARGIN
 
 
 def _place(plane: ScanPlane, layer: Drifting, seconds: Floats) -> tuple[Floats, Floats, Floats]:
-    """Lattice coordinates (across, along the wind) = matrix (x, y) + (i, j) of positions per metre of height.
+    """Lattice coordinates (across, along the wind) = matrix (x, y) + (i, j) of positions per metre
+    of height.
 
-    Equation (2) of `geometry`; matrix (4,), i and j at ``seconds``, both about 0 where the scan begins.
+    Equation (2) of `geometry`; matrix (4,), i and j at ``seconds``, both about 0 where the scan
+    begins.
     """
     matrix, start, velocity = plane.affine(layer.height, layer.wind)
     d = layer.field.spacing
-    i, j = (np.asarray((b + v * seconds) / d, np.float64) for b, v in zip(start, velocity, strict=True))
+    i, j = (
+        np.asarray((b + v * seconds) / d, np.float64) for b, v in zip(start, velocity, strict=True)
+    )
     return matrix.ravel() / d, i, j

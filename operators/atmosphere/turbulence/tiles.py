@@ -1,11 +1,13 @@
-"""Tiles of the layers' spline coefficients: how a lattice is cut into them, and the store that keeps them.
+"""Tiles of the layers' spline coefficients: how a lattice is cut into them, and the store that
+keeps them.
 
-Tiles overlap by the three cells that a cubic spline needs, so that every point is interpolated from one tile. A tile has the same
-bits whenever it is made. Where a scan sweeps over few cells they are made as one piece; over a strip along the wind, in slabs as
-wide as that, since squares would hold more than is used; along a narrow path that turns, in strips.
+Tiles overlap by the three cells that a cubic spline needs, so that every point is interpolated from
+one tile. A tile has the same bits whenever it is made. Where a scan sweeps over few cells they are
+made as one piece; over a strip along the wind, in slabs as wide as that, since squares would hold
+more than is used; along a narrow path that turns, in strips.
 
-Bands of one camera whose beams are alike look through the same random numbers, each with kernels of its own. The band that comes
-first makes a tile for the others too: the numbers are drawn once.
+Bands of one camera whose beams are alike look through the same random numbers, each with kernels of
+its own. The band that comes first makes a tile for the others too: the numbers are drawn once.
 """
 
 from __future__ import annotations
@@ -35,26 +37,34 @@ BYTES_KEPT = 256 << 20
 """Memory of the tiles that are kept."""
 
 SQUARE, STRIP = (8, 9), (5, 10)
-"""Sides of a tile, as powers of two of cells (across, along the wind): in general, and where the path is narrow."""
+"""Sides of a tile, as powers of two of cells (across, along the wind): in general, and where the
+path is narrow.
+"""
 
 NARROW = 96
-"""Cells: a path that is narrower than this across the wind, and has no slabs, is tiled by strips."""
+"""Cells: a path that is narrower than this across the wind, and has no slabs, is tiled by strips.
+"""
 
 SLAB, WIDEST, LONGEST = 1 << 18, 1024, 1 << 10
-"""Cells of a slab, about; cells across the wind up to which there are slabs; most cells along it."""
+"""Cells of a slab, about; cells across the wind up to which there are slabs; most cells along it.
+"""
 
 DENSE = 1.5
 """Slabs serve where all that they hold is at most this many times what is swept over."""
 
 ONE_PIECE = 1 << 16
-"""Cells of a layer, with `AROUND` more on every side, up to which all that a scan sweeps over is made as one piece."""
+"""Cells of a layer, with `AROUND` more on every side, up to which all that a scan sweeps over is
+made as one piece.
+"""
 
 AROUND, SPARE, BEYOND = 20, 2, 32
-"""Cells about the made ones that the pyramid works out too, about; cells beyond what some points of the rim sweep over: so many,
-and one for so many across the wind."""
+"""Cells about the made ones that the pyramid works out too, about; cells beyond what some points of
+the rim sweep over: so many, and one for so many across the wind."""
 
 MOST = 0.5
-"""Bands make tiles for each other where they reach at least this share of the cells between the outermost of both."""
+"""Bands make tiles for each other where they reach at least this share of the cells between the
+outermost of both.
+"""
 
 _WHOLE = 30
 """Side of the only tile, as a power of two of cells: none is so large."""
@@ -63,7 +73,9 @@ _Tile = tuple[Field, int]
 """Coefficients (rows, cells in a row, bands), and their address."""
 
 Bands = tuple[int, ...]
-"""Numbers of bands that look at the same cells at the same times: their coefficients are next to each other."""
+"""Numbers of bands that look at the same cells at the same times: their coefficients are next to
+each other.
+"""
 
 
 class Cover(NamedTuple):
@@ -91,7 +103,8 @@ class Tiles:
         self._free = BYTES_KEPT
 
     def get(self, lattice: int, bands: Bands, box: Box, fields: Mapping[int, Turbulence]) -> _Tile:
-        """The cells low <= i < high, low <= j < high of a box, with the apron, as some bands see them.
+        """The cells low <= i < high, low <= j < high of a box, with the apron, as some bands see
+        them.
 
         ``fields``: of all bands that look through this lattice, by number.
         """
@@ -106,7 +119,10 @@ class Tiles:
                 if making is None:
                     mine = self._making[place] = Future()
                     others = [(b,) for b in fields if b not in bands]
-                    wanted = [bands, *(one for one in others if (lattice, one, box) not in self._begun)]
+                    wanted = [
+                        bands,
+                        *(one for one in others if (lattice, one, box) not in self._begun),
+                    ]
                     self._begun.update((lattice, some, box) for some in wanted)
                     break
             if bands in (made := making.result()):  # or it was made for others alone
@@ -114,12 +130,19 @@ class Tiles:
         return self._make(mine, place, {some: [fields[b] for b in some] for some in wanted})[bands]
 
     def _make(
-        self, mine: Future[dict[Bands, _Tile]], place: tuple[int, Box], fields: Mapping[Bands, Sequence[Turbulence]]
+        self,
+        mine: Future[dict[Bands, _Tile]],
+        place: tuple[int, Box],
+        fields: Mapping[Bands, Sequence[Turbulence]],
     ) -> dict[Bands, _Tile]:
         lattice, box = place
         try:
             a, b, c, d = box
-            parts = iter(coefficients([one for some in fields.values() for one in some], a, b + APRON, c, d + APRON))
+            parts = iter(
+                coefficients(
+                    [one for some in fields.values() for one in some], a, b + APRON, c, d + APRON
+                )
+            )
             tiles = {bands: _alternating([next(parts) for _ in bands]) for bands in fields}
             made = {bands: (tile, tile.ctypes.data) for bands, tile in tiles.items()}
         except BaseException as error:
@@ -129,7 +152,9 @@ class Tiles:
             raise
         with self._lock:
             self._free -= sum(tile.nbytes for tile, _ in made.values())
-            while self._free < 0 and self._kept:  # the oldest goes first; a thread that works with it still holds it
+            while (
+                self._free < 0 and self._kept
+            ):  # the oldest goes first; a thread that works with it still holds it
                 self._free += self._kept.pop(next(iter(self._kept)))[0].nbytes
             self._kept.update({(lattice, bands, box): tile for bands, tile in made.items()})
             del self._making[place]
@@ -139,7 +164,9 @@ class Tiles:
 
 @dataclass(frozen=True)
 class Swept:
-    """What lines of sight sweep over of a lattice: first and last cells, and about how many lattice points."""
+    """What lines of sight sweep over of a lattice: first and last cells, and about how many lattice
+    points.
+    """
 
     box: Box
     cells: float
@@ -167,7 +194,9 @@ class Tiling:
         By the lines of sight of all of them.
     """
 
-    def __init__(self, tiles: Tiles, number: int, fields: Mapping[int, Turbulence], swept: Swept) -> None:
+    def __init__(
+        self, tiles: Tiles, number: int, fields: Mapping[int, Turbulence], swept: Swept
+    ) -> None:
         self._tiles, self._number, self.fields = tiles, number, fields
         low, high, begin, end = swept.box
         spare = SPARE + (high - low) // BEYOND
@@ -177,20 +206,38 @@ class Tiling:
         self._slab: tuple[int, int, int] | None = None
         """Cells across, low <= i < high, and the side along the wind, a power of two."""
         if high - low <= WIDEST and held <= DENSE * swept.cells:
-            self._slab = low, high, max(1, min(SLAB // max(high - low, 1), LONGEST)).bit_length() - 1
+            self._slab = (
+                low,
+                high,
+                max(1, min(SLAB // max(high - low, 1), LONGEST)).bit_length() - 1,
+            )
         self._sides = STRIP if swept.box[1] - swept.box[0] < NARROW else SQUARE
 
     def cover(self, bands: Bands, matrix: Floats, boxes: Floats, i: Floats, j: Floats) -> Cover:
-        """The tiles under the cells at matrix (x, y) + (i, j), as some bands see them; ``boxes`` of x, y as of `boxes_of`."""
+        """The tiles under the cells at matrix (x, y) + (i, j), as some bands see them; ``boxes`` of
+        x, y as of `boxes_of`.
+        """
         low_i, high_i, low_j, high_j = extent(matrix, boxes, i, j)
         piece, slab, sides = self._piece, self._slab, self._sides
-        if piece and piece[0] <= low_i <= high_i < piece[1] and piece[2] <= low_j <= high_j < piece[3]:
+        if (
+            piece
+            and piece[0] <= low_i <= high_i < piece[1]
+            and piece[2] <= low_j <= high_j < piece[3]
+        ):
             tile, address = self._get(bands, piece)
-            return Cover((_WHOLE, _WHOLE), (piece[0], piece[2]), tile.shape[1], np.array([[address]], np.uint64), [tile])
+            return Cover(
+                (_WHOLE, _WHOLE),
+                (piece[0], piece[2]),
+                tile.shape[1],
+                np.array([[address]], np.uint64),
+                [tile],
+            )
         if slab and slab[0] <= low_i <= high_i < slab[1]:
             sides = _WHOLE, slab[2]
         first_i, first_j = low_i >> sides[0], low_j >> sides[1]
-        wanted = np.zeros(((high_i >> sides[0]) - first_i + 1, (high_j >> sides[1]) - first_j + 1), np.uint8)
+        wanted = np.zeros(
+            ((high_i >> sides[0]) - first_i + 1, (high_j >> sides[1]) - first_j + 1), np.uint8
+        )
         mark(matrix, boxes, i, j, *sides, first_i, first_j, wanted)
         begin, across = first_i << sides[0], 1 << sides[0]
         if slab and sides[0] == _WHOLE:

@@ -1,7 +1,8 @@
-"""Absorption cross-sections of air, interpolated in a table that was computed with am (see data/README.md).
+"""Absorption cross-sections of air, interpolated in a table that was computed with am (see
+data/README.md).
 
-The table holds logarithms of cross-sections per molecule, averaged over cells of 0.5 GHz, on 28 pressures times 5
-temperatures. It is read once, in a few hundredths of a second.
+The table holds logarithms of cross-sections per molecule, averaged over cells of 0.5 GHz, on 28
+pressures times 5 temperatures. It is read once, in a few hundredths of a second.
 """
 
 from __future__ import annotations
@@ -29,19 +30,23 @@ RATIO_LOW, RATIO_HIGH = 1e-3, 64.0
 TEMPERATURE_MARGIN = 15.0
 """K by which a temperature may lie outside the table."""
 PRESSURE_MARGIN = 1.3
-"""Extrapolation above the highest pressure or below the lowest one, in steps of the table (a factor 0.72 each)."""
+"""Extrapolation above the highest pressure or below the lowest one, in steps of the table (a factor
+0.72 each).
+"""
 THIN_AIR = 50.0
-"""Pa: above this height air absorbs too little for its temperature to matter, and any temperature is taken as the nearest that
-the table has. The air of a `Profile` ends below, at 75 Pa: only other users of the table come here."""
+"""Pa: above this height air absorbs too little for its temperature to matter, and any temperature
+is taken as the nearest that the table has. The air of a `Profile` ends below, at 75 Pa: only other
+users of the table come here."""
 
 
 @dataclass(frozen=True)
 class CrossSections:
     """m2 per molecule, each (n_layer, n_frequency).
 
-    Water's own pressure broadening makes its cross-section linear in the mixing ratio: ``water + mixing_ratio * water_self``.
-    Ozone's lines are narrower than a cell: ``ozone_ratio`` (n_part, n_layer, n_frequency) is its cross-section in parts of the
-    cell, `OZONE_PARTS`, over the cell's mean.
+    Water's own pressure broadening makes its cross-section linear in the mixing ratio: ``water +
+    mixing_ratio * water_self``. Ozone's lines are narrower than a cell: ``ozone_ratio`` (n_part,
+    n_layer, n_frequency) is its cross-section in parts of the cell, `OZONE_PARTS`, over the cell's
+    mean.
     """
 
     dry_air: Floats
@@ -91,14 +96,20 @@ class AbsorptionTable:
         if not edges[0] <= low < high <= edges[-1]:
             limits = f"{edges[0] / 1e9:g} to {edges[-1] / 1e9:g} GHz"
             raise InputError(
-                f"{low / 1e9:g} to {high / 1e9:g} GHz is not inside the range of the absorption table, {limits}",
+                f"{low / 1e9:g} to {high / 1e9:g} GHz is not inside the range of the absorption"
+                f" table, {limits}",
                 place=place,
                 cure=f"keep the band within {limits}",
             )
-        return slice(int(np.searchsorted(edges, low, "right")) - 1, int(np.searchsorted(edges, high, "left")))
+        return slice(
+            int(np.searchsorted(edges, low, "right")) - 1, int(np.searchsorted(edges, high, "left"))
+        )
 
-    def cross_sections(self, pressure: Floats, temperature: Floats, cells: slice = slice(None)) -> CrossSections:
-        """Cross-sections of layers at ``pressure`` [Pa] and ``temperature`` [K], both (n_layer,), in some cells.
+    def cross_sections(
+        self, pressure: Floats, temperature: Floats, cells: slice = slice(None)
+    ) -> CrossSections:
+        """Cross-sections of layers at ``pressure`` [Pa] and ``temperature`` [K], both (n_layer,),
+        in some cells.
 
         The logarithm is interpolated linearly in ln(pressure) and as a quartic in 1/temperature.
 
@@ -107,7 +118,10 @@ class AbsorptionTable:
         InputError
             A pressure or temperature outside the table; the message names the limits.
         """
-        pressure, temperature = np.asarray(pressure, np.float64), np.asarray(temperature, np.float64)
+        pressure, temperature = (
+            np.asarray(pressure, np.float64),
+            np.asarray(temperature, np.float64),
+        )
         below, upper_weight = self._bracket(pressure)
         scale = (self._high - self._low)[..., cells] / 65535.0
         log = self._low[..., cells] + self._code[..., cells] * scale
@@ -117,7 +131,8 @@ class AbsorptionTable:
             for k, tap in enumerate(taps):
                 total += tap[:, None] * log[:, row, k]
         dry, water, water_high, ozone = np.exp(total) * 1e-4
-        # In the margins the ratios are those of the edge: their mean over a cell stays 1, its ozone is what it is.
+        # In the margins the ratios are those of the edge: their mean over a cell stays 1, its ozone
+        # is what it is.
         code, upper = self._ozone_code[..., cells], np.clip(upper_weight, 0.0, 1.0)[:, None]
         log_ratio = code[:, below] * (1 - upper) + code[:, below + 1] * upper
         ratio = RATIO_LOW * np.exp(log_ratio * (math.log(RATIO_HIGH / RATIO_LOW) / 255))
@@ -129,26 +144,44 @@ class AbsorptionTable:
         grid, x = -np.log(self.pressure), -np.log(pressure)
         step = grid[1] - grid[0]
         if (x < grid[0] - (PRESSURE_MARGIN - 1) * step).any():
-            worst, limit = pressure.max() / 100, self.pressure[0] / 100 * 0.72 ** (1 - PRESSURE_MARGIN)
-            raise InputError(f"a pressure of {worst:.5g} hPa is above the absorption table's limit of {limit:.5g} hPa")
-        below = np.clip(np.searchsorted(grid, x) - 1, 0, len(grid) - 2)  # the first and last step also serve the margins
-        # Air thinner than the table's 0.13 hPa has the cross-sections of its edge; a `Profile` has none, it ends at 0.75 hPa.
+            worst, limit = (
+                pressure.max() / 100,
+                self.pressure[0] / 100 * 0.72 ** (1 - PRESSURE_MARGIN),
+            )
+            raise InputError(
+                f"a pressure of {worst:.5g} hPa is above the absorption table's limit of"
+                f" {limit:.5g} hPa"
+            )
+        below = np.clip(
+            np.searchsorted(grid, x) - 1, 0, len(grid) - 2
+        )  # the first and last step also serve the margins
+        # Air thinner than the table's 0.13 hPa has the cross-sections of its edge; a `Profile` has
+        # none, it ends at 0.75 hPa.
         return below, np.minimum((x - grid[below]) / step, PRESSURE_MARGIN)
 
-    def _temperature_weights(self, pressure: Floats, temperature: Floats, row: NDArray[np.intp]) -> Floats:
-        """Lagrange weights in 1/temperature on the nodes of each layer's row. (n_temperature, n_layer)."""
+    def _temperature_weights(
+        self, pressure: Floats, temperature: Floats, row: NDArray[np.intp]
+    ) -> Floats:
+        """Lagrange weights in 1/temperature on the nodes of each layer's row. (n_temperature,
+        n_layer).
+        """
         nodes = self.temperature[row]
         low, high = nodes[:, 0] - TEMPERATURE_MARGIN, nodes[:, -1] + TEMPERATURE_MARGIN
         outside = ((temperature < low) | (temperature > high)) & (pressure > THIN_AIR)
         if outside.any():
             k = int(np.argmax(outside))
             raise InputError(
-                f"a temperature of {temperature[k]:.1f} K at {pressure[k] / 100:.4g} hPa is outside the absorption table's "
-                f"limits there, {low[k]:.0f} to {high[k]:.0f} K"
+                f"a temperature of {temperature[k]:.1f} K at {pressure[k] / 100:.4g} hPa is outside"
+                f" the absorption table's limits there, {low[k]:.0f} to {high[k]:.0f} K"
             )
         x, y = 1 / np.clip(temperature, low, high), 1 / nodes
         n = nodes.shape[1]
-        return np.array([np.prod([(x - y[:, m]) / (y[:, k] - y[:, m]) for m in range(n) if m != k], axis=0) for k in range(n)])
+        return np.array(
+            [
+                np.prod([(x - y[:, m]) / (y[:, k] - y[:, m]) for m in range(n) if m != k], axis=0)
+                for k in range(n)
+            ]
+        )
 
 
 @lru_cache(maxsize=1)

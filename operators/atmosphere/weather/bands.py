@@ -1,10 +1,12 @@
-"""A passband's view of the atmosphere: emission and transmission against water vapour and elevation, fast and smooth.
+"""A passband's view of the atmosphere: emission and transmission against water vapour and
+elevation, fast and smooth.
 
-The radiative transfer is run on Chebyshev nodes in u = ln(1 + pwv / p) and v = ln(1 / sin(elevation)); three functions,
+The radiative transfer is run on Chebyshev nodes in u = ln(1 + pwv / p) and v = ln(1 /
+sin(elevation)); three functions,
 
-    emission               T = integral t(nu) T_RJ(nu) dnu / integral t(nu) dnu                                    (1)
-    log transmission       ln <e^-tau> = ln [integral t(nu) e^-tau(nu) dnu / integral t(nu) dnu]                   (2)
-    log background         ln <J(nu, 2.725 K) e^-tau>                                                              (3)
+    emission               T = integral t(nu) T_RJ(nu) dnu / integral t(nu) dnu                  (1)
+    log transmission   ln <e^-tau> = ln [integral t(nu) e^-tau(nu) dnu / integral t(nu) dnu]  (2)
+    log background         ln <J(nu, 2.725 K) e^-tau>                                            (3)
 
 are then polynomials in u and v. The transmission is averaged over the band, never the opacity.
 """
@@ -36,16 +38,20 @@ if TYPE_CHECKING:
 
 
 TOLERANCE = 1e-5
-"""Aim of the interpolation: largest error of T relative to T, and of the logarithms relative to 1 + |logarithm|."""
+"""Aim of the interpolation: largest error of T relative to T, and of the logarithms relative to 1 +
+|logarithm|.
+"""
 ERROR_MAX = 1e-4
 """A band that cannot be interpolated to this error is refused."""
 GRIDS = ((10, 10, 3e1), (14, 10, 1e2), (20, 12, 1e2), (32, 16, 1e4), (48, 24, 1e4))
-"""Numbers of nodes in u and v, and pwv_max / p; tried in this order until `TOLERANCE` is met. Clear windows need no more than the
-first, others the second; only saturated lines (183, 557 GHz) need more."""
+"""Numbers of nodes in u and v, and pwv_max / p; tried in this order until `TOLERANCE` is met. Clear
+windows need no more than the first, others the second; only saturated lines (183, 557 GHz) need
+more."""
 
 
 class BandAtmosphere:
-    """Emission and transmission of a band; all methods take floats or arrays that broadcast, and return float64.
+    """Emission and transmission of a band; all methods take floats or arrays that broadcast, and
+    return float64.
 
     Parameters
     ----------
@@ -64,18 +70,24 @@ class BandAtmosphere:
     Raises
     ------
     InputError
-        A band outside the absorption table, or too opaque to interpolate; later, a PWV or elevation outside the limits,
-        which the message names.
+        A band outside the absorption table, or too opaque to interpolate; later, a PWV or elevation
+        outside the limits, which the message names.
     """
 
     def __init__(
-        self, band: Band, profile: Profile, pwv_max: float | None = None, spectra: AbsorptionTable | None = None
+        self,
+        band: Band,
+        profile: Profile,
+        pwv_max: float | None = None,
+        spectra: AbsorptionTable | None = None,
     ) -> None:
         self.band = band
         self.pwv_max = min(3 * profile.pwv, PWV_MAX) if pwv_max is None else pwv_max
         check_pwv(self.pwv_max)
         if self.pwv_max == 0:
-            raise InputError("the profile is dry, so there is no vapour to vary", cure="give a PWV above 0 mm")
+            raise InputError(
+                "the profile is dry, so there is no vapour to vary", cure="give a PWV above 0 mm"
+            )
         self._transfer = BandTransfer(band, replace(profile.layers, spectra=spectra))
         self._v_max = -math.log(math.sin(ELEVATION_MIN))
         for n_u, n_v, ratio in GRIDS:
@@ -86,17 +98,22 @@ class BandAtmosphere:
                 break
         if not self.error <= ERROR_MAX:
             raise InputError(
-                f"its atmosphere cannot be interpolated to better than {self.error:.0e}, the limit is {ERROR_MAX:.0e}",
+                f"its atmosphere cannot be interpolated to better than {self.error:.0e}, the limit"
+                f" is {ERROR_MAX:.0e}",
                 place=f"band '{band.name}'",
                 cure="choose a narrower band, or one off the saturated water lines",
             )
 
     def direct(self, pwv: float, elevation: float) -> tuple[float, float, float]:
-        """Equations (1) to (3) by radiative transfer, without interpolation: K_RJ, neper, ln K_RJ."""
+        """Equations (1) to (3) by radiative transfer, without interpolation: K_RJ, neper, ln
+        K_RJ.
+        """
         return self._transfer(pwv, [elevation])[0]
 
     def spectra(self, pwv: float, elevations: Sequence[float]) -> LoadSpectra:
-        """Brightness and transmission over the passband by radiative transfer. PWV in m, elevations in rad."""
+        """Brightness and transmission over the passband by radiative transfer. PWV in m, elevations
+        in rad.
+        """
         return self._transfer.spectra(pwv, elevations)
 
     def of_water(self, pwv: float, elevations: Sequence[float]) -> WaterResponse:
@@ -104,7 +121,9 @@ class BandAtmosphere:
         return self._transfer.of_water(pwv, elevations)
 
     def emission(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
-        """Equation (1): the atmosphere alone, background 0 K. PWV in m, elevation in rad -> K_RJ."""
+        """Equation (1): the atmosphere alone, background 0 K. PWV in m, elevation in rad ->
+        K_RJ.
+        """
         return self._evaluate(0, pwv, elevation)
 
     def log_transmission(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
@@ -124,26 +143,40 @@ class BandAtmosphere:
         return np.exp(self._evaluate(2, pwv, elevation))
 
     def emission_difference(self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Floats:
-        """emission(pwv + dpwv) - emission(pwv), K_RJ, to float64 precision of the difference however small it is."""
+        """emission(pwv + dpwv) - emission(pwv), K_RJ, to float64 precision of the difference
+        however small it is.
+        """
         return self._difference(0, pwv, dpwv, elevation)
 
-    def log_transmission_difference(self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Floats:
-        """log_transmission(pwv + dpwv) - log_transmission(pwv), to float64 precision of the difference."""
+    def log_transmission_difference(
+        self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike
+    ) -> Floats:
+        """log_transmission(pwv + dpwv) - log_transmission(pwv), to float64 precision of the
+        difference.
+        """
         return self._difference(1, pwv, dpwv, elevation)
 
     def __repr__(self) -> str:
-        return f"BandAtmosphere({self.band.name}, PWV 0 to {self.pwv_max * 1e3:.3g} mm, error {self.error:.0e})"
+        return (
+            f"BandAtmosphere({self.band.name}, PWV 0 to {self.pwv_max * 1e3:.3g} mm, error"
+            f" {self.error:.0e})"
+        )
 
     def _tabulate(self, n_u: int, n_v: int) -> Floats:
         """Chebyshev coefficients (3, n_u, n_v) from values at the Chebyshev points."""
         x_u, x_v = _chebyshev_points(n_u), _chebyshev_points(n_v)
-        values = np.array([self._transfer(self._pwv(x), [self._elevation(y) for y in x_v]) for x in x_u])  # (n_u, n_v, 3)
+        values = np.array(
+            [self._transfer(self._pwv(x), [self._elevation(y) for y in x_v]) for x in x_u]
+        )  # (n_u, n_v, 3)
         to_u, to_v = _chebyshev_transform(n_u), _chebyshev_transform(n_v)
         return np.asarray(np.einsum("iu,uvf,jv->fij", to_u, values, to_v))
 
     def _check(self) -> float:
         """Largest error at 45 points: between the nodes, and the ends."""
-        points_u, points_v = np.array([-1.0, *_chebyshev_points(7), 1.0]), [-1.0, -0.61, 0.13, 0.87, 1.0]
+        points_u, points_v = (
+            np.array([-1.0, *_chebyshev_points(7), 1.0]),
+            [-1.0, -0.61, 0.13, 0.87, 1.0],
+        )
         pwv, elevations = [self._pwv(x) for x in points_u], [self._elevation(y) for y in points_v]
         direct = np.moveaxis(np.array([self._transfer(each, elevations) for each in pwv]), 2, 0)
         found = np.array([self._evaluate(k, np.array(pwv)[:, None], elevations) for k in range(3)])
@@ -162,18 +195,22 @@ class BandAtmosphere:
         if pwv.size and not (pwv.min() >= 0 and pwv.max() <= self.pwv_max * (1 + 1e-12)):
             at = int(np.argmax((pwv < 0) | ~(pwv <= self.pwv_max)))
             raise InputError(
-                f"PWV of {pwv.ravel()[at] * 1e3:.6g} mm (value {at} of {pwv.size}) is outside the table of band "
-                f"'{self.band.name}', 0 to {self.pwv_max * 1e3:.6g} mm",
+                f"PWV of {pwv.ravel()[at] * 1e3:.6g} mm (value {at} of {pwv.size}) is outside the"
+                f" table of band '{self.band.name}', 0 to {self.pwv_max * 1e3:.6g} mm",
                 cure="lower the PWV or its rms, or ask for a larger pwv_max",
             )
         return 2 * np.log1p(pwv / self._scale) / self._u_max - 1
 
     def _y(self, elevation: Floats) -> Floats:
-        low, high = (float(elevation.min()), float(elevation.max())) if elevation.size else (ELEVATION_MIN, ELEVATION_MAX)
+        low, high = (
+            (float(elevation.min()), float(elevation.max()))
+            if elevation.size
+            else (ELEVATION_MIN, ELEVATION_MAX)
+        )
         if not ELEVATION_MIN * (1 - 1e-9) <= low <= high <= ELEVATION_MAX * (1 + 1e-9):
             raise InputError(
-                f"elevations of {math.degrees(low):.2f} to {math.degrees(high):.2f} deg leave the limits "
-                "of the radiative transfer, 4.5 to 90 deg",
+                f"elevations of {math.degrees(low):.2f} to {math.degrees(high):.2f} deg leave the"
+                " limits of the radiative transfer, 4.5 to 90 deg",
                 cure="choose a target or a time with a higher elevation",
             )
         return -2 * np.log(np.sin(elevation)) / self._v_max - 1
@@ -185,25 +222,39 @@ class BandAtmosphere:
         basis = _chebyshev(self._x(pwv).ravel(), self._coefficients.shape[1])
         return self._contract(which, basis, elevation)
 
-    def _difference(self, which: int, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Floats:
-        pwv, dpwv, elevation = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (pwv, dpwv, elevation)))
+    def _difference(
+        self, which: int, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike
+    ) -> Floats:
+        pwv, dpwv, elevation = np.broadcast_arrays(
+            *(np.asarray(a, np.float64) for a in (pwv, dpwv, elevation))
+        )
         start, stop = self._x(pwv).ravel(), self._x(pwv + dpwv).ravel()
         step = (2 * np.log1p(dpwv / (self._scale + pwv)) / self._u_max).ravel()
         basis = _chebyshev_difference(start, stop, step, self._coefficients.shape[1])
         return self._contract(which, basis, elevation)
 
     def _contract(self, which: int, basis: Floats, elevation: Floats) -> Floats:
-        """sum_ij basis_i C_ij T_j(y) of one PWV or many, without BLAS: its sums may depend on the number of threads."""
-        y, found, along = self._y(elevation).ravel(), np.empty(elevation.size), self._coefficients[which]
+        """sum_ij basis_i C_ij T_j(y) of one PWV or many, without BLAS: its sums may depend on the
+        number of threads.
+        """
+        y, found, along = (
+            self._y(elevation).ravel(),
+            np.empty(elevation.size),
+            self._coefficients[which],
+        )
         for chunk in chunks(len(y)):
-            one, other = basis[:, chunk] if basis.shape[1] > 1 else basis, _chebyshev(y[chunk], along.shape[1])
+            one, other = (
+                basis[:, chunk] if basis.shape[1] > 1 else basis,
+                _chebyshev(y[chunk], along.shape[1]),
+            )
             found[chunk] = np.sum(np.einsum("ij,in->jn", along, one) * other, axis=0)
         return found.reshape(elevation.shape)
 
 
 @dataclass(frozen=True)
 class WaterResponse:
-    """What water that is added at a height changes, per metre of PWV, along lines of sight at k elevations.
+    """What water that is added at a height changes, per metre of PWV, along lines of sight at k
+    elevations.
 
     Attributes
     ----------
@@ -225,17 +276,23 @@ class WaterResponse:
         return np.asarray(getattr(self, name) @ self.water / self.water.sum())
 
     def at(self, name: str, height: Floats) -> Floats:
-        """(k, m) ``emission`` or ``opacity`` at heights (m,) above the site [m]; below the lowest middle as there."""
+        """(k, m) ``emission`` or ``opacity`` at heights (m,) above the site [m]; below the lowest
+        middle as there.
+        """
         return np.array([np.interp(height, self.height, row) for row in getattr(self, name)])
 
 
 class BandTransfer:
-    """Radiative transfer averaged over a band: pwv [m], elevations [rad] -> (emission, ln transmission, ln background) each."""
+    """Radiative transfer averaged over a band: pwv [m], elevations [rad] -> (emission, ln
+    transmission, ln background) each.
+    """
 
     def __init__(self, band: Band, layers: Layers) -> None:
         weight, frequency, cells = _cell_weights(band, layers.table)
         self._layers = layers
-        self._cross_sections, cell, share = layers.in_parts(_at_frequencies(layers, frequency, cells))
+        self._cross_sections, cell, share = layers.in_parts(
+            _at_frequencies(layers, frequency, cells)
+        )
         frequency = frequency[cell]
         self._weight = weight[cell] * share / weight.sum()
         self._frequency, self._width, self._square = (
@@ -263,13 +320,18 @@ class BandTransfer:
     def of_water(self, pwv: float, elevations: Sequence[float]) -> WaterResponse:
         """What water at each height changes, where the column holds ``pwv`` [m]."""
         layers = self._layers.scaled(pwv)
-        vertical, per_water = layers.opacity(self._cross_sections), layers.opacity_of_water(self._cross_sections)
+        vertical, per_water = (
+            layers.opacity(self._cross_sections),
+            layers.opacity_of_water(self._cross_sections),
+        )
         emitted, absorbed = [], []
         for elevation in elevations:
             airmass = layers.airmass(elevation)[:, None]
             slant = vertical * airmass
             gained = per_water * airmass
-            emitted.append(np.einsum("lf,lf,f->l", emission_slopes(slant, self._source), gained, self._weight))
+            emitted.append(
+                np.einsum("lf,lf,f->l", emission_slopes(slant, self._source), gained, self._weight)
+            )
             opacity = slant.sum(axis=0)
             passed = self._weight * np.exp(opacity.min() - opacity)
             absorbed.append(gained @ (passed / passed.sum()))
@@ -284,15 +346,24 @@ class BandTransfer:
 
 
 def _cell_weights(band: Band, table: AbsorptionTable) -> tuple[Floats, Floats, slice]:
-    """Integral of the (piecewise linear) transmission over each cell of the absorption table that it touches, and the mean
-    frequency of that integral: not the cell's centre where the band ends inside the cell.
+    """Integral of the (piecewise linear) transmission over each cell of the absorption table that
+    it touches, and the mean frequency of that integral: not the cell's centre where the band ends
+    inside the cell.
     """
     points, values, cell, cells = _divided(band, table)
     edges, step = table.edges[cells.start : cells.stop + 1], np.diff(points)
-    offset = points - table.frequency[cells][np.append(cell, cell[-1])]  # from the centre of the cell that begins there
+    offset = (
+        points - table.frequency[cells][np.append(cell, cell[-1])]
+    )  # from the centre of the cell that begins there
     end = offset[:-1] + step
-    integral = np.bincount(cell, step * (values[1:] + values[:-1]) / 2, len(edges) - 1).astype(np.float64)
-    first = step * (offset[:-1] * (2 * values[:-1] + values[1:]) + end * (values[:-1] + 2 * values[1:])) / 6
+    integral = np.bincount(cell, step * (values[1:] + values[:-1]) / 2, len(edges) - 1).astype(
+        np.float64
+    )
+    first = (
+        step
+        * (offset[:-1] * (2 * values[:-1] + values[1:]) + end * (values[:-1] + 2 * values[1:]))
+        / 6
+    )
     moment = np.bincount(cell, first, len(edges) - 1)
     shift = np.divide(moment, integral, out=np.zeros_like(moment), where=integral > 0)
     return integral, table.frequency[cells] + shift, cells
@@ -302,12 +373,14 @@ def _cell_squares(band: Band, table: AbsorptionTable) -> Floats:
     """Integral of the square of the transmission over each of the cells of `_cell_weights`."""
     points, values, cell, cells = _divided(band, table)
     square = values[:-1] ** 2 + values[:-1] * values[1:] + values[1:] ** 2
-    return np.bincount(cell, np.diff(points) * square / 3, cells.stop - cells.start).astype(np.float64)
+    return np.bincount(cell, np.diff(points) * square / 3, cells.stop - cells.start).astype(
+        np.float64
+    )
 
 
 def _divided(band: Band, table: AbsorptionTable) -> tuple[Floats, Floats, NDArray[np.intp], slice]:
-    """Frequencies at which the passband bends or a cell of the table begins, its transmission there, and between each and the
-    next the cell, of a slice of them."""
+    """Frequencies at which the passband bends or a cell of the table begins, its transmission
+    there, and between each and the next the cell, of a slice of them."""
     open_ = np.flatnonzero(band.transmission)  # a table of a passband may have zeros far outside it
     support = slice(max(int(open_[0]) - 1, 0), int(open_[-1]) + 2)
     nu, transmission = band.frequency[support], band.transmission[support]
@@ -332,7 +405,11 @@ def _at_frequencies(layers: Layers, frequency: Floats, cells: slice) -> CrossSec
         return np.asarray(sections[..., low] * (1 - upper) + sections[..., low + 1] * upper)
 
     return CrossSections(
-        linear(known.dry_air), linear(known.water), linear(known.water_self), linear(known.ozone), known.ozone_ratio[..., nearest]
+        linear(known.dry_air),
+        linear(known.water),
+        linear(known.water_self),
+        linear(known.ozone),
+        known.ozone_ratio[..., nearest],
     )
 
 
@@ -357,7 +434,8 @@ def _chebyshev(x: Floats, n: int) -> Floats:
 
 
 def _chebyshev_difference(x: Floats, y: Floats, step: Floats, n: int) -> Floats:
-    """(n, len(x)) T_k(y) - T_k(x) for y - x = step, by the recurrence of the differences, so nothing cancels:
+    """(n, len(x)) T_k(y) - T_k(x) for y - x = step, by the recurrence of the differences, so
+    nothing cancels:
 
     D_k+1 = 2 y D_k + 2 step T_k(x) - D_k-1.
     """

@@ -1,10 +1,13 @@
 """The embedded climatology (see data/README.md).
 
-Per site and pressure level the median temperature, ln(vapour density), wind and height of 15 years of ERA5 are harmonics,
+Per site and pressure level the median temperature, ln(vapour density), wind and height of 15 years
+of ERA5 are harmonics,
 
-    x(day, hour) = sum_k c_k A_i(2 pi day / 365.25) H_j(2 pi hour / 24),   k = 5 i + j                             (1)
+    x(day, hour) = sum_k c_k A_i(2 pi day / 365.25) H_j(2 pi hour / 24),
+    k = 5 i + j                             (1)
 
-with A = 1, cos a, sin a, ... cos 4a, sin 4a and H = 1, cos b, sin b, cos 2b, sin 2b; day counts from 1 January, hour is UTC.
+with A = 1, cos a, sin a, ... cos 4a, sin 4a and H = 1, cos b, sin b, cos 2b, sin 2b; day counts
+from 1 January, hour is UTC.
 """
 
 from __future__ import annotations
@@ -44,12 +47,16 @@ def profile(site: Site, time: Instant, pwv: float | None = None) -> Profile:
     Raises
     ------
     InputError
-        Neither climatology nor PWV, an unknown climatology, one whose levels begin far above the site, an unphysical PWV, a
-        time outside `YEARS`.
+        Neither climatology nor PWV, an unknown climatology, one whose levels begin far above the
+        site, an unphysical PWV, a time outside `YEARS`.
     """
     if pwv is not None:
         check_pwv(pwv)
-    column = standard_column(site) if site.climatology is None and pwv is not None else climatology_column(site, time)
+    column = (
+        standard_column(site)
+        if site.climatology is None and pwv is not None
+        else climatology_column(site, time)
+    )
     median = on_heights(column, site)
     return median if pwv is None else median.scaled(pwv)
 
@@ -76,12 +83,19 @@ def climatology_column(site: Site, time: Instant) -> Column:
         raise InputError(
             "has no climatology, so the atmosphere above it is unknown",
             place=place,
-            cure="give its PWV, e.g. weather: {pwv: 3 mm}, or an ERA5 file, weather: {file: era5.nc}, which "
-            "`zonda weather fetch` gets; or choose a site that has a climatology (see `zonda plugins`), or set the site's "
-            f"climatology to one of: {', '.join(known)}",
+            cure=(
+                "give its PWV, e.g. weather: {pwv: 3 mm}, or an ERA5 file, weather: {file:"
+                " era5.nc}, which `zonda weather fetch` gets; or choose a site that has a"
+                " climatology (see `zonda plugins`), or set the site's climatology to one of:"
+                f" {', '.join(known)}"
+            ),
         )
     if name not in known:
-        raise InputError(f"climatology '{name}' does not exist", place=place, cure=f"choose one of: {', '.join(known)}")
+        raise InputError(
+            f"climatology '{name}' does not exist",
+            place=place,
+            cure=f"choose one of: {', '.join(known)}",
+        )
     if not YEARS[0] <= time.datetime.year < YEARS[1]:
         raise InputError(
             f"{time} is outside what the climatology stands for, {YEARS[0]} to {YEARS[1]}",
@@ -98,7 +112,10 @@ def climatology_column(site: Site, time: Instant) -> Column:
     pressure = every_pressure[: len(height)]  # the highest levels have ozone only
     h2o = np.exp(median("log_vapour_density")) * VAPOUR_GAS_CONSTANT * temperature / pressure
     annual = basis[::5]  # 1, cos a, sin a, ...
-    spread = {name: annual[:3] @ arrays[f"{name}_spread"] for name in ("log_vapour_density", "wind_east", "wind_north")}
+    spread = {
+        name: annual[:3] @ arrays[f"{name}_spread"]
+        for name in ("log_vapour_density", "wind_east", "wind_north")
+    }
     shares = arrays.get("column_spread")
     return Column(
         pressure=pressure,
@@ -112,14 +129,22 @@ def climatology_column(site: Site, time: Instant) -> Column:
         log_vapour_spread=spread["log_vapour_density"],
         wind_east_spread=spread["wind_east"],
         wind_north_spread=spread["wind_north"],
-        column_spread=None if shares is None else (float(shares[0] @ annual[:3]), float(shares[1] @ annual[:3])),
-        ground_temperature=float(median("ground_temperature")) if "ground_temperature" in arrays else None,
+        column_spread=(
+            None
+            if shares is None
+            else (float(shares[0] @ annual[:3]), float(shares[1] @ annual[:3]))
+        ),
+        ground_temperature=(
+            float(median("ground_temperature")) if "ground_temperature" in arrays else None
+        ),
         stated=f"climatology '{name}' (ERA5), {time}",
     )
 
 
 def _day_and_hour(time: Instant) -> tuple[float, float]:
-    """Days since 1 January, stretched so that every year has 365.25 and closes, and the hour of the day, UTC."""
+    """Days since 1 January, stretched so that every year has 365.25 and closes, and the hour of the
+    day, UTC.
+    """
     moment = time.datetime
     hour = moment.hour + moment.minute / 60 + moment.second / 3600
     return (moment.timetuple().tm_yday - 1 + hour / 24) * 365.25 / (365 + isleap(moment.year)), hour
@@ -129,6 +154,7 @@ def harmonics(day: float, hour: float) -> Floats:
     """(45,) the products A_i H_j of equation (1)."""
     a, b = 2 * np.pi * day / 365.25, 2 * np.pi * hour / 24
     annual, diurnal = (
-        np.concatenate([[1.0], *([np.cos(k * x), np.sin(k * x)] for k in range(1, n + 1))]) for x, n in ((a, 4), (b, 2))
+        np.concatenate([[1.0], *([np.cos(k * x), np.sin(k * x)] for k in range(1, n + 1))])
+        for x, n in ((a, 4), (b, 2))
     )
     return np.outer(annual, diurnal).ravel()

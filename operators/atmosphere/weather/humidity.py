@@ -1,4 +1,6 @@
-"""Between measures of humidity. Pressures in Pa, temperatures in K; mixing ratios by volume unless said otherwise."""
+"""Between measures of humidity. Pressures in Pa, temperatures in K; mixing ratios by volume unless
+said otherwise.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ MOLAR_MASS_OZONE = 47.998e-3
 
 
 def saturation_pressure(temperature: Floats) -> Floats:
-    """Saturation pressure [Pa] over water above 0 C, ice below -23 C, both between (IFS documentation cy41r2, IV, eq. 7.93)."""
+    """Saturation pressure [Pa] over water above 0 C, ice below -23 C, both between (IFS
+    documentation cy41r2, IV, eq. 7.93).
+    """
     t = np.asarray(temperature, np.float64)
     liquid = 611.21 * np.exp(17.502 * (t - 273.16) / (t - 32.19))
     ice = 611.21 * np.exp(22.587 * (t - 273.16) / (t + 0.7))

@@ -1,7 +1,8 @@
 """Fields on pressure levels in a NetCDF file, whoever named its variables, axes and units.
 
-What is read: the names of the Climate Data Store (old and new), cfgrib, ARCO-ERA5 and CMIP (`plev`), or the CF standard name.
-A unit that is not known is refused; where a file states none it is what ERA5 has, and the values must be air's (`era5`).
+What is read: the names of the Climate Data Store (old and new), cfgrib, ARCO-ERA5 and CMIP
+(`plev`), or the CF standard name. A unit that is not known is refused; where a file states none it
+is what ERA5 has, and the values must be air's (`era5`).
 """
 
 from __future__ import annotations
@@ -22,32 +23,73 @@ from zonda.core.types import Floats
 from .radiative_transfer import GRAVITY
 from .time_reference import duration, posix_times
 
-GET = "`zonda weather fetch SITE --time TIME --output era5.nc` gets such a file, or the Climate Data Store's pages do"
+GET = (
+    "`zonda weather fetch SITE --time TIME --output era5.nc` gets such a file, or the Climate Data"
+    " Store's pages do"
+)
 
 Scale = tuple[float, float]
 """(factor, offset) from a unit to SI."""
 
-_SHARE = {"kg kg-1": (1.0, 0.0), "kg/kg": (1.0, 0.0), "1": (1.0, 0.0), "g kg-1": (1e-3, 0.0), "g/kg": (1e-3, 0.0)}
-_SPEED = {"m s-1": (1.0, 0.0), "m/s": (1.0, 0.0), "ms-1": (1.0, 0.0), "km h-1": (1 / 3.6, 0.0), "km/h": (1 / 3.6, 0.0),
-          **dict.fromkeys(("knot", "knots", "kt", "kts"), (1852 / 3600, 0.0))}  # fmt: skip
+_SHARE = {
+    "kg kg-1": (1.0, 0.0),
+    "kg/kg": (1.0, 0.0),
+    "1": (1.0, 0.0),
+    "g kg-1": (1e-3, 0.0),
+    "g/kg": (1e-3, 0.0),
+}
+_SPEED = {
+    "m s-1": (1.0, 0.0),
+    "m/s": (1.0, 0.0),
+    "ms-1": (1.0, 0.0),
+    "km h-1": (1 / 3.6, 0.0),
+    "km/h": (1 / 3.6, 0.0),
+    **dict.fromkeys(("knot", "knots", "kt", "kts"), (1852 / 3600, 0.0)),
+}
 _PERCENT = {"%": (1.0, 0.0), "percent": (1.0, 0.0), "1": (100.0, 0.0), "(0 - 1)": (100.0, 0.0)}
-_KELVIN = {**dict.fromkeys(("k", "kelvin", "kelvins", "deg k", "degk"), (1.0, 0.0)),
-           **dict.fromkeys(("degc", "c", "celsius", "°c", "deg c", "degree_celsius", "degrees_celsius", "degree celsius",
-                            "degrees celsius", "degree_c", "degrees_c"), (1.0, 273.15))}  # fmt: skip
+_KELVIN = {
+    **dict.fromkeys(("k", "kelvin", "kelvins", "deg k", "degk"), (1.0, 0.0)),
+    **dict.fromkeys(
+        (
+            "degc",
+            "c",
+            "celsius",
+            "°c",
+            "deg c",
+            "degree_celsius",
+            "degrees_celsius",
+            "degree celsius",
+            "degrees celsius",
+            "degree_c",
+            "degrees_c",
+        ),
+        (1.0, 273.15),
+    ),
+}
 _ENERGY = dict.fromkeys(("m2 s-2", "m2/s2", "m2s-2", "j kg-1", "j/kg"), (1.0, 0.0))
-_HEIGHT = {**dict.fromkeys(("m", "gpm", "meter", "meters", "metre", "metres", "geopotential meters"), (GRAVITY, 0.0)),
-           **dict.fromkeys(("dam", "gpdam", "gpdm"), (10 * GRAVITY, 0.0)), "km": (1e3 * GRAVITY, 0.0)}  # fmt: skip
+_HEIGHT = {
+    **dict.fromkeys(
+        ("m", "gpm", "meter", "meters", "metre", "metres", "geopotential meters"), (GRAVITY, 0.0)
+    ),
+    **dict.fromkeys(("dam", "gpdam", "gpdm"), (10 * GRAVITY, 0.0)),
+    "km": (1e3 * GRAVITY, 0.0),
+}
 PRESSURES = {
     **dict.fromkeys(("pa", "pascal", "pascals"), (1.0, 0.0)),
-    **dict.fromkeys(("hpa", "hectopascal", "hectopascals", "mbar", "mb", "millibar", "millibars"), (100.0, 0.0)),
-    "kpa": (1e3, 0.0), "bar": (1e5, 0.0),
-}  # fmt: skip
+    **dict.fromkeys(
+        ("hpa", "hectopascal", "hectopascals", "mbar", "mb", "millibar", "millibars"), (100.0, 0.0)
+    ),
+    "kpa": (1e3, 0.0),
+    "bar": (1e5, 0.0),
+}
 """Of the level axis."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """Names that a variable may have, and its units; ``default`` is the unit of a variable that states none."""
+    """Names that a variable may have, and its units; ``default`` is the unit of a variable that
+    states none.
+    """
 
     what: str
     names: tuple[str, ...]
@@ -58,36 +100,70 @@ class Quantity:
 
 QUANTITIES = {
     "t": Quantity("temperature", ("t", "temperature", "ta"), "air_temperature", "k", _KELVIN),
-    "q": Quantity("specific_humidity", ("q", "specific_humidity", "hus"), "specific_humidity", "kg kg-1", _SHARE),
-    "r": Quantity("relative_humidity", ("r", "relative_humidity", "hur"), "relative_humidity", "%", _PERCENT),
-    "u": Quantity("u_component_of_wind", ("u", "u_component_of_wind", "ua"), "eastward_wind", "m s-1", _SPEED),
-    "v": Quantity("v_component_of_wind", ("v", "v_component_of_wind", "va"), "northward_wind", "m s-1", _SPEED),
-    "z": Quantity("geopotential", ("z", "geopotential"), "geopotential", "m2 s-2", _ENERGY | _HEIGHT),
-    "gh": Quantity("geopotential_height", ("gh", "zg", "geopotential_height"), "geopotential_height", "gpm", _HEIGHT),
-    "o3": Quantity("ozone_mass_mixing_ratio", ("o3", "ozone_mass_mixing_ratio"), "mass_fraction_of_ozone_in_air", "kg kg-1",
-                   _SHARE),
-}  # fmt: skip
+    "q": Quantity(
+        "specific_humidity",
+        ("q", "specific_humidity", "hus"),
+        "specific_humidity",
+        "kg kg-1",
+        _SHARE,
+    ),
+    "r": Quantity(
+        "relative_humidity", ("r", "relative_humidity", "hur"), "relative_humidity", "%", _PERCENT
+    ),
+    "u": Quantity(
+        "u_component_of_wind", ("u", "u_component_of_wind", "ua"), "eastward_wind", "m s-1", _SPEED
+    ),
+    "v": Quantity(
+        "v_component_of_wind", ("v", "v_component_of_wind", "va"), "northward_wind", "m s-1", _SPEED
+    ),
+    "z": Quantity(
+        "geopotential", ("z", "geopotential"), "geopotential", "m2 s-2", _ENERGY | _HEIGHT
+    ),
+    "gh": Quantity(
+        "geopotential_height",
+        ("gh", "zg", "geopotential_height"),
+        "geopotential_height",
+        "gpm",
+        _HEIGHT,
+    ),
+    "o3": Quantity(
+        "ozone_mass_mixing_ratio",
+        ("o3", "ozone_mass_mixing_ratio"),
+        "mass_fraction_of_ozone_in_air",
+        "kg kg-1",
+        _SHARE,
+    ),
+}
 """By ERA5's short name; a geopotential height is read as a geopotential."""
 
 AXES = {
     "time": (("valid_time", "time"), "time"),
-    "level": (("pressure_level", "isobaricInhPa", "isobaricInPa", "plev", "level", "lev"), "air_pressure"),
+    "level": (
+        ("pressure_level", "isobaricInhPa", "isobaricInPa", "plev", "level", "lev"),
+        "air_pressure",
+    ),
     "lat": (("latitude", "lat"), "latitude"),
     "lon": (("longitude", "lon"), "longitude"),
 }
 """Names of the axes, and their standard name."""
 FIRST_OF = ("expver", "number", "realization", "member")
-"""Axes of which the first entry with values is taken: ERA5 and its preliminary months, members of an ensemble."""
+"""Axes of which the first entry with values is taken: ERA5 and its preliminary months, members of
+an ensemble.
+"""
 
 DRIEST = 1e-9
-"""kg/kg, or % of relative humidity: less is taken as this, which is 1e-5 mm of water in the whole column."""
+"""kg/kg, or % of relative humidity: less is taken as this, which is 1e-5 mm of water in the whole
+column.
+"""
 
 _NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A coordinate: its variable, the axes of the file that it lies on (none: one value for all), and its values, flat."""
+    """A coordinate: its variable, the axes of the file that it lies on (none: one value for all),
+    and its values, flat.
+    """
 
     name: str
     dims: tuple[str, ...]
@@ -96,21 +172,28 @@ class Axis:
 
     def at(self, number: int) -> dict[str, int]:
         """Index of its value ``number``, by axis of the file."""
-        return {dim: int(k) for dim, k in zip(self.dims, np.unravel_index(number, self.shape), strict=True)}
+        return {
+            dim: int(k)
+            for dim, k in zip(self.dims, np.unravel_index(number, self.shape), strict=True)
+        }
 
 
 class NetCdf:
     """Base of the readers of NetCDF-3 and NetCDF-4.
 
-    ``below_none``: how many values below 0 were raised to `DRIEST` before their logarithm was taken.
-    ``remarks``: what was chosen.
+    ``below_none``: how many values below 0 were raised to `DRIEST` before their logarithm was
+    taken. ``remarks``: what was chosen.
     """
 
     def __init__(self, variables: Any, dimensions: dict[str, list[str]], place: str) -> None:
         self._variables, self._dimensions, self._place = variables, dimensions, place
         self.below_none = 0
         self.remarks: dict[str, None] = {}
-        self._names = {key: name for key, quantity in QUANTITIES.items() if (name := self._found(quantity)) is not None}
+        self._names = {
+            key: name
+            for key, quantity in QUANTITIES.items()
+            if (name := self._found(quantity)) is not None
+        }
 
     def __contains__(self, key: str) -> bool:
         return key in self._names
@@ -123,11 +206,16 @@ class NetCdf:
         InputError
             Without one of them, or with one in a unit or a calendar that is not known.
         """
-        found = {"time": self._times(), **{kind: self._axis(*AXES[kind]) for kind in ("level", "lat", "lon")}}
+        found = {
+            "time": self._times(),
+            **{kind: self._axis(*AXES[kind]) for kind in ("level", "lat", "lon")},
+        }
         for kind in ("lat", "lon"):
             unit = self.units(found[kind].name)
             if unit and not unit.startswith("deg"):
-                raise InputError(f"its {found[kind].name} has the unit '{unit}'", cure="expected degrees")
+                raise InputError(
+                    f"its {found[kind].name} has the unit '{unit}'", cure="expected degrees"
+                )
         level = found["level"]
         scale, offset = self._scale(level.name, PRESSURES, _of_levels(level.values))
         found["level"] = Axis(level.name, level.dims, level.shape, level.values * scale + offset)
@@ -135,13 +223,19 @@ class NetCdf:
 
     def attribute(self, name: str, key: str, default: Any = None) -> Any:
         variable = self._variables[name]
-        value = variable.attrs.get(key, default) if hasattr(variable, "attrs") else getattr(variable, key, default)
+        value = (
+            variable.attrs.get(key, default)
+            if hasattr(variable, "attrs")
+            else getattr(variable, key, default)
+        )
         if isinstance(value, bytes):
             return value.decode(errors="replace")
         return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
 
     def units(self, name: str) -> str:
-        """Units as the file has them, in lower case, with one way to write a power; empty where there are none."""
+        """Units as the file has them, in lower case, with one way to write a power; empty where
+        there are none.
+        """
         text = str(self.attribute(name, "units", "") or "")
         return " ".join(text.replace("**", "").replace("^", "").replace("*", " ").lower().split())
 
@@ -155,14 +249,19 @@ class NetCdf:
         """Unpacked values, NaN where they are missing."""
         raw = self.raw(name, where)
         missing = [self.attribute(name, key) for key in ("_FillValue", "missing_value")]
-        scale, offset = float(self.attribute(name, "scale_factor", 1.0)), float(self.attribute(name, "add_offset", 0))
+        scale, offset = (
+            float(self.attribute(name, "scale_factor", 1.0)),
+            float(self.attribute(name, "add_offset", 0)),
+        )
         out = raw.astype(np.float64) * scale + offset
         for value in missing:
             if value is not None:
                 out = np.where(raw == value, np.nan, out)
         return np.atleast_1d(out)
 
-    def interpolated(self, key: str, axes: dict[str, Axis], weights: dict[str, dict[int, float]], log: bool) -> Floats:
+    def interpolated(
+        self, key: str, axes: dict[str, Axis], weights: dict[str, dict[int, float]], log: bool
+    ) -> Floats:
         """(n_level,) of a quantity, SI but for a relative humidity in %."""
         name, quantity = self._names[key], QUANTITIES[key]
         factor, offset = self._scale(name, quantity.units, quantity.default)
@@ -181,8 +280,14 @@ class NetCdf:
     def _found(self, quantity: Quantity) -> str | None:
         fields = {name: dims for name, dims in self._dimensions.items() if len(dims) > 0}
         by_case = {name.lower(): name for name in reversed(fields)}
-        named = [n for n in quantity.names if n in fields] or [by_case[n] for n in quantity.names if n in by_case]
-        standard = (n for n, dims in fields.items() if len(dims) > 1 and self._standard(n) == quantity.standard)
+        named = [n for n in quantity.names if n in fields] or [
+            by_case[n] for n in quantity.names if n in by_case
+        ]
+        standard = (
+            n
+            for n, dims in fields.items()
+            if len(dims) > 1 and self._standard(n) == quantity.standard
+        )
         return named[0] if named else next(standard, None)
 
     def _standard(self, name: str) -> str:
@@ -192,18 +297,31 @@ class NetCdf:
         unit = self.units(name) or default
         if unit not in known:
             raise InputError(
-                f"the variable {name} has the unit '{self.attribute(name, 'units')}'", cure=f"expected one of {', '.join(known)}"
+                f"the variable {name} has the unit '{self.attribute(name, 'units')}'",
+                cure=f"expected one of {', '.join(known)}",
             )
         return known[unit]
 
-    def _axis(self, names: tuple[str, ...], standard: str, convert: Callable[[str], Floats] | None = None) -> Axis:
+    def _axis(
+        self, names: tuple[str, ...], standard: str, convert: Callable[[str], Floats] | None = None
+    ) -> Axis:
         found = next((name for name in names if name in self._dimensions), None)
-        found = found or next((name for name in self._dimensions if self._standard(name) == standard), None)
+        found = found or next(
+            (name for name in self._dimensions if self._standard(name) == standard), None
+        )
         if found is None:
-            raise InputError(f"has no axis {' or '.join(names)}", cure=f"it must be on pressure levels: {GET}")
-        values, dims = self.values(found) if convert is None else convert(found), self._dimensions[found]
+            raise InputError(
+                f"has no axis {' or '.join(names)}", cure=f"it must be on pressure levels: {GET}"
+            )
+        values, dims = (
+            self.values(found) if convert is None else convert(found),
+            self._dimensions[found],
+        )
         if convert is None and len(dims) > 1:
-            raise InputError(f"its {found} lies on {', '.join(dims)}", cure=f"it must be one row of values: {GET}")
+            raise InputError(
+                f"its {found} lies on {', '.join(dims)}",
+                cure=f"it must be one row of values: {GET}",
+            )
         return Axis(found, tuple(dims), values.shape if dims else (), np.ravel(values))
 
     def _times(self) -> Axis:
@@ -214,15 +332,25 @@ class NetCdf:
             return axis
         steps = self.values(step) * duration(str(self.attribute(step, "units", "")), step)
         values, dims = axis.values[:, None] + steps, (*axis.dims, *self._dimensions[step])
-        shape = tuple(n for n, of in zip(values.shape, (axis.dims, self._dimensions[step]), strict=True) if of)
+        shape = tuple(
+            n for n, of in zip(values.shape, (axis.dims, self._dimensions[step]), strict=True) if of
+        )
         return Axis(axis.name, dims, shape, values.ravel())
 
     def _posix(self, name: str) -> Floats:
-        units, calendar = str(self.attribute(name, "units", "") or ""), self.attribute(name, "calendar")
+        units, calendar = (
+            str(self.attribute(name, "units", "") or ""),
+            self.attribute(name, "calendar"),
+        )
         raw = self.raw(name)
-        if self.attribute(name, "scale_factor") is not None or self.attribute(name, "add_offset") is not None:
+        if (
+            self.attribute(name, "scale_factor") is not None
+            or self.attribute(name, "add_offset") is not None
+        ):
             raw = self.values(name).reshape(raw.shape)
-        return np.atleast_1d(posix_times(raw, units, None if calendar is None else str(calendar), name))
+        return np.atleast_1d(
+            posix_times(raw, units, None if calendar is None else str(calendar), name)
+        )
 
     def _column(self, name: str, axes: dict[str, Axis], at: dict[str, int]) -> Floats:
         names, level = self._dimensions[name], axes["level"].dims
@@ -236,13 +364,23 @@ class NetCdf:
             rest = [n for n in names if n in extra or n == level[0]]
             several = [n for n in extra if values.shape[rest.index(n)] > 1]
             if unknown := [n for n in several if n not in FIRST_OF]:
-                raise InputError(f"the variable {name} lies on {', '.join(names)}", cure=f"keep one entry of {unknown[0]}")
-            values = np.moveaxis(values, rest.index(level[0]), 0).reshape(values.shape[rest.index(level[0])], -1)
+                raise InputError(
+                    f"the variable {name} lies on {', '.join(names)}",
+                    cure=f"keep one entry of {unknown[0]}",
+                )
+            values = np.moveaxis(values, rest.index(level[0]), 0).reshape(
+                values.shape[rest.index(level[0])], -1
+            )
             whole = np.flatnonzero(np.isfinite(values).all(axis=0))
             values = values[:, whole[0] if len(whole) else 0]
-            self.remarks.update((f"the first {n} of several", None) for n in several if n != "expver")
+            self.remarks.update(
+                (f"the first {n} of several", None) for n in several if n != "expver"
+            )
         if not np.isfinite(values).all():
-            raise InputError(f"the variable {name} has no values at this place and time", cure="download the file again")
+            raise InputError(
+                f"the variable {name} has no values at this place and time",
+                cure="download the file again",
+            )
         return values
 
 
@@ -262,13 +400,19 @@ def opened(path: Path, place: str) -> Iterator[NetCdf]:
     if of_hdf5:
         with hdf5_files.opened(path, place, kind, cure) as file:
             sets = {name: file[name] for name in file if isinstance(file.get(name), h5py.Dataset)}
-            own = {name: item for name, item in sets.items() if not _text(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE)}
+            own = {
+                name: item
+                for name, item in sets.items()
+                if not _text(item.attrs.get("NAME", "")).startswith(_NO_VARIABLE)
+            }
             yield NetCdf(own, {name: _dimensions(name, item) for name, item in own.items()}, place)
         return
     from scipy.io import netcdf_file
 
     with reading(place, kind, cure), netcdf_file(path, "r", mmap=False) as file:
-        yield NetCdf(file.variables, {name: list(v.dimensions) for name, v in file.variables.items()}, place)
+        yield NetCdf(
+            file.variables, {name: list(v.dimensions) for name, v in file.variables.items()}, place
+        )
 
 
 def _dimensions(name: str, item: Any) -> list[str]:

@@ -1,4 +1,6 @@
-"""The atmosphere above a site: profiles from the ground up, made from the levels of a weather source."""
+"""The atmosphere above a site: profiles from the ground up, made from the levels of a weather
+source.
+"""
 
 from __future__ import annotations
 
@@ -32,20 +34,24 @@ EXTRAPOLATION_MAX = 500.0
 """m that a site may lie below the lowest level of its climatology."""
 
 STACKING = 0.77
-"""Levels do not vary together: the column's ln(PWV) scatters this much of what the levels' quantiles, stacked, would give. This
-is the mean of the sites where ERA5's own columns tell (0.6 to 0.96, `Column.column_spread`), for the others."""
+"""Levels do not vary together: the column's ln(PWV) scatters this much of what the levels'
+quantiles, stacked, would give. This is the mean of the sites where ERA5's own columns tell (0.6 to
+0.96, `Column.column_spread`), for the others."""
 INVERSION_DEPTH = 100.0
-"""m in which an inversion on the ground falls to 1/e. Over the South Pole it is a few hundred metres deep, steepest below
-(Hudson & Brandt 2005, J. Climate 18, 1673)."""
+"""m in which an inversion on the ground falls to 1/e. Over the South Pole it is a few hundred
+metres deep, steepest below (Hudson & Brandt 2005, J. Climate 18, 1673)."""
 STRATOSPHERE_LAPSE = 2.8e-3
-"""K / m above the highest climatological level, 10 hPa, as in the US Standard Atmosphere 1976 ..."""
+"""K / m above the highest climatological level, 10 hPa, as in the US Standard Atmosphere 1976 ...
+"""
 STRATOPAUSE_TEMPERATURE = 270.65
 """... up to this temperature, K."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions at given heights, arrays of the shape asked for: m above the site, Pa, K, kg/m3, m/s, m/s."""
+    """Conditions at given heights, arrays of the shape asked for: m above the site, Pa, K, kg/m3,
+    m/s, m/s.
+    """
 
     height: Floats
     pressure: Floats
@@ -57,14 +63,16 @@ class Conditions:
 
 @dataclass(frozen=True)
 class PwvDistribution:
-    """Law of the PWV: its logarithm is normal with one width below the median and another above, cut at `PWV_MAX`.
+    """Law of the PWV: its logarithm is normal with one width below the median and another above,
+    cut at `PWV_MAX`.
 
     Attributes
     ----------
     median
         m.
     below, above
-        Standard deviation of ln(PWV) of the two halves; ``above`` None: the same, which is the log-normal law.
+        Standard deviation of ln(PWV) of the two halves; ``above`` None: the same, which is the
+        log-normal law.
     """
 
     median: float
@@ -82,7 +90,9 @@ class PwvDistribution:
         above = self.below if self.above is None else self.above
         reach = math.log(PWV_MAX) - centre
         most = normal.cdf(reach / (above if reach > 0 else self.below))
-        deviate = normal.inv_cdf(min(max(quantile * most, 1e-300), 1 - 1e-16))  # a quantile of 0 or 1 is 37 or 8 sigma away
+        deviate = normal.inv_cdf(
+            min(max(quantile * most, 1e-300), 1 - 1e-16)
+        )  # a quantile of 0 or 1 is 37 or 8 sigma away
         return min(math.exp(centre + deviate * (above if deviate > 0 else self.below)), PWV_MAX)
 
 
@@ -103,9 +113,11 @@ class Profile:
     altitude
         m above sea level of the site.
     wind_east_spread, wind_north_spread
-        Standard deviations of the winds [m/s] over the weather of the season and hour; None: not known.
+        Standard deviations of the winds [m/s] over the weather of the season and hour; None: not
+        known.
     distribution
-        How the PWV of that season and hour is distributed, whatever the PWV is scaled to; None: not known.
+        How the PWV of that season and hour is distributed, whatever the PWV is scaled to; None: not
+        known.
     stated
         (what, text): where this profile comes from, for the reports.
     """
@@ -130,7 +142,9 @@ class Profile:
 
     @cached_property
     def layers(self) -> Layers:
-        """The layers between the heights, and one more up to zero pressure, for radiative transfer."""
+        """The layers between the heights, and one more up to zero pressure, for radiative
+        transfer.
+        """
         return Layers(
             pressure=np.append(self.pressure, 0.0),
             temperature=np.append(self.temperature, self.temperature[-1]),
@@ -154,19 +168,28 @@ class Profile:
         """
         check_pwv(pwv)
         if pwv > 0 and not self.pwv > 0:
-            raise InputError("the profile has no vapour at all, so there is nothing to scale", cure="give a profile with vapour")
+            raise InputError(
+                "the profile has no vapour at all, so there is nothing to scale",
+                cure="give a profile with vapour",
+            )
         profile = self
         for _ in range(8):  # as in Layers.scaled
-            profile = replace(profile, h2o=profile.h2o * (pwv / profile.pwv)) if pwv > 0 else replace(self, h2o=0 * self.h2o)
+            profile = (
+                replace(profile, h2o=profile.h2o * (pwv / profile.pwv))
+                if pwv > 0
+                else replace(self, h2o=0 * self.h2o)
+            )
         return profile
 
     @property
     def typical_wind(self) -> Profile:
         """The same profile with the median speed along the median direction.
 
-        Of a wind whose components are normal with means (u, v) and spreads su, sv, the median speed is within 3 % of
+        Of a wind whose components are normal with means (u, v) and spreads su, sv, the median speed
+        is within 3 % of
 
-            V^2 = u^2 + v^2 + s^2 (1 + 0.386 exp(-(u^2 + v^2) / (2 s^2))),   s^2 = (su^2 + sv^2) / 2                (2)
+            V^2 = u^2 + v^2 + s^2 (1 + 0.386 exp(-(u^2 + v^2) / (2 s^2))),
+            s^2 = (su^2 + sv^2) / 2                (2)
 
         which the vector of medians understates. Without spreads the profile itself.
         """
@@ -182,7 +205,8 @@ class Profile:
         return replace(self, wind_east=speed * east, wind_north=speed * north)
 
     def at(self, height: ArrayLike) -> Conditions:
-        """Conditions at heights above the site [m], any shape: winds as vectors, pressure and vapour as logarithms, linearly.
+        """Conditions at heights above the site [m], any shape: winds as vectors, pressure and
+        vapour as logarithms, linearly.
 
         Raises
         ------
@@ -213,13 +237,15 @@ def check_pwv(pwv: float) -> None:
     """Refuse a precipitable water vapour [m] that does not occur on Earth (`InputError`)."""
     if not 0 <= pwv <= PWV_MAX:
         raise InputError(
-            f"a precipitable water vapour of {pwv * 1e3:g} mm is outside the limits, 0 to {PWV_MAX * 1e3:g} mm",
+            f"a precipitable water vapour of {pwv * 1e3:g} mm is outside the limits, 0 to"
+            f" {PWV_MAX * 1e3:g} mm",
             cure="give the PWV above the site, for example 7.7 mm",
         )
 
 
 def on_heights(column: Column, site: Site) -> Profile:
-    """A column from its levels to heights above the site; above it the stratosphere of the US Standard Atmosphere.
+    """A column from its levels to heights above the site; above it the stratosphere of the US
+    Standard Atmosphere.
 
     Raises
     ------
@@ -239,10 +265,19 @@ def on_heights(column: Column, site: Site) -> Profile:
     top = column.temperature[-1]
     warming = np.minimum(STRATOSPHERE_LAPSE * above, max(STRATOPAUSE_TEMPERATURE - top, 0.0))
     temperature = linear(column.temperature) + lapse * below + warming
-    h2o = np.exp(linear(np.log(np.maximum(column.h2o, 1e-12))))  # a logarithm of dry air: 6e-9 mm of water in the whole column
-    mean = np.where(above > 0, (temperature + top) / 2, temperature)  # of the air between the outermost level and z
-    log_pressure = linear(np.log(column.pressure)) - GRAVITY * (above + below) / (DRY_AIR_GAS_CONSTANT * mean)
-    spreads = [None if s is None else linear(s) for s in (column.wind_east_spread, column.wind_north_spread)]
+    h2o = np.exp(
+        linear(np.log(np.maximum(column.h2o, 1e-12)))
+    )  # a logarithm of dry air: 6e-9 mm of water in the whole column
+    mean = np.where(
+        above > 0, (temperature + top) / 2, temperature
+    )  # of the air between the outermost level and z
+    log_pressure = linear(np.log(column.pressure)) - GRAVITY * (above + below) / (
+        DRY_AIR_GAS_CONSTANT * mean
+    )
+    spreads = [
+        None if s is None else linear(s)
+        for s in (column.wind_east_spread, column.wind_north_spread)
+    ]
     made = Profile(
         height=height,
         pressure=np.exp(log_pressure),
@@ -263,7 +298,9 @@ def on_heights(column: Column, site: Site) -> Profile:
     wide = linear(column.log_vapour_spread)
     low, high = (replace(made, h2o=made.h2o * np.exp(sign * wide)).pwv for sign in (-1, 1))
     stacked, shares = math.log(high / low) / 2, column.column_spread or (STACKING, STACKING)
-    return replace(made, distribution=PwvDistribution(made.pwv, shares[0] * stacked, shares[1] * stacked))
+    return replace(
+        made, distribution=PwvDistribution(made.pwv, shares[0] * stacked, shares[1] * stacked)
+    )
 
 
 def _check_altitude(column: Column, site: Site) -> None:
@@ -287,8 +324,12 @@ def _ozone(column: Column, log_pressure: Floats) -> Floats:
 
 
 def _inverted(profile: Profile, ground_temperature: float) -> Profile:
-    """The profile with the inversion that a temperature on the ground implies; vapour is limited to saturation."""
-    temperature = profile.temperature + (ground_temperature - profile.temperature[0]) * np.exp(-profile.height / INVERSION_DEPTH)
+    """The profile with the inversion that a temperature on the ground implies; vapour is limited to
+    saturation.
+    """
+    temperature = profile.temperature + (ground_temperature - profile.temperature[0]) * np.exp(
+        -profile.height / INVERSION_DEPTH
+    )
     saturated = saturation_pressure(temperature) / profile.pressure
     cold = (profile.height < 5 * INVERSION_DEPTH) & (profile.h2o > saturated)
     whole = replace(profile, temperature=temperature)
@@ -296,13 +337,20 @@ def _inverted(profile: Profile, ground_temperature: float) -> Profile:
         return whole
     cut = replace(whole, h2o=np.where(cold, saturated, profile.h2o))
     lost = 1 - cut.pwv / whole.pwv
-    text = f"cut to saturation at {np.count_nonzero(cold)} levels of the inversion, which takes {lost:.2%} of the column"
+    text = (
+        f"cut to saturation at {np.count_nonzero(cold)} levels of the inversion, which takes"
+        f" {lost:.2%} of the column"
+    )
     return replace(cut, stated=(*cut.stated, ("vapour near the ground", text)))
 
 
 def _continued(column: Column) -> Column:
-    """A column that ends below 15 hPa, continued to 31 km: standard lapse rates, a dry stratosphere, the topmost wind."""
-    height, pressure, temperature = upper_levels(*(float(a[-1]) for a in (column.height, column.pressure, column.temperature)))
+    """A column that ends below 15 hPa, continued to 31 km: standard lapse rates, a dry
+    stratosphere, the topmost wind.
+    """
+    height, pressure, temperature = upper_levels(
+        *(float(a[-1]) for a in (column.height, column.pressure, column.temperature))
+    )
     if not height.size:
         return column
 
@@ -314,7 +362,9 @@ def _continued(column: Column) -> Column:
         pressure=np.append(column.pressure, pressure),
         height=np.append(column.height, height),
         temperature=np.append(column.temperature, temperature),
-        h2o=np.append(column.h2o, np.full(height.size, min(float(column.h2o[-1]), STRATOSPHERIC_WATER))),
+        h2o=np.append(
+            column.h2o, np.full(height.size, min(float(column.h2o[-1]), STRATOSPHERIC_WATER))
+        ),
         wind_east=np.append(column.wind_east, np.full(height.size, column.wind_east[-1])),
         wind_north=np.append(column.wind_north, np.full(height.size, column.wind_north[-1])),
         log_vapour_spread=held(column.log_vapour_spread),
@@ -324,11 +374,15 @@ def _continued(column: Column) -> Column:
 
 
 def _layer_mean(pressure: Floats, mixing_ratio: Floats) -> Floats:
-    """Mean over each layer's mass of a mixing ratio that is a power of the pressure between its boundaries. (n - 1,)."""
+    """Mean over each layer's mass of a mixing ratio that is a power of the pressure between its
+    boundaries. (n - 1,).
+    """
     low, high = mixing_ratio[:-1], mixing_ratio[1:]
     if not mixing_ratio.all():
         return (low + high) / 2
     thickness = np.log(pressure[:-1] / pressure[1:])
-    x = thickness + np.log(low / high)  # (1 + power) x thickness; 0 where the vapour pressure does not change
+    x = thickness + np.log(
+        low / high
+    )  # (1 + power) x thickness; 0 where the vapour pressure does not change
     share = np.where(x == 0, 1.0, -np.expm1(-x) / np.where(x == 0, 1.0, x))
     return np.asarray(low * pressure[:-1] * thickness * share / (pressure[:-1] - pressure[1:]))

@@ -1,11 +1,12 @@
 """Radiative transfer through a clear atmosphere of layers, in numpy.
 
-Rays are straight and the layers are spherical shells, so a layer at height h is crossed at the airmass
+Rays are straight and the layers are spherical shells, so a layer at height h is crossed at the
+airmass
 
-    m(h) = [1 - (cos(elevation) R / (R + h))^2]^(-1/2)                                                             (1)
+    m(h) = [1 - (cos(elevation) R / (R + h))^2]^(-1/2)                                           (1)
 
-which is 1/sin(elevation) high in the sky and 2-7 % less at 5 deg. Refraction, clouds and scattering are left out: the
-results are as good as am's (see data/README.md), for clear sky.
+which is 1/sin(elevation) high in the sky and 2-7 % less at 5 deg. Refraction, clouds and scattering
+are left out: the results are as good as am's (see data/README.md), for clear sky.
 """
 
 from __future__ import annotations
@@ -37,10 +38,12 @@ VAPOUR_GAS_CONSTANT = BOLTZMANN * AVOGADRO / MOLAR_MASS_WATER
 EARTH_RADIUS = 6.371e6
 """m, mean."""
 OZONE_SPREAD = 4e-4
-"""Neper at zenith: where ozone's opacity scatters by more within a cell, the cell is taken in parts. At 4.5 deg such a cell
-absorbs 1e-5 less than its mean opacity says."""
+"""Neper at zenith: where ozone's opacity scatters by more within a cell, the cell is taken in
+parts. At 4.5 deg such a cell absorbs 1e-5 less than its mean opacity says."""
 ELEVATION_MIN, ELEVATION_MAX = math.radians(4.5), math.radians(90.0)
-"""rad: limits of equation (1) without refraction; a telescope at 5 deg has detectors a little lower."""
+"""rad: limits of equation (1) without refraction; a telescope at 5 deg has detectors a little
+lower.
+"""
 
 
 @dataclass(frozen=True)
@@ -79,41 +82,66 @@ class Layers:
     @property
     def pwv(self) -> float:
         """Precipitable water vapour, m."""
-        return float(np.sum(self.molecules * self.h2o)) * MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY
+        return (
+            float(np.sum(self.molecules * self.h2o)) * MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY
+        )
 
     def scaled(self, pwv: float) -> Layers:
-        """The same layers with all vapour multiplied so that the PWV is ``pwv`` [m]. The pressure stays as it is."""
+        """The same layers with all vapour multiplied so that the PWV is ``pwv`` [m]. The pressure
+        stays as it is.
+        """
         if pwv == 0:
             return replace(self, h2o=np.zeros_like(self.h2o))
         air, h2o = -np.diff(self.pressure) / GRAVITY, self.h2o
-        for _ in range(8):  # the number of molecules depends on the water by a few per mille: converges as 0.005^n
+        for _ in range(
+            8
+        ):  # the number of molecules depends on the water by a few per mille: converges as 0.005^n
             mass = MOLAR_MASS_DRY_AIR + (MOLAR_MASS_WATER - MOLAR_MASS_DRY_AIR) * h2o
             h2o = h2o * (pwv * WATER_DENSITY / (MOLAR_MASS_WATER * np.sum(air * h2o / mass)))
         return replace(self, h2o=h2o)
 
     def cross_sections(self, cells: slice = slice(None)) -> CrossSections:
-        """Cross-sections of each layer at its mean pressure and temperature (independent of the water vapour)."""
-        pressure, temperature = (self.pressure[1:] + self.pressure[:-1]) / 2, (self.temperature[1:] + self.temperature[:-1]) / 2
+        """Cross-sections of each layer at its mean pressure and temperature (independent of the
+        water vapour).
+        """
+        pressure, temperature = (
+            (self.pressure[1:] + self.pressure[:-1]) / 2,
+            (self.temperature[1:] + self.temperature[:-1]) / 2,
+        )
         return self.table.cross_sections(pressure, temperature, cells)
 
     def opacity(self, cross_sections: CrossSections) -> Floats:
         """(n, n_frequency) vertical opacity of each layer, neper."""
         k, water, ozone = cross_sections, self.h2o[:, None], self.o3[:, None]
-        # Linear in the mixing ratio, falling to 0.8 of its dry value at 0.05 at most: it is positive up to 0.25, which no air
-        # holds (a source of more than 0.1 is refused), so nothing is cut.
+        # Linear in the mixing ratio, falling to 0.8 of its dry value at 0.05 at most: it is
+        # positive up to 0.25, which no air holds (a source of more than 0.1 is refused), so nothing
+        # is cut.
         water_section = np.maximum(k.water + water * k.water_self, 0.0)
-        return self.molecules[:, None] * ((1 - water) * k.dry_air + water * water_section + ozone * k.ozone)
+        return self.molecules[:, None] * (
+            (1 - water) * k.dry_air + water * water_section + ozone * k.ozone
+        )
 
     def opacity_of_water(self, cross_sections: CrossSections) -> Floats:
-        """(n, n_frequency) vertical opacity that each layer gains per metre of water [neper / m of PWV] that is added to it.
+        """(n, n_frequency) vertical opacity that each layer gains per metre of water [neper / m of
+        PWV] that is added to it.
 
         The pressure stays: vapour takes the place of dry air, which is lighter by its mass.
         """
         k, water, ozone = cross_sections, self.h2o[:, None], self.o3[:, None]
-        heavier = (MOLAR_MASS_WATER - MOLAR_MASS_DRY_AIR) / (MOLAR_MASS_DRY_AIR * (1 - self.h2o) + MOLAR_MASS_WATER * self.h2o)
-        each = (1 - water) * k.dry_air + water * np.maximum(k.water + water * k.water_self, 0.0) + ozone * k.ozone
-        of_mixing = k.water + 2 * water * k.water_self - k.dry_air - heavier[:, None] * each  # per molecule of air
-        columns = (1 - self.h2o * heavier) * (MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY)  # d PWV / d mixing ratio, likewise
+        heavier = (MOLAR_MASS_WATER - MOLAR_MASS_DRY_AIR) / (
+            MOLAR_MASS_DRY_AIR * (1 - self.h2o) + MOLAR_MASS_WATER * self.h2o
+        )
+        each = (
+            (1 - water) * k.dry_air
+            + water * np.maximum(k.water + water * k.water_self, 0.0)
+            + ozone * k.ozone
+        )
+        of_mixing = (
+            k.water + 2 * water * k.water_self - k.dry_air - heavier[:, None] * each
+        )  # per molecule of air
+        columns = (1 - self.h2o * heavier) * (
+            MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY
+        )  # d PWV / d mixing ratio, likewise
         return np.asarray(of_mixing / columns[:, None], np.float64)
 
     @property
@@ -127,11 +155,16 @@ class Layers:
         return np.asarray((self.height[1:] + self.height[:-1]) / 2 - self.height[0])
 
     def in_parts(self, sections: CrossSections) -> tuple[CrossSections, NDArray[np.intp], Floats]:
-        """Cross-sections with each cell that has narrow ozone lines in parts, (n, n_part); the cell of each part; its share."""
+        """Cross-sections with each cell that has narrow ozone lines in parts, (n, n_part); the cell
+        of each part; its share.
+        """
         column = (self.molecules * self.o3)[:, None] * sections.ozone
         opacity = np.einsum("lf,glf->gf", column, sections.ozone_ratio)
         scatter = np.sqrt(OZONE_PARTS @ (opacity - column.sum(axis=0)) ** 2)
-        lines, smooth = np.flatnonzero(scatter > OZONE_SPREAD), np.flatnonzero(scatter <= OZONE_SPREAD)
+        lines, smooth = (
+            np.flatnonzero(scatter > OZONE_SPREAD),
+            np.flatnonzero(scatter <= OZONE_SPREAD),
+        )
         cell = np.concatenate([smooth, np.repeat(lines, len(OZONE_PARTS))])
         share = np.concatenate([np.ones(len(smooth)), np.tile(OZONE_PARTS, len(lines))])
         ratio = sections.ozone_ratio[:, :, lines].transpose(1, 2, 0).reshape(len(self.o3), -1)
@@ -139,7 +172,13 @@ class Layers:
         ozone[:, len(smooth) :] *= ratio
         k = sections
         return (
-            replace(k, dry_air=k.dry_air[:, cell], water=k.water[:, cell], water_self=k.water_self[:, cell], ozone=ozone),
+            replace(
+                k,
+                dry_air=k.dry_air[:, cell],
+                water=k.water[:, cell],
+                water_self=k.water_self[:, cell],
+                ozone=ozone,
+            ),
             cell,
             share,
         )
@@ -154,11 +193,15 @@ class Layers:
         """
         if not ELEVATION_MIN * (1 - 1e-9) <= elevation <= ELEVATION_MAX * (1 + 1e-9):
             raise InputError(
-                f"an elevation of {math.degrees(elevation):.2f} deg is outside the limits of the radiative transfer, "
-                "4.5 to 90 deg",
+                f"an elevation of {math.degrees(elevation):.2f} deg is outside the limits of the"
+                " radiative transfer, 4.5 to 90 deg",
                 cure="choose a target or a time with a higher elevation",
             )
-        ratio = math.cos(elevation) * (EARTH_RADIUS + self.height[0]) / (EARTH_RADIUS + self.height[0] + self.middle)
+        ratio = (
+            math.cos(elevation)
+            * (EARTH_RADIUS + self.height[0])
+            / (EARTH_RADIUS + self.height[0] + self.middle)
+        )
         return np.asarray(1 / np.sqrt(1 - ratio**2))
 
 
@@ -185,14 +228,17 @@ class Spectrum:
 
     @property
     def cmb(self) -> Floats:
-        """Rayleigh-Jeans brightness of the cosmic microwave background behind the atmosphere, J(2.725 K) e^-tau, K."""
+        """Rayleigh-Jeans brightness of the cosmic microwave background behind the atmosphere,
+        J(2.725 K) e^-tau, K.
+        """
         return rayleigh_jeans(self.frequency, T_CMB) * np.exp(-self.slant_opacity)
 
 
 def emission(slant_opacity: Floats, source: Floats) -> Floats:
-    """Brightness at the ground of layers whose source function is linear in the opacity from boundary to boundary.
+    """Brightness at the ground of layers whose source function is linear in the opacity from
+    boundary to boundary.
 
-        T = sum_i e^-tau_below,i [J_i (1 - e^-t_i) + (J_i+1 - J_i) ((1 - e^-t_i)/t_i - e^-t_i)]                    (2)
+        T = sum_i e^-tau_below,i [J_i (1 - e^-t_i) + (J_i+1 - J_i) ((1 - e^-t_i)/t_i - e^-t_i)]  (2)
 
     Parameters
     ----------
@@ -201,7 +247,9 @@ def emission(slant_opacity: Floats, source: Floats) -> Floats:
     source
         (n + 1, ...) J at the boundaries, K.
     """
-    opacity = np.maximum(slant_opacity, np.finfo(np.float64).tiny)  # so that (1 - e^-t) / t is 1 where t is 0
+    opacity = np.maximum(
+        slant_opacity, np.finfo(np.float64).tiny
+    )  # so that (1 - e^-t) / t is 1 where t is 0
     absorbed = np.expm1(-opacity)
     np.negative(absorbed, out=absorbed)
     mean = np.divide(absorbed, opacity, out=opacity)
@@ -217,10 +265,11 @@ def emission(slant_opacity: Floats, source: Floats) -> Floats:
 
 
 def emission_slopes(slant_opacity: Floats, source: Floats) -> Floats:
-    """(n, ...) derivatives of `emission` with respect to the opacity t_i of each layer, K: what the layer itself emits more, less
-    what it takes from those above it,
+    """(n, ...) derivatives of `emission` with respect to the opacity t_i of each layer, K: what the
+    layer itself emits more, less what it takes from those above it,
 
-        dT/dt_i = e^-tau_below,i [J_i e^-t + (J_i+1 - J_i) (e^-t / t - (1 - e^-t) / t^2 + e^-t)] - sum_k>i T_k           (3)
+        dT/dt_i = e^-tau_below,i [J_i e^-t + (J_i+1 - J_i) (e^-t / t - (1 - e^-t) / t^2 + e^-t)]
+                   - sum_k>i T_k                                                   (3)
     """
     t = np.maximum(slant_opacity, 0.0)
     passed, absorbed = np.exp(-t), -np.expm1(-t)
@@ -236,8 +285,11 @@ def emission_slopes(slant_opacity: Floats, source: Floats) -> Floats:
     return np.asarray(below * (source[:-1] * passed + step * (rise + passed)) - above, np.float64)
 
 
-def spectrum(layers: Layers, elevation: float, *, low: float | None = None, high: float | None = None) -> Spectrum:
-    """Opacity and brightness between two frequencies [Hz] (default: the whole table) at an elevation [rad].
+def spectrum(
+    layers: Layers, elevation: float, *, low: float | None = None, high: float | None = None
+) -> Spectrum:
+    """Opacity and brightness between two frequencies [Hz] (default: the whole table) at an
+    elevation [rad].
 
     Raises
     ------
@@ -251,6 +303,9 @@ def spectrum(layers: Layers, elevation: float, *, low: float | None = None, high
     sections = layers.cross_sections(cells)
     vertical = layers.opacity(sections)
     parts, cell, share = layers.in_parts(sections)
-    seen = emission(layers.opacity(parts) * airmass, rayleigh_jeans(frequency, layers.temperature[:, None])[:, cell])
+    seen = emission(
+        layers.opacity(parts) * airmass,
+        rayleigh_jeans(frequency, layers.temperature[:, None])[:, cell],
+    )
     brightness = np.bincount(cell, share * seen, len(frequency)).astype(np.float64)
     return Spectrum(frequency, vertical.sum(axis=0), (vertical * airmass).sum(axis=0), brightness)

@@ -1,4 +1,6 @@
-"""The built-in weather sources, and the profile of a scene, from its source, site, time, PWV and seed."""
+"""The built-in weather sources, and the profile of a scene, from its source, site, time, PWV and
+seed.
+"""
 
 from __future__ import annotations
 
@@ -43,14 +45,20 @@ class Climatology(WeatherSource):
 
 
 class Standard(WeatherSource):
-    """The US Standard Atmosphere 1976 with a west wind, whatever the place and season: give its PWV."""
+    """The US Standard Atmosphere 1976 with a west wind, whatever the place and season: give its
+    PWV.
+    """
 
     source: Literal["standard"] = "standard"
     """Registered name."""
 
     def column(self, site: Site, time: Instant) -> Column:
         if self.pwv is None or self.pwv.metres is None:
-            raise InputError("the standard atmosphere has no PWV of its own", place="weather", cure="give pwv, e.g. 3 mm")
+            raise InputError(
+                "the standard atmosphere has no PWV of its own",
+                place="weather",
+                cure="give pwv, e.g. 3 mm",
+            )
         return standard_column(site)
 
 
@@ -60,7 +68,9 @@ class Era5(WeatherSource):
     source: Literal["era5"] = "era5"
     """Registered name."""
     file: InputPath
-    """NetCDF file of `reanalysis-era5-pressure-levels`: t, q (or r), u, v, z, and o3 where it has it."""
+    """NetCDF file of `reanalysis-era5-pressure-levels`: t, q (or r), u, v, z, and o3 where it has
+    it.
+    """
 
     def column(self, site: Site, time: Instant) -> Column:
         return read_era5(self.file, site, time)
@@ -72,17 +82,23 @@ class Table(WeatherSource):
     source: Literal["table"] = "table"
     """Registered name."""
     table: InputPath
-    """CSV with a header, e.g. `height [m], pressure [hPa], temperature [K], relative humidity [%]`; see docs/weather.md."""
+    """CSV with a header, e.g. `height [m], pressure [hPa], temperature [K], relative humidity [%]`;
+    see docs/weather.md.
+    """
 
     def column(self, site: Site, time: Instant) -> Column:
         return read_table(self.table, site)
 
 
 DRY = 1e-12
-"""m: PWV that a profile of 0 mm is given, so that the vapour keeps its shape; it absorbs 1e-9 of what a millimetre does."""
+"""m: PWV that a profile of 0 mm is given, so that the vapour keeps its shape; it absorbs 1e-9 of
+what a millimetre does.
+"""
 
 
-def profile_of(weather: WeatherSource | None, site: Site, time: Instant, seed: int, pwv: float | None = None) -> Profile:
+def profile_of(
+    weather: WeatherSource | None, site: Site, time: Instant, seed: int, pwv: float | None = None
+) -> Profile:
     """The profile of a scene; its ``stated`` says what was used, and why.
 
     Parameters
@@ -97,29 +113,41 @@ def profile_of(weather: WeatherSource | None, site: Site, time: Instant, seed: i
     Raises
     ------
     InputError
-        Two different PWVs, a quantile where the source knows no distribution, and what the source raises.
+        Two different PWVs, a quantile where the source knows no distribution, and what the source
+        raises.
     """
     weather = Climatology() if weather is None else weather
     if pwv is not None:
         check_pwv(pwv)
         if weather.pwv is not None and weather.pwv.metres != pwv:
             raise InputError(
-                f"the PWV is given twice: {pwv * 1e3:g} mm by the operator, {weather.pwv} by the scene's weather",
+                f"the PWV is given twice: {pwv * 1e3:g} mm by the operator, {weather.pwv} by the"
+                " scene's weather",
                 place="weather",
                 cure="remove pwv from AtmosphereLayers or from weather",
             )
-    without_climatology = isinstance(weather, Climatology) and site.climatology is None and pwv is not None
-    profile = on_heights(standard_column(site) if without_climatology else weather.column(site, time), site)
+    without_climatology = (
+        isinstance(weather, Climatology) and site.climatology is None and pwv is not None
+    )
+    profile = on_heights(
+        standard_column(site) if without_climatology else weather.column(site, time), site
+    )
     profile, how = _scaled(profile, weather, seed, pwv)
     profile, wind = _blown(profile, weather, seed)
-    return replace(profile, stated=(*profile.stated, ("PWV", how), *_supersaturated(profile), ("wind", wind)))
+    return replace(
+        profile, stated=(*profile.stated, ("PWV", how), *_supersaturated(profile), ("wind", wind))
+    )
 
 
 def on_the_ground(profile: Profile, time: Instant, wind: AnyFloats | None = None) -> GroundWeather:
-    """What instruments at the telescope read; ``wind`` (east, north) [m/s] where it is not the profile's."""
+    """What instruments at the telescope read; ``wind`` (east, north) [m/s] where it is not the
+    profile's.
+    """
     ground, air = profile.at(0.0), profile.at(10.0)
     vapour, temperature = float(air.vapour_density), float(air.temperature)
-    dry = (float(air.pressure) - vapour * VAPOUR_GAS_CONSTANT * temperature) / (DRY_AIR_GAS_CONSTANT * temperature)
+    dry = (float(air.pressure) - vapour * VAPOUR_GAS_CONSTANT * temperature) / (
+        DRY_AIR_GAS_CONSTANT * temperature
+    )
     east, north = (air.wind_east, air.wind_north) if wind is None else wind
     return GroundWeather(
         time=time.posix,
@@ -146,11 +174,16 @@ def _supersaturated(profile: Profile) -> tuple[tuple[str, str], ...]:
         return ()
     most = float((profile.h2o / saturated)[over].max())
     share = 1 - replace(profile, h2o=np.minimum(profile.h2o, saturated)).pwv / profile.pwv
-    text = f"at {np.count_nonzero(over)} of {len(over)} levels, up to {most:.0%}; {share:.2%} of the column is above saturation"
+    text = (
+        f"at {np.count_nonzero(over)} of {len(over)} levels, up to {most:.0%}; {share:.2%} of the"
+        " column is above saturation"
+    )
     return (("relative humidity above 100 %", f"{text}; taken as it is"),)
 
 
-def _scaled(profile: Profile, weather: WeatherSource, seed: int, pwv: float | None) -> tuple[Profile, str]:
+def _scaled(
+    profile: Profile, weather: WeatherSource, seed: int, pwv: float | None
+) -> tuple[Profile, str]:
     given = weather.pwv
     if pwv is not None or (given is not None and given.metres is not None):
         wanted = pwv if pwv is not None else given.metres if given is not None else None
@@ -161,15 +194,26 @@ def _scaled(profile: Profile, weather: WeatherSource, seed: int, pwv: float | No
     law = profile.distribution
     if law is None:
         raise InputError(
-            f"a PWV of '{given}' needs a distribution, and source '{weather.source}' has one state of the atmosphere only",
+            f"a PWV of '{given}' needs a distribution, and source '{weather.source}' has one state"
+            " of the atmosphere only",
             place="weather",
             cure="give the PWV in mm, or leave it away to take the source's own",
         )
-    quantile = given.quantile if given.quantile is not None else float(uniforms(stream_key(seed, "weather", "pwv"), 0, 1)[0])
+    quantile = (
+        given.quantile
+        if given.quantile is not None
+        else float(uniforms(stream_key(seed, "weather", "pwv"), 0, 1)[0])
+    )
     wanted = law.at(quantile)
     low, high = law.at(0.25) * 1e3, law.at(0.75) * 1e3
-    text = f"{wanted * 1e3:.4g} mm, the {100 * quantile:.4g} % quantile{'' if given.quantile is not None else ' (drawn)'}"
-    season = f"of that season and hour: median {law.median * 1e3:.4g} mm, half the days between {low:.3g} and {high:.3g} mm"
+    text = (
+        f"{wanted * 1e3:.4g} mm, the {100 * quantile:.4g} %"
+        f" quantile{'' if given.quantile is not None else ' (drawn)'}"
+    )
+    season = (
+        f"of that season and hour: median {law.median * 1e3:.4g} mm, half the days between"
+        f" {low:.3g} and {high:.3g} mm"
+    )
     return profile.scaled(wanted), f"{text} {season}"
 
 
@@ -181,5 +225,11 @@ def _blown(profile: Profile, weather: WeatherSource, seed: int) -> tuple[Profile
     if weather.wind == "typical":
         return profile.typical_wind, "median speed along the median direction"
     z = [float(x) for x in normals(stream_key(seed, "weather", "wind"), 0, 2)]
-    east, north = profile.wind_east + z[0] * profile.wind_east_spread, profile.wind_north + z[1] * profile.wind_north_spread
-    return replace(profile, wind_east=east, wind_north=north), f"drawn: medians {z[0]:+.2f}, {z[1]:+.2f} spreads (east, north)"
+    east, north = (
+        profile.wind_east + z[0] * profile.wind_east_spread,
+        profile.wind_north + z[1] * profile.wind_north_spread,
+    )
+    return (
+        replace(profile, wind_east=east, wind_north=north),
+        f"drawn: medians {z[0]:+.2f}, {z[1]:+.2f} spreads (east, north)",
+    )

@@ -1,4 +1,6 @@
-"""The US Standard Atmosphere 1976: used where nothing better is known, and above what a source reaches."""
+"""The US Standard Atmosphere 1976: used where nothing better is known, and above what a source
+reaches.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +23,35 @@ TEMPERATURE = np.array([294.65, 288.15, 216.65, 216.65, 228.65, 270.65])
 SEA_LEVEL_PRESSURE = 101325.0
 """Pa."""
 
-OZONE_HEIGHT = 1e3 * np.array([0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 27.5, 30, 32.5, 35, 37.5, 40, 45, 50])
+OZONE_HEIGHT = 1e3 * np.array(
+    [0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 27.5, 30, 32.5, 35, 37.5, 40, 45, 50]
+)
 """m above sea level."""
 OZONE = 1e-6 * np.array(
-    [.027, .032, .034, .041, .06, .13, .31, .50, .87, 1.6, 2.6, 3.6, 4.6, 5.8, 6.6, 7.4, 7.8, 7.8, 7.3, 5.3, 3.1]
-)  # fmt: skip
+    [
+        0.027,
+        0.032,
+        0.034,
+        0.041,
+        0.06,
+        0.13,
+        0.31,
+        0.50,
+        0.87,
+        1.6,
+        2.6,
+        3.6,
+        4.6,
+        5.8,
+        6.6,
+        7.4,
+        7.8,
+        7.8,
+        7.3,
+        5.3,
+        3.1,
+    ]
+)
 """Volume mixing ratio (AFGL-TR-86-0110, US standard, rounded)."""
 
 VAPOUR_SCALE_HEIGHT = 2e3
@@ -49,11 +75,15 @@ def pressure(height: ArrayLike) -> Floats:
     step = np.diff(fine) * GRAVITY / DRY_AIR_GAS_CONSTANT / temperature((fine[1:] + fine[:-1]) / 2)
     logarithm = np.concatenate([[0.0], -np.cumsum(step)])
     at_sea_level = np.interp(0.0, fine, logarithm)
-    return np.asarray(SEA_LEVEL_PRESSURE * np.exp(np.interp(np.asarray(height, np.float64), fine, logarithm) - at_sea_level))
+    return np.asarray(
+        SEA_LEVEL_PRESSURE
+        * np.exp(np.interp(np.asarray(height, np.float64), fine, logarithm) - at_sea_level)
+    )
 
 
 def misplaced(pressures: Floats, height: Floats) -> int | None:
-    """The first level whose pressure [Pa] no air has at its height [m above sea level]: a unit is wrong. None: there is none.
+    """The first level whose pressure [Pa] no air has at its height [m above sea level]: a unit is
+    wrong. None: there is none.
 
     Off by more than `OFF`, where weather moves a level by less than half of that.
     """
@@ -64,7 +94,9 @@ def misplaced(pressures: Floats, height: Floats) -> int | None:
 
 
 def wind_speed(above_ground: ArrayLike) -> Floats:
-    """Wind where there is none in the profile, m/s: 8 + 30 exp(-((h - 9400 m) / 4800 m)^2), h above the ground."""
+    """Wind where there is none in the profile, m/s: 8 + 30 exp(-((h - 9400 m) / 4800 m)^2), h above
+    the ground.
+    """
     return 8 + 30 * np.exp(-(((np.asarray(above_ground, np.float64) - 9400) / 4800) ** 2))
 
 
@@ -75,7 +107,9 @@ def ozone(pressures: ArrayLike) -> Floats:
 
 
 def standard_column(site: Site) -> Column:
-    """The standard atmosphere above a site, a west wind, and 10 mm of water at sea level: to be scaled to the PWV wanted."""
+    """The standard atmosphere above a site, a west wind, and 10 mm of water at sea level: to be
+    scaled to the PWV wanted.
+    """
     low = site.altitude + np.array([-100.0, 0, 250, 500, 1000, 1500])
     height = np.concatenate([low, np.arange(site.altitude + 2e3, 47e3, 1e3)])
     t, p = temperature(height), pressure(height)
@@ -87,16 +121,26 @@ def standard_column(site: Site) -> Column:
         h2o=np.maximum(density * VAPOUR_GAS_CONSTANT * t / p, STRATOSPHERIC_WATER),
         wind_east=wind_speed(np.maximum(height - site.altitude, 0.0)),
         wind_north=np.zeros_like(height),
-        stated="US Standard Atmosphere 1976: temperatures may be 30 K off at the poles, the wind is a guess",
+        stated=(
+            "US Standard Atmosphere 1976: temperatures may be 30 K off at the poles, the wind is a"
+            " guess"
+        ),
     )
 
 
-def upper_levels(top_height: float, top_pressure: float, top_temperature: float) -> tuple[Floats, Floats, Floats]:
-    """(height, pressure, temperature) above a source's highest level up to 31 km, with the standard lapse rates."""
+def upper_levels(
+    top_height: float, top_pressure: float, top_temperature: float
+) -> tuple[Floats, Floats, Floats]:
+    """(height, pressure, temperature) above a source's highest level up to 31 km, with the standard
+    lapse rates.
+    """
     height = np.arange(top_height + 1e3, 31.5e3, 1e3)
     if top_pressure < EXTEND_BELOW or not height.size:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     t = top_temperature + temperature(height) - temperature(top_height)
-    edges_h, edges_t = np.concatenate([[top_height], height]), np.concatenate([[top_temperature], t])
+    edges_h, edges_t = (
+        np.concatenate([[top_height], height]),
+        np.concatenate([[top_temperature], t]),
+    )
     step = np.diff(edges_h) * GRAVITY / DRY_AIR_GAS_CONSTANT / ((edges_t[1:] + edges_t[:-1]) / 2)
     return height, top_pressure * np.exp(-np.cumsum(step)), t

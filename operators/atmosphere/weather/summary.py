@@ -32,7 +32,9 @@ MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", 
 
 @dataclass(frozen=True)
 class PwvByMonth:
-    """PWV [m] on the 15th of each month: ``median`` (12, n_hour), and the mean over the hours of ``quantiles`` (12, 5)."""
+    """PWV [m] on the 15th of each month: ``median`` (12, n_hour), and the mean over the hours of
+    ``quantiles`` (12, 5).
+    """
 
     median: Floats
     quantiles: Floats
@@ -43,7 +45,9 @@ def pwv_by_month(site: Site, year: int = 2023) -> PwvByMonth:
     median, quantiles = np.empty((12, len(HOURS))), np.zeros((12, len(QUANTILES)))
     for month in range(12):
         for k, hour in enumerate(HOURS):
-            law = climatology.profile(site, Instant.parse(f"{year}-{month + 1:02d}-15T{hour:02d}:00Z")).distribution
+            law = climatology.profile(
+                site, Instant.parse(f"{year}-{month + 1:02d}-15T{hour:02d}:00Z")
+            ).distribution
             assert law is not None  # the climatology has spreads
             median[month, k] = law.median
             quantiles[month] += np.array([law.at(q) for q in QUANTILES]) / len(HOURS)
@@ -51,12 +55,20 @@ def pwv_by_month(site: Site, year: int = 2023) -> PwvByMonth:
 
 
 def pwv_steps(profile: Profile) -> list[float]:
-    """The PWVs [m] for which spectra are shown: the profile's own among round values from very dry to very wet there."""
+    """The PWVs [m] for which spectra are shown: the profile's own among round values from very dry
+    to very wet there.
+    """
     law = profile.distribution
-    low, high = (law.at(0.05), law.at(0.95)) if law is not None else (profile.pwv / 3, min(3 * profile.pwv, PWV_MAX))
+    low, high = (
+        (law.at(0.05), law.at(0.95))
+        if law is not None
+        else (profile.pwv / 3, min(3 * profile.pwv, PWV_MAX))
+    )
     rounded = {float(f"{low * (high / low) ** (k / 3):.1g}") for k in range(4)}
     return (
-        sorted(p for p in {*rounded, profile.pwv} if p == profile.pwv or abs(p / profile.pwv - 1) > 0.2)
+        sorted(
+            p for p in {*rounded, profile.pwv} if p == profile.pwv or abs(p / profile.pwv - 1) > 0.2
+        )
         if profile.pwv > 0
         else [0.0, 1e-3]
     )
@@ -64,7 +76,10 @@ def pwv_steps(profile: Profile) -> list[float]:
 
 def place_lines(site: Site, time: Instant, profile: Profile) -> list[str]:
     """Where and when, and where the profile comes from."""
-    where = f"{math.degrees(site.latitude):.4f} deg, {math.degrees(site.longitude):.4f} deg, {site.altitude:g} m"
+    where = (
+        f"{math.degrees(site.latitude):.4f} deg, {math.degrees(site.longitude):.4f} deg,"
+        f" {site.altitude:g} m"
+    )
     head = f"{site.name}: {site.description}" if site.description else site.name
     return [head, f"{where}; {time}", *(f"{what}: {text}" for what, text in profile.stated)]
 
@@ -80,18 +95,26 @@ def profile_lines(profile: Profile) -> list[str]:
         east, north = float(a.wind_east), float(a.wind_north)
         direction = math.degrees(math.atan2(-east, -north)) % 360
         lines.append(
-            f"{h:12.0f} {float(a.pressure) / 100:10.1f} {float(a.temperature):12.1f} {float(a.vapour_density) * 1e3:8.3g} "
-            f"{math.hypot(east, north):8.1f} {direction:9.0f}"
+            f"{h:12.0f} {float(a.pressure) / 100:10.1f} {float(a.temperature):12.1f}"
+            f" {float(a.vapour_density) * 1e3:8.3g} {math.hypot(east, north):8.1f} {direction:9.0f}"
         )
     return lines
 
 
 def pwv_lines(water: PwvByMonth) -> list[str]:
     """A table of the PWV by month and hour."""
-    head = "".join(f"{f'{hour:02d}h':>7}" for hour in HOURS) + "  |" + "".join(f"{f'{100 * q:g} %':>7}" for q in QUANTILES)
+    head = (
+        "".join(f"{f'{hour:02d}h':>7}" for hour in HOURS)
+        + "  |"
+        + "".join(f"{f'{100 * q:g} %':>7}" for q in QUANTILES)
+    )
     lines = ["PWV [mm]: median by hour (UTC), and quantiles of the month", "     " + head]
     for month, medians, quantiles in zip(MONTHS, water.median, water.quantiles, strict=True):
-        row = "".join(f"{_short(p)}" for p in medians) + "  |" + "".join(f"{_short(p)}" for p in quantiles)
+        row = (
+            "".join(f"{_short(p)}" for p in medians)
+            + "  |"
+            + "".join(f"{_short(p)}" for p in quantiles)
+        )
         lines.append(f"{month}  {row}")
     return lines
 
@@ -103,12 +126,20 @@ def band_lines(profile: Profile, bands: Iterable[Band], elevation: float) -> lis
     lines = [f"{at}: emission of the atmosphere (background 0 K), transmission, opacity"]
     for band in bands:
         seen = BandAtmosphere(band, profile, min(max(*steps, 1e-4) * 1.01, PWV_MAX))
-        lines.append(f"  {band.name} ({band.frequency[0] / 1e9:g} to {band.frequency[-1] / 1e9:g} GHz)")
+        lines.append(
+            f"  {band.name} ({band.frequency[0] / 1e9:g} to {band.frequency[-1] / 1e9:g} GHz)"
+        )
         for pwv in steps:
             mark = "  <" if pwv == profile.pwv else ""
-            kelvin, passed = float(seen.emission(pwv, elevation)), float(seen.transmission(pwv, elevation))
+            kelvin, passed = (
+                float(seen.emission(pwv, elevation)),
+                float(seen.transmission(pwv, elevation)),
+            )
             opacity = float(seen.opacity(pwv, elevation))
-            lines.append(f"    PWV {_short(pwv)} mm: {kelvin:7.2f} K_RJ, {_fraction(passed)}, {opacity:.4g}{mark}")
+            lines.append(
+                f"    PWV {_short(pwv)} mm: {kelvin:7.2f} K_RJ, {_fraction(passed)},"
+                f" {opacity:.4g}{mark}"
+            )
     return lines
 
 

@@ -1,4 +1,6 @@
-"""Maps that are compared: from FITS files of any origin and from products; and their comparison as a FITS file and tables."""
+"""Maps that are compared: from FITS files of any origin and from products; and their comparison as
+a FITS file and tables.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,12 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.measured_noise import ELSEWHERE
 from zonda.core.maps.noise_figures import FREE
 from zonda.core.maps.stokes import IQU
-from zonda.core.maps.stokes_names import along_axis, columns_of_q_and_u, intensity_column, pixel_column
+from zonda.core.maps.stokes_names import (
+    along_axis,
+    columns_of_q_and_u,
+    intensity_column,
+    pixel_column,
+)
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
@@ -51,7 +58,10 @@ NOISES = {
 }
 """Of a file's extensions and columns: standard errors, or variances; and noise alone."""
 FLUXES = ("Jy/pixel", "Jy/beam", "MJy/sr")
-CURE = "give a FITS file with a two-dimensional image that has a celestial WCS, or with a HEALPix table"
+CURE = (
+    "give a FITS file with a two-dimensional image that has a celestial WCS, or with a HEALPix"
+    " table"
+)
 
 
 @dataclass(frozen=True)
@@ -82,7 +92,9 @@ class ReadMap:
     measured_in: dict[str, str] = field(default_factory=dict)
 
     def is_of_the_band_of(self, other: ReadMap) -> bool:
-        """False where the frequencies that both state differ, or the names where one of them states no frequency."""
+        """False where the frequencies that both state differ, or the names where one of them states
+        no frequency.
+        """
         if self.frequency and other.frequency:
             return math.isclose(self.frequency, other.frequency, rel_tol=SAME_BAND)
         return not (self.band and other.band) or self.band == other.band
@@ -90,7 +102,12 @@ class ReadMap:
     @property
     def band_in_words(self) -> str:
         """Name and frequency, as far as they are stated."""
-        return " ".join([*([self.band] if self.band else []), *([f"{self.frequency / 1e9:.4g} GHz"] if self.frequency else [])])
+        return " ".join(
+            [
+                *([self.band] if self.band else []),
+                *([f"{self.frequency / 1e9:.4g} GHz"] if self.frequency else []),
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -102,12 +119,13 @@ class Wanted:
     hdu
         Extension by name or number; None: the first image or HEALPix table.
     plane
-        Of a cube, counted from 1, in FITS's order of the axes behind the first two; None: it has to be the only one,
-        or I of Stokes parameters.
+        Of a cube, counted from 1, in FITS's order of the axes behind the first two; None: it has to
+        be the only one, or I of Stokes parameters.
     coordsys
         Of a HEALPix table: C, G or E; None: that of its header.
     shared
-        Plane and system are those of another file, too: where they do not apply to this one, they are left out.
+        Plane and system are those of another file, too: where they do not apply to this one, they
+        are left out.
     """
 
     hdu: int | str | None = None
@@ -117,21 +135,24 @@ class Wanted:
 
 
 def read_planes(path: Path, name: str = "", wanted: Wanted | None = None) -> ReadMap:
-    """An image or HEALPix table of a FITS file with its noise (extension or column NOISE, or COV_II); Q and U beside it.
+    """An image or HEALPix table of a FITS file with its noise (extension or column NOISE, or
+    COV_II); Q and U beside it.
 
-    Q and U are further planes along an axis STOKES, extensions or columns with their names. They are taken as COSMO or IAU by
-    POLCCONV; of a HEALPix table without it as COSMO, of an image without it not at all. Axes of length one are dropped. A file
-    without BUNIT has no unit (an empty text), one without BMAJ no known beam.
+    Q and U are further planes along an axis STOKES, extensions or columns with their names. They
+    are taken as COSMO or IAU by POLCCONV; of a HEALPix table without it as COSMO, of an image
+    without it not at all. Axes of length one are dropped. A file without BUNIT has no unit (an
+    empty text), one without BMAJ no known beam.
 
-    What holds noise alone is taken from the map of all but the sky that a run wrote beside it (``source_free_NAME.fits``), else
-    from HALF_DIFFERENCE; where neither is there, the factor on the noise that the header states (NOISEFAC).
+    What holds noise alone is taken from the map of all but the sky that a run wrote beside it
+    (``source_free_NAME.fits``), else from HALF_DIFFERENCE; where neither is there, the factor on
+    the noise that the header states (NOISEFAC).
 
     Raises
     ------
     InputError
-        Unreadable; no image of the sky in it; a cube of which no plane is wanted; an unknown unit or frame; a HEALPix table
-        without NSIDE, ORDERING or COORDSYS, or of which no column is I; cards that are no numbers; a beam far wider
-        than the image.
+        Unreadable; no image of the sky in it; a cube of which no plane is wanted; an unknown unit
+        or frame; a HEALPix table without NSIDE, ORDERING or COORDSYS, or of which no column is I;
+        cards that are no numbers; a beam far wider than the image.
     """
     read = _read(path, name, wanted or Wanted())
     beside = path.with_name(f"source_free_{path.name}")
@@ -141,8 +162,18 @@ def read_planes(path: Path, name: str = "", wanted: Wanted | None = None) -> Rea
     made = {}
     for key, plane in read.planes.items():
         found = free.planes.get(key)
-        alike = found is not None and free.own and found.unit == plane.unit and _on_one_grid(found, plane)
-        if alike and found is not None and plane.noise is not None and read.measured_in.get(key) == FREE:
+        alike = (
+            found is not None
+            and free.own
+            and found.unit == plane.unit
+            and _on_one_grid(found, plane)
+        )
+        if (
+            alike
+            and found is not None
+            and plane.noise is not None
+            and read.measured_in.get(key) == FREE
+        ):
             white = plane.noise / (plane.factor or 1.0)
             plane = replace(plane, noise=white, alone=found.values, alone_of=FREE, factor=None)
         made[key] = plane
@@ -166,10 +197,18 @@ def _read(path: Path, name: str, wanted: Wanted) -> ReadMap:
         check_size(path, hdu, place)
         if not _is_healpix(hdu):
             if wanted.coordsys is not None and not wanted.shared:
-                raise InputError("coordsys is for HEALPix maps", place=place, cure="remove it: CTYPE says what an image's are")
-            return _told(name or path.name, hdu.header, True, _images(hdus, hdu, wanted, place), place)
+                raise InputError(
+                    "coordsys is for HEALPix maps",
+                    place=place,
+                    cure="remove it: CTYPE says what an image's are",
+                )
+            return _told(
+                name or path.name, hdu.header, True, _images(hdus, hdu, wanted, place), place
+            )
         if wanted.plane is not None and not wanted.shared:
-            raise InputError("plane is for images, and this is a HEALPix table", place=place, cure="remove it")
+            raise InputError(
+                "plane is for images, and this is a HEALPix table", place=place, cure="remove it"
+            )
         return _told(name or path.name, hdu.header, False, _healpix(hdu, wanted, place), place)
 
 
@@ -179,23 +218,43 @@ def _is_healpix(hdu: Any) -> bool:
 
 def _chosen(hdus: Any, wanted: int | str | None, place: str) -> Any:
     """The extension that is ``wanted``, or the first that is a map."""
-    maps = [hdu for hdu in hdus if _is_healpix(hdu) or (hdu.is_image and hdu.header.get("NAXIS", 0) >= 2)]
+    maps = [
+        hdu
+        for hdu in hdus
+        if _is_healpix(hdu) or (hdu.is_image and hdu.header.get("NAXIS", 0) >= 2)
+    ]
     if wanted is None:
         if not maps:
-            raise InputError("is not a map: it holds no image of two axes and no HEALPix table", place=place, cure=CURE)
+            raise InputError(
+                "is not a map: it holds no image of two axes and no HEALPix table",
+                place=place,
+                cure=CURE,
+            )
         return maps[0]
-    found = [hdu for k, hdu in enumerate(hdus) if str(wanted).strip().upper() in (str(k), str(hdu.name).upper())]
+    found = [
+        hdu
+        for k, hdu in enumerate(hdus)
+        if str(wanted).strip().upper() in (str(k), str(hdu.name).upper())
+    ]
     if not found or not any(found[0] is one for one in maps):
-        there = ", ".join(f"{k}{f' {hdu.name}' if hdu.name else ''}" for k, hdu in enumerate(hdus) if any(hdu is m for m in maps))
+        there = ", ".join(
+            f"{k}{f' {hdu.name}' if hdu.name else ''}"
+            for k, hdu in enumerate(hdus)
+            if any(hdu is m for m in maps)
+        )
         what = "is neither an image of two axes nor a HEALPix table" if found else "is not there"
-        raise InputError(f"the extension {wanted} {what}", place=place, cure=f"set hdu to one of these: {there or 'none'}")
+        raise InputError(
+            f"the extension {wanted} {what}",
+            place=place,
+            cure=f"set hdu to one of these: {there or 'none'}",
+        )
     return found[0]
 
 
 @dataclass(frozen=True)
 class Found:
-    """Planes of a file as they are: ``where`` they are (celestial header, or HEALPix pixels), their ``unit``, and factors on the
-    noise that headers state, by plane."""
+    """Planes of a file as they are: ``where`` they are (celestial header, or HEALPix pixels), their
+    ``unit``, and factors on the noise that headers state, by plane."""
 
     where: Any
     values: dict[str, Floats]
@@ -209,15 +268,24 @@ def _told(name: str, about: Any, image: bool, found: Found, place: str) -> ReadM
     """With what the header ``about`` says of the planes."""
     label, factor = "", 1.0
     if unit := str(found.unit or "").strip():
-        label, factor = parse_unit(unit, place=place, temperature_scale=text(about, "TEMPSCAL", place) or None)
+        label, factor = parse_unit(
+            unit, place=place, temperature_scale=text(about, "TEMPSCAL", place) or None
+        )
     major = number(about, "BMAJ", place)
     minor = number(about, "BMIN", place) or major
-    fwhm = math.radians(math.sqrt(major * minor)) if major and minor and major > 0 and minor > 0 else None
+    fwhm = (
+        math.radians(math.sqrt(major * minor))
+        if major and minor and major > 0 and minor > 0
+        else None
+    )
     hertz = number(about, "RESTFRQ", place) or number(about, "RESTFREQ", place)
     convention = (text(about, "POLCCONV", place) or ("" if image else "COSMO")).upper()
     values, notes = found.values, list(found.notes)
     if "Q" in values and convention not in ("COSMO", "IAU"):
-        notes.append(f"Q and U: not compared: {name} has them and no POLCCONV; set that header key to COSMO or IAU")
+        notes.append(
+            f"Q and U: not compared: {name} has them and no POLCCONV; set that header key to COSMO"
+            " or IAU"
+        )
         values = {key: plane for key, plane in values.items() if key not in ("Q", "U")}
     planes: dict[str, Plane] = {}
     for key in IQU:
@@ -233,14 +301,26 @@ def _told(name: str, about: Any, image: bool, found: Found, place: str) -> ReadM
             elif own is not None and noise is not None:
                 noise = noise * own
             plane = Plane(
-                name if key == "I" else f"{name} {key}", sign * values[key], found.where if image else None, "", fwhm, noise,
-                None if image else found.where, 0.0, alone, words, own, quiet=quiet,
-            )  # fmt: skip
+                name if key == "I" else f"{name} {key}",
+                sign * values[key],
+                found.where if image else None,
+                "",
+                fwhm,
+                noise,
+                None if image else found.where,
+                0.0,
+                alone,
+                words,
+                own,
+                quiet=quiet,
+            )
             planes[key] = plane.scaled(factor, label)
     if fwhm and image and planes:
         first = next(iter(planes.values()))
         across = max(n * side for n, side in zip(first.values.shape, first.grid.sides, strict=True))
-        check_width(fwhm, across, place, "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them")
+        check_width(
+            fwhm, across, place, "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them"
+        )
     origin = text(about, "ORIGIN", place).lower() == "zonda"
     return ReadMap(
         planes,
@@ -253,7 +333,9 @@ def _told(name: str, about: Any, image: bool, found: Found, place: str) -> ReadM
 
 
 def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
-    """A plane or a cube of Stokes parameters, or extensions: with their noise and what holds noise alone."""
+    """A plane or a cube of Stokes parameters, or extensions: with their noise and what holds noise
+    alone.
+    """
     from astropy.wcs import WCS
 
     header, frame = with_known_frame(hdu.header, place)
@@ -261,13 +343,25 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
     wcs = WCS(header)
     if not wcs.has_celestial:
         kinds = ", ".join(str(header.get(f"CTYPE{k}", "none")) for k in (1, 2))
-        raise InputError(f"is not a map: it has no celestial coordinates (CTYPE: {kinds})", place=place, cure=CURE)
+        raise InputError(
+            f"is not a map: it has no celestial coordinates (CTYPE: {kinds})",
+            place=place,
+            cure=CURE,
+        )
     stokes, index, note = _plane_of(header, shape, wanted, place)
     values = np.asarray(hdu.data[index], np.float64)
     names = along_axis(header, stokes, shape[len(shape) - stokes]) if stokes else ["I"]
-    found = {key: plane for key, plane in zip(names, values.reshape(-1, *shape[-2:]), strict=True) if key in ("I", "Q", "U")}
+    found = {
+        key: plane
+        for key, plane in zip(names, values.reshape(-1, *shape[-2:]), strict=True)
+        if key in ("I", "Q", "U")
+    }
     if "I" not in found:
-        raise InputError(f"its axis STOKES has {', '.join(names)} and no I", place=place, cure="give a map of I, Q and U")
+        raise InputError(
+            f"its axis STOKES has {', '.join(names)} and no I",
+            place=place,
+            cure="give a map of I, Q and U",
+        )
     stated: dict[str, tuple[float, str]] = {}
     halves = "of two halves"
     first = wanted.hdu is None and len(names) == 1  # the extensions beside it are of it
@@ -284,38 +378,64 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
     both = found.keys() >= {"Q", "U"}
     kept = {k: v for k, v in found.items() if both or k[-1] == "I"}
     notes = [f"{what}: {said}" for what, said in (("plane", note), ("frame", frame)) if said]
-    return Found(wcs.celestial.to_header(relax=True), kept, header.get("BUNIT"), stated, notes, halves)
+    return Found(
+        wcs.celestial.to_header(relax=True), kept, header.get("BUNIT"), stated, notes, halves
+    )
 
 
-def _plane_of(header: Any, shape: Sequence[int], choice: Wanted, place: str) -> tuple[int, tuple[int | slice, ...], str]:
-    """(FITS number of the axis STOKES whose planes are all read, or 0; index of what is read; a note of the plane of a cube)."""
+def _plane_of(
+    header: Any, shape: Sequence[int], choice: Wanted, place: str
+) -> tuple[int, tuple[int | slice, ...], str]:
+    """(FITS number of the axis STOKES whose planes are all read, or 0; index of what is read; a
+    note of the plane of a cube).
+    """
     axes = {len(shape) - k: n for k, n in enumerate(shape[:-2])}  # FITS counts from the fastest
     kinds = {axis: str(header.get(f"CTYPE{axis}", "")).strip().upper() for axis in axes}
     if any(kind[:4] in ("RA--", "DEC-", "GLON", "GLAT") for kind in kinds.values()):
         cure = "transpose it, so that axes 1 and 2 are longitude and latitude"
-        raise InputError("the axes of the sky are not the first two of the cube", place=place, cure=cure)
+        raise InputError(
+            "the axes of the sky are not the first two of the cube", place=place, cure=cure
+        )
     stokes = next((axis for axis, n in axes.items() if n > 1 and kinds[axis] == "STOKES"), 0)
     asked = [axis for axis in sorted(axes) if axes[axis] > 1 and axis != stokes]
     wanted = choice.plane if asked or not choice.shared else None
     if wanted is not None and stokes and len(wanted) == len(asked) + 1:
         asked, stokes = sorted([*asked, stokes]), 0
     if asked and wanted is None:
-        ranges = ", ".join(f"1 to {axes[axis]} along {kinds[axis] or f'axis {axis}'}" for axis in asked)
+        ranges = ", ".join(
+            f"1 to {axes[axis]} along {kinds[axis] or f'axis {axis}'}" for axis in asked
+        )
         sides = " x ".join(str(n) for n in reversed(shape))
         example = ",".join("1" for _ in asked)
-        cure = f"choose its plane ({ranges}): --plane {example}, or plane: {example if len(asked) == 1 else f'[{example}]'}"
+        cure = (
+            f"choose its plane ({ranges}): --plane {example}, or plane:"
+            f" {example if len(asked) == 1 else f'[{example}]'}"
+        )
         raise InputError(f"is a cube of {sides} pixels, not a map", place=place, cure=cure)
     if len(wanted or ()) != len(asked):
         cure = f"give {len(asked)} of them" if asked else "leave plane out: it is no cube"
         raise InputError(
-            f"plane has {len(wanted or ())} numbers, and the image {len(asked)} axes of planes", place=place, cure=cure
+            f"plane has {len(wanted or ())} numbers, and the image {len(asked)} axes of planes",
+            place=place,
+            cure=cure,
         )
     numbers = dict(zip(asked, wanted or (), strict=True))
     for axis, chosen in numbers.items():
         if not 1 <= chosen <= axes[axis]:
-            raise InputError(f"there is no plane {chosen} of {axes[axis]}", place=place, cure="planes are counted from 1")
-    note = ", ".join(f"{n} of {axes[axis]}{f' along {kinds[axis]}' if kinds[axis] else ''}" for axis, n in numbers.items())
-    return stokes, tuple(slice(None) if axis == stokes else numbers.get(axis, 1) - 1 for axis in axes), note
+            raise InputError(
+                f"there is no plane {chosen} of {axes[axis]}",
+                place=place,
+                cure="planes are counted from 1",
+            )
+    note = ", ".join(
+        f"{n} of {axes[axis]}{f' along {kinds[axis]}' if kinds[axis] else ''}"
+        for axis, n in numbers.items()
+    )
+    return (
+        stokes,
+        tuple(slice(None) if axis == stokes else numbers.get(axis, 1) - 1 for axis in axes),
+        note,
+    )
 
 
 def _root(variance: Floats) -> Floats:
@@ -324,44 +444,89 @@ def _root(variance: Floats) -> Floats:
 
 
 def _stated(header: Any, of: str, place: str) -> dict[str, tuple[float, str]]:
-    """The factor on white noise that the header of a plane of noise states, and what it was measured in."""
+    """The factor on white noise that the header of a plane of noise states, and what it was
+    measured in.
+    """
     factor = number(header, "NOISEFAC", place) if of.startswith("noise") else None
     if of.startswith("noise") and text(header, "NOISEOF", place) == ELSEWHERE:
         return {of[-1]: (1.0, ELSEWHERE)}
-    return {of[-1]: (factor, text(header, "NOISEOF", place) or "its file")} if factor and factor > 0 else {}
+    return (
+        {of[-1]: (factor, text(header, "NOISEOF", place) or "its file")}
+        if factor and factor > 0
+        else {}
+    )
 
 
 def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
     """Pixels of a HEALPix table with a value, with their noise and what holds noise alone."""
     header, names = hdu.header, [str(n).upper() for n in hdu.columns.names]
     stated_there = text(header, "COORDSYS", place)
-    written = ((stated_there or wanted.coordsys if wanted.shared else wanted.coordsys or stated_there) or "").upper()
+    written = (
+        (stated_there or wanted.coordsys if wanted.shared else wanted.coordsys or stated_there)
+        or ""
+    ).upper()
     frame = FRAMES.get(written)
     if frame is None:
         what = f"unknown: COORDSYS = {written!r}" if written else "missing"
-        cure = "give it: --coordsys C (ICRS), G (galactic) or E (ecliptic), or coordsys: C; or set the header key COORDSYS"
-        raise InputError(f"the coordinate system of the HEALPix map is {what}", place=place, cure=cure)
+        cure = (
+            "give it: --coordsys C (ICRS), G (galactic) or E (ecliptic), or coordsys: C; or set the"
+            " header key COORDSYS"
+        )
+        raise InputError(
+            f"the coordinate system of the HEALPix map is {what}", place=place, cure=cure
+        )
     nest = str(header["ORDERING"]).upper().startswith("NEST")
     place_of, first = pixel_column(names), intensity_column(names, None, place)
     columns = {"I": first, **dict(zip(("Q", "U"), columns_of_q_and_u(names) or (), strict=False))}
-    columns |= {key: names.index(name) for name, key in NOISES.items() if name in names and key[-1] in columns}
+    columns |= {
+        key: names.index(name)
+        for name, key in NOISES.items()
+        if name in names and key[-1] in columns
+    }
     planes = {key: np.asarray(hdu.data.field(k), np.float64).ravel() for key, k in columns.items()}
-    planes = {key: np.where(marked_bad(plane, header, place), np.nan, plane) for key, plane in planes.items()}
-    planes = {key: _root(plane) if names[columns[key]].startswith("COV") else plane for key, plane in planes.items()}
-    pixels = np.arange(planes["I"].size) if place_of is None else np.asarray(hdu.data.field(place_of), np.int64).ravel()
+    planes = {
+        key: np.where(marked_bad(plane, header, place), np.nan, plane)
+        for key, plane in planes.items()
+    }
+    planes = {
+        key: _root(plane) if names[columns[key]].startswith("COV") else plane
+        for key, plane in planes.items()
+    }
+    pixels = (
+        np.arange(planes["I"].size)
+        if place_of is None
+        else np.asarray(hdu.data.field(place_of), np.int64).ravel()
+    )
     seen = np.isfinite(planes["I"])
     if not seen.any():
-        raise InputError("no pixel has a value", place=place, cure="give a map that is not NaN everywhere")
+        raise InputError(
+            "no pixel has a value", place=place, cure="give a map that is not NaN everywhere"
+        )
     nside = number(header, "NSIDE", place)
     order = np.flatnonzero(seen)[np.argsort(pixels[seen])]
-    bad = not nside or nside != int(nside) or pixels[order[0]] < 0 or pixels[order[-1]] >= 12 * nside**2
-    if bad or (np.diff(pixels[order]) == 0).any() or (place_of is None and pixels.size != 12 * (nside or 0) ** 2):
+    bad = (
+        not nside
+        or nside != int(nside)
+        or pixels[order[0]] < 0
+        or pixels[order[-1]] >= 12 * nside**2
+    )
+    if (
+        bad
+        or (np.diff(pixels[order]) == 0).any()
+        or (place_of is None and pixels.size != 12 * (nside or 0) ** 2)
+    ):
         cure = "check NSIDE and the column of the pixel numbers"
-        raise InputError("the pixel numbers are out of range or twice there", place=place, cure=cure)
+        raise InputError(
+            "the pixel numbers are out of range or twice there", place=place, cure=cure
+        )
     where = healpix_grid(int(nside or 0), nest, pixels[order], frame)
     stated: dict[str, tuple[float, str]] = {}
     for of in ("I", *(("Q", "U") if "Q" in columns else ())):
-        stated |= _stated({"NOISEFAC": header.get(f"NOISFAC{of}"), "NOISEOF": header.get("NOISEOF")}, f"noise {of}", place)
+        stated |= _stated(
+            {"NOISEFAC": header.get(f"NOISFAC{of}"), "NOISEOF": header.get("NOISEOF")},
+            f"noise {of}",
+            place,
+        )
     return Found(
         where,
         {key: v[order] for key, v in planes.items()},
@@ -371,45 +536,73 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
     )
 
 
-def plane_of(product: MapProduct | Image, name: str, alone: tuple[Floats, str] | None = None) -> Plane:
-    """A product of a run, with its noise. The input image has no beam, but where its pixels were spread (BMAJ).
+def plane_of(
+    product: MapProduct | Image, name: str, alone: tuple[Floats, str] | None = None
+) -> Plane:
+    """A product of a run, with its noise. The input image has no beam, but where its pixels were
+    spread (BMAJ).
 
     ``alone``: a map of the noise alone, and what it is in words.
     Where the noise is not known and there is a map of it, it has the shape of 1 / sqrt(samples).
     """
     if isinstance(product, Image):
-        return Plane(name, np.asarray(product.values, np.float64), product.header, product.unit, product.fwhm)
+        return Plane(
+            name, np.asarray(product.values, np.float64), product.header, product.unit, product.fwhm
+        )
     noise: Floats | None = product.noise
     if not np.isfinite(product.noise).any():
         with np.errstate(divide="ignore"):
-            noise = None if alone is None else np.where(product.known, 1 / np.sqrt(product.hits), np.nan)
+            noise = (
+                None
+                if alone is None
+                else np.where(product.known, 1 / np.sqrt(product.hits), np.nan)
+            )
     pixels = None
     if product.pixels is not None:
         pixels = healpix_grid(product.nside, product.nest, product.pixels, product.frame)
     return Plane(
-        name, np.where(product.known, product.signal, np.nan), product.header, product.unit, product.resolution or None, noise,
-        pixels, product.smoothed_by / FWHM_PER_SIGMA, *(alone or ()),
-    )  # fmt: skip
+        name,
+        np.where(product.known, product.signal, np.nan),
+        product.header,
+        product.unit,
+        product.resolution or None,
+        noise,
+        pixels,
+        product.smoothed_by / FWHM_PER_SIGMA,
+        *(alone or ()),
+    )
 
 
 def in_unit(plane: Plane, unit: str, frequency: float | None, beam: float = 0.0) -> Plane:
-    """The plane in ``unit``, a name of `parse_unit` with a prefix (``mK_RJ``), at one frequency [Hz].
+    """The plane in ``unit``, a name of `parse_unit` with a prefix (``mK_RJ``), at one frequency
+    [Hz].
 
-    Jy/beam are converted by the beam of the plane; what becomes Jy/beam is that of a Gaussian of FWHM ``beam`` [rad], to which
-    it will be smoothed. Raises InputError where that needs a frequency or a beam that are not known, or the plane has no unit;
-    for Jy/pixel, which is no brightness.
+    Jy/beam are converted by the beam of the plane; what becomes Jy/beam is that of a Gaussian of
+    FWHM ``beam`` [rad], to which it will be smoothed. Raises InputError where that needs a
+    frequency or a beam that are not known, or the plane has no unit; for Jy/pixel, which is no
+    brightness.
     """
     try:
         wanted, factor = parse_unit(unit, place="unit")
     except InputError as error:
-        raise InputError(error.message, place="unit", cure=f"use {KNOWN_UNITS}, with a prefix where you like: mK_RJ") from error
+        raise InputError(
+            error.message,
+            place="unit",
+            cure=f"use {KNOWN_UNITS}, with a prefix where you like: mK_RJ",
+        ) from error
     if wanted == "Jy/pixel":
         cure = "use MJy/sr; smoothed and interpolated maps have no flux of their own pixels"
-        raise InputError("Jy/pixel depends on the pixel, and maps are compared as brightness", place="unit", cure=cure)
+        raise InputError(
+            "Jy/pixel depends on the pixel, and maps are compared as brightness",
+            place="unit",
+            cure=cure,
+        )
     if plane.unit == wanted != "Jy/beam":
         return plane.scaled(1 / factor, unit)
     if not plane.unit:
-        raise InputError(f"has no unit, and {unit} is wanted", place=plane.name, cure="set the header key BUNIT")
+        raise InputError(
+            f"has no unit, and {unit} is wanted", place=plane.name, cure="set the header key BUNIT"
+        )
     known = plane.unit in FLUXES and wanted in FLUXES  # their ratio depends on no frequency
     per = 1.0 if known else frequency
     ratio = _kelvin(plane, plane.unit, per, plane.fwhm or 0.0) / _kelvin(plane, wanted, per, beam)
@@ -417,28 +610,48 @@ def in_unit(plane: Plane, unit: str, frequency: float | None, beam: float = 0.0)
 
 
 def _kelvin(plane: Plane, unit: str, frequency: float | None, beam: float) -> float | Floats:
-    """Rayleigh-Jeans kelvin of one ``unit``: a number, of Jy/pixel one for each pixel. ``beam``: FWHM of a Jy/beam."""
+    """Rayleigh-Jeans kelvin of one ``unit``: a number, of Jy/pixel one for each pixel. ``beam``:
+    FWHM of a Jy/beam.
+    """
     if unit == "K_RJ":
         return 1.0
     if frequency is None:
         cure = "give the frequency: --frequency '93 GHz', or set the header key RESTFRQ"
-        raise InputError(f"units differ ({plane.unit}), and their ratio depends on the frequency", place=plane.name, cure=cure)
+        raise InputError(
+            f"units differ ({plane.unit}), and their ratio depends on the frequency",
+            place=plane.name,
+            cure=cure,
+        )
     if unit in ("K_CMB", "y"):
         return float((cmb_slope if unit == "K_CMB" else thermal_sz)(frequency))
     scale = float(intensity_to_kelvin(frequency))
     if unit == "MJy/sr":
         return scale * 1e-20
     if unit == "Jy/pixel":
-        return np.asarray(scale * 1e-26 / np.broadcast_to(plane.grid.areas, plane.values.shape), np.float64)
+        return np.asarray(
+            scale * 1e-26 / np.broadcast_to(plane.grid.areas, plane.values.shape), np.float64
+        )
     if not beam > 0:
-        raise InputError("is in Jy/beam, and its beam is not known", place=plane.name, cure="set the header keys BMAJ and BMIN")
+        raise InputError(
+            "is in Jy/beam, and its beam is not known",
+            place=plane.name,
+            cure="set the header keys BMAJ and BMIN",
+        )
     return scale * 1e-26 / (math.pi / math.log(16) * beam**2)
 
 
 def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> list[Path]:
-    """``STEM.fits`` (an image for each plane), ``STEM_spectra.ecsv``, ``STEM_profiles.ecsv``: paths. Raises OutputError."""
-    paths = [stem.with_name(stem.name + end) for end in (".fits", "_spectra.ecsv", "_profiles.ecsv")]
-    world = Cards((k, v) for k, v in found.header.items() if k not in ("COMMENT", "HISTORY", "SIMPLE", "EXTEND", "BITPIX"))
+    """``STEM.fits`` (an image for each plane), ``STEM_spectra.ecsv``, ``STEM_profiles.ecsv``:
+    paths. Raises OutputError.
+    """
+    paths = [
+        stem.with_name(stem.name + end) for end in (".fits", "_spectra.ecsv", "_profiles.ecsv")
+    ]
+    world = Cards(
+        (k, v)
+        for k, v in found.header.items()
+        if k not in ("COMMENT", "HISTORY", "SIMPLE", "EXTEND", "BITPIX")
+    )
     with atomic_path(paths[0]) as temporary, open(temporary, "wb") as file:
         for k, (name, values) in enumerate(found.planes.items()):
             header = world.copy()
@@ -467,7 +680,14 @@ def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> 
     columns = [Column("radius", p.radius / ARCSEC, "arcsec", "middle of the ring")]
     for name in p.mean:
         columns.append(Column(name, p.mean[name], unit, "mean in the ring"))
-        columns.append(Column(f"{name}_error", p.error[name], unit, "standard error from the scatter, one value per beam"))
+        columns.append(
+            Column(
+                f"{name}_error",
+                p.error[name],
+                unit,
+                "standard error from the scatter, one value per beam",
+            )
+        )
     write_ecsv(paths[2], columns, about)
     return paths
 
@@ -478,15 +698,35 @@ def spectra_columns(found: Comparison) -> list[Column]:
     return [
         Column("scale", s.scale / ARCSEC, "arcsec", "1 / mean wavenumber of the ring"),
         Column("wavenumber", 1 / s.scale, "rad-1", "mean over the ring's modes"),
-        *(Column(n, p, f"{unit}2 sr" if unit else "sr", "power spectral density") for n, p in s.power.items()),
-        Column("coherence", s.coherence, "", "Re sum a b* / sqrt(sum |a|^2 sum |b|^2), a the reference, b the map"),
-        Column("modes", s.modes, "", "independent modes; relative standard error of the power: modes^-1/2"),
+        *(
+            Column(n, p, f"{unit}2 sr" if unit else "sr", "power spectral density")
+            for n, p in s.power.items()
+        ),
+        Column(
+            "coherence",
+            s.coherence,
+            "",
+            "Re sum a b* / sqrt(sum |a|^2 sum |b|^2), a the reference, b the map",
+        ),
+        Column(
+            "modes",
+            s.modes,
+            "",
+            "independent modes; relative standard error of the power: modes^-1/2",
+        ),
     ]
 
 
 def fits_unit(unit: str) -> str:
     """The unit as FITS writes it where that is one word, else none: the header's text says it."""
-    return {"K_RJ": "K", "mK_RJ": "mK", "uK_RJ": "uK", "K_CMB": "K", "mK_CMB": "mK", "uK_CMB": "uK"}.get(unit, "")
+    return {
+        "K_RJ": "K",
+        "mK_RJ": "mK",
+        "uK_RJ": "uK",
+        "K_CMB": "K",
+        "mK_CMB": "mK",
+        "uK_CMB": "uK",
+    }.get(unit, "")
 
 
 def _unit_cards(unit: str) -> Cards:

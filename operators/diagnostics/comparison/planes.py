@@ -1,18 +1,21 @@
 """Maps that are compared, and how they are brought to one beam and one grid.
 
-One beam: each map is convolved, on its own pixels, with a Gaussian of FWHM sqrt(target^2 - own^2) on the sky (`core.maps.grid`).
-Pixels count with their solid angles W; those without a value count neither in the sum nor in its weight, and stay without one:
+One beam: each map is convolved, on its own pixels, with a Gaussian of FWHM sqrt(target^2 - own^2)
+on the sky (`core.maps.grid`). Pixels count with their solid angles W; those without a value count
+neither in the sum nor in its weight, and stay without one:
 
-    m'_p = sum_q K_pq W_q m_q / sum_q K_pq W_q,    q with a value                                            (1)
-    n'_p = [sum_q (K_pq W_q n_q)^2]^(1/2) / sum_q K_pq W_q      (pixels independent before)                  (2)
+    m'_p = sum_q K_pq W_q m_q / sum_q K_pq W_q,
+    q with a value                                            (1)
+    n'_p = [sum_q (K_pq W_q n_q)^2]^(1/2) / sum_q K_pq W_q      (pixels independent before)      (2)
 
-One grid: that of the map with the smaller pixels, so that nothing is aliased; of a HEALPix map its pixels,
-whatever those of the other. The other is interpolated by cubic B-splines (HEALPix by the four neighbours); a
-pixel has a value where the pixel of the other map that it lies in has one. Where the grids differ by whole
-pixels values are copied, bit by bit. With the weights w_i of an interpolation and the correlation rho_ij =
-exp(-r_ij^2 / 4 sigma^2) that a smoothing by sigma has left between pixels, noise becomes
+One grid: that of the map with the smaller pixels, so that nothing is aliased; of a HEALPix map its
+pixels, whatever those of the other. The other is interpolated by cubic B-splines (HEALPix by the
+four neighbours); a pixel has a value where the pixel of the other map that it lies in has one.
+Where the grids differ by whole pixels values are copied, bit by bit. With the weights w_i of an
+interpolation and the correlation rho_ij = exp(-r_ij^2 / 4 sigma^2) that a smoothing by sigma has
+left between pixels, noise becomes
 
-    n'^2 = n^2 sum_ij w_i w_j rho_ij                                                                         (3)
+    n'^2 = n^2 sum_ij w_i w_j rho_ij                                                             (3)
 """
 
 from __future__ import annotations
@@ -43,7 +46,9 @@ EQUAL_BEAMS = 1e-3
 MOST = 2000
 """Points along each side of the plane onto which a HEALPix map is brought."""
 NEIGHBOURS = 12
-"""Pixels on either side that a cubic spline through values looks at: beyond, its weights are below 2e-7."""
+"""Pixels on either side that a cubic spline through values looks at: beyond, its weights are below
+2e-7.
+"""
 
 
 @dataclass(frozen=True)
@@ -67,12 +72,14 @@ class Plane:
     pixels
         Of HEALPix, else None.
     blurred
-        Standard deviation [rad] of the Gaussian that the noise was smoothed with: 0 where pixels are independent.
+        Standard deviation [rad] of the Gaussian that the noise was smoothed with: 0 where pixels
+        are independent.
     spread
-        Solid angle [sr] of the pixels on which it was before it was brought to these; 0: these are its own.
+        Solid angle [sr] of the pixels on which it was before it was brought to these; 0: these are
+        its own.
     alone, alone_of
-        A map of the noise alone, of the same shape and unit (all but the sky; half the difference of two halves of the samples),
-        and what it is in words; None, empty: there is none.
+        A map of the noise alone, of the same shape and unit (all but the sky; half the difference
+        of two halves of the samples), and what it is in words; None, empty: there is none.
     factor
         What `measured` has multiplied the noise by; None: it is white noise alone.
     quiet
@@ -100,7 +107,11 @@ class Plane:
             return ""
         if self.quiet and self.factor is None:
             return ELSEWHERE
-        return WHITE if self.factor is None else f"{self.factor:.3g} x white noise, as in {self.alone_of}"
+        return (
+            WHITE
+            if self.factor is None
+            else f"{self.factor:.3g} x white noise, as in {self.alone_of}"
+        )
 
     @property
     def grid(self) -> MapGrid:
@@ -126,15 +137,21 @@ class Plane:
 
     def scaled(self, factor: float | Floats, unit: str) -> Plane:
         """In another unit."""
-        noise, alone = (None if found is None else found * factor for found in (self.noise, self.alone))
+        noise, alone = (
+            None if found is None else found * factor for found in (self.noise, self.alone)
+        )
         return replace(self, values=self.values * factor, unit=unit, noise=noise, alone=alone)
 
     def smoothed(self, fwhm: float) -> Plane:
-        """With a resolution of ``fwhm`` [rad], equations (1) and (2); as it is where its own is unknown or equal."""
+        """With a resolution of ``fwhm`` [rad], equations (1) and (2); as it is where its own is
+        unknown or equal.
+        """
         if self.fwhm is None or self.fwhm >= fwhm * (1 - EQUAL_BEAMS):
             return self
         more = math.sqrt(fwhm**2 - self.fwhm**2)
-        noise = None if self.noise is None else np.where(np.isfinite(self.values), self.noise, np.nan)
+        noise = (
+            None if self.noise is None else np.where(np.isfinite(self.values), self.noise, np.nan)
+        )
         values, noise = self.grid.smoothed(self.values, more, noise=noise)
         if noise is not None and self.blurred:  # pixels were not independent before
             noise = noise * _left(self.blurred, more / FWHM_PER_SIGMA, self.pixel)
@@ -143,7 +160,9 @@ class Plane:
         return replace(self, values=values, noise=noise, fwhm=fwhm, blurred=blurred, alone=alone)
 
     def measured(self) -> Plane:
-        """With the noise times what ``alone`` is of it (`noise_factor`); as it is where there is no ``alone``."""
+        """With the noise times what ``alone`` is of it (`noise_factor`); as it is where there is no
+        ``alone``.
+        """
         if self.alone is None or self.noise is None:
             return self
         factor = noise_factor(self.noise, self.alone)
@@ -151,7 +170,12 @@ class Plane:
 
     def onto(self, other: Plane) -> Plane:
         """On the grid of another; NaN where it does not reach."""
-        there = {"header": other.header, "pixels": other.pixels, "alone": None, "spread": self.pixel**2}
+        there = {
+            "header": other.header,
+            "pixels": other.pixels,
+            "alone": None,
+            "spread": self.pixel**2,
+        }
         if self.pixels is not None:
             values, noise = _of_neighbours(self, other.grid)
             return replace(self, values=values, noise=noise, **there)
@@ -159,29 +183,34 @@ class Plane:
         values = _sampled(self.values, x, y, 3)
         noise = None
         if self.noise is not None:
-            noise = np.sqrt(_sampled(self.noise**2, x, y, 1)) * _kept(x, y, self.blurred, self.grid.sides)
+            noise = np.sqrt(_sampled(self.noise**2, x, y, 1)) * _kept(
+                x, y, self.blurred, self.grid.sides
+            )
         return replace(self, values=values, noise=noise, **there)
 
     def independent(self, where: NDArray[np.bool_]) -> float:
-        """How many independent values the noise of the pixels ``where`` has: their solid angle / (2 pi
-        blurred^2), or over that of its own pixels, at most their number. 2 pi sigma^2 is the integral of the
-        square of the correlation."""
+        """How many independent values the noise of the pixels ``where`` has: their solid angle / (2
+        pi blurred^2), or over that of its own pixels, at most their number. 2 pi sigma^2 is the
+        integral of the square of the correlation."""
         count = float(np.count_nonzero(where))
         each = max(2 * math.pi * self.blurred**2, self.spread)
         return min(count, max(self.grid.solid_angle(where) / each, 1.0)) if each else count
 
 
 def _left(before: float, more: float, pixel: float) -> float:
-    """Factor on equation (2) for white noise that a Gaussian of ``before`` [rad] has smoothed, of ``more`` after it.
+    """Factor on equation (2) for white noise that a Gaussian of ``before`` [rad] has smoothed, of
+    ``more`` after it.
 
-    The rms goes from 1 / (sqrt(4 pi) before) to 1 / (sqrt(4 pi) hypot(before, more)); equation (2) divides by sqrt(4 pi) more /
-    pixel.
+    The rms goes from 1 / (sqrt(4 pi) before) to 1 / (sqrt(4 pi) hypot(before, more)); equation (2)
+    divides by sqrt(4 pi) more / pixel.
     """
     return max(1.0, before / math.hypot(before, more) * math.sqrt(4 * math.pi) * more / pixel)
 
 
 def positions(target: MapGrid, source: MapGrid) -> tuple[Floats, Floats]:
-    """0-based pixels (x, y) of the image ``source`` at the pixels of a grid, of its shape; NaN where the projection has none."""
+    """0-based pixels (x, y) of the image ``source`` at the pixels of a grid, of its shape; NaN
+    where the projection has none.
+    """
     assert isinstance(source, ImagePixels)  # HEALPix has no such coordinates
     if isinstance(target, ImagePixels) and target.kind == source.kind == "TAN":
         y, x = np.indices(target.shape, np.float64)
@@ -202,29 +231,40 @@ def _by_astropy(target: Any, source: Any, shape: tuple[int, ...]) -> tuple[Float
     from astropy.wcs.utils import pixel_to_pixel
 
     y, x = np.indices(shape, np.float64)
-    whole = [wcs.astropy() if isinstance(wcs, tangent.TangentWcs) else wcs for wcs in (target, source)]
+    whole = [
+        wcs.astropy() if isinstance(wcs, tangent.TangentWcs) else wcs for wcs in (target, source)
+    ]
     try:
         return pixel_to_pixel(*whole, x, y)  # type: ignore[no-any-return]
     except Exception as error:
         raise InputError(
-            f"the two projections cannot be compared: {error}", place="WCS", cure="check CTYPE and RADESYS"
+            f"the two projections cannot be compared: {error}",
+            place="WCS",
+            cure="check CTYPE and RADESYS",
         ) from error
 
 
 def _sampled(values: Floats, x: Floats, y: Floats, order: int) -> Floats:
-    """``values`` at pixels (x, y), by splines of ``order``; copied where all lie at whole pixels."""
+    """``values`` at pixels (x, y), by splines of ``order``; copied where all lie at whole
+    pixels.
+    """
     from scipy.ndimage import distance_transform_edt, map_coordinates
 
     ny, nx = values.shape
     with np.errstate(invalid="ignore"):
         inside = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
-    column, row = (np.rint(np.where(inside, at, 0)).astype(np.int64).clip(0, n - 1) for at, n in ((x, nx), (y, ny)))
+    column, row = (
+        np.rint(np.where(inside, at, 0)).astype(np.int64).clip(0, n - 1)
+        for at, n in ((x, nx), (y, ny))
+    )
     near = np.where(inside, values[row, column], np.nan)
     if _off(x, y, inside) < SAME or not inside.any():
         return near
     missing = ~np.isfinite(values)
     if missing.any() and not missing.all():
-        values = values[tuple(distance_transform_edt(missing, return_distances=False, return_indices=True))]
+        values = values[
+            tuple(distance_transform_edt(missing, return_distances=False, return_indices=True))
+        ]
     at = np.stack([np.where(inside, y, 0.0), np.where(inside, x, 0.0)])
     if order == 1:
         found = map_coordinates(values, at, order=1, mode="nearest")
@@ -235,11 +275,15 @@ def _sampled(values: Floats, x: Floats, y: Floats, order: int) -> Floats:
 
 def _off(x: Floats, y: Floats, inside: NDArray[np.bool_]) -> float:
     """How far pixels ``inside`` are from whole ones, at most."""
-    return max(float(np.abs(np.where(inside, at - np.rint(at), 0)).max(initial=0.0)) for at in (x, y))
+    return max(
+        float(np.abs(np.where(inside, at - np.rint(at), 0)).max(initial=0.0)) for at in (x, y)
+    )
 
 
 def _kept(x: Floats, y: Floats, blurred: float, sides: tuple[float, float]) -> Floats:
-    """Equation (3) of a cubic spline: n' / n at pixels (x, y) of an image with pixels of these sides (y, x)."""
+    """Equation (3) of a cubic spline: n' / n at pixels (x, y) of an image with pixels of these
+    sides (y, x).
+    """
     with np.errstate(invalid="ignore"):
         if _off(x, y, np.isfinite(x) & np.isfinite(y)) < SAME:
             return np.ones_like(x)
@@ -252,11 +296,15 @@ def _kept(x: Floats, y: Floats, blurred: float, sides: tuple[float, float]) -> F
 
 
 def _variances(offsets: Floats, sigma: float) -> Floats:
-    """sum_ij w_i w_j rho_ij of the cubic spline along one axis at ``offsets`` (n,) from a pixel; ``sigma`` in pixels."""
+    """sum_ij w_i w_j rho_ij of the cubic spline along one axis at ``offsets`` (n,) from a pixel;
+    ``sigma`` in pixels.
+    """
     from zonda.core.numerics.smooth import interpolating, spline_basis
 
     count = 2 * NEIGHBOURS
-    coefficients = interpolating(np.eye(count))  # (pixel, coefficient): the splines through a one at each pixel
+    coefficients = interpolating(
+        np.eye(count)
+    )  # (pixel, coefficient): the splines through a one at each pixel
     middle = NEIGHBOURS - 1  # offsets lie between it and the next
     weights = coefficients[:, middle - 1 : middle + 3] @ spline_basis(offsets)  # (pixel, n)
     apart = np.subtract.outer(np.arange(count), np.arange(count))
@@ -265,20 +313,30 @@ def _variances(offsets: Floats, sigma: float) -> Floats:
 
 
 def _of_neighbours(plane: Plane, target: MapGrid) -> tuple[Floats, Floats | None]:
-    """Values and noise of a HEALPix map at the pixels of a grid: its own where the two are alike, else from four neighbours."""
+    """Values and noise of a HEALPix map at the pixels of a grid: its own where the two are alike,
+    else from four neighbours.
+    """
     import healpy
 
     source = plane.pixels
     assert source is not None  # asked for of HEALPix maps alone
     directions = target.directions() @ target.turn @ source.turn.T
-    same = isinstance(target, HealpixPixels) and (target.nside, target.frame) == (source.nside, source.frame)
+    same = isinstance(target, HealpixPixels) and (target.nside, target.frame) == (
+        source.nside,
+        source.frame,
+    )
     own = source.pixels_at(directions)
     there = (own >= 0) & np.isfinite(plane.values[own])
     if same:
         values = np.where(there, plane.values[own], np.nan)
         return values, None if plane.noise is None else np.where(there, plane.noise[own], np.nan)
-    lon, lat = np.arctan2(directions[..., 1], directions[..., 0]), np.arcsin(np.clip(directions[..., 2], -1, 1))
-    near, weights = healpy.get_interp_weights(source.nside, np.pi / 2 - lat.ravel(), lon.ravel(), nest=source.nest)
+    lon, lat = (
+        np.arctan2(directions[..., 1], directions[..., 0]),
+        np.arcsin(np.clip(directions[..., 2], -1, 1)),
+    )
+    near, weights = healpy.get_interp_weights(
+        source.nside, np.pi / 2 - lat.ravel(), lon.ravel(), nest=source.nest
+    )
     place = np.clip(np.searchsorted(source.pixels, near), 0, len(source.pixels) - 1)
     known = (source.pixels[place] == near) & np.isfinite(plane.values[place])
     weights = np.where(known, weights, 0.0).reshape(4, *target.shape)
@@ -291,12 +349,18 @@ def _of_neighbours(plane: Plane, target: MapGrid) -> tuple[Floats, Floats | None
         noise = np.nan_to_num(plane.noise[place])
         apart = np.array(healpy.pix2vec(source.nside, source.pixels[place], nest=source.nest))
         apart = ((apart[:, :, None] - apart[:, None]) ** 2).sum(axis=0)
-        rho = np.exp(-apart / (4 * plane.blurred**2)) if plane.blurred else (apart == 0).astype(np.float64)
+        rho = (
+            np.exp(-apart / (4 * plane.blurred**2))
+            if plane.blurred
+            else (apart == 0).astype(np.float64)
+        )
         variance = np.einsum("i...,ij...,j...->...", weights * noise, rho, weights * noise)
         return values, np.where(there, np.sqrt(variance), np.nan)
 
 
-def common(reference: Plane, other: Plane, fwhm: float | None = None) -> tuple[Plane, Plane, list[str]]:
+def common(
+    reference: Plane, other: Plane, fwhm: float | None = None
+) -> tuple[Plane, Plane, list[str]]:
     """Both maps with one beam and on one grid, and what was done to them.
 
     Parameters
@@ -312,11 +376,18 @@ def common(reference: Plane, other: Plane, fwhm: float | None = None) -> tuple[P
     target, notes = common_beam(reference, other) if fwhm is None else fwhm, []
     for plane in (reference, other):
         if not np.isfinite(plane.values).any():
-            raise InputError("no pixel has a value", place=plane.name, cure="give a map that is not NaN everywhere")
+            raise InputError(
+                "no pixel has a value",
+                place=plane.name,
+                cure="give a map that is not NaN everywhere",
+            )
         if plane.fwhm is None:
             notes.append(f"{plane.name}: its beam is not known (BMAJ), so that it is not smoothed")
         elif target < plane.fwhm * (1 - EQUAL_BEAMS):
-            beams = f"the beam of {angle_text(target)} is smaller than the map's, {angle_text(plane.fwhm)}"
+            beams = (
+                f"the beam of {angle_text(target)} is smaller than the map's,"
+                f" {angle_text(plane.fwhm)}"
+            )
             raise InputError(beams, place=plane.name, cure="choose a larger one")
     made = []
     for plane in (reference, other):
@@ -334,37 +405,64 @@ def common(reference: Plane, other: Plane, fwhm: float | None = None) -> tuple[P
     both = np.isfinite(first.values) & np.isfinite(second.values)
     if not both.any():
         raise InputError(
-            f"{reference.name} and {other.name} have no pixel in common", place="compare", cure="compare maps of one field"
+            f"{reference.name} and {other.name} have no pixel in common",
+            place="compare",
+            cure="compare maps of one field",
         )
-    notes.append(f"grid of {grid.name}, pixels of {angle_text(grid.pixel)}; {moved.name} {_how(grid, moved, reference, other)}")
+    notes.append(
+        f"grid of {grid.name}, pixels of {angle_text(grid.pixel)}; {moved.name}"
+        f" {_how(grid, moved, reference, other)}"
+    )
     return first, second, notes
 
 
-def on_a_plane(pixels: HealpixPixels, planes: Mapping[str, Floats]) -> tuple[Any, dict[str, Floats]]:
-    """Planes of HEALPix pixels as images about their middle, with points as far apart as the pixels are and
-    the value of the pixel that each lies in: header, and planes. For pictures and spectra."""
+def on_a_plane(
+    pixels: HealpixPixels, planes: Mapping[str, Floats]
+) -> tuple[Any, dict[str, Floats]]:
+    """Planes of HEALPix pixels as images about their middle, with points as far apart as the pixels
+    are and the value of the pixel that each lies in: header, and planes. For pictures and
+    spectra."""
     middle = pixels.directions().mean(axis=0)
     centre = tuple(float(a) for a in angles(middle))
-    reach = float(np.arccos(np.clip((pixels.directions() @ middle).min() / np.linalg.norm(middle), -1, 1)))
+    reach = float(
+        np.arccos(np.clip((pixels.directions() @ middle).min() / np.linalg.norm(middle), -1, 1))
+    )
     size = int(min(MOST, max(8.0, 2 * reach / pixels.pixel + 2)))
     ones = np.ones(len(pixels.pixels))
     product = MapProduct(
-        ones, ones.astype(np.int64), ones, ones, None, None, (centre[0], centre[1]), pixels.pixel, pixels.frame,
-        nside=pixels.nside, nest=pixels.nest, pixels=pixels.pixels,
-    )  # fmt: skip
+        ones,
+        ones.astype(np.int64),
+        ones,
+        ones,
+        None,
+        None,
+        (centre[0], centre[1]),
+        pixels.pixel,
+        pixels.frame,
+        nside=pixels.nside,
+        nest=pixels.nest,
+        pixels=pixels.pixels,
+    )
     made, wcs = on_plane(product, dict(planes), size=size)
-    return wcs.to_header(relax=True), {key: np.asarray(values, np.float64) for key, values in made.items()}
+    return wcs.to_header(relax=True), {
+        key: np.asarray(values, np.float64) for key, values in made.items()
+    }
 
 
 def cell_of(grid: ImagePixels) -> Floats:
-    """(2, 2): steps east and north [rad] of the middle pixel, by one in x (first column) and in y."""
+    """(2, 2): steps east and north [rad] of the middle pixel, by one in x (first column) and in
+    y.
+    """
     y, x = ((n - 1) / 2 for n in grid.shape)
     if not np.isfinite(grid.at(x, y)).all():
         x, y = (float(v) - 1 for v in grid.wcs.wcs.crpix[:2])
     h = 0.25
     longitude, latitude = angles(grid.at(x, y))
     east, north = local_axes(float(longitude), float(latitude))[1:]
-    steps = [(grid.at(x + h * i, y + h * j) - grid.at(x - h * i, y - h * j)) / (2 * h) for i, j in ((1, 0), (0, 1))]
+    steps = [
+        (grid.at(x + h * i, y + h * j) - grid.at(x - h * i, y - h * j)) / (2 * h)
+        for i, j in ((1, 0), (0, 1))
+    ]
     return np.array([[axis @ step for step in steps] for axis in (east, north)])
 
 
@@ -374,8 +472,8 @@ def common_beam(reference: Plane, other: Plane) -> float:
 
 
 def _is_the_grid(second: Plane, first: Plane) -> bool:
-    """Whether two maps are compared on the pixels of the second: those of HEALPix, of two such maps the
-    larger ones; else the smaller ones."""
+    """Whether two maps are compared on the pixels of the second: those of HEALPix, of two such maps
+    the larger ones; else the smaller ones."""
     if first.pixels is not None and second.pixels is not None:
         return second.pixels.nside < first.pixels.nside
     if first.pixels is not None or second.pixels is not None:
@@ -386,7 +484,14 @@ def _is_the_grid(second: Plane, first: Plane) -> bool:
 def _how(grid: Plane, moved: Plane, *given: Plane) -> str:
     own = next(plane for plane in given if plane.name == moved.name)
     if own.pixels is not None:
-        same = grid.pixels is not None and (grid.pixels.nside, grid.pixels.frame) == (own.pixels.nside, own.pixels.frame)
+        same = grid.pixels is not None and (grid.pixels.nside, grid.pixels.frame) == (
+            own.pixels.nside,
+            own.pixels.frame,
+        )
         return "is on the same pixels" if same else "is interpolated between four neighbours"
     x, y = positions(grid.grid, own.grid)
-    return "is on the same pixels" if _off(x, y, np.isfinite(x) & np.isfinite(y)) < SAME else "is interpolated by cubic splines"
+    return (
+        "is on the same pixels"
+        if _off(x, y, np.isfinite(x) & np.isfinite(y)) < SAME
+        else "is interpolated by cubic splines"
+    )

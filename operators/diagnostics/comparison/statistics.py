@@ -1,14 +1,16 @@
 """How a map differs from a reference: figures, difference, fidelity and SNR.
 
-    B = g A + o,  g and o by least squares, A without error                                                  (1)
-    fidelity F = |A| / max(|B - A|, t rms(B - A))                                                            (2)
-    chi^2 = sum (B - A)^2 / (n_A^2 + n_B^2)                                                                  (3)
+    B = g A + o,
+    g and o by least squares, A without error                                                  (1)
+    fidelity F = |A| / max(|B - A|, t rms(B - A))                                                (2)
+    chi^2 = sum (B - A)^2 / (n_A^2 + n_B^2)                                                      (3)
 
-A is the reference, B the map. In means, fits and rms, pixels of different size count with their solid angles,
-and those that repeat another (columns of a CAR image beyond a full turn) not at all. (2) with t = 0.7 is the
-fidelity of ALMA's memo 398 (Pety, Gueth & Guilloteau 2001): the threshold keeps it from being large by
-chance. The standard error of g and o is that of a jackknife: the fit is repeated without each of `BLOCKS`^2
-parts of the field, so that neighbouring pixels need not be independent.
+A is the reference, B the map. In means, fits and rms, pixels of different size count with their
+solid angles, and those that repeat another (columns of a CAR image beyond a full turn) not at all.
+(2) with t = 0.7 is the fidelity of ALMA's memo 398 (Pety, Gueth & Guilloteau 2001): the threshold
+keeps it from being large by chance. The standard error of g and o is that of a jackknife: the fit
+is repeated without each of `BLOCKS`^2 parts of the field, so that neighbouring pixels need not be
+independent.
 """
 
 from __future__ import annotations
@@ -49,8 +51,8 @@ class Comparison:
     names
         Of the reference and of the map.
     planes
-        (ny, nx) each: ``reference``, ``map``, ``difference`` (map - reference), ``fidelity``; ``snr`` of the map where its
-        noise is known, and ``reference_snr``.
+        (ny, nx) each: ``reference``, ``map``, ``difference`` (map - reference), ``fidelity``;
+        ``snr`` of the map where its noise is known, and ``reference_snr``.
     header
         Celestial WCS of all of them.
     unit, fwhm, pixel
@@ -66,8 +68,8 @@ class Comparison:
     label
         Of the step that made it.
     noise
-        Of ``snr`` and ``reference_snr``: what stands behind the noise, in words, and the measured factor on it (None: there is no
-        map of the noise alone).
+        Of ``snr`` and ``reference_snr``: what stands behind the noise, in words, and the measured
+        factor on it (None: there is no map of the noise alone).
     """
 
     names: tuple[str, str]
@@ -87,21 +89,28 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Settings:
-    """How maps are compared: common resolution [rad] (None: the wider of the two), t of equation (2), number of rings."""
+    """How maps are compared: common resolution [rad] (None: the wider of the two), t of equation
+    (2), number of rings.
+    """
 
     fwhm: float | None = None
     threshold: float = THRESHOLD
     bins: int = 24
 
 
-def compare(reference: Plane, other: Plane, settings: Settings | None = None, label: str = "compare") -> Comparison:
+def compare(
+    reference: Plane, other: Plane, settings: Settings | None = None, label: str = "compare"
+) -> Comparison:
     """Compare a map with a reference. Raises InputError where they cannot be: `planes.common`."""
     settings = settings or Settings()
     a, b, notes = common(reference, other, settings.fwhm)
     centre, names = _centre(a), (reference.name, other.name)
     a, b = _cropped(a, b)
     grid, both = a.grid, np.isfinite(a.values) & np.isfinite(b.values)
-    planes = {"reference": np.where(both, a.values, np.nan), "map": np.where(both, b.values, np.nan)}
+    planes = {
+        "reference": np.where(both, a.values, np.nan),
+        "map": np.where(both, b.values, np.nan),
+    }
     difference = planes["difference"] = planes["map"] - planes["reference"]
     areas, weights = _weights(grid, both)
     floor = settings.threshold * rms(difference, weights)
@@ -109,17 +118,29 @@ def compare(reference: Plane, other: Plane, settings: Settings | None = None, la
         planes["fidelity"] = np.abs(planes["reference"]) / np.maximum(np.abs(difference), floor)
         for name, plane in (("snr", b), ("reference_snr", a)):
             if plane.noise is not None and np.isfinite(plane.noise[both]).any():
-                planes[name] = np.where(both & (plane.noise > 0), plane.values / plane.noise, np.nan)
+                planes[name] = np.where(
+                    both & (plane.noise > 0), plane.values / plane.noise, np.nan
+                )
     pixel, fwhm = a.pixel, max(a.fwhm or 0.0, b.fwhm or 0.0)
     maps = {name: planes[name] for name in ("reference", "map", "difference")}
     area = math.pi / math.log(16) * fwhm**2
     found = profiles(maps, grid.distance(centre), areas, max(pixel, fwhm / 2), area)
     noisy = [plane for plane in (a, b) if plane.noise is not None and not plane.quiet]
-    figures = figures_of(planes["reference"], planes["map"], [plane.noise for plane in noisy], weights, _places(a, centre))
+    figures = figures_of(
+        planes["reference"],
+        planes["map"],
+        [plane.noise for plane in noisy],
+        weights,
+        _places(a, centre),
+    )
     figures["pixels"] = float(np.count_nonzero(both & (weights > 0)))
-    figures["median fidelity where the reference is above 10 % of its peak"] = _median_fidelity(planes)
+    figures["median fidelity where the reference is above 10 % of its peak"] = _median_fidelity(
+        planes
+    )
     if "chi2" in figures:
-        figures["chi2 values"] = min(figures["chi2 pixels"], *(plane.independent(both) for plane in noisy))
+        figures["chi2 values"] = min(
+            figures["chi2 pixels"], *(plane.independent(both) for plane in noisy)
+        )
     noise = {name: plane for name, plane in (("snr", b), ("reference_snr", a)) if name in planes}
     for name, plane in noise.items():
         of = "the map" if name == "snr" else "the reference"
@@ -130,10 +151,13 @@ def compare(reference: Plane, other: Plane, settings: Settings | None = None, la
         maps = {name: planes[name] for name in maps}
     flat = image_grid(header, planes["map"].shape)
     cell, known = cell_of(flat), np.isfinite(planes["map"])
-    spectra = radial_spectra(maps, tapered(known, cell), cell, ring_edges(known.shape, cell, settings.bins))
+    spectra = radial_spectra(
+        maps, tapered(known, cell), cell, ring_edges(known.shape, cell, settings.bins)
+    )
     if (uneven := _unevenness(flat, known)) > UNEVEN:
         notes.append(
-            f"solid angles of the pixels: they differ by a factor of {1 + uneven:.3g}; scales of spectra are the middle's"
+            f"solid angles of the pixels: they differ by a factor of {1 + uneven:.3g}; scales of"
+            " spectra are the middle's"
         )
     return Comparison(
         names, planes, header, a.unit, fwhm, pixel, figures, spectra, found, notes, centre, label,
@@ -147,24 +171,42 @@ def _cropped(a: Plane, b: Plane) -> tuple[Plane, Plane]:
     if a.pixels is not None:
         pixels = replace(a.pixels, pixels=a.pixels.pixels[both])
         first, second = (
-            replace(p, values=p.values[both], noise=None if p.noise is None else p.noise[both], pixels=pixels, alone=None)
+            replace(
+                p,
+                values=p.values[both],
+                noise=None if p.noise is None else p.noise[both],
+                pixels=pixels,
+                alone=None,
+            )
             for p in (a, b)
         )
         return first, second
     y, x = (np.flatnonzero(both.any(axis=axis)) for axis in (1, 0))
     window = slice(int(y[0]), int(y[-1]) + 1), slice(int(x[0]), int(x[-1]) + 1)
-    header = {key: a.header[key] for key in a.header if key and isinstance(a.header[key], bool | int | float | str)}
+    header = {
+        key: a.header[key]
+        for key in a.header
+        if key and isinstance(a.header[key], bool | int | float | str)
+    }
     for key, cut in (("CRPIX1", window[1]), ("CRPIX2", window[0])):
         header[key] = float(header.get(key, 0.0)) - cut.start
     first, second = (
-        replace(p, values=p.values[window], noise=None if p.noise is None else p.noise[window], header=header, alone=None)
+        replace(
+            p,
+            values=p.values[window],
+            noise=None if p.noise is None else p.noise[window],
+            header=header,
+            alone=None,
+        )
         for p in (a, b)
     )
     return first, second
 
 
 def _weights(grid: MapGrid, known: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Solid angles of the pixels [sr], 0 for those that repeat another; and what pixels count: equal ones 1 each."""
+    """Solid angles of the pixels [sr], 0 for those that repeat another; and what pixels count:
+    equal ones 1 each.
+    """
     areas = np.broadcast_to(np.nan_to_num(np.where(grid.once, grid.areas, 0.0)), known.shape)
     used = areas[known & (areas > 0)]
     if used.size and used.max() < (1 + EVEN) * used.min():
@@ -180,7 +222,9 @@ def _unevenness(grid: ImagePixels, known: NDArray[np.bool_]) -> float:
 
 
 def _places(plane: Plane, centre: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Where pixels are, up and across: numbers of rows and columns; of HEALPix offsets in latitude and longitude."""
+    """Where pixels are, up and across: numbers of rows and columns; of HEALPix offsets in latitude
+    and longitude.
+    """
     if plane.pixels is None:
         row, column = np.indices(plane.values.shape, np.float64)
         return np.asarray(row), np.asarray(column)
@@ -194,7 +238,9 @@ def rms(values: Floats, weights: Floats | None = None) -> float:
     known = np.isfinite(values) if weights is None else np.isfinite(values) & (weights > 0)
     if not known.any():
         return math.nan
-    return float(np.sqrt(np.average(values[known] ** 2, weights=None if weights is None else weights[known])))
+    return float(
+        np.sqrt(np.average(values[known] ** 2, weights=None if weights is None else weights[known]))
+    )
 
 
 def _median_fidelity(planes: Mapping[str, Floats]) -> float:
@@ -204,8 +250,9 @@ def _median_fidelity(planes: Mapping[str, Floats]) -> float:
 
 
 def _centre(plane: Plane) -> tuple[float, float]:
-    """(longitude, latitude) [rad], in the frame of the grid, of the reference point of the projection where it is in the image,
-    else of its middle; of HEALPix of the mean of the pixels."""
+    """(longitude, latitude) [rad], in the frame of the grid, of the reference point of the
+    projection where it is in the image, else of its middle; of HEALPix of the mean of the
+    pixels."""
     grid = plane.grid
     if not isinstance(grid, ImagePixels):
         longitude, latitude = angles(grid.directions()[np.isfinite(plane.values)].mean(axis=0))
@@ -230,12 +277,13 @@ def figures_of(
 ) -> dict[str, float]:
     """Figures of a map b against a reference a, both of one shape, NaN where either has no value.
 
-    ``rms reference``, ``rms map``, ``rms difference`` and ``mean ...`` (about zero, over pixels with both); ``correlation``
-    (Pearson); ``gain``, ``offset`` and their errors, equation (1); ``peak ratio``: b over a where \\|a\\| is largest; ``chi2``
-    and its number of pixels, equation (3), where a noise is known.
+    ``rms reference``, ``rms map``, ``rms difference`` and ``mean ...`` (about zero, over pixels
+    with both); ``correlation`` (Pearson); ``gain``, ``offset`` and their errors, equation (1);
+    ``peak ratio``: b over a where \\|a\\| is largest; ``chi2`` and its number of pixels, equation
+    (3), where a noise is known.
 
-    ``weights``: of the pixels, 0 for those that repeat another; default 1. ``places``: where they are (row, column), for the
-    parts of the jackknife; default those of an image.
+    ``weights``: of the pixels, 0 for those that repeat another; default 1. ``places``: where they
+    are (row, column), for the parts of the jackknife; default those of an image.
     """
     weight = np.ones(a.shape) if weights is None else weights
     both = np.isfinite(a) & np.isfinite(b) & (weight > 0)
@@ -248,21 +296,37 @@ def figures_of(
     found["correlation"] = float((w * u * v).sum() / scatter) if scatter > 0 else math.nan
     where: Any = np.indices(a.shape, np.float64) if places is None else places
     fit, error = _line(x, y, w, [place[both] for place in where])
-    found["gain"], found["gain error"], found["offset"], found["offset error"] = fit[0], error[0], fit[1], error[1]
+    found["gain"], found["gain error"], found["offset"], found["offset error"] = (
+        fit[0],
+        error[0],
+        fit[1],
+        error[1],
+    )
     peak = int(np.abs(x).argmax())
-    found["peak reference"], found["peak ratio"] = float(x[peak]), float(y[peak] / x[peak]) if x[peak] else math.nan
+    found["peak reference"], found["peak ratio"] = (
+        float(x[peak]),
+        float(y[peak] / x[peak]) if x[peak] else math.nan,
+    )
     squares = [n[both] ** 2 for n in noise if n is not None]
     if squares:
         variance = np.sum(squares, axis=0)
         used = np.isfinite(variance) & (variance > 0)
-        found["chi2"], found["chi2 pixels"] = float(((y - x)[used] ** 2 / variance[used]).sum()), float(np.count_nonzero(used))
+        found["chi2"], found["chi2 pixels"] = (
+            float(((y - x)[used] ** 2 / variance[used]).sum()),
+            float(np.count_nonzero(used)),
+        )
     return found
 
 
-def _line(x: Floats, y: Floats, w: Floats, places: Sequence[Floats]) -> tuple[tuple[float, float], tuple[float, float]]:
+def _line(
+    x: Floats, y: Floats, w: Floats, places: Sequence[Floats]
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """(gain, offset) and their standard errors, of values with weights at places (up, across)."""
     x0 = float((w * x).sum() / w.sum())
-    up, across = (np.minimum((p - p.min()) / (np.ptp(p) * (1 + 1e-9) + 1e-300) * BLOCKS, BLOCKS - 1) for p in places)
+    up, across = (
+        np.minimum((p - p.min()) / (np.ptp(p) * (1 + 1e-9) + 1e-300) * BLOCKS, BLOCKS - 1)
+        for p in places
+    )
     part = up.astype(np.int64) * BLOCKS + across.astype(np.int64)
     terms = (w, w * (x - x0), w * y, w * (x - x0) ** 2, w * (x - x0) * y)
     sums = np.array([np.bincount(part, t, BLOCKS**2) for t in terms])
@@ -272,7 +336,11 @@ def _line(x: Floats, y: Floats, w: Floats, places: Sequence[Floats]) -> tuple[tu
     fits[:, 1] -= fits[:, 0] * x0
     left = fits[1:]
     n = len(left)
-    error = np.sqrt((n - 1) / n * ((left - left.mean(axis=0)) ** 2).sum(axis=0)) if n > 2 else np.full(2, math.nan)
+    error = (
+        np.sqrt((n - 1) / n * ((left - left.mean(axis=0)) ** 2).sum(axis=0))
+        if n > 2
+        else np.full(2, math.nan)
+    )
     return (float(fits[0, 0]), float(fits[0, 1])), (float(error[0]), float(error[1]))
 
 

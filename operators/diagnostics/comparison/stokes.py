@@ -1,10 +1,13 @@
-"""I, Q and U of maps that are compared: each plane for itself, Q and U of both from the meridians of one frame.
+"""I, Q and U of maps that are compared: each plane for itself, Q and U of both from the meridians
+of one frame.
 
-Where the frames differ, Q and U of the reference are turned on its own pixels, before anything is smoothed or interpolated:
+Where the frames differ, Q and U of the reference are turned on its own pixels, before anything is
+smoothed or interpolated:
 
-    Q' + i U' = (Q + i U) exp(-2 i delta),                                                                   (1)
+    Q' + i U' = (Q + i U) exp(-2 i delta),   (1)
 
-delta the angle from the meridian of its own frame to that of the map's (`core.polarization.between_meridians`).
+delta the angle from the meridian of its own frame to that of the map's
+(`core.polarization.between_meridians`).
 """
 
 from __future__ import annotations
@@ -29,20 +32,30 @@ SAME = 1e-12
 """1 - cos of the angle between poles that count as one."""
 
 
-def products_of(product: MapProduct | Image, name: str) -> dict[str, tuple[str, MapProduct | Image]]:
-    """(name, product) of I, and of Q and U where there are some: ``name``, ``name_Q``, ``name_U``."""
+def products_of(
+    product: MapProduct | Image, name: str
+) -> dict[str, tuple[str, MapProduct | Image]]:
+    """(name, product) of I, and of Q and U where there are some: ``name``, ``name_Q``,
+    ``name_U``.
+    """
     if product.polarization is None:
         return {"I": (name, product)}
-    return {plane: (name if plane == "I" else f"{name}_{plane}", product.stokes(plane)) for plane in IQU}
+    return {
+        plane: (name if plane == "I" else f"{name}_{plane}", product.stokes(plane)) for plane in IQU
+    }
 
 
 def planes_of(product: MapProduct | Image, name: str) -> dict[str, Plane]:
     """The planes of a product of a run, with their noise."""
-    return {plane: plane_of(one, its_name) for plane, (its_name, one) in products_of(product, name).items()}
+    return {
+        plane: plane_of(one, its_name)
+        for plane, (its_name, one) in products_of(product, name).items()
+    }
 
 
 def on_meridians_of(other: Plane, planes: Mapping[str, Plane]) -> dict[str, Plane]:
-    """The planes with Q and U from the meridians of another map's frame, equation (1); as they are where it is their own.
+    """The planes with Q and U from the meridians of another map's frame, equation (1); as they are
+    where it is their own.
 
     The covariance of Q and U counts as 0 in their noise.
     """
@@ -56,7 +69,10 @@ def on_meridians_of(other: Plane, planes: Mapping[str, Plane]) -> dict[str, Plan
     values, alone = (_turned(turn, a, b) for a, b in ((q.values, u.values), (q.alone, u.alone)))
     noise: list[Floats | None] = [None, None]
     if q.noise is not None and u.noise is not None:
-        noise = [np.hypot(turn.real * a, turn.imag * b) for a, b in ((q.noise, u.noise), (u.noise, q.noise))]
+        noise = [
+            np.hypot(turn.real * a, turn.imag * b)
+            for a, b in ((q.noise, u.noise), (u.noise, q.noise))
+        ]
     q = replace(q, values=values[0], noise=noise[0], alone=alone[0])
     u = replace(u, values=values[1], noise=noise[1], alone=alone[1])
     return {**planes, "Q": q, "U": u}

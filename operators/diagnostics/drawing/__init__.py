@@ -1,1 +1,3 @@
-"""Pictures of maps, spectra, streams and scans from plain values: figures, axes on the sky, PNG files, the process that draws."""
+"""Pictures of maps, spectra, streams and scans from plain values: figures, axes on the sky, PNG
+files, the process that draws.
+"""

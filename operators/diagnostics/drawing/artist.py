@@ -1,8 +1,10 @@
-"""A second process that draws while this one computes: matplotlib holds Python's lock, so a thread would not do.
+"""A second process that draws while this one computes: matplotlib holds Python's lock, so a thread
+would not do.
 
-It is a child that hears from nobody but its parent, through pipes, and ends with it. On Linux it has two processes of its own,
-made when all is imported, so that two pictures are drawn at a time. Whatever goes wrong there (no processes allowed, killed for
-memory, a warning or an error while drawing) is no matter: the caller draws the picture itself.
+It is a child that hears from nobody but its parent, through pipes, and ends with it. On Linux it
+has two processes of its own, made when all is imported, so that two pictures are drawn at a time.
+Whatever goes wrong there (no processes allowed, killed for memory, a warning or an error while
+drawing) is no matter: the caller draws the picture itself.
 """
 
 from __future__ import annotations
@@ -45,11 +47,16 @@ class Artist:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         waiting, ended = Waiting(), Event()
-        for line in (partial(_ask, self._process.stdin, self._calls), partial(_hear, self._process.stdout)):
+        for line in (
+            partial(_ask, self._process.stdin, self._calls),
+            partial(_hear, self._process.stdout),
+        ):
             Thread(target=line, args=(waiting, ended), name="artist", daemon=True).start()
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """What ``function(*arguments)`` returned there; None where it failed, warned, or there is no process any more."""
+        """What ``function(*arguments)`` returned there; None where it failed, warned, or there is
+        no process any more.
+        """
         future: Future[Any] = Future()
         if self._closed:
             future.set_result(None)
@@ -61,7 +68,9 @@ class Artist:
         """End the process and its children; the rest of the answers are None."""
         self._closed = True
         self._calls.put(None)
-        if self._process.returncode is None:  # nobody has waited for it: dead or not, the group's number is still its own
+        if (
+            self._process.returncode is None
+        ):  # nobody has waited for it: dead or not, the group's number is still its own
             if hasattr(os, "killpg"):
                 with suppress(OSError):
                     os.killpg(self._process.pid, signal.SIGKILL)
@@ -80,7 +89,11 @@ def _ask(outbox: IO[bytes], calls: Calls, waiting: Waiting, ended: Event) -> Non
         future, task = call
         waiting[id(future)] = future
         try:
-            pickle.dump((id(future), pickle.dumps(task, pickle.HIGHEST_PROTOCOL)), outbox, pickle.HIGHEST_PROTOCOL)
+            pickle.dump(
+                (id(future), pickle.dumps(task, pickle.HIGHEST_PROTOCOL)),
+                outbox,
+                pickle.HIGHEST_PROTOCOL,
+            )
             outbox.flush()
         except Exception:  # something that cannot be pickled, or nobody there
             _answer(waiting, id(future), None)
@@ -153,9 +166,15 @@ def _prepare() -> None:
     from importlib import import_module
 
     gc.disable()
-    with suppress(Exception):  # this process shows nobody the lists of properties in matplotlib's docstrings
+    with suppress(
+        Exception
+    ):  # this process shows nobody the lists of properties in matplotlib's docstrings
         vars(import_module("matplotlib.artist")).update(kwdoc=lambda artist: "")
-    for name in ("zonda.operators.diagnostics.drawing.pictures", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+    for name in (
+        "zonda.operators.diagnostics.drawing.pictures",
+        "matplotlib.figure",
+        "matplotlib.backends.backend_agg",
+    ):
         with suppress(Exception):
             import_module(name)
     gc.freeze()

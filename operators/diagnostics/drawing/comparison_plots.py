@@ -42,17 +42,27 @@ def _maps(file: str, found: Comparison) -> Sketch:
     where = SkyAxes.of(header) or header
     shape = planes["map"].shape
     axes = map_axes(shape, where, 3)
-    both = np.abs(np.concatenate([planes[name][np.isfinite(planes[name])] for name in ("reference", "map")]))
+    both = np.abs(
+        np.concatenate([planes[name][np.isfinite(planes[name])] for name in ("reference", "map")])
+    )
     limit = float(np.percentile(both, 99.7))
     reference, other = found.names
     style: dict[str, Any] = {"fwhm": found.fwhm or None, "unit": found.unit}
-    plot_map(planes["reference"], where, ax=axes[0], title=_short(f"Reference: {reference}"), limit=limit, **style)
+    plot_map(
+        planes["reference"],
+        where,
+        ax=axes[0],
+        title=_short(f"Reference: {reference}"),
+        limit=limit,
+        **style,
+    )
     plot_map(planes["map"], where, ax=axes[1], title=_short(f"Map: {other}"), limit=limit, **style)
     plot_map(planes["difference"], where, ax=axes[2], title="Map − reference", **style)
     f = found.figures
     caption = (
-        f"{other} against {reference}: {'; '.join(found.notes)}. Gain {f['gain']:.4g} ± {f['gain error']:.2g}, correlation "
-        f"{f['correlation']:.4g}. The difference has a scale of its own."
+        f"{other} against {reference}: {'; '.join(found.notes)}. Gain {f['gain']:.4g} ±"
+        f" {f['gain error']:.2g}, correlation {f['correlation']:.4g}. The difference has a scale of"
+        " its own."
     )
     return Sketch(file, "Comparison", caption, axes[0])
 
@@ -64,16 +74,23 @@ def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
     axes = map_axes(planes["map"].shape, where, 1 if snr is None else 2)
     finite = planes["fidelity"][np.isfinite(planes["fidelity"])]  # infinite where maps are equal
     most = (min(MOST_FIDELITY, float(np.percentile(finite, 99.9))) if finite.size else 0.0) or 1.0
-    plot_plain(planes["fidelity"], where, (0.0, most), "viridis", "fidelity", ax=axes[0], title="Fidelity")
+    plot_plain(
+        planes["fidelity"], where, (0.0, most), "viridis", "fidelity", ax=axes[0], title="Fidelity"
+    )
     caption = "Fidelity: |reference| / max(|difference|, threshold times its rms)."
     if snr is not None:
         reached = [abs(level) for level in levels if (snr * np.sign(level) >= abs(level)).any()]
         top = float(math.ceil(max(float(np.nanpercentile(np.abs(snr), 99.9)), *reached, 1.0)))
         words = noise_text(found.noise["snr"][0])
         title = f"Signal-to-noise ratio, {noise_text(found.noise['snr'][0], short=True)}"
-        plot_plain(snr, where, (-top, top), "RdBu_r", "signal-to-noise ratio", ax=axes[1], title=title)
+        plot_plain(
+            snr, where, (-top, top), "RdBu_r", "signal-to-noise ratio", ax=axes[1], title=title
+        )
         plot_contours(axes[1], snr, levels)
-        caption += f" Contours of the SNR: {contour_text(levels)} (negative ones dashed). Its noise: {words}."
+        caption += (
+            f" Contours of the SNR: {contour_text(levels)} (negative ones dashed). Its noise:"
+            f" {words}."
+        )
     return Sketch(f"{file}_quality", "Fidelity and SNR", caption, axes[0])
 
 
@@ -81,14 +98,24 @@ def _curves(file: str, found: Comparison) -> Sketch:
     size = (10.6, 4.6)
     left, right = new_figure(size, [(0.085, 0.135, 0.395, 0.7), (0.585, 0.135, 0.395, 0.7)])
     plot_radial_spectra(left, found.spectra, found.unit, found.fwhm)
-    p, names = found.profiles, {"reference": found.names[0], "map": found.names[1], "difference": "difference"}
+    p, names = (
+        found.profiles,
+        {"reference": found.names[0], "map": found.names[1], "difference": "difference"},
+    )
     used = np.isfinite(p.mean["map"])
     factor, unit = 1.0, found.unit
     if unit == "K_RJ":
-        factor, unit = unit_of(max(float(np.abs(mean[used]).max(initial=0.0)) for mean in p.mean.values()))
+        factor, unit = unit_of(
+            max(float(np.abs(mean[used]).max(initial=0.0)) for mean in p.mean.values())
+        )
     for k, (name, mean) in enumerate(p.mean.items()):
         error = np.where(np.isfinite(p.error[name]), p.error[name], 0.0)
-        style: dict[str, Any] = {"color": SEQUENCE[k], "linewidth": 1.3, "markersize": 3, "elinewidth": 0.8}
+        style: dict[str, Any] = {
+            "color": SEQUENCE[k],
+            "linewidth": 1.3,
+            "markersize": 3,
+            "elinewidth": 0.8,
+        }
         right.errorbar(
             p.radius[used] / ARCSEC,
             factor * mean[used],
@@ -106,7 +133,8 @@ def _curves(file: str, found: Comparison) -> Sketch:
     write_title(left, "Radial power spectra", pad=42)
     write_title(right, "Radial profiles")
     caption = (
-        "Power spectral densities in rings of angular scale under a cosine window, and means in rings about the map's centre."
+        "Power spectral densities in rings of angular scale under a cosine window, and means in"
+        " rings about the map's centre."
     )
     if found.fwhm:
         caption += f" Resolution {angle_text(found.fwhm)} FWHM (dotted)."
@@ -114,27 +142,55 @@ def _curves(file: str, found: Comparison) -> Sketch:
 
 
 def plot_radial_spectra(
-    ax: Any, found: RadialSpectra, unit: str, fwhm: float = 0.0, names: Mapping[str, str] | None = None
+    ax: Any,
+    found: RadialSpectra,
+    unit: str,
+    fwhm: float = 0.0,
+    names: Mapping[str, str] | None = None,
 ) -> Any:
-    """Power spectral densities against the angular scale, log-log; shaded: standard errors; dashed: the white level."""
+    """Power spectral densities against the angular scale, log-log; shaded: standard errors; dashed:
+    the white level.
+    """
     scale = found.scale / ARCSEC
     values: list[Floats] = []
     for k, (name, power) in enumerate(found.power.items()):
         good = np.isfinite(power) & (power > 0)
         error = 1 / np.sqrt(np.maximum(found.modes, 1.0))
         colour, y = SEQUENCE[k % len(SEQUENCE)], power / ARCSEC**2
-        ax.plot(scale[good], y[good], "o-", color=colour, linewidth=1.4, markersize=3, label=(names or {}).get(name, name))
+        ax.plot(
+            scale[good],
+            y[good],
+            "o-",
+            color=colour,
+            linewidth=1.4,
+            markersize=3,
+            label=(names or {}).get(name, name),
+        )
         low, high = (y * np.maximum(1 - error, 0.05))[good], (y * (1 + error))[good]
         ax.fill_between(scale[good], low, high, color=colour, alpha=0.15, linewidth=0)
         values.append(y[good])
         if name in found.white:
             level, known = found.white[name] / ARCSEC**2, np.isfinite(found.white[name])
-            ax.plot(scale[known], level[known], "--", color=colour, linewidth=1.0, label=f"white level of {name}")
+            ax.plot(
+                scale[known],
+                level[known],
+                "--",
+                color=colour,
+                linewidth=1.0,
+                label=f"white level of {name}",
+            )
             values.append(level[known])
     for name, power in found.cross.items():
         if name.endswith("_TE"):
             good = np.isfinite(power) & (power != 0)
-            ax.plot(scale[good], np.abs(power[good]) / ARCSEC**2, ":", color="0.4", linewidth=1.2, label=f"|{name}|")
+            ax.plot(
+                scale[good],
+                np.abs(power[good]) / ARCSEC**2,
+                ":",
+                color="0.4",
+                linewidth=1.2,
+                label=f"|{name}|",
+            )
     ax.set_xscale("log")
     ax.set_yscale("log")
     every = np.concatenate(values) if values else np.ones(1)
@@ -150,7 +206,9 @@ def plot_radial_spectra(
     upper.set_xlabel("wavenumber 1/scale [1/arcmin]")
     log_labels(upper.xaxis, _inverse(ends[0]), _inverse(ends[1]))
     ax.set_xlabel("angular scale [arcsec]")
-    ax.set_ylabel(f"power spectral density [{unit}² arcsec²]" if unit else "power spectral density [arcsec²]")
+    ax.set_ylabel(
+        f"power spectral density [{unit}² arcsec²]" if unit else "power spectral density [arcsec²]"
+    )
     ax.grid(which="major", color="0.9", linewidth=0.7)
     ax.legend(frameon=False, fontsize=8)
     return ax
@@ -167,7 +225,10 @@ def draw_map_spectra(file: str, found: MapSpectra) -> list[Sketch]:
     (ax,) = new_figure((7.2, 5.2), [(0.13, 0.12, 0.85, 0.74)])
     plot_radial_spectra(ax, found.spectra, "K_RJ", found.fwhm, found.names)
     write_title(ax, "Radial power spectra of the maps", pad=42)
-    caption = "Power spectral densities of the maps in rings of angular scale under a cosine window over the well covered field."
+    caption = (
+        "Power spectral densities of the maps in rings of angular scale under a cosine window over"
+        " the well covered field."
+    )
     if found.spectra.white:
         caption += " Dashed: the level of white noise by NET and samples."
     if found.fwhm:

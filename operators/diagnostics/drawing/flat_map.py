@@ -32,7 +32,8 @@ class FlatMap:
     centre
         (longitude, latitude) of its centre, rad.
     pixel, fwhm, smoothed_by
-        Side of a pixel, the beam's FWHM and that of the Gaussian applied to the map, rad; ``smoothed_by`` 0 for none.
+        Side of a pixel, the beam's FWHM and that of the Gaussian applied to the map, rad;
+        ``smoothed_by`` 0 for none.
     rms
         What is known of a plane's rms beforehand (maps that were not flat).
     smooth
@@ -58,13 +59,18 @@ class FlatMap:
     difference: str = "even minus odd scans"
 
     def window(self) -> tuple[slice, slice]:
-        """Rows and columns where there are samples, with a margin of a hundredth of the longer side; all, if they are most."""
+        """Rows and columns where there are samples, with a margin of a hundredth of the longer
+        side; all, if they are most.
+        """
         edges = []
         for axis, size in enumerate(self.hits.shape):
             used = np.flatnonzero((self.hits > 0).any(axis=1 - axis))
             edges.append((int(used[0]), int(used[-1]) + 1) if used.size else (0, size))
         spare = math.ceil(0.01 * max(high - low for low, high in edges))
-        y, x = (slice(max(0, a - spare), min(n, b + spare)) for (a, b), n in zip(edges, self.hits.shape, strict=True))
+        y, x = (
+            slice(max(0, a - spare), min(n, b + spare))
+            for (a, b), n in zip(edges, self.hits.shape, strict=True)
+        )
         whole = (y.stop - y.start) * (x.stop - x.start) >= 0.9 * self.hits.size
         return (slice(0, self.hits.shape[0]), slice(0, self.hits.shape[1])) if whole else (y, x)
 
@@ -91,7 +97,9 @@ class FlatMap:
         return self.header if self.axes is None else self.axes
 
     def smoothed(self, fwhm: float) -> FlatMap:
-        """As `MapProduct.smoothed`: every plane convolved with a Gaussian of ``fwhm`` [rad], weighted, without empty pixels."""
+        """As `MapProduct.smoothed`: every plane convolved with a Gaussian of ``fwhm`` [rad],
+        weighted, without empty pixels.
+        """
         planes = {}
         for name, values in self.planes.items():
             use = np.isfinite(values) & (self.hits > 0)
@@ -103,8 +111,8 @@ class FlatMap:
         return replace(self, planes=planes, smoothed_by=math.hypot(self.smoothed_by, fwhm))
 
     def covered(self, least: float) -> NDArray[np.bool_]:
-        """Pixels with at least ``least`` of the 99th percentile of the samples, as smoothed as the map is: the edge is not
-        ragged then."""
+        """Pixels with at least ``least`` of the 99th percentile of the samples, as smoothed as the
+        map is: the edge is not ragged then."""
         hits = self.hits
         if self.smooth and self.smoothed_by:
             hits = self._convolve(hits, self.smoothed_by)
@@ -112,25 +120,39 @@ class FlatMap:
         return np.asarray(hits >= least * np.percentile(seen, 99) if seen.size else self.hits > 0)
 
     def limit(self, plane: str, hits: AnyFloats, share: float) -> float | None:
-        """Brightness scale that covers ``share`` per cent of what ``hits`` cover well: the noisy rim must not set it."""
+        """Brightness scale that covers ``share`` per cent of what ``hits`` cover well: the noisy
+        rim must not set it.
+        """
         values = self.planes[plane]
         if not hits.any():
             return None
-        good = np.abs(values[(hits > 0.25 * np.percentile(hits[hits > 0], 99)) & np.isfinite(values)])
+        good = np.abs(
+            values[(hits > 0.25 * np.percentile(hits[hits > 0], 99)) & np.isfinite(values)]
+        )
         return float(np.percentile(good, share)) if good.size else None
 
     def central_rms(self, plane: str, radius: float) -> float:
-        """Weighted rms about zero within ``radius`` [rad] of the centre; NaN where it is not known."""
+        """Weighted rms about zero within ``radius`` [rad] of the centre; NaN where it is not
+        known.
+        """
         if plane in self.rms or self.axes is None:
             return self.rms.get(plane, math.nan)
         values = self.planes[plane]
         use = (self.axes.distance(values.shape, self.centre) <= radius) & np.isfinite(values)
         w = self.weights[use].astype(np.float64)
-        return math.sqrt((w * values[use].astype(np.float64) ** 2).sum() / w.sum()) if w.sum() > 0 else math.nan
+        return (
+            math.sqrt((w * values[use].astype(np.float64) ** 2).sum() / w.sum())
+            if w.sum() > 0
+            else math.nan
+        )
 
     def _convolve(self, values: AnyFloats, fwhm: float) -> AnyFloats:
-        """Convolve with a Gaussian of ``fwhm`` [rad], in single precision; of a wide map each pixel with its own kernel."""
+        """Convolve with a Gaussian of ``fwhm`` [rad], in single precision; of a wide map each pixel
+        with its own kernel.
+        """
         grid = image_grid(self.header, (values.shape[0], values.shape[1]), self.pixel)
         if not grid.even:
             return grid.smoother(fwhm)(values).astype(np.float32)
-        return convolved(values, gaussian_taps(fwhm / FWHM_PER_SIGMA / self.pixel).astype(np.float32))
+        return convolved(
+            values, gaussian_taps(fwhm / FWHM_PER_SIGMA / self.pixel).astype(np.float32)
+        )

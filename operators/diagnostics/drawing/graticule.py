@@ -1,7 +1,9 @@
-"""Meridians and parallels of an image whose edges they do not follow: near a pole, turned, or of all the sky.
+"""Meridians and parallels of an image whose edges they do not follow: near a pole, turned, or of
+all the sky.
 
-numpy alone. A longitude is written where its meridian leaves the image, a latitude likewise; where there is no such place for two
-of them, or a pole is in the image, latitudes are written on their circles.
+numpy alone. A longitude is written where its meridian leaves the image, a latitude likewise; where
+there is no such place for two of them, or a pole is in the image, latitudes are written on their
+circles.
 """
 
 from __future__ import annotations
@@ -62,7 +64,9 @@ class AstropyAxes:
 
 
 class Crossing(NamedTuple):
-    """Where a line leaves the image: the edge, the pixel coordinate along it, the sine of the angle to it."""
+    """Where a line leaves the image: the edge, the pixel coordinate along it, the sine of the angle
+    to it.
+    """
 
     edge: str
     place: float
@@ -71,7 +75,9 @@ class Crossing(NamedTuple):
 
 @dataclass
 class Graticule:
-    """Lines (n, 2) of pixels, NaN between their parts; marks by edge; texts (x, y, text) in the image; names of the axes."""
+    """Lines (n, 2) of pixels, NaN between their parts; marks by edge; texts (x, y, text) in the
+    image; names of the axes.
+    """
 
     lines: list[Floats] = field(default_factory=list)
     marks: dict[str, Ticks] = field(default_factory=dict)
@@ -79,8 +85,12 @@ class Graticule:
     names: tuple[str, str] = ("", "")
 
 
-def graticule(axes: Projected, shape: tuple[int, ...], per_character: float, per_line: float) -> Graticule:
-    """The graticule of an image (ny, nx). ``per_character``, ``per_line``: width of a character, height of a line, pixels."""
+def graticule(
+    axes: Projected, shape: tuple[int, ...], per_character: float, per_line: float
+) -> Graticule:
+    """The graticule of an image (ny, nx). ``per_character``, ``per_line``: width of a character,
+    height of a line, pixels.
+    """
     image = _Image(axes, shape, per_character, per_line)
     polar = image.polar
     if polar:
@@ -93,13 +103,23 @@ def graticule(axes: Projected, shape: tuple[int, ...], per_character: float, per
             else (("left",), ("bottom",))
         )
     made = Graticule()
-    inner = [image.add(made, longitude, where) for longitude, where in zip((True, False), edges, strict=True)]
+    inner = [
+        image.add(made, longitude, where)
+        for longitude, where in zip((True, False), edges, strict=True)
+    ]
     lon, lat, frame = axes.names
     if polar and not inner[0]:
         made.names = f"{lon} along the edges, {lat} on its circles ({frame})", ""
         return made
-    written = {edge: name for name, where, within in zip((lon, lat), edges, inner, strict=True) if not within for edge in where}
-    rest = [f"{name} on its lines" for name, within in zip((lon, lat), inner, strict=True) if within]
+    written = {
+        edge: name
+        for name, where, within in zip((lon, lat), edges, inner, strict=True)
+        if not within
+        for edge in where
+    }
+    rest = [
+        f"{name} on its lines" for name, within in zip((lon, lat), inner, strict=True) if within
+    ]
     if rest:
         made.names = (
             ", ".join([*(written[e] for e in ("bottom",) if e in written), *rest]) + f" ({frame})",
@@ -113,11 +133,15 @@ def graticule(axes: Projected, shape: tuple[int, ...], per_character: float, per
 class _Image:
     """What is seen in an image."""
 
-    def __init__(self, axes: Projected, shape: tuple[int, ...], per_character: float, per_line: float) -> None:
+    def __init__(
+        self, axes: Projected, shape: tuple[int, ...], per_character: float, per_line: float
+    ) -> None:
         self.axes, self.hours = axes, axes.names[0] == "RA"
         self.ny, self.nx = shape
         self.per_character, self.per_line = per_character, per_line
-        x, y = np.meshgrid(np.linspace(-0.5, self.nx - 0.5, 41), np.linspace(-0.5, self.ny - 0.5, 41))
+        x, y = np.meshgrid(
+            np.linspace(-0.5, self.nx - 0.5, 41), np.linspace(-0.5, self.ny - 0.5, 41)
+        )
         lon, lat = axes.world(x, y)
         seen = np.isfinite(lon) & np.isfinite(lat)
         self.pole = 0
@@ -142,7 +166,9 @@ class _Image:
     def within(self, x: Any, y: Any) -> NDArray[np.bool_]:
         """Whether pixel coordinates are in the image."""
         with np.errstate(invalid="ignore"):
-            return np.asarray((x >= -0.5) & (x <= self.nx - 0.5) & (y >= -0.5) & (y <= self.ny - 0.5))
+            return np.asarray(
+                (x >= -0.5) & (x <= self.nx - 0.5) & (y >= -0.5) & (y <= self.ny - 0.5)
+            )
 
     def line(self, longitude: bool, value: float) -> Floats:
         """(n, 2): a meridian or parallel, NaN where it is not in the projection or jumps."""
@@ -181,15 +207,28 @@ class _Image:
         return found
 
     def leaves(self, longitude: bool, edge: str) -> float:
-        """How well lines leave the image at ``edge``: the sum of the sines of their angles to it."""
+        """How well lines leave the image at ``edge``: the sum of the sines of their angles to
+        it.
+        """
         low, high = self.lon if longitude else self.lat
         probes = np.linspace(low, high, 9)[1:-1]
-        return float(sum(c.sine for value in probes for c in self.crossings(self.line(longitude, value)) if c.edge == edge))
+        return float(
+            sum(
+                c.sine
+                for value in probes
+                for c in self.crossings(self.line(longitude, value))
+                if c.edge == edge
+            )
+        )
 
     def add(self, made: Graticule, longitude: bool, edges: Sequence[str]) -> bool:
-        """Add lines of the smallest round step whose labels have room, and the labels; whether they are in the image."""
+        """Add lines of the smallest round step whose labels have room, and the labels; whether they
+        are in the image.
+        """
         low, high = self.lon if longitude else self.lat
-        steps = [s for s in round_steps(longitude, self.hours) if (high - low) / s <= _MOST[longitude]] or [360.0]
+        steps = [
+            s for s in round_steps(longitude, self.hours) if (high - low) / s <= _MOST[longitude]
+        ] or [360.0]
         for step in steps:
             values = multiples(low, high, step) * step
             if longitude and high - low >= 360:
@@ -208,7 +247,9 @@ class _Image:
         made.inside += self._within(lines, texts, [(x, y) for x, y, _ in made.inside])
         return True
 
-    def _at_edges(self, lines: Iterable[Floats], texts: Iterable[str], edges: Sequence[str]) -> tuple[dict[str, Ticks], bool]:
+    def _at_edges(
+        self, lines: Iterable[Floats], texts: Iterable[str], edges: Sequence[str]
+    ) -> tuple[dict[str, Ticks], bool]:
         """Marks of lines that are steep enough at ``edges``, and whether they have room."""
         found: dict[str, list[tuple[float, str]]] = {edge: [] for edge in edges}
         for points, text in zip(lines, texts, strict=True):
@@ -231,7 +272,9 @@ class _Image:
     def _within(
         self, lines: Iterable[Floats], texts: Iterable[str], taken: Sequence[tuple[float, float]]
     ) -> list[tuple[float, float, str]]:
-        """Labels on the lines: each as far from the edges and the other labels as it can be, up to its own size."""
+        """Labels on the lines: each as far from the edges and the other labels as it can be, up to
+        its own size.
+        """
         found: list[tuple[float, float, str]] = []
         for points, text in zip(lines, texts, strict=True):
             here = points[self.within(*points.T)]
@@ -240,7 +283,8 @@ class _Image:
             wide, high = (len(text) + 1) * self.per_character, 1.5 * self.per_line
             x, y = here.T
             room = np.minimum(
-                np.minimum(x + 0.5, self.nx - 0.5 - x) / (0.5 * wide), np.minimum(y + 0.5, self.ny - 0.5 - y) / (0.5 * high)
+                np.minimum(x + 0.5, self.nx - 0.5 - x) / (0.5 * wide),
+                np.minimum(y + 0.5, self.ny - 0.5 - y) / (0.5 * high),
             )
             room = np.minimum(room, 1.2)
             for a, b in [*taken, *((a, b) for a, b, _ in found)]:

@@ -16,11 +16,15 @@ from .sky_axes import SkyAxes, Ticks, names_of
 IMAGE = (4.23, 4.28)
 """Largest width and height of an image, in."""
 LONG, THIN = 8.4, 1.05
-"""Width of an image of a strip, and the least height or width of one, in: a longer strip is stretched across."""
+"""Width of an image of a strip, and the least height or width of one, in: a longer strip is
+stretched across.
+"""
 STRIP = 2.2
 """Width over height from which an image is a strip."""
 BAR, GAP, UNDER = 1.12, 0.2, 0.62
-"""Room for a colour bar with its labels beside an image, before the next image, and for a colour bar below, in."""
+"""Room for a colour bar with its labels beside an image, before the next image, and for a colour
+bar below, in.
+"""
 NEARLY = 0.01
 """Relative difference of steps on the sky that no picture shows."""
 TITLE = 4.4
@@ -37,14 +41,20 @@ class _Marks:
 
     @property
     def left(self) -> float:
-        longest = max((len(label) for label in self.ticks["left"].labels), default=0) if "left" in self.ticks else 0
+        longest = (
+            max((len(label) for label in self.ticks["left"].labels), default=0)
+            if "left" in self.ticks
+            else 0
+        )
         return 0.36 + CHARACTER * longest
 
     @property
     def right(self) -> float:
         if self.grid is None or "right" not in self.grid.marks:
             return 0.0
-        return 0.08 + CHARACTER * max((len(label) for label in self.grid.marks["right"].labels), default=0)
+        return 0.08 + CHARACTER * max(
+            (len(label) for label in self.grid.marks["right"].labels), default=0
+        )
 
     @property
     def top(self) -> float:
@@ -52,7 +62,9 @@ class _Marks:
 
 
 def located(wcs: Any) -> SkyAxes | AstropyAxes:
-    """Where an image is: its `SkyAxes`, or astropy's WCS in their place. ``wcs``: one of them, or a FITS header."""
+    """Where an image is: its `SkyAxes`, or astropy's WCS in their place. ``wcs``: one of them, or a
+    FITS header.
+    """
     if isinstance(wcs, SkyAxes | AstropyAxes):
         return wcs
     header = wcs.to_header(relax=True) if hasattr(wcs, "to_header") else wcs
@@ -60,13 +72,15 @@ def located(wcs: Any) -> SkyAxes | AstropyAxes:
 
 
 def map_axes(shape: tuple[int, ...], wcs: Any, count: int = 1, scales: int = 1) -> list[Any]:
-    """Axes of a new figure for ``count`` images (ny, nx), each with one for its colour bar as ``bar_axes``.
+    """Axes of a new figure for ``count`` images (ny, nx), each with one for its colour bar as
+    ``bar_axes``.
 
-    They have the image's pixel coordinates, with tick marks in longitude and latitude, or lines of them where these do
-    not follow the edges. Pixels have the shape that they have on the sky in the middle of the image. Images of strips
-    are wide, with the colour bar below and one below the other; a strip too thin to be seen is stretched, and its axis
-    says so. ``scales``: of a colour bar, 1 or 2. Latitudes are written at the first of images side by side only, since
-    they are the same for all.
+    They have the image's pixel coordinates, with tick marks in longitude and latitude, or lines of
+    them where these do not follow the edges. Pixels have the shape that they have on the sky in the
+    middle of the image. Images of strips are wide, with the colour bar below and one below the
+    other; a strip too thin to be seen is stretched, and its axis says so. ``scales``: of a colour
+    bar, 1 or 2. Latitudes are written at the first of images side by side only, since they are the
+    same for all.
     """
     axes = located(wcs)
     ny, nx = shape
@@ -91,7 +105,9 @@ def map_axes(shape: tuple[int, ...], wcs: Any, count: int = 1, scales: int = 1) 
 
 
 def sky_steps(axes: SkyAxes | AstropyAxes, shape: tuple[int, ...]) -> tuple[float, float]:
-    """Steps on the sky [deg] of the middle pixel of an image (ny, nx), by one in x and in y; those of the header to 1 %."""
+    """Steps on the sky [deg] of the middle pixel of an image (ny, nx), by one in x and in y; those
+    of the header to 1 %.
+    """
     y, x = ((n - 1) / 2 for n in shape)
     lon, lat = axes.world(x + np.array([0.5, -0.5, 0.0, 0.0]), y + np.array([0.0, 0.0, 0.5, -0.5]))
     ends = unit_vectors(np.radians(lon), np.radians(lat))
@@ -102,18 +118,28 @@ def sky_steps(axes: SkyAxes | AstropyAxes, shape: tuple[int, ...]) -> tuple[floa
 
 
 def _stretched(names: tuple[str, str], sky: tuple[str, str, str], ratio: float) -> tuple[str, str]:
-    """Names of the axes; the lower one says which is stretched. ``ratio``: of the scales across and up."""
+    """Names of the axes; the lower one says which is stretched. ``ratio``: of the scales across and
+    up.
+    """
     if 0.99 < ratio < 1.01:
         return names
-    text = f"{names[0]}, {sky[1]} stretched {1 / ratio:.2g}×" if ratio < 1 else f"{names[0]}, stretched {ratio:.2g}×"
+    text = (
+        f"{names[0]}, {sky[1]} stretched {1 / ratio:.2g}×"
+        if ratio < 1
+        else f"{names[0]}, stretched {ratio:.2g}×"
+    )
     return text, names[1]
 
 
-def _marks(axes: SkyAxes | AstropyAxes, shape: tuple[int, ...], width: float, height: float) -> _Marks:
+def _marks(
+    axes: SkyAxes | AstropyAxes, shape: tuple[int, ...], width: float, height: float
+) -> _Marks:
     """Tick marks of an image of this width and height, in."""
     ny, nx = shape
     lon, lat, frame = axes.names
-    ticks = axes.ticks(shape, width / CHARACTER, height / LINE) if isinstance(axes, SkyAxes) else None
+    ticks = (
+        axes.ticks(shape, width / CHARACTER, height / LINE) if isinstance(axes, SkyAxes) else None
+    )
     if ticks is not None:
         return _Marks(ticks, None, (f"{lon} ({frame})", f"{lat} ({frame})"))
     grid = graticule(axes, shape, CHARACTER * nx / width, LINE * ny / height)
@@ -123,7 +149,9 @@ def _marks(axes: SkyAxes | AstropyAxes, shape: tuple[int, ...], width: float, he
 def _places(
     image: tuple[float, float], marks: _Marks, count: int, strip: bool, scales: int
 ) -> tuple[list[tuple[float, float, float, float]], tuple[float, float]]:
-    """Places (left, bottom, width, height) of each image and its colour bar, shares of the figure; its size, in."""
+    """Places (left, bottom, width, height) of each image and its colour bar, shares of the figure;
+    its size, in.
+    """
     width, height = image
     left, top = marks.left, TOP + marks.top
     found = []
@@ -140,7 +168,10 @@ def _places(
         beside = 0.1 + marks.right + (0.75 if scales == 2 else 0.0)
         spare = max(0.0, TITLE - width - BAR - beside)
         pitch = width + beside + BAR - 0.1 + spare + (GAP if marks.grid is None else left)
-        size = left + spare / 2 + width + beside + BAR - 0.1 + spare / 2 + (count - 1) * pitch, tall + top + BOTTOM
+        size = (
+            left + spare / 2 + width + beside + BAR - 0.1 + spare / 2 + (count - 1) * pitch,
+            tall + top + BOTTOM,
+        )
         for k in range(count):
             x = left + spare / 2 + k * pitch
             found += [
@@ -175,11 +206,26 @@ def _mark(ax: Any, marks: _Marks, shape: tuple[int, ...]) -> None:
     ):
         for place, label in zip(*marks.ticks.get(edge, none), strict=True):
             at = (place, ny - 0.5) if edge == "top" else (nx - 0.5, place)
-            ax.annotate(label, at, xytext=(dx, dy), textcoords="offset points", fontsize=9, annotation_clip=False, **where)
+            ax.annotate(
+                label,
+                at,
+                xytext=(dx, dy),
+                textcoords="offset points",
+                fontsize=9,
+                annotation_clip=False,
+                **where,
+            )
     for x, y, text in marks.grid.inside:
         ax.text(x, y, text, fontsize=8, ha="center", va="center", zorder=4, bbox=PALE)
 
 
 def _tick_style(marker: int) -> dict[str, Any]:
     """Style of tick marks that no axis draws."""
-    return {"linestyle": "none", "marker": marker, "markersize": 3.5, "markeredgewidth": 0.8, "color": "black", "clip_on": False}
+    return {
+        "linestyle": "none",
+        "marker": marker,
+        "markersize": 3.5,
+        "markeredgewidth": 0.8,
+        "color": "black",
+        "clip_on": False,
+    }

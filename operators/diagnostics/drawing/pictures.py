@@ -1,4 +1,6 @@
-"""Pictures of a run from plain values: what is drawn in the second process. numpy and, when something is drawn, matplotlib."""
+"""Pictures of a run from plain values: what is drawn in the second process. numpy and, when
+something is drawn, matplotlib.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ from .vector import vector_of
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture: ``name`` without suffix, a title, what it shows, its bytes as PNG and, by format, as further files."""
+    """A picture: ``name`` without suffix, a title, what it shows, its bytes as PNG and, by format,
+    as further files.
+    """
 
     name: str
     title: str
@@ -49,7 +53,9 @@ class Picture:
 
 @dataclass(frozen=True)
 class Style:
-    """Parameters of `Plots`; angles in rad, ``smooth`` None: with the beam, 0: not; ``central_diameter`` None: as the map."""
+    """Parameters of `Plots`; angles in rad, ``smooth`` None: with the beam, 0: not;
+    ``central_diameter`` None: as the map.
+    """
 
     smooth: float | None
     central_diameter: float | None
@@ -60,16 +66,23 @@ class Style:
 
 
 def printed(draw: Callable[..., list[Sketch]], style: Style, *arguments: Any) -> list[Picture]:
-    """What ``draw(*arguments)`` sketches, in the formats of the style; PNG always, since reports show it."""
+    """What ``draw(*arguments)`` sketches, in the formats of the style; PNG always, since reports
+    show it.
+    """
     made = []
     for sketch in draw(*arguments):
         png = png_of(sketch.ax, style.dpi)
-        files = {name: png if name == "png" else vector_of(sketch.ax, name, style.dpi) for name in style.formats}
+        files = {
+            name: png if name == "png" else vector_of(sketch.ax, name, style.dpi)
+            for name in style.formats
+        }
         made.append(Picture(sketch.name, sketch.title, sketch.caption, png, files))
     return made
 
 
-def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, Any], signed: bool = False) -> list[Sketch]:
+def draw_input(
+    file: str, values: Any, axes: SkyAxes | None, header: dict[str, Any], signed: bool = False
+) -> list[Sketch]:
     """The input map (ny, nx), K_RJ; ``signed``: Q or U, with zero in the middle of the colours."""
     what, where = _named("Input", file, "input"), header if axes is None else axes
     title = f"{what}: the sky before the beam"
@@ -77,7 +90,9 @@ def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, A
         top = float(np.nanpercentile(np.abs(values), 99.7)) or 1.0
         factor, unit = unit_of(top)
         label = f"Rayleigh–Jeans brightness [{unit}]"
-        ax = plot_plain(values * factor, where, (-top * factor, top * factor), "RdBu_r", label, title=title)
+        ax = plot_plain(
+            values * factor, where, (-top * factor, top * factor), "RdBu_r", label, title=title
+        )
     else:
         ax = plot_map(values, where, title=title)
     text = "The input map, before beam, opacity and filters."
@@ -88,16 +103,26 @@ def draw_input(file: str, values: Any, axes: SkyAxes | None, header: dict[str, A
 
 
 def draw_map(
-    file: str, signal: str, key: str, product: FlatMap, style: Style, snr: tuple[AnyFloats, str] | None = None
+    file: str,
+    signal: str,
+    key: str,
+    product: FlatMap,
+    style: Style,
+    snr: tuple[AnyFloats, str] | None = None,
 ) -> list[Sketch]:
-    """Plane ``signal`` of a map of a signal, called ``key``; ``snr``: (ny, nx), contours of it, and what its noise is."""
+    """Plane ``signal`` of a map of a signal, called ``key``; ``snr``: (ny, nx), contours of it, and
+    what its noise is.
+    """
     window = product.window()
     shown, how = _shown(product.cropped(window), style)
     title = {"": "Map", "noiseless": "Noiseless map"}.get(signal, f"Map of signal {signal}")
     title = _named(title, key)
     meaning = {
         "": "Everything: sky, atmosphere and noise, filtered and binned.",
-        "noiseless": "The sky alone through the same pointing, filters and binning: what the processing leaves of it.",
+        "noiseless": (
+            "The sky alone through the same pointing, filters and binning: what the processing"
+            " leaves of it."
+        ),
     }.get(signal, "A part of the components, filtered and binned.")
     limit = shown.limit("signal", shown.hits, SHOWN if signal == "noiseless" else 99.7)
     head = _titled(title, shown)
@@ -106,18 +131,30 @@ def draw_map(
     ax = _panels([(shown, head)], style, limit)
     text = f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}"
     if snr is not None:
-        plot_contours(ax, np.where(shown.covered(style.least_coverage), snr[0][window], np.nan), style.contours)
-        text += f" Contours of the signal-to-noise ratio: {contour_text(style.contours)} (negative ones dashed)."
+        plot_contours(
+            ax,
+            np.where(shown.covered(style.least_coverage), snr[0][window], np.nan),
+            style.contours,
+        )
+        text += (
+            f" Contours of the signal-to-noise ratio: {contour_text(style.contours)} (negative ones"
+            " dashed)."
+        )
         text += f" Its noise: {noise_text(snr[1])}."
     return [Sketch(file, title, text, ax)]
 
 
 def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Sketch]:
-    """Maps of noise alone: ``half_difference`` (of the map, which comes first) and ``source_free`` (plane ``signal``)."""
+    """Maps of noise alone: ``half_difference`` (of the map, which comes first) and ``source_free``
+    (plane ``signal``).
+    """
     words = {"source_free": "all but the sky"}
     panels, figures, limits, how = [], [], [], ""
     first = next(iter(sources.values()))
-    window, diameter = first.window(), central_diameter(first.fwhm, first.pixel, style.central_diameter)
+    window, diameter = (
+        first.window(),
+        central_diameter(first.fwhm, first.pixel, style.central_diameter),
+    )
     for of, source in sources.items():
         words.setdefault(of, source.difference)
         shown, how = _shown(source.cropped(window), style)
@@ -136,44 +173,81 @@ def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Ske
     return [Sketch(file, _named("Noise", file, "noise"), text, ax)]
 
 
-def draw_coverage(file: str, product: FlatMap, samples: int, pixels: int, sides: tuple[float, float]) -> list[Sketch]:
-    """Samples per pixel and seconds per beam; ``samples`` in ``pixels`` in all, of these `MapArrays.sides`."""
+def draw_coverage(
+    file: str, product: FlatMap, samples: int, pixels: int, sides: tuple[float, float]
+) -> list[Sketch]:
+    """Samples per pixel and seconds per beam; ``samples`` in ``pixels`` in all, of these
+    `MapArrays.sides`.
+    """
     product = product.cropped()
     what = "Samples per pixel" if product.per_beam is None else "Integration time per beam"
-    ax = plot_coverage(product.hits, product.sky, per_beam=product.per_beam, title=_named(what, file, "coverage"))
-    text = f"{samples:,} samples in {pixels:,} pixels of {sides_text(*sides)}.".replace(",", "\u202f")
+    ax = plot_coverage(
+        product.hits, product.sky, per_beam=product.per_beam, title=_named(what, file, "coverage")
+    )
+    text = f"{samples:,} samples in {pixels:,} pixels of {sides_text(*sides)}.".replace(
+        ",", "\u202f"
+    )
     if product.per_beam is not None:
         beam = f"of {angle_text(product.fwhm)} FWHM (area π FWHM² / (4 ln 2))"
-        text += f" Integration time: of all detectors together, in the area of the telescope's beam {beam}."
+        text += (
+            " Integration time: of all detectors together, in the area of the telescope's beam"
+            f" {beam}."
+        )
     return [Sketch(file, "Coverage", text, ax)]
 
 
 def draw_crosslinking(file: str, product: FlatMap) -> list[Sketch]:
     """How evenly scan directions cross in each pixel."""
     product = product.cropped()
-    text = "The size of the mean of exp(2iψ), ψ the direction in which detectors move through a pixel."
-    return [Sketch(file, "Crosslinking", text, plot_crosslinking(product.planes["crosslinking"], product.sky))]
+    text = (
+        "The size of the mean of exp(2iψ), ψ the direction in which detectors move through a pixel."
+    )
+    return [
+        Sketch(
+            file,
+            "Crosslinking",
+            text,
+            plot_crosslinking(product.planes["crosslinking"], product.sky),
+        )
+    ]
 
 
 def draw_scan(tracks: Sequence[ScanTrack]) -> list[Sketch]:
     """Where the boresight went."""
     ax = plot_scan(tracks)
-    return [Sketch("scan", "Boresight track", "The boresight about the target, one line per scan.", ax)]
+    return [
+        Sketch("scan", "Boresight track", "The boresight about the target, one line per scan.", ax)
+    ]
 
 
 def draw_spectra(file: str, spectrum: Spectrum, before: str) -> list[Sketch]:
     """Power spectra, taken after the step ``before``."""
     where = f"after {before}" if before else f"at step {spectrum.label}"
-    many = f"{spectrum.detectors} detectors and {spectrum.observations} scan{'s' if spectrum.observations > 1 else ''}"
+    many = (
+        f"{spectrum.detectors} detectors and {spectrum.observations}"
+        f" scan{'s' if spectrum.observations > 1 else ''}"
+    )
     made = []
     for kind in dict.fromkeys(map(unit_of_stream, spectrum.psd)):
-        part = replace(spectrum, psd={name: psd for name, psd in spectrum.psd.items() if unit_of_stream(name) == kind})
-        extra, caption = "" if kind == "K_RJ" else f"_{'_'.join(part.psd)}", f"Mean of {many} {where}"
+        part = replace(
+            spectrum,
+            psd={name: psd for name, psd in spectrum.psd.items() if unit_of_stream(name) == kind},
+        )
+        extra, caption = (
+            "" if kind == "K_RJ" else f"_{'_'.join(part.psd)}",
+            f"Mean of {many} {where}",
+        )
         if kind == "K_RJ":
-            caption += ", referred to the calibrated sky: divided by ζ exp(−τ), the atmosphere multiplied by ε"
+            caption += (
+                ", referred to the calibrated sky: divided by ζ exp(−τ), the atmosphere multiplied"
+                " by ε"
+            )
         caption += "."
         if "signal" in part.psd:
-            caption += " The signal holds the mean emission too, which changes as the scan moves in elevation."
+            caption += (
+                " The signal holds the mean emission too, which changes as the scan moves in"
+                " elevation."
+            )
         ax = plot_spectra(part, title=f"Power spectra of the time streams {where}")
         made.append(Sketch(f"{file}{extra}", "Power spectra", caption, ax))
     return made
@@ -185,8 +259,9 @@ def draw_modes(file: str, modes: Modes, before: str) -> list[Sketch]:
     what = f"{modes.detectors} detectors"
     what += f" at {modes.delays + 1} delays of {modes.delay:.3g} s" if modes.delays else ""
     caption = (
-        f"Principal components of {what} {where}: left, the share of the variance in each, mean of {len(modes.values)} "
-        f"scan{'s' if len(modes.values) > 1 else ''}; right, the first in time, of {modes.observation}."
+        f"Principal components of {what} {where}: left, the share of the variance in each, mean of"
+        f" {len(modes.values)} scan{'s' if len(modes.values) > 1 else ''}; right, the first in"
+        f" time, of {modes.observation}."
     )
     ax = plot_modes(modes, title=f"Modes {where}")
     return [Sketch(file, "Modes", caption, ax)]
@@ -196,9 +271,10 @@ def draw_transfer(file: str, transfer: Any) -> list[Sketch]:
     """A `Transfer`."""
     whose = "the sky alone" if transfer.modes == "sky" else "the complete data"
     caption = (
-        "The map of the sky alone through all filters against the same map without filters, by angular scale: the ratio of "
-        "their cross spectrum to the spectrum of the latter, with the standard error from the scatter of the modes (bars); "
-        f"dashed, the ratio of amplitudes. Dotted, the beam. Singular modes of {whose}."
+        "The map of the sky alone through all filters against the same map without filters, by"
+        " angular scale: the ratio of their cross spectrum to the spectrum of the latter, with the"
+        " standard error from the scatter of the modes (bars); dashed, the ratio of amplitudes."
+        f" Dotted, the beam. Singular modes of {whose}."
     )
     of = "" if file == "transfer_function" else f" ({file.removeprefix('transfer_function_')})"
     ax = plot_transfer(transfer, title=f"Transfer function{of}, singular modes of {whose}")
@@ -217,10 +293,19 @@ def draw_streams(file: str, stream: TimeStream, before: str) -> list[Sketch]:
     for which in stream.streams:
         extra = "" if which == "signal" else f"_{which}"
         meaning = (
-            "divided by ζ exp(−τ), with the mean emission that no filter has removed" if which == "signal" else "at the detector"
+            "divided by ζ exp(−τ), with the mean emission that no filter has removed"
+            if which == "signal"
+            else "at the detector"
         )
-        meaning = meaning if unit_of_stream(which) == "K_RJ" else "along the line of sight, without its mean"
-        caption = f"Stream {which} of {len(stream.names)} detectors {where}: {meaning}. Pale: samples; dark: means over 1 s."
+        meaning = (
+            meaning
+            if unit_of_stream(which) == "K_RJ"
+            else "along the line of sight, without its mean"
+        )
+        caption = (
+            f"Stream {which} of {len(stream.names)} detectors {where}: {meaning}. Pale: samples;"
+            " dark: means over 1 s."
+        )
         ax = plot_tod(stream, name=which, title=f"Time streams of {stream.observation} {where}")
         made.append(Sketch(f"{file}{extra}", "Time streams", caption, ax))
     return made
@@ -229,9 +314,20 @@ def draw_streams(file: str, stream: TimeStream, before: str) -> list[Sketch]:
 def _shown(product: FlatMap, style: Style) -> tuple[FlatMap, str]:
     """The map as its picture shows it, and what was done to it."""
     if not product.smooth or style.smooth == 0 or product.smoothed_by:
-        return product, f"smoothed by {angle_text(product.smoothed_by)}" if product.smoothed_by else "not smoothed"
+        return (
+            product,
+            (
+                f"smoothed by {angle_text(product.smoothed_by)}"
+                if product.smoothed_by
+                else "not smoothed"
+            ),
+        )
     fwhm = product.fwhm if style.smooth is None else style.smooth
-    return (product.smoothed(fwhm), f"smoothed by {angle_text(fwhm)} for this picture") if fwhm > 0 else (product, "not smoothed")
+    return (
+        (product.smoothed(fwhm), f"smoothed by {angle_text(fwhm)} for this picture")
+        if fwhm > 0
+        else (product, "not smoothed")
+    )
 
 
 def _resolution(shown: FlatMap) -> str:
@@ -242,24 +338,35 @@ def _resolution(shown: FlatMap) -> str:
     if not shown.smoothed_by:
         return f" Resolution {beam} FWHM, the beam's."
     whole = angle_text(math.hypot(shown.fwhm, shown.smoothed_by))
-    return f" Resolution {whole} FWHM: the beam's {beam} and the smoothing's {smoothing}, added in quadrature."
+    return (
+        f" Resolution {whole} FWHM: the beam's {beam} and the smoothing's {smoothing}, added in"
+        " quadrature."
+    )
 
 
 def _named(title: str, key: str, shows: str = "") -> str:
-    """With the product's name; of ``map`` only what is behind it (band, Stokes parameter): ``f150 Q``. ``shows``: before it."""
+    """With the product's name; of ``map`` only what is behind it (band, Stokes parameter): ``f150
+    Q``. ``shows``: before it.
+    """
     more = key.removeprefix(shows).lstrip("_").removeprefix("map").lstrip("_").replace("_", " ")
     return f"{title} ({more})" if more else title
 
 
 def _titled(title: str, shown: FlatMap) -> str:
-    """With the resolution, which the circle in the map's corner shows: beam and smoothing together."""
+    """With the resolution, which the circle in the map's corner shows: beam and smoothing
+    together.
+    """
     if not shown.smoothed_by:
         return f"{title}, not smoothed"
     return f"{title}, smoothed to {angle_text(math.hypot(shown.fwhm, shown.smoothed_by))}"
 
 
-def _panels(panels: Sequence[tuple[FlatMap, str]], style: Style, limit: float | None, circle: float = 0.0) -> Any:
-    """The first plane of each map with its title, side by side, where the first map is well covered; ``circle``: diameter."""
+def _panels(
+    panels: Sequence[tuple[FlatMap, str]], style: Style, limit: float | None, circle: float = 0.0
+) -> Any:
+    """The first plane of each map with its title, side by side, where the first map is well
+    covered; ``circle``: diameter.
+    """
     whole = panels[0][0]
     covered = whole.covered(style.least_coverage)
     fwhm = math.hypot(whole.fwhm, whole.smoothed_by)

@@ -18,10 +18,16 @@ SHOWN = 4
 
 
 def plot_modes(modes: Modes, *, axes: Any = None, title: str = "Modes") -> Axes:
-    """Share of the variance in each mode, and the leading modes in time, below one another; ``axes``: two Axes to draw into."""
-    left, right = axes or new_figure((9.6, 4.2), [(0.085, 0.14, 0.30, 0.77), (0.475, 0.14, 0.515, 0.77)])
+    """Share of the variance in each mode, and the leading modes in time, below one another;
+    ``axes``: two Axes to draw into.
+    """
+    left, right = axes or new_figure(
+        (9.6, 4.2), [(0.085, 0.14, 0.30, 0.77), (0.475, 0.14, 0.515, 0.77)]
+    )
     share = modes.shares[modes.shares > 0]
-    left.loglog(np.arange(1, share.size + 1), share, "o-", color=SEQUENCE[0], markersize=3.5, linewidth=0.9)
+    left.loglog(
+        np.arange(1, share.size + 1), share, "o-", color=SEQUENCE[0], markersize=3.5, linewidth=0.9
+    )
     for k, value in enumerate(share[:2]):
         place: dict[str, Any] = {"xytext": (5, 5), "textcoords": "offset points", "fontsize": 9}
         left.annotate(f"{100 * value:.3g} %", (k + 1, value), **place)
@@ -36,7 +42,14 @@ def plot_modes(modes: Modes, *, axes: Any = None, title: str = "Modes") -> Axes:
     factor, unit = unit_of(peak) if modes.unit else (1.0, "")
     step = max(1, rows.shape[1] // 4000)
     for k, row in enumerate(rows):
-        right.plot(modes.seconds[::step], row[::step] * factor, linewidth=0.7, color=SEQUENCE[k], label=f"{k + 1}", zorder=4 - k)
+        right.plot(
+            modes.seconds[::step],
+            row[::step] * factor,
+            linewidth=0.7,
+            color=SEQUENCE[k],
+            label=f"{k + 1}",
+            zorder=4 - k,
+        )
     right.set_xlabel(f"time since the start of {modes.observation} [s]")
     right.set_ylabel(f"mode / √rows [{unit}]" if unit else "mode / √rows")
     right.margins(x=0)

@@ -1,8 +1,10 @@
-"""Pictures of spectra, time streams and scans, drawn into ``ax`` or a new figure; each returns its Axes.
+"""Pictures of spectra, time streams and scans, drawn into ``ax`` or a new figure; each returns its
+Axes.
 
-matplotlib is imported inside; no window system is needed and no global state is touched. Colours are told apart by
-colour-blind eyes (Okabe & Ito 2008) and brightness scales are perceptually ordered. Margins of a new figure are fixed, and
-labels are plain Unicode text: measuring the one and parsing the other take longer than drawing.
+matplotlib is imported inside; no window system is needed and no global state is touched. Colours
+are told apart by colour-blind eyes (Okabe & Ito 2008) and brightness scales are perceptually
+ordered. Margins of a new figure are fixed, and labels are plain Unicode text: measuring the one and
+parsing the other take longer than drawing.
 """
 
 from __future__ import annotations
@@ -19,7 +21,18 @@ from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import AnyFloats
 
 from ..series import unit_of_stream
-from .canvas import CHARACTER, COLOURS, OTHER, PALE, SEQUENCE, fit_left, log_labels, new_axes, unit_of, write_title
+from .canvas import (
+    CHARACTER,
+    COLOURS,
+    OTHER,
+    PALE,
+    SEQUENCE,
+    fit_left,
+    log_labels,
+    new_axes,
+    unit_of,
+    write_title,
+)
 from .map_layout import map_axes
 from .map_plots import plot_coverage, plot_map
 
@@ -31,7 +44,16 @@ if TYPE_CHECKING:
     from ..series import Spectrum, TimeStream
     from ..transfer_function import Transfer
 
-__all__ = ["ScanTrack", "map_axes", "plot_coverage", "plot_map", "plot_scan", "plot_spectra", "plot_tod", "plot_transfer"]
+__all__ = [
+    "ScanTrack",
+    "map_axes",
+    "plot_coverage",
+    "plot_map",
+    "plot_scan",
+    "plot_spectra",
+    "plot_tod",
+    "plot_transfer",
+]
 
 MANY = 2000
 """Points of a track that are drawn, however near to one another."""
@@ -39,7 +61,9 @@ MANY = 2000
 
 @dataclass(frozen=True)
 class ScanTrack:
-    """A scan for `plot_scan`: unit vectors (n, 3) of the boresight, ICRS; the scan's centre (RA, Dec) [rad]."""
+    """A scan for `plot_scan`: unit vectors (n, 3) of the boresight, ICRS; the scan's centre (RA,
+    Dec) [rad].
+    """
 
     name: str
     centre: tuple[float, float]
@@ -51,10 +75,14 @@ class ScanTrack:
         from zonda.core.numerics.projection import boresights
 
         step = -(-observation.n_samples // most)
-        return cls(observation.name, observation.centre, boresights(observation.boresight_radec[::step]).T)
+        return cls(
+            observation.name, observation.centre, boresights(observation.boresight_radec[::step]).T
+        )
 
 
-def _binned(frequency: AnyFloats, psd: AnyFloats, per_decade: int = 24) -> tuple[AnyFloats, AnyFloats]:
+def _binned(
+    frequency: AnyFloats, psd: AnyFloats, per_decade: int = 24
+) -> tuple[AnyFloats, AnyFloats]:
     """Means of a spectrum in logarithmic bins (each at least one frequency wide)."""
     position = np.floor(np.log10(frequency / frequency[0]) * per_decade).astype(int)
     _, first = np.unique(position, return_index=True)
@@ -62,15 +90,24 @@ def _binned(frequency: AnyFloats, psd: AnyFloats, per_decade: int = 24) -> tuple
     return np.add.reduceat(frequency, first) / count, np.add.reduceat(psd, first) / count
 
 
-def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spectra of the time streams") -> Axes:
-    """One-sided power spectra, log-log: thin lines as measured, thick ones averaged in logarithmic bins.
+def plot_spectra(
+    spectrum: Spectrum, *, ax: Any = None, title: str = "Power spectra of the time streams"
+) -> Axes:
+    """One-sided power spectra, log-log: thin lines as measured, thick ones averaged in logarithmic
+    bins.
 
-    Dashed are closed forms: the level of white noise, 2 NET^2, and the laws of 1/f noise and of the atmosphere. The dotted line
-    is the measured knee, where the spectrum of pink noise crosses that of white noise; it scatters about the knee of the law.
-    Shades and names above tell which of the three laws dominates.
+    Dashed are closed forms: the level of white noise, 2 NET^2, and the laws of 1/f noise and of the
+    atmosphere. The dotted line is the measured knee, where the spectrum of pink noise crosses that
+    of white noise; it scatters about the knee of the law. Shades and names above tell which of the
+    three laws dominates.
     """
     ax = new_axes(ax, left=0.95)
-    names = {"signal": "signal (all)", "sky": "astronomical sky", "pink": "pink noise", "white": "white noise"}
+    names = {
+        "signal": "signal (all)",
+        "sky": "astronomical sky",
+        "pink": "pink noise",
+        "white": "white noise",
+    }
     top, bottom = 0.0, np.inf
     others = [name for name in spectrum.psd if name not in COLOURS]
     colours = COLOURS | dict(zip(others, (OTHER, *SEQUENCE[4:], *SEQUENCE), strict=False))
@@ -82,7 +119,14 @@ def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spec
         x, y = _binned(frequency, power)
         ax.loglog(frequency, power, color=colours.get(name, OTHER), linewidth=0.5, alpha=0.25)
         width, order = (2.2, 3) if name == "signal" else (1.6, 2.5)
-        ax.loglog(x, y, color=colours.get(name, OTHER), linewidth=width, label=names.get(name, name), zorder=order)
+        ax.loglog(
+            x,
+            y,
+            color=colours.get(name, OTHER),
+            linewidth=width,
+            label=names.get(name, name),
+            zorder=order,
+        )
         if name != "sky" or len(spectrum.psd) == 1:
             top, bottom = max(top, float(y.max())), min(bottom, float(np.percentile(y, 5)))
     floor = spectrum.white_level if {"white", "signal"} & set(spectrum.psd) else 0.0
@@ -92,13 +136,24 @@ def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spec
         ax.set_ylim(max(bottom * 1e-2, min(floor or bottom, top) * 1e-4), top * 5)
     ax.set_xlim(spectrum.frequency[0], spectrum.frequency[-1])
     for name, law in spectrum.closed_forms.items():
-        ax.loglog(spectrum.frequency, law, color=colours[name], linestyle=(0, (4, 2)), linewidth=1.1, zorder=3.5)
+        ax.loglog(
+            spectrum.frequency,
+            law,
+            color=colours[name],
+            linestyle=(0, (4, 2)),
+            linewidth=1.1,
+            zorder=3.5,
+        )
     _mark_regimes(ax, spectrum.regimes())
     _mark_levels(ax, floor, spectrum.knee())
     log_labels(ax.xaxis, *ax.get_xlim())
     log_labels(ax.yaxis, *ax.get_ylim())
     kinds = {unit_of_stream(name) for name in spectrum.psd}
-    what = {"K_RJ": ", Rayleigh–Jeans [K²/Hz]", "m": " [m²/Hz]"}.get(next(iter(kinds)), " [1/Hz]") if len(kinds) == 1 else ""
+    what = (
+        {"K_RJ": ", Rayleigh–Jeans [K²/Hz]", "m": " [m²/Hz]"}.get(next(iter(kinds)), " [1/Hz]")
+        if len(kinds) == 1
+        else ""
+    )
     _name(ax, "frequency [Hz]", f"power spectral density{what}")
     ax.legend(frameon=False, fontsize=9, loc="upper right")
     write_title(ax, title)
@@ -106,14 +161,28 @@ def plot_spectra(spectrum: Spectrum, *, ax: Any = None, title: str = "Power spec
 
 
 def _mark_regimes(ax: Any, regimes: Sequence[tuple[str, float, float]]) -> None:
-    """Where which law dominates: a pale shade, and its name below the upper edge where there is room."""
+    """Where which law dominates: a pale shade, and its name below the upper edge where there is
+    room.
+    """
     words = {"atmosphere": "atmosphere", "pink": "1/f noise", "white": "white noise"}
     low, high = np.log10(ax.get_xlim())
     for name, start, stop in regimes:
         ax.axvspan(start, stop, color=COLOURS[name], alpha=0.07, linewidth=0, zorder=0)
         if (np.log10(stop / start)) / (high - low) > 0.015 * len(words[name]):
-            place: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom", "fontsize": 8.5}
-            ax.annotate(words[name], (np.sqrt(start * stop), 0.012), color=COLOURS[name], bbox=PALE, zorder=4, **place)
+            place: dict[str, Any] = {
+                "xycoords": ("data", "axes fraction"),
+                "ha": "center",
+                "va": "bottom",
+                "fontsize": 8.5,
+            }
+            ax.annotate(
+                words[name],
+                (np.sqrt(start * stop), 0.012),
+                color=COLOURS[name],
+                bbox=PALE,
+                zorder=4,
+                **place,
+            )
 
 
 def _mark_levels(ax: Any, level: float, knee: float | None) -> None:
@@ -121,12 +190,30 @@ def _mark_levels(ax: Any, level: float, knee: float | None) -> None:
     if level > 0:
         ax.axhline(level, color="black", linestyle="--", linewidth=1.0, zorder=2)
         text = f"2 NET² (NET = {np.sqrt(level / 2) * 1e3:.3g} mK√s)"
-        place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "xytext": (-4, -5), "ha": "right", "va": "top"}
+        place: dict[str, Any] = {
+            "xycoords": ("axes fraction", "data"),
+            "xytext": (-4, -5),
+            "ha": "right",
+            "va": "top",
+        }
         ax.annotate(text, (1, level), textcoords="offset points", fontsize=8, **place)
     if knee is not None:
         ax.axvline(knee, color="black", linestyle=":", linewidth=1.0, zorder=2)
-        place = {"xycoords": ("data", "axes fraction"), "xytext": (4, 0), "rotation": 90, "va": "bottom", "bbox": PALE}
-        ax.annotate(f"measured knee {knee:.2g} Hz", (knee, 0.06), textcoords="offset points", fontsize=8, zorder=4, **place)
+        place = {
+            "xycoords": ("data", "axes fraction"),
+            "xytext": (4, 0),
+            "rotation": 90,
+            "va": "bottom",
+            "bbox": PALE,
+        }
+        ax.annotate(
+            f"measured knee {knee:.2g} Hz",
+            (knee, 0.06),
+            textcoords="offset points",
+            fontsize=8,
+            zorder=4,
+            **place,
+        )
 
 
 def _name(ax: Any, across: str, up: str, grey: str = "0.9") -> None:
@@ -143,17 +230,28 @@ def _legend(ax: Any, **style: Any) -> None:
 
 
 def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer function") -> Axes:
-    """Share of each angular scale that the filters leave: T with its standard error, and S, the ratio of amplitudes.
+    """Share of each angular scale that the filters leave: T with its standard error, and S, the
+    ratio of amplitudes.
 
-    S grows without bound where the beam leaves no sky: above 2 it is not drawn, so that T can be read; the legend says where.
-    Horizontal bars are the rings. The dotted line is the beam's FWHM; the upper axis counts wavelengths.
+    S grows without bound where the beam leaves no sky: above 2 it is not drawn, so that T can be
+    read; the legend says where. Horizontal bars are the rings. The dotted line is the beam's FWHM;
+    the upper axis counts wavelengths.
     """
     ax = new_axes(ax, (7.2, 4.8), top=0.86)
     r = transfer.rings
     scale, edges = transfer.scale / ARCSEC, 1 / transfer.edges / ARCSEC
     width = [np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)]
     error = np.where(np.isfinite(r.error), r.error, 0.0)
-    ax.errorbar(scale, r.transfer, yerr=error, xerr=width, fmt="o", color=SEQUENCE[0], markersize=4, label="T: share in phase")
+    ax.errorbar(
+        scale,
+        r.transfer,
+        yerr=error,
+        xerr=width,
+        fmt="o",
+        color=SEQUENCE[0],
+        markersize=4,
+        label="T: share in phase",
+    )
     high = scale[r.amplitude > 2].max(initial=0.0)
     label = "S: ratio of amplitudes" + (f" (above 2 from {high:.2g} arcsec down)" if high else "")
     shown = np.where(r.amplitude > 2, np.nan, r.amplitude)
@@ -182,7 +280,9 @@ def _to_kilolambda(arcsec: Any) -> Any:
 
 
 def _envelope(x: AnyFloats, y: AnyFloats, columns: int = 1600) -> tuple[AnyFloats, AnyFloats]:
-    """Lowest and highest of y, in turn, in ``columns`` equal parts: what a line of many more points looks like."""
+    """Lowest and highest of y, in turn, in ``columns`` equal parts: what a line of many more points
+    looks like.
+    """
     width = len(y) // columns
     if width < 4:
         return x, y
@@ -194,7 +294,9 @@ def _envelope(x: AnyFloats, y: AnyFloats, columns: int = 1600) -> tuple[AnyFloat
 
 
 def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title: str = "") -> Axes:
-    """Stream ``name`` of a few detectors against time, K_RJ: samples pale, means over one second dark."""
+    """Stream ``name`` of a few detectors against time, K_RJ: samples pale, means over one second
+    dark.
+    """
     own, ax = ax is None, new_axes(ax, (7.2, 3.6))
     values = stream.streams[name]
     finite = values[np.isfinite(values)]
@@ -202,18 +304,31 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
     factor, unit = unit_of(largest)
     label = f"{name}, Rayleigh–Jeans [{unit}]"
     if (kind := unit_of_stream(name)) != "K_RJ":
-        words = {"transmission": "relative change of the transmission", "opacity": "change of the opacity"}
+        words = {
+            "transmission": "relative change of the transmission",
+            "opacity": "change of the opacity",
+        }
         words |= {"pwv": "change of the line-of-sight PWV", "path_delay": "change of the path"}
         factor, unit = (factor, f" [{unit.replace('K', 'm')}]") if kind == "m" else (1.0, "")
         label = words.get(name, name) + unit
-    step = float(np.median(np.diff(stream.seconds))) if len(stream.seconds) > 1 else 0.0  # samples need not be a comb
+    step = (
+        float(np.median(np.diff(stream.seconds))) if len(stream.seconds) > 1 else 0.0
+    )  # samples need not be a comb
     width = max(1, round(1.0 / step)) if step > 0 else 1
     whole = values.shape[1] // width * width
     centres = stream.seconds[:whole].reshape(-1, width).mean(axis=1)
     for k, detector in enumerate(stream.names):
         colour = SEQUENCE[k % len(SEQUENCE)]
-        ax.plot(*_envelope(stream.seconds, values[k] * factor), linewidth=0.4, alpha=0.2, color=colour)
-        ax.plot(centres, values[k, :whole].reshape(-1, width).mean(axis=1) * factor, linewidth=0.9, color=colour, label=detector)
+        ax.plot(
+            *_envelope(stream.seconds, values[k] * factor), linewidth=0.4, alpha=0.2, color=colour
+        )
+        ax.plot(
+            centres,
+            values[k, :whole].reshape(-1, width).mean(axis=1) * factor,
+            linewidth=0.9,
+            color=colour,
+            label=detector,
+        )
     _name(ax, "time since the start of the scan [s]", label, "0.92")
     ax.margins(x=0)
     if len(stream.seconds) > 1:
@@ -231,8 +346,14 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
     return ax  # type: ignore[no-any-return]
 
 
-def plot_scan(observations: Sequence[Observation | ScanTrack], *, ax: Any = None, title: str = "Boresight track") -> Axes:
-    """ScanTrack of the boresight about the centre of the first scan, tangent-plane offsets in arcmin or deg, a line per scan.
+def plot_scan(
+    observations: Sequence[Observation | ScanTrack],
+    *,
+    ax: Any = None,
+    title: str = "Boresight track",
+) -> Axes:
+    """ScanTrack of the boresight about the centre of the first scan, tangent-plane offsets in
+    arcmin or deg, a line per scan.
 
     Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
     """
@@ -269,7 +390,9 @@ def _offsets(track: ScanTrack, centre: tuple[float, float]) -> NDArray[np.float6
 
 
 def _apart(points: NDArray[np.float64], least: float) -> NDArray[np.float64]:
-    """The points of a track (n, 2), without those less than ``least`` along it from one that is kept."""
+    """The points of a track (n, 2), without those less than ``least`` along it from one that is
+    kept.
+    """
     steps = np.nan_to_num(np.hypot(*np.diff(points, axis=0).T))
     if least <= 0 or len(points) < MANY:
         return points

@@ -14,7 +14,9 @@ LEVEL = 2
 
 
 def png_of(ax: Any, dpi: float | None = None) -> bytes:
-    """The figure of ``ax``, drawn once: without the rehearsal and the opaque alpha channel of ``figure.savefig``."""
+    """The figure of ``ax``, drawn once: without the rehearsal and the opaque alpha channel of
+    ``figure.savefig``.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     if dpi is not None:
@@ -28,14 +30,19 @@ def png_of(ax: Any, dpi: float | None = None) -> bytes:
 def encoded(pixels: NDArray[np.uint8], dpi: float, texts: dict[str, str]) -> bytes:
     """``pixels`` (ny, nx, 3) as a PNG file (ISO/IEC 15948). ``texts``: ASCII notes by keyword.
 
-    Rows are not filtered: flat areas and text, of which these pictures are made, are smaller without, and quicker to pack.
+    Rows are not filtered: flat areas and text, of which these pictures are made, are smaller
+    without, and quicker to pack.
     """
     ny, nx = pixels.shape[:2]
-    rows = np.zeros((ny, 1 + 3 * nx), np.uint8)  # a row begins with the number of its filter: 0, none
+    rows = np.zeros(
+        (ny, 1 + 3 * nx), np.uint8
+    )  # a row begins with the number of its filter: 0, none
     rows[:, 1:].reshape(ny, nx, 3)[...] = pixels
     per_metre = round(dpi / 0.0254)
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", nx, ny, 8, 2, 0, 0, 0))]
-    chunks += [(b"tEXt", key.encode("ascii") + b"\0" + text.encode("ascii")) for key, text in texts.items()]
+    chunks += [
+        (b"tEXt", key.encode("ascii") + b"\0" + text.encode("ascii")) for key, text in texts.items()
+    ]
     chunks += [
         (b"pHYs", struct.pack(">IIB", per_metre, per_metre, 1)),
         (b"IDAT", zlib.compress(rows.tobytes(), LEVEL)),

@@ -20,9 +20,15 @@ def draw_stream_comparison(file: str, found: StreamComparison) -> list[Sketch]:
         (7.2, 7.2), [(0.12, 0.52, 0.86, 0.43), (0.12, 0.29, 0.86, 0.21), (0.12, 0.07, 0.86, 0.20)]
     )
     f, (x, y, d) = found.frequency, found.power
-    for row, label, colour in ((x, found.stream, "black"), (y, found.reference, SEQUENCE[0]), (d, "difference", SEQUENCE[1])):
+    for row, label, colour in (
+        (x, found.stream, "black"),
+        (y, found.reference, SEQUENCE[0]),
+        (d, "difference", SEQUENCE[1]),
+    ):
         if np.isfinite(row).all() and (row > 0).any():
-            spectra.loglog(f, np.where(row > 0, row, np.nan), color=colour, linewidth=1.1, label=label)
+            spectra.loglog(
+                f, np.where(row > 0, row, np.nan), color=colour, linewidth=1.1, label=label
+            )
     spectra.set_ylabel("power spectral density [unit²/Hz]")
     spectra.legend(frameon=False, fontsize=9)
     positive = y > 0
@@ -53,11 +59,17 @@ def _finish(ax: Any, f: Any, last: bool) -> None:
 
 
 def _caption(found: StreamComparison) -> str:
-    (r, scatter, error), (gain, _, gain_error) = (found.over_detectors(k) for k in ("correlation", "gain"))
-    many = f"{len(found.names)} detectors and {found.observations} scan{'s' if found.observations > 1 else ''}"
+    (r, scatter, error), (gain, _, gain_error) = (
+        found.over_detectors(k) for k in ("correlation", "gain")
+    )
+    many = (
+        f"{len(found.names)} detectors and {found.observations}"
+        f" scan{'s' if found.observations > 1 else ''}"
+    )
     return (
-        f"Streams {found.stream} and {found.reference} at step {found.label}, mean of {many}: power spectra on the calibrated "
-        f"sky, their ratio (dashed: gain², {gain:.4g} ± {gain_error:.2g}) and the coherence (dashed: 1/n of independent streams, "
-        f"n = {found.segments:.3g} segments). Correlation {r:.4f} ± {error:.2g} of one detector, "
-        f"scatter over detectors {scatter:.2g}."
+        f"Streams {found.stream} and {found.reference} at step {found.label}, mean of {many}: power"
+        f" spectra on the calibrated sky, their ratio (dashed: gain², {gain:.4g} ±"
+        f" {gain_error:.2g}) and the coherence (dashed: 1/n of independent streams, n ="
+        f" {found.segments:.3g} segments). Correlation {r:.4f} ± {error:.2g} of one detector,"
+        f" scatter over detectors {scatter:.2g}."
     )

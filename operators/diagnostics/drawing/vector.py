@@ -8,7 +8,9 @@ from typing import Any
 LEAST_DPI = 300.0
 """Lowest resolution of images inside a page, dots per inch."""
 SETTINGS = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "zonda"}
-"""Text stays text: PDF carries its TrueType fonts, SVG names them. Names inside an SVG file do not change from run to run."""
+"""Text stays text: PDF carries its TrueType fonts, SVG names them. Names inside an SVG file do not
+change from run to run.
+"""
 METADATA = {
     "pdf": {"Creator": "zonda", "Producer": "matplotlib", "CreationDate": None},
     "svg": {"Creator": "zonda", "Date": None},

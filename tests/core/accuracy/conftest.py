@@ -24,20 +24,31 @@ class Toy:
     calls: int = 0
 
     def knobs(self, **changes):
-        made = [PipelineKnob(f"Step{i}.n", f"Step{i}", self.ladder, "a sum", False, "8", False) for i in range(len(self.errors))]
+        made = [
+            PipelineKnob(f"Step{i}.n", f"Step{i}", self.ladder, "a sum", False, "8", False)
+            for i in range(len(self.errors))
+        ]
         return [PipelineKnob(**(k.__dict__ | changes)) for k in made] if changes else made
 
     def value(self, setting, seed=0):
-        return 1 + sum(a / int(setting[f"Step{i}.n"]) ** 2 for i, a in enumerate(self.errors)) + self.noise * (seed or 0)
+        return (
+            1
+            + sum(a / int(setting[f"Step{i}.n"]) ** 2 for i, a in enumerate(self.errors))
+            + self.noise * (seed or 0)
+        )
 
     def seconds(self, setting):
         return 1 + sum(b * int(setting[f"Step{i}.n"]) for i, b in enumerate(self.costs))
 
     def run(self, setting, seeds, yardstick):
         self.calls += 1
-        steps = {f"Step{i}": (b * int(setting[f"Step{i}.n"]),) * 3 for i, b in enumerate(self.costs)}
+        steps = {
+            f"Step{i}": (b * int(setting[f"Step{i}.n"]),) * 3 for i, b in enumerate(self.costs)
+        }
         found = tuple(self.value(setting, s) for s in seeds)
-        return Measured(found, steps | {"(rest)": (1.0,) * 3}, (self.seconds(yardstick),) * 3, 2.0, 10**8)
+        return Measured(
+            found, steps | {"(rest)": (1.0,) * 3}, (self.seconds(yardstick),) * 3, 2.0, 10**8
+        )
 
     def bench(self, metric, run=None):
         return Bench(run or self.run, metric, tightest(self.knobs()))

@@ -1,4 +1,6 @@
-"""`zonda accuracy` and `zonda run --verify` in processes of their own, on a toy whose error and cost are known."""
+"""`zonda accuracy` and `zonda run --verify` in processes of their own, on a toy whose error and
+cost are known.
+"""
 
 import json
 import os
@@ -82,7 +84,9 @@ operators: [ZaStare, ZaIntegral]
 @pytest.fixture
 def toy_file(plugin, tmp_path, monkeypatch):
     folder = plugin("zonda-accuracy-toys", "1.0", GROUPS, za_toys=MODULE)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+    )
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "toy.yaml"
     path.write_text(PIPELINE)
@@ -94,18 +98,38 @@ def command(*arguments):
 
 
 def test_the_whole_command(toy_file, tmp_path, capsys):
-    options = ("--metric", "integral", "--repeats", "2", "--seeds", "2", "--knob", "n", "--target", "0.3 %", "--store")
+    options = (
+        "--metric",
+        "integral",
+        "--repeats",
+        "2",
+        "--seeds",
+        "2",
+        "--knob",
+        "n",
+        "--target",
+        "0.3 %",
+        "--store",
+    )
     assert command("accuracy", toy_file, *options, "--output", tmp_path / "out") == 0
     said = capsys.readouterr().out
     assert "refused: two is no number" in said
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"accuracy.txt", "front.json", "work_precision.png", "fragment.yaml"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {
+        "accuracy.txt",
+        "front.json",
+        "work_precision.png",
+        "fragment.yaml",
+    }
     values = json.loads((tmp_path / "out" / "front.json").read_text())
     for rung in values["alone"][0]["rungs"]:
         if rung["value"] in ("1", "4", "8"):
             n = int(rung["value"])
-            assert rung["error"] == pytest.approx(1 / (12 * n**2) - 1 / (12 * 64**2), rel=0.03)  # next term: 1 / (720 n^4)
+            assert rung["error"] == pytest.approx(
+                1 / (12 * n**2) - 1 / (12 * 64**2), rel=0.03
+            )  # next term: 1 / (720 n^4)
     assert values["chosen"]["setting"] == {"ZaIntegral.n": "8"}  # 0.13 %; 4 intervals have 0.52 %
-    # the process's own memory, not this one's: an interpreter with numpy, well below what pytest and its plugins take
+    # the process's own memory, not this one's: an interpreter with numpy, well below what pytest
+    # and its plugins take
     assert all(1e7 < p["memory"] < 1e9 for p in values["points"])
     assert (tmp_path / "out" / "work_precision.png").read_bytes()[:4] == b"\x89PNG"
     assert "- ZaIntegral: {n: 8}" in (tmp_path / "out" / "fragment.yaml").read_text()

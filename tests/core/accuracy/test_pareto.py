@@ -32,7 +32,9 @@ def test_the_search_is_economical(toy, metric):
 
 
 def test_the_front_is_the_true_one_within_a_tenth(toy, metric):
-    """No setting of the full product beats a point of the front by more than a tenth in cost at the same error."""
+    """No setting of the full product beats a point of the front by more than a tenth in cost at the
+    same error.
+    """
     points, found = searched(toy, metric, 0.01)
     best = toy.value(found.reference)
     every = [(abs(toy.value(s) - best) / best, toy.seconds(s)) for s in toy.all_settings()]
@@ -53,7 +55,9 @@ def test_joint_errors_are_measured_not_added(toy, metric):
 def test_a_saving_within_the_noise_is_none(toy, metric):
     def run(setting, seeds, yardstick):
         measured = toy.run(setting, seeds, yardstick)
-        measured.steps["Step0"] = tuple(t + d for t, d in zip(measured.steps["Step0"], (-1.0, 0.0, 1.0), strict=True))
+        measured.steps["Step0"] = tuple(
+            t + d for t, d in zip(measured.steps["Step0"], (-1.0, 0.0, 1.0), strict=True)
+        )
         return measured
 
     bench = toy.bench(metric, run)

@@ -39,7 +39,10 @@ def toy_run(setting, seeds, yardstick):
     coarse = 1 / float(setting.get("HighpassFilter.oversampling", 24))
     loose = float(setting.get("CommonModeFilter.residual", 1e-6))
     signal = np.full((4, 4), 1 + 0.1 * coarse + loose)
-    seconds = {"HighpassFilter": (1 / coarse,) * 3, "CommonModeFilter": (-float(np.log10(loose)),) * 3}
+    seconds = {
+        "HighpassFilter": (1 / coarse,) * 3,
+        "CommonModeFilter": (-float(np.log10(loose)),) * 3,
+    }
     product = {"I": {"signal": signal, "weights": np.ones((4, 4)), "noise": np.ones((4, 4))}}
     return Measured((product,) * len(seeds), seconds, (), 1.0, 10**8)
 
@@ -61,7 +64,9 @@ def test_what_is_written_reads_back(made, tmp_path):
     front = store.read(path)
     assert (front.metric, front.seed, front.fingerprint) == ("map_rms", 5, store.fingerprint(file))
     assert [p.setting for p in front.points] == [p.setting for p in found.points]
-    assert [p.error for p in front.points] == pytest.approx([p.error for p in found.points], rel=1e-5)
+    assert [p.error for p in front.points] == pytest.approx(
+        [p.error for p in found.points], rel=1e-5
+    )
 
 
 def test_the_chosen_setting_meets_the_target(made):
@@ -71,7 +76,11 @@ def test_the_chosen_setting_meets_the_target(made):
     for target in (0.03, 0.005):
         choice = store.settings_for(file, target)
         chosen = dict(text.split("=") for text in choice.overrides)
-        error = 0.1 / float(chosen["HighpassFilter.oversampling"]) - 0.1 / 48 + float(chosen["CommonModeFilter.residual"])
+        error = (
+            0.1 / float(chosen["HighpassFilter.oversampling"])
+            - 0.1 / 48
+            + float(chosen["CommonModeFilter.residual"])
+        )
         assert error <= choice.error <= target
         assert "stored Pareto front" in choice.reason
 
@@ -112,7 +121,9 @@ def test_without_a_front_the_tightest(made):
     assert choice.error is None
     assert "no stored Pareto front" in choice.reason
     assert {"HighpassFilter.oversampling=48", "precision=float64"} <= set(choice.overrides)
-    assert not any("poles" in text for text in choice.overrides)  # another number of poles is another realization
+    assert not any(
+        "poles" in text for text in choice.overrides
+    )  # another number of poles is another realization
 
 
 def test_a_target_that_no_point_meets(made):
@@ -128,7 +139,15 @@ def test_a_front_holds_for_its_own_values_of_knobs_that_redraw(tmp_path):
     path = tmp_path / "my.yaml"
     path.write_text(TEXT)
     file = zonda.load(path)
-    store.save(study(file, Setup(str(path), (), "map_rms", 0.5, {}, seeds=(5, 6)), knobs_of(file), run=toy_run), file)
+    store.save(
+        study(
+            file,
+            Setup(str(path), (), "map_rms", 0.5, {}, seeds=(5, 6)),
+            knobs_of(file),
+            run=toy_run,
+        ),
+        file,
+    )
     assert store.settings_for(file, 0.5).error is not None
     other = store.settings_for(zonda.load(path, overrides=["PinkNoise.poles=4"]), 0.5)
     assert other.error is None
@@ -145,7 +164,9 @@ def test_what_the_file_states_stays(made):
     assert choice.error is None  # the front's error is not that of this mixture
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 99}', '{"format": 1, "points": 3}', "{"])
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"format": 99}', '{"format": 1, "points": 3}', "{"]
+)
 def test_a_spoilt_file_is_named(made, text):
     _, file, found = made
     path = store.save(found, file)
@@ -157,7 +178,16 @@ def test_a_spoilt_file_is_named(made, text):
 def test_json_is_complete(made):
     _, file, found = made
     values = json.loads(json.dumps(store.as_json(found, file)))
-    assert {"alone", "front", "points", "chosen", "reference", "noise_floor", "realization_scatter", "versions"} <= values.keys()
+    assert {
+        "alone",
+        "front",
+        "points",
+        "chosen",
+        "reference",
+        "noise_floor",
+        "realization_scatter",
+        "versions",
+    } <= values.keys()
     assert values["chosen"]["setting"] == found.chosen.setting
 
 

@@ -20,7 +20,8 @@ def test_errors_follow_the_law(toy, metric):
 
 
 def test_what_is_left_is_what_is_left(toy, metric):
-    """Errors fall fourfold per rung, so the estimate is the rest of the series, a / 32^2 of the value.
+    """Errors fall fourfold per rung, so the estimate is the rest of the series, a / 32^2 of the
+    value.
 
     Steps are relative to the finer of two neighbours, whose values differ by a / 16^2 = 0.4 %.
     """
@@ -35,9 +36,17 @@ def test_what_is_left_is_what_is_left(toy, metric):
     [
         ((1.0, 0.25), 0.25 / 3, "rest of that series"),
         ((1.0, 1e-9), 1e-9 / 9, "rest of that series"),  # no ratio below a tenth is believed
-        ((1.0, 0.25, 0.0), 0.25 / 3, "rest of that series"),  # a step that changes no bit says nothing
+        (
+            (1.0, 0.25, 0.0),
+            0.25 / 3,
+            "rest of that series",
+        ),  # a step that changes no bit says nothing
         ((0.1, 0.1), 0.1, "not converging"),
-        ((0.4, 1e-8, 0.1), 0.1 / 3, "rest of that series"),  # a small step before a larger one says nothing either
+        (
+            (0.4, 1e-8, 0.1),
+            0.1 / 3,
+            "rest of that series",
+        ),  # a small step before a larger one says nothing either
         ((0.1,), 0.1, "not a bound"),
         ((0.0, 0.0), 0.0, "no rung changes"),
         ((), 0.0, "no rung changes"),
@@ -63,7 +72,9 @@ def test_an_inert_knob_costs_one_run(toy, metric):
 
 
 def test_a_knob_that_redraws_is_compared_by_means_over_seeds(toy, metric):
-    """The summary is the value plus noise that the two rungs share up to one part in a hundred: what is shared cancels."""
+    """The summary is the value plus noise that the two rungs share up to one part in a hundred:
+    what is shared cancels.
+    """
     random = np.random.default_rng(0).standard_normal((40, 2))
 
     def run(setting, seeds, yardstick):
@@ -78,9 +89,13 @@ def test_a_knob_that_redraws_is_compared_by_means_over_seeds(toy, metric):
     error, resolution = bench.mean_error(coarse, fine)
     shift = 0.4 * (1 / 4 - 1 / 32**2)
     scale = 1 + 0.4 / 32**2 + 0.05 * random[:, 0].mean()
-    assert resolution == pytest.approx(0.0005 * random[:, 1].std(ddof=1) / np.sqrt(40) / scale, rel=1e-6)
+    assert resolution == pytest.approx(
+        0.0005 * random[:, 1].std(ddof=1) / np.sqrt(40) / scale, rel=1e-6
+    )
     assert abs(error - shift / scale) < 4 * resolution
-    assert bench.scatter(fine) == pytest.approx(0.05, rel=0.4)  # standard error 0.05 / sqrt(80): 11 %
+    assert bench.scatter(fine) == pytest.approx(
+        0.05, rel=0.4
+    )  # standard error 0.05 / sqrt(80): 11 %
 
 
 def test_refused_rungs_are_kept_with_the_reason(toy, metric):
@@ -114,8 +129,12 @@ def test_medians_and_spread():
 
 
 def test_the_load_of_the_machine_cancels():
-    """Runs that take three times as long while the yardstick beside them does, too, cost the same."""
-    measured = Measured((1.0,), {"a": (1.0, 3.0, 1.0), "b": (0.5, 1.5, 0.5)}, yardstick=(2.0, 6.0, 2.0))
+    """Runs that take three times as long while the yardstick beside them does, too, cost the
+    same.
+    """
+    measured = Measured(
+        (1.0,), {"a": (1.0, 3.0, 1.0), "b": (0.5, 1.5, 0.5)}, yardstick=(2.0, 6.0, 2.0)
+    )
     assert measured.cost() == pytest.approx((0.75, 0.0))
 
 

@@ -13,7 +13,17 @@ from zonda.core.accuracy.table import lines
 
 def study_of(found, points, target=0.01, shorter=None, **more):
     setup = Setup("toy", (), "value", target, shorter or {}, **more)
-    return Study(setup, "a toy", found, points[0], tuple(points), cheapest(points, target, found.left), None, None, 1.0)
+    return Study(
+        setup,
+        "a toy",
+        found,
+        points[0],
+        tuple(points),
+        cheapest(points, target, found.left),
+        None,
+        None,
+        1.0,
+    )
 
 
 def said(found, points, **more):
@@ -21,23 +31,34 @@ def said(found, points, **more):
 
 
 def test_what_is_called_the_cheapest_is_the_cheapest():
-    """A setting that costs as much within the spread of the cheapest, and errs less, is recommended, and not called cheapest."""
+    """A setting that costs as much within the spread of the cheapest, and errs less, is
+    recommended, and not called cheapest.
+    """
     tight = Point({"k": "9"}, 0.0, 3.0, 0.1, 100)
     cheap, near = Point({"k": "1"}, 4e-3, 1.0, 0.3, 100), Point({"k": "2"}, 1e-3, 1.2, 0.1, 100)
     text = said(Sweep({"k": "9"}), [tight, cheap, near])
     assert "cheapest setting" not in text
-    assert "setting within 1 %: 0.1 % (+ 0 % of the reference), 1.2 ± 0.1 CPU s, the most accurate of those" in text
+    assert (
+        "setting within 1 %: 0.1 % (+ 0 % of the reference), 1.2 ± 0.1 CPU s, the most accurate of"
+        " those" in text
+    )
     assert "that is 0.4 %, 1 ± 0.3 CPU s" in text
     assert text.rstrip().endswith("--set k=2")
     text = said(Sweep({"k": "9"}), [tight, replace(near, seconds=0.9)])
-    assert "cheapest setting within 1 %: 0.1 % (+ 0 % of the reference), 0.9 ± 0.1 CPU s, 3.3 times cheaper" in text
-    assert "cheapest setting within 1 %: 0 % (+ 0 % of the reference), 3 ± 0.1 CPU s; it is the tightest" in said(
-        Sweep({"k": "9"}), [tight]
+    assert (
+        "cheapest setting within 1 %: 0.1 % (+ 0 % of the reference), 0.9 ± 0.1 CPU s, 3.3 times"
+        " cheaper" in text
+    )
+    assert (
+        "cheapest setting within 1 %: 0 % (+ 0 % of the reference), 3 ± 0.1 CPU s; it is the"
+        " tightest" in said(Sweep({"k": "9"}), [tight])
     )
 
 
 def redrawing(toy, present, noise=0.0):
-    """The sweep of one knob that redraws, 0.4 / n^2 of about 1, beside one that does not, and the standard error of its rungs."""
+    """The sweep of one knob that redraws, 0.4 / n^2 of about 1, beside one that does not, and the
+    standard error of its rungs.
+    """
 
     def run(setting, seeds, yardstick):
         n = int(setting.get("Step0.n", present))
@@ -60,8 +81,8 @@ def metric_of(toy):
 
 @pytest.mark.parametrize("present", ["4", "8", "32"])
 def test_the_reference_is_charged_with_the_knobs_that_stay_as_in_the_file(toy, present):
-    """At n the toy is off by 0.4 / n^2 of its value, of which the rest of the series beyond 32 is known to one part in a hundred
-    (`test_what_is_left_is_what_is_left`)."""
+    """At n the toy is off by 0.4 / n^2 of its value, of which the rest of the series beyond 32 is
+    known to one part in a hundred (`test_what_is_left_is_what_is_left`)."""
     found = redrawing(toy, present)
     assert found.left_of_turned == 0.0
     assert found.left == pytest.approx(0.4 / int(present) ** 2, rel=0.01)
@@ -75,18 +96,26 @@ def test_the_reference_is_charged_with_the_knobs_that_stay_as_in_the_file(toy, p
 
 
 def test_what_is_not_resolved_is_charged_with_twice_its_standard_error(toy):
-    """Seeds scatter by 0.1 about the tightest rung's, whose 8 differs by 0.4 / 8^2 - 0.4 / 32^2 = 0.6 %: the standard error of
-    four is 0.1 sqrt(4 / 3) / 2, of a value of 1.0004."""
+    """Seeds scatter by 0.1 about the tightest rung's, whose 8 differs by 0.4 / 8^2 - 0.4 / 32^2 =
+    0.6 %: the standard error of four is 0.1 sqrt(4 / 3) / 2, of a value of 1.0004."""
     found = redrawing(toy, "8", noise=0.1)
     alone = found.alone[0]
     expected = 2 * 0.1 * (4 / 3) ** 0.5 / 2 / (1 + 0.4 / 32**2)
     assert alone.rung("8").error < expected
     assert alone.stays - alone.left == pytest.approx(expected)
-    assert alone.stays == pytest.approx(0.231, abs=0.001)  # of the tightest rung, whose neighbour is not resolved either, as much
+    assert alone.stays == pytest.approx(
+        0.231, abs=0.001
+    )  # of the tightest rung, whose neighbour is not resolved either, as much
     text = said(found, [Point({}, 0.0, 1.0, 0.1, 100)], seeds=range(4))
     assert "cause: Step0.n, 23 %: twice the standard error of means over 4 seeds" in text
     assert text.endswith("cure: more --seeds, or --target '30 %'")
-    text = said(found, [Point({}, 0.0, 1.0, 0.1, 100)], target=0.1, seeds=range(4), shorter={"Scan.scan_duration": "30 s"})
+    text = said(
+        found,
+        [Point({}, 0.0, 1.0, 0.1, 100)],
+        target=0.1,
+        seeds=range(4),
+        shorter={"Scan.scan_duration": "30 s"},
+    )
     assert text.endswith("cure: --seeds 22, or longer scans (--duration), or --target '30 %'")
 
 

@@ -63,7 +63,13 @@ class Bench:
         self.number += 1
         return self.folder / f"out{self.number}"
 
-    def run(self, campaign: str, *arguments: Any, status: int = 0, changes: tuple[tuple[str, str], ...] = ()) -> Path:
+    def run(
+        self,
+        campaign: str,
+        *arguments: Any,
+        status: int = 0,
+        changes: tuple[tuple[str, str], ...] = (),
+    ) -> Path:
         out = self.new()
         assert command("run", self.file(campaign, *changes), "--output", out, *arguments) == status
         return out
@@ -71,7 +77,21 @@ class Bench:
     def run_file(self, file: Path, *arguments: Any) -> Path:
         """Run a file in series, in full."""
         out = self.new()
-        assert command("run", file, "--output", out, "--engine", "serial", "--threads", 1, "--no-prune", *arguments) == 0
+        assert (
+            command(
+                "run",
+                file,
+                "--output",
+                out,
+                "--engine",
+                "serial",
+                "--threads",
+                1,
+                "--no-prune",
+                *arguments,
+            )
+            == 0
+        )
         return out
 
 
@@ -88,4 +108,6 @@ def module_bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output of ``{nights: 3, realizations: 2}``, run in series: 12 tasks."""
-    return Bench(tmp_path_factory.mktemp("campaign")).run(CAMPAIGN, "--engine", "serial", "--threads", 1)
+    return Bench(tmp_path_factory.mktemp("campaign")).run(
+        CAMPAIGN, "--engine", "serial", "--threads", 1
+    )

@@ -41,7 +41,9 @@ runs:
 
 @pytest.fixture
 def files(bench):
-    """The same scene as an ordinary run and as a campaign of its scans, its output folders beside it."""
+    """The same scene as an ordinary run and as a campaign of its scans, its output folders beside
+    it.
+    """
     write_sky(bench.folder / "sky.fits", 41, 0.001, 1.0)
 
     def write(campaign: str, name: str, *more: tuple[str, str]) -> Path:
@@ -75,14 +77,19 @@ def test_products_of_operators_at_the_end_are_those_of_one_run(bench, files):
     assert names == sorted(p.name for p in split.glob("*.fits"))
     for name in names:
         assert bench.planes(plain, name) == bench.planes(split, name)
-    noise, joined_noise = (fits.getheader(folder / "map.fits", "NOISE") for folder in (plain, split))
+    noise, joined_noise = (
+        fits.getheader(folder / "map.fits", "NOISE") for folder in (plain, split)
+    )
     assert noise["NOISEFAC"] > 1  # pink noise
     assert joined_noise["NOISEFAC"] == pytest.approx(noise["NOISEFAC"])
     assert joined_noise["NOISEOF"] == noise["NOISEOF"] == "the map of all but the sky"
     scans = sorted(plain.glob("tod_*.h5"))
     assert len(scans) == 3
     for path in scans:
-        with h5py.File(path) as a, h5py.File(split / "entries" / "000000" / path.name.replace("tod_", "tod_000000-")) as b:
+        with (
+            h5py.File(path) as a,
+            h5py.File(split / "entries" / "000000" / path.name.replace("tod_", "tod_000000-")) as b,
+        ):
             assert a["detdata/signal"][:].tobytes() == b["detdata/signal"][:].tobytes()
 
     file = load(str(one), ())
@@ -92,17 +99,36 @@ def test_products_of_operators_at_the_end_are_those_of_one_run(bench, files):
     assert data.products.keys() == joined.products.keys()
     a, b = data.products["spectrum"], joined.products["spectrum"]
     assert {k: v.tobytes() for k, v in a.psd.items()} == {k: v.tobytes() for k, v in b.psd.items()}
-    assert (a.averages, a.white_level, a.observations) == (b.averages, b.white_level, b.observations)
+    assert (a.averages, a.white_level, a.observations) == (
+        b.averages,
+        b.white_level,
+        b.observations,
+    )
     c, d = data.products["time_streams"], joined.products["time_streams"]
-    assert {k: v.tobytes() for k, v in c.streams.items()} == {k: v.tobytes() for k, v in d.streams.items()}
+    assert {k: v.tobytes() for k, v in c.streams.items()} == {
+        k: v.tobytes() for k, v in d.streams.items()
+    }
 
 
 def test_the_transfer_function_of_several_nights_is_that_of_their_maps(bench, files):
-    """Each combination has one of its own, from its co-added maps, not a mean of the nights' ones."""
-    both = bench.run_file(files("{nights: 2, grid: {HighpassFilter.frequency: [0.3 Hz, 0.6 Hz]}, combine: [night]}", "n.yaml"))
-    folders = [p for p in sorted(both.iterdir()) if p.is_dir() and p.name.startswith("HighpassFilter")]
+    """Each combination has one of its own, from its co-added maps, not a mean of the nights'
+    ones.
+    """
+    both = bench.run_file(
+        files(
+            "{nights: 2, grid: {HighpassFilter.frequency: [0.3 Hz, 0.6 Hz]}, combine: [night]}",
+            "n.yaml",
+        )
+    )
+    folders = [
+        p for p in sorted(both.iterdir()) if p.is_dir() and p.name.startswith("HighpassFilter")
+    ]
     assert len(folders) == 2
     tables = [table(folder / "own.ecsv") for folder in folders]
     assert tables[0] != tables[1]
-    one = bench.run_file(files("{nights: 2}", "one.yaml", ("- HighpassFilter", "- HighpassFilter: {frequency: 0.6 Hz}")))
+    one = bench.run_file(
+        files(
+            "{nights: 2}", "one.yaml", ("- HighpassFilter", "- HighpassFilter: {frequency: 0.6 Hz}")
+        )
+    )
     assert table(one / "own.ecsv") == tables[1]

@@ -1,4 +1,6 @@
-"""A job log that is damaged anyhow: what is resumed is right, and no finished task is done again without a word."""
+"""A job log that is damaged anyhow: what is resumed is right, and no finished task is done again
+without a word.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from zonda.core.campaign.task import Outcome, perform
 from zonda.core.errors import InputError
 
 SERIAL = ("--engine", "serial", "--threads", 1)
-SETS = "{grid: {PointingDaisy.radius: [1 arcmin, 2 arcmin]}, nights: 2, combine: [night], retries: 0}"
+SETS = (
+    "{grid: {PointingDaisy.radius: [1 arcmin, 2 arcmin]}, nights: 2, combine: [night], retries: 0}"
+)
 FOLDERS = ("PointingDaisy.radius=1-arcmin", "PointingDaisy.radius=2-arcmin")
 ROUNDS = int(os.environ.get("ZONDA_DAMAGE_ROUNDS", "24"))
 """Logs that are damaged; a thousand take some minutes."""
@@ -24,13 +28,19 @@ ROUNDS = int(os.environ.get("ZONDA_DAMAGE_ROUNDS", "24"))
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory, module_bench):
-    """A campaign of 8 tasks: the first four are done and combined, of the others two are done. And its maps when all are."""
+    """A campaign of 8 tasks: the first four are done and combined, of the others two are done. And
+    its maps when all are.
+    """
     bench = module_bench
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             campaign,
             "perform",
-            lambda order: perform(order) if order.task.number < 6 else Outcome("", 0.0, error="no", final=True),
+            lambda order: (
+                perform(order)
+                if order.task.number < 6
+                else Outcome("", 0.0, error="no", final=True)
+            ),
         )
         half = bench.run(SETS, *SERIAL, status=2)
     assert (half / FOLDERS[0] / "map.fits").exists()
@@ -41,7 +51,9 @@ def template(tmp_path_factory, module_bench):
 
 
 def hot_journal(path: Path) -> None:
-    """Leave the log as a process that is killed amid a transaction leaves it: half of it written, the rest in the journal."""
+    """Leave the log as a process that is killed amid a transaction leaves it: half of it written,
+    the rest in the journal.
+    """
     database = sqlite3.connect(path, isolation_level=None)
     database.execute("PRAGMA cache_size = 1")
     database.execute("PRAGMA cache_spill = 1")
@@ -66,7 +78,9 @@ def damage(content: bytes, chance: random.Random) -> bytes:
         length = chance.randrange(1, 2000)
         spoilt[begin : begin + length] = chance.randbytes(min(length, len(spoilt) - begin))
         return bytes(spoilt)
-    used = [k for k, byte in enumerate(spoilt) if byte] if how < 4 else range(100)  # the last: in the header
+    used = (
+        [k for k, byte in enumerate(spoilt) if byte] if how < 4 else range(100)
+    )  # the last: in the header
     for _ in range(chance.choice([1, 1, 3, 30])):
         spoilt[chance.choice(used)] ^= 1 << chance.randrange(8)
     return bytes(spoilt)
@@ -75,7 +89,9 @@ def damage(content: bytes, chance: random.Random) -> bytes:
 def test_a_log_damaged_at_random(module_bench, template, tmp_path, monkeypatch, capsys):
     bench, (half, expected) = module_bench, template
     done: list[int] = []
-    monkeypatch.setattr(campaign, "perform", lambda order: done.append(order.task.number) or perform(order))
+    monkeypatch.setattr(
+        campaign, "perform", lambda order: done.append(order.task.number) or perform(order)
+    )
     aside = again = 0
     for number in [*range(ROUNDS), 77]:  # the last: an error whose own text cannot be read
         chance = random.Random(number)
@@ -97,7 +113,10 @@ def test_a_log_damaged_at_random(module_bench, template, tmp_path, monkeypatch, 
         assert {6, 7} <= set(done), number
         assert sorted(set(done)) == sorted(done), number
         if set(done) & {0, 1, 2, 3}:  # these are combined, and nothing but the log says so
-            assert "the job log was damaged: it is kept as jobs.damaged-1.sqlite" in said, (number, said)
+            assert "the job log was damaged: it is kept as jobs.damaged-1.sqlite" in said, (
+                number,
+                said,
+            )
             aside += 1
         if set(done) & {4, 5}:
             assert "partial products were missing or damaged" in said, (number, said)

@@ -17,8 +17,16 @@ from zonda.core.errors import PipelineError
 
 
 def test_dask_cluster_of_two_workers(undisturbed, bench):
-    distributed = pytest.importorskip("distributed", reason="distributed is not installed: pip install 'zonda[dask]'")
-    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None, "host": "127.0.0.1"}
+    distributed = pytest.importorskip(
+        "distributed", reason="distributed is not installed: pip install 'zonda[dask]'"
+    )
+    options = {
+        "n_workers": 2,
+        "threads_per_worker": 1,
+        "processes": True,
+        "dashboard_address": None,
+        "host": "127.0.0.1",
+    }
     with distributed.LocalCluster(**options) as cluster:
         out = bench.run(bench.CAMPAIGN, "--scheduler", cluster.scheduler_address)
     assert bench.planes(out) == bench.planes(undisturbed)
@@ -29,8 +37,16 @@ TOO_FAST = ("50 arcsec/s", "500 arcsec/s")
 
 
 def test_workers_of_dask_leave_their_warnings_to_the_main_process(bench, capfd, recwarn):
-    distributed = pytest.importorskip("distributed", reason="distributed is not installed: pip install 'zonda[dask]'")
-    options = {"n_workers": 1, "threads_per_worker": 2, "processes": True, "dashboard_address": None, "host": "127.0.0.1"}
+    distributed = pytest.importorskip(
+        "distributed", reason="distributed is not installed: pip install 'zonda[dask]'"
+    )
+    options = {
+        "n_workers": 1,
+        "threads_per_worker": 2,
+        "processes": True,
+        "dashboard_address": None,
+        "host": "127.0.0.1",
+    }
     with distributed.LocalCluster(**options) as cluster:
         bench.run("{nights: 2}", "--scheduler", cluster.scheduler_address, changes=(TOO_FAST,))
     assert "samples per FWHM" not in capfd.readouterr().err
@@ -39,7 +55,9 @@ def test_workers_of_dask_leave_their_warnings_to_the_main_process(bench, capfd, 
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory):
-    """``ca.pem``, ``node.pem`` which it signed, ``other.pem`` which it did not; each with its ``.key``."""
+    """``ca.pem``, ``node.pem`` which it signed, ``other.pem`` which it did not; each with its
+    ``.key``.
+    """
     openssl = shutil.which("openssl")
     if openssl is None:
         pytest.skip("there is no openssl command to make certificates with")
@@ -50,7 +68,19 @@ def certificates(tmp_path_factory):
 
     key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
     for name in ("ca", "other"):
-        make("req", "-x509", *key, "-days", "2", "-subj", f"/CN={name}", "-keyout", f"{name}.key", "-out", f"{name}.pem")
+        make(
+            "req",
+            "-x509",
+            *key,
+            "-days",
+            "2",
+            "-subj",
+            f"/CN={name}",
+            "-keyout",
+            f"{name}.key",
+            "-out",
+            f"{name}.pem",
+        )
     make("req", *key, "-subj", "/CN=node", "-keyout", "node.key", "-out", "node.csr")
     make(
         "x509",
@@ -73,11 +103,24 @@ def certificates(tmp_path_factory):
 @pytest.fixture(scope="module")
 def encrypted(certificates):
     """Address of a Dask cluster that talks to nobody without a certificate."""
-    distributed = pytest.importorskip("distributed", reason="distributed is not installed: pip install 'zonda[dask]'")
-    pairs = {f"tls_{who}_{what}": str(certificates / file) for who in ("scheduler", "worker", "client")
-             for what, file in (("cert", "node.pem"), ("key", "node.key"))}  # fmt: skip
-    security = distributed.Security(tls_ca_file=str(certificates / "ca.pem"), require_encryption=True, **pairs)
-    options = {"n_workers": 1, "threads_per_worker": 1, "processes": True, "dashboard_address": None, "host": "127.0.0.1"}
+    distributed = pytest.importorskip(
+        "distributed", reason="distributed is not installed: pip install 'zonda[dask]'"
+    )
+    pairs = {
+        f"tls_{who}_{what}": str(certificates / file)
+        for who in ("scheduler", "worker", "client")
+        for what, file in (("cert", "node.pem"), ("key", "node.key"))
+    }
+    security = distributed.Security(
+        tls_ca_file=str(certificates / "ca.pem"), require_encryption=True, **pairs
+    )
+    options = {
+        "n_workers": 1,
+        "threads_per_worker": 1,
+        "processes": True,
+        "dashboard_address": None,
+        "host": "127.0.0.1",
+    }
     with distributed.LocalCluster(**options, protocol="tls://", security=security) as cluster:
         assert cluster.scheduler_address.startswith("tls://")
         yield cluster.scheduler_address
@@ -91,18 +134,28 @@ def in_a_shell(arguments, **variables):
     return done.returncode, done.stderr
 
 
-def test_dask_with_tls_by_its_own_configuration(undisturbed, bench, certificates, encrypted, tmp_path):
+def test_dask_with_tls_by_its_own_configuration(
+    undisturbed, bench, certificates, encrypted, tmp_path
+):
     """Certificates in variables of the environment, as Dask reads them."""
     names = {"CA_FILE": "ca.pem", "CLIENT__CERT": "node.pem", "CLIENT__KEY": "node.key"}
-    variables = {f"DASK_DISTRIBUTED__COMM__TLS__{name}": str(certificates / file) for name, file in names.items()}
+    variables = {
+        f"DASK_DISTRIBUTED__COMM__TLS__{name}": str(certificates / file)
+        for name, file in names.items()
+    }
     out = bench.new()
-    status, said = in_a_shell(["run", bench.file(bench.CAMPAIGN), "--scheduler", encrypted, "--output", out], **variables)
+    status, said = in_a_shell(
+        ["run", bench.file(bench.CAMPAIGN), "--scheduler", encrypted, "--output", out], **variables
+    )
     assert status == 0, said
     assert bench.planes(out) == bench.planes(undisturbed)
 
 
 def test_dask_with_tls_by_the_pipeline_file(bench, certificates, encrypted):
-    tls = f"{{ca_file: {certificates}/ca.pem, cert: {certificates}/node.pem, key: {certificates}/node.key}}"
+    tls = (
+        f"{{ca_file: {certificates}/ca.pem, cert: {certificates}/node.pem, key:"
+        f" {certificates}/node.key}}"
+    )
     out = bench.run(f"{{engine: dask, scheduler: '{encrypted}', tls: {tls}}}")
     assert (out / "map.fits").exists()
 
@@ -114,18 +167,34 @@ def test_dask_with_tls_by_the_pipeline_file(bench, certificates, encrypted):
         ("ca", None, "no cert for TLS is named"),
         ("gone", "node", "ca_file of TLS: there is no file"),
         ("ca", ("node", "other"), "the certificates for TLS cannot be used"),  # not a pair
-        ("other", "other", "cannot reach the Dask scheduler: "),  # the scheduler's was signed by somebody else
+        (
+            "other",
+            "other",
+            "cannot reach the Dask scheduler: ",
+        ),  # the scheduler's was signed by somebody else
         ("ca", "other", "cannot reach the Dask scheduler: "),  # the scheduler does not accept it
     ],
 )
-def test_wrong_certificates_are_one_clean_error(bench, certificates, encrypted, capfd, ca, pair, why):
+def test_wrong_certificates_are_one_clean_error(
+    bench, certificates, encrypted, capfd, ca, pair, why
+):
     dask = pytest.importorskip("dask")
     cert, key = pair if isinstance(pair, tuple) else (pair, pair)
-    files = {"ca-file": ca and f"{ca}.pem", "client.cert": cert and f"{cert}.pem", "client.key": key and f"{key}.key"}
-    with dask.config.set({f"distributed.comm.tls.{k}": str(certificates / v) for k, v in files.items() if v}):
+    files = {
+        "ca-file": ca and f"{ca}.pem",
+        "client.cert": cert and f"{cert}.pem",
+        "client.key": key and f"{key}.key",
+    }
+    with dask.config.set(
+        {f"distributed.comm.tls.{k}": str(certificates / v) for k, v in files.items() if v}
+    ):
         out = bench.run(bench.CAMPAIGN, "--scheduler", encrypted, status=2)
     gc.collect()  # a client that was never connected says so when it is thrown away
-    said = [line for line in capfd.readouterr().err.splitlines() if "distributed" not in line.partition(" - ")[2]]
+    said = [
+        line
+        for line in capfd.readouterr().err.splitlines()
+        if "distributed" not in line.partition(" - ")[2]
+    ]
     assert said[0].startswith(f"error: {encrypted}: {why}"), said
     assert len(said) == 2, said
     assert "certificates" in said[1] or "comm.tls" in said[1]
@@ -143,7 +212,14 @@ def mpi(bench):
 
     def run(number, campaign, *changes):
         out = bench.new()
-        arguments = ["run", str(bench.file(campaign, *changes)), "--engine", "mpi", "--output", str(out)]
+        arguments = [
+            "run",
+            str(bench.file(campaign, *changes)),
+            "--engine",
+            "mpi",
+            "--output",
+            str(out),
+        ]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
         command = [mpiexec, "-n", str(number), sys.executable, "-m", "zonda.core.cli", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, env=environment)
@@ -172,9 +248,19 @@ def test_a_missing_package_is_named_with_its_cure(monkeypatch, name, module):
 
 def test_dask_connects_only_where_it_is_told(bench, capsys):
     pytest.importorskip("distributed", reason="distributed is not installed")
-    assert bench.command("run", bench.file(bench.CAMPAIGN), "--engine", "dask", "--output", bench.new()) == 2
+    assert (
+        bench.command(
+            "run", bench.file(bench.CAMPAIGN), "--engine", "dask", "--output", bench.new()
+        )
+        == 2
+    )
     assert "no Dask scheduler is named" in capsys.readouterr().err
-    assert bench.command("run", bench.file(bench.CAMPAIGN), "--scheduler", "no address", "--output", bench.new()) == 2
+    assert (
+        bench.command(
+            "run", bench.file(bench.CAMPAIGN), "--scheduler", "no address", "--output", bench.new()
+        )
+        == 2
+    )
     assert "cannot reach the Dask scheduler" in capsys.readouterr().err
 
 
@@ -184,7 +270,11 @@ def test_a_scheduler_file_that_is_still_being_written_is_waited_for(monkeypatch,
 
     def write_more(seconds):
         tries.append(seconds)
-        file.write_text({1: "", 2: '{"type": "Sched', 3: "{}"}.get(len(tries), '{"address": "tcp://127.0.0.1:8786"}'))
+        file.write_text(
+            {1: "", 2: '{"type": "Sched', 3: "{}"}.get(
+                len(tries), '{"address": "tcp://127.0.0.1:8786"}'
+            )
+        )
 
     monkeypatch.setattr(engines.time, "sleep", write_more)
     assert engines._address(str(file)) == "tcp://127.0.0.1:8786"
@@ -193,7 +283,13 @@ def test_a_scheduler_file_that_is_still_being_written_is_waited_for(monkeypatch,
 
 @pytest.mark.parametrize(
     ("text", "why"),
-    [(None, "No such file"), ("", "JSONDecodeError"), ("[]", "TypeError"), ("{}", "KeyError: 'addr"), ("\xff", "UnicodeDecode")],
+    [
+        (None, "No such file"),
+        ("", "JSONDecodeError"),
+        ("[]", "TypeError"),
+        ("{}", "KeyError: 'addr"),
+        ("\xff", "UnicodeDecode"),
+    ],
 )
 def test_a_scheduler_file_that_never_comes(monkeypatch, tmp_path, text, why):
     pytest.importorskip("distributed", reason="distributed is not installed")
@@ -201,7 +297,10 @@ def test_a_scheduler_file_that_never_comes(monkeypatch, tmp_path, text, why):
     file = tmp_path / "scheduler.json"
     if text is not None:
         file.write_bytes(text.encode("latin-1"))
-    with pytest.raises(PipelineError, match=f"its file cannot be read: .*{why}") as caught, engine("dask", scheduler=str(file)):
+    with (
+        pytest.raises(PipelineError, match=f"its file cannot be read: .*{why}") as caught,
+        engine("dask", scheduler=str(file)),
+    ):
         pass
     assert caught.value.place == str(file)
 
@@ -222,18 +321,19 @@ def test_cores_and_memory_are_shared_among_workers(monkeypatch):
 
 
 def test_ctrl_c_does_not_reach_workers_that_start():
-    """A Ctrl-C of the terminal goes to all processes; one that is still importing would show a traceback."""
+    """A Ctrl-C of the terminal goes to all processes; one that is still importing would show a
+    traceback.
+    """
     code = (
-        "import os, signal, sys, time\n"
-        "from zonda.core.campaign.engines import engine\n"
-        "if __name__ == '__main__':\n"
-        "    with engine('processes', workers=2) as pool:\n"
-        "        futures = [pool.executor.submit(time.sleep, 0) for _ in range(2)]\n"
-        "        for process in pool.executor._processes.values():\n"
-        "            for _ in range(3):\n"
-        "                os.kill(process.pid, signal.SIGINT)\n"
-        "        print([f.result() for f in futures], signal.pthread_sigmask(signal.SIG_BLOCK, []))\n"
+        "import os, signal, sys, time\nfrom zonda.core.campaign.engines import engine\nif __name__"
+        " == '__main__':\n    with engine('processes', workers=2) as pool:\n        futures ="
+        " [pool.executor.submit(time.sleep, 0) for _ in range(2)]\n        for process in"
+        " pool.executor._processes.values():\n            for _ in range(3):\n               "
+        " os.kill(process.pid, signal.SIGINT)\n        print([f.result() for f in futures],"
+        " signal.pthread_sigmask(signal.SIG_BLOCK, []))\n"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "[None, None] set()\n", "")

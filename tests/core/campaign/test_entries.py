@@ -23,7 +23,9 @@ def expand(seed=7, **campaign):
 
 
 def test_a_grid_is_every_combination_with_the_first_axis_slowest():
-    found = expand(grid={"site": ["a", "b"], "PointingDaisy.radius": ["1 arcmin", "2 arcmin"]}, realizations=2)
+    found = expand(
+        grid={"site": ["a", "b"], "PointingDaisy.radius": ["1 arcmin", "2 arcmin"]}, realizations=2
+    )
     points = [tuple(e.values.values()) for e in found]
     radii = ("1 arcmin", "2 arcmin")
     assert points == [(s, r, k) for s in ("a", "b") for r in radii for k in (0, 1)]
@@ -33,9 +35,15 @@ def test_a_grid_is_every_combination_with_the_first_axis_slowest():
 
 def test_a_list_is_one_after_the_other_and_crosses_the_grid():
     found = expand(
-        observations=[{"time": "2024-11-25T07:00"}, {"time": "2024-11-26T07:00", "seed": 9}], grid={"site": ["a", "b"]}
+        observations=[{"time": "2024-11-25T07:00"}, {"time": "2024-11-26T07:00", "seed": 9}],
+        grid={"site": ["a", "b"]},
     )
-    assert [(e.values["observation"], e.values["site"]) for e in found] == [(0, "a"), (0, "b"), (1, "a"), (1, "b")]
+    assert [(e.values["observation"], e.values["site"]) for e in found] == [
+        (0, "a"),
+        (0, "b"),
+        (1, "a"),
+        (1, "b"),
+    ]
     assert [e.time.seconds_since(START) for e in found] == [0, 0, 86400, 86400]
     assert [e.seed for e in found[::2]] == [7, 9]
 
@@ -55,9 +63,13 @@ def test_realizations_never_share_random_numbers(combine):
     found = expand(grid={"site": ["a", "b"]}, nights=2, realizations=3, combine=combine)
     for site in "ab":
         for night in (0, 1):
-            seeds = {e.seed for e in found if (e.values["site"], e.values["night"]) == (site, night)}
+            seeds = {
+                e.seed for e in found if (e.values["site"], e.values["night"]) == (site, night)
+            }
             assert len(seeds) == 3
-    shared = {e.seed for e in found if e.values["site"] == "a"} == {e.seed for e in found if e.values["site"] == "b"}
+    shared = {e.seed for e in found if e.values["site"] == "a"} == {
+        e.seed for e in found if e.values["site"] == "b"
+    }
     assert shared == (combine != "all")
 
 
@@ -67,17 +79,44 @@ def test_realizations_never_share_random_numbers(combine):
         ({"nights": 3}, False),
         ({"realizations": 3}, False),
         ({"grid": {"time": ["2024-11-25T07:00", "2024-11-26T07:00", "2024-11-27T07:00"]}}, False),
-        ({"observations": [{"target": "05h +20d"}, {"target": "06h +20d"}, {"target": "07h +20d"}]}, False),
-        ({"observations": [{"seed": 7, "time": "2024-11-25T07:00"}, {"seed": 7, "time": "2024-11-26T07:00"}]}, True),
+        (
+            {
+                "observations": [
+                    {"target": "05h +20d"},
+                    {"target": "06h +20d"},
+                    {"target": "07h +20d"},
+                ]
+            },
+            False,
+        ),
+        (
+            {
+                "observations": [
+                    {"seed": 7, "time": "2024-11-25T07:00"},
+                    {"seed": 7, "time": "2024-11-26T07:00"},
+                ]
+            },
+            True,
+        ),
         ({"grid": {"PointingDaisy.radius": ["1 arcmin", "2 arcmin", "3 arcmin"]}}, True),
-        ({"observations": [{"PointingDaisy.radius": "1 arcmin"}, {"PointingDaisy.radius": "2 arcmin"}]}, True),
+        (
+            {
+                "observations": [
+                    {"PointingDaisy.radius": "1 arcmin"},
+                    {"PointingDaisy.radius": "2 arcmin"},
+                ]
+            },
+            True,
+        ),
         ({"nights": 3, "paired": True}, True),
         ({"grid": {"time": ["2024-11-25T07:00", "2024-11-26T07:00"]}, "paired": True}, True),
         ({"realizations": 3, "paired": True}, False),
     ],
 )
 def test_what_is_not_combined_is_independent_where_it_is_another_observation(axes, shared):
-    """Other nights, times and targets have noise of their own; parameters are compared with the same noise."""
+    """Other nights, times and targets have noise of their own; parameters are compared with the
+    same noise.
+    """
     seeds = [e.seed for e in expand(combine=[], **axes)]
     assert seeds[0] == 7
     assert len(set(seeds)) == (1 if shared else len(seeds))
@@ -102,7 +141,9 @@ def test_explicit_seeds_are_as_they_are():
 
 def test_nights_are_whole_turns_of_the_earth():
     found = expand(nights=3)
-    assert [e.time.seconds_since(START) for e in found] == pytest.approx([0, TURN, 2 * TURN], abs=1e-8)
+    assert [e.time.seconds_since(START) for e in found] == pytest.approx(
+        [0, TURN, 2 * TURN], abs=1e-8
+    )
     between = expand(nights={"start": "2024-11-23", "stop": "2024-12-01", "every": 2})
     assert [e.values["night"] for e in between] == [-2, 0, 2, 4]
     with pytest.raises(InputError, match="no observation begins between"):
@@ -130,14 +171,34 @@ def test_a_target_is_at_the_same_place_on_the_next_night():
     ("campaign", "words", "place"),
     [
         ("{grid: {sed: [1]}}", ["nothing is called 'sed'", "did you mean 'seed'?"], "17:19"),
-        ("{grid: {site: [green_bank, green_bnak]}}", ["unknown site 'green_bnak'", "did you mean 'green_bank'?"], "17:38"),
+        (
+            "{grid: {site: [green_bank, green_bnak]}}",
+            ["unknown site 'green_bnak'", "did you mean 'green_bank'?"],
+            "17:38",
+        ),
         ("{grid: {BinMap.pixel: [4 arcsec, 2 s]}}", ["BinMap, pixel: expected an angle"], "17:46"),
-        ("{grid: {BinMap.pixle: [4 arcsec]}}", ["unknown key 'pixle' for BinMap", "did you mean 'pixel'?"], "17:19"),
+        (
+            "{grid: {BinMap.pixle: [4 arcsec]}}",
+            ["unknown key 'pixle' for BinMap", "did you mean 'pixel'?"],
+            "17:19",
+        ),
         ("{observations: [{time: now}]}", ["cannot read 'now' as a time"], "17:34"),
-        ("{BinMap.pixel: [4 arcsec]}", ["unknown key 'BinMap.pixel'", "write grid: {BinMap.pixel: [...]}"], "17:12"),
-        ("{realization: 2}", ["unknown key 'realization'", "did you mean 'realizations'?"], "17:12"),
+        (
+            "{BinMap.pixel: [4 arcsec]}",
+            ["unknown key 'BinMap.pixel'", "write grid: {BinMap.pixel: [...]}"],
+            "17:12",
+        ),
+        (
+            "{realization: 2}",
+            ["unknown key 'realization'", "did you mean 'realizations'?"],
+            "17:12",
+        ),
         ("{engine: dsk}", ["did you mean 'dask'?"], "17:20"),
-        ("{nights: 2, combine: [site]}", ["which is no axis of this campaign; its axes: night"], "17:11"),
+        (
+            "{nights: 2, combine: [site]}",
+            ["which is no axis of this campaign; its axes: night"],
+            "17:11",
+        ),
         ("{grid: {name: [a, b]}}", ["'name' cannot change from one entry to the next"], "17:19"),
         ("{scheduler: 'tcp://a:1'}", ["scheduler is for engine: dask"], "17:11"),
         ("{nights: {start: 2024-11-25}}", ["give a number of nights, or start and stop"], "17:20"),
@@ -155,7 +216,12 @@ def test_mistakes_are_shown_at_their_place(bench, campaign, words, place):
 @pytest.mark.parametrize(
     ("gone", "campaign", "words", "place"),
     [
-        ("site: green_bank\n", "{grid: {site: [mauna_kea, atacama]}}", "write 'site: \"mauna_kea\"' at the top level", "16:19"),
+        (
+            "site: green_bank\n",
+            "{grid: {site: [mauna_kea, atacama]}}",
+            "write 'site: \"mauna_kea\"' at the top level",
+            "16:19",
+        ),
         (
             "time: 2024-11-25T07:00\n",
             "{observations: [{time: 2024-11-26}, {time: 2024-11-27}]}",
@@ -178,13 +244,16 @@ def test_an_axis_of_what_the_pipeline_lacks(bench, gone, campaign, words, place)
 def test_check_and_plan_know_a_campaign(bench, capsys):
     path = bench.file("{grid: {seed: [1, 2]}, nights: 4, combine: [night]}")
     assert bench.command("check", path) == 0
-    assert capsys.readouterr().out.endswith("campaign of 8 entries, combined into 2 sets of products\n")
+    assert capsys.readouterr().out.endswith(
+        "campaign of 8 entries, combined into 2 sets of products\n"
+    )
     assert bench.command("plan", path) == 0
     shown = capsys.readouterr().out
     assert "the plan of the first one:" in shown
     spent = next(line for line in shown.splitlines() if line.startswith("budget for map_rms"))
     noise = next(line for line in shown.splitlines() if line.startswith("noise: "))
-    # a tenth of the noise of a pixel, divided by the square root of the four nights that are co-added
+    # a tenth of the noise of a pixel, divided by the square root of the four nights that are
+    # co-added
     pixel, budget = float(noise.split()[1]), float(spent.split(" of ")[1].split()[0])
     assert noise.split()[2] == "mK"
     assert spent.split(" of ")[1].split()[1] == "uK"
@@ -192,7 +261,9 @@ def test_check_and_plan_know_a_campaign(bench, capsys):
 
 
 def test_resolved_campaign_reads_back(bench):
-    text = bench.file("{grid: {seed: [1, 2]}, nights: {start: 2024-11-24, stop: 2024-11-29}, combine: [night]}").read_text()
+    text = bench.file(
+        "{grid: {seed: [1, 2]}, nights: {start: 2024-11-24, stop: 2024-11-29}, combine: [night]}"
+    ).read_text()
     file = parse(text)
     again = parse(file.resolved_yaml())
     assert again.header.campaign == file.header.campaign

@@ -27,7 +27,9 @@ def moving(monkeypatch):
 
     def begin(after, until=10**6):
         calls = iter(range(10**6))
-        monkeypatch.setattr(machines, "here", lambda: strange if after <= next(calls) < until else mine)
+        monkeypatch.setattr(
+            machines, "here", lambda: strange if after <= next(calls) < until else mine
+        )
 
     return begin
 
@@ -40,14 +42,25 @@ def status(bench, out, capsys):
     return found, capsys.readouterr().out
 
 
-@pytest.mark.parametrize("engine", [SERIAL, ("--engine", "processes", "--workers", 2)], ids=["serial", "processes"])
+@pytest.mark.parametrize(
+    "engine", [SERIAL, ("--engine", "processes", "--workers", 2)], ids=["serial", "processes"]
+)
 def test_each_task_has_its_machine(bench, capsys, engine):
     out = bench.run(SMALL, *engine)
     assert "another kind" not in capsys.readouterr().err
     found, said = status(bench, out, capsys)
     (machine,) = found["machines"]
     assert machine == versions.arithmetic()
-    assert {"zonda", "numpy", "numba", "scipy", "astropy", "cpu", "instructions", "processor"} <= machine.keys()
+    assert {
+        "zonda",
+        "numpy",
+        "numba",
+        "scipy",
+        "astropy",
+        "cpu",
+        "instructions",
+        "processor",
+    } <= machine.keys()
     assert [task["machine"] for task in found["tasks"]] == [0] * 6
     assert f"numpy {machine['numpy']}" in said
     assert machine["cpu"] in said
@@ -92,7 +105,10 @@ def test_what_another_kind_has_done_is_done_again_on_request(bench, moving, caps
     assert len(status(bench, out, capsys)[0]["machines"]) == 2
     moving(10**6)
     assert bench.command("resume", out, *SERIAL, "--same-machine") == 0
-    assert "3 tasks ran on another kind of machine than the first: run again" in capsys.readouterr().err
+    assert (
+        "3 tasks ran on another kind of machine than the first: run again"
+        in capsys.readouterr().err
+    )
     assert len(status(bench, out, capsys)[0]["machines"]) == 1
 
 
@@ -117,14 +133,25 @@ def test_a_task_that_is_put_off_has_no_machine(tmp_path):
 
 
 def test_what_counts_as_another_kind():
-    one = {"cpu": "a", "instructions": "sse2 avx2", "numpy": "2.4.6", "processor": "x", "python": "3.12.1"}
+    one = {
+        "cpu": "a",
+        "instructions": "sse2 avx2",
+        "numpy": "2.4.6",
+        "processor": "x",
+        "python": "3.12.1",
+    }
     text = json.dumps(one)
     assert kind(text) == kind(json.dumps(one | {"processor": "y", "python": "3.13.0"}))
-    for change in ({"cpu": "b"}, {"numpy": "2.4.5"}, {"instructions": "sse2"}, {"libc": "glibc 2.36"}):
+    for change in (
+        {"cpu": "b"},
+        {"numpy": "2.4.5"},
+        {"instructions": "sse2"},
+        {"libc": "glibc 2.36"},
+    ):
         assert kind(text) != kind(json.dumps(one | change))
-    assert differences(json.dumps(one | {"instructions": "sse2 avx512f", "numpy": "2.3"}), text) == (
-        "instructions with avx512f, without avx2, numpy 2.3 (2.4.6 there)"
-    )
+    assert differences(
+        json.dumps(one | {"instructions": "sse2 avx512f", "numpy": "2.3"}), text
+    ) == ("instructions with avx512f, without avx2, numpy 2.3 (2.4.6 there)")
     assert kinds(["", "null", "[1", text, text]) == [(text, 2)]
     assert read("[]") == {}
 
@@ -137,7 +164,10 @@ def test_an_unknown_machine_is_not_compared(tmp_path):
     assert not said
 
 
-@pytest.mark.parametrize("name", ["NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE"])
+@pytest.mark.parametrize(
+    "name",
+    ["NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE"],
+)
 def test_what_is_remembered_of_a_processor_knows_its_restraints(monkeypatch, name):
     from zonda.core.storage import user_cache
 

@@ -1,4 +1,6 @@
-"""``--memory`` of a campaign: for all of it on this machine, shared out and checked before it starts."""
+"""``--memory`` of a campaign: for all of it on this machine, shared out and checked before it
+starts.
+"""
 
 import re
 
@@ -39,7 +41,8 @@ def test_fewer_workers_where_more_do_not_fit():
 @pytest.mark.parametrize(("workers", "size"), [(None, 50 * MB), (None, 300 * MB), (4, 1500 * MB)])
 def test_too_little_is_refused_with_figures_that_work(workers, size):
     with pytest.raises(
-        PipelineError, match=r"500 MB for its tasks, and the main process holds 320 MB; the memory budget is"
+        PipelineError,
+        match=r"500 MB for its tasks, and the main process holds 320 MB; the memory budget is",
     ) as err:
         shared(size, workers)
     found = re.match(r"use --memory (\d+)MB", err.value.cure)
@@ -54,7 +57,11 @@ def test_too_little_is_refused_with_figures_that_work(workers, size):
 def test_without_a_budget_half_of_what_is_free_is_shared():
     assert shared(None, 4) == (4, 2, 2000 * MB)
     assert shared(None, need=3000 * MB) == (2, 4, 4000 * MB)
-    assert shared(None, 4, need=3000 * MB) == (4, 2, 3000 * MB)  # asked for, and there is room for them
+    assert shared(None, 4, need=3000 * MB) == (
+        4,
+        2,
+        3000 * MB,
+    )  # asked for, and there is room for them
     with pytest.raises(PipelineError, match=r"each of 8 workers needs 3000 MB.*16000 MB are free"):
         shared(None, 8, need=3000 * MB)
 
@@ -68,7 +75,9 @@ def test_in_series_it_is_that_of_the_one_process():
 
 @pytest.mark.parametrize("size", ["50MB", "300MB"])
 def test_a_campaign_is_refused_before_it_starts(bench, capsys, size):
-    out = bench.run("{nights: 2}", "--memory", size, "--engine", "processes", "--workers", 2, status=2)
+    out = bench.run(
+        "{nights: 2}", "--memory", size, "--engine", "processes", "--workers", 2, status=2
+    )
     message = capsys.readouterr().err
     assert "for its tasks" in message
     assert "use --memory" in message

@@ -10,7 +10,11 @@ import pytest
 from zonda.core.campaign import parts
 from zonda.core.errors import InputError
 
-TREE = {"a": {"b": np.arange(5), "names": ["x", "y"]}, "c": [1, 2.5, None, True, "é"], "d": np.zeros((2, 0), np.float32)}
+TREE = {
+    "a": {"b": np.arange(5), "names": ["x", "y"]},
+    "c": [1, 2.5, None, True, "é"],
+    "d": np.zeros((2, 0), np.float32),
+}
 
 
 def test_what_is_written_is_read(tmp_path):
@@ -37,7 +41,9 @@ def test_every_damage_is_noticed(tmp_path):
         damaged = bytearray(whole)
         damaged[at] ^= 0x55
         path.write_bytes(damaged)
-        with contextlib.suppress(InputError):  # bits of the archive's own bookkeeping that nobody reads may change
+        with contextlib.suppress(
+            InputError
+        ):  # bits of the archive's own bookkeeping that nobody reads may change
             found = parts.read(path, "me", digest)
             assert np.array_equal(found["a"]["b"], np.arange(5))
             assert found["c"] == TREE["c"]

@@ -27,7 +27,11 @@ MAP_IN_FILE = ("  - WhiteNoise\n", STEP + "  - WhiteNoise\n")
 def wcs() -> WCS:
     """Turned and of uneven scale: numbers that 14 digits do not hold."""
     made = WCS(naxis=2)
-    made.wcs.ctype, made.wcs.crval, made.wcs.crpix = ["RA---TAN", "DEC--TAN"], TARGET, [32.123456789012345, 24.4]
+    made.wcs.ctype, made.wcs.crval, made.wcs.crpix = (
+        ["RA---TAN", "DEC--TAN"],
+        TARGET,
+        [32.123456789012345, 24.4],
+    )
     made.wcs.cdelt = [-4.1 / 3600, 4.1 / 3600]
     made.wcs.pc = [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]
     made.wcs.set()
@@ -40,7 +44,14 @@ def sky() -> zonda.Operator:
 
 def steps(*more: zonda.Operator) -> list[zonda.Operator]:
     daisy = zonda.PointingDaisy(radius="1 arcmin", speed="50 arcsec/s", scan_duration="3 s")
-    return [daisy, *more, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="4 arcsec"), zonda.SaveMap()]
+    return [
+        daisy,
+        *more,
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.BinMap(pixel="4 arcsec"),
+        zonda.SaveMap(),
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +60,21 @@ def with_array(module_bench):
     bench = module_bench
     fits.PrimaryHDU(BLOB, fits.Header(dict(sky().wcs))).writeto(bench.folder / "sky.fits")
     put = MAP_IN_FILE[0], MAP_IN_FILE[1].replace("FILE", "sky.fits")
-    theirs = bench.run("{nights: 2, realizations: 2}", "--no-prune", "--engine", "serial", "--threads", 1, changes=(put,))
+    theirs = bench.run(
+        "{nights: 2, realizations: 2}",
+        "--no-prune",
+        "--engine",
+        "serial",
+        "--threads",
+        1,
+        changes=(put,),
+    )
     file = zonda.load(bench.file("null", put))
     operators = [sky() if isinstance(o, zonda.SkyMap) else o for o in file.operators]
     ours = bench.new()
-    made = zonda.campaign(zonda.Pipeline(operators), file.scene(), output=ours, nights=2, realizations=2, **SERIAL)
+    made = zonda.campaign(
+        zonda.Pipeline(operators), file.scene(), output=ours, nights=2, realizations=2, **SERIAL
+    )
     assert made.folder == ours
     assert made.sets == (({}, ours),)
     return theirs, ours
@@ -69,12 +90,18 @@ def test_an_array_gives_the_bits_of_its_file(with_array, module_bench):
 
 
 def test_products_say_what_the_array_was(with_array, module_bench, tmp_path):
-    """Shape, type, unit and hash, as a plain run of the array states them in the log and in its provenance."""
+    """Shape, type, unit and hash, as a plain run of the array states them in the log and in its
+    provenance.
+    """
     _, ours = with_array
     pipeline = zonda.Pipeline(steps(sky()))
     plain = pipeline.run(scene(camera(7)), output=tmp_path, threads=1)
     told = {what: value for who, what, value in plain.tally if who == "SkyMap"}["input"]
-    assert told == f"array of 64 x 48, float64, hash {pipeline.operators[1].map.record()['hash']}, in K_RJ, given in Python"
+    assert (
+        told
+        == f"array of 64 x 48, float64, hash {pipeline.operators[1].map.record()['hash']}, in K_RJ,"
+        " given in Python"
+    )
     for folder in (ours, tmp_path):
         with fits.open(folder / "map.fits") as found:
             assert told in [row["VALUE"] for row in found["TALLY"].data]
@@ -126,7 +153,10 @@ def test_an_array_that_changed_is_noticed_by_its_hash(with_array, module_bench, 
 
 
 def test_one_observation_is_the_plain_run(tmp_path, bench):
-    pipeline, where = zonda.Pipeline(steps(sky()), runs={"noiseless": {"only": ["sky"]}}), scene(camera(7))
+    pipeline, where = (
+        zonda.Pipeline(steps(sky()), runs={"noiseless": {"only": ["sky"]}}),
+        scene(camera(7)),
+    )
     zonda.campaign(pipeline, where, output=tmp_path / "a", **SERIAL)
     pipeline.run(where, output=tmp_path / "b", threads=1)
     for name in ("map.fits", "noiseless_map.fits"):
@@ -144,11 +174,21 @@ def test_signals_of_outputs_are_asked_for_by_these_again(tmp_path):
 def test_sets_of_products_by_their_values(tmp_path):
     grid = {"PointingDaisy.radius": [1, 1.5] * u.arcmin}
     made = zonda.campaign(
-        zonda.Pipeline(steps()), scene(camera(7)), output=tmp_path, grid=grid, realizations=2, combine=["realization"], **SERIAL
+        zonda.Pipeline(steps()),
+        scene(camera(7)),
+        output=tmp_path,
+        grid=grid,
+        realizations=2,
+        combine=["realization"],
+        **SERIAL,
     )
-    assert [values for values, _ in made.sets] == [{"PointingDaisy.radius": t} for t in ("1 arcmin", "1.5 arcmin")]
+    assert [values for values, _ in made.sets] == [
+        {"PointingDaisy.radius": t} for t in ("1 arcmin", "1.5 arcmin")
+    ]
     assert all((folder / "map.fits").is_file() for _, folder in made.sets)
-    assert {row[0] for row in made.tally} == {f"PointingDaisy.radius={t}" for t in ("1 arcmin", "1.5 arcmin")}
+    assert {row[0] for row in made.tally} == {
+        f"PointingDaisy.radius={t}" for t in ("1 arcmin", "1.5 arcmin")
+    }
 
 
 @pytest.mark.parametrize(
@@ -160,7 +200,10 @@ def test_sets_of_products_by_their_values(tmp_path):
         (np.arange(2), [0, 1]),
         (np.float64(1) / 3, 1 / 3),
         ([None, True, ("a",)], [None, True, ["a"]]),
-        (zonda.Band(name="x", low="90 GHz", high="100 GHz"), {"name": "x", "low": "90 GHz", "high": "100 GHz"}),
+        (
+            zonda.Band(name="x", low="90 GHz", high="100 GHz"),
+            {"name": "x", "low": "90 GHz", "high": "100 GHz"},
+        ),
     ],
 )
 def test_values_of_axes(value, written):
@@ -170,15 +213,15 @@ def test_values_of_axes(value, written):
 def test_a_script_needs_no_guard(tmp_path):
     """Worker processes do not run the user's script again."""
     (tmp_path / "script.py").write_text(
-        "import zonda\n"
-        "from zonda.plugins.checks.scenes import camera, scene\n"
-        "print('once')\n"
-        "daisy = zonda.PointingDaisy(radius='1 arcmin', speed='50 arcsec/s', scan_duration='2 s')\n"
-        "steps = [daisy, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel='4 arcsec'), zonda.SaveMap()]\n"
-        "made = zonda.campaign(zonda.Pipeline(steps), scene(camera(7)), output='out', realizations=2, workers=2)\n"
-        "print(made.folder)\n"
+        "import zonda\nfrom zonda.plugins.checks.scenes import camera, scene\nprint('once')\ndaisy"
+        " = zonda.PointingDaisy(radius='1 arcmin', speed='50 arcsec/s', scan_duration='2 s')\nsteps"
+        " = [daisy, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel='4 arcsec'),"
+        " zonda.SaveMap()]\nmade = zonda.campaign(zonda.Pipeline(steps), scene(camera(7)),"
+        " output='out', realizations=2, workers=2)\nprint(made.folder)\n"
     )
-    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout == "once\nout\n"
     assert "2 tasks in" in done.stderr
@@ -192,8 +235,16 @@ class OfThisSession(zonda.BinMap):
 @pytest.mark.parametrize(
     ("make", "axes", "said"),
     [
-        (lambda: [*steps()[:-2], zonda.operator(lambda b: None, name="f"), *steps()[-2:]], {}, "f is a function or a class of"),
-        (lambda: [*steps()[:-2], OfThisSession(pixel="4 arcsec"), zonda.SaveMap()], {}, "zonda new plugin NAME"),
+        (
+            lambda: [*steps()[:-2], zonda.operator(lambda b: None, name="f"), *steps()[-2:]],
+            {},
+            "f is a function or a class of",
+        ),
+        (
+            lambda: [*steps()[:-2], OfThisSession(pixel="4 arcsec"), zonda.SaveMap()],
+            {},
+            "zonda new plugin NAME",
+        ),
         (lambda: steps()[:-1], {}, "no step writes anything"),
         (steps, {"grid": {"BinMap.pixel": [object()]}}, "grid.BinMap.pixel: <object"),
         (steps, {"grid": {"BinMap.pixl": ["4 arcsec"]}}, "did you mean 'pixel'"),
@@ -203,14 +254,20 @@ class OfThisSession(zonda.BinMap):
 )
 def test_mistakes(tmp_path, make, axes, said):
     with pytest.raises(ZondaError, match=said):
-        zonda.campaign(zonda.Pipeline(make()), scene(camera(7)), output=tmp_path, **{**SERIAL, **axes})
+        zonda.campaign(
+            zonda.Pipeline(make()), scene(camera(7)), output=tmp_path, **{**SERIAL, **axes}
+        )
     assert not list(tmp_path.iterdir())
 
 
 def test_arrays_are_removed_where_nothing_begins(tmp_path):
     with pytest.raises(ZondaError, match="unknown key 'pixl'"):
         zonda.campaign(
-            zonda.Pipeline(steps(sky())), scene(camera(7)), output=tmp_path, grid={"BinMap.pixl": ["4 arcsec"]}, **SERIAL
+            zonda.Pipeline(steps(sky())),
+            scene(camera(7)),
+            output=tmp_path,
+            grid={"BinMap.pixl": ["4 arcsec"]},
+            **SERIAL,
         )
     assert not list(tmp_path.iterdir())
 
@@ -218,7 +275,10 @@ def test_arrays_are_removed_where_nothing_begins(tmp_path):
 def test_an_unfinished_campaign_keeps_its_arrays(tmp_path, monkeypatch):
     pipeline = zonda.Pipeline(steps(sky()))
     with monkeypatch.context() as patch:
-        patch.setattr("zonda.core.campaign.work.perform", lambda order: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(
+            "zonda.core.campaign.work.perform",
+            lambda order: (_ for _ in ()).throw(KeyboardInterrupt),
+        )
         with pytest.raises(KeyboardInterrupt):
             zonda.campaign(pipeline, scene(camera(7)), output=tmp_path, **SERIAL)
     content = (tmp_path / "inputs" / "SkyMap.fits").read_bytes()

@@ -66,8 +66,12 @@ def test_processes_give_the_same_bits(undisturbed, bench):
 
 def test_any_order_of_completion_gives_the_same_bits(undisturbed, bench, monkeypatch):
     for seed in (1, 2):
-        monkeypatch.setattr("zonda.core.campaign.engines.SerialExecutor", lambda seed=seed: Shuffled(12, seed))
-        monkeypatch.setattr("zonda.core.campaign.engines.Pool", lambda ex, *rest, **more: Pool(ex, 12, 0, 1, None))
+        monkeypatch.setattr(
+            "zonda.core.campaign.engines.SerialExecutor", lambda seed=seed: Shuffled(12, seed)
+        )
+        monkeypatch.setattr(
+            "zonda.core.campaign.engines.Pool", lambda ex, *rest, **more: Pool(ex, 12, 0, 1, None)
+        )
         out = bench.run(bench.CAMPAIGN, *SERIAL)
         assert bench.planes(out) == bench.planes(undisturbed)
 
@@ -84,7 +88,9 @@ def test_a_tree_of_several_levels_gives_the_same_maps(undisturbed, bench, monkey
 
 
 def test_scans_as_tasks_are_the_plain_run(bench, capsys):
-    """One entry is an ordinary run: same maps, same mean spectrum, same tally, the same told of it with its shares."""
+    """One entry is an ordinary run: same maps, same mean spectrum, same tally, the same told of it
+    with its shares.
+    """
     plain, split = bench.new(), bench.new()
     file = bench.file("null")
     said = []
@@ -99,19 +105,28 @@ def test_scans_as_tasks_are_the_plain_run(bench, capsys):
     tallies = []
     for out in (plain, split):
         with fits.open(out / "map.fits") as opened:
-            tallies.append([tuple(row) for row in opened["TALLY"].data if row["WHAT"].startswith("samples")])
+            tallies.append(
+                [tuple(row) for row in opened["TALLY"].data if row["WHAT"].startswith("samples")]
+            )
     assert tallies[0] == tallies[1]
 
 
 def test_one_set_of_products_for_each_combination(bench):
-    out = bench.run("{grid: {PointingDaisy.radius: [1 arcmin, 2 arcmin]}, realizations: 2, combine: [realization]}", *SERIAL)
+    out = bench.run(
+        "{grid: {PointingDaisy.radius: [1 arcmin, 2 arcmin]}, realizations: 2, combine:"
+        " [realization]}",
+        *SERIAL,
+    )
     folders = sorted(p.name for p in out.iterdir() if p.is_dir())
     assert folders == ["PointingDaisy.radius=1-arcmin", "PointingDaisy.radius=2-arcmin"]
     assert bench.planes(out / folders[0]) != bench.planes(out / folders[1])
 
 
 def test_several_files(bench):
-    one, two = bench.file("null", name="one.yaml"), bench.file("null", ("seed: 1", "seed: 2"), name="two.yaml")
+    one, two = (
+        bench.file("null", name="one.yaml"),
+        bench.file("null", ("seed: 1", "seed: 2"), name="two.yaml"),
+    )
     out = bench.new()
     assert bench.command("run", one, two, "--output", out, *SERIAL) == 0
     assert bench.planes(out / "one") != bench.planes(out / "two")
@@ -127,10 +142,17 @@ def test_time_streams_spectra_pictures_and_report(bench):
         with h5py.File(path) as f:
             session = f["instrument"].attrs
             numbers.append(
-                [f.attrs["observation_name"], f.attrs["observation_uid"], session["session_name"], session["session_uid"]]
+                [
+                    f.attrs["observation_name"],
+                    f.attrs["observation_uid"],
+                    session["session_name"],
+                    session["session_uid"],
+                ]
             )
     assert [len(set(column)) for column in zip(*numbers, strict=True)] == [4, 4, 4, 4]
-    assert {"map.png", "power_spectra.png", "tod.png", "scan.png", "report.html"} <= {p.name for p in out.iterdir()}
+    assert {"map.png", "power_spectra.png", "tod.png", "scan.png", "report.html"} <= {
+        p.name for p in out.iterdir()
+    }
     report = (out / "report.html").read_text()
     assert "000001-scan-001" in report
     assert "this table and the plan are of its first entry" in report
@@ -159,7 +181,10 @@ def failing(times, error="it broke", **more):
 
 def test_a_campaign_that_cannot_begin_leaves_nothing(bench, capsys):
     """The first of two sets of products is laid out before the second is found to be impossible."""
-    path = bench.file("{nights: 2, grid: {target: ['az 180 deg el 60 deg', 'az 180 deg el 1 deg']}, combine: [night]}")
+    path = bench.file(
+        "{nights: 2, grid: {target: ['az 180 deg el 60 deg', 'az 180 deg el 1 deg']}, combine:"
+        " [night]}"
+    )
     folder = bench.folder / "out"
     assert bench.command("run", path, "--output", folder, "--engine", "serial") == 2
     assert "elevation" in capsys.readouterr().err
@@ -213,7 +238,9 @@ def test_an_exception_leaves_a_campaign_that_resumes(undisturbed, bench, monkeyp
     assert states(out) == ["done"] * 5 + ["waiting"] * 7
     assert not (out / ".zonda-lock").exists()
     monkeypatch.setattr(campaign, "perform", perform)
-    assert bench.command("run", bench.folder / "p.yaml", "--output", out, *SERIAL) == 2  # unfinished: not thrown away
+    assert (
+        bench.command("run", bench.folder / "p.yaml", "--output", out, *SERIAL) == 2
+    )  # unfinished: not thrown away
     assert bench.command("resume", out, *SERIAL) == 0
     assert bench.planes(out) == bench.planes(undisturbed)
 
@@ -225,11 +252,16 @@ def test_a_plain_run_leaves_an_unfinished_campaign_alone(undisturbed, bench, mon
     plain = bench.file("null", name="plain.yaml")
     assert bench.command("run", plain, "--output", out) == 2
     said = capsys.readouterr().err
-    assert f"error: {out}: holds an unfinished campaign\n  = zonda resume {out}, remove it, or choose another folder" in said
+    assert (
+        f"error: {out}: holds an unfinished campaign\n  = zonda resume {out}, remove it, or choose"
+        " another folder" in said
+    )
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()} == before
     assert bench.command("resume", out, *SERIAL) == 0
     assert bench.planes(out) == bench.planes(undisturbed)
-    assert bench.command("run", plain, "--output", out) == 0  # a finished one's products are replaced, as another run's are
+    assert (
+        bench.command("run", plain, "--output", out) == 0
+    )  # a finished one's products are replaced, as another run's are
     assert bench.planes(out) != bench.planes(undisturbed)
     assert not (out / "campaign.json").exists()
     assert not list(out.glob("jobs*"))
@@ -244,7 +276,10 @@ def test_a_campaign_into_the_folder_of_a_plain_run_says_so(undisturbed, bench, c
     (out / "of-mine.txt").write_text("")
     capsys.readouterr()
     assert bench.command("run", bench.file(bench.CAMPAIGN), "--output", out, *SERIAL) == 0
-    assert f"{out} holds products of an earlier run: those of the same names are replaced, others stay" in capsys.readouterr().err
+    assert (
+        f"{out} holds products of an earlier run: those of the same names are replaced, others stay"
+        in capsys.readouterr().err
+    )
     assert bench.planes(out) == bench.planes(undisturbed)
     assert (out / "of-mine.txt").exists()
 
@@ -270,8 +305,13 @@ def test_a_killed_worker_does_not_lose_the_campaign(undisturbed, bench, monkeypa
 
 def half(bench, monkeypatch):
     """A campaign of which tasks 0 to 4 are done."""
-    monkeypatch.setattr(campaign, "perform", lambda order: Outcome("", 0.0, error="no", final=True) if order.task.number > 4
-                        else perform(order))  # fmt: skip
+    monkeypatch.setattr(
+        campaign,
+        "perform",
+        lambda order: (
+            Outcome("", 0.0, error="no", final=True) if order.task.number > 4 else perform(order)
+        ),
+    )
     out = bench.run(bench.CAMPAIGN, *SERIAL, status=2)
     monkeypatch.setattr(campaign, "perform", perform)
     return out
@@ -301,7 +341,9 @@ def test_a_damaged_log_is_made_anew(undisturbed, bench, monkeypatch, damage):
     else:
         path.write_bytes(path.read_bytes()[:5000] if damage == "short" else damage)
     done = []
-    monkeypatch.setattr(campaign, "perform", lambda order: done.append(order.task.number) or perform(order))
+    monkeypatch.setattr(
+        campaign, "perform", lambda order: done.append(order.task.number) or perform(order)
+    )
     assert bench.command("resume", out, *SERIAL) == 0
     assert sorted(done) == [5, 6, 7, 8, 9, 10, 11]
     assert bench.planes(out) == bench.planes(undisturbed)
@@ -349,14 +391,21 @@ def test_shares_of_an_array(undisturbed, bench, capsys):
     assert {t["entry"] for t in found["tasks"]} >= {"night=2, realization=1"}
     assert bench.command("resume", out, *SERIAL) == 0
     assert bench.planes(out) == bench.planes(undisturbed)
-    assert bench.command("run", bench.file("{nights: 2}"), "--output", out, *SERIAL, "--task", "1/3") == 2
+    assert (
+        bench.command("run", bench.file("{nights: 2}"), "--output", out, *SERIAL, "--task", "1/3")
+        == 2
+    )
     assert "holds another campaign" in capsys.readouterr().err
 
 
 def test_an_operator_that_cannot_be_combined_is_named(bench, monkeypatch, capsys):
     from zonda.operators.diagnostics.power_spectrum import PowerSpectrum
 
-    monkeypatch.setattr(PowerSpectrum, "collect", lambda self, data, observation, state: data.products.update(spectrum=state))
+    monkeypatch.setattr(
+        PowerSpectrum,
+        "collect",
+        lambda self, data, observation, state: data.products.update(spectrum=state),
+    )
     out = bench.run(bench.CAMPAIGN, *SERIAL, "--no-prune", status=2)
     assert "'spectrum' cannot be combined" in capsys.readouterr().err
     assert states(out).count("failed") == 1  # the others would fail alike: they are not tried
@@ -371,8 +420,15 @@ def test_every_transition_is_in_the_log(tmp_path):
     log.claim([0])
     log.done(0, "h", 2.0, "abc")
     log.failed(1, "h", 1.0, "no", again=False)
-    assert [(r.state, r.attempts, r.error, r.digest) for r in log.rows()] == [("done", 2, "no", "abc"), ("failed", 1, "no", "")]
+    assert [(r.state, r.attempts, r.error, r.digest) for r in log.rows()] == [
+        ("done", 2, "no", "abc"),
+        ("failed", 1, "no", ""),
+    ]
     log.put_off([1], "because")
-    assert (log.rows()[1].state, log.rows()[1].attempts, log.rows()[1].error) == ("waiting", 0, "because")
+    assert (log.rows()[1].state, log.rows()[1].attempts, log.rows()[1].error) == (
+        "waiting",
+        0,
+        "because",
+    )
     log.close()
     assert isinstance(SerialExecutor().submit(len, "ab").result(), int)

@@ -85,10 +85,20 @@ def test_it_is_resumed_and_its_own_yaml_makes_it_again(path, tmp_path, capsys, m
         ("WhiteNoise.net: [1", "WhitNoise.net: [1", "nothing is called 'WhitNoise'", 19),
         ("2 mK s(1/2), 4", "2 s, 4", "expected a noise level", 19),
         ("seeds: 3", "sedes: 3", "unknown", 20),
-        ("  over:\n    WhiteNoise.net: [1", "  WhiteNoise.net: [1", r"write over: \{WhiteNoise.net: \[...\]\}", 18),
+        (
+            "  over:\n    WhiteNoise.net: [1",
+            "  WhiteNoise.net: [1",
+            r"write over: \{WhiteNoise.net: \[...\]\}",
+            18,
+        ),
         ("seeds: 3", "seeds: 0", "seeds", 20),
         ("sweep:\n", "campaign: {realizations: 2}\nsweep:\n", "either a sweep or a campaign", 18),
-        ("  - MeasureFigures: {metrics: [central_rms, coverage]}\n", "", "no step measures figures", 17),
+        (
+            "  - MeasureFigures: {metrics: [central_rms, coverage]}\n",
+            "",
+            "no step measures figures",
+            17,
+        ),
     ],
 )
 def test_mistakes_are_shown_in_the_sweep(old, new, message, place):
@@ -99,14 +109,19 @@ def test_mistakes_are_shown_in_the_sweep(old, new, message, place):
 
 
 def test_a_sweep_over_nothing():
-    text = YAML.replace("  over:\n    WhiteNoise.net: [1 mK s(1/2), 2 mK s(1/2), 4000 uK s(1/2)]\n  seeds: 3\n", "")
+    text = YAML.replace(
+        "  over:\n    WhiteNoise.net: [1 mK s(1/2), 2 mK s(1/2), 4000 uK s(1/2)]\n  seeds: 3\n", ""
+    )
     with pytest.raises(ConfigurationError, match="give over, points or seeds"):
         parse(text)
 
 
 def test_points_are_drawn_in_the_unit_of_the_first():
     def points(values):
-        return [Point((("a", v), ("b", 1)), "m", "K", (float(k),), (math.nan,)) for k, v in enumerate(values)]
+        return [
+            Point((("a", v), ("b", 1)), "m", "K", (float(k),), (math.nan,))
+            for k, v in enumerate(values)
+        ]
 
     [ax] = draw(points(["1 mm", "0.5 cm", "1 m"])).axes
     assert list(ax.lines[0].get_xdata()) == pytest.approx([1, 5, 1000])
@@ -120,9 +135,9 @@ def test_points_are_drawn_in_the_unit_of_the_first():
 
 def test_the_mean_emission_of_scans_is_that_of_a_plain_run(path, tmp_path):
     """The levels of the atmosphere are those of scans, which a task hands on beside its maps."""
-    text = YAML.replace("[central_rms, coverage]", "[mean_t_scan, {mean_t_scan: {of: atmosphere}}]").replace(
-        "seeds: 3", "seeds: 1"
-    )
+    text = YAML.replace(
+        "[central_rms, coverage]", "[mean_t_scan, {mean_t_scan: {of: atmosphere}}]"
+    ).replace("seeds: 3", "seeds: 1")
     text = text.replace("scan_duration: 5 s", "scan_duration: 5 s, scans: 2").replace(
         "  - WhiteNoise", "  - AtmosphereLayers\n  - WhiteNoise"
     )
@@ -139,5 +154,7 @@ def test_the_mean_emission_of_scans_is_that_of_a_plain_run(path, tmp_path):
 
 
 def test_the_mean_emission_needs_an_atmosphere():
-    with pytest.raises(ConfigurationError, match="MeasureFigures needs atmosphere, which no step provides"):
+    with pytest.raises(
+        ConfigurationError, match="MeasureFigures needs atmosphere, which no step provides"
+    ):
         parse(YAML.replace("[central_rms, coverage]", "[mean_t_scan, central_rms]"))

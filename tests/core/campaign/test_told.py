@@ -1,4 +1,6 @@
-"""What a run in several tasks tells is what one process tells: counts of all scans once, warnings once."""
+"""What a run in several tasks tells is what one process tells: counts of all scans once, warnings
+once.
+"""
 
 from __future__ import annotations
 
@@ -24,30 +26,67 @@ TWO = {
 @pytest.mark.parametrize("bands", [ONE, TWO])
 def test_tasks_count_their_own_scans(bands, tmp_path):
     camera = zonda.Instrument(
-        name="camera", telescope={"name": "dish", "diameter": "6 m"}, detectors=7, field_of_view="20 arcmin",
-        main_beam_efficiency=0.8, illumination_efficiency=0.9, sample_rate="50 Hz",
+        name="camera",
+        telescope={"name": "dish", "diameter": "6 m"},
+        detectors=7,
+        field_of_view="20 arcmin",
+        main_beam_efficiency=0.8,
+        illumination_efficiency=0.9,
+        sample_rate="50 Hz",
         **bands,
-    )  # fmt: skip
-    scene = zonda.Scene(site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d", seed=3)
+    )
+    scene = zonda.Scene(
+        site="llano_de_chajnantor",
+        instrument=camera,
+        time="2022-08-01T23:00",
+        target="260d -10d",
+        seed=3,
+    )
     pointing = zonda.PointingBackAndForth(
         throw="1 deg", speed="0.5 deg/s", acceleration="1 deg/s2", scan_duration="10 s", scans=3
     )
-    steps = zonda.Pipeline([pointing, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="2 arcmin"), zonda.SaveMap()])
-    once = [row for row in steps.run(scene, output=tmp_path / "once", threads=1).tally.told() if row[1].startswith("samples")]
-    made = zonda.campaign(steps, scene, output=tmp_path / "tasks", realizations=1, engine="serial", threads=1)
+    steps = zonda.Pipeline(
+        [
+            pointing,
+            zonda.WhiteNoise(),
+            zonda.Efficiency(),
+            zonda.BinMap(pixel="2 arcmin"),
+            zonda.SaveMap(),
+        ]
+    )
+    once = [
+        row
+        for row in steps.run(scene, output=tmp_path / "once", threads=1).tally.told()
+        if row[1].startswith("samples")
+    ]
+    made = zonda.campaign(
+        steps, scene, output=tmp_path / "tasks", realizations=1, engine="serial", threads=1
+    )
     assert [row[1:] for row in made.tally if row[2].startswith("samples")] == once
-    assert any(what.startswith("samples in turnarounds") and value.endswith("%)") for _, what, value in once)
+    assert any(
+        what.startswith("samples in turnarounds") and value.endswith("%)")
+        for _, what, value in once
+    )
 
 
 def test_workers_leave_their_warnings_to_the_main_process(bench, capfd, recwarn):
     """The pointing is too fast for the sample rate: planning and both tasks warn of it."""
-    bench.run("{nights: 1}", "--engine", "processes", "--workers", 2, changes=(("50 arcsec/s", "500 arcsec/s"),))
+    bench.run(
+        "{nights: 1}",
+        "--engine",
+        "processes",
+        "--workers",
+        2,
+        changes=(("50 arcsec/s", "500 arcsec/s"),),
+    )
     assert "UserWarning" not in capfd.readouterr().err
     assert sum("samples per FWHM" in str(one.message) for one in recwarn) == 1
 
 
 def test_warnings_of_a_worker_are_sent_with_the_results_and_shown_once(recwarn):
-    """Also of two calls at once in one process, as Dask's workers have them; it then shows warnings as before."""
+    """Also of two calls at once in one process, as Dask's workers have them; it then shows warnings
+    as before.
+    """
     both = threading.Barrier(2, timeout=20)
 
     def work(number):

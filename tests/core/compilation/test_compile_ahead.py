@@ -10,7 +10,14 @@ from numba.core.dispatcher import Dispatcher
 
 import zonda.core.numerics.random  # noqa: F401  it says where kernels are kept, before any is defined
 from zonda.core.compilation import compile_ahead, kernel_cache
-from zonda.core.compilation.compile_ahead import Helper, compile_listed, for_child, listed, text_of, type_of
+from zonda.core.compilation.compile_ahead import (
+    Helper,
+    compile_listed,
+    for_child,
+    listed,
+    text_of,
+    type_of,
+)
 
 CHEAP = ("0.1", "zonda.operators.maps.sums", "_scales", "f8", "f8", "b1")
 
@@ -33,7 +40,12 @@ def test_types_there_and_back(kind):
 
 
 @pytest.mark.parametrize(
-    "kind", [types.unicode_type, types.Tuple((types.int64, types.float32)), types.Array(types.complex128, 1, "C").dtype]
+    "kind",
+    [
+        types.unicode_type,
+        types.Tuple((types.int64, types.float32)),
+        types.Array(types.complex128, 1, "C").dtype,
+    ],
 )
 def test_other_types_are_not_listed(kind):
     assert text_of(kind) is None
@@ -48,10 +60,16 @@ def test_other_texts_are_no_types(text):
 def test_the_list_names_kernels():
     rows = listed()
     assert len(rows) >= 20
-    assert [row[2] for row in rows[:2]] == ["_prefilter", "_lines"]  # in the order of their first use
+    assert [row[2] for row in rows[:2]] == [
+        "_prefilter",
+        "_lines",
+    ]  # in the order of their first use
     for _, module, name, *kinds in rows:
         assert isinstance(getattr(import_module(module), name), Dispatcher), f"{module}.{name}"
-        assert len(list(map(type_of, kinds))) == getattr(import_module(module), name).py_func.__code__.co_argcount
+        assert (
+            len(list(map(type_of, kinds)))
+            == getattr(import_module(module), name).py_func.__code__.co_argcount
+        )
 
 
 def test_the_second_process_begins_with_the_dearest_of_the_second_half():
@@ -61,7 +79,12 @@ def test_the_second_process_begins_with_the_dearest_of_the_second_half():
 
 
 def test_listed_kernels_are_compiled_and_what_is_wrong_is_passed_over(monkeypatch):
-    wrong = [("0.3", "zonda.no_module", "_scales"), ("0.1", CHEAP[1], "no_kernel"), (*CHEAP[:3], "f8"), (*CHEAP[:3], "x8")]
+    wrong = [
+        ("0.3", "zonda.no_module", "_scales"),
+        ("0.1", CHEAP[1], "no_kernel"),
+        (*CHEAP[:3], "f8"),
+        (*CHEAP[:3], "x8"),
+    ]
     monkeypatch.setattr(compile_ahead, "listed", lambda: [list(row) for row in (CHEAP, *wrong)])
     assert compile_listed(["zonda.elsewhere"]) == 0
     enough = Event()
@@ -78,7 +101,11 @@ def test_there_is_one_first_run(monkeypatch, tmp_path):
     monkeypatch.setattr(compile_ahead, "available_threads", lambda: 2)
     monkeypatch.setattr(kernel_cache, "_CLAIMS", kernel_cache._Claims())
     started, before = [], gc.get_threshold()
-    monkeypatch.setattr(compile_ahead.subprocess, "Popen", lambda command, **options: started.append(command) or Process())
+    monkeypatch.setattr(
+        compile_ahead.subprocess,
+        "Popen",
+        lambda command, **options: started.append(command) or Process(),
+    )
     for expected in (1, 2):  # the first failed
         helper = Helper()
         helper.prepare()
@@ -93,7 +120,9 @@ def test_there_is_one_first_run(monkeypatch, tmp_path):
     helper.succeeded()
     helper.close()
     loaded = []
-    monkeypatch.setattr(compile_ahead, "compile_listed", lambda *arguments: loaded.append(arguments))
+    monkeypatch.setattr(
+        compile_ahead, "compile_listed", lambda *arguments: loaded.append(arguments)
+    )
     later = Helper()
     later.prepare()
     later.begin()

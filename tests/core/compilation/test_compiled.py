@@ -14,8 +14,12 @@ def unset(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home" / "cache"))
 
 
-def test_a_folder_that_lasts_is_preferred(unset: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(compiled, "_writable", lambda folder: folder == tmp_path / "home" / "cache" / "numba")
+def test_a_folder_that_lasts_is_preferred(
+    unset: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(
+        compiled, "_writable", lambda folder: folder == tmp_path / "home" / "cache" / "numba"
+    )
     compiled.ensure_cache()
     assert os.environ["NUMBA_CACHE_DIR"] == ""
 

@@ -85,7 +85,9 @@ def write(folder: Path, factor: float = 3.0) -> None:
 
 def fresh(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """`outer`, as a new process would have it."""
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # Python takes sources of the same second and size for the same
+    monkeypatch.setattr(
+        sys, "dont_write_bytecode", True
+    )  # Python takes sources of the same second and size for the same
     for name in ("toy_inner", "toy_outer"):
         spec = importlib.util.spec_from_file_location(f"zonda.{name}", folder / f"{name}.py")
         assert spec is not None
@@ -113,7 +115,9 @@ def test_compiled_once(folder, monkeypatch):
 
 
 def test_a_kernel_is_compiled_with_a_kept_one(folder, monkeypatch):
-    """What is loaded at first is machine code alone; the bitcode of what a kernel calls is there when it is compiled."""
+    """What is loaded at first is machine code alone; the bitcode of what a kernel calls is there
+    when it is compiled.
+    """
     assert fresh(folder, monkeypatch)(2.0) == 7.0
     for path in kept(folder, "outer"):
         path.unlink()
@@ -255,7 +259,9 @@ def test_a_kept_kernel_is_loaded_without_the_compiler(tmp_path):
     (tmp_path / "toy_outer.py").write_text(EVERYTHING)
     command = [sys.executable, "-c", LOADED, str(tmp_path)]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    first, second = (subprocess.run(command, env=environment, capture_output=True, text=True) for _ in range(2))
+    first, second = (
+        subprocess.run(command, env=environment, capture_output=True, text=True) for _ in range(2)
+    )
     assert first.stdout.endswith("too short True\n"), first.stderr
     assert second.stdout == first.stdout.replace("True", "False"), second.stderr
 
@@ -306,7 +312,9 @@ def test_first_runs_at_once(tmp_path):
 def test_another_processor_has_its_own_files(tmp_path):
     write(tmp_path)
     for number, processor in enumerate(("", "generic"), 1):
-        out, err = run(tmp_path, **({"NUMBA_CPU_NAME": processor} if processor else {})).communicate()
+        out, err = run(
+            tmp_path, **({"NUMBA_CPU_NAME": processor} if processor else {})
+        ).communicate()
         assert (out.split(), err) == (["7.0", "7.0", "0"], "")
         assert len(kept(tmp_path)) == 4 * number
 
@@ -317,7 +325,9 @@ def test_beside_a_read_only_installation_the_user_keeps_it(tmp_path):
     write(program)
     (program / "__pycache__").touch()  # a file: no folder can be made, not even by root
     for expected in ("0", "2"):
-        out, err = run(program, XDG_CACHE_HOME=str(caches), HOME=str(caches), PYTHONDONTWRITEBYTECODE="1").communicate()
+        out, err = run(
+            program, XDG_CACHE_HOME=str(caches), HOME=str(caches), PYTHONDONTWRITEBYTECODE="1"
+        ).communicate()
         assert (out.split(), err) == (["7.0", "7.0", expected], "")
     assert kept(program) == []
     assert len(kept(caches)) == 4
@@ -347,23 +357,36 @@ with warnings.catch_warnings(record=True) as told:
         ("del caching.CacheImpl._locator_classes", True),
         ("del caching.CompileResultCacheImpl", False),
         ("del caching.Cache._save_overload", False),
-        ("del dispatcher.FunctionCache; dispatcher.Dispatcher.enable_caching = lambda self: None", False),
+        (
+            (
+                "del dispatcher.FunctionCache; dispatcher.Dispatcher.enable_caching = lambda self:"
+                " None"
+            ),
+            False,
+        ),
     ],
 )
 def test_a_numba_with_another_inside_keeps_kernels_itself(tmp_path, change, own):
-    """Whatever of its inside is gone: the numbers are right, and it is said once; never a traceback."""
+    """Whatever of its inside is gone: the numbers are right, and it is said once; never a
+    traceback.
+    """
     import numba
 
     if own and not hasattr(numba.config, "CACHE_LOCATOR_CLASSES"):
         pytest.skip("this numba has no other list of locators")
     write(tmp_path)
-    first, second, count, *told = run_with_numba(tmp_path, change, "InTreeCacheLocator,UserWideCacheLocator" if own else "")
+    first, second, count, *told = run_with_numba(
+        tmp_path, change, "InTreeCacheLocator,UserWideCacheLocator" if own else ""
+    )
     assert (first, second) == ("7.0", "7.0")
     assert bool(kept(tmp_path)) == own
     if own:
         assert count == "0"
     else:
-        assert (count, told) == ("1", [f"zonda cannot keep compiled code itself with numba {numba.__version__}"])
+        assert (count, told) == (
+            "1",
+            [f"zonda cannot keep compiled code itself with numba {numba.__version__}"],
+        )
 
 
 def test_a_numba_that_cannot_load_what_is_kept_says_so_once(tmp_path):
@@ -373,15 +396,23 @@ def test_a_numba_that_cannot_load_what_is_kept_says_so_once(tmp_path):
     write(tmp_path)
     assert run_with_numba(tmp_path, "")[2] == "0"
     assert len(kept(tmp_path)) >= 3
-    first, second, count, *told = run_with_numba(tmp_path, "del caching.CompileResultCacheImpl.rebuild")
+    first, second, count, *told = run_with_numba(
+        tmp_path, "del caching.CompileResultCacheImpl.rebuild"
+    )
     assert (first, second) == ("7.0", "7.0")
-    assert (count, told) == ("1", [f"zonda cannot keep compiled code itself with numba {numba.__version__}"])
+    assert (count, told) == (
+        "1",
+        [f"zonda cannot keep compiled code itself with numba {numba.__version__}"],
+    )
 
 
 def run_with_numba(folder, change, locators=""):
     """What `CHANGED_NUMBA` prints, in parts."""
     env = {**os.environ, "NUMBA_CACHE_LOCATOR_CLASSES": locators}
-    env |= {"XDG_CACHE_HOME": str(folder / "caches"), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    env |= {
+        "XDG_CACHE_HOME": str(folder / "caches"),
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+    }
     env.pop("NUMBA_CACHE_DIR", None)
     command = [sys.executable, "-c", CHANGED_NUMBA.format(change=change), str(folder)]
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
@@ -415,14 +446,18 @@ def test_every_kernel_is_kept_this_way():
         for value in vars(module).values()
         if isinstance(value, Dispatcher) and value.py_func.__module__ in sys.modules
     }
-    ours = [k for k in found.values() if k.py_func.__module__.startswith("zonda.") and "toy_" not in k.py_func.__module__]
+    ours = [
+        k
+        for k in found.values()
+        if k.py_func.__module__.startswith("zonda.") and "toy_" not in k.py_func.__module__
+    ]
     assert len(ours) > 30
     assert [k for k in ours if not isinstance(k._cache, KernelCache)] == []
 
 
 def test_kernels_that_others_call_say_how_they_round():
-    """A kernel that does not state ``fastmath`` inherits it from whoever has it compiled first; numba keeps the result for all:
-    bits would depend on the order of compilation."""
+    """A kernel that does not state ``fastmath`` inherits it from whoever has it compiled first;
+    numba keeps the result for all: bits would depend on the order of compilation."""
     kernels: dict[Any, Dispatcher] = {}
     for module in pkgutil.walk_packages(zonda.__path__, "zonda."):
         if module.name.startswith(("zonda.core", "zonda.operators")):
@@ -434,12 +469,18 @@ def test_kernels_that_others_call_say_how_they_round():
     for function, kernel in kernels.items():
         if kernel.targetoptions.get("fastmath"):
             called = (function.__globals__.get(name) for name in function.__code__.co_names)
-            silent |= {k.py_func.__qualname__ for k in called if isinstance(k, Dispatcher) and "fastmath" not in k.targetoptions}
+            silent |= {
+                k.py_func.__qualname__
+                for k in called
+                if isinstance(k, Dispatcher) and "fastmath" not in k.targetoptions
+            }
     assert not silent
 
 
 def test_a_kernel_in_the_place_of_another_does_not_run(folder, monkeypatch):
-    """A whole file of another kernel under this one's name: its content is right, its name is not."""
+    """A whole file of another kernel under this one's name: its content is right, its name is
+    not.
+    """
     assert fresh(folder, monkeypatch)(2.0) == 7.0
     (mine,) = kept(folder, "outer")
     write(folder, factor=5.0)

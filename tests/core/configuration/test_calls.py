@@ -1,4 +1,6 @@
-"""Mistakes in Python are ZondaErrors as good as those of a file: the place in the call, the cause, the cure, the right name."""
+"""Mistakes in Python are ZondaErrors as good as those of a file: the place in the call, the cause,
+the cure, the right name.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,12 @@ import zonda
 from zonda.core.configuration.calls import ParameterError
 from zonda.core.errors import ZondaError
 
-SCENE = {"site": "green_bank", "instrument": "mustang2", "time": "2024-11-25T07:00", "target": "05h +20d"}
+SCENE = {
+    "site": "green_bank",
+    "instrument": "mustang2",
+    "time": "2024-11-25T07:00",
+    "target": "05h +20d",
+}
 
 
 def scene(**changes: Any) -> zonda.Scene:
@@ -25,37 +32,117 @@ def scene(**changes: Any) -> zonda.Scene:
 @pytest.mark.parametrize(
     ("call", "message", "under", "words"),
     [
-        (lambda: zonda.BinMap(pixle="2 arcsec"), "unknown parameter 'pixle' for BinMap", "pixle", "did you mean 'pixel'?"),
+        (
+            lambda: zonda.BinMap(pixle="2 arcsec"),
+            "unknown parameter 'pixle' for BinMap",
+            "pixle",
+            "did you mean 'pixel'?",
+        ),
         (lambda: zonda.BinMap(pixel=2), "BinMap, pixel: 2 has no unit", "2", "add a unit"),
         (lambda: zonda.BinMap(pixel="2 K"), "'K' is a unit of temperature", "K", "not an angle"),
-        (lambda: zonda.BinMap(pixel=2 * u.K), "'K' is a unit of temperature", "<Quantity 2. K>", "not an angle"),
+        (
+            lambda: zonda.BinMap(pixel=2 * u.K),
+            "'K' is a unit of temperature",
+            "<Quantity 2. K>",
+            "not an angle",
+        ),
         (
             lambda: zonda.BinMap(pixel="-2 arcsec"),
             "must be greater than 0 arcsec, got -2 arcsec",
             "'-2 arcsec'",
             "Side of a pixel",
         ),
-        (lambda: zonda.BinMap(pixel=np.zeros(3)), "expected an angle such as", "array([0., 0., 0.])", ""),
-        (lambda: zonda.BinMap("2 arcsec"), "takes its parameters by their names", "'2 arcsec'", "as in pixel='2 arcsec'"),
-        (lambda: zonda.BinMap(projection="tan"), "must be 'TAN' or 'CAR', got 'tan'", "'tan'", "did you mean 'TAN'?"),
-        (lambda: zonda.BinMap(half_difference="maybe"), "expected True or False, got 'maybe'", "'maybe'", ""),
-        (lambda: zonda.PointingDaisy(scans=1.5), "scans: expected a whole number, got 1.5", "1.5", "Number of scans"),
+        (
+            lambda: zonda.BinMap(pixel=np.zeros(3)),
+            "expected an angle such as",
+            "array([0., 0., 0.])",
+            "",
+        ),
+        (
+            lambda: zonda.BinMap("2 arcsec"),
+            "takes its parameters by their names",
+            "'2 arcsec'",
+            "as in pixel='2 arcsec'",
+        ),
+        (
+            lambda: zonda.BinMap(projection="tan"),
+            "must be 'TAN' or 'CAR', got 'tan'",
+            "'tan'",
+            "did you mean 'TAN'?",
+        ),
+        (
+            lambda: zonda.BinMap(half_difference="maybe"),
+            "expected True or False, got 'maybe'",
+            "'maybe'",
+            "",
+        ),
+        (
+            lambda: zonda.PointingDaisy(scans=1.5),
+            "scans: expected a whole number, got 1.5",
+            "1.5",
+            "Number of scans",
+        ),
         (lambda: zonda.PointingDaisy(scans=0), "scans: must be at least 1, got 0", "0", ""),
-        (lambda: zonda.PointingDaisy(radius="1 furlong"), "unknown unit 'furlong'", "furlong", "e.g. '4 arcmin'"),
-        (lambda: zonda.PointingDaisy(offsets=[("1 arcmin", "2 K")]), "offsets.0.1: expected an angle", "K", "not an angle"),
-        (lambda: zonda.PointingDaisy(target="M31"), "target: cannot read 'M31' as a position", "'M31'", "e.g. 05h00m00s"),
-        (lambda: zonda.PointingRecorded(), "PointingRecorded needs 'file'", "PointingRecorded()", "add file=..."),
-        (lambda: zonda.SkyMap(), "give either file, the path of a FITS map, or in Python map, an array", "SkyMap()", ""),
-        (lambda: zonda.WhiteNoise(model="foo"), "model: unknown noise model 'foo'", "'foo'", "fixed_net"),
+        (
+            lambda: zonda.PointingDaisy(radius="1 furlong"),
+            "unknown unit 'furlong'",
+            "furlong",
+            "e.g. '4 arcmin'",
+        ),
+        (
+            lambda: zonda.PointingDaisy(offsets=[("1 arcmin", "2 K")]),
+            "offsets.0.1: expected an angle",
+            "K",
+            "not an angle",
+        ),
+        (
+            lambda: zonda.PointingDaisy(target="M31"),
+            "target: cannot read 'M31' as a position",
+            "'M31'",
+            "e.g. 05h00m00s",
+        ),
+        (
+            lambda: zonda.PointingRecorded(),
+            "PointingRecorded needs 'file'",
+            "PointingRecorded()",
+            "add file=...",
+        ),
+        (
+            lambda: zonda.SkyMap(),
+            "give either file, the path of a FITS map, or in Python map, an array",
+            "SkyMap()",
+            "",
+        ),
+        (
+            lambda: zonda.WhiteNoise(model="foo"),
+            "model: unknown noise model 'foo'",
+            "'foo'",
+            "fixed_net",
+        ),
         (
             lambda: zonda.WhiteNoise(model={"name": "background_limited", "mods": 1}),
             "model: unknown parameter 'mods' for BackgroundLimited",
             "{'name': 'background_limited', 'mods': 1}",
             "did you mean 'modes'?",
         ),
-        (lambda: zonda.AtmosphereLayers(spectra="x"), "unknown spectra 'x'", "'x'", "installed: am"),
-        (lambda: zonda.Scene(), "Scene needs 'site', 'instrument', 'time'", "Scene()", "time: Start of the first scan"),
-        (lambda: scene(site="lmt"), "site: unknown site 'lmt'", "'lmt'", "did you mean 'sierra_negra'?"),
+        (
+            lambda: zonda.AtmosphereLayers(spectra="x"),
+            "unknown spectra 'x'",
+            "'x'",
+            "installed: am",
+        ),
+        (
+            lambda: zonda.Scene(),
+            "Scene needs 'site', 'instrument', 'time'",
+            "Scene()",
+            "time: Start of the first scan",
+        ),
+        (
+            lambda: scene(site="lmt"),
+            "site: unknown site 'lmt'",
+            "'lmt'",
+            "did you mean 'sierra_negra'?",
+        ),
         (
             lambda: scene(instrument="mustng2"),
             "instrument: unknown instrument 'mustng2'",
@@ -68,19 +155,44 @@ def scene(**changes: Any) -> zonda.Scene:
             "intrument",
             "did you mean 'instrument'?",
         ),
-        (lambda: scene(time="yesterday"), "time: cannot read 'yesterday' as a time", "'yesterday'", "YYYY-MM-DD"),
+        (
+            lambda: scene(time="yesterday"),
+            "time: cannot read 'yesterday' as a time",
+            "'yesterday'",
+            "YYYY-MM-DD",
+        ),
         (lambda: scene(seed=-1), "seed: must be at least 0, got -1", "-1", ""),
         (lambda: scene(site=3), "site: expected a dict, got 3", "3", "a registered name"),
-        (lambda: scene(weather="1.2 mm"), "'1.2 mm' is no source of weather", "'1.2 mm'", "weather: {pwv: 1.2 mm}"),
-        (lambda: scene(weather={"pvw": "1 mm"}), "unknown parameter 'pvw' for Scene, weather", "'pvw'", "did you mean 'pwv'?"),
+        (
+            lambda: scene(weather="1.2 mm"),
+            "'1.2 mm' is no source of weather",
+            "'1.2 mm'",
+            "weather: {pwv: 1.2 mm}",
+        ),
+        (
+            lambda: scene(weather={"pvw": "1 mm"}),
+            "unknown parameter 'pvw' for Scene, weather",
+            "'pvw'",
+            "did you mean 'pwv'?",
+        ),
         (
             lambda: scene(site={"name": "x", "latitude": "95 deg", "longitude": "0 deg"}),
             "site.latitude: must be",
             "'95 deg'",
             "90 deg",
         ),
-        (lambda: zonda.Band(name="x", low="90 GHz"), "a band needs 0 < low < high", "Band(name='x', low='90 GHz')", ""),
-        (lambda: zonda.Telescope(name="x", diameter="0 m"), "diameter: must be greater than 0 m", "'0 m'", ""),
+        (
+            lambda: zonda.Band(name="x", low="90 GHz"),
+            "a band needs 0 < low < high",
+            "Band(name='x', low='90 GHz')",
+            "",
+        ),
+        (
+            lambda: zonda.Telescope(name="x", diameter="0 m"),
+            "diameter: must be greater than 0 m",
+            "'0 m'",
+            "",
+        ),
     ],
 )
 def test_a_mistake_in_a_call(call: Callable[[], Any], message: str, under: str, words: str) -> None:
@@ -99,7 +211,14 @@ def test_all_mistakes_of_a_call_at_once() -> None:
     with pytest.raises(ZondaError) as caught:
         zonda.PointingDaisy(radius="1 K", scans=0, petal=3)
     text = str(caught.value)
-    assert all(words in text for words in ("radius: expected an angle", "scans: must be at least 1", "unknown parameter 'petal'"))
+    assert all(
+        words in text
+        for words in (
+            "radius: expected an angle",
+            "scans: must be at least 1",
+            "unknown parameter 'petal'",
+        )
+    )
     assert pickle.loads(pickle.dumps(caught.value)).diagnostics == caught.value.diagnostics  # type: ignore[attr-defined]
 
 
@@ -115,7 +234,12 @@ def test_what_is_made_is_not_changed() -> None:
     assert "make another: BinMap(pixel=..., ...)" in str(caught.value)
 
 
-STEPS = [zonda.PointingDaisy(scan_duration="2 s"), zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="2 arcsec")]
+STEPS = [
+    zonda.PointingDaisy(scan_duration="2 s"),
+    zonda.WhiteNoise(),
+    zonda.Efficiency(),
+    zonda.BinMap(pixel="2 arcsec"),
+]
 
 
 @pytest.mark.parametrize(
@@ -125,39 +249,96 @@ STEPS = [zonda.PointingDaisy(scan_duration="2 s"), zonda.WhiteNoise(), zonda.Eff
             lambda: zonda.Pipeline([lambda: 0, zonda.BinMap]),
             ["step 1 is a function (lambda)", "step 2 is the class BinMap", "BinMap(...)"],
         ),
-        (lambda: zonda.Pipeline(STEPS[0]), ["a list of operators, not PointingDaisy(", "write Pipeline(["]),
-        (lambda: zonda.Pipeline(["BinMap"]), ["step 1 is the text 'BinMap'", "write zonda.BinMap(...)"]),
+        (
+            lambda: zonda.Pipeline(STEPS[0]),
+            ["a list of operators, not PointingDaisy(", "write Pipeline(["],
+        ),
+        (
+            lambda: zonda.Pipeline(["BinMap"]),
+            ["step 1 is the text 'BinMap'", "write zonda.BinMap(...)"],
+        ),
         (lambda: zonda.Pipeline([{"BinMap": {}}]), ["of type dict", "write zonda.BinMap(...)"]),
         (lambda: zonda.Pipeline(None), ["a list of operators, not None"]),
-        (lambda: zonda.Pipeline([zonda.SkyMap]), ["step 1 is the class SkyMap", "make one of the class at step 1: SkyMap(...)"]),
-        (lambda: zonda.Pipeline(STEPS[::-1]), ["step 1: BinMap needs boresight", "move it below PointingDaisy"]),
-        (lambda: zonda.Pipeline(STEPS, runs={"a": {"onyl": ["sky"]}}), ["unknown parameter 'onyl'", "did you mean 'only'?"]),
-        (lambda: zonda.Pipeline(STEPS, runs={"a": "sky"}), ["signal a is a dict, not the text 'sky'"]),
+        (
+            lambda: zonda.Pipeline([zonda.SkyMap]),
+            ["step 1 is the class SkyMap", "make one of the class at step 1: SkyMap(...)"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS[::-1]),
+            ["step 1: BinMap needs boresight", "move it below PointingDaisy"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS, runs={"a": {"onyl": ["sky"]}}),
+            ["unknown parameter 'onyl'", "did you mean 'only'?"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS, runs={"a": "sky"}),
+            ["signal a is a dict, not the text 'sky'"],
+        ),
         (lambda: zonda.Pipeline(STEPS, runs=["a"]), ["runs is a dict of signals"]),
         (
             lambda: zonda.Pipeline(STEPS, precision="float23"),
             ["'float32' or 'float64', not 'float23'", "did you mean 'float32'?"],
         ),
-        (lambda: zonda.Pipeline(STEPS).run("mustang2"), ["runs on a Scene, not on the text 'mustang2'"]),
+        (
+            lambda: zonda.Pipeline(STEPS).run("mustang2"),
+            ["runs on a Scene, not on the text 'mustang2'"],
+        ),
         (lambda: zonda.Pipeline(STEPS).run(zonda.Scene), ["not on the class Scene"]),
         (
             lambda: zonda.Pipeline(STEPS).run(scene(target=None)),
             ["there is no target", "give the scene or this operator a target"],
         ),
-        (lambda: zonda.Pipeline(STEPS).run(scene(), memory="abc"), ["memory is a number of bytes, not 'abc'", "memory=4e9"]),
-        (lambda: zonda.Pipeline(STEPS).run(scene(), memory=-5), ["memory is a number of bytes, not -5"]),
-        (lambda: zonda.Pipeline(STEPS).run(scene(), ceiling="4GB"), ["ceiling is a number of bytes, not '4GB'"]),
-        (lambda: zonda.Pipeline(STEPS).run(scene(), threads=0), ["threads is a number of threads, 1 or more, not 0"]),
-        (lambda: zonda.Pipeline(STEPS).run(scene(), threads=1.5), ["threads is a number of threads, 1 or more, not 1.5"]),
-        (lambda: zonda.Pipeline(STEPS).run(scene(), output=3), ["output is the path of a folder, not 3"]),
-        (lambda: zonda.Pipeline(STEPS).run(scene(), output=__file__), ["there is a file of that name"]),
-        (lambda: zonda.Pipeline(STEPS).run(scene(), keep="signal"), ["keep is a list of streams", "keep=['signal']"]),
-        (lambda: zonda.Pipeline(STEPS).run(scene(), keep=["sgnal"]), ["the stream 'sgnal' cannot be kept: no step makes it"]),
+        (
+            lambda: zonda.Pipeline(STEPS).run(scene(), memory="abc"),
+            ["memory is a number of bytes, not 'abc'", "memory=4e9"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS).run(scene(), memory=-5),
+            ["memory is a number of bytes, not -5"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS).run(scene(), ceiling="4GB"),
+            ["ceiling is a number of bytes, not '4GB'"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS).run(scene(), threads=0),
+            ["threads is a number of threads, 1 or more, not 0"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS).run(scene(), threads=1.5),
+            ["threads is a number of threads, 1 or more, not 1.5"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS).run(scene(), output=3),
+            ["output is the path of a folder, not 3"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS).run(scene(), output=__file__),
+            ["there is a file of that name"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS).run(scene(), keep="signal"),
+            ["keep is a list of streams", "keep=['signal']"],
+        ),
+        (
+            lambda: zonda.Pipeline(STEPS).run(scene(), keep=["sgnal"]),
+            ["the stream 'sgnal' cannot be kept: no step makes it"],
+        ),
         (lambda: zonda.load(3), ["3: is not a path"]),
         (lambda: zonda.load("mustang2_clustr"), ["did you mean 'mustang2_cluster'?"]),
-        (lambda: zonda.load("mustang2_cluster", "seed=a"), ["seed: expected a whole number, got 'a'", "1 mistake"]),
-        (lambda: zonda.plan("mustang2_cluster"), ["a plan is made of a pipeline file", "zonda.load"]),
-        (lambda: zonda.plan(zonda.load("mustang2_cluster"), keep="poles"), ["keep is a list of names", "keep=['poles']"]),
+        (
+            lambda: zonda.load("mustang2_cluster", "seed=a"),
+            ["seed: expected a whole number, got 'a'", "1 mistake"],
+        ),
+        (
+            lambda: zonda.plan("mustang2_cluster"),
+            ["a plan is made of a pipeline file", "zonda.load"],
+        ),
+        (
+            lambda: zonda.plan(zonda.load("mustang2_cluster"), keep="poles"),
+            ["keep is a list of names", "keep=['poles']"],
+        ),
     ],
 )
 def test_a_mistake_with_pipelines(call: Callable[[], Any], words: list[str]) -> None:

@@ -20,7 +20,11 @@ from zonda.core.registry import operators
         ("BinMap", "pixel", "an angle such as '4 arcmin'"),
         ("BinMap", "frame", "'icrs' or 'galactic'"),
         ("BinMap", "projection", "'TAN' or 'CAR'"),
-        ("BinMap", "half_difference", "'scans', 'detectors', 'halves', 'directions' or 'radii', or True or False"),
+        (
+            "BinMap",
+            "half_difference",
+            "'scans', 'detectors', 'halves', 'directions' or 'radii', or True or False",
+        ),
         ("SkyMap", "file", "the path of a file"),
         ("SkyMap", "map", "an array"),
         ("SkyMap", "wcs", "an astropy WCS"),
@@ -48,7 +52,9 @@ def test_help_shows_every_parameter_and_nothing_of_pydantics(name: str) -> None:
     text = pydoc.plain(pydoc.render_doc(cls))
     assert own_doc(cls).splitlines()[0] in text
     for parameter, field in cls.model_fields.items():
-        (line,) = [row for row in text.splitlines() if row.startswith(f" |  {field.alias or parameter} : ")]
+        (line,) = [
+            row for row in text.splitlines() if row.startswith(f" |  {field.alias or parameter} : ")
+        ]
         assert line.endswith("; required") if field.is_required() else "; default " in line
         assert all(repr(choice) in line for choice in choices(field))
         assert "see below" not in line
@@ -59,7 +65,10 @@ def test_help_shows_every_parameter_and_nothing_of_pydantics(name: str) -> None:
 def test_the_signature_is_what_a_user_writes() -> None:
     signature = inspect.signature(zonda.PointingDaisy)
     assert signature.parameters["radius"].default == "4 arcmin"
-    assert inspect.signature(zonda.PointingRecorded).parameters["file"].default is inspect.Parameter.empty
+    assert (
+        inspect.signature(zonda.PointingRecorded).parameters["file"].default
+        is inspect.Parameter.empty
+    )
     assert "Annotated" not in str(signature)
 
 

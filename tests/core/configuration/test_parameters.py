@@ -53,7 +53,12 @@ def texts(model: type[BaseModel]) -> dict[str, str | None]:
 
 def test_docstrings_are_those_of_the_nearest_class_that_has_the_field() -> None:
     assert texts(Plain) == {"one": "The first;\non two lines.", "two": "Said here.", "three": None}
-    assert texts(Odd) == {"one": "The first;\non two lines.", "two": None, "three": None, "four": "The fourth."}
+    assert texts(Odd) == {
+        "one": "The first;\non two lines.",
+        "two": None,
+        "three": None,
+        "four": "The fourth.",
+    }
 
 
 def test_two_classes_of_one_name_have_their_own() -> None:
@@ -77,7 +82,8 @@ def test_two_classes_of_one_name_have_their_own() -> None:
 
 def test_a_class_of_a_notebook_cell_is_read_and_one_without_source_has_none() -> None:
     text = (
-        'from zonda.core.configuration.parameters import Parameters\nclass Cell(Parameters):\n    a: int = 1\n    """Here."""\n'
+        "from zonda.core.configuration.parameters import Parameters\nclass Cell(Parameters):\n   "
+        ' a: int = 1\n    """Here."""\n'
     )
     linecache.cache["<cell>"] = (len(text), None, text.splitlines(True), "<cell>")
     for name, wanted in (("<cell>", "Here."), ("<nowhere>", None)):
@@ -120,4 +126,6 @@ def test_schema_has_them() -> None:
 
     schema = Outer.model_json_schema()
     assert schema["properties"]["inner"]["description"] == "A nested one."
-    assert schema["$defs"]["Plain"]["properties"]["one"]["description"] == "The first;\non two lines."
+    assert (
+        schema["$defs"]["Plain"]["properties"]["one"]["description"] == "The first;\non two lines."
+    )

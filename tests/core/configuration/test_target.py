@@ -38,10 +38,14 @@ class Model(BaseModel):
         ("0h -90 deg", "icrs", 0, -90),
     ],
 )
-def test_every_way_to_write_it(given_: object, frame: str, longitude: float, latitude: float) -> None:
+def test_every_way_to_write_it(
+    given_: object, frame: str, longitude: float, latitude: float
+) -> None:
     target = Model(target=given_).target  # type: ignore[arg-type]
     assert target.frame == frame
-    assert np.degrees([target.longitude, target.latitude]) == pytest.approx([longitude, latitude], rel=1e-15, abs=1e-15)
+    assert np.degrees([target.longitude, target.latitude]) == pytest.approx(
+        [longitude, latitude], rel=1e-15, abs=1e-15
+    )
 
 
 def test_quantities() -> None:
@@ -61,14 +65,18 @@ def test_text_round_trip_keeps_the_bits(frame: str, longitude: float, latitude: 
 
 @given(st.integers(-720, 720), st.integers(-3, 3))
 def test_a_whole_turn_of_right_ascension_moves_nothing(degrees: int, turns: int) -> None:
-    assert Target.parse(f"{degrees + 360 * turns} deg 20 deg") == Target.parse(f"{degrees} deg 20 deg")
+    assert Target.parse(f"{degrees + 360 * turns} deg 20 deg") == Target.parse(
+        f"{degrees} deg 20 deg"
+    )
 
 
 def test_galactic_is_astropys() -> None:
     from astropy.coordinates import SkyCoord
 
     rng = np.random.default_rng(3)
-    for longitude, latitude in zip(rng.uniform(0, 2 * np.pi, 50), np.arcsin(rng.uniform(-1, 1, 50)), strict=True):
+    for longitude, latitude in zip(
+        rng.uniform(0, 2 * np.pi, 50), np.arcsin(rng.uniform(-1, 1, 50)), strict=True
+    ):
         ra, dec = Target("galactic", longitude, latitude).icrs()
         theirs = SkyCoord(longitude, latitude, unit="rad", frame="galactic").icrs
         assert abs(dec - theirs.dec.rad) < 1e-14
@@ -87,10 +95,16 @@ def test_icrs_of_icrs_is_itself_and_horizontal_has_none() -> None:
         ("Crab", "names of objects are not looked up"),
         ("75 20", "ra '75' has no unit; write an angle such as '75 deg'"),
         ("75 deg", "'75 deg' is one angle; a position needs two"),
-        ("+25:00", "'+25:00' is one angle; a position needs two, a right ascension and a declination"),
+        (
+            "+25:00",
+            "'+25:00' is one angle; a position needs two, a right ascension and a declination",
+        ),
         ("05h00m00s", "is one angle"),
         ("05 00 +20 00", "cannot read"),
-        ("05:00:00 +20:00:00 J2000", "positions are ICRS (FK5 J2000 to 0.1 arcsec); 'J2000' is not read"),
+        (
+            "05:00:00 +20:00:00 J2000",
+            "positions are ICRS (FK5 J2000 to 0.1 arcsec); 'J2000' is not read",
+        ),
         ("B1950 05:00:00 +20:00:00", "'B1950' is not read"),
         ("25:00 +20:00", "the hours of ra '25:00' must be below 24"),
         ("24h00m00s +20d", "the hours of ra '24h00m00s' must be below 24"),
@@ -129,7 +143,9 @@ def test_forms_that_people_bring_along() -> None:
         assert Target.parse(form) == wanted
     there = Target.parse(SkyCoord("13h47m30.6s -11d45m09s"))
     assert there.frame == "icrs"
-    assert abs(there.longitude - wanted.longitude) < 1e-15 * 2 * math.pi  # two roundings of astropy's own at most
+    assert (
+        abs(there.longitude - wanted.longitude) < 1e-15 * 2 * math.pi
+    )  # two roundings of astropy's own at most
     assert abs(there.latitude - wanted.latitude) < 1e-15
 
 

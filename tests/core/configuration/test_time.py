@@ -47,7 +47,9 @@ def test_datetime_naive_is_utc_and_aware_is_converted() -> None:
 def test_astropy_time_of_any_scale() -> None:
     from astropy.time import Time
 
-    assert Instant.parse(Time("2024-11-25T07:00:37", scale="tai")) == Instant.parse("2024-11-25T07:00:00Z")
+    assert Instant.parse(Time("2024-11-25T07:00:37", scale="tai")) == Instant.parse(
+        "2024-11-25T07:00:00Z"
+    )
     with pytest.raises(ValueError, match="one time, got an array of 2"):
         Instant.parse(Time(["2024-11-25", "2024-11-26"]))
 

@@ -49,7 +49,15 @@ def test_defaults_are_si() -> None:
     assert a.angle == pytest.approx(4 * arcmin, rel=1e-15)
     assert a.speed == pytest.approx(51 * arcmin / 60, rel=1e-15)
     assert a.acceleration == pytest.approx(np.radians(0.05), rel=1e-15)
-    assert (a.time, a.frequency, a.length, a.wind, a.temperature, a.net, a.share) == (2700, 78e9, 7.7e-3, 10, 270, 1.7e-3, 0.3)
+    assert (a.time, a.frequency, a.length, a.wind, a.temperature, a.net, a.share) == (
+        2700,
+        78e9,
+        7.7e-3,
+        10,
+        270,
+        1.7e-3,
+        0.3,
+    )
 
 
 @pytest.mark.parametrize("name", sorted(UNITS))
@@ -84,11 +92,15 @@ def test_compound_units_agree_with_astropy(text: str) -> None:
 
     own = read_unit(text)
     assert own is not None
-    base = u.rad ** own.powers[0] * u.s ** own.powers[1] * u.m ** own.powers[2] * u.K ** own.powers[3]
+    base = (
+        u.rad ** own.powers[0] * u.s ** own.powers[1] * u.m ** own.powers[2] * u.K ** own.powers[3]
+    )
     assert u.Unit(text).to(base) == pytest.approx(own.factor, rel=4 * np.finfo(float).eps)
 
 
-@pytest.mark.parametrize("text", ["m / s / K", "K / s m", "furlong", "1 / s", "K_RJ", "m / (s K)", "s(1/2"])
+@pytest.mark.parametrize(
+    "text", ["m / s / K", "K / s m", "furlong", "1 / s", "K_RJ", "m / (s K)", "s(1/2"]
+)
 def test_other_texts_are_left_to_astropy(text: str) -> None:
     assert read_unit(text) is None
 
@@ -185,17 +197,23 @@ def test_a_unit_of_ones_own() -> None:
     flux = Unit("Jy")
     assert flux.parse("3 mJy") == pytest.approx(3e-3)
     assert flux.parse(flux.write(0.1)) == 0.1
-    with pytest.raises(ValueError, match="expected a quantity in Jy such as '1 Jy', but 'K' is a unit of temperature"):
+    with pytest.raises(
+        ValueError,
+        match="expected a quantity in Jy such as '1 Jy', but 'K' is a unit of temperature",
+    ):
         flux.parse("3 K")
 
 
 def test_common_units_do_not_import_astropy() -> None:
     code = (
-        "import sys; from zonda.core.configuration.units import Unit; "
-        "Unit('rad').parse('4 arcmin'); Unit('K s(1/2)').parse('1.7 mK s(1/2)'); Unit('').parse('5 %'); "
-        "print('astropy' in sys.modules, 'numpy' in sys.modules)"
+        "import sys; from zonda.core.configuration.units import Unit; Unit('rad').parse('4"
+        " arcmin'); Unit('K s(1/2)').parse('1.7 mK s(1/2)'); Unit('').parse('5 %'); print('astropy'"
+        " in sys.modules, 'numpy' in sys.modules)"
     )
-    assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == ["False", "False"]
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == [
+        "False",
+        "False",
+    ]
 
 
 def test_schema_shows_unit_and_examples() -> None:

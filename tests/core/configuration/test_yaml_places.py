@@ -16,8 +16,19 @@ def read(text: str) -> Document:
 
 
 def test_scalars_are_yaml_1_2() -> None:
-    text = "ra: 13:47:30.6\ndec: -11:45:09\nk: 1e-3\nsw: on\nd: 2020-01-01\nn: 0o17\nz: 007\nu: 1_000\ne: \nt: true\nf: 1.\n"
-    expected = {"ra": "13:47:30.6", "dec": "-11:45:09", "k": 1e-3, "sw": "on", "d": "2020-01-01", "n": 15, "z": 7}
+    text = (
+        "ra: 13:47:30.6\ndec: -11:45:09\nk: 1e-3\nsw: on\nd: 2020-01-01\nn: 0o17\nz: 007\nu:"
+        " 1_000\ne: \nt: true\nf: 1.\n"
+    )
+    expected = {
+        "ra": "13:47:30.6",
+        "dec": "-11:45:09",
+        "k": 1e-3,
+        "sw": "on",
+        "d": "2020-01-01",
+        "n": 15,
+        "z": 7,
+    }
     assert read(text).value == expected | {"u": "1_000", "e": None, "t": True, "f": 1.0}
     assert yaml.safe_load(text)["dec"] == -42309  # what plain PyYAML makes of a declination
 
@@ -64,12 +75,22 @@ def test_merged_keys_may_be_overridden() -> None:
         (f"a: {'9' * 5000}\n", "cannot be read: a number of 5000 digits", 0, 3),
         (f"a: 0x{'f' * 5000}\n", "cannot be read: a number of 5002 digits", 0, 3),
         ("a: !!python/name:os.system ''\n", "the tag !!python/name:os.system is not known", 0, 3),
-        ("a: !!python/object/apply:os.system [id]\n", "the tag !!python/object/apply:os.system is not known", 0, 3),
+        (
+            "a: !!python/object/apply:os.system [id]\n",
+            "the tag !!python/object/apply:os.system is not known",
+            0,
+            3,
+        ),
         ("a: !!set {b}\n", "the tag !!set is not known", 0, 3),
         ("a: !!timestamp 99\n", "the tag !!timestamp is not known", 0, 3),
         ("a: !!bool maybe\n", "cannot be read: ", 0, 3),
         ("a: {<<: [1]}\n", "only mappings can be merged", 0, 9),
-        ("a0: &a0 [1]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}]\n" for k in range(1, 100)), "not valid YAML: nested deeper", 0, 9),
+        (
+            "a0: &a0 [1]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}]\n" for k in range(1, 100)),
+            "not valid YAML: nested deeper",
+            0,
+            9,
+        ),
     ],
 )
 def test_bad_text(text: str, message: str, line: int, column: int) -> None:
@@ -110,7 +131,9 @@ def test_exploding_aliases_are_refused() -> None:
 def test_exploding_merges_stay_small() -> None:
     """Every key once: PyYAML's own list of merged keys has 2e8 members here."""
     text = "x0: &x0 {a: 1, b: 2}\n"
-    text += "".join(f"x{k}: &x{k} {{<<: [{', '.join([f'*x{k - 1}'] * 10)}], c{k}: {k}}}\n" for k in range(1, 9))
+    text += "".join(
+        f"x{k}: &x{k} {{<<: [{', '.join([f'*x{k - 1}'] * 10)}], c{k}: {k}}}\n" for k in range(1, 9)
+    )
     document = read(text)
     assert document.faults == []
     assert document.value["x8"] == {"a": 1, "b": 2} | {f"c{k}": k for k in range(1, 9)}
@@ -132,7 +155,8 @@ def test_long_lists_are_refused_before_they_are_built() -> None:
 def test_merged_keys_give_way_to_nearer_ones(text: str, value: Any) -> None:
     """YAML's language-independent type "merge": own keys first, then the first of several mappings.
 
-    PyYAML 6.0.4 takes {c: 1} of the last case, against the mapping that is merged there by its own rule.
+    PyYAML 6.0.4 takes {c: 1} of the last case, against the mapping that is merged there by its own
+    rule.
     """
     assert read(text).value == value
 
@@ -163,7 +187,21 @@ def test_dump_loads_again(value: Any) -> None:
 
 
 def test_texts_that_look_like_numbers_stay_texts() -> None:
-    values = ["1e3", "on", "13:47:30", "0x1f", "1_0", ".5", "null", "~", "", "- a", "a: b", "#c", ".inf"]
+    values = [
+        "1e3",
+        "on",
+        "13:47:30",
+        "0x1f",
+        "1_0",
+        ".5",
+        "null",
+        "~",
+        "",
+        "- a",
+        "a: b",
+        "#c",
+        ".inf",
+    ]
     assert read(dump(values)).value == values
     assert math.isinf(read(dump(math.inf)).value)
 

@@ -54,7 +54,11 @@ def test_other_units_follow_the_band_and_the_beam_of_the_run(data, brightness):
     }.items():
         other = brightness.to(unit)
         for plane in ("signal", "noise", "half_difference"):
-            np.testing.assert_allclose(finite(getattr(other, plane)), factor * finite(getattr(brightness, plane)), rtol=1e-12)
+            np.testing.assert_allclose(
+                finite(getattr(other, plane)),
+                factor * finite(getattr(brightness, plane)),
+                rtol=1e-12,
+            )
         assert other.rms() == pytest.approx(factor * brightness.rms())
         back = other.to("K_RJ")
         np.testing.assert_allclose(finite(back.signal), finite(brightness.signal), rtol=1e-12)
@@ -71,7 +75,10 @@ def test_weights_stay_the_inverse_variance(data):
     ]  # fmt: skip
     one = zonda.Pipeline(steps).run(scene(camera(7)), threads=1)["map"]
     other = one.to("uK_CMB")
-    np.testing.assert_allclose(other.weights * np.nan_to_num(other.signal) ** 2, one.weights * np.nan_to_num(one.signal) ** 2)
+    np.testing.assert_allclose(
+        other.weights * np.nan_to_num(other.signal) ** 2,
+        one.weights * np.nan_to_num(one.signal) ** 2,
+    )
 
 
 def test_flux_in_the_pixels_of_a_tangent_plane_is_kept(data):
@@ -87,7 +94,11 @@ def test_flux_in_the_pixels_of_a_tangent_plane_is_kept(data):
     found = wide.run(scene(camera(7)), threads=1)["map"]
     found.signal[...] = 1.0
     flux = found.to("Jy/pixel").signal
-    np.testing.assert_allclose(flux / flux.max(), np.cos(found.distance()) ** 3 / np.cos(found.distance().min()) ** 3, rtol=1e-12)
+    np.testing.assert_allclose(
+        flux / flux.max(),
+        np.cos(found.distance()) ** 3 / np.cos(found.distance().min()) ** 3,
+        rtol=1e-12,
+    )
 
 
 def test_a_smoothed_map_has_a_wider_beam(brightness):
@@ -112,7 +123,14 @@ def test_what_cannot_be_converted_is_said(brightness):
     with pytest.raises(InputError, match="cannot be the width of a smoothing"):
         brightness.smooth("0 arcsec")
     bare = MapProduct(
-        np.ones((2, 2)), np.ones((2, 2), np.int64), np.ones((2, 2)), np.ones((2, 2)), None, brightness.header, (0.0, 0.0), ARCSEC
+        np.ones((2, 2)),
+        np.ones((2, 2), np.int64),
+        np.ones((2, 2)),
+        np.ones((2, 2)),
+        None,
+        brightness.header,
+        (0.0, 0.0),
+        ARCSEC,
     )
     assert bare.to("mK").signal[0, 0] == pytest.approx(1e3)
     with pytest.raises(InputError, match="band of the map is not known"):
@@ -154,7 +172,12 @@ def test_a_map_far_from_zero_is_shown_between_its_lowest_and_highest(brightness)
 def test_healpix_maps_are_drawn_and_converted():
     from matplotlib import pyplot as plt
 
-    steps = [zonda.PointingDaisy(scan_duration="5 s"), zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(nside=1024)]
+    steps = [
+        zonda.PointingDaisy(scan_duration="5 s"),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.BinMap(nside=1024),
+    ]
     found = zonda.Pipeline(steps).run(scene(camera(7)), threads=1)["map"]
     drawn = found.to("mK_CMB").plot().images[0].get_array()
     known = np.asarray(drawn[np.isfinite(drawn)])
@@ -182,6 +205,8 @@ def test_a_written_map_is_a_sky_map_again(brightness, tmp_path):
     filled.signal[...] = 7.0
     path = filled.write(tmp_path / "flat.fits")
     steps = [zonda.PointingStare(scan_duration="1 s"), zonda.SkyMap(file=path, beam="none")]
-    data = zonda.Pipeline(steps).run(scene(camera(1), target=f"{TARGET[0]} deg {TARGET[1]} deg"), keep=["sky"], threads=1)
+    data = zonda.Pipeline(steps).run(
+        scene(camera(1), target=f"{TARGET[0]} deg {TARGET[1]} deg"), keep=["sky"], threads=1
+    )
     per_cmb = band_average(data.scene.instrument.band, cmb_slope)
     np.testing.assert_allclose(data.tod("sky"), 7e-6 * per_cmb, rtol=1e-5)  # float32

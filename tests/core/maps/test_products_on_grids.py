@@ -19,8 +19,12 @@ from zonda.plugins.metrics.common import relative_error_of_rms
 FWHM = 5 * ARCMIN
 
 
-def product(kind: str, dec: float, seed: int | None = 0, side: float = 1.5, pixel: float = ARCMIN) -> MapProduct:
-    """A map of ``side`` deg that is equally deep everywhere: 1 K in an equatorial pixel, as hits go with the solid angle."""
+def product(
+    kind: str, dec: float, seed: int | None = 0, side: float = 1.5, pixel: float = ARCMIN
+) -> MapProduct:
+    """A map of ``side`` deg that is equally deep everywhere: 1 K in an equatorial pixel, as hits go
+    with the solid angle.
+    """
     if kind == "CAR":
         step = type("Step", (), {"width": math.radians(side), "height": None, "pixel": pixel})
         box = box_about(step, (1.0, math.radians(dec)))
@@ -31,16 +35,26 @@ def product(kind: str, dec: float, seed: int | None = 0, side: float = 1.5, pixe
         shape = (n, n)
         header = tangent_wcs(centre, pixel, shape).to_header()
     ones = np.ones(shape)
-    found = MapProduct(ones, np.ones(shape, np.int64), ones, ones, None, header, centre, pixel, fwhm=FWHM)
+    found = MapProduct(
+        ones, np.ones(shape, np.int64), ones, ones, None, header, centre, pixel, fwhm=FWHM
+    )
     share = np.broadcast_to(found.areas(), shape) / pixel**2
-    found.weights, found.noise, found.hits = share * 1.0, share**-0.5, np.rint(1e4 * share).astype(np.int64)
+    found.weights, found.noise, found.hits = (
+        share * 1.0,
+        share**-0.5,
+        np.rint(1e4 * share).astype(np.int64),
+    )
     found.signal = np.random.default_rng(seed).standard_normal(shape) * found.noise
     return found
 
 
-@pytest.mark.parametrize(("kind", "dec"), [("TAN", 60.0), ("CAR", 0.0), ("CAR", 60.0), ("CAR", 75.0), ("CAR", 85.0)])
+@pytest.mark.parametrize(
+    ("kind", "dec"), [("TAN", 60.0), ("CAR", 0.0), ("CAR", 60.0), ("CAR", 75.0), ("CAR", 85.0)]
+)
 def test_white_noise_is_what_the_map_and_the_report_state(kind, dec):
-    """Smoothed: 1 K arcmin / sqrt(4 pi) sigma wherever the map is. The report's was 1 / sqrt(cos dec) of that in CAR maps."""
+    """Smoothed: 1 K arcmin / sqrt(4 pi) sigma wherever the map is. The report's was 1 / sqrt(cos
+    dec) of that in CAR maps.
+    """
     one = product(kind, dec)
     sigma = FWHM / FWHM_PER_SIGMA
     wanted = ARCMIN / math.sqrt(4 * math.pi) / sigma
@@ -48,8 +62,11 @@ def test_white_noise_is_what_the_map_and_the_report_state(kind, dec):
     near = one.distance() <= radius
     smooth = one.smoothed(FWHM)
     assert smooth.noise[near] == pytest.approx(wanted, rel=0.01 if dec < 80 else 0.02)
-    # some A / 4 pi sigma^2 = 55 independent values in the circle: their rms is known to (2 x 55)^-1/2 = 9 %, of ten maps to 3 %
-    rms = math.sqrt(np.mean([product(kind, dec, seed).smoothed(FWHM).rms(radius) ** 2 for seed in range(10)]))
+    # some A / 4 pi sigma^2 = 55 independent values in the circle: their rms is known to (2 x
+    # 55)^-1/2 = 9 %, of ten maps to 3 %
+    rms = math.sqrt(
+        np.mean([product(kind, dec, seed).smoothed(FWHM).rms(radius) ** 2 for seed in range(10)])
+    )
     assert rms == pytest.approx(wanted, rel=0.09)  # three of these errors
     assert one.smoothed_rms(FWHM, radius) == pytest.approx(smooth.rms(radius), rel=1e-4)
     ((shown, what),) = expected("map", one, 2 * radius)
@@ -68,7 +85,9 @@ def test_the_error_of_an_rms_is_its_scatter(kind, dec):
     assert found.std() / found.mean() == pytest.approx(error, rel=0.27)
 
 
-@pytest.mark.parametrize(("kind", "dec"), [("TAN", 60.0), ("CAR", 30.0), ("CAR", 60.0), ("CAR", 80.0)])
+@pytest.mark.parametrize(
+    ("kind", "dec"), [("TAN", 60.0), ("CAR", 30.0), ("CAR", 60.0), ("CAR", 80.0)]
+)
 def test_a_single_pixel_keeps_its_flux(kind, dec):
     """In Jy/pixel 1, in K/sr 1 / area; smoothed the Gaussian of that flux, to 0.5 %."""
     one = product(kind, dec)
@@ -83,19 +102,25 @@ def test_a_single_pixel_keeps_its_flux(kind, dec):
 
 
 def test_units_per_pixel_there_and_back():
-    """At 60 deg a pixel of 1 arcmin is half as wide: its Jy/pixel are half of those on the equator."""
+    """At 60 deg a pixel of 1 arcmin is half as wide: its Jy/pixel are half of those on the
+    equator.
+    """
     one = product("CAR", 60.0)
     one.band = Band(name="b", low="80 GHz", high="100 GHz")
     one.signal = np.ones(one.signal.shape)
     there = one.to("Jy/pixel")
-    np.testing.assert_allclose(there.signal, 1e6 * one.to("MJy/sr").signal * one.areas(), rtol=1e-12)
+    np.testing.assert_allclose(
+        there.signal, 1e6 * one.to("MJy/sr").signal * one.areas(), rtol=1e-12
+    )
     middle = there.signal[there.signal.shape[0] // 2, 0]
     assert middle == pytest.approx(1e6 * one.to("MJy/sr").signal[0, 0] * ARCMIN**2 / 2, rel=1e-3)
     np.testing.assert_allclose(there.to("K_RJ").signal, 1.0, rtol=1e-12)
 
 
 def test_a_wide_tangent_plane_is_smoothed_by_its_own_pixels():
-    """20 deg from the tangent point a pixel is cos^3 of its size there: the kernel is wider in pixels, and noise as it is."""
+    """20 deg from the tangent point a pixel is cos^3 of its size there: the kernel is wider in
+    pixels, and noise as it is.
+    """
     one = product("TAN", 0.0, side=45.0, pixel=12 * ARCMIN)
     one.signal = np.zeros(one.signal.shape)
     one.noise[:] = 1.0
@@ -106,11 +131,15 @@ def test_a_wide_tangent_plane_is_smoothed_by_its_own_pixels():
     found = one.smoothed(fwhm)
     sigma = fwhm / FWHM_PER_SIGMA
     assert found.signal[at] == pytest.approx(areas[at] / (2 * math.pi * sigma**2), rel=0.005)
-    assert found.noise[at] == pytest.approx(math.sqrt(areas[at] / (4 * math.pi * sigma**2)), rel=0.005)
+    assert found.noise[at] == pytest.approx(
+        math.sqrt(areas[at] / (4 * math.pi * sigma**2)), rel=0.005
+    )
 
 
 def test_large_images_are_smoothed_by_tiles(monkeypatch):
-    """A single pixel 20 deg from the tangent point, as in small images, where each pixel has its own kernel."""
+    """A single pixel 20 deg from the tangent point, as in small images, where each pixel has its
+    own kernel.
+    """
     one = product("TAN", 0.0, side=45.0, pixel=10 * ARCMIN)
     fwhm, sigma = 50 * ARCMIN, 50 * ARCMIN / FWHM_PER_SIGMA
     values = np.zeros(one.signal.shape)
@@ -135,5 +164,7 @@ def test_the_beam_of_a_picture_is_round_on_the_sky():
     draw(Shown(one.signal, one.wcs, "K_RJ", fwhm=FWHM), ax, None)
     (beam,) = ax.patches
     sizes = sorted([beam.width, beam.height])
-    assert sizes == pytest.approx([5.0, 10.0], rel=0.03)  # pixels of 1 arcmin, by half that in longitude; 2 % more in the corner
+    assert sizes == pytest.approx(
+        [5.0, 10.0], rel=0.03
+    )  # pixels of 1 arcmin, by half that in longitude; 2 % more in the corner
     assert beam.angle % 180 == pytest.approx(0 if beam.width > beam.height else 90, abs=1)

@@ -19,7 +19,13 @@ from zonda.core.numerics.projection import (
 )
 
 
-def tan(ctype=("RA---TAN", "DEC--TAN"), crval=(75.0, 20.0), crpix=(17.3, -4.0), lonpole=180.0, cdelt=(-2 / 3600, 3 / 3600)):
+def tan(
+    ctype=("RA---TAN", "DEC--TAN"),
+    crval=(75.0, 20.0),
+    crpix=(17.3, -4.0),
+    lonpole=180.0,
+    cdelt=(-2 / 3600, 3 / 3600),
+):
     wcs = WCS(naxis=2)
     wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = ctype, crval, crpix, cdelt
     wcs.wcs.pc = [[0.8, 0.6], [-0.6, 0.8]]
@@ -40,12 +46,15 @@ def tan(ctype=("RA---TAN", "DEC--TAN"), crval=(75.0, 20.0), crpix=(17.3, -4.0), 
 def test_pixels_equal_astropys(wcs):
     rng = np.random.default_rng(0)
     centre = SkyCoord(wcs.pixel_to_world(17.0, -5.0)).icrs
-    # boresights within half a degree of the centre, any roll, then detectors within 0.1 deg of those
+    # boresights within half a degree of the centre, any roll, then detectors within 0.1 deg of
+    # those
     from scipy.spatial.transform import Rotation
 
     lon = centre.ra.rad + rng.normal(0, 4e-3, 50) / max(np.cos(centre.dec.rad), 1e-3)
     lat = np.clip(centre.dec.rad + rng.normal(0, 4e-3, 50), -np.pi / 2, np.pi / 2)
-    quaternions = Rotation.from_euler("ZYZ", np.stack([lon, np.pi / 2 - lat, rng.uniform(0, 6, 50)], axis=1)).as_quat()
+    quaternions = Rotation.from_euler(
+        "ZYZ", np.stack([lon, np.pi / 2 - lat, rng.uniform(0, 6, 50)], axis=1)
+    ).as_quat()
     xi, eta = rng.normal(0, 1e-3, (2, 3))
     x, y, z = np.moveaxis(directions(quaternions, xi, eta), 2, 0)
     sky = SkyCoord(x=x, y=y, z=z, representation_type="cartesian", frame="icrs")
@@ -68,20 +77,28 @@ def test_behind_the_image_has_negative_w():
 def test_rotation_matrices_turn_the_boresight():
     q = np.array([[0.1, -0.4, 0.3, 0.8], [0, 0, 0, 2.0]])
     matrices = rotation_matrices(q)
-    np.testing.assert_allclose(matrices @ matrices.transpose(0, 2, 1), np.tile(np.eye(3), (2, 1, 1)), atol=1e-15)
+    np.testing.assert_allclose(
+        matrices @ matrices.transpose(0, 2, 1), np.tile(np.eye(3), (2, 1, 1)), atol=1e-15
+    )
     np.testing.assert_allclose(matrices[1], np.eye(3), atol=1e-15)
 
 
 def test_galactic_frame_rotation_equals_astropy():
     here = SkyCoord("05h00m00s +20d00m00s", frame="icrs")
     np.testing.assert_allclose(
-        frame_rotation("galactic") @ here.cartesian.xyz.value, here.galactic.cartesian.xyz.value, atol=1e-14
+        frame_rotation("galactic") @ here.cartesian.xyz.value,
+        here.galactic.cartesian.xyz.value,
+        atol=1e-14,
     )
 
 
 @pytest.mark.parametrize(
     ("wcs", "message"),
-    [(tan(("RA---SIN", "DEC--SIN")), "not a plain TAN"), (WCS(naxis=2), "celestial"), (WCS(naxis=3), "celestial")],
+    [
+        (tan(("RA---SIN", "DEC--SIN")), "not a plain TAN"),
+        (WCS(naxis=2), "celestial"),
+        (WCS(naxis=3), "celestial"),
+    ],
 )
 def test_other_images_are_refused(wcs, message):
     with pytest.raises(InputError, match=message):
@@ -94,19 +111,32 @@ def test_unknown_frame_is_refused():
 
 
 def test_share_of_the_samples_outside_an_image():
-    """A boresight that crosses an image of half its track, seen by detectors in a row across it; behind it is outside."""
+    """A boresight that crosses an image of half its track, seen by detectors in a row across it;
+    behind it is outside.
+    """
     wcs = WCS(naxis=2)
-    wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [0.0, 0.0], [50.5, 50.5], [-0.01, 0.01]
+    wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = (
+        ["RA---TAN", "DEC--TAN"],
+        [0.0, 0.0],
+        [50.5, 50.5],
+        [-0.01, 0.01],
+    )
     matrix = pixel_matrix(wcs)  # 1 deg x 1 deg about (0, 0)
     n = 3000
 
     def along(longitude):
-        return Rotation.from_euler("ZY", np.stack([longitude, np.full(n, np.pi / 2)], axis=1)).as_quat()
+        return Rotation.from_euler(
+            "ZY", np.stack([longitude, np.full(n, np.pi / 2)], axis=1)
+        ).as_quat()
 
     inside = np.radians(np.linspace(-1.0, 1.0, n))  # half of 2 deg
     one = np.zeros(1)
-    assert share_outside([(along(inside), one, one)], matrix, (100, 100)) == pytest.approx(0.5, abs=2 / 250)
-    across = np.radians(np.linspace(-0.25, 0.75, 400))  # a quarter of the detectors is beyond the edge
+    assert share_outside([(along(inside), one, one)], matrix, (100, 100)) == pytest.approx(
+        0.5, abs=2 / 250
+    )
+    across = np.radians(
+        np.linspace(-0.25, 0.75, 400)
+    )  # a quarter of the detectors is beyond the edge
     many = [(along(0 * inside), 0 * across, across), (along(0 * inside + np.pi), one, one)]
     assert share_outside(many[:1], matrix, (100, 100)) == pytest.approx(0.25, abs=1 / 30)
     assert share_outside(many[1:], matrix, (100, 100)) == 1.0

@@ -50,7 +50,9 @@ def test_intensity_and_cmb_against_astropy():
     nu = 150 * u.GHz
     kelvin = (1 * u.MJy / u.sr).to_value(u.K, u.brightness_temperature(nu))
     assert to_kelvin_rj("MJy/sr", narrow(150)) == pytest.approx(kelvin, rel=1e-6)
-    per_cmb = (1 * u.K).to_value(u.MJy / u.sr, u.thermodynamic_temperature(nu, T_CMB * u.K)) * kelvin
+    per_cmb = (1 * u.K).to_value(
+        u.MJy / u.sr, u.thermodynamic_temperature(nu, T_CMB * u.K)
+    ) * kelvin
     assert to_kelvin_rj("K_CMB", narrow(150)) == pytest.approx(per_cmb, rel=1e-6)
     assert per_cmb == pytest.approx(0.5764, abs=2e-4)
 
@@ -66,16 +68,24 @@ def test_thermal_sz_solves_the_kompaneets_equation(ghz):
 
 
 def test_thermal_sz_is_negative_at_93_ghz_and_changes_sign_at_217_ghz():
-    assert to_kelvin_rj("y", narrow(93)) == pytest.approx(-3.441, abs=0.003)  # x = 1.6376: -4.283 K_CMB x 0.8034
+    assert to_kelvin_rj("y", narrow(93)) == pytest.approx(
+        -3.441, abs=0.003
+    )  # x = 1.6376: -4.283 K_CMB x 0.8034
     assert to_kelvin_rj("y", MUSTANG2) < -3.3
     assert to_kelvin_rj("y", narrow(217.0)) < 0 < to_kelvin_rj("y", narrow(218.0))
 
 
 @pytest.mark.parametrize(("low", "high"), [(78, 108), (66, 118), (30, 950)])
-@pytest.mark.parametrize(("unit", "function"), [("K_CMB", cmb_slope), ("y", thermal_sz), ("MJy/sr", intensity_to_kelvin)])
+@pytest.mark.parametrize(
+    ("unit", "function"), [("K_CMB", cmb_slope), ("y", thermal_sz), ("MJy/sr", intensity_to_kelvin)]
+)
 def test_band_is_integrated(low, high, unit, function):
     scale = 1e-20 if unit == "MJy/sr" else 1.0
-    want = quad(lambda nu: float(function(nu * 1e9)), low, high, epsabs=0, epsrel=1e-12)[0] / (high - low) * scale
+    want = (
+        quad(lambda nu: float(function(nu * 1e9)), low, high, epsabs=0, epsrel=1e-12)[0]
+        / (high - low)
+        * scale
+    )
     assert to_kelvin_rj(unit, band(low, high)) == pytest.approx(want, rel=1e-9)
 
 
@@ -84,7 +94,12 @@ def test_tabulated_band_is_integrated_between_its_points(tmp_path):
     path.write_text("80 0\n90 1\n100 0\n")
     triangle = Band(name="triangle", file=path)
     weight = lambda nu: 1 - abs(nu - 90) / 10  # noqa: E731
-    want = quad(lambda nu: weight(nu) * float(cmb_slope(nu * 1e9)), 80, 100, points=[90], epsrel=1e-12)[0] / 10
+    want = (
+        quad(
+            lambda nu: weight(nu) * float(cmb_slope(nu * 1e9)), 80, 100, points=[90], epsrel=1e-12
+        )[0]
+        / 10
+    )
     assert to_kelvin_rj("K_CMB", triangle) == pytest.approx(want, rel=1e-9)
 
 
@@ -100,7 +115,9 @@ def test_flux_units_divide_by_their_solid_angle():
     pixel, beam = 2.35e-11, 1.9e-9
     intensity = to_kelvin_rj("MJy/sr", MUSTANG2, spectral_index=-0.7)
     per_pixel = to_kelvin_rj("Jy/pixel", MUSTANG2, pixel_solid_angle=pixel, spectral_index=-0.7)
-    per_beam = to_kelvin_rj("Jy/beam", MUSTANG2, pixel_solid_angle=pixel, beam_solid_angle=beam, spectral_index=-0.7)
+    per_beam = to_kelvin_rj(
+        "Jy/beam", MUSTANG2, pixel_solid_angle=pixel, beam_solid_angle=beam, spectral_index=-0.7
+    )
     assert per_pixel == pytest.approx(intensity * 1e-6 / pixel, rel=1e-12)
     assert per_beam == pytest.approx(intensity * 1e-6 / beam, rel=1e-12)
 
@@ -113,11 +130,20 @@ def test_brightness_is_already_k_rj():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"unit": "furlong"}, "unknown unit 'furlong'.*\n.*K_RJ, K_CMB, Jy/pixel, Jy/beam, MJy/sr, y"),
+        (
+            {"unit": "furlong"},
+            "unknown unit 'furlong'.*\n.*K_RJ, K_CMB, Jy/pixel, Jy/beam, MJy/sr, y",
+        ),
         ({"unit": "Jy/pixel"}, "needs the solid angle of its pixel, but none is given"),
-        ({"unit": "Jy/pixel", "pixel_solid_angle": 0.0}, "solid angle of its pixel, but 0 sr is given"),
+        (
+            {"unit": "Jy/pixel", "pixel_solid_angle": 0.0},
+            "solid angle of its pixel, but 0 sr is given",
+        ),
         ({"unit": "Jy/beam", "pixel_solid_angle": 1e-11}, "needs the solid angle of its beam"),
-        ({"unit": "K_CMB", "spectral_index": 2.0}, "own spectrum, a spectral index of 2 does not apply"),
+        (
+            {"unit": "K_CMB", "spectral_index": 2.0},
+            "own spectrum, a spectral index of 2 does not apply",
+        ),
     ],
 )
 def test_bad_requests_name_cause_and_cure(arguments, message):

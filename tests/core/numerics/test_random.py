@@ -42,7 +42,20 @@ def test_philox_many_counters_at_once():
 
 
 def test_stream_keys_are_unambiguous():
-    names = [(), ("",), ("a",), ("a", ""), ("", "a"), ("ab", "c"), ("a", "bc"), (1,), ("1",), (11,), (1, 1), (-1,)]
+    names = [
+        (),
+        ("",),
+        ("a",),
+        ("a", ""),
+        ("", "a"),
+        ("ab", "c"),
+        ("a", "bc"),
+        (1,),
+        ("1",),
+        (11,),
+        (1, 1),
+        (-1,),
+    ]
     keys = {tuple(stream_key(seed, *n).tolist()) for seed in (0, 1, -1, 2**70) for n in names}
     assert len(keys) == 4 * len(names)
     assert stream_key(3, "x").dtype == np.uint32
@@ -53,7 +66,9 @@ def test_stream_keys_are_unambiguous():
 
 
 def test_bits_are_pinned():
-    """The same seed gives the same sky in the next version. Rounded: the last bits may differ between processors."""
+    """The same seed gives the same sky in the next version. Rounded: the last bits may differ
+    between processors.
+    """
     assert stream_key(1, "test").tolist() == PINNED_KEY
     np.testing.assert_allclose(normals(KEY, -2, 2), PINNED_NORMALS, rtol=1e-5)
     np.testing.assert_allclose(uniforms(KEY, -2, 2), PINNED_UNIFORMS, rtol=1e-9)
@@ -61,7 +76,9 @@ def test_bits_are_pinned():
 
 
 @settings(max_examples=40, deadline=None)
-@given(start=st.integers(-(2**62), 2**62), cuts=st.lists(st.integers(0, 5000), min_size=2, max_size=6))
+@given(
+    start=st.integers(-(2**62), 2**62), cuts=st.lists(st.integers(0, 5000), min_size=2, max_size=6)
+)
 def test_cuts_never_change_a_bit(start, cuts):
     cuts = sorted(cuts)
     for make in (normals, uniforms):
@@ -71,7 +88,12 @@ def test_cuts_never_change_a_bit(start, cuts):
 
 
 @settings(max_examples=25, deadline=None)
-@given(i=st.integers(-(2**63), 2**63 - 200), j=st.integers(-(2**63), 2**63 - 200), a=st.integers(0, 99), b=st.integers(0, 99))
+@given(
+    i=st.integers(-(2**63), 2**63 - 200),
+    j=st.integers(-(2**63), 2**63 - 200),
+    a=st.integers(0, 99),
+    b=st.integers(0, 99),
+)
 def test_lattice_regions_agree(i, j, a, b):
     whole = lattice_normals(KEY, i, i + 100, j, j + 100)
     part = lattice_normals(KEY, i + a, i + 100, j + b, j + 100)
@@ -106,7 +128,11 @@ def test_normals_are_uncorrelated():
     for lag in (1, 2, 255, 256, 512, 768, TILE):  # 256: the two numbers of a Box-Muller pair
         assert abs((x[:n] * x[lag : lag + n]).mean()) < bound
         assert abs(((x[:n] ** 2 - 1) * (x[lag : lag + n] ** 2 - 1)).mean()) < 2 * bound
-    others = [normals(KEY, 0, n, stream=1), normals(stream_key(2, "test"), 0, n), normals(KEY, TILE, TILE + n)]
+    others = [
+        normals(KEY, 0, n, stream=1),
+        normals(stream_key(2, "test"), 0, n),
+        normals(KEY, TILE, TILE + n),
+    ]
     others.append(lattice_normals(KEY, 0, 1024, 0, 1024).ravel())
     for y in others:
         assert abs((x[:n] * y).mean()) < bound

@@ -7,7 +7,12 @@ import pytest
 from scipy.fft import dct, next_fast_len
 from scipy.ndimage import spline_filter1d
 
-from zonda.core.numerics.transforms import cosine_transform, fast_length, spline_filter, spline_response
+from zonda.core.numerics.transforms import (
+    cosine_transform,
+    fast_length,
+    spline_filter,
+    spline_response,
+)
 
 ROUNDING = 1e-13  # of sums of up to 1000 terms of order 1
 
@@ -24,7 +29,9 @@ def test_spline_filter(shape: tuple[int, int], axis: int) -> None:
     x = np.random.default_rng(0).normal(size=shape)
     found = spline_filter(x, axis)
     # scipy's recursion starts from a sum that it cuts at 1e-15
-    np.testing.assert_allclose(found, spline_filter1d(x, 3, axis=axis, mode="mirror"), rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(
+        found, spline_filter1d(x, 3, axis=axis, mode="mirror"), rtol=0, atol=ROUNDING
+    )
 
 
 def test_spline_of_one_value_is_itself() -> None:
@@ -34,7 +41,9 @@ def test_spline_of_one_value_is_itself() -> None:
 def test_spline_response_is_that_of_its_values_at_the_knots() -> None:
     values = np.zeros(64)
     values[[-1, 0, 1]] = [1 / 6, 4 / 6, 1 / 6]
-    np.testing.assert_allclose(spline_response(np.fft.fftfreq(64)), np.fft.fft(values).real, atol=1e-15)
+    np.testing.assert_allclose(
+        spline_response(np.fft.fftfreq(64)), np.fft.fft(values).real, atol=1e-15
+    )
 
 
 def test_fast_lengths() -> None:

@@ -1,4 +1,6 @@
-"""`CommonModeFilter: {group: all}` in plans, accuracy and forecasts: what holds for each band alone need not hold for all."""
+"""`CommonModeFilter: {group: all}` in plans, accuracy and forecasts: what holds for each band alone
+need not hold for all.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -52,18 +54,29 @@ def coarse(made: PlanOfBands) -> set[str]:
 
 
 def test_a_plan_coarsens_nothing_where_bands_are_joined() -> None:
-    """With 919 detectors fewer poles changed the map of f090 by 1.5 times the bound of that band alone."""
-    by_band, joined = (zonda.plan(parse(TEXT, overrides=[*LARGE, *more]), threads=1) for more in ([BY_BAND], []))
+    """With 919 detectors fewer poles changed the map of f090 by 1.5 times the bound of that band
+    alone.
+    """
+    by_band, joined = (
+        zonda.plan(parse(TEXT, overrides=[*LARGE, *more]), threads=1) for more in ([BY_BAND], [])
+    )
     assert isinstance(by_band, PlanOfBands)
     assert isinstance(joined, PlanOfBands)
     assert "PinkNoise.poles" in coarse(by_band)
     assert coarse(joined) == set()
     assert joined.summary.settings == {}
-    assert str(joined).count("CommonModeFilter joins the bands: the bounds are of this band alone and need not hold") == 2
+    assert (
+        str(joined).count(
+            "CommonModeFilter joins the bands: the bounds are of this band alone and need not hold"
+        )
+        == 2
+    )
     assert "joins" not in str(by_band)
     reasons = {d.name: d.reason for d in joined.plans["f090"].decided}
     assert reasons["PinkNoise.poles"] == "CommonModeFilter joins the bands"
-    assert [one["joins_bands"] for one in as_dict(joined)["bands"].values()] == ["CommonModeFilter"] * 2
+    assert [one["joins_bands"] for one in as_dict(joined)["bands"].values()] == [
+        "CommonModeFilter"
+    ] * 2
 
 
 def test_what_is_dropped_all_the_same_is_audited_of_each_band_alone() -> None:
@@ -74,13 +87,18 @@ def test_what_is_dropped_all_the_same_is_audited_of_each_band_alone() -> None:
     found = audit_of_bands(file, made, threads=1)
     for one in found.bands.values():
         assert isinstance(one, Audit)
-        assert one.slice.endswith("this band alone: with the others, which CommonModeFilter joins, the bounds need not hold")
+        assert one.slice.endswith(
+            "this band alone: with the others, which CommonModeFilter joins, the bounds need not"
+            " hold"
+        )
 
 
 def test_a_camera_of_one_band_is_planned_as_before() -> None:
     file = parse(TEXT)
     scene = file.scene()
-    one = dataclasses.replace(file, _scene=scene.model_copy(update={"instrument": scene.instrument.cameras["f090"]}))
+    one = dataclasses.replace(
+        file, _scene=scene.model_copy(update={"instrument": scene.instrument.cameras["f090"]})
+    )
     assert "joins" not in str(zonda.plan(one, threads=1))
 
 
@@ -91,13 +109,18 @@ def test_accuracy_is_measured_of_the_bands_together() -> None:
     data, complete = execute(file, metric, 1, timed=False)
     assert complete
     run, by_band = (
-        f.pipeline().run(f.scene(), output=Path(), threads=1).products for f in (file, parse(TEXT, overrides=[BY_BAND]))
+        f.pipeline().run(f.scene(), output=Path(), threads=1).products
+        for f in (file, parse(TEXT, overrides=[BY_BAND]))
     )
     for band, found in metric.measure(data).items():
         np.testing.assert_array_equal(found["I"]["signal"], run[f"map_{band}"].signal)
-        assert not np.array_equal(found["I"]["signal"], by_band[f"map_{band}"].signal, equal_nan=True)
+        assert not np.array_equal(
+            found["I"]["signal"], by_band[f"map_{band}"].signal, equal_nan=True
+        )
 
 
 def test_a_forecast_refuses_them() -> None:
-    with pytest.raises(PipelineError, match="CommonModeFilter: the forecast does not cover group: all"):
+    with pytest.raises(
+        PipelineError, match="CommonModeFilter: the forecast does not cover group: all"
+    ):
         zonda.sensitivity(parse(TEXT))

@@ -1,4 +1,6 @@
-"""The planner: what it chooses, what it says, what it refuses; and every bound against the error itself."""
+"""The planner: what it chooses, what it says, what it refuses; and every bound against the error
+itself.
+"""
 
 from __future__ import annotations
 
@@ -42,22 +44,34 @@ def made(file):
 
 def decide(effects, allowed, **options):
     now = Prediction({"A": 10.0}, 0.0, factors={"stream": 1.0})
-    return {d.effect.name: d for d in deciding.decide([Decided("A", e) for e in effects], allowed, now, **options)}
+    return {
+        d.effect.name: d
+        for d in deciding.decide([Decided("A", e) for e in effects], allowed, now, **options)
+    }
 
 
 def effect(name, *coarser):
-    choices = [Choice("coarse", f"{name} {k}", {"k": k}, bound={"map_rms": b}, seconds=s) for k, (b, s) in enumerate(coarser)]
+    choices = [
+        Choice("coarse", f"{name} {k}", {"k": k}, bound={"map_rms": b}, seconds=s)
+        for k, (b, s) in enumerate(coarser)
+    ]
     return Effect(name, (full("in full"), *choices))
 
 
 def test_the_largest_saving_for_its_error_first_and_within_the_budget():
-    found = decide([effect("dear", (0.9, 1.0)), effect("cheap", (0.2, 1.0)), effect("other", (0.75, 2.0))], {"map_rms": 1.0})
+    found = decide(
+        [effect("dear", (0.9, 1.0)), effect("cheap", (0.2, 1.0)), effect("other", (0.75, 2.0))],
+        {"map_rms": 1.0},
+    )
     assert {name: d.chosen for name, d in found.items()} == {"dear": 0, "cheap": 1, "other": 1}
     assert found["dear"].reason == "a coarser form would exceed the budget"
 
 
 def test_the_coarsest_choice_that_fits():
-    assert decide([effect("one", (0.1, 1.0), (0.5, 2.0), (2.0, 5.0))], {"map_rms": 1.0})["one"].chosen == 2
+    assert (
+        decide([effect("one", (0.1, 1.0), (0.5, 2.0), (2.0, 5.0))], {"map_rms": 1.0})["one"].chosen
+        == 2
+    )
 
 
 def test_no_saving_no_error():
@@ -91,7 +105,9 @@ def test_keep_drop_and_no_prune():
 
 
 def test_what_is_dropped_by_hand_takes_of_the_budget():
-    found = decide([effect("one", (0.9, 1.0)), effect("two", (0.5, 1.0))], {"map_rms": 1.0}, forced={"A.one"})
+    found = decide(
+        [effect("one", (0.9, 1.0)), effect("two", (0.5, 1.0))], {"map_rms": 1.0}, forced={"A.one"}
+    )
     assert found["two"].chosen == 0
 
 
@@ -99,7 +115,13 @@ def test_what_is_dropped_by_hand_takes_of_the_budget():
 
 
 def test_limits():
-    assert limits(0.1, 2.0, 30.0) == {"map_rms": 0.2, "peak": 0.2, "transfer": 0.01, "tod": 3.0, "psd": 0.1}
+    assert limits(0.1, 2.0, 30.0) == {
+        "map_rms": 0.2,
+        "peak": 0.2,
+        "transfer": 0.01,
+        "tod": 3.0,
+        "psd": 0.1,
+    }
     stated = limits(Limits(map_rms="3 uK"), 2.0, 30.0)
     assert stated["map_rms"] == stated["peak"] == pytest.approx(3e-6)
     assert stated["transfer"] == 0.01
@@ -128,18 +150,24 @@ def test_a_wrong_budget_is_refused_at_its_place(text, words):
 
 
 def test_a_budget_in_the_file(file):
-    stated = zonda.load("mustang2_cluster", overrides=[*SHORT, "budget={map_rms: 3 uK, transfer: 0.1 %}"])
+    stated = zonda.load(
+        "mustang2_cluster", overrides=[*SHORT, "budget={map_rms: 3 uK, transfer: 0.1 %}"]
+    )
     found = zonda.plan(stated, threads=1)
     assert found.limits["map_rms"] == pytest.approx(3e-6)
     assert found.limits["transfer"] == pytest.approx(1e-3)
-    nothing = zonda.plan(zonda.load("mustang2_cluster", overrides=[*SHORT, "budget=0 %"]), threads=1)
+    nothing = zonda.plan(
+        zonda.load("mustang2_cluster", overrides=[*SHORT, "budget=0 %"]), threads=1
+    )
     assert all(d.chosen == 0 for d in nothing.decided)
 
 
 # ---- names
 
 
-@pytest.mark.parametrize(("name", "near"), [("pols", "poles"), ("PinkNois", "PinkNoise"), ("ozon", "ozone")])
+@pytest.mark.parametrize(
+    ("name", "near"), [("pols", "poles"), ("PinkNois", "PinkNoise"), ("ozon", "ozone")]
+)
 @pytest.mark.parametrize("option", ["keep", "drop"])
 def test_an_unknown_name_is_answered_with_the_nearest(file, option, name, near):
     with pytest.raises(ZondaError) as caught:
@@ -178,7 +206,9 @@ def test_what_runs_is_an_ordinary_pipeline(file):
     assert [o.model_dump() for o in again.operators] == [o.model_dump() for o in planned.operators]
     assert {s.key: s.operator for s in planned.steps}["PinkNoise"].poles == 4
     assert sorted({s.key: s.operator for s in planned.steps}["AtmosphereLayers"].omit) == [8, 9]
-    assert all(d.chosen == 0 for d in zonda.plan(again, threads=1).decided), "a planned file is not planned further"
+    assert all(d.chosen == 0 for d in zonda.plan(again, threads=1).decided), (
+        "a planned file is not planned further"
+    )
 
 
 def test_a_namesake_left_out_does_not_change_the_random_numbers():
@@ -198,12 +228,24 @@ operators:
 
     file = parse(text)
     planned = zonda.plan(file, threads=1, drop=["WhiteNoise"]).apply(file)
-    assert [o.label for o in planned.pipeline().operators] == ["PointingStare", "WhiteNoise.2", "Efficiency", "BinMap"]
+    assert [o.label for o in planned.pipeline().operators] == [
+        "PointingStare",
+        "WhiteNoise.2",
+        "Efficiency",
+        "BinMap",
+    ]
 
 
 def test_the_table_and_json(made):
     shown = str(made)
-    for words in ("noise: ", "budget for map_rms", "AtmosphereLayers  ", "  layer 3  ", "not simulated", "of CPU time and"):
+    for words in (
+        "noise: ",
+        "budget for map_rms",
+        "AtmosphereLayers  ",
+        "  layer 3  ",
+        "not simulated",
+        "of CPU time and",
+    ):
         assert words in shown
     data = json.loads(json.dumps(as_dict(made)))
     assert len(data["effects"]) == len(made.decided)
@@ -211,11 +253,27 @@ def test_the_table_and_json(made):
     assert all(len(row) == 4 for row in made.summary.short)
     covered = {d.effect.name for d in made.decided}
     assert covered >= {
-        "layer 0", "detector nodes and time steps", "turbulence lattice", "spectral resolution", "ozone", "refraction",
-        "opacity with elevation", "mean emission with elevation", "sky rotation", "aberration", "beam convolution",
-        "sampling order", "poles", "high-pass decimation", "common-mode residual", "sample integration", "time stamps",
-        "coordinate precision", "precision", "beam chromaticity",
-    }  # fmt: skip
+        "layer 0",
+        "detector nodes and time steps",
+        "turbulence lattice",
+        "spectral resolution",
+        "ozone",
+        "refraction",
+        "opacity with elevation",
+        "mean emission with elevation",
+        "sky rotation",
+        "aberration",
+        "beam convolution",
+        "sampling order",
+        "poles",
+        "high-pass decimation",
+        "common-mode residual",
+        "sample integration",
+        "time stamps",
+        "coordinate precision",
+        "precision",
+        "beam chromaticity",
+    }
     assert all(d.choice.formula or d.effect.formula for d in made.decided)
     for d in made.decided:
         for bound in (d.effect.size, *(c.bound for c in d.effect.choices)):
@@ -223,7 +281,13 @@ def test_the_table_and_json(made):
 
 
 def test_units():
-    assert [kelvin(v) for v in (2.0, 3.14159e-3, 2e-6, 4e-9, 0.0)] == ["2 K", "3.14 mK", "2 uK", "4 nK", "0 K"]
+    assert [kelvin(v) for v in (2.0, 3.14159e-3, 2e-6, 4e-9, 0.0)] == [
+        "2 K",
+        "3.14 mK",
+        "2 uK",
+        "4 nK",
+        "0 K",
+    ]
 
 
 def test_no_noise_no_budget():
@@ -238,7 +302,12 @@ def test_no_noise_no_budget():
 
 def test_hits_and_speed_of_a_real_scan(file):
     scene = file.scene()
-    data = zonda.Pipeline(file.operators[:1] + file.operators[3:4] + file.operators[5:6] + [zonda.BinMap(pixel="4 arcsec")])
+    data = zonda.Pipeline(
+        file.operators[:1]
+        + file.operators[3:4]
+        + file.operators[5:6]
+        + [zonda.BinMap(pixel="4 arcsec")]
+    )
     product = data.run(scene, threads=1)
     pixel = math.radians(4 / 3600)
     found = cover(product.observations, pixel)
@@ -281,15 +350,24 @@ SET = [a for s in SHORT for a in ("--set", s)]
 
 
 def test_streams_that_are_made_again_are_paid_for_again():
-    """`method: mean` reads each of two signals for its mean, and both to subtract it: without room all above it acts thrice.
-    Steps that only look (spectra, excerpts) see a sample once; what is prepared is prepared once."""
+    """`method: mean` reads each of two signals for its mean, and both to subtract it: without room
+    all above it acts thrice. Steps that only look (spectra, excerpts) see a sample once; what is
+    prepared is prepared once."""
     file = zonda.load("mustang2_cluster", overrides=[*SHORT, "CommonModeFilter.method=mean"])
     roomy, tight = (zonda.plan(file, prune_all=False, threads=2, memory=m) for m in (10**10, 1))
-    more = {k: tight.prediction.seconds[k] / v for k, v in roomy.prediction.seconds.items() if v > 0}
+    more = {
+        k: tight.prediction.seconds[k] / v for k, v in roomy.prediction.seconds.items() if v > 0
+    }
     assert more["WhiteNoise"] == pytest.approx(3)
     assert 1 < more["SkyMap"] < 3
     assert 1 < more["HighpassFilter"] < 3
-    assert {k for k, v in more.items() if v == 1} >= {"PowerSpectrum", "TimeStreams", "CommonModeFilter", "BinMap", "SaveMap"}
+    assert {k for k, v in more.items() if v == 1} >= {
+        "PowerSpectrum",
+        "TimeStreams",
+        "CommonModeFilter",
+        "BinMap",
+        "SaveMap",
+    }
 
 
 def test_command(capsys):
@@ -306,14 +384,18 @@ def test_command_refuses(capsys):
     assert status == 2
     assert "did you mean 'poles'?" in err
     assert "Traceback" not in err
-    status, _, err = command(capsys, "run", "mustang2_cluster", *SET, "--drop", "ozone", "--output", "/nonexistent/x")
+    status, _, err = command(
+        capsys, "run", "mustang2_cluster", *SET, "--drop", "ozone", "--output", "/nonexistent/x"
+    )
     assert status == 2
 
 
 def test_products_carry_the_plan(tmp_path, capsys):
     from astropy.io import fits
 
-    status, _, err = command(capsys, "run", "mustang2_cluster", *SET, "--drop", "poles", "--output", tmp_path)
+    status, _, err = command(
+        capsys, "run", "mustang2_cluster", *SET, "--drop", "poles", "--output", tmp_path
+    )
     assert status == 0
     assert "of CPU time and" in err
     with fits.open(tmp_path / "map.fits") as hdus:
@@ -327,8 +409,7 @@ def test_products_carry_the_plan(tmp_path, capsys):
 def test_a_map_of_hits_alone(tmp_path, capsys):
     from astropy.io import fits
 
-    (tmp_path / "hits.yaml").write_text(
-        """
+    (tmp_path / "hits.yaml").write_text("""
 site: green_bank
 instrument: mustang2
 time: 2024-11-25T07:00
@@ -341,8 +422,7 @@ operators:
   - Efficiency
   - BinMap: {contents: hits}
   - SaveMap
-"""
-    )
+""")
     file = zonda.load(str(tmp_path / "hits.yaml"))
     planned = zonda.plan(file, threads=1).apply(file)
     assert [s.key for s in planned.steps] == ["PointingDaisy", "BinMap", "SaveMap"]
@@ -358,16 +438,30 @@ operators:
 @pytest.mark.parametrize(
     ("steps", "coarse"),
     [
-        ("[{AtmosphereLayers: {pwv: 5 mm}}, WhiteNoise, Efficiency, CommonModeFilter, BinMap]", False),
-        ("[{AtmosphereLayers: {pwv: 5 mm}}, WhiteNoise, Efficiency, HighpassFilter, CommonModeFilter, BinMap]", True),
+        (
+            "[{AtmosphereLayers: {pwv: 5 mm}}, WhiteNoise, Efficiency, CommonModeFilter, BinMap]",
+            False,
+        ),
+        (
+            (
+                "[{AtmosphereLayers: {pwv: 5 mm}}, WhiteNoise, Efficiency, HighpassFilter,"
+                " CommonModeFilter, BinMap]"
+            ),
+            True,
+        ),
     ],
 )
 def test_float64_is_not_taken_away_where_the_mean_emission_needs_it(steps, coarse):
     """Tens of kelvin in the stream of a common-mode filter: float32 would be refused there."""
     from zonda.core.configuration.pipeline_file import parse
 
-    head = "site: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\ntarget: 05h +20d\nprecision: float64\n"
-    file = parse(head + "operators: " + steps.replace("[", "[{PointingDaisy: {scan_duration: 20 s}}, ", 1))
+    head = (
+        "site: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\ntarget: 05h"
+        " +20d\nprecision: float64\n"
+    )
+    file = parse(
+        head + "operators: " + steps.replace("[", "[{PointingDaisy: {scan_duration: 20 s}}, ", 1)
+    )
     made = zonda.plan(file, threads=1)
     row = next(d for d in made.decided if d.effect.name == "precision")
     assert len(row.effect.choices) == 1 + coarse
@@ -375,17 +469,22 @@ def test_float64_is_not_taken_away_where_the_mean_emission_needs_it(steps, coars
     assert planned.header.precision == ("float32" if row.chosen else "float64")
     planned.pipeline().run(file.scene(), threads=1)
     if coarse:
-        found = audit(file, zonda.plan(file, threads=1, drop=["precision"]), threads=1, seconds=20.0)
+        found = audit(
+            file, zonda.plan(file, threads=1, drop=["precision"]), threads=1, seconds=20.0
+        )
         assert not found.violated, str(found)
         assert any(r.effect == "pipeline.precision" and r.actual > 0 for r in found.rows)
 
 
 def test_decisions_do_not_depend_on_the_machine(monkeypatch):
-    """A machine with a slow random generator, eight threads and little memory predicts other times for the same plan; decisions
-    made for it would find that a coarser form is not worth its error."""
+    """A machine with a slow random generator, eight threads and little memory predicts other times
+    for the same plan; decisions made for it would find that a coarser form is not worth its
+    error."""
     file = zonda.load("mustang2_cluster")
     made = zonda.plan(file, threads=1)
-    monkeypatch.setattr("zonda.core.plan.cost.calibrate", lambda: {"random": 300.0, "stream": 1.0, "python": 300.0})
+    monkeypatch.setattr(
+        "zonda.core.plan.cost.calibrate", lambda: {"random": 300.0, "stream": 1.0, "python": 300.0}
+    )
     slow = zonda.plan(file, threads=8, memory=1 << 29)
     assert slow.prediction.total > 10 * made.prediction.total
     assert slow.settings() == made.settings()

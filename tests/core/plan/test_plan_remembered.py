@@ -55,8 +55,14 @@ def test_what_it_depends_on_makes_it_anew(file, tmp_path, no_planning, monkeypat
     changes = [
         lambda: summary(file, drop=["poles"]),
         lambda: summary(file, prune_all=False),
-        lambda: summary(zonda.load(tmp_path / "mustang2_cluster.yaml", overrides=[*SHORT, "seed=1"])),
-        lambda: summary(zonda.load(tmp_path / "mustang2_cluster.yaml", overrides=[*SHORT, "AtmosphereLayers.pwv=3 mm"])),
+        lambda: summary(
+            zonda.load(tmp_path / "mustang2_cluster.yaml", overrides=[*SHORT, "seed=1"])
+        ),
+        lambda: summary(
+            zonda.load(
+                tmp_path / "mustang2_cluster.yaml", overrides=[*SHORT, "AtmosphereLayers.pwv=3 mm"]
+            )
+        ),
     ]
     for change in changes:
         with pytest.raises(RuntimeError, match="planned again"):
@@ -94,7 +100,10 @@ def test_an_input_map_of_other_content_and_the_same_size_and_time(file, tmp_path
         summary(file)
 
 
-@pytest.mark.parametrize("value", [None, [], {}, {"operators": 1}, {"operators": [], "runs": [], "settings": {}, "short": [[1]]}])
+@pytest.mark.parametrize(
+    "value",
+    [None, [], {}, {"operators": 1}, {"operators": [], "runs": [], "settings": {}, "short": [[1]]}],
+)
 def test_foreign_memories_count_as_none(value):
     with pytest.raises(ValidationError):
         remembered.SUMMARY.validate_python(value)
@@ -103,7 +112,9 @@ def test_foreign_memories_count_as_none(value):
 def test_others_operators_are_not_remembered(file, monkeypatch):
     from zonda.core.discovery import Found
 
-    monkeypatch.setattr(remembered, "discover", lambda group: [Found("Mine", "mine:Mine", "zonda-mine", "1")])
+    monkeypatch.setattr(
+        remembered, "discover", lambda group: [Found("Mine", "mine:Mine", "zonda-mine", "1")]
+    )
     assert remembered._key(file, {}) is None
 
 

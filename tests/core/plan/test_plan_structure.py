@@ -16,18 +16,32 @@ from zonda.core.signal import Component, Signal
 
 
 def kind(name, requires=(), provides=(), optional=(), base=Operator, **attributes):
-    sets = {"requires": frozenset(requires), "provides": frozenset(provides), "optional": frozenset(optional)}
-    step = "finalize" if issubclass(base, Output) else "observe" if "boresight" in provides else "exec"
+    sets = {
+        "requires": frozenset(requires),
+        "provides": frozenset(provides),
+        "optional": frozenset(optional),
+    }
+    step = (
+        "finalize" if issubclass(base, Output) else "observe" if "boresight" in provides else "exec"
+    )
     acts = {} if "configure" in attributes else {step: lambda self, *given: None}
-    acts |= {"measure": lambda self, stream, model=None: None} if attributes.get("couples") == "all" else {}
-    return type(name, (base,), {"__doc__": name, "__module__": __name__, **sets, **acts, **attributes})()
+    acts |= (
+        {"measure": lambda self, stream, model=None: None}
+        if attributes.get("couples") == "all"
+        else {}
+    )
+    return type(
+        name, (base,), {"__doc__": name, "__module__": __name__, **sets, **acts, **attributes}
+    )()
 
 
 POINT = kind("Point", provides={"boresight"})
 SKY = kind("Sky", {"boresight"}, {"sky"})
 AIR = kind("Air", {"boresight"}, {"atmosphere", "transmission"})
 NOISE = kind("Noise", {"boresight"}, {"white"})
-SUM = kind("Sum", (), {"signal"}, {"sky", "atmosphere", "transmission", "white", "pink"}, linear=True)
+SUM = kind(
+    "Sum", (), {"signal"}, {"sky", "atmosphere", "transmission", "white", "pink"}, linear=True
+)
 FILTER = kind("Filter", {"signal"}, {"signal"}, couples="all", linear=True)
 MAP = kind("Map", {"signal", "boresight"}, {"map"}, base=MapMaker, linear=True)
 HITS = kind("Hits", {"boresight"}, {"map"}, base=MapMaker, linear=True)
@@ -35,8 +49,16 @@ SPECTRUM = kind("Spectrum", {"signal"}, {"spectrum"})
 TOD = kind("Tod", {"signal"}, base=StreamOutput)
 SAVE = kind("Save", {"map"}, {"map_file"}, base=Output)
 FREEZES = kind("Freezes", {"signal"}, {"signal"}, couples="all", linear=True)
-TRANSFER = kind("Transfer", {"map"}, {"table"}, base=Output, signals=lambda self: (Signal(only=["sky"]),))
-FULL = kind("Full", {"map"}, {"table"}, base=Output, signals=lambda self: (Signal(only=["sky"], modes="full"),))
+TRANSFER = kind(
+    "Transfer", {"map"}, {"table"}, base=Output, signals=lambda self: (Signal(only=["sky"]),)
+)
+FULL = kind(
+    "Full",
+    {"map"},
+    {"table"},
+    base=Output,
+    signals=lambda self: (Signal(only=["sky"], modes="full"),),
+)
 RUNS = {"noiseless": {"only": ["sky"]}, "source_free": {"without": ["sky"]}}
 
 
@@ -55,7 +77,9 @@ def test_everything_is_needed_where_a_map_is_written():
 def test_a_component_that_a_step_declares_as_one_is_part_of_the_sum():
     """The step that forms the signal adds up every `Component`, whether it names it or not."""
     ground = kind("Ground", {"boresight"}, {Component("ground", "at the detector")})
-    found, runs, structure = acting(POINT, NOISE, ground, SUM, MAP, SAVE, runs={"clean": {"without": ["ground"]}})
+    found, runs, structure = acting(
+        POINT, NOISE, ground, SUM, MAP, SAVE, runs={"clean": {"without": ["ground"]}}
+    )
     assert found == {"Point", "Noise", "Ground", "Sum", "Map", "Save"}
     assert runs == {"clean"}
     assert not structure.rows
@@ -75,11 +99,18 @@ def test_a_run_without_a_map_bins_nothing():
 
 
 def test_each_further_signal_is_formed_filtered_and_mapped():
-    pipeline = Pipeline([POINT, SKY, AIR, NOISE, SUM, FILTER, MAP, SAVE], runs={"noiseless": {"only": ["sky"]}})
+    pipeline = Pipeline(
+        [POINT, SKY, AIR, NOISE, SUM, FILTER, MAP, SAVE], runs={"noiseless": {"only": ["sky"]}}
+    )
     found = work(pipeline, prune(pipeline))
     assert [signal.name for signal in found.signals] == ["", "noiseless"]
     once = dict.fromkeys(("Point", "Sky", "Air", "Noise", "Save"), 1.0)
-    assert found.times == {**once, "Sum": 1 + shares.FORM, "Filter": 1 + shares.FILTER, "Map": 1 + shares.MAP}
+    assert found.times == {
+        **once,
+        "Sum": 1 + shares.FORM,
+        "Filter": 1 + shares.FILTER,
+        "Map": 1 + shares.MAP,
+    }
 
 
 def test_a_remainder_is_not_formed():
@@ -91,7 +122,9 @@ def test_a_remainder_is_not_formed():
 
 
 def test_what_determines_singular_modes_stays():
-    """The modes come from everything in the stream: nothing above the filter is left out for a map below it."""
+    """The modes come from everything in the stream: nothing above the filter is left out for a map
+    below it.
+    """
     found, _, _ = acting(POINT, SKY, AIR, NOISE, SUM, FILTER, MAP, SAVE)
     assert {"Air", "Noise"} <= found
 
@@ -136,8 +169,12 @@ def test_keep(keep):
 
 @pytest.mark.parametrize("runs", [None, RUNS])
 def test_a_transfer_function_alone_is_a_run_of_the_sky(runs):
-    """Nothing random is drawn where only the sky's map is read, and the sky is not simulated twice."""
-    found, left, structure = acting(POINT, SKY, AIR, NOISE, SUM, FILTER, SPECTRUM, MAP, TRANSFER, runs=runs)
+    """Nothing random is drawn where only the sky's map is read, and the sky is not simulated
+    twice.
+    """
+    found, left, structure = acting(
+        POINT, SKY, AIR, NOISE, SUM, FILTER, SPECTRUM, MAP, TRANSFER, runs=runs
+    )
     assert found == {"Point", "Sky", "Sum", "Filter", "Map", "Transfer"}
     assert not left
     assert structure.instead == ("noiseless" if runs else "_sky")
@@ -162,7 +199,9 @@ def test_without_singular_modes_there_is_nothing_to_keep():
     found, runs, _ = acting(POINT, SKY, NOISE, SUM, MAP, FULL)
     assert found == {"Point", "Sky", "Sum", "Map", "Full"}
     assert not runs
-    found, runs, _ = acting(POINT, SKY, AIR, NOISE, SUM, MAP, FULL)  # but the transmission of the air
+    found, runs, _ = acting(
+        POINT, SKY, AIR, NOISE, SUM, MAP, FULL
+    )  # but the transmission of the air
     assert found == {"Point", "Sky", "Air", "Sum", "Map", "Full"}
     assert runs == {"_sky_full"}
 
@@ -201,13 +240,18 @@ operators:
     ("end", "without"),
     [
         ("  - BinMap\n  - SaveTOD\n", {"BinMap"}),
-        ("  - BinMap: {contents: hits}\n  - SaveMap\n", {"SkyMap", "WhiteNoise", "Efficiency", "HighpassFilter"}),
+        (
+            "  - BinMap: {contents: hits}\n  - SaveMap\n",
+            {"SkyMap", "WhiteNoise", "Efficiency", "HighpassFilter"},
+        ),
         ("  - BinMap\n  - TransferFunction\n", {"WhiteNoise"}),
         ("  - BinMap\n  - SaveMap\n", set()),
     ],
 )
 def test_what_runs_of_a_file(end, without, tmp_path):
-    """No map asked for: nothing is binned. A map of hits: no noise. The steps that are left take time, the others none."""
+    """No map asked for: nothing is binned. A map of hits: no noise. The steps that are left take
+    time, the others none.
+    """
     from pathlib import Path
 
     sky = Path(__file__).parents[3] / "pipelines" / "data" / "merging_cluster.fits"
@@ -215,7 +259,9 @@ def test_what_runs_of_a_file(end, without, tmp_path):
     planned = plan_band(file).apply(file)
     assert {s.key for s in file.steps} - {s.key for s in planned.steps} == without
     data = planned.pipeline().run(planned.scene(), output=tmp_path, threads=1)
-    assert {label for label, _, _ in data.provenance["timings"]} == {s.key for s in file.steps} - without
+    assert {label for label, _, _ in data.provenance["timings"]} == {
+        s.key for s in file.steps
+    } - without
 
 
 PLATE = kind("Plate", {"boresight"}, configure=lambda self, observation: None)
@@ -224,7 +270,9 @@ OWN_FILE = kind("OwnFile", {"signal"}, exec=lambda self, block, state: None)
 
 @pytest.mark.parametrize("step", [PLATE, OWN_FILE])
 def test_a_step_that_provides_nothing_is_no_output_but_where_it_says_so(step):
-    """It changes observations, or may do anything: the products are the output, as where nothing is saved at all."""
+    """It changes observations, or may do anything: the products are the output, as where nothing is
+    saved at all.
+    """
     found, runs, _ = acting(POINT, SKY, AIR, NOISE, SUM, step, FILTER, MAP, runs=RUNS)
     assert found == {"Point", step.label, "Sky", "Air", "Noise", "Sum", "Filter", "Map"}
     assert runs == set(RUNS)
@@ -238,7 +286,9 @@ def test_a_step_that_writes_streams_says_so():
 
 
 def test_what_changes_observations_stays_where_the_sky_alone_takes_the_place_of_everything():
-    """A plate turns the polarization of the sky alone, too; it is not a reason to simulate the noise."""
+    """A plate turns the polarization of the sky alone, too; it is not a reason to simulate the
+    noise.
+    """
     found, _, structure = acting(POINT, PLATE, SKY, NOISE, SUM, MAP, TRANSFER)
     assert structure.instead
     assert found == {"Point", "Plate", "Sky", "Sum", "Map", "Transfer"}

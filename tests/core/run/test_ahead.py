@@ -1,4 +1,6 @@
-"""The next observation is prepared while one is executed: the same bits, order, errors and memory as one after the other."""
+"""The next observation is prepared while one is executed: the same bits, order, errors and memory
+as one after the other.
+"""
 
 import threading
 from typing import ClassVar
@@ -27,7 +29,20 @@ class Point(Operator):
         for k in range(3):
             plane, t = scene.instrument.focalplane(), np.arange(3000.0)
             data.observations.append(
-                Observation(f"scan-{k}", k, scene.site, scene.instrument, plane, scene.time, t, 1.0, q, q, (0, 0), scene.seed)
+                Observation(
+                    f"scan-{k}",
+                    k,
+                    scene.site,
+                    scene.instrument,
+                    plane,
+                    scene.time,
+                    t,
+                    1.0,
+                    q,
+                    q,
+                    (0, 0),
+                    scene.seed,
+                )
             )
 
 
@@ -45,7 +60,9 @@ class Log:
 
 
 class Maker(Operator):
-    """Makes a signal from what it drew in `prepare`; where it ``waits``, `exec` goes on once the next observation is prepared."""
+    """Makes a signal from what it drew in `prepare`; where it ``waits``, `exec` goes on once the
+    next observation is prepared.
+    """
 
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     log: ClassVar[Log | None] = None
@@ -61,7 +78,9 @@ class Maker(Operator):
     def prepare(self, observation):
         self.at("prepare", observation)
         observation.tally.count(self.label, "prepared", 1)
-        drawn = np.random.default_rng(observation.index).normal(size=observation.n_samples) * (observation.index + 1)
+        drawn = np.random.default_rng(observation.index).normal(size=observation.n_samples) * (
+            observation.index + 1
+        )
         if self.log:
             self.log.prepared[observation.index].set()
         return drawn
@@ -97,7 +116,9 @@ class Total(Operator):
 
 @pytest.fixture(scope="module")
 def scene():
-    return zonda.Scene(site="green_bank", instrument="hexagonal_array", time="2024-11-25T07:00", seed=3)
+    return zonda.Scene(
+        site="green_bank", instrument="hexagonal_array", time="2024-11-25T07:00", seed=3
+    )
 
 
 @pytest.fixture
@@ -113,7 +134,11 @@ def test_same_bits_and_tally_and_really_ahead(scene, log, monkeypatch):
     log.__init__()
     monkeypatch.setattr(Maker, "waits", True)
     beside = Pipeline([Point(), Maker(), Total()]).run(scene, threads=2)
-    assert [log.threads["prepare", k].partition("_")[0] for k in range(3)] == ["MainThread", "ahead", "ahead"]
+    assert [log.threads["prepare", k].partition("_")[0] for k in range(3)] == [
+        "MainThread",
+        "ahead",
+        "ahead",
+    ]
     for a, b in zip(alone.products["total"], beside.products["total"], strict=True):
         assert np.array_equal(a, b)
     assert list(alone.tally) == list(beside.tally)

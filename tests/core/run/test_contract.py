@@ -1,4 +1,6 @@
-"""A class that would do nothing, or whose declarations are none, is refused when the pipeline is built."""
+"""A class that would do nothing, or whose declarations are none, is refused when the pipeline is
+built.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,15 @@ STEPS = (zonda.PointingDaisy(scan_duration="4 s"), zonda.WhiteNoise(), zonda.Eff
 def made(**attributes: Any) -> Any:
     """An operator with these attributes; None: without it."""
     own = {
-        "requires": frozenset({"signal"}), "provides": frozenset({"signal"}), "exec": lambda self, block, state: None,
-        "__doc__": "A step.", "__module__": __name__,
-    } | attributes  # fmt: skip
-    return type(zonda.Operator)("Mine", (zonda.Operator,), {k: v for k, v in own.items() if v is not None})
+        "requires": frozenset({"signal"}),
+        "provides": frozenset({"signal"}),
+        "exec": lambda self, block, state: None,
+        "__doc__": "A step.",
+        "__module__": __name__,
+    } | attributes
+    return type(zonda.Operator)(
+        "Mine", (zonda.Operator,), {k: v for k, v in own.items() if v is not None}
+    )
 
 
 def method(*arguments: str) -> Any:
@@ -31,7 +38,9 @@ def test_a_method_that_takes_no_self_is_a_method() -> None:
     def emptied(block: Any, state: Any) -> None:
         block.detdata["signal"][...] = 0
 
-    data = zonda.Pipeline([*STEPS, made(exec=staticmethod(emptied))(), zonda.BinMap()]).run(scene(camera(4)))
+    data = zonda.Pipeline([*STEPS, made(exec=staticmethod(emptied))(), zonda.BinMap()]).run(
+        scene(camera(4))
+    )
     signal = data["map"].signal
     assert (signal[data["map"].hits > 0] == 0).all()
 
@@ -39,16 +48,28 @@ def test_a_method_that_takes_no_self_is_a_method() -> None:
 @pytest.mark.parametrize(
     ("attributes", "said"),
     [
-        ({"exec": None, "process": method("block")}, "overrides none of observe.*is process what the step does"),
+        (
+            {"exec": None, "process": method("block")},
+            "overrides none of observe.*is process what the step does",
+        ),
         ({"exec": None}, "overrides none of observe"),
-        ({"exec": None, "prepare": method("observation"), "apply": method("x")}, "provides signal, but.*is apply what"),
-        ({"exec": None, "collect": method("data", "observation", "state")}, "provides signal, but overrides no exec"),
+        (
+            {"exec": None, "prepare": method("observation"), "apply": method("x")},
+            "provides signal, but.*is apply what",
+        ),
+        (
+            {"exec": None, "collect": method("data", "observation", "state")},
+            "provides signal, but overrides no exec",
+        ),
         (
             {"exec": None, "provides": frozenset({DUST}), "check": method("data")},
             "provides dust",
         ),
         ({"couples": "all"}, "couples all samples, but overrides no measure"),
-        ({"requires": ("signal",)}, r'requires is a frozenset of names, not \(.*write requires = frozenset\(\{"signal"\}\)'),
+        (
+            {"requires": ("signal",)},
+            r'requires is a frozenset of names, not \(.*write requires = frozenset\(\{"signal"\}\)',
+        ),
         ({"requires": ["signal", "white"]}, r'write requires = frozenset\(\{"signal", "white"\}\)'),
         ({"requires": "signal"}, "requires is a frozenset of names, not 'signal'"),
         ({"requires": frozenset({1})}, "requires is a frozenset of names"),
@@ -58,7 +79,10 @@ def test_a_method_that_takes_no_self_is_a_method() -> None:
         ({"couples": "detector"}, "couples is one of.*detectors"),
         ({"linear": "yes"}, "linear is True or False"),
         ({"knows_means": 1}, "knows_means is True or False"),
-        ({"exec": method("block")}, r"exec does not take block, state.*def exec\(self, block, state\)"),
+        (
+            {"exec": method("block")},
+            r"exec does not take block, state.*def exec\(self, block, state\)",
+        ),
         ({"prepare": method()}, "prepare does not take observation"),
         ({"halo": method()}, "halo does not take observation"),
         ({"collect": method("data")}, "collect does not take data, observation, state"),
@@ -87,9 +111,19 @@ def test_a_class_that_cannot_be_made(attributes: Any, said: str) -> None:
     "attributes",
     [
         {"provides": {"signal"}},
-        {"provides": frozenset(), "requires": frozenset(), "exec": None, "configure": method("observation")},
+        {
+            "provides": frozenset(),
+            "requires": frozenset(),
+            "exec": None,
+            "configure": method("observation"),
+        },
         {"provides": frozenset({"figure"}), "exec": None, "finalize": method("data")},
-        {"provides": frozenset({"found"}), "exec": None, "couples": "all", "measure": method("stream", "model=None")},
+        {
+            "provides": frozenset({"found"}),
+            "exec": None,
+            "couples": "all",
+            "measure": method("stream", "model=None"),
+        },
         {"exec": lambda self, *given: None},
     ],
 )
@@ -106,5 +140,7 @@ def test_a_class_inherits_what_it_does() -> None:
 
 def test_what_exec_returns_is_not_lost_without_a_word() -> None:
     step = made(exec=lambda self, block, state: 2 * block.detdata["signal"])()
-    with pytest.raises(PipelineError, match=r"(?s)Mine: exec returned ndarray, which nobody takes.*\[\.\.\.\]"):
+    with pytest.raises(
+        PipelineError, match=r"(?s)Mine: exec returned ndarray, which nobody takes.*\[\.\.\.\]"
+    ):
         zonda.Pipeline([*STEPS, step]).run(scene(camera(3)), threads=1)

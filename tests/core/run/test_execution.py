@@ -61,7 +61,9 @@ class Source(Operator):
         d = np.arange(block.detectors.start, block.detectors.stop)[:, None]
         t = np.arange(block.samples.start, block.samples.stop)
         block.new("signal")[...] += np.sin(0.37 * d + 0.01 * t) + np.cos(1.3 * d * t)
-        block.means["signal"] = SmoothField.constant(np.full(block.observation.n_detectors, 5.0), block.observation.n_samples)
+        block.means["signal"] = SmoothField.constant(
+            np.full(block.observation.n_detectors, 5.0), block.observation.n_samples
+        )
 
 
 class Smooth(Operator):
@@ -80,7 +82,10 @@ class Smooth(Operator):
         out, hits = np.zeros_like(signal), np.zeros(signal.shape[1])
         n = signal.shape[1]
         for k in (-self.width, 0, self.width):
-            to, of = slice(max(0, -k), max(0, min(n, n - k))), slice(max(0, k), max(0, min(n, n + k)))
+            to, of = (
+                slice(max(0, -k), max(0, min(n, n - k))),
+                slice(max(0, k), max(0, min(n, n + k))),
+            )
             out[:, to] += signal[:, of]
             hits[to] += 1
         block.detdata["signal"][...] = out / hits
@@ -127,7 +132,9 @@ class Scale(Operator):
 
     def measure(self, stream, model=None):
         assert stream.means["signal"].weights[0, 0] == 5.0
-        return np.sqrt(sum(float(np.sum(row.astype(float) ** 2)) for row in stream.array) / stream.array.size)
+        return np.sqrt(
+            sum(float(np.sum(row.astype(float) ** 2)) for row in stream.array) / stream.array.size
+        )
 
     def exec(self, block, state):
         block.detdata["signal"] /= block.dtype(state)
@@ -149,11 +156,22 @@ class Sink(Operator):
         data.products["seen"] = state
 
 
-CHAIN = [Source(), Smooth(width=3), Demean(), Smooth(width=700), FocalPlaneMean(), Smooth(width=2500), Scale(), Sink()]
+CHAIN = [
+    Source(),
+    Smooth(width=3),
+    Demean(),
+    Smooth(width=700),
+    FocalPlaneMean(),
+    Smooth(width=2500),
+    Scale(),
+    Sink(),
+]
 
 
 def execute(operators, obs, room=None, **settings):
-    """The execution, the signal it keeps, the products. ``room``: bytes that streams may take, where not half of the memory."""
+    """The execution, the signal it keeps, the products. ``room``: bytes that streams may take,
+    where not half of the memory.
+    """
     operators = [o.model_copy() for o in operators]
     for i, o in enumerate(operators):
         o._label = f"{type(o).__name__}.{i}"
@@ -163,7 +181,9 @@ def execute(operators, obs, room=None, **settings):
         if room is not None:
             keeps = lambda self, stage, size, held, later: held + size <= room  # noqa: E731
             stack.enter_context(mock.patch.object(Schedule, "_keeps", keeps))
-            stack.enter_context(mock.patch.object(Store, "fits", lambda self, size: self._in_use + size <= room))
+            stack.enter_context(
+                mock.patch.object(Store, "fits", lambda self, size: self._in_use + size <= room)
+            )
         execution.run(data)
     return execution, obs.detdata["signal"], data
 
@@ -177,7 +197,9 @@ def reference(obs, chain=CHAIN):
     for operator in chain[:-1]:
         state = None
         if operator.couples == "all":
-            state = operator.measure(type("S", (), {"array": block.detdata["signal"], "means": block.means})())
+            state = operator.measure(
+                type("S", (), {"array": block.detdata["signal"], "means": block.means})()
+            )
         operator.exec(block, state)
     return block.total("signal")
 
@@ -185,7 +207,12 @@ def reference(obs, chain=CHAIN):
 def test_blocks_halos_threads_and_spilling_change_no_bit():
     want = reference(observation())
     size = want.size * 4
-    for memory, threads in ((1 << 30, 1), (3 * size, 3), (int(1.9 * size), 1), (int(1.9 * size), 3)):
+    for memory, threads in (
+        (1 << 30, 1),
+        (3 * size, 3),
+        (int(1.9 * size), 1),
+        (int(1.9 * size), 3),
+    ):
         for prefer in ("spilled", "again"):
             obs = observation()
             got, data = run(CHAIN, obs, memory=memory * threads, threads=threads, prefer=prefer)
@@ -233,7 +260,10 @@ class Level(Operator):
             total = np.zeros(stream.shape[0])
 
             def tiles(detectors, samples, part):
-                return [part[:, k : k + TILE_SAMPLES].sum(axis=1, dtype=float) for k in range(0, part.shape[1], TILE_SAMPLES)]
+                return [
+                    part[:, k : k + TILE_SAMPLES].sum(axis=1, dtype=float)
+                    for k in range(0, part.shape[1], TILE_SAMPLES)
+                ]
 
             for detectors, samples, parts in stream.sweep(tiles):
                 seen[detectors, samples] += 1
@@ -259,7 +289,9 @@ planning.register(LevelPlanning, name="Level")
 
 
 class Square(Operator):
-    """Add the square of the signal, kept beside it, so that a second stream comes into being piece by piece."""
+    """Add the square of the signal, kept beside it, so that a second stream comes into being piece
+    by piece.
+    """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"square", "signal"})
@@ -273,7 +305,9 @@ class Square(Operator):
 
 @pytest.mark.parametrize("coupled", [Demean(), FocalPlaneMean()])
 def test_pieces_of_a_block_change_no_bit(coupled):
-    """Operators without coupling that share a segment with a coupled one, before and after the stream was stored whole."""
+    """Operators without coupling that share a segment with a coupled one, before and after the
+    stream was stored whole.
+    """
     chain = [Source(), Square(), coupled, Scale(), Square(), coupled, Sink()]
     assert observation().n_samples > 2 * PIECE
     assert [len(s.split()[0]) for s in cut(chain, observation())] == [2, 2]
@@ -286,22 +320,45 @@ def test_pieces_of_a_block_change_no_bit(coupled):
 
 CHAINS_MADE_AGAIN = {
     "whole scans": [Tell(), Peek(), Demean(), Peek(), Level(), Sink()],
-    "margins": [Tell(), Smooth(width=40), Peek(), Level(), Smooth(width=4000), Level(), Peek(), Sink()],
-    "focal plane": [Tell(), Square(), Peek(), Level(), FocalPlaneMean(), Square(), Peek(), Level(), Sink()],
+    "margins": [
+        Tell(),
+        Smooth(width=40),
+        Peek(),
+        Level(),
+        Smooth(width=4000),
+        Level(),
+        Peek(),
+        Sink(),
+    ],
+    "focal plane": [
+        Tell(),
+        Square(),
+        Peek(),
+        Level(),
+        FocalPlaneMean(),
+        Square(),
+        Peek(),
+        Level(),
+        Sink(),
+    ],
 }
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("name", CHAINS_MADE_AGAIN)
 def test_streams_made_again_change_no_bit_and_are_counted_once(name, threads):
-    """Steps that make no stream see every sample once, in whichever reading comes first; so does the tally."""
+    """Steps that make no stream see every sample once, in whichever reading comes first; so does
+    the tally.
+    """
     chain = CHAINS_MADE_AGAIN[name]
     want, _ = run(chain, observation(), memory=1 << 30)
     size = 4 * want.size
     for prefer, said in (("again", "made again"), ("spilled", "spilled")):
         obs = observation()
         memory = threads * int(1.9 * size)
-        execution, got, data = execute(chain, obs, memory=memory, threads=threads, prefer=prefer, room=size // 2)
+        execution, got, data = execute(
+            chain, obs, memory=memory, threads=threads, prefer=prefer, room=size // 2
+        )
         assert np.array_equal(got, want)
         assert any(said in what for _, what, _ in obs.tally)
         assert all((seen == 1).all() for seen in data.products.values())
@@ -316,17 +373,30 @@ def test_a_stream_wanted_whole_is_spilled_or_refused(monkeypatch):
     run(chain, obs, memory=int(1.9 * size), prefer="again")
     assert any("spilled" in what for _, what, _ in obs.tally)
     monkeypatch.setattr("zonda.core.run.streams.free_disk", lambda: 1000)
-    with pytest.raises(PipelineError, match=r"(?s)neither in memory nor on the disk.*Scale.2 reads it as a whole.*--memory 16MB"):
+    with pytest.raises(
+        PipelineError,
+        match=r"(?s)neither in memory nor on the disk.*Scale.2 reads it as a whole.*--memory 16MB",
+    ):
         run(chain, observation(), memory=int(1.9 * size))
     level = [Source(), Demean(), Level(), Sink()]
-    run(level, observation(), memory=int(1.9 * size), prefer="spilled")  # the disk has no room: made again
+    run(
+        level, observation(), memory=int(1.9 * size), prefer="spilled"
+    )  # the disk has no room: made again
 
 
 def test_the_quicker_way_is_taken(monkeypatch):
     """Equation (1) of `core.run.streams`: 2 N b / D against k N c / threads."""
     # by disk 2 s; to make it again twice, 1.8 or 2.2 s, on two threads 1.1 s
     for again, how in ((0.9, "again"), (1.1, "spilled"), (0.55, "again")):
-        found, why = choose("s", 4000, spill_seconds=2.0, again=(2, again), hindrance="", prefer=None, refusal=("", ""))
+        found, why = choose(
+            "s",
+            4000,
+            spill_seconds=2.0,
+            again=(2, again),
+            hindrance="",
+            prefer=None,
+            refusal=("", ""),
+        )
         assert found == how
         assert why == f"4e-06 GB: about 2 s by disk, {2 * again:.2g} s to make 2 times more"
 
@@ -337,7 +407,9 @@ def test_the_ceiling_of_the_process_leaves_what_is_not_held_already():
     obs = observation()
     size = 4 * obs.n_detectors * obs.n_samples
     chain = [Source(), Demean(), Level(), Sink()]
-    execution, got, _ = execute(chain, obs, memory=1 << 30, ceiling=resident_memory() + 3 * size // 2)
+    execution, got, _ = execute(
+        chain, obs, memory=1 << 30, ceiling=resident_memory() + 3 * size // 2
+    )
     assert execution.settings.memory <= 2 * size
     assert np.array_equal(got, run(chain, observation())[0])
     with pytest.raises(PipelineError, match="raise --memory to"):
@@ -353,14 +425,25 @@ def test_a_stream_made_again_has_no_array():
 
     obs = observation()
     with pytest.raises(PipelineError, match="nowhere held as a whole"):
-        run([Source(), Greedy(), Sink()], obs, memory=int(1.9 * 4 * obs.n_detectors * obs.n_samples), prefer="again")
+        run(
+            [Source(), Greedy(), Sink()],
+            obs,
+            memory=int(1.9 * 4 * obs.n_detectors * obs.n_samples),
+            prefer="again",
+        )
 
 
 def test_margins_that_reach_the_ends_leave_the_source_alone():
-    """A block with margins can be the whole scan: it must not be filtered where other blocks read it."""
+    """A block with margins can be the whole scan: it must not be filtered where other blocks read
+    it.
+    """
     chain = [Source(), Smooth(width=20)]
     want, _ = run(chain, observation(16, 3 * TILE_SAMPLES + 321), memory=1 << 30)
-    got, _ = run(chain, observation(16, 3 * TILE_SAMPLES + 321), memory=2 * 4 * 4 * 16 * 3 * TILE_SAMPLES + 1000)
+    got, _ = run(
+        chain,
+        observation(16, 3 * TILE_SAMPLES + 321),
+        memory=2 * 4 * 4 * 16 * 3 * TILE_SAMPLES + 1000,
+    )
     assert np.array_equal(got, want)
 
 
@@ -372,7 +455,9 @@ def test_spilling_is_stated():
 
 
 def test_budget_too_small_says_what_is_needed():
-    with pytest.raises(PipelineError, match=r"(?s)one block of 16 detectors needs .* raise --memory"):
+    with pytest.raises(
+        PipelineError, match=r"(?s)one block of 16 detectors needs .* raise --memory"
+    ):
         run(CHAIN, observation(), memory=100_000)
 
 
@@ -392,10 +477,12 @@ def test_segments():
         (1, "sample", 2500),
         (2, "sample", 0),
     ]
-    assert [s.operators[0].couples for s in cut([Source(), Demean(), Scale(), Sink()], observation())] == ["sample", "all"]
-    assert [len(s.operators) for s in cut([Source(), Demean(), Smooth(), Sink()], observation())] == [
-        4
-    ]  # whole scans need no halo
+    assert [
+        s.operators[0].couples for s in cut([Source(), Demean(), Scale(), Sink()], observation())
+    ] == ["sample", "all"]
+    assert [
+        len(s.operators) for s in cut([Source(), Demean(), Smooth(), Sink()], observation())
+    ] == [4]  # whole scans need no halo
 
 
 def test_failure_discards_what_was_begun():

@@ -1,4 +1,6 @@
-"""Memory is forecast by the schedule that is followed, and what does not fit is refused before anything is prepared."""
+"""Memory is forecast by the schedule that is followed, and what does not fit is refused before
+anything is prepared.
+"""
 
 import re
 from dataclasses import replace
@@ -7,7 +9,16 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from tests.core.run.test_execution import CHAIN, Demean, Level, Scale, Sink, Source, execute, observation
+from tests.core.run.test_execution import (
+    CHAIN,
+    Demean,
+    Level,
+    Scale,
+    Sink,
+    Source,
+    execute,
+    observation,
+)
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
@@ -24,13 +35,20 @@ def labelled(steps):
     return Chain(steps)
 
 
-@pytest.mark.parametrize("chain", [[Source(), Demean(), Level(), Sink()], [Source(), Demean(), Scale(), Sink()], CHAIN])
+@pytest.mark.parametrize(
+    "chain", [[Source(), Demean(), Level(), Sink()], [Source(), Demean(), Scale(), Sink()], CHAIN]
+)
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("share", [1.9, 4.0, 40.0])
 def test_what_is_held_is_what_was_forecast(chain, threads, share):
-    """The ledger's peak stays below the forecast, and that below the budget; the least that is forecast is enough."""
+    """The ledger's peak stays below the forecast, and that below the budget; the least that is
+    forecast is enough.
+    """
     obs = observation()
-    settings = {"memory": int(share * threads * 4 * obs.n_detectors * obs.n_samples), "threads": threads}
+    settings = {
+        "memory": int(share * threads * 4 * obs.n_detectors * obs.n_samples),
+        "threads": threads,
+    }
     found = schedule(labelled(chain), obs, Settings(**settings))
     # the bench keeps the last stream besides
     kept = 4 * obs.n_detectors * obs.n_samples
@@ -45,7 +63,11 @@ def test_what_is_held_is_what_was_forecast(chain, threads, share):
 def test_the_schedule_is_followed():
     """What a run does with its streams is what its schedule says, with the same blocks."""
     obs = observation()
-    execution, _, _ = execute([Source(), Demean(), Level(), Sink()], obs, memory=int(1.9 * 4 * obs.n_detectors * obs.n_samples))
+    execution, _, _ = execute(
+        [Source(), Demean(), Level(), Sink()],
+        obs,
+        memory=int(1.9 * 4 * obs.n_detectors * obs.n_samples),
+    )
     planned = execution.schedule.planned
     assert [p.how for p in planned] == ["spilled", "kept"]
     assert execution.schedule.elsewhere == ("signal spilled to disk",)
@@ -83,7 +105,10 @@ def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
     obs, settings = observation(), Settings(threads=2, asked=2 * 10**9)
     libraries(monkeypatch)
     with pytest.raises(
-        PipelineError, match=r"(?s)3\.23 GB: Heavy\.1 3 GB.*budget is 2 GB.*use --memory 33..MB.*Heavy.1: choose a l"
+        PipelineError,
+        match=(
+            r"(?s)3\.23 GB: Heavy\.1 3 GB.*budget is 2 GB.*use --memory 33..MB.*Heavy.1: choose a l"
+        ),
     ):
         divided(chain, obs, settings, "test")
     libraries(monkeypatch, 10**9)
@@ -96,10 +121,17 @@ def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
 
 
 def test_blocks_that_are_too_large_are_worked_on_by_fewer_threads(monkeypatch):
-    """Blocks of 4 threads take 774 MB, of one 193.5 MB: 630 MB less the libraries' 230 MB have room for two of them."""
+    """Blocks of 4 threads take 774 MB, of one 193.5 MB: 630 MB less the libraries' 230 MB have room
+    for two of them.
+    """
     libraries(monkeypatch)
     chain = labelled([Source(), Demean(), Sink()])
-    assert divided(chain, observation(16, 1_000_000), Settings(threads=4, asked=630 * 10**6), "test").threads == 2
+    assert (
+        divided(
+            chain, observation(16, 1_000_000), Settings(threads=4, asked=630 * 10**6), "test"
+        ).threads
+        == 2
+    )
 
 
 def test_the_figure_that_a_refusal_names_works(monkeypatch):
@@ -107,7 +139,9 @@ def test_the_figure_that_a_refusal_names_works(monkeypatch):
     libraries(monkeypatch)
     with pytest.raises(PipelineError, match=r"blocks on 1 thread 19\d MB") as refused:
         divided(chain, obs, Settings(threads=4, asked=3 * 10**8), "test")
-    found = re.search(r"use --memory (\d+)MB; or split the scan into shorter ones", refused.value.cure)
+    found = re.search(
+        r"use --memory (\d+)MB; or split the scan into shorter ones", refused.value.cure
+    )
     assert found is not None
     settings = divided(chain, obs, Settings(threads=4, asked=int(found[1]) * 10**6), "test")
     assert settings.threads == 1
@@ -121,7 +155,12 @@ def test_no_cure_is_named_that_cannot_work(monkeypatch):
     for free, cure in ((10**10, r"use --memory \d+MB"), (10**8, "use a machine with more memory")):
         libraries(monkeypatch, free)
         with pytest.raises(PipelineError) as refused:
-            divided(labelled([Source(), Demean(), Sink()]), obs, Settings(threads=4, asked=BASE // 2), "test")
+            divided(
+                labelled([Source(), Demean(), Sink()]),
+                obs,
+                Settings(threads=4, asked=BASE // 2),
+                "test",
+            )
         assert re.fullmatch(cure, refused.value.cure)
 
 

@@ -1,4 +1,6 @@
-"""Bands in step: `CommonModeFilter` with `group: all` finds the modes of the detectors of all bands together."""
+"""Bands in step: `CommonModeFilter` with `group: all` finds the modes of the detectors of all bands
+together.
+"""
 
 from typing import Any, ClassVar
 
@@ -17,13 +19,25 @@ PLANES = ("signal", "hits", "weights")
 
 def scene(count: int = 2, **changes: Any) -> zonda.Scene:
     settings = {
-        "name": "camera", "telescope": {"name": "dish", "diameter": "6 m"}, "detectors": 19, "field_of_view": "20 arcmin",
-        "main_beam_efficiency": 0.8, "illumination_efficiency": 0.9, "sample_rate": "50 Hz",
-        **({"bands": [dict(b) for b in BANDS]} if count > 1 else {
-            "band": {k: BANDS[0][k] for k in ("name", "low", "high")}, "net": BANDS[0]["net"]}),
-    } | changes  # fmt: skip
+        "name": "camera",
+        "telescope": {"name": "dish", "diameter": "6 m"},
+        "detectors": 19,
+        "field_of_view": "20 arcmin",
+        "main_beam_efficiency": 0.8,
+        "illumination_efficiency": 0.9,
+        "sample_rate": "50 Hz",
+        **(
+            {"bands": [dict(b) for b in BANDS]}
+            if count > 1
+            else {"band": {k: BANDS[0][k] for k in ("name", "low", "high")}, "net": BANDS[0]["net"]}
+        ),
+    } | changes
     return zonda.Scene(
-        site="llano_de_chajnantor", instrument=zonda.Instrument(**settings), time="2022-08-01T23:00", target="260d -10d", seed=3
+        site="llano_de_chajnantor",
+        instrument=zonda.Instrument(**settings),
+        time="2022-08-01T23:00",
+        target="260d -10d",
+        seed=3,
     )
 
 
@@ -41,7 +55,9 @@ class Poison(zonda.Operator):
 
 
 class Opaque(zonda.Operator):
-    """Flags samples of the second band alone, as `Efficiency` does where the atmosphere is opaque in it."""
+    """Flags samples of the second band alone, as `Efficiency` does where the atmosphere is opaque
+    in it.
+    """
 
     requires = frozenset({"signal"})
     provides = frozenset({"signal"})
@@ -54,11 +70,15 @@ class Opaque(zonda.Operator):
         pass
 
 
-def pipeline(*filters: zonda.Operator, scans: int = 1, precision: Any = "float32") -> zonda.Pipeline:
+def pipeline(
+    *filters: zonda.Operator, scans: int = 1, precision: Any = "float32"
+) -> zonda.Pipeline:
     values = np.zeros((64, 64))
     values[30, 34] = 1e-4
     steps = [
-        zonda.PointingDaisy(radius="15 arcmin", speed="10 arcmin/s", scan_duration="30 s", scans=scans),
+        zonda.PointingDaisy(
+            radius="15 arcmin", speed="10 arcmin/s", scan_duration="30 s", scans=scans
+        ),
         zonda.SkyMap(map=values, unit="K_CMB", pixel_size="30 arcsec", centre="target"),
         zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="2 %"),
         zonda.WhiteNoise(),
@@ -67,7 +87,9 @@ def pipeline(*filters: zonda.Operator, scans: int = 1, precision: Any = "float32
         *filters,
         zonda.BinMap(pixel="1 arcmin", crosslinking=True),
     ]
-    return zonda.Pipeline(steps, runs={"noiseless": {"only": ["sky"], "modes": "full"}}, precision=precision)
+    return zonda.Pipeline(
+        steps, runs={"noiseless": {"only": ["sky"], "modes": "full"}}, precision=precision
+    )
 
 
 def streams(data: Any, name: str = "signal") -> list[Any]:
@@ -82,12 +104,16 @@ def before() -> Any:
 
 @pytest.mark.parametrize("method", ["svd", "mean"])
 def test_the_mode_is_that_of_all_detectors(before: Any, method: str) -> None:
-    """Equation (1) on the streams of both bands, one above the other, by numpy; equation (3) on the signal of the sky alone.
+    """Equation (1) on the streams of both bands, one above the other, by numpy; equation (3) on the
+    signal of the sky alone.
 
-    The iteration ends at a residual of 1e-9 sigma^2, so that u errs by less than 1e-9 sigma_1^2 / (sigma_1^2 - sigma_2^2), here
-    below 1e-8, and the streams by this share of the mode, 0.1 K: 1e-9 K.
+    The iteration ends at a residual of 1e-9 sigma^2, so that u errs by less than 1e-9 sigma_1^2 /
+    (sigma_1^2 - sigma_2^2), here below 1e-8, and the streams by this share of the mode, 0.1 K: 1e-9
+    K.
     """
-    step = zonda.CommonModeFilter(group="all", method=method, **({"residual": 1e-9} if method == "svd" else {}))
+    step = zonda.CommonModeFilter(
+        group="all", method=method, **({"residual": 1e-9} if method == "svd" else {})
+    )
     found = pipeline(step, precision="float64").run(scene(), keep=["signal", "signal/noiseless"])
     good = before.observations[0].good_samples
     whole = np.concatenate(streams(before))
@@ -106,14 +132,19 @@ def test_the_mode_is_that_of_all_detectors(before: Any, method: str) -> None:
 
 def test_bits_depend_neither_on_threads_nor_on_memory() -> None:
     """Streams of 4 MB are kept, or spilled and made again."""
-    run, fast = pipeline(zonda.CommonModeFilter(group="all"), scans=2).run, scene(detectors=169, sample_rate="200 Hz")
+    run, fast = (
+        pipeline(zonda.CommonModeFilter(group="all"), scans=2).run,
+        scene(detectors=169, sample_rate="200 Hz"),
+    )
     first, tight = run(fast, threads=1), run(fast, threads=1, memory=24_000_000)
     assert any("spilled" in key[1] or "made again" in key[1] for key in tight.tally)
     assert not any("spilled" in key[1] or "made again" in key[1] for key in first.tally)
     for other in (run(fast, threads=2), tight):
         for name in ("map_f090", "map_f150", "noiseless/map_f150"):
             for plane in PLANES:
-                np.testing.assert_array_equal(getattr(first[name], plane), getattr(other[name], plane))
+                np.testing.assert_array_equal(
+                    getattr(first[name], plane), getattr(other[name], plane)
+                )
     by_band = pipeline(zonda.CommonModeFilter(), scans=2).run(fast, threads=1)
     assert not np.array_equal(first["map_f150"].signal, by_band["map_f150"].signal, equal_nan=True)
 
@@ -126,7 +157,9 @@ def test_a_dead_detector_of_one_band_is_flagged_there() -> None:
     assert np.isfinite(data["map_f150"].signal[data["map_f150"].hits > 0]).all()
 
 
-def test_samples_that_one_band_flags_are_no_data_of_the_other_which_would_keep_its_common_mode() -> None:
+def test_samples_that_one_band_flags_are_no_data_of_the_other_which_would_keep_its_common_mode() -> (
+    None
+):
     unfiltered = pipeline(Opaque()).run(scene(), keep=["signal"]).observations[0].detdata["signal"]
     data = pipeline(Opaque(), zonda.CommonModeFilter(group="all")).run(scene(), keep=["signal"])
     one, other = data.observations
@@ -140,7 +173,10 @@ def test_samples_that_one_band_flags_are_no_data_of_the_other_which_would_keep_i
 
 
 def test_a_camera_of_one_band_is_that_band() -> None:
-    found = [pipeline(zonda.CommonModeFilter(group=group)).run(scene(1))["map"].signal for group in ("all", "band")]
+    found = [
+        pipeline(zonda.CommonModeFilter(group=group)).run(scene(1))["map"].signal
+        for group in ("all", "band")
+    ]
     np.testing.assert_array_equal(*found)
 
 
@@ -163,13 +199,22 @@ class Watched(zonda.Operator):
         self.discarded.append(observation.instrument.band.name)
 
 
-def watched(scene: zonda.Scene, fail: str = "", filters: Any = (), nside: int = 512, **options: Any) -> list[str]:
+def watched(
+    scene: zonda.Scene, fail: str = "", filters: Any = (), nside: int = 512, **options: Any
+) -> list[str]:
     """Names of the bands in the order in which they worked on blocks."""
     Watched.seen.clear()
     Watched.discarded.clear()
     pointing = zonda.PointingDaisy(radius="15 arcmin", speed="10 arcmin/s", scan_duration="100 s")
     grid = {"nside": nside} if nside else {"pixel": "1 arcmin"}
-    steps = [pointing, zonda.WhiteNoise(), Watched(fail=fail), zonda.Efficiency(), *filters, zonda.BinMap(**grid)]
+    steps = [
+        pointing,
+        zonda.WhiteNoise(),
+        Watched(fail=fail),
+        zonda.Efficiency(),
+        *filters,
+        zonda.BinMap(**grid),
+    ]
     zonda.Pipeline(steps).run(scene, threads=1, keep=["watched"], **options)
     return [name for name, *_ in Watched.seen]
 
@@ -193,8 +238,8 @@ def test_bands_that_would_save_nothing_follow_each_other() -> None:
 
 
 def test_bands_follow_each_other_where_their_streams_would_not_be_kept_side_by_side() -> None:
-    """Both streams of a band, each 19 x 40000 x 4 bytes = 3 MB, are kept where half of the memory is 10 MB; beside 15 MB of
-    blocks there is no room for them in a band's share of 10 MB."""
+    """Both streams of a band, each 19 x 40000 x 4 bytes = 3 MB, are kept where half of the memory
+    is 10 MB; beside 15 MB of blocks there is no room for them in a band's share of 10 MB."""
     fast = scene(sample_rate="400 Hz")
     filters = [zonda.HighpassFilter(frequency="0.2 Hz"), zonda.CommonModeFilter()]
     names = watched(fast, filters=filters, memory=21_000_000)
@@ -215,7 +260,12 @@ def test_bands_in_step_have_the_bits_that_they_have_alone(threads: int) -> None:
     both = pipeline(scans=2).run(scene(), threads=threads)
     for number, band in enumerate(BANDS):
         alone = pipeline(scans=2).run(
-            scene(1, band={k: band[k] for k in ("name", "low", "high")}, net=band["net"]), threads=threads
+            scene(1, band={k: band[k] for k in ("name", "low", "high")}, net=band["net"]),
+            threads=threads,
         )
         for plane in PLANES:
-            np.testing.assert_array_equal(getattr(both[f"map_{band['name']}"], plane), getattr(alone["map"], plane), str(number))
+            np.testing.assert_array_equal(
+                getattr(both[f"map_{band['name']}"], plane),
+                getattr(alone["map"], plane),
+                str(number),
+            )

@@ -1,4 +1,6 @@
-"""Signals of one pass: what each is formed of, how it is measured, masked, filtered and mapped, and what follows from others."""
+"""Signals of one pass: what each is formed of, how it is measured, masked, filtered and mapped, and
+what follows from others.
+"""
 
 from __future__ import annotations
 
@@ -53,22 +55,33 @@ def steps(*filters: Operator, **binning: Any) -> list[Operator]:
     return [*generators, *filters, zonda.BinMap(**{"pixel": "8 arcsec", **binning})]
 
 
-def observed(operators: list[Operator], runs: Any, scans: int = 2, **settings: Any) -> tuple[Pipeline, Data]:
+def observed(
+    operators: list[Operator], runs: Any, scans: int = 2, **settings: Any
+) -> tuple[Pipeline, Data]:
     """The pipeline, and what it made of a source of 50 mK."""
     y, x = np.indices((40, 40)) - 19.5
     more = {name: settings.pop(name) for name in ("only", "precision") if name in settings}
     part = settings.pop("part", None)
     with sky_file(0.05 * np.exp(-(x**2 + y**2) / 50), 8.0) as path:
-        pipeline = Pipeline([Several(scans=scans), zonda.SkyMap(file=path), *operators], runs=runs, **more)
+        pipeline = Pipeline(
+            [Several(scans=scans), zonda.SkyMap(file=path), *operators], runs=runs, **more
+        )
         scene, settings = scenes.scene(camera(19)), {"threads": 2, **settings}
-        return pipeline, pipeline.run(scene, **settings) if part is None else pipeline.run_part(scene, part, **settings)
+        return pipeline, (
+            pipeline.run(scene, **settings)
+            if part is None
+            else pipeline.run_part(scene, part, **settings)
+        )
 
 
 HIGHPASS = zonda.HighpassFilter(frequency="0.5 Hz")
 FILTERS = {
     "none": (),
     "high-pass": (HIGHPASS,),
-    "modes": (zonda.HighpassFilter(frequency="0.5 Hz", trim="1 s"), zonda.CommonModeFilter(modes=2)),
+    "modes": (
+        zonda.HighpassFilter(frequency="0.5 Hz", trim="1 s"),
+        zonda.CommonModeFilter(modes=2),
+    ),
     "mean": (HIGHPASS, zonda.CommonModeFilter(method="mean")),
 }
 
@@ -83,7 +96,8 @@ def same(one: Any, other: Any, *names: str) -> bool:
 @pytest.mark.parametrize("filters", FILTERS.values(), ids=FILTERS)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_a_remainder_is_what_would_be_formed(filters, precision):
-    """Streams of up to 0.5 K (fluctuations of the atmosphere), rounded to 2^-24 of it some 20 times in a sample: 6e-7 K.
+    """Streams of up to 0.5 K (fluctuations of the atmosphere), rounded to 2^-24 of it some 20 times
+    in a sample: 6e-7 K.
 
     float64: each of three sums is rounded to 2^-37 K, times weights of 2^(1/2) at most.
     """
@@ -91,11 +105,17 @@ def test_a_remainder_is_what_would_be_formed(filters, precision):
     assert pipeline.signals.remainders == {"rest": ("sky",)}
     assert [s.stream for s in pipeline.signals.formed] == ["signal", "signal/sky"]
     _, formed = observed(steps(*filters), {"rest": REST}, precision=precision)
-    found, true, whole = data.products["rest/map"], formed.products["rest/map"], data.products["map"]
+    found, true, whole = (
+        data.products["rest/map"],
+        formed.products["rest/map"],
+        data.products["map"],
+    )
     allowed = 6e-7 if precision == "float32" else 4 * 2.0**-36
     assert np.nanmax(abs(found.signal - true.signal)) < allowed < 1e-2 * np.nanstd(true.signal)
     assert np.nanmax(abs(found.half_difference - true.half_difference)) < allowed
-    assert np.nanmax(abs(whole.signal - true.signal)) > 100 * allowed, "there is a sky to be taken away"
+    assert np.nanmax(abs(whole.signal - true.signal)) > 100 * allowed, (
+        "there is a sky to be taken away"
+    )
     assert same(found, true, "hits", "weights", "noise")
     assert ("rest", "remainder", "the complete signal minus sky") in list(data.tally)
 
@@ -120,13 +140,30 @@ MAP = zonda.SkyMap(file=Path(zonda.__file__).parent / "pipelines" / "data" / "me
         ({}, {**BOTH, "sky": {"only": ["sky"]}}, ()),
         ({}, {**BOTH, "sky": {**SKY, "filters": "none"}}, ()),
         ({}, {"sky": SKY, "white": {"only": ["white"], "modes": "full"}}, ()),
-        ({}, {"a": {"only": ["transmission"], "modes": "full"}, "b": {"without": ["transmission"], "modes": "full"}}, ()),
+        (
+            {},
+            {
+                "a": {"only": ["transmission"], "modes": "full"},
+                "b": {"without": ["transmission"], "modes": "full"},
+            },
+            (),
+        ),
         ({}, BOTH, (Unsaid(),)),
     ],
-    ids=["scatter", "own modes", "no filters", "not all", "a factor", "says nothing of being linear"],
+    ids=[
+        "scatter",
+        "own modes",
+        "no filters",
+        "not all",
+        "a factor",
+        "says nothing of being linear",
+    ],
 )
 def test_what_is_no_remainder(binning, runs, more):
-    assert Pipeline([scenes.Points(), MAP, *steps(*more, **binning)], runs=runs).signals.remainders == {}
+    assert (
+        Pipeline([scenes.Points(), MAP, *steps(*more, **binning)], runs=runs).signals.remainders
+        == {}
+    )
 
 
 def test_several_signals_make_up_the_rest():
@@ -139,18 +176,29 @@ def test_several_signals_make_up_the_rest():
 
 
 def test_noise_from_the_scatter_is_each_signals_own():
-    """Sums of squares are not linear: each of three signals has noise and sums of its own, as if it were mapped alone."""
+    """Sums of squares are not linear: each of three signals has noise and sums of its own, as if it
+    were mapped alone.
+    """
     filters = FILTERS["high-pass"]
     _, data = observed(steps(*filters, noise="scatter"), BOTH)
     for name in ("sky", "rest"):
         _, alone = observed(steps(*filters, noise="scatter"), {name: BOTH[name]})
-        assert same(data.products[f"{name}/map"], alone.products[f"{name}/map"], "signal", "noise", "hits", "half_difference")
+        assert same(
+            data.products[f"{name}/map"],
+            alone.products[f"{name}/map"],
+            "signal",
+            "noise",
+            "hits",
+            "half_difference",
+        )
     quiet, loud = (np.nanmedian(data.products[n].noise) for n in ("sky/map", "rest/map"))
     assert quiet < 0.5 * loud
 
 
 def test_hits_alone_are_of_no_signal_and_no_remainder_is_taken_from_them():
-    _, data = observed([*steps(HIGHPASS), zonda.BinMap(pixel="8 arcsec", contents="hits", product="seen")], BOTH)
+    _, data = observed(
+        [*steps(HIGHPASS), zonda.BinMap(pixel="8 arcsec", contents="hits", product="seen")], BOTH
+    )
     assert same(data.products["map"], data.products["seen"], "hits")
     assert {"rest/map", "sky/map"} < data.products.keys()
 
@@ -158,7 +206,11 @@ def test_hits_alone_are_of_no_signal_and_no_remainder_is_taken_from_them():
 # ---- bits
 
 
-@pytest.mark.parametrize("settings", [{"threads": 1}, {"threads": 3, "memory": 24_000_000}], ids=["one thread", "small blocks"])
+@pytest.mark.parametrize(
+    "settings",
+    [{"threads": 1}, {"threads": 3, "memory": 24_000_000}],
+    ids=["one thread", "small blocks"],
+)
 @pytest.mark.parametrize("filters", ["modes", "mean"])
 def test_bits_depend_on_neither_threads_nor_memory(filters, settings):
     runs = {**BOTH, "own": {"only": ["sky"]}, "raw": {"only": ["sky"], "filters": "none"}}
@@ -171,12 +223,24 @@ def test_bits_depend_on_neither_threads_nor_memory(filters, settings):
 def test_the_complete_signal_has_the_bits_that_it_has_alone():
     for filters in FILTERS.values():
         _, alone = observed(steps(*filters), {})
-        _, beside = observed(steps(*filters), {**BOTH, "raw": {"only": ["pink"], "filters": "none"}})
-        assert same(alone.products["map"], beside.products["map"], "signal", "hits", "weights", "noise", "half_difference")
+        _, beside = observed(
+            steps(*filters), {**BOTH, "raw": {"only": ["pink"], "filters": "none"}}
+        )
+        assert same(
+            alone.products["map"],
+            beside.products["map"],
+            "signal",
+            "hits",
+            "weights",
+            "noise",
+            "half_difference",
+        )
 
 
 @pytest.mark.parametrize(
-    "binning", [{"pixel": "8 arcsec"}, {"nside": 8192}, {"noise": "scatter"}], ids=["image", "HEALPix", "scatter"]
+    "binning",
+    [{"pixel": "8 arcsec"}, {"nside": 8192}, {"noise": "scatter"}],
+    ids=["image", "HEALPix", "scatter"],
 )
 def test_parts_of_a_campaign_give_the_same_bits(binning):
     operators = [*steps(*FILTERS["modes"])[:-1], zonda.BinMap(**binning)]
@@ -191,19 +255,26 @@ def test_parts_of_a_campaign_give_the_same_bits(binning):
             data.add(label, type(product).of(product.arrays()))
     pipeline.finish(data)
     for name in ("map", "sky/map", "rest/map"):
-        assert same(whole.products[name], data.products[name], "signal", "hits", "noise", "half_difference")
+        assert same(
+            whole.products[name], data.products[name], "signal", "hits", "noise", "half_difference"
+        )
 
 
 # ---- transmission and means
 
 
 def test_the_sky_is_seen_through_the_fluctuating_transmission_with_the_modes_of_the_complete_data():
-    """x of 2 % of the PWV: with `full` the sky is multiplied by 1 + x, with `own` modes it is not; without filters they differ by
-    nothing else. Transmission that is left out by name is not applied either."""
+    """x of 2 % of the PWV: with `full` the sky is multiplied by 1 + x, with `own` modes it is not;
+    without filters they differ by nothing else. Transmission that is left out by name is not
+    applied either."""
     runs = {
         "full": {**SKY, "filters": "none"},
         "own": {"only": ["sky"], "filters": "none"},
-        "bare": {"without": ["transmission", "atmosphere", "white", "pink"], "modes": "full", "filters": "none"},
+        "bare": {
+            "without": ["transmission", "atmosphere", "white", "pink"],
+            "modes": "full",
+            "filters": "none",
+        },
     }
     _, data = observed(steps(), runs)
     full, own, bare = (data.products[f"{n}/map"].signal for n in runs)
@@ -212,10 +283,19 @@ def test_the_sky_is_seen_through_the_fluctuating_transmission_with_the_modes_of_
 
 
 def test_only_a_signal_with_the_atmosphere_has_its_mean():
-    """Tens of kelvin in the maps of signals without a high-pass that hold the atmosphere, none in the others."""
-    runs = {"sky": {"only": ["sky"]}, "air": {"only": ["atmosphere"]}, "quiet": {"without": ["atmosphere"], "modes": "full"}}
+    """Tens of kelvin in the maps of signals without a high-pass that hold the atmosphere, none in
+    the others.
+    """
+    runs = {
+        "sky": {"only": ["sky"]},
+        "air": {"only": ["atmosphere"]},
+        "quiet": {"without": ["atmosphere"], "modes": "full"},
+    }
     _, data = observed(steps(), runs, precision="float64")
-    level = {name: abs(np.nanmean(data.products[f"{name}/map" if name else "map"].signal)) for name in ("", *runs)}
+    level = {
+        name: abs(np.nanmean(data.products[f"{name}/map" if name else "map"].signal))
+        for name in ("", *runs)
+    }
     assert level[""] > 10 < level["air"]
     assert level["sky"] < 0.1 > level["quiet"]
 
@@ -224,7 +304,9 @@ def test_a_map_maker_that_does_not_know_of_means_sees_whole_signals():
     """Tens of kelvin in the signals with the atmosphere, under all their names."""
     runs = {"air": {"only": ["atmosphere"]}, "sky": {"only": ["sky"]}}
     _, data = observed([*steps()[:-1], Keep()], runs, scans=1)
-    level = {name: data.products[f"signal/{name}" if name else "signal"].mean() for name in ("", *runs)}
+    level = {
+        name: data.products[f"signal/{name}" if name else "signal"].mean() for name in ("", *runs)
+    }
     assert level[""] == pytest.approx(level["air"], rel=1e-3)
     assert level["air"] > 10 > 0.1 > level["sky"]
 
@@ -237,7 +319,9 @@ class Plain(Operator):
     linear: ClassVar[bool] = True
 
     def exec(self, block: Block, state: object) -> None:
-        names = block.entering("at the detector") + [n for n in block.entering("above the atmosphere") if n != "transmission"]
+        names = block.entering("at the detector") + [
+            n for n in block.entering("above the atmosphere") if n != "transmission"
+        ]
         block.new("signal")[...] = sum(block.detdata[name] for name in names)
 
 
@@ -250,7 +334,9 @@ def test_a_step_that_forms_signals_and_does_not_know_of_means_is_told_the_compon
 
 
 def test_instantaneous_calibration_divides_the_signals_that_have_the_transmission():
-    """(1 + x) is in the sky and divided out: `full` is then what `own` modes are without x, to rounding."""
+    """(1 + x) is in the sky and divided out: `full` is then what `own` modes are without x, to
+    rounding.
+    """
     operators = steps()
     operators[3] = zonda.Efficiency(calibration="instantaneous")
     runs = {"full": {**SKY, "filters": "none"}, "own": {"only": ["sky"], "filters": "none"}}
@@ -275,7 +361,9 @@ class Gaps(Operator):
 
 @pytest.mark.parametrize("filters", [(), (HIGHPASS,)], ids=["none", "high-pass"])
 def test_what_is_not_finite_in_one_signal_is_in_none(filters):
-    """All maps have the same hits, and the sky and the rest add up to the map (float64, as above)."""
+    """All maps have the same hits, and the sky and the rest add up to the map (float64, as
+    above).
+    """
     operators = steps(*filters)
     operators.insert(2, Gaps())
     _, data = observed(operators, {**BOTH, "raw": {**SKY, "filters": "none"}}, precision="float64")
@@ -288,7 +376,9 @@ def test_what_is_not_finite_in_one_signal_is_in_none(filters):
 
 
 def test_a_filter_bridges_the_same_gaps_in_all_signals():
-    """The mask is shared before the filter: what is formed of a part is the remainder of the others, behind it too (float64)."""
+    """The mask is shared before the filter: what is formed of a part is the remainder of the
+    others, behind it too (float64).
+    """
     operators = steps(HIGHPASS)
     operators.insert(2, Gaps())
     _, both = observed(operators, BOTH, precision="float64", keep=("signal", "signal/sky"))
@@ -296,7 +386,10 @@ def test_a_filter_bridges_the_same_gaps_in_all_signals():
     whole, sky = (both.observations[0].detdata[name] for name in ("signal", "signal/sky"))
     assert np.isnan(sky).any()
     assert np.array_equal(np.isnan(whole), np.isnan(sky))
-    assert np.nanmax(abs(both.products["rest/map"].signal - formed.products["rest/map"].signal)) < 4 * 2.0**-36
+    assert (
+        np.nanmax(abs(both.products["rest/map"].signal - formed.products["rest/map"].signal))
+        < 4 * 2.0**-36
+    )
 
 
 class Holes(Operator):
@@ -315,7 +408,10 @@ def test_a_step_that_is_not_linear_acts_on_each_signal_and_they_share_its_mask()
     pipeline, data = observed(steps(HIGHPASS, Holes()), BOTH)
     assert pipeline.signals.remainders == {}
     said = {(who, what): text for who, what, text in data.tally}
-    assert said["sky", "modes"] == "its own from Holes on, which is not linear, instead of those of the complete signal"
+    assert (
+        said["sky", "modes"]
+        == "its own from Holes on, which is not linear, instead of those of the complete signal"
+    )
     whole, sky, rest = (data.products[n] for n in ("map", "sky/map", "rest/map"))
     assert 0 < whole.hits.sum() < 0.99 * 2 * 19 * 6000
     assert same(whole, sky, "hits")
@@ -323,17 +419,23 @@ def test_a_step_that_is_not_linear_acts_on_each_signal_and_they_share_its_mask()
 
 
 def test_modes_of_the_complete_signal_are_taken_up_to_the_first_step_that_is_not_linear():
-    """`Unsaid` changes nothing, so that before it the map keeps its bits; behind it the modes are those of the sky."""
+    """`Unsaid` changes nothing, so that before it the map keeps its bits; behind it the modes are
+    those of the sky.
+    """
     highpass, common = FILTERS["modes"]
     _, full = observed(steps(highpass, common), {"sky": SKY})
     _, before = observed(steps(highpass, common, Unsaid()), {"sky": SKY})
     _, behind = observed(steps(highpass, Unsaid(), common), {"sky": SKY})
     assert same(full.products["sky/map"], before.products["sky/map"], "signal")
-    assert np.nanstd(behind.products["sky/map"].signal) < 0.9 * np.nanstd(full.products["sky/map"].signal)
+    assert np.nanstd(behind.products["sky/map"].signal) < 0.9 * np.nanstd(
+        full.products["sky/map"].signal
+    )
 
 
 def test_unfiltered_signals_share_the_mask_of_the_filters_in_maps_with_noise_of_their_own():
-    """Hits are those of all signals: what a filter spoils in others is not added up in the unfiltered one either."""
+    """Hits are those of all signals: what a filter spoils in others is not added up in the
+    unfiltered one either.
+    """
     runs = {"raw": {"only": ["sky"], "filters": "none"}}
     _, net = observed(steps(HIGHPASS, Holes()), runs)
     _, scatter = observed(steps(HIGHPASS, Holes(), noise="scatter"), runs)
@@ -373,7 +475,9 @@ class Noise(Given):
     provides: ClassVar[frozenset[str]] = frozenset({"white"})
 
     def configure(self, observation: Observation) -> None:
-        observation.focalplane.net = observation.focalplane.net * np.linspace(1, 3, observation.n_detectors)
+        observation.focalplane.net = observation.focalplane.net * np.linspace(
+            1, 3, observation.n_detectors
+        )
 
     def prepare(self, observation: Observation) -> None:
         observation.flags[700:720] |= 64
@@ -387,7 +491,9 @@ class Sum(Operator):
     linear: ClassVar[bool] = True
 
     def exec(self, block: Block, state: object) -> None:
-        block.new("signal")[...] = sum(block.detdata[n] for n in ("sky", "white", "pink") if n in block.detdata)
+        block.new("signal")[...] = sum(
+            block.detdata[n] for n in ("sky", "white", "pink") if n in block.detdata
+        )
 
 
 class Median(Operator):
@@ -431,7 +537,10 @@ class Keep(MapMaker):
     provides: ClassVar[frozenset[str]] = frozenset({"kept"})
 
     def prepare(self, observation: Observation) -> dict[str, np.ndarray]:
-        return {name: np.zeros((observation.n_detectors, observation.n_samples)) for name in observation.signals}
+        return {
+            name: np.zeros((observation.n_detectors, observation.n_samples))
+            for name in observation.signals
+        }
 
     def exec(self, block: Block, state: dict[str, np.ndarray]) -> None:
         for name in block.signals:
@@ -461,7 +570,9 @@ def chain(*filters: Operator, dead: bool = True) -> list[Operator]:
 def run(steps: list[Operator], runs: object = BOTH, **settings: object) -> Data:
     points = scenes.Points()
     points._observation = scenes.scan(N_DET, N)
-    return Pipeline([points, *steps], runs=runs, precision="float64").run(scenes.scene(), **{"threads": 1, **settings})
+    return Pipeline([points, *steps], runs=runs, precision="float64").run(
+        scenes.scene(), **{"threads": 1, **settings}
+    )
 
 
 MEASURED = [
@@ -474,29 +585,37 @@ MEASURED = [
 
 @pytest.mark.parametrize("filters", MEASURED, ids=["two modes", "mean", "after a filter", "twice"])
 def test_signals_of_all_components_add_up_to_the_complete_one(filters):
-    """Dead detectors, flags, unequal weights included. Each of three maps rounds w d to 2^-36 K, 1/w at most 9 2^(1/2)."""
+    """Dead detectors, flags, unequal weights included. Each of three maps rounds w d to 2^-36 K,
+    1/w at most 9 2^(1/2).
+    """
     data = run(chain(*filters), {"sky": SKY, "noise": {"only": ["white"], "modes": "full"}})
     whole, sky, rest = (data.products[n] for n in ("map", "sky/map", "noise/map"))
     assert same(whole, sky, "hits", "weights")
     assert same(whole, rest, "hits", "weights")
     assert data.observations[0].n_samples * N_DET > whole.hits.sum() > 0
-    np.testing.assert_allclose(sky.signal + rest.signal, whole.signal, atol=3 * 2**-37 * 9 * 2**0.5, rtol=0)
+    np.testing.assert_allclose(
+        sky.signal + rest.signal, whole.signal, atol=3 * 2**-37 * 9 * 2**0.5, rtol=0
+    )
     alone = run(chain(*filters), {"sky": {"only": ["sky"]}}).products["sky/map"].signal
     if filters[-1].method == "svd":
         assert np.nanmax(abs(alone - sky.signal)) > 1e-3  # the sky's own modes are others
 
 
 def test_given_its_modes_the_filter_is_a_symmetric_projection():
-    """F = 1 - U U^T over the detectors in use: <b, F a> = <F b, a> (the dot test), and nothing of what it removes is left.
+    """F = 1 - U U^T over the detectors in use: <b, F a> = <F b, a> (the dot test), and nothing of
+    what it removes is left.
 
-    float64: sums of n = 33 000 terms of order 1, rounded at each step, err by n^(1/2) 2^-53 n^(1/2) = 4e-12 at most.
+    float64: sums of n = 33 000 terms of order 1, rounded at each step, err by n^(1/2) 2^-53 n^(1/2)
+    = 4e-12 at most.
     """
     a, b = np.random.default_rng(8).standard_normal((2, N_DET, N))
     given = [Sky(), Other(), Noise()]
     for step, values in zip(given, (a, b, streams()[1]), strict=True):
         step._values = values
     runs = {"a": {"only": ["sky"], "modes": "full"}, "b": {"only": ["pink"], "modes": "full"}}
-    data = run([*given, Sum(), zonda.CommonModeFilter(modes=2, on_undetermined="remove"), Keep()], runs)
+    data = run(
+        [*given, Sum(), zonda.CommonModeFilter(modes=2, on_undetermined="remove"), Keep()], runs
+    )
     use = np.ix_(data.observations[0].detector_flags == 0, data.observations[0].flags == 0)
     a, b, fa, fb = a[use], b[use], data.products["signal/a"][use], data.products["signal/b"][use]
     left, right = np.vdot(b, fa), np.vdot(fb, a)
@@ -558,11 +677,16 @@ def test_exec_is_given_what_was_found_in_a_component_or_in_the_complete_signal()
     data = run([*given[:2], Centred(), given[2], Peak(), Keep()])
     whole = sky + (noise - noise.mean())
     np.testing.assert_allclose(data.products["signal"], whole, rtol=0, atol=1e-12)
-    assert data.products["near"] == (int((data.products["signal"] > 0.9 * data.products["signal"].max()).sum()), ["signal"])
+    assert data.products["near"] == (
+        int((data.products["signal"] > 0.9 * data.products["signal"].max()).sum()),
+        ["signal"],
+    )
 
 
 def test_the_complete_signal_decides_which_detectors_are_dead():
-    """Detector 4 has no noise and no sky: dead. In the sky alone detector 5, which sees nothing, is a valid zero."""
+    """Detector 4 has no noise and no sky: dead. In the sky alone detector 5, which sees nothing, is
+    a valid zero.
+    """
     operators = chain(zonda.CommonModeFilter(), dead=False)
     operators[0]._values = operators[0]._values.copy()
     operators[0]._values[[4, 5]] = 0.0
@@ -579,7 +703,9 @@ def test_a_sky_of_two_components_is_the_sky_alone():
     class Background(Given):
         """Another part of the sky."""
 
-        provides: ClassVar[frozenset[str]] = frozenset({Component("background", "above the atmosphere")})
+        provides: ClassVar[frozenset[str]] = frozenset(
+            {Component("background", "above the atmosphere")}
+        )
 
     class Both(Operator):
         """Adds up the two."""
@@ -593,7 +719,9 @@ def test_a_sky_of_two_components_is_the_sky_alone():
     sky, background = Sky(), Background()
     sky._values = background._values = streams()[0].copy()
     sky._values[5] = 0.0
-    data = run([sky, background, Both(), zonda.CommonModeFilter(), zonda.BinMap(pixel="10 arcsec")], {})
+    data = run(
+        [sky, background, Both(), zonda.CommonModeFilter(), zonda.BinMap(pixel="10 arcsec")], {}
+    )
     assert not data.observations[0].detector_flags.any()
 
 
@@ -617,7 +745,11 @@ def test_a_finite_filter_sees_each_signal_with_its_neighbours(memory):
     sky, _ = streams(dead=False)
     padded = np.pad(sky, ((0, 0), (2, 2)), mode="edge")
     expected = sum(padded[:, k : k + N] for k in range(5)) / 5
-    data = run([*chain(Boxcar(), dead=False)[:-1], Keep()], {"sky": SKY}, **({"memory": memory} if memory else {}))
+    data = run(
+        [*chain(Boxcar(), dead=False)[:-1], Keep()],
+        {"sky": SKY},
+        **({"memory": memory} if memory else {}),
+    )
     np.testing.assert_allclose(data.products["signal/sky"], expected, rtol=0, atol=1e-14)
     assert abs(data.products["signal"] - data.products["signal/sky"]).max() > 0.1
 
@@ -636,7 +768,9 @@ def test_an_unfiltered_signal_is_mapped_as_it_was_formed(filters):
 
 
 def test_an_unfiltered_signal_is_made_of_its_own_components_alone(monkeypatch):
-    """Behind a filter that measures, where memory has no room for its stream, the sky is sampled again; the noise is not."""
+    """Behind a filter that measures, where memory has no room for its stream, the sky is sampled
+    again; the noise is not.
+    """
     made: list[tuple[str, bool]] = []
     for cls in (zonda.SkyMap, zonda.WhiteNoise):
         original = cls.exec
@@ -663,11 +797,15 @@ def test_an_unfiltered_signal_is_made_of_its_own_components_alone(monkeypatch):
 def test_narrowed_to_the_sky_the_complete_signal_has_the_bits_of_the_sky_in_the_full_run(filters):
     _, full = observed(steps(*filters), {"sky": {"only": ["sky"]}})
     _, narrow = observed(steps(*filters), {}, only=["sky"])
-    assert same(full.products["sky/map"], narrow.products["map"], "signal", "hits", "weights", "noise")
+    assert same(
+        full.products["sky/map"], narrow.products["map"], "signal", "hits", "weights", "noise"
+    )
 
 
 def test_narrowed_to_the_noise_its_level_is_that_of_the_scene():
-    """Noise at the detector under the load of the atmosphere: `--only white` has the level of the whole scene."""
+    """Noise at the detector under the load of the atmosphere: `--only white` has the level of the
+    whole scene.
+    """
     operators = steps()
     operators[1] = zonda.WhiteNoise(model="background_limited")
     pipeline, full = observed(operators, {"white": {"only": ["white"], "modes": "full"}})
@@ -684,7 +822,9 @@ class Template(Operator):
     provides: ClassVar[frozenset[str]] = frozenset({"template"})
 
     def exec(self, block: Block, state: object) -> None:
-        block.new("template")[...] = np.sin(np.arange(block.samples.start, block.samples.stop) / 300)
+        block.new("template")[...] = np.sin(
+            np.arange(block.samples.start, block.samples.stop) / 300
+        )
 
 
 class Responds(Operator):
@@ -699,7 +839,9 @@ class Responds(Operator):
 
 
 def test_a_signal_that_is_made_again_alone_has_what_its_filters_read(monkeypatch):
-    """Streams that do not fit in memory are swept, one signal after the other, through filters that read other streams."""
+    """Streams that do not fit in memory are swept, one signal after the other, through filters that
+    read other streams.
+    """
     operators = [Template(), *steps(Responds(), *FILTERS["mean"])]
     _, ample = observed(operators, BOTH, scans=1, threads=1)
     monkeypatch.setattr("zonda.core.run.schedule.Schedule._keeps", lambda *arguments: False)
@@ -739,7 +881,9 @@ def test_an_unfiltered_signal_whose_components_need_neighbours_is_held(monkeypat
 
 @pytest.mark.parametrize("enters", ["above the atmosphere", "at the detector", "calibrated"])
 def test_what_adds_to_the_data_is_a_component(enters):
-    """Ground pickup of 10 mK: divided by zeta e^-tau at the detector, as it is when it is calibrated; in signals that keep it."""
+    """Ground pickup of 10 mK: divided by zeta e^-tau at the detector, as it is when it is
+    calibrated; in signals that keep it.
+    """
 
     class Ground(Operator):
         provides: ClassVar[frozenset[str]] = frozenset({Component("ground", enters)})
@@ -756,7 +900,11 @@ def test_what_adds_to_the_data_is_a_component(enters):
     level = np.nanmean(data.products["ground/map"].signal)
     plane, t = data.observations[0].focalplane, data.observations[0].smooth["transmission"]
     passed = plane.main_beam_efficiency[:, None] * t.evaluate(slice(0, 19), slice(0, 6000))
-    expected = {"above the atmosphere": 0.01, "at the detector": float((0.01 / passed).mean()), "calibrated": 0.01}
+    expected = {
+        "above the atmosphere": 0.01,
+        "at the detector": float((0.01 / passed).mean()),
+        "calibrated": 0.01,
+    }
     assert level == pytest.approx(expected[enters], rel=2e-3)
     assert same(data.products["rest/map"], before.products["map"], "signal")
     whole, rest = data.products["map"].signal, data.products["rest/map"].signal
@@ -782,7 +930,9 @@ def test_outputs_ask_for_signals():
     points, sky._values = scenes.Points(), streams()[0]
     pipeline = Pipeline([points, sky, zonda.CommonModeFilter(), Reads()])
     assert pipeline.operators[-1].shown == ("", "_sky_unfiltered")
-    more = Pipeline([points, sky, Noise(), Sum(), zonda.CommonModeFilter(), Reads()], runs={"mine": SKY})
+    more = Pipeline(
+        [points, sky, Noise(), Sum(), zonda.CommonModeFilter(), Reads()], runs={"mine": SKY}
+    )
     assert more.operators[-1].shown == ("mine", "_sky_unfiltered")
     assert list(more.runs) == ["mine", "_sky_unfiltered"]
 
@@ -814,7 +964,9 @@ def test_in_a_pipeline_file():
     assert parse(file.resolved_yaml()).runs == file.runs
     with pytest.raises(ZondaError, match=r"(?s)modes.*own.*full"):
         parse(FILE.replace("modes: full", "modes: mine"))
-    with pytest.raises(ZondaError, match=r"(?s)'_quiet' cannot name a signal.*use letters") as found:
+    with pytest.raises(
+        ZondaError, match=r"(?s)'_quiet' cannot name a signal.*use letters"
+    ) as found:
         parse(FILE.replace("quiet:", "_quiet:"))
     assert "did you mean" not in str(found.value), "the component is not the mistake"
 
@@ -823,13 +975,24 @@ def test_in_a_pipeline_file():
     ("runs", "settings", "message"),
     [
         ({1: SKY}, {}, "'1' cannot name a signal"),
-        (BOTH, {"only": "sky"}, r"only is a list of components, not the text 'sky'\n.*write only=\['sky'\]"),
+        (
+            BOTH,
+            {"only": "sky"},
+            r"only is a list of components, not the text 'sky'\n.*write only=\['sky'\]",
+        ),
         (
             BOTH,
             {"keep": ["signal/rest"]},
-            r"(?s)'signal/rest' cannot be kept: it is the complete signal minus sky.*signal/sky, and sub",
+            (
+                r"(?s)'signal/rest' cannot be kept: it is the complete signal minus"
+                r" sky.*signal/sky, and sub"
+            ),
         ),
-        (BOTH, {"keep": ["signal/skyy"]}, r"(?s)there is no such signal.*did you mean 'signal/sky'"),
+        (
+            BOTH,
+            {"keep": ["signal/skyy"]},
+            r"(?s)there is no such signal.*did you mean 'signal/sky'",
+        ),
     ],
     ids=["a number", "a text", "a remainder", "a typing mistake"],
 )
@@ -840,7 +1003,9 @@ def test_what_is_asked_for_and_cannot_be_is_refused(runs, settings, message):
 
 def test_an_unfiltered_signal_can_be_kept(monkeypatch):
     monkeypatch.setattr("zonda.core.run.schedule.AMPLE", np.inf)
-    _, data = observed(steps(*FILTERS["modes"]), {"raw": {"only": ["sky"], "filters": "none"}}, keep=["signal/raw"])
+    _, data = observed(
+        steps(*FILTERS["modes"]), {"raw": {"only": ["sky"], "filters": "none"}}, keep=["signal/raw"]
+    )
     assert 0.04 < data.observations[0].detdata["signal/raw"].max() < 0.06
 
 

@@ -28,7 +28,9 @@ def mean_of(obs, name="signal"):
 
 
 class Gives(Operator):
-    """Millikelvins with their mean beside them, or in them; ``atmosphere`` has its mean in ``observation.smooth``."""
+    """Millikelvins with their mean beside them, or in them; ``atmosphere`` has its mean in
+    ``observation.smooth``.
+    """
 
     provides: ClassVar[frozenset[str]] = frozenset({"signal", "atmosphere", "white"})
     knows_means: ClassVar[bool] = True
@@ -43,11 +45,15 @@ class Gives(Operator):
         t = np.arange(block.samples.start, block.samples.stop)
         for k, name in enumerate(("signal", "atmosphere", "white")):
             # float32 in every precision, so that all runs begin with the same numbers
-            block.new(name)[...] = (1e-3 * np.sin(0.37 * d + 0.01 * t + k) + 1e-3 * np.cos(1.3 * d * t)).astype(np.float32)
+            block.new(name)[...] = (
+                1e-3 * np.sin(0.37 * d + 0.01 * t + k) + 1e-3 * np.cos(1.3 * d * t)
+            ).astype(np.float32)
             if name == "white":
                 continue
             if not self.beside:
-                block.detdata[name] += mean_of(block.observation, name).evaluate(block.detectors, block.samples)
+                block.detdata[name] += mean_of(block.observation, name).evaluate(
+                    block.detectors, block.samples
+                )
             elif name == "signal":
                 block.means[name] = mean_of(block.observation)
 
@@ -132,7 +138,9 @@ class Measures(Gain):
             assert rows.dtype == np.float64
             return np.sqrt(sum(float((row**2).sum()) for row in rows) / rows.size)
         power = 0.0
-        for tiles in stream.sweep(lambda d, t, part: [(x**2).sum() for x in np.split(part, range(16, len(part), 16))]):
+        for tiles in stream.sweep(
+            lambda d, t, part: [(x**2).sum() for x in np.split(part, range(16, len(part), 16))]
+        ):
             power += float(sum(tiles[2]))
         return np.sqrt(power / np.prod(stream.shape))
 
@@ -160,7 +168,9 @@ class Adds(Operator):
 
     def exec(self, block, state):
         assert block.dtype is np.float64
-        assert np.array_equal(block.total("signal"), block.detdata["signal"])  # the mean is added once
+        assert np.array_equal(
+            block.total("signal"), block.detdata["signal"]
+        )  # the mean is added once
         block.detdata["white"][...] = block.detdata["signal"]
         block.detdata["signal"] += 1  # a breach of the contract that does no harm here
 
@@ -208,12 +218,15 @@ CHAINS = {
 def test_a_mean_beside_the_stream_is_as_good_as_one_in_it(chain):
     """float32 with the mean beside, against float64 with the mean in the stream.
 
-    What stands beside the mean is rounded to 2^-24 of itself once in each step. Of six steps the largest are 16 K beside the mean
-    (half of it was taken away), and a later one multiplies by 2.2 what was rounded before.
+    What stands beside the mean is rounded to 2^-24 of itself once in each step. Of six steps the
+    largest are 16 K beside the mean (half of it was taken away), and a later one multiplies by 2.2
+    what was rounded before.
     """
     obs = observation(37, 3 * TILE_SAMPLES + 21)
     _, found, _ = execute([Gives(), *chain], obs)
-    _, true, _ = execute([Gives(beside=False), *chain], observation(37, 3 * TILE_SAMPLES + 21), dtype=np.float64)
+    _, true, _ = execute(
+        [Gives(beside=False), *chain], observation(37, 3 * TILE_SAMPLES + 21), dtype=np.float64
+    )
     name = "atmosphere" if isinstance(chain[-1], Whole) else "signal"
     left = np.abs(true - mean_of(obs, name).evaluate(slice(0, 37), slice(0, obs.n_samples))).max()
     assert np.abs(found - true).max() <= 2.0**-24 * (left if len(chain) < 3 else 6 * 16 * 2.2)
@@ -223,8 +236,15 @@ def test_a_mean_beside_the_stream_is_as_good_as_one_in_it(chain):
 def test_blocks_and_threads_change_no_bit(chain):
     size = 37 * (5 * TILE_SAMPLES + 21) * 4
     want, n = None, 5 * TILE_SAMPLES + 21
-    for memory, threads, prefer in ((1 << 30, 1, None), (1 << 30, 3, None), (24 * size, 3, "again"), (6 * size, 1, "spilled")):
-        _, got, _ = execute([Gives(), *chain], observation(37, n), memory=memory, threads=threads, prefer=prefer)
+    for memory, threads, prefer in (
+        (1 << 30, 1, None),
+        (1 << 30, 3, None),
+        (24 * size, 3, "again"),
+        (6 * size, 1, "spilled"),
+    ):
+        _, got, _ = execute(
+            [Gives(), *chain], observation(37, n), memory=memory, threads=threads, prefer=prefer
+        )
         want = got if want is None else want
         assert np.array_equal(got, want)
 
@@ -235,7 +255,9 @@ def test_streams_made_again_are_whole():
     chain = [Gives(), Gain(), Measures(readings=1), Gain()]
     _, want, _ = execute(chain, obs)
     _, got, _ = execute(chain, obs, room=0, prefer="again")
-    assert ("Execution", "stream signal made again when it is read") in {(who, what) for who, what, _ in obs.tally}
+    assert ("Execution", "stream signal made again when it is read") in {
+        (who, what) for who, what, _ in obs.tally
+    }
     assert np.array_equal(got, want)
 
 
@@ -254,7 +276,9 @@ class Restates(Gain):
     def exec(self, block, state):
         assert "signal" not in block.means
         block.detdata["signal"] -= 7.0
-        block.means["signal"] = SmoothField.constant(np.full(block.observation.n_detectors, 7.0), block.observation.n_samples)
+        block.means["signal"] = SmoothField.constant(
+            np.full(block.observation.n_detectors, 7.0), block.observation.n_samples
+        )
 
 
 def test_a_mean_that_a_step_sets_itself_is_the_one_that_counts():
@@ -334,13 +358,22 @@ def put(make):
     ("what", "words"),
     [
         (put(lambda x: x[:, :5].copy()), r"exec left the stream 'signal' as an array \(3, 5\)"),
-        (put(lambda x: x.astype(np.int32)), r"as an array \(3, 100\) of int32; it must be an array \(3, 100\) of float"),
+        (
+            put(lambda x: x.astype(np.int32)),
+            r"as an array \(3, 100\) of int32; it must be an array \(3, 100\) of float",
+        ),
         (put(lambda x: x.astype(np.float16)), "of float16"),
         (put(lambda x: x.tolist()), "as a list"),
         (put(lambda x: np.asfortranarray(x)), "not in C order"),
         (put(lambda x: 1.0), "as a float"),
-        (lambda block: block.detdata.pop("signal"), "exec left no stream 'signal', which it provides"),
-        (lambda block: block.detdata.pop("white"), "exec left no stream 'white', which others read"),
+        (
+            lambda block: block.detdata.pop("signal"),
+            "exec left no stream 'signal', which it provides",
+        ),
+        (
+            lambda block: block.detdata.pop("white"),
+            "exec left no stream 'white', which others read",
+        ),
     ],
 )
 def test_what_a_step_leaves_is_looked_at(what, words, beside):

@@ -1,4 +1,6 @@
-"""Small tables: what is written is read; astropy's are read; what is wrong is named with its place."""
+"""Small tables: what is written is read; astropy's are read; what is wrong is named with its
+place.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,10 @@ from zonda.core.storage.ecsv import Column, read_table, write_ecsv
 
 
 def test_what_is_written_is_read(tmp_path):
-    columns = [Column("name", ["a b", 'say "c"'], "", "who"), Column("ra", [1.5, -2.25], "deg", "where")]
+    columns = [
+        Column("name", ["a b", 'say "c"'], "", "who"),
+        Column("ra", [1.5, -2.25], "deg", "where"),
+    ]
     table = read_table(write_ecsv(tmp_path / "t.ecsv", columns, {"made": "by a test", "seed": 1}))
     assert table.texts("name") == ["a b", 'say "c"']
     np.testing.assert_allclose(table.numbers("ra", "rad"), np.radians([1.5, -2.25]), rtol=1e-15)
@@ -21,7 +26,9 @@ def test_what_is_written_is_read(tmp_path):
 
 def test_tables_of_astropy(tmp_path):
     path = tmp_path / "t.ecsv"
-    made = AstropyTable({"name": ["one two", "three"], "flux": [1.0, 2.0] * u.mJy, "index": [-0.7, 3.5]})
+    made = AstropyTable(
+        {"name": ["one two", "three"], "flux": [1.0, 2.0] * u.mJy, "index": [-0.7, 3.5]}
+    )
     made.meta["comment"] = ["a", "b"]
     made.write(path, format="ascii.ecsv")
     table = read_table(path)
@@ -32,7 +39,9 @@ def test_tables_of_astropy(tmp_path):
 
 def test_csv_has_its_units_in_brackets(tmp_path):
     path = tmp_path / "t.csv"
-    path.write_text("\ufeff# name, ra [arcmin], n\n# a remark\nx, 60, 3\n\ny,120,4\n", encoding="utf-8")
+    path.write_text(
+        "\ufeff# name, ra [arcmin], n\n# a remark\nx, 60, 3\n\ny,120,4\n", encoding="utf-8"
+    )
     table = read_table(path)
     np.testing.assert_allclose(table.numbers("ra", "deg"), [1, 2])
     np.testing.assert_array_equal(table.numbers("n"), [3, 4])
@@ -48,17 +57,51 @@ def test_csv_has_its_units_in_brackets(tmp_path):
         ("a\n1\ninf\n", ("a", ""), "line 3: a is 'inf', not a finite number"),
         ("a\n1\nx\n", ("a", ""), "line 3: a is 'x'"),
         ("a\n1\n", ("a", "deg"), "line 1: a has no unit\n  = give it in deg"),
-        ("a\n1\n", ("a", "rad"), "give it in deg, arcmin, arcsec or rad: in ECSV 'unit: deg', in CSV a heading such as a .deg."),
+        (
+            "a\n1\n",
+            ("a", "rad"),
+            (
+                "give it in deg, arcmin, arcsec or rad: in ECSV 'unit: deg', in CSV a heading such"
+                " as a .deg."
+            ),
+        ),
         ("a [K]\n1\n", ("a", "deg"), "a has the unit 'K'"),
-        ("a [K]\n1\n", ("a", "rad"), "give it in deg, arcmin, arcsec or rad, or another unit of its kind"),
+        (
+            "a [K]\n1\n",
+            ("a", "rad"),
+            "give it in deg, arcmin, arcsec or rad, or another unit of its kind",
+        ),
         ("# of May, 2024\n\na,b\n# a remark\n1,2\n3,x\n", ("b", ""), "line 6: b is 'x'"),
-        ("a,b\n1,2,3\n\n4\n5,6\n", ("b", ""), "2 mistakes\n  = line 2: has 3 values, not 2; .*\n  = line 4: has 1 values"),
-        ("a\nx\n1\nnan\n", ("a", "s"), "3 mistakes\n  = line 1: a has no unit.*\n  = line 2: a is 'x'.*\n  = line 4: a is 'nan'"),
-        ("a\n" + "x\n" * 20, ("a", ""), "20 mistakes\n  = line 2: (.*\n)+  = line 13: .*\n  = and 8 more$"),
+        (
+            "a,b\n1,2,3\n\n4\n5,6\n",
+            ("b", ""),
+            "2 mistakes\n  = line 2: has 3 values, not 2; .*\n  = line 4: has 1 values",
+        ),
+        (
+            "a\nx\n1\nnan\n",
+            ("a", "s"),
+            (
+                "3 mistakes\n  = line 1: a has no unit.*\n  = line 2: a is 'x'.*\n  = line 4: a is"
+                " 'nan'"
+            ),
+        ),
+        (
+            "a\n" + "x\n" * 20,
+            ("a", ""),
+            "20 mistakes\n  = line 2: (.*\n)+  = line 13: .*\n  = and 8 more$",
+        ),
         ("a [nonsense]\n1\n", ("a", "deg"), "a has the unit 'nonsense'"),
         ("# %ECSV 1.0\n# ---\n# - nonsense\na\n1\n", ("a", ""), "cannot be read as ECSV"),
-        ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\n", ("a", ""), "cannot be read as ECSV"),
-        ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\nb\n1\n", ("a", ""), "incomplete or corrupt: b"),
+        (
+            "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\n",
+            ("a", ""),
+            "cannot be read as ECSV",
+        ),
+        (
+            "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a, datatype: int64}\nb\n1\n",
+            ("a", ""),
+            "incomplete or corrupt: b",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path, text, what, match):

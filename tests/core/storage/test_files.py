@@ -8,7 +8,13 @@ import os
 import pytest
 
 from zonda.core.errors import OutputError
-from zonda.core.storage.files import atomic_path, check_output_folder, output_error, product_path, write_text
+from zonda.core.storage.files import (
+    atomic_path,
+    check_output_folder,
+    output_error,
+    product_path,
+    write_text,
+)
 
 
 def left(folder):
@@ -39,7 +45,10 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path, error):
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")
 def test_a_really_full_disk(tmp_path):
-    with pytest.raises(OutputError, match="no space left on the disk") as caught, atomic_path(tmp_path / "a.bin") as temporary:  # noqa: PT012
+    with (  # noqa: PT012
+        pytest.raises(OutputError, match="no space left on the disk") as caught,
+        atomic_path(tmp_path / "a.bin") as temporary,
+    ):
         temporary.symlink_to("/dev/full")  # every write to it fails with ENOSPC
         temporary.write_bytes(b"x" * 10)
     assert caught.value.place == str(tmp_path / "a.bin")
@@ -58,7 +67,10 @@ def test_a_disk_that_is_full_only_when_the_file_is_synchronized(tmp_path, monkey
 
 
 def test_hdf5_reports_a_full_disk_without_an_error_number(tmp_path):
-    error = OSError("Can't write data (file write failed: time = now, errno = 28, error message = 'No space left on device')")
+    error = OSError(
+        "Can't write data (file write failed: time = now, errno = 28, error message = 'No space"
+        " left on device')"
+    )
     assert "no space left on the disk" in str(output_error(error, tmp_path / "tod.h5"))
 
 

@@ -1,4 +1,6 @@
-"""FITS files that claim what cannot be, and HDF5 files likewise: refused before anything is read or counted."""
+"""FITS files that claim what cannot be, and HDF5 files likewise: refused before anything is read or
+counted.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +19,18 @@ from zonda.core.storage import fits_files, hdf5_files
 from zonda.operators.sky.read import read_map
 
 WORLD = {
-    "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 3, "CRPIX2": 2, "CRVAL1": 75.0, "CRVAL2": 20.0, "CDELT1": -0.01,
-    "CDELT2": 0.01, "CUNIT1": "deg", "CUNIT2": "deg", "BUNIT": "K_RJ",
-}  # fmt: skip
+    "CTYPE1": "RA---TAN",
+    "CTYPE2": "DEC--TAN",
+    "CRPIX1": 3,
+    "CRPIX2": 2,
+    "CRVAL1": 75.0,
+    "CRVAL2": 20.0,
+    "CDELT1": -0.01,
+    "CDELT2": 0.01,
+    "CUNIT1": "deg",
+    "CUNIT2": "deg",
+    "BUNIT": "K_RJ",
+}
 
 
 def image(path: Path, **cards: Any) -> Path:
@@ -31,7 +42,9 @@ def image(path: Path, **cards: Any) -> Path:
 
 def table(path: Path, values: Any, code: str, **cards: Any) -> Path:
     hdu = fits.BinTableHDU.from_columns([fits.Column("T", code, unit="K_CMB", array=values)])
-    hdu.header.update({"PIXTYPE": "HEALPIX", "ORDERING": "RING", "NSIDE": 1, "COORDSYS": "C"} | cards)
+    hdu.header.update(
+        {"PIXTYPE": "HEALPIX", "ORDERING": "RING", "NSIDE": 1, "COORDSYS": "C"} | cards
+    )
     hdu.writeto(path)
     return path
 
@@ -40,7 +53,9 @@ def changed(path: Path, key: str, value: str, instead: str = "") -> Path:
     """Replace the first card of a key, bytes for bytes."""
     content = path.read_bytes()
     at = next(k for k in range(0, len(content), 80) if content[k : k + 8] == key.ljust(8).encode())
-    path.write_bytes(content[:at] + f"{instead or key:8}= {value:>20}".ljust(80).encode() + content[at + 80 :])
+    path.write_bytes(
+        content[:at] + f"{instead or key:8}= {value:>20}".ljust(80).encode() + content[at + 80 :]
+    )
     return path
 
 
@@ -68,7 +83,10 @@ def test_headers_that_claim_too_much(tmp_path: Path, key: str, value: str, words
 
 
 def test_a_table_of_a_billion_columns(tmp_path: Path) -> None:
-    refused(changed(table(tmp_path / "map.fits", np.ones(12), "D"), "TFIELDS", "1000000000"), "TFIELDS = 1000000000")
+    refused(
+        changed(table(tmp_path / "map.fits", np.ones(12), "D"), "TFIELDS", "1000000000"),
+        "TFIELDS = 1000000000",
+    )
 
 
 def test_texts_instead_of_numbers(tmp_path: Path) -> None:
@@ -80,7 +98,9 @@ def test_units_that_are_none(tmp_path: Path, unit: str) -> None:
     refused(changed(image(tmp_path / "map.fits"), "BUNIT", unit), "unit|cannot be read")
 
 
-def test_a_small_file_that_unpacks_to_a_large_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_small_file_that_unpacks_to_a_large_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = changed(changed(image(tmp_path / "map.fits"), "NAXIS1", "20000"), "NAXIS2", "20000")
     with gzip.open(tmp_path / "bomb.fits.gz", "wb") as packed:
         packed.write(path.read_bytes())
@@ -112,7 +132,9 @@ def test_a_data_set_that_claims_more_than_the_file(tmp_path: Path) -> None:
             hdf5_files.check_size(times, "file")
 
 
-def test_what_the_disk_refuses_is_told_after_libhdf5_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_disk_refuses_is_told_after_libhdf5_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It crashes when it closes a file that it could not write."""
     import errno
 

@@ -34,7 +34,9 @@ def as_astropy(path: Path) -> tuple[dict[str, Any], np.ndarray]:
 
 
 def agree(path: Path) -> bool:
-    """True where the file is read, and then as astropy reads it: the same keys in the same order, values, types and pixels."""
+    """True where the file is read, and then as astropy reads it: the same keys in the same order,
+    values, types and pixels.
+    """
     found = read_image(path)
     if found is None:
         return False
@@ -55,12 +57,16 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def plain(*cards: str, values: np.ndarray | None = None) -> bytes:
     """A plain image whose header goes on with ``cards``."""
     image = fits.PrimaryHDU(np.arange(6.0).reshape(2, 3) if values is None else values)
-    head = "".join(str(c).ljust(CARD) for c in image.header.cards if c.keyword != "EXTEND") + "".join(
-        c.ljust(CARD) for c in cards
-    )
+    head = "".join(
+        str(c).ljust(CARD) for c in image.header.cards if c.keyword != "EXTEND"
+    ) + "".join(c.ljust(CARD) for c in cards)
     head += "END".ljust(CARD)
     data = image.data.astype(image.data.dtype.newbyteorder(">")).tobytes()
-    return head.ljust(-(-len(head) // BLOCK) * BLOCK).encode("latin-1") + data + bytes(-len(data) % BLOCK)
+    return (
+        head.ljust(-(-len(head) // BLOCK) * BLOCK).encode("latin-1")
+        + data
+        + bytes(-len(data) % BLOCK)
+    )
 
 
 # -- reading --
@@ -69,44 +75,138 @@ def plain(*cards: str, values: np.ndarray | None = None) -> bytes:
 @pytest.mark.parametrize("shape", [(7,), (4, 5), (1, 4, 5), (2, 3, 4, 5)])
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int32, np.int64, np.float32, np.float64])
 def test_types_and_shapes(file: Path, dtype: Any, shape: tuple[int, ...]) -> None:
-    fits.PrimaryHDU((np.random.default_rng(1).standard_normal(shape) * 50).astype(dtype)).writeto(file, overwrite=True)
+    fits.PrimaryHDU((np.random.default_rng(1).standard_normal(shape) * 50).astype(dtype)).writeto(
+        file, overwrite=True
+    )
     assert agree(file)
 
 
 TEXT = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=30)
-NUMBERS = st.integers(-(10**20), 10**20) | st.floats(allow_nan=False, allow_infinity=False) | st.booleans()
+NUMBERS = (
+    st.integers(-(10**20), 10**20)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.booleans()
+)
 
 
 @many
-@given(st.dictionaries(st.from_regex(r"[A-Z][A-Z0-9_-]{0,7}", fullmatch=True), st.tuples(NUMBERS | TEXT, TEXT), max_size=40))
+@given(
+    st.dictionaries(
+        st.from_regex(r"[A-Z][A-Z0-9_-]{0,7}", fullmatch=True),
+        st.tuples(NUMBERS | TEXT, TEXT),
+        max_size=40,
+    )
+)
 def test_headers_that_astropy_writes(file: Path, cards: dict[str, tuple[Any, str]]) -> None:
     image = fits.PrimaryHDU(np.ones((2, 3), np.float32))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for key, card in cards.items():
-            if key not in (*image.header, "END", "CONTINUE", "HIERARCH", "GROUPS", "SIMPLE", "XTENSION"):
+            if key not in (
+                *image.header,
+                "END",
+                "CONTINUE",
+                "HIERARCH",
+                "GROUPS",
+                "SIMPLE",
+                "XTENSION",
+            ):
                 image.header[key] = card
         image.writeto(file, overwrite=True)
     agree(file)
 
 
 VALUES = [
-    "T", "F", "t", "0", "-0", "+7", "007", "1.", ".5", "-1.5", "+1.5E3", "1.5E+03", "1.5e3", "1.5D3", "1E5", "1.E400", "NaN",
-    "INF", "'a'", "'a  '", "'  a'", "''", "'   '", "'it''s'", "'a' b", "'a'/b'c'", "'a", "'a&'", "'x: 5'", "'AXIS.1: 2'",
-    "'12:30:05'", "'tab\t'", "(1, 2)", "", "/ only a comment", "5/6", "5 6", "5 /", "'a''/ b' / c", "1 2", "- 3",
-    "99999999999999999999", "1_000", "'\xe9'",
-]  # fmt: skip
-NAMES = ["KEY", "K-E_Y9", "key", "A KEY", "CTYPE1", "COMMENT", "HISTORY", "", "HIERARCH", "CONTINUE", "NAXIS", "NAXIS3", "BITPIX",
-         "BSCALE", "BZERO", "BLANK", "GROUPS", "PCOUNT", "END", "EXTEND", "SIMPLE", "XTENSION", "DP1", "ZIMAGE"]  # fmt: skip
+    "T",
+    "F",
+    "t",
+    "0",
+    "-0",
+    "+7",
+    "007",
+    "1.",
+    ".5",
+    "-1.5",
+    "+1.5E3",
+    "1.5E+03",
+    "1.5e3",
+    "1.5D3",
+    "1E5",
+    "1.E400",
+    "NaN",
+    "INF",
+    "'a'",
+    "'a  '",
+    "'  a'",
+    "''",
+    "'   '",
+    "'it''s'",
+    "'a' b",
+    "'a'/b'c'",
+    "'a",
+    "'a&'",
+    "'x: 5'",
+    "'AXIS.1: 2'",
+    "'12:30:05'",
+    "'tab\t'",
+    "(1, 2)",
+    "",
+    "/ only a comment",
+    "5/6",
+    "5 6",
+    "5 /",
+    "'a''/ b' / c",
+    "1 2",
+    "- 3",
+    "99999999999999999999",
+    "1_000",
+    "'\xe9'",
+]
+NAMES = [
+    "KEY",
+    "K-E_Y9",
+    "key",
+    "A KEY",
+    "CTYPE1",
+    "COMMENT",
+    "HISTORY",
+    "",
+    "HIERARCH",
+    "CONTINUE",
+    "NAXIS",
+    "NAXIS3",
+    "BITPIX",
+    "BSCALE",
+    "BZERO",
+    "BLANK",
+    "GROUPS",
+    "PCOUNT",
+    "END",
+    "EXTEND",
+    "SIMPLE",
+    "XTENSION",
+    "DP1",
+    "ZIMAGE",
+]
 EQUALS = ["= ", "=", " =", "  ", " = "]
 
 
 @many
 @given(
-    st.lists(st.tuples(st.sampled_from(NAMES), st.sampled_from(EQUALS), st.sampled_from(VALUES), st.integers(0, 12)), max_size=4)
+    st.lists(
+        st.tuples(
+            st.sampled_from(NAMES),
+            st.sampled_from(EQUALS),
+            st.sampled_from(VALUES),
+            st.integers(0, 12),
+        ),
+        max_size=4,
+    )
 )
 def test_cards_of_all_kinds(file: Path, cards: list[tuple[str, str, str, int]]) -> None:
-    file.write_bytes(plain(*(f"{name:8}{equals}{' ' * gap}{value}" for name, equals, value, gap in cards)))
+    file.write_bytes(
+        plain(*(f"{name:8}{equals}{' ' * gap}{value}" for name, equals, value, gap in cards))
+    )
     agree(file)
 
 
@@ -135,19 +235,34 @@ def test_what_is_read_at_all(file: Path) -> None:
         "'a' / of it",
         "-1.5 / [deg] why",
     ):
-        file.write_bytes(plain(f"KEY     = {value}", "COMMENT = 'x", "HISTORY of it", "", "EXTEND  = T"))
+        file.write_bytes(
+            plain(f"KEY     = {value}", "COMMENT = 'x", "HISTORY of it", "", "EXTEND  = T")
+        )
         assert agree(file), value
 
 
 @pytest.mark.parametrize(
     "cards",
     [
-        ["BSCALE  = 1.0"], ["BZERO   = 0"], ["BLANK   = -1"], ["GROUPS  = T"], ["PCOUNT  = 0"], ["KEY     = 1", "KEY     = 1"],
-        ["KEY     = 'a&'", "CONTINUE  'b'"], ["HIERARCH A B = 1"], ["key     = 1"], ["KEY     = 1D3"], ["NAXIS3  = 1"],
-        ["OBJECT  = 'AXIS.1: 2'"], ["KEY     ="], ["KEY     = 'it''s'"], ["KEY     = '' / '"], ["COMMENT \xe9"],
+        ["BSCALE  = 1.0"],
+        ["BZERO   = 0"],
+        ["BLANK   = -1"],
+        ["GROUPS  = T"],
+        ["PCOUNT  = 0"],
+        ["KEY     = 1", "KEY     = 1"],
+        ["KEY     = 'a&'", "CONTINUE  'b'"],
+        ["HIERARCH A B = 1"],
+        ["key     = 1"],
+        ["KEY     = 1D3"],
+        ["NAXIS3  = 1"],
+        ["OBJECT  = 'AXIS.1: 2'"],
+        ["KEY     ="],
+        ["KEY     = 'it''s'"],
+        ["KEY     = '' / '"],
+        ["COMMENT \xe9"],
         ["XTENSION= 'IMAGE   '"],
     ],
-)  # fmt: skip
+)
 def test_what_is_left_to_astropy(file: Path, cards: list[str]) -> None:
     file.write_bytes(plain(*cards))
     assert read_image(file) is None
@@ -157,7 +272,11 @@ def test_files_that_are_not_one_whole_image(file: Path, tmp_path: Path) -> None:
     whole = plain()
     file.write_bytes(whole)
     assert agree(file)
-    no_mark, no_end, no_type = (b"SIMPLE  =  ", b"SIMPLE  = T"), (b"END  ", b"END ="), (b"  -64", b"  -63")
+    no_mark, no_end, no_type = (
+        (b"SIMPLE  =  ", b"SIMPLE  = T"),
+        (b"END  ", b"END ="),
+        (b"  -64", b"  -63"),
+    )
     replaced = [whole.replace(*pair, 1) for pair in (no_mark, no_end, no_type)]
     for data in (b"", whole[:BLOCK], whole[:-1], whole[:-BLOCK], whole + bytes(BLOCK), *replaced):
         file.write_bytes(data)
@@ -173,8 +292,18 @@ def test_files_that_are_not_one_whole_image(file: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("how", ["byte", "letter", "card", "cut"])
 def test_damage(file: Path, how: str) -> None:
     """Whatever is still read is what astropy reads."""
-    header = fits.Header([("CTYPE1", "RA---TAN"), ("CRVAL1", 75.5, "[deg]"), ("BUNIT", "K"), ("N", 3), ("FLAG", True)])
-    fits.PrimaryHDU(np.arange(12, dtype=np.int16).reshape(3, 4), header).writeto(file, overwrite=True)
+    header = fits.Header(
+        [
+            ("CTYPE1", "RA---TAN"),
+            ("CRVAL1", 75.5, "[deg]"),
+            ("BUNIT", "K"),
+            ("N", 3),
+            ("FLAG", True),
+        ]
+    )
+    fits.PrimaryHDU(np.arange(12, dtype=np.int16).reshape(3, 4), header).writeto(
+        file, overwrite=True
+    )
     whole, read = file.read_bytes(), 0
     for seed in range(400):
         rng, made = random.Random(seed), bytearray(whole)
@@ -198,18 +327,42 @@ def test_damage(file: Path, how: str) -> None:
 
 WRITABLE = st.dictionaries(
     st.from_regex(r"[A-Z][A-Z0-9_-]{0,7}", fullmatch=True),
-    st.tuples(NUMBERS | st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=200) | st.none(), TEXT),
+    st.tuples(
+        NUMBERS
+        | st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=200)
+        | st.none(),
+        TEXT,
+    ),
     max_size=30,
 )
 
 
 @many
-@given(WRITABLE, st.lists(st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=150), max_size=5))
-def test_astropy_reads_what_is_written(file: Path, given: dict[str, tuple[Any, str]], history: list[str]) -> None:
-    reserved = ("END", "COMMENT", "HISTORY", "CONTINUE", "HIERARCH", "SIMPLE", "XTENSION", "BITPIX", "GROUPS", "BSCALE", "BZERO")
+@given(
+    WRITABLE,
+    st.lists(st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=150), max_size=5),
+)
+def test_astropy_reads_what_is_written(
+    file: Path, given: dict[str, tuple[Any, str]], history: list[str]
+) -> None:
+    reserved = (
+        "END",
+        "COMMENT",
+        "HISTORY",
+        "CONTINUE",
+        "HIERARCH",
+        "SIMPLE",
+        "XTENSION",
+        "BITPIX",
+        "GROUPS",
+        "BSCALE",
+        "BZERO",
+    )
     rvkc = {k: v for k, v in given.items() if isinstance(v[0], str) and ": " in v[0]}
     wanted = {
-        k: v for k, v in given.items() if k not in (*reserved, *rvkc) and not k.startswith(("NAXIS", "PCOUNT", "GCOUNT", "BLANK"))
+        k: v
+        for k, v in given.items()
+        if k not in (*reserved, *rvkc) and not k.startswith(("NAXIS", "PCOUNT", "GCOUNT", "BLANK"))
     }
     cards = Cards((key, *card) for key, card in wanted.items())
     for line in history:
@@ -228,7 +381,11 @@ def test_astropy_reads_what_is_written(file: Path, given: dict[str, tuple[Any, s
                     assert read == (value.rstrip() if isinstance(value, str) else value)
                     assert type(read) is type(value)
                 assert comment.strip().startswith(hdu.header.comments[key].strip())
-            lines = [line[k : k + 72].rstrip() for line in history for k in range(0, max(len(line), 1), 72)]
+            lines = [
+                line[k : k + 72].rstrip()
+                for line in history
+                for k in range(0, max(len(line), 1), 72)
+            ]
             assert list(hdu.header.get("HISTORY", [])) == lines
 
 
@@ -244,14 +401,19 @@ def test_every_type_is_written(file: Path) -> None:
         assert agree(file)
 
 
-@pytest.mark.parametrize(("key", "value"), [("KEY", "\xe9"), ("KEY", float("nan")), ("key", 1), ("LONGERKEY", 1), ("A B", 1)])
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("KEY", "\xe9"), ("KEY", float("nan")), ("key", 1), ("LONGERKEY", 1), ("A B", 1)],
+)
 def test_what_no_card_holds(key: str, value: Any) -> None:
     with pytest.raises(ValueError, match="FITS"):
         Cards([(key, value)]).tostring()
 
 
 def test_cards_are_a_header_for_astropy() -> None:
-    cards = Cards([("CTYPE1", "RA---TAN", "axis"), ("CTYPE2", "DEC--TAN"), ("CRVAL1", 75.0), ("CRVAL2", 20.0)])
+    cards = Cards(
+        [("CTYPE1", "RA---TAN", "axis"), ("CTYPE2", "DEC--TAN"), ("CRVAL1", 75.0), ("CRVAL2", 20.0)]
+    )
     assert list(WCS(cards).wcs.crval) == [75.0, 20.0]
     assert fits.Header(cards)["CTYPE1"] == "RA---TAN"
     assert fits.Header.fromstring(cards.tostring()).comments["CTYPE1"] == "axis"

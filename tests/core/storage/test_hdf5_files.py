@@ -12,7 +12,9 @@ from zonda.core.storage import hdf5_files
 def test_a_first_look_that_fails_is_told(tmp_path, monkeypatch, status):
     (tmp_path / "x.h5").write_bytes(b"")
     program = tmp_path / "python"
-    program.write_text(f"#!/bin/sh\necho 'Traceback' >&2\necho 'ImportError: no h5py' >&2\nexit {status}\n")
+    program.write_text(
+        f"#!/bin/sh\necho 'Traceback' >&2\necho 'ImportError: no h5py' >&2\nexit {status}\n"
+    )
     program.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(program))
     with pytest.raises(InputError) as caught:

@@ -23,7 +23,12 @@ with lock(sys.argv[1]):
 
 def test_two_are_refused_and_nothing_stays(tmp_path):
     with lock(tmp_path):
-        with pytest.raises(OutputError, match=f"process {os.getpid()} on .* is writing to this folder"), lock(tmp_path):
+        with (
+            pytest.raises(
+                OutputError, match=f"process {os.getpid()} on .* is writing to this folder"
+            ),
+            lock(tmp_path),
+        ):
             pass
         with pytest.raises(OutputError), lock(tmp_path, "1-of-2"):
             pass
@@ -43,7 +48,9 @@ def test_shares_run_beside_each_other_but_not_beside_a_whole_run(tmp_path):
 def test_a_killed_holder_leaves_a_lock_that_is_taken_over(tmp_path):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], env=environment, **pipes) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)], env=environment, **pipes
+    ) as process:
         assert process.stdout.readline() == "held\n"
         with pytest.raises(OutputError, match=f"process {process.pid} on"), lock(tmp_path):
             pass
@@ -57,7 +64,10 @@ def test_a_killed_holder_leaves_a_lock_that_is_taken_over(tmp_path):
 @pytest.mark.parametrize(
     ("change", "taken"),
     [
-        ({}, True),  # this process itself, but the file is not locked: it was written by an earlier one
+        (
+            {},
+            True,
+        ),  # this process itself, but the file is not locked: it was written by an earlier one
         ({"host": "elsewhere"}, False),
         ({"boot": "before"}, True),
         ({"began": "1"}, True),  # the number of the process was given away again
@@ -75,7 +85,12 @@ def test_who_is_gone(tmp_path, change, taken):
 
 def test_without_locks_of_the_file_system_the_process_decides(tmp_path, monkeypatch):
     monkeypatch.setattr("zonda.core.storage.lock._flock", lambda handle: None)
-    for change, taken in (({}, False), ({"began": "1"}, True), ({"boot": "before"}, True), ({"pid": -5}, True)):
+    for change, taken in (
+        ({}, False),
+        ({"began": "1"}, True),
+        ({"boot": "before"}, True),
+        ({"pid": -5}, True),
+    ):
         (tmp_path / NAME).write_text(json.dumps(_myself() | change))
         if taken:
             with lock(tmp_path):

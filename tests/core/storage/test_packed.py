@@ -1,4 +1,6 @@
-"""Small files that unpack to much: refused at a stated size; nothing is left behind, and ordinary ones are read as before."""
+"""Small files that unpack to much: refused at a stated size; nothing is left behind, and ordinary
+ones are read as before.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,18 @@ from zonda.operators.pointing.recording_files import read_recording
 from zonda.operators.sky.read import read_map
 
 WORLD = {
-    "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 3, "CRPIX2": 2, "CRVAL1": 75.0, "CRVAL2": 20.0, "CDELT1": -0.01,
-    "CDELT2": 0.01, "CUNIT1": "deg", "CUNIT2": "deg", "BUNIT": "K_RJ",
-}  # fmt: skip
+    "CTYPE1": "RA---TAN",
+    "CTYPE2": "DEC--TAN",
+    "CRPIX1": 3,
+    "CRPIX2": 2,
+    "CRVAL1": 75.0,
+    "CRVAL2": 20.0,
+    "CDELT1": -0.01,
+    "CDELT2": 0.01,
+    "CUNIT1": "deg",
+    "CUNIT2": "deg",
+    "BUNIT": "K_RJ",
+}
 
 
 def zipped(path: Path, content: bytes) -> None:
@@ -59,37 +70,58 @@ def image(path: Path, side: int) -> bytes:
 
 
 @pytest.mark.parametrize("kind", PACK)
-def test_a_small_file_that_unpacks_to_much_is_refused(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_small_file_that_unpacks_to_much_is_refused(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / f"bomb.fits.{kind}"
     PACK[kind](path, image(tmp_path / "plain.fits", 1200))  # 5.8 MB
     assert path.stat().st_size < 30_000
     assert read_map(path).values.shape == (1200, 1200)
     monkeypatch.setattr(packed, "UNPACKED_MAX", 5_000_000)
-    with pytest.raises(InputError, match=r"unpacks to (at least )?0\.0057\d+ GB; reading stops at 0\.005 GB") as caught:
+    with pytest.raises(
+        InputError, match=r"unpacks to (at least )?0\.0057\d+ GB; reading stops at 0\.005 GB"
+    ) as caught:
         read_map(path)
     assert path.name in caught.value.place
     assert "unpack it before" in (caught.value.cure or "")
-    assert read_map(tmp_path / "plain.fits").values.shape == (1200, 1200)  # the limit is of compressed files
+    assert read_map(tmp_path / "plain.fits").values.shape == (
+        1200,
+        1200,
+    )  # the limit is of compressed files
 
 
 def test_what_a_header_promises_beyond_the_limit_is_not_unpacked(tmp_path: Path) -> None:
     """9 PB: not one byte after the header is read."""
-    header = fits.Header([("SIMPLE", True), ("BITPIX", 8), ("NAXIS", 2), ("NAXIS1", 95_000_000), ("NAXIS2", 95_000_000)])
+    header = fits.Header(
+        [
+            ("SIMPLE", True),
+            ("BITPIX", 8),
+            ("NAXIS", 2),
+            ("NAXIS1", 95_000_000),
+            ("NAXIS2", 95_000_000),
+        ]
+    )
     path = tmp_path / "bomb.fits.gz"
     path.write_bytes(gzip.compress(header.tostring().encode() + bytes(2880)))
-    with pytest.raises(InputError, match=r"unpacks to at least 9\.025e\+06 GB; reading stops at 4 GB"):
+    with pytest.raises(
+        InputError, match=r"unpacks to at least 9\.025e\+06 GB; reading stops at 4 GB"
+    ):
         read_map(path)
 
 
 def test_zeros_after_a_map_are_not_read_without_end(tmp_path: Path) -> None:
     path = tmp_path / "bomb.fits.gz"
-    path.write_bytes(gzip.compress(image(tmp_path / "plain.fits", 4) + bytes(fits_files.HEADER_MAX + 2880)))
+    path.write_bytes(
+        gzip.compress(image(tmp_path / "plain.fits", 4) + bytes(fits_files.HEADER_MAX + 2880))
+    )
     assert path.stat().st_size < 30_000
     with pytest.raises(InputError, match="a header is longer than 10 MB"):
         read_map(path)
 
 
-def test_tiles_that_unpack_to_much_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_that_unpack_to_much_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "tiles.fits"
     hdu = fits.CompImageHDU(np.ones((1000, 1000), np.int32), compression_type="RICE_1")
     hdu.header.update(WORLD)
@@ -116,7 +148,9 @@ def test_a_passband_that_unpacks_to_much_is_refused(kind: str, tmp_path: Path) -
 
 
 def test_a_chunk_that_unpacks_to_more_than_it_holds_is_refused(tmp_path: Path) -> None:
-    """libhdf5 unpacks a stored chunk to its end: 100 kB of zeros deflated are 100 MB, in a data set of eight numbers."""
+    """libhdf5 unpacks a stored chunk to its end: 100 kB of zeros deflated are 100 MB, in a data set
+    of eight numbers.
+    """
     import zlib
 
     path = tmp_path / "scan.h5"
@@ -127,7 +161,9 @@ def test_a_chunk_that_unpacks_to_more_than_it_holds_is_refused(tmp_path: Path) -
             data.id.write_direct_chunk((0,), zlib.compress(bytes(100_000_000), 9))
         except OSError:
             pytest.skip("this libhdf5 writes no chunk larger than what it holds")
-    with pytest.raises(InputError, match=r"a chunk of /az is stored in \d+ bytes, more than the 64 that it holds"):
+    with pytest.raises(
+        InputError, match=r"a chunk of /az is stored in \d+ bytes, more than the 64 that it holds"
+    ):
         read_recording(path, "unix")
 
 
@@ -139,12 +175,17 @@ def test_what_is_deflated_twice_is_refused(tmp_path: Path) -> None:
         plist.set_deflate(9)
         plist.set_deflate(9)
         space = h5py.h5s.create_simple((100_000,))
-        h5py.Dataset(h5py.h5d.create(file.id, b"az", h5py.h5t.NATIVE_DOUBLE, space, plist))[...] = 1.0
+        h5py.Dataset(h5py.h5d.create(file.id, b"az", h5py.h5t.NATIVE_DOUBLE, space, plist))[...] = (
+            1.0
+        )
     with pytest.raises(InputError, match="/az is deflated twice over"):
         read_recording(path, "unix")
 
 
-@pytest.mark.parametrize("options", [{}, {"compression": "gzip", "shuffle": True}, {"compression": "lzf", "fletcher32": True}])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"compression": "gzip", "shuffle": True}, {"compression": "lzf", "fletcher32": True}],
+)
 def test_ordinary_chunks_are_read(options: dict[str, Any], tmp_path: Path) -> None:
     values = np.random.default_rng(1).integers(0, 2**63, 5000)  # cannot be compressed
     with h5py.File(tmp_path / "a.h5", "w") as file:

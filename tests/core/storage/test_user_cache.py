@@ -26,7 +26,9 @@ def test_there_and_back(place):
     assert [p.name[:5] for p in place.iterdir()] == ["kind-"]
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", "null", '{"key": "another", "value": 1}', "\x00"])
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", "null", '{"key": "another", "value": 1}', "\x00"]
+)
 def test_a_damaged_file_is_none(place, content):
     user_cache.remember("kind", "key", 1)
     next(place.iterdir()).write_text(content)
@@ -71,5 +73,8 @@ def test_where(monkeypatch, tmp_path):
     monkeypatch.setenv("ZONDA_CACHE_DIR", "")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
-    expected = {"win32": tmp_path / "zonda" / "cache", "darwin": Path.home() / "Library/Caches/zonda"}
+    expected = {
+        "win32": tmp_path / "zonda" / "cache",
+        "darwin": Path.home() / "Library/Caches/zonda",
+    }
     assert user_cache.folder() == expected.get(sys.platform, tmp_path / "zonda")

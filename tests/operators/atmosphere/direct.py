@@ -1,4 +1,6 @@
-"""A layer at any points, directly: cubic B-spline through its lattice, in float64, a box of it at a time."""
+"""A layer at any points, directly: cubic B-spline through its lattice, in float64, a box of it at a
+time.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ def at_points(field: Turbulence, across: Floats, along: Floats, cells: int = 1 <
     return out.reshape(across.shape)
 
 
-def _fill(field: Turbulence, x: Floats, y: Floats, which: NDArray[np.int64], out: Floats, cells: int) -> None:
+def _fill(
+    field: Turbulence, x: Floats, y: Floats, which: NDArray[np.int64], out: Floats, cells: int
+) -> None:
     i, j = np.floor(x[which]).astype(int), np.floor(y[which]).astype(int)
     i0, i1, j0, j1 = i.min() - 1, i.max() + 3, j.min() - 1, j.max() + 3
     if (i1 - i0) * (j1 - j0) > cells and len(which) > 1:

@@ -1,11 +1,18 @@
-"""The atmosphere's power spectrum in closed form: its integral and its limits; that of pink noise beside simulated streams."""
+"""The atmosphere's power spectrum in closed form: its integral and its limits; that of pink noise
+beside simulated streams.
+"""
 
 import numpy as np
 import pytest
 
 import zonda
 from zonda.core.instrument import Band, Instrument, Telescope
-from zonda.operators.atmosphere.closed_form import KNOTS, WAVE_NUMBERS, between_knots, layer_spectrum
+from zonda.operators.atmosphere.closed_form import (
+    KNOTS,
+    WAVE_NUMBERS,
+    between_knots,
+    layer_spectrum,
+)
 from zonda.operators.atmosphere.turbulence.beams import Aperture
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, mixture
 from zonda.operators.atmosphere.turbulence.nodes import Layer
@@ -23,7 +30,9 @@ def layer(sigma=40.0, aperture=None):
 def test_its_integral_is_the_variance_behind_the_beam(speeds):
     found = layer_spectrum(layer(), F, np.array(speeds))
     below = F[0] * found[0]  # level at low frequencies
-    assert np.trapezoid(found, F) + below == pytest.approx(float(beam_correlation(0.0, 500.0, 40.0)[0]), rel=1e-4)
+    assert np.trapezoid(found, F) + below == pytest.approx(
+        float(beam_correlation(0.0, 500.0, 40.0)[0]), rel=1e-4
+    )
 
 
 @pytest.mark.parametrize("taper", [0.0, 10.0])
@@ -33,12 +42,17 @@ def test_behind_an_aperture(taper):
     assert np.trapezoid(found, F) + F[0] * found[0] == pytest.approx(dish.variance(500.0), rel=2e-3)
     # scales that a dish does not resolve look as behind the Gaussian of the same second moment
     low = F < 0.005
-    assert found[low] == pytest.approx(layer_spectrum(layer(dish.sigma), F[low], np.array([10.0])), rel=0.01)
+    assert found[low] == pytest.approx(
+        layer_spectrum(layer(dish.sigma), F[low], np.array([10.0])), rel=0.01
+    )
 
 
 def test_faster_winds_move_it_to_higher_frequencies():
     """S(f; V) = S(f / c; V / c) / c."""
-    slow, fast = layer_spectrum(layer(), F, np.array([5.0])), layer_spectrum(layer(), 3 * F, np.array([15.0]))
+    slow, fast = (
+        layer_spectrum(layer(), F, np.array([5.0])),
+        layer_spectrum(layer(), 3 * F, np.array([15.0])),
+    )
     assert fast == pytest.approx(slow / 3, rel=1e-12)
 
 
@@ -46,14 +60,23 @@ def test_its_sum_of_gaussians_is_fine_enough():
     """The shorter sum agrees with the one of 1e-14 until the power is 1e-12 of the largest."""
     f, speed = np.geomspace(1e-4, 0.3, 200), 10.0
     e, w = mixture(500.0, 40.0)
-    fine = 2 / speed * np.exp(-np.multiply.outer((2 * np.pi * f / speed) ** 2, e)) @ (w * np.sqrt(4 * np.pi * e))
+    fine = (
+        2
+        / speed
+        * np.exp(-np.multiply.outer((2 * np.pi * f / speed) ** 2, e))
+        @ (w * np.sqrt(4 * np.pi * e))
+    )
     seen = fine > 1e-12 * fine[0]
     assert f[seen].max() > 0.15
-    np.testing.assert_allclose(layer_spectrum(layer(), f[seen], np.array([speed])), fine[seen], rtol=1e-6)
+    np.testing.assert_allclose(
+        layer_spectrum(layer(), f[seen], np.array([speed])), fine[seen], rtol=1e-6
+    )
 
 
 def test_many_speeds_share_one_table():
-    """Against the sum over the speeds; the error is that of `test_between_knots_it_is_the_law_itself` times (h / 0.059)^2."""
+    """Against the sum over the speeds; the error is that of
+    `test_between_knots_it_is_the_law_itself` times (h / 0.059)^2.
+    """
     f, speeds = np.geomspace(0.004, 50, 100), np.geomspace(5.0, 20.0, 64)
     found = layer_spectrum(layer(), f, speeds)
     direct = np.mean([layer_spectrum(layer(), f, np.array([v])) for v in speeds], axis=0)
@@ -75,8 +98,9 @@ def law_of(f):
 def test_between_knots_it_is_the_law_itself():
     f = np.geomspace(0.004, 50, 4000)
     direct, found = law_of(f), between_knots(law_of, f)
-    # P = exp(-x^2), x proportional to f: h^2 / 8 |d^2 ln P / d(ln f)^2| = h^2 x^2 / 2 = 0.8, 1.6, 2.4 % at most with h = 0.059;
-    # half of that, since the Kolmogorov spectrum in front of it falls without a curvature
+    # P = exp(-x^2), x proportional to f: h^2 / 8 |d^2 ln P / d(ln f)^2| = h^2 x^2 / 2 = 0.8, 1.6,
+    # 2.4 % at most with h = 0.059; half of that, since the Kolmogorov spectrum in front of it falls
+    # without a curvature
     for depth, error in ((1e-2, 0.004), (1e-4, 0.008), (1e-6, 0.012)):
         seen = direct > depth * direct[0]
         np.testing.assert_allclose(found[seen], direct[seen], rtol=error)
@@ -98,7 +122,9 @@ def test_between_knots_the_frequency_zero_and_the_order_do_not_matter():
 
 
 def through_hann(law, number, step):
-    """Expectation of Welch's periodogram at k ``step``, k = 1 ... ``number`` - 1: the law convolved with the window's |W|^2."""
+    """Expectation of Welch's periodogram at k ``step``, k = 1 ... ``number`` - 1: the law convolved
+    with the window's |W|^2.
+    """
     fine, length = 4, 2 * number
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
     kernel = np.abs(np.fft.fft(window, fine * length)) ** 2
@@ -110,13 +136,20 @@ def through_hann(law, number, step):
 
 @pytest.mark.parametrize("radius", [0.0, 4.0])
 def test_an_ensemble_of_streams_has_it(radius):
-    """Ten layers, a stare and a scan, 12 atmospheres. Each band's mean is within 4 standard errors, as they scatter (t of 11
-    degrees of freedom exceeds 4 once in 500)."""
+    """Ten layers, a stare and a scan, 12 atmospheres. Each band's mean is within 4 standard errors,
+    as they scatter (t of 11 degrees of freedom exceeds 4 once in 500)."""
     camera = Instrument(
-        name="camera", telescope=Telescope(name="dish", diameter="6 m"), band=Band(name="band", low="78 GHz", high="108 GHz"),
-        detectors=1, field_of_view="0 deg", main_beam_efficiency=0.3, illumination_efficiency=0.8, net="1 mK s(1/2)",
-        knee="0.5 Hz", sample_rate="100 Hz",
-    )  # fmt: skip
+        name="camera",
+        telescope=Telescope(name="dish", diameter="6 m"),
+        band=Band(name="band", low="78 GHz", high="108 GHz"),
+        detectors=1,
+        field_of_view="0 deg",
+        main_beam_efficiency=0.3,
+        illumination_efficiency=0.8,
+        net="1 mK s(1/2)",
+        knee="0.5 Hz",
+        sample_rate="100 Hz",
+    )
     steps = [
         zonda.AtmosphereLayers(pwv="5 mm", pwv_rms="1 %"),
         zonda.Efficiency(),
@@ -129,9 +162,15 @@ def test_an_ensemble_of_streams_has_it(radius):
         spectrum = scenes.run(steps, scan).products["spectrum"]
         if not ratios:
             f = spectrum.frequency
-            expected = through_hann(lambda x, scan=scan: scan.closed_forms["atmosphere"][0](x), f.size, f[0])
+            expected = through_hann(
+                lambda x, scan=scan: scan.closed_forms["atmosphere"][0](x), f.size, f[0]
+            )
         ratios.append(spectrum.psd["atmosphere"][:31] / expected[:31])
-    for low, high in ((4, 8), (8, 16), (16, 32)):  # 0.2 to 1.6 Hz, where the power falls by a factor of 2000
+    for low, high in (
+        (4, 8),
+        (8, 16),
+        (16, 32),
+    ):  # 0.2 to 1.6 Hz, where the power falls by a factor of 2000
         band = np.array(ratios)[:, low - 1 : high - 1].mean(axis=1)
         error = band.std(ddof=1) / np.sqrt(band.size)
         assert error < 0.15
@@ -161,7 +200,11 @@ def test_pink_noise_and_the_mean_over_scans():
 
 
 def test_log_normal_fluctuations_have_none():
-    steps = [zonda.AtmosphereLayers(pwv="2 mm", pwv_rms="25 %"), zonda.Efficiency(), zonda.PowerSpectrum()]
+    steps = [
+        zonda.AtmosphereLayers(pwv="2 mm", pwv_rms="25 %"),
+        zonda.Efficiency(),
+        zonda.PowerSpectrum(),
+    ]
     assert scenes.run(steps, scenes.scan(3, 2000)).products["spectrum"].closed_forms == {}
 
 

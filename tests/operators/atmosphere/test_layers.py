@@ -1,4 +1,6 @@
-"""`AtmosphereLayers` as a whole: rms, structure function, evaluation at nodes, invariances, corners."""
+"""`AtmosphereLayers` as a whole: rms, structure function, evaluation at nodes, invariances,
+corners.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +43,19 @@ at_points = _direct.at_points
 
 Floats = NDArray[np.float64]
 PWV = 7.7e-3
-SITE = Site(name="here", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="825 m", climatology="green_bank")
+SITE = Site(
+    name="here",
+    latitude="38.4331 deg",
+    longitude="-79.8398 deg",
+    altitude="825 m",
+    climatology="green_bank",
+)
 START = "2024-11-25T07:00:00Z"
 
 
-def instrument(detectors: int = 223, field: str = "4.2 arcmin", diameter: str = "100 m") -> Instrument:
+def instrument(
+    detectors: int = 223, field: str = "4.2 arcmin", diameter: str = "100 m"
+) -> Instrument:
     return Instrument(
         name="camera",
         telescope=Telescope(name="dish", diameter=diameter),
@@ -62,7 +72,15 @@ def instrument(detectors: int = 223, field: str = "4.2 arcmin", diameter: str = 
 def quaternions(azimuth: Floats, elevation: Floats) -> Floats:
     """Rz(-az) Ry(pi/2 - el), multiplied out: (n, 4)."""
     a, b = -azimuth / 2, (np.pi / 2 - elevation) / 2
-    return np.stack([-np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
+    return np.stack(
+        [
+            -np.sin(a) * np.sin(b),
+            np.cos(a) * np.sin(b),
+            np.sin(a) * np.cos(b),
+            np.cos(a) * np.cos(b),
+        ],
+        axis=1,
+    )
 
 
 def observe(
@@ -90,14 +108,34 @@ def observe(
         xi, eta = (np.asarray(v, np.float64) for v in offsets)
         one = np.ones(len(xi))
         plane = Focalplane([f"d{k}" for k in range(len(xi))], xi, eta, one * 4e-5, one, one, one)
-    return Observation(f"scan{index}", index, SITE, camera, plane, Instant.parse(start), t, rate, q, q, (0.0, 0.0), seed)
+    return Observation(
+        f"scan{index}",
+        index,
+        SITE,
+        camera,
+        plane,
+        Instant.parse(start),
+        t,
+        rate,
+        q,
+        q,
+        (0.0, 0.0),
+        seed,
+    )
 
 
 def operator(**parameters: Any) -> AtmosphereLayers:
-    return AtmosphereLayers(**{"pwv": "7.7 mm", "layer_response": "column", **parameters})  # equation (1), of the water
+    return AtmosphereLayers(
+        **{"pwv": "7.7 mm", "layer_response": "column", **parameters}
+    )  # equation (1), of the water
 
 
-def whole(observation: Observation, state: AtNodes | OfDetectors, name: str = "emission", dtype: type = np.float64) -> Floats:
+def whole(
+    observation: Observation,
+    state: AtNodes | OfDetectors,
+    name: str = "emission",
+    dtype: type = np.float64,
+) -> Floats:
     """(n_det, n_samp)."""
     n_det, n = observation.n_detectors, observation.n_samples
     out = np.empty((n_det, n), dtype)
@@ -106,11 +144,17 @@ def whole(observation: Observation, state: AtNodes | OfDetectors, name: str = "e
 
 
 def water(op: AtmosphereLayers, observation: Observation) -> Floats:
-    """y of every detector and sample: relative fluctuation of the water, from the emission and its slope (y << 1)."""
+    """y of every detector and sample: relative fluctuation of the water, from the emission and its
+    slope (y << 1).
+    """
     emission = whole(observation, op.prepare(observation))
     band = op.model(observation).band
-    u = rays(axes(observation.boresight_azel), observation.focalplane.xi, observation.focalplane.eta)
-    slope = (band.emission(PWV * 1.001, np.arcsin(u[2])) - band.emission(PWV * 0.999, np.arcsin(u[2]))) / 0.002
+    u = rays(
+        axes(observation.boresight_azel), observation.focalplane.xi, observation.focalplane.eta
+    )
+    slope = (
+        band.emission(PWV * 1.001, np.arcsin(u[2])) - band.emission(PWV * 0.999, np.arcsin(u[2]))
+    ) / 0.002
     return emission / slope
 
 
@@ -121,24 +165,33 @@ def layers_of(op: AtmosphereLayers, observation: Observation) -> list[Any]:
 def expected_variance(op: AtmosphereLayers, observation: Observation) -> float:
     """Variance of y after the beam."""
     return sum(
-        (op.pwv_rms * m.amplitude) ** 2 * beam_correlation(0.0, op.outer_scale, m.sigma)[0] for m in layers_of(op, observation)
+        (op.pwv_rms * m.amplitude) ** 2 * beam_correlation(0.0, op.outer_scale, m.sigma)[0]
+        for m in layers_of(op, observation)
     )
 
 
-# ------------------------------------------------------------------------------------------------------- statistics
+# --------------------------------------------------------------------------------------------------
+# statistics
 
 
 @pytest.mark.parametrize("seconds", [30.0, 120.0, 2700.0])
 def test_mean_and_rms_are_ensemble_properties_whatever_the_duration(seconds: float) -> None:
-    # 25 seeds x 16 lines of sight >= 2 km = 4 r0 apart at the layer. The scan mean of y^2 varies by at most 2 v^2 and that of
-    # y by at most v, whatever the duration, so the standard errors are at most sqrt(2 k2 / n) v = 8 % v and sqrt(k1 v / n),
-    # n = 400, with k_m = sum of rho^m over the 16 lines of sight, rho(separation) their correlation. 4 of each are allowed.
-    op = operator(layers=1, lowest="4000 m", pwv_rms="1 %", wind={"speed": "20 m/s", "direction": "250 deg"})
+    # 25 seeds x 16 lines of sight >= 2 km = 4 r0 apart at the layer. The scan mean of y^2 varies by
+    # at most 2 v^2 and that of y by at most v, whatever the duration, so the standard errors are at
+    # most sqrt(2 k2 / n) v = 8 % v and sqrt(k1 v / n), n = 400, with k_m = sum of rho^m over the 16
+    # lines of sight, rho(separation) their correlation. 4 of each are allowed.
+    op = operator(
+        layers=1, lowest="4000 m", pwv_rms="1 %", wind={"speed": "20 m/s", "direction": "250 deg"}
+    )
     xi, eta = (v.ravel() * 0.5 for v in np.mgrid[-1.5:2, -1.5:2])
     observations = [observe(seconds, 0.2, 75.0, seed=seed, offsets=(xi, eta)) for seed in range(25)]
     y = np.array([water(op, o) for o in observations])
     v = expected_variance(op, observations[0])
-    separation = 4000 / np.sin(np.radians(75.0)) * np.hypot(np.subtract.outer(xi, xi), np.subtract.outer(eta, eta))
+    separation = (
+        4000
+        / np.sin(np.radians(75.0))
+        * np.hypot(np.subtract.outer(xi, xi), np.subtract.outer(eta, eta))
+    )
     rho = beam_correlation(separation, 500.0, 42.5)
     k1, k2 = (float((rho**m).sum(1).mean()) for m in (1, 2))
     n = 25 * 16
@@ -148,9 +201,10 @@ def test_mean_and_rms_are_ensemble_properties_whatever_the_duration(seconds: flo
 
 @pytest.mark.parametrize("direction", ["along", "across"])
 def test_structure_function_between_detectors_through_the_whole_operator(direction: str) -> None:
-    # Two lines of sight r = 12 m apart in one layer seen through a 42.5 m beam. D = <(y1 - y2)^2> = 2 p^2 S(r). The estimate
-    # averages d^2 over 30 seeds of 2700 s at 30 m/s; its relative variance is 2 / n_eff with
-    # 1 / n_eff = mean over lags of rho(lag)^2, rho the correlation of d from the analytic covariance.
+    # Two lines of sight r = 12 m apart in one layer seen through a 42.5 m beam. D = <(y1 - y2)^2> =
+    # 2 p^2 S(r). The estimate averages d^2 over 30 seeds of 2700 s at 30 m/s; its relative variance
+    # is 2 / n_eff with 1 / n_eff = mean over lags of rho(lag)^2, rho the correlation of d from the
+    # analytic covariance.
     r, height, elevation, speed, seeds, seconds = 12.0, 2000.0, 50.0, 30.0, 30, 2700.0
     distance = height / np.sin(np.radians(elevation))
     half = r / distance / 2
@@ -166,9 +220,15 @@ def test_structure_function_between_detectors_through_the_whole_operator(directi
     s = beam_structure(r, 500.0, sigma)[0]
     lag = speed * np.arange(0, int(seconds))
     near = lag < 3000
-    far = [np.hypot(lag[near] + r * a, r * b) for a, b in (((1, 0), (-1, 0)) if direction == "along" else ((0, 1), (0, -1)))]
+    far = [
+        np.hypot(lag[near] + r * a, r * b)
+        for a, b in (((1, 0), (-1, 0)) if direction == "along" else ((0, 1), (0, -1)))
+    ]
     rho = np.zeros(len(lag))
-    rho[near] = (2 * beam_correlation(lag[near], 500.0, sigma) - sum(beam_correlation(v, 500.0, sigma) for v in far)) / (2 * s)
+    rho[near] = (
+        2 * beam_correlation(lag[near], 500.0, sigma)
+        - sum(beam_correlation(v, 500.0, sigma) for v in far)
+    ) / (2 * s)
     per_scan = (2 * (rho**2 * (1 - lag / seconds / speed)).sum() - 1) / len(lag)
     error = np.sqrt(2 * per_scan / seeds)
     assert error < 0.02
@@ -185,7 +245,8 @@ def test_rms_after_the_beam_is_the_option() -> None:
 
 
 def test_large_rms_takes_the_log_normal_map_and_keeps_mean_and_rms() -> None:
-    # Single lines of sight of n = 1500 seeds, through the map itself: y = exp(s g - s^2 v / 2) - 1 with g normal.
+    # Single lines of sight of n = 1500 seeds, through the map itself: y = exp(s g - s^2 v / 2) - 1
+    # with g normal.
     op, law = operator(pwv_rms="40 %", pwv_rms_after_beam=True), Fluctuation(0.4, True, 0.9)
     g = np.random.default_rng(0).standard_normal(400_000) * np.sqrt(0.9)
     y = law(g)
@@ -200,21 +261,26 @@ def test_large_rms_takes_the_log_normal_map_and_keeps_mean_and_rms() -> None:
     assert covariance == pytest.approx(0.16, rel=0.03)
 
 
-# --------------------------------------------------------------------------------------------- evaluation at nodes
+# ---------------------------------------------------------------------------------------------
+# evaluation at nodes
 
 
 @pytest.mark.parametrize(
     ("diameter", "field", "tolerance"),
     [("100 m", "4.2 arcmin", 0.01), ("100 m", "4.2 arcmin", 0.5), ("12 m", "30 arcmin", 0.05)],
 )
-def test_nodes_agree_with_direct_evaluation_within_the_stated_bound(diameter: str, field: str, tolerance: float) -> None:
-    # Every detector and sample evaluated directly in the same realization. The bound is an ensemble rms; one realization of
-    # 80 s has some tens of independent errors, hence the factor 3. The lattice's own interpolation is common to both.
+def test_nodes_agree_with_direct_evaluation_within_the_stated_bound(
+    diameter: str, field: str, tolerance: float
+) -> None:
+    # Every detector and sample evaluated directly in the same realization. The bound is an ensemble
+    # rms; one realization of 80 s has some tens of independent errors, hence the factor 3. The
+    # lattice's own interpolation is common to both.
     camera = instrument(detectors=61, field=field, diameter=diameter)
     op = operator(layers=3, tolerance=tolerance)
     o = observe(80.0, 50.0, scan=4.0, camera=camera)
     state = op.prepare(o)
-    # `tolerance` is a fraction of what the focal-plane mean leaves; from here on of the whole fluctuation.
+    # `tolerance` is a fraction of what the focal-plane mean leaves; from here on of the whole
+    # fluctuation.
     left = differential_rms(o.focalplane.xi, o.focalplane.eta, layers_of(op, o))
     tolerance *= op.pwv_rms * left / np.sqrt(expected_variance(op, o))
     model = op.model(o)
@@ -226,14 +292,21 @@ def test_nodes_agree_with_direct_evaluation_within_the_stated_bound(diameter: st
         g += layer.amplitude * at_points(beam, across, along)
     elevation = np.arcsin(u[2])
     direct = band.emission_difference(PWV, PWV * op.pwv_rms * g, elevation)
-    rms = np.sqrt(expected_variance(op, o)) * np.mean(band.emission_difference(PWV, 0.01 * PWV, elevation)) / 0.01
+    rms = (
+        np.sqrt(expected_variance(op, o))
+        * np.mean(band.emission_difference(PWV, 0.01 * PWV, elevation))
+        / 0.01
+    )
     error = whole(o, state) - direct
     assert isinstance(state, AtNodes)
     assert state.fields["emission"].step > 1
     assert state.fields["emission"].weights.shape[1] < 61
     assert np.sqrt(np.mean(error**2)) < 3 * np.sqrt(2) * tolerance * rms
     relative = np.expm1(band.log_transmission_difference(PWV, PWV * op.pwv_rms * g, elevation))
-    assert np.sqrt(np.mean((whole(o, state, "transmission") - relative) ** 2)) < 10 * tolerance * relative.std() + 1e-7
+    assert (
+        np.sqrt(np.mean((whole(o, state, "transmission") - relative) ** 2))
+        < 10 * tolerance * relative.std() + 1e-7
+    )
     # The mean, in float64: within the same share of the fluctuation.
     mean = o.smooth["atmosphere"].evaluate(slice(0, 61), slice(0, o.n_samples))
     assert mean.dtype == np.float64
@@ -259,7 +332,9 @@ def test_tiles_and_chunks_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(tiles, "coefficients", watched)
     expected = series()
     assert len(made) == 2  # a piece for each layer
-    monkeypatch.setattr(tiles, "SPARE", -1)  # of the path's end nothing is in the piece: the others' tiles serve
+    monkeypatch.setattr(
+        tiles, "SPARE", -1
+    )  # of the path's end nothing is in the piece: the others' tiles serve
     np.testing.assert_array_equal(series(), expected)
     assert len(made) > 4
     monkeypatch.setattr(tiles, "ONE_PIECE", 0)
@@ -307,7 +382,8 @@ def test_the_default_job_is_compressed_by_nodes_and_steps() -> None:
     assert said["PWV rms after the beam, per layer"].count("m:") == 10
 
 
-# ------------------------------------------------------------------------------------------ bits, seeds, invariances
+# ------------------------------------------------------------------------------------------ bits,
+# seeds, invariances
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -322,7 +398,10 @@ def test_bits_do_not_depend_on_the_block(dtype: type) -> None:
         return block.detdata
 
     everything = run(slice(0, 223), slice(0, o.n_samples))
-    for detectors, samples in ((slice(16, 48), slice(2048, 6144)), (slice(208, 223), slice(8192, o.n_samples))):
+    for detectors, samples in (
+        (slice(16, 48), slice(2048, 6144)),
+        (slice(208, 223), slice(8192, o.n_samples)),
+    ):
         part = run(detectors, samples)
         for name in ("atmosphere", "transmission"):
             assert part[name].dtype == dtype
@@ -336,7 +415,9 @@ def test_exec_adds_to_what_is_there() -> None:
     block = Block(o, slice(0, 16), slice(0, 500))
     block.new("atmosphere")[:] = 2.0
     op.exec(block, state)
-    np.testing.assert_allclose(block.detdata["atmosphere"] - 2, whole(o, state)[:16, :500], atol=1e-6)
+    np.testing.assert_allclose(
+        block.detdata["atmosphere"] - 2, whole(o, state)[:16, :500], atol=1e-6
+    )
 
 
 def test_same_seed_same_bits_and_two_seeds_are_incoherent() -> None:
@@ -364,7 +445,9 @@ def test_turning_telescope_and_wind_together_changes_nothing(angle: float) -> No
     wind = {"speed": "12 m/s", "direction": "200 deg"}
     turned = {"speed": "12 m/s", "direction": f"{200 + angle} deg"}
     one, two = observe(20.0, azimuth=40.0, scan=4.0), observe(20.0, azimuth=40.0 + angle, scan=4.0)
-    a, b = (whole(o, operator(layers=3, wind=w).prepare(o)) for o, w in ((one, wind), (two, turned)))
+    a, b = (
+        whole(o, operator(layers=3, wind=w).prepare(o)) for o, w in ((one, wind), (two, turned))
+    )
     np.testing.assert_allclose(a, b, atol=1e-9)
 
 
@@ -380,17 +463,24 @@ def test_zero_wind_and_a_stare_give_identical_samples() -> None:
 
 
 def test_frozen_flow_carries_the_air_to_the_next_detector() -> None:
-    # A detector downwind sees the same air r / v later (one layer; the shift along eta = 0 is level with the boresight).
+    # A detector downwind sees the same air r / v later (one layer; the shift along eta = 0 is level
+    # with the boresight).
     distance = 2000.0 / np.sin(np.radians(50.0))
     r = 60.0
-    op = operator(layers=1, lowest="2000 m", wind={"speed": "10 m/s", "direction": "270 deg"}, tolerance="0.1 %")
+    op = operator(
+        layers=1,
+        lowest="2000 m",
+        wind={"speed": "10 m/s", "direction": "270 deg"},
+        tolerance="0.1 %",
+    )
     o = observe(60.0, 10.0, 50.0, 0.0, offsets=([0.0, r / distance], [0.0, 0.0]))
     west, east = water(op, o)
     np.testing.assert_allclose(east[60:], west[:-60], atol=2e-3 * op.pwv_rms)
 
 
 def test_consecutive_scans_see_the_same_air_continuously() -> None:
-    # The second scan starts where the first one ends, 0.3 deg away; at 60 s the pointing jumps, the air does not.
+    # The second scan starts where the first one ends, 0.3 deg away; at 60 s the pointing jumps, the
+    # air does not.
     op = operator(tolerance="0.1 %")
     whole_scan = observe(120.0, 10.0)
     first = observe(60.0, 10.0, index=0)
@@ -401,18 +491,26 @@ def test_consecutive_scans_see_the_same_air_continuously() -> None:
     alone = operator(tolerance="0.1 %")
     alone.observe(Data(scene, [whole_scan]))
     expected = whole(whole_scan, alone.prepare(whole_scan))[:20]
-    np.testing.assert_allclose(np.concatenate(parts, axis=1), expected, atol=1e-4 * expected.std() + 5e-6)
-    moved = observe(60.0, 10.0, azimuth=153.0, elevation=57.2, index=1, start="2024-11-25T07:01:00Z")
+    np.testing.assert_allclose(
+        np.concatenate(parts, axis=1), expected, atol=1e-4 * expected.std() + 5e-6
+    )
+    moved = observe(
+        60.0, 10.0, azimuth=153.0, elevation=57.2, index=1, start="2024-11-25T07:01:00Z"
+    )
     op.observe(Data(scene, [first, moved]))
     values = whole(moved, op.prepare(moved))[:20]
-    # 3 deg at 3 km is 150 m of other air, far less than r0: the values stay correlated, and no realization is redrawn.
+    # 3 deg at 3 km is 150 m of other air, far less than r0: the values stay correlated, and no
+    # realization is redrawn.
     assert abs(values[:, 0] - parts[0][:, -1]).max() < 2 * 0.005 * 34
 
 
-# -------------------------------------------------------------------------------------------------------- corners
+# --------------------------------------------------------------------------------------------------
+# corners
 
 
-@pytest.mark.parametrize(("seconds", "rate"), [(0.01, 100.0), (0.02, 100.0), (0.5, 100.0), (0.5, 1.0)])
+@pytest.mark.parametrize(
+    ("seconds", "rate"), [(0.01, 100.0), (0.02, 100.0), (0.5, 100.0), (0.5, 1.0)]
+)
 def test_short_scans_of_one_detector(seconds: float, rate: float) -> None:
     o = observe(seconds, rate, camera=instrument(detectors=1, field="0 deg"))
     op = operator(wind={"speed": "0 m/s"})
@@ -435,7 +533,8 @@ def test_low_and_high_elevations(elevation: float) -> None:
     o = observe(10.0, elevation=elevation)
     assert np.isfinite(whole(o, operator().prepare(o))).all()
     mean = o.smooth["atmosphere"].evaluate(slice(0, 223), slice(0, 1))[:, 0]
-    # Emission falls with elevation, smoothly through the limit: a parabola in eta leaves < 3 mK over 4 arcmin.
+    # Emission falls with elevation, smoothly through the limit: a parabola in eta leaves < 3 mK
+    # over 4 arcmin.
     left = mean - np.polyval(np.polyfit(o.focalplane.eta, mean, 2), o.focalplane.eta)
     assert abs(left).max() < 3e-3
     assert np.corrcoef(mean, o.focalplane.eta)[0, 1] < -0.99
@@ -462,11 +561,15 @@ def test_mean_emission_is_as_good_at_the_ends_of_a_scan_as_inside(seconds: float
     band = op.model(o).band
     field, n = o.smooth["atmosphere"], o.n_samples
     d = int(o.focalplane.eta.argmax())
-    truth = band.emission(PWV, np.arcsin(rays(axes(o.boresight_azel), o.focalplane.xi[[d]], o.focalplane.eta[[d]])[2, 0]))
+    truth = band.emission(
+        PWV,
+        np.arcsin(rays(axes(o.boresight_azel), o.focalplane.xi[[d]], o.focalplane.eta[[d]])[2, 0]),
+    )
     error = abs(field.evaluate(slice(d, d + 1), slice(0, n))[0] - truth)
     edge = 2 * field.step
     inside = error[edge:-edge].max()
-    # The path beyond the ends is extrapolated to third order; second order made the ends three times worse than the rest.
+    # The path beyond the ends is extrapolated to third order; second order made the ends three
+    # times worse than the rest.
     assert max(error[:edge].max(), error[-edge:].max()) < 2 * inside
 
 
@@ -483,7 +586,9 @@ def test_below_the_horizon_is_an_error() -> None:
 def swept(elevation: float, azimuths: Floats, camera: Instrument | None = None) -> Observation:
     """A scan through given azimuths [deg] at constant elevation, 100 Hz."""
     o = observe(len(azimuths) / 100, elevation=elevation, camera=camera)
-    o.boresight_azel = quaternions(np.radians(azimuths), np.full(len(azimuths), np.radians(elevation)))
+    o.boresight_azel = quaternions(
+        np.radians(azimuths), np.full(len(azimuths), np.radians(elevation))
+    )
     return o
 
 
@@ -494,10 +599,18 @@ def back_and_forth(throw: float) -> Floats:
 
 @pytest.mark.parametrize(
     ("elevation", "throw", "field", "bound"),
-    [(50.0, 60.0, "1 arcmin", 1e-3), (30.0, 60.0, "2 deg", 3e-3), (50.0, 93.0, "2 deg", 2e-3), (50.0, 60.0, "35 deg", 0.18)],
+    [
+        (50.0, 60.0, "1 arcmin", 1e-3),
+        (30.0, 60.0, "2 deg", 3e-3),
+        (50.0, 93.0, "2 deg", 2e-3),
+        (50.0, 60.0, "35 deg", 0.18),
+    ],
 )
-def test_wide_throws_unroll_the_cone(elevation: float, throw: float, field: str, bound: float) -> None:
-    # Pairs of detectors, any azimuth of the scan: squared separation on the plane against that across the line of sight.
+def test_wide_throws_unroll_the_cone(
+    elevation: float, throw: float, field: str, bound: float
+) -> None:
+    # Pairs of detectors, any azimuth of the scan: squared separation on the plane against that
+    # across the line of sight.
     camera = instrument(detectors=61, field=field, diameter="6 m")
     o = swept(elevation, back_and_forth(throw), camera)
     track = scan_planes([o])[0]
@@ -506,12 +619,20 @@ def test_wide_throws_unroll_the_cone(elevation: float, throw: float, field: str,
     u = rays(axes(o.boresight_azel[::200]), o.focalplane.xi, o.focalplane.eta)
     near = 1e-4  # towards xi and eta of every detector: the metric itself
     for step in ((near, 0.0), (0.0, near), (near, near)):
-        other = rays(axes(o.boresight_azel[::200]), o.focalplane.xi + step[0], o.focalplane.eta + step[1])
+        other = rays(
+            axes(o.boresight_azel[::200]), o.focalplane.xi + step[0], o.focalplane.eta + step[1]
+        )
         on_plane = ((track.unroll(crossing(other)) - track.unroll(crossing(u))) ** 2).sum(0)
         across = np.cross(u, other, axis=0)
-        sky = (across**2).sum(0) / (u[2] * other[2])  # (theta z)^2 per squared metre of height, z that of the pair
-        assert abs(on_plane / sky - 1).max() < track.bound + 3 * near / np.sin(np.radians(elevation - 20))
-    operator(layers=2, tolerance="20 %").prepare(swept(elevation, back_and_forth(throw)[:400], camera))
+        sky = (across**2).sum(0) / (
+            u[2] * other[2]
+        )  # (theta z)^2 per squared metre of height, z that of the pair
+        assert abs(on_plane / sky - 1).max() < track.bound + 3 * near / np.sin(
+            np.radians(elevation - 20)
+        )
+    operator(layers=2, tolerance="20 %").prepare(
+        swept(elevation, back_and_forth(throw)[:400], camera)
+    )
 
 
 def test_a_narrow_scan_keeps_one_plane_and_the_horizon_falls_back() -> None:
@@ -552,7 +673,11 @@ def test_transverse_plane_measures_separations_across_the_line_of_sight() -> Non
         track = scan_planes([o])[0]
         theta = np.radians(1 / 60)
         angle = np.linspace(0, 2 * np.pi, 9)
-        u = rays(axes(o.boresight_azel[:1]), np.r_[0, theta * np.cos(angle)], np.r_[0, theta * np.sin(angle)])
+        u = rays(
+            axes(o.boresight_azel[:1]),
+            np.r_[0, theta * np.cos(angle)],
+            np.r_[0, theta * np.sin(angle)],
+        )
         x, y = track.positions(crossing(u), np.zeros(1), 1000.0, np.array([3.0, 4.0]))
         r = np.hypot(x[1:] - x[0], y[1:] - y[0])[:, 0]
         np.testing.assert_allclose(r, 1000 / np.sin(np.radians(elevation)) * theta, rtol=3e-3)
@@ -561,27 +686,37 @@ def test_transverse_plane_measures_separations_across_the_line_of_sight() -> Non
 def test_rays_agree_with_azimuth_and_elevation() -> None:
     az, el = np.radians([10.0, 200.0]), np.radians([30.0, 70.0])
     u = rays(axes(quaternions(az, el)), np.array([0.0, 1e-4, 0.0]), np.array([0.0, 0.0, 1e-4]))
-    np.testing.assert_allclose(u[:, 0], [np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)], atol=1e-14)
+    np.testing.assert_allclose(
+        u[:, 0], [np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)], atol=1e-14
+    )
     azimuth, elevation = np.arctan2(u[0], u[1]) % (2 * np.pi), np.arcsin(u[2])
     np.testing.assert_allclose(azimuth[1] - az, 1e-4 / np.cos(el), rtol=1e-6)
     np.testing.assert_allclose(elevation[2] - el, 1e-4, rtol=1e-6)
 
 
 def test_wind_directions_are_where_the_wind_comes_from() -> None:
-    np.testing.assert_allclose(Wind(speed="10 m/s", direction="270 deg").vector, [10, 0], atol=1e-14)
+    np.testing.assert_allclose(
+        Wind(speed="10 m/s", direction="270 deg").vector, [10, 0], atol=1e-14
+    )
     np.testing.assert_allclose(Wind(speed="10 m/s", direction="0 deg").vector, [0, -10], atol=1e-14)
 
 
 def test_winds_and_weights_per_layer() -> None:
     o = observe(1.0)
-    op = operator(layers=2, wind=[{"speed": "3 m/s"}, {"speed": "5 m/s", "direction": "0 deg"}], weights="equal")
+    op = operator(
+        layers=2,
+        wind=[{"speed": "3 m/s"}, {"speed": "5 m/s", "direction": "0 deg"}],
+        weights="equal",
+    )
     one, two = op.model(o).layers
     np.testing.assert_allclose([one.amplitude, two.amplitude], np.sqrt(0.5))
     np.testing.assert_allclose([one.wind, two.wind], [[3, 0], [0, -5]], atol=1e-14)
     vapour, profile = operator().model(o).layers, op.model(o).profile
     assert sum(v.amplitude**2 for v in vapour) == pytest.approx(1)
     assert [v.amplitude for v in vapour] == sorted((v.amplitude for v in vapour), reverse=True)
-    np.testing.assert_allclose(vapour[3].wind, [profile.at(2000.0).wind_east, profile.at(2000.0).wind_north])
+    np.testing.assert_allclose(
+        vapour[3].wind, [profile.at(2000.0).wind_east, profile.at(2000.0).wind_north]
+    )
 
 
 def test_climatology_gives_the_pwv_where_none_is_asked_for() -> None:
@@ -596,7 +731,9 @@ def test_near_field_beam() -> None:
     assert beam_sigma(camera.telescope, camera.band, 0.0) == pytest.approx(100 / 2.3548, rel=1e-4)
     far = 1e9
     rayleigh = np.pi * 50**2 * camera.band.centre / 299792458
-    assert beam_sigma(camera.telescope, camera.band, far) == pytest.approx(100 / 2.3548 * far / rayleigh, rel=1e-4)
+    assert beam_sigma(camera.telescope, camera.band, far) == pytest.approx(
+        100 / 2.3548 * far / rayleigh, rel=1e-4
+    )
 
 
 def test_the_beam_is_that_of_the_distance_along_the_line_of_sight() -> None:
@@ -604,13 +741,16 @@ def test_the_beam_is_that_of_the_distance_along_the_line_of_sight() -> None:
     o = observe(1.0, elevation=30.0, camera=camera)
     one, *_, last = layers_of(operator(), o)
     assert one.distance == pytest.approx(1000.0, rel=2e-4)  # 500 m / sin 30 deg
-    # A shell of radius R + h is met at sqrt(R^2 sin^2 e + 2 R h + h^2) - R sin e: 12 m nearer than a flat layer.
+    # A shell of radius R + h is met at sqrt(R^2 sin^2 e + 2 R h + h^2) - R sin e: 12 m nearer than
+    # a flat layer.
     radius = 6371000.0
     shell = np.sqrt((radius / 2) ** 2 + 2 * radius * 5000 + 5000**2) - radius / 2
     assert last.distance == pytest.approx(shell, rel=1e-6)
     assert 10 < 10000 - last.distance < 14
     assert last.sigma == pytest.approx(beam_sigma(camera.telescope, camera.band, shell))
-    assert last.sigma > 1.3 * one.sigma  # far beyond the Rayleigh distance of 8.8 km the beam has widened
+    assert (
+        last.sigma > 1.3 * one.sigma
+    )  # far beyond the Rayleigh distance of 8.8 km the beam has widened
 
 
 @pytest.mark.parametrize(
@@ -634,7 +774,8 @@ def test_an_outer_scale_beyond_the_measured_range_is_refused() -> None:
         operator(outer_scale="1e9 m").prepare(observe(1.0))
 
 
-# ------------------------------------------------------------------------------------------------------- products
+# --------------------------------------------------------------------------------------------------
+# products
 
 
 def test_outputs_are_the_fluctuations_along_each_line_of_sight() -> None:
@@ -643,17 +784,25 @@ def test_outputs_are_the_fluctuations_along_each_line_of_sight() -> None:
     state = op.prepare(o)
     block = Block(o, slice(0, 7), slice(0, o.n_samples), dtype=np.float64)
     op.exec(block, state)
-    assert set(block.detdata) == {"atmosphere", "transmission", "pwv", "opacity", "path_delay"} == op.provides
+    assert (
+        set(block.detdata)
+        == {"atmosphere", "transmission", "pwv", "opacity", "path_delay"}
+        == op.provides
+    )
     y = water(operator(layers=3), o)
     elevation = np.arcsin(rays(axes(o.boresight_azel), o.focalplane.xi, o.focalplane.eta)[2])
     pwv = block.detdata["pwv"]
-    # Airmass of a shell some 1.5 km up: 1 / sin(elevation) to 1e-3 at 57 deg. Emission is linear in y to some 1e-3.
+    # Airmass of a shell some 1.5 km up: 1 / sin(elevation) to 1e-3 at 57 deg. Emission is linear in
+    # y to some 1e-3.
     np.testing.assert_allclose(pwv, PWV * y / np.sin(elevation), rtol=0.01, atol=0.005 * pwv.std())
-    np.testing.assert_allclose(np.exp(-block.detdata["opacity"]) - 1, block.detdata["transmission"], atol=1e-8)
+    np.testing.assert_allclose(
+        np.exp(-block.detdata["opacity"]) - 1, block.detdata["transmission"], atol=1e-8
+    )
     assert np.corrcoef(block.detdata["opacity"].ravel(), pwv.ravel())[0, 1] > 0.999
     ratio = block.detdata["path_delay"] / pwv
     assert np.ptp(ratio) < 1e-6
-    # Bevis et al. (1994): 6.2 to 6.5 over the world's weather; here vapour at about 0 C (0.35 % per K).
+    # Bevis et al. (1994): 6.2 to 6.5 over the world's weather; here vapour at about 0 C (0.35 % per
+    # K).
     assert 6.3 < ratio.mean() < 6.8
     said = {what: text for _, what, text in o.tally}
     assert said["wet path delay"].startswith(f"{ratio.mean():.3f} times")
@@ -661,7 +810,13 @@ def test_outputs_are_the_fluctuations_along_each_line_of_sight() -> None:
 
 def test_outputs_are_made_only_where_asked_for() -> None:
     assert operator().provides == {"atmosphere", "transmission"}
-    assert AtmosphereLayers.provides == {"atmosphere", "transmission", "pwv", "opacity", "path_delay"}, "what may be asked for"
+    assert AtmosphereLayers.provides == {
+        "atmosphere",
+        "transmission",
+        "pwv",
+        "opacity",
+        "path_delay",
+    }, "what may be asked for"
     o = observe(5.0)
     assert set(operator().prepare(o).fields) == {"emission", "transmission"}
     with pytest.raises(ZondaError, match="outputs"):
@@ -683,14 +838,20 @@ def test_delay_per_vapour_is_that_of_bevis() -> None:
     # Bevis et al. (1994): T_m = 270 K, 0.15 being a rule of thumb for its inverse.
     assert 1 / delay_per_vapour(np.array([270.0]), np.ones(1)) == pytest.approx(0.154, abs=1e-3)
     mixed = delay_per_vapour(np.array([290.0, 250.0]), np.array([3.0, 1.0]))
-    assert delay_per_vapour(np.array([290.0]), np.ones(1)) < mixed < delay_per_vapour(np.array([250.0]), np.ones(1))
+    assert (
+        delay_per_vapour(np.array([290.0]), np.ones(1))
+        < mixed
+        < delay_per_vapour(np.array([250.0]), np.ones(1))
+    )
 
 
-# ----------------------------------------------------------------------------------- without focal-plane compression
+# ----------------------------------------------------------------------------------- without
+# focal-plane compression
 
 
 def test_wide_field_per_detector_evaluation_agrees_with_direct_evaluation() -> None:
-    # A 6 m telescope with 10 deg: no grid of nodes pays. Every detector and sample directly, in the same air.
+    # A 6 m telescope with 10 deg: no grid of nodes pays. Every detector and sample directly, in the
+    # same air.
     camera = instrument(detectors=61, field="10 deg", diameter="6 m")
     op = operator(layers=3, tolerance="1 %")
     o = swept(50.0, 180 + 12 * np.sin(2 * np.pi * np.arange(3000) / 6000), camera)
@@ -701,11 +862,14 @@ def test_wide_field_per_detector_evaluation_agrees_with_direct_evaluation() -> N
     left = direct - direct.mean(0)
     wrong = whole(o, state) - band.emission_difference(PWV, PWV * op.pwv_rms * direct, elevation)
     slope = np.mean(band.emission_difference(PWV, 0.01 * PWV, elevation)) / 0.01 * op.pwv_rms
-    # The bound is on the ensemble; this realization of 30 s holds some tens of independent errors: factor 3.
+    # The bound is on the ensemble; this realization of 30 s holds some tens of independent errors:
+    # factor 3.
     assert np.sqrt(np.mean((wrong / slope) ** 2)) < 3 * 0.01 * np.sqrt(np.mean(left**2))
 
 
-def test_layers_take_steps_of_their_own_within_the_same_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_layers_take_steps_of_their_own_within_the_same_bound(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(resolution, "PAYS_FROM", 0)
     camera = instrument(detectors=61, field="10 deg", diameter="6 m")
     op = operator(layers=4, lowest="300 m", tolerance="1 %")
@@ -737,7 +901,13 @@ def test_units_and_tiles_do_not_change_bits(monkeypatch: pytest.MonkeyPatch) -> 
             state.into(
                 detectors,
                 samples,
-                {"emission": (part := np.empty((detectors.stop - detectors.start, samples.stop - samples.start)))},
+                {
+                    "emission": (
+                        part := np.empty(
+                            (detectors.stop - detectors.start, samples.stop - samples.start)
+                        )
+                    )
+                },
             )
             out[detectors, samples] = part
         return out
@@ -805,8 +975,11 @@ def test_a_thread_that_would_wait_makes_what_comes_next(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("kept", [128 << 20, 0])
-def test_a_pipeline_gives_the_same_bits_in_any_order_of_blocks(kept: int, bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Where the units do not all fit, the executor takes blocks of all detectors in order of time, even before a filter in time.
+def test_a_pipeline_gives_the_same_bits_in_any_order_of_blocks(
+    kept: int, bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Where the units do not all fit, the executor takes blocks of all detectors in order of time,
+    # even before a filter in time.
     from zonda.operators.filters.highpass import HighpassFilter
 
     camera = instrument(detectors=37, field="10 deg", diameter="6 m")
@@ -817,10 +990,15 @@ def test_a_pipeline_gives_the_same_bits_in_any_order_of_blocks(kept: int, bench:
     state = steps[0].prepare(o)
     assert planning_of(steps[0]).in_time_order(o) is (kept == 0)
     assert [
-        s.in_time_order for s in cut([*steps, HighpassFilter(frequency="0.1 Hz")], o, [steps[0].label] if kept == 0 else [])
+        s.in_time_order
+        for s in cut(
+            [*steps, HighpassFilter(frequency="0.1 Hz")], o, [steps[0].label] if kept == 0 else []
+        )
     ] == ([True, False] if kept == 0 else [False])
     kept_streams = bench.run(steps, o, keep=("atmosphere",)).observations[0].detdata["atmosphere"]
-    np.testing.assert_allclose(kept_streams, whole(o, state, dtype=np.float32).astype(float), rtol=0, atol=0)
+    np.testing.assert_allclose(
+        kept_streams, whole(o, state, dtype=np.float32).astype(float), rtol=0, atol=0
+    )
 
 
 def directly(op: AtmosphereLayers, o: Observation) -> tuple[Floats, Any, Floats]:
@@ -838,20 +1016,30 @@ def directly(op: AtmosphereLayers, o: Observation) -> tuple[Floats, Any, Floats]
 @pytest.mark.parametrize("angle", [37.0, 180.0])
 def test_turning_a_wide_throw_and_the_wind_together_changes_nothing(angle: float) -> None:
     def series(turn: float) -> Floats:
-        o = swept(50.0, turn + back_and_forth(60.0)[:1000], instrument(detectors=7, field="2 deg", diameter="6 m"))
-        op = operator(layers=2, wind={"speed": "12 m/s", "direction": f"{40 + turn} deg"}, tolerance="5 %")
+        o = swept(
+            50.0,
+            turn + back_and_forth(60.0)[:1000],
+            instrument(detectors=7, field="2 deg", diameter="6 m"),
+        )
+        op = operator(
+            layers=2, wind={"speed": "12 m/s", "direction": f"{40 + turn} deg"}, tolerance="5 %"
+        )
         return whole(o, op.prepare(o))
 
     one, two = series(0.0), series(angle)
-    np.testing.assert_allclose(two[:, 160:-160], one[:, 160:-160], atol=2e-6 * one.std())  # float32 splines
-    # The path beyond the ends of the scan is extrapolated by components: felt within some steps, far less than the tolerance.
+    np.testing.assert_allclose(
+        two[:, 160:-160], one[:, 160:-160], atol=2e-6 * one.std()
+    )  # float32 splines
+    # The path beyond the ends of the scan is extrapolated by components: felt within some steps,
+    # far less than the tolerance.
     np.testing.assert_allclose(two, one, atol=5e-3 * one.std())
 
 
 @pytest.mark.parametrize("direction", [0.0, 90.0, 180.0, 45.0])
 def test_wind_along_across_and_against_the_scan(direction: float) -> None:
-    # A scan at constant speed s along a parallel of elevation and a wind w: consecutive samples lie |s - w| dt apart on the
-    # layer, and so do they on the plane; s = w along the scan would see the same air for ever.
+    # A scan at constant speed s along a parallel of elevation and a wind w: consecutive samples lie
+    # |s - w| dt apart on the layer, and so do they on the plane; s = w along the scan would see the
+    # same air for ever.
     az = 180 + np.arange(500) * 0.002 / np.cos(np.radians(50.0))
     o = swept(50.0, az, instrument(detectors=1, field="0 deg"))
     track = scan_planes([o])[0]
@@ -863,4 +1051,6 @@ def test_wind_along_across_and_against_the_scan(direction: float) -> None:
     step = np.hypot(np.diff(across[0]), np.diff(along[0])) * 100
     foreshortened = np.array([wind[0], wind[1] * np.sin(np.radians(50.0))])
     expected = np.hypot(-speed - foreshortened[0], -foreshortened[1])
-    np.testing.assert_allclose(step, expected, atol=0.03 * speed)  # the path is an arc: 1.5 deg of azimuth
+    np.testing.assert_allclose(
+        step, expected, atol=0.03 * speed
+    )  # the path is an arc: 1.5 deg of azimuth

@@ -1,4 +1,6 @@
-"""What a user is told of bad input to `AtmosphereLayers`: the place, what is wrong, and what would mend it."""
+"""What a user is told of bad input to `AtmosphereLayers`: the place, what is wrong, and what would
+mend it.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,14 @@ operators:
 STRAIGHT_UP = "{az: 0 deg, el: 60 deg}"
 
 
-def complaint(capsys: Any, monkeypatch: Any, folder: Path, parameters: str, target: str = STRAIGHT_UP, run: bool = False) -> str:
+def complaint(
+    capsys: Any,
+    monkeypatch: Any,
+    folder: Path,
+    parameters: str,
+    target: str = STRAIGHT_UP,
+    run: bool = False,
+) -> str:
     """Standard error of a command that must end as a user's mistake."""
     monkeypatch.chdir(folder)
     (folder / "my.yaml").write_text(PIPELINE.format(parameters=parameters, target=target))
@@ -46,9 +55,15 @@ def complaint(capsys: Any, monkeypatch: Any, folder: Path, parameters: str, targ
     [
         ("outer_scale: 0 m", ["my.yaml:8:37", "outer_scale: must be greater than 0 m, got 0 m"]),
         ("outer_scale: -5 m", ["outer_scale: must be greater than 0 m, got -5 m"]),
-        ("outer_scale: nan m", ["my.yaml:8:37", "cannot read 'nan m' as a length", "such as '1.8 mm'"]),
+        (
+            "outer_scale: nan m",
+            ["my.yaml:8:37", "cannot read 'nan m' as a length", "such as '1.8 mm'"],
+        ),
         ("outer_scale: .nan", ["outer_scale: nan has no unit"]),
-        ("lowest: -100 m", ["my.yaml:8:32", "lowest: must be greater than 0 m, got -100 m", "above the site"]),
+        (
+            "lowest: -100 m",
+            ["my.yaml:8:32", "lowest: must be greater than 0 m, got -100 m", "above the site"],
+        ),
         ("highest: 25 km", ["highest: must be at most 20 km, got 25 km"]),
         ("lowest: 6 km", ["lowest must be below highest"]),
         ("layers: 0", ["my.yaml:8:32", "layers: must be at least 1, got 0"]),
@@ -70,7 +85,9 @@ def complaint(capsys: Any, monkeypatch: Any, folder: Path, parameters: str, targ
         ("outputs: [ozone]", ["outputs", "must be 'pwv', 'opacity' or 'path_delay'"]),
     ],
 )
-def test_parameters(capsys: Any, monkeypatch: Any, tmp_path: Path, parameters: str, words: list[str]) -> None:
+def test_parameters(
+    capsys: Any, monkeypatch: Any, tmp_path: Path, parameters: str, words: list[str]
+) -> None:
     message = complaint(capsys, monkeypatch, tmp_path, parameters)
     for word in ["AtmosphereLayers", "my.yaml:8:", *words]:
         assert word in message, message
@@ -79,13 +96,21 @@ def test_parameters(capsys: Any, monkeypatch: Any, tmp_path: Path, parameters: s
 @pytest.mark.parametrize(
     ("target", "parameters", "words"),
     [
-        ("{az: 0 deg, el: 0 deg}", "pwv: 7 mm", ["elevation 0.00 deg", "reaches 5 deg", "choose an elevation"]),
+        (
+            "{az: 0 deg, el: 0 deg}",
+            "pwv: 7 mm",
+            ["elevation 0.00 deg", "reaches 5 deg", "choose an elevation"],
+        ),
         (
             STRAIGHT_UP,
             "pwv: 7 mm, outer_scale: 1e9 m",
             ["outer scale 1e+09 m", "known from 0.001 to 1e+06", "choose an outer_scale"],
         ),
-        (STRAIGHT_UP, "pwv: 7 mm, outer_scale: 1 mm", ["outer scale 0.001 m", "choose an outer_scale from 0.042 m"]),
+        (
+            STRAIGHT_UP,
+            "pwv: 7 mm, outer_scale: 1 mm",
+            ["outer scale 0.001 m", "choose an outer_scale from 0.042 m"],
+        ),
     ],
 )
 def test_what_only_the_scan_shows(
@@ -96,13 +121,15 @@ def test_what_only_the_scan_shows(
         assert word in message, message
 
 
-# ------------------------------------------------------------------------------------------------- known faults
-# Strict: whoever mends one is told to take the mark away.
+# -------------------------------------------------------------------------------------------------
+# known faults Strict: whoever mends one is told to take the mark away.
 
 
 def test_an_elevation_of_zero_is_named() -> None:
     with pytest.raises(ZondaError, match=r"elevation|horizon"):
-        operator().prepare(observe(1.0, elevation=1e-9, camera=instrument(detectors=1, field="0 deg")))
+        operator().prepare(
+            observe(1.0, elevation=1e-9, camera=instrument(detectors=1, field="0 deg"))
+        )
 
 
 def test_nan_in_the_pointing_is_named() -> None:
@@ -113,9 +140,12 @@ def test_nan_in_the_pointing_is_named() -> None:
 
 
 def test_a_scan_round_the_horizon_is_at_its_own_elevation() -> None:
-    # Footprints, separations and every error bound use height / sin(elevation): half of it at 30 deg, and the nodes are wrong
-    # by 2.4e-3 of the fluctuation where the report states 3e-5 (50 m, 0.5 deg).
-    track = scan_planes([swept(30.0, np.linspace(0, 360, 2000), instrument(detectors=1, field="0 deg"))])[0]
+    # Footprints, separations and every error bound use height / sin(elevation): half of it at 30
+    # deg, and the nodes are wrong by 2.4e-3 of the fluctuation where the report states 3e-5 (50 m,
+    # 0.5 deg).
+    track = scan_planes(
+        [swept(30.0, np.linspace(0, 360, 2000), instrument(detectors=1, field="0 deg"))]
+    )[0]
     assert track.elevation == pytest.approx(np.radians(30.0), abs=1e-3)
 
 
@@ -133,8 +163,12 @@ def test_the_realization_is_reported() -> None:
 
 def test_the_rms_stated_after_the_beam_is_that_of_the_log_normal() -> None:
     o = observe(5.0, camera=instrument(detectors=1, field="0 deg"))
-    zonda.AtmosphereLayers(pwv="1 mm", pwv_rms=1.0, layers=1, lowest="1 km", outer_scale="20 m").prepare(o)
+    zonda.AtmosphereLayers(
+        pwv="1 mm", pwv_rms=1.0, layers=1, lowest="1 km", outer_scale="20 m"
+    ).prepare(o)
     stated = next(text for _, what, text in o.tally if what == "PWV rms")
     variance = next(text for _, what, text in o.tally if what.startswith("PWV rms after the beam"))
     v = (float(variance.split(": ")[1].rstrip("%")) / 100) ** 2
-    assert float(stated.split(", ")[1].split("%")[0]) / 100 == pytest.approx(np.sqrt(np.expm1(np.log(2) * v)), rel=2e-3)
+    assert float(stated.split(", ")[1].split("%")[0]) / 100 == pytest.approx(
+        np.sqrt(np.expm1(np.log(2) * v)), rel=2e-3
+    )

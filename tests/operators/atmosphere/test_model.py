@@ -1,4 +1,6 @@
-"""The model of an observation is built once, and belongs to the parameters that it was built with."""
+"""The model of an observation is built once, and belongs to the parameters that it was built
+with.
+"""
 
 from __future__ import annotations
 

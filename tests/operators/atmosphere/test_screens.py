@@ -24,7 +24,11 @@ def run(tmp_path_factory):
     """A field of 12 arcmin, 15 s."""
     folder = tmp_path_factory.mktemp("screens")
     observation = scenes.scan(instrument=scenes.camera(19, field="12 arcmin"), samples=1500)
-    steps = [AtmosphereLayers(pwv="5 mm", layers=3, outputs=["pwv"]), AtmosphereScreens(moments=3, pixels=12), Plots()]
+    steps = [
+        AtmosphereLayers(pwv="5 mm", layers=3, outputs=["pwv"]),
+        AtmosphereScreens(moments=3, pixels=12),
+        Plots(),
+    ]
     return scenes.run(steps, observation, keep=("pwv",), output=folder), folder
 
 
@@ -33,7 +37,9 @@ def test_contract():
 
 
 def test_it_is_what_the_detectors_saw(run):
-    """The PWV along each detector's line of sight is its stream's within the errors that are allowed for nodes and step."""
+    """The PWV along each detector's line of sight is its stream's within the errors that are
+    allowed for nodes and step.
+    """
     data, _ = run
     (o,) = data.observations
     assert isinstance(o.expected_load, ExpectedLoad)
@@ -76,10 +82,12 @@ def test_layers_have_their_variance_and_wind(run):
 
 
 def test_the_boresight_sees_the_sum_of_the_layers(run):
-    """What the layers' pictures show where the boresight is adds up to the stream there, but for the airmass.
+    """What the layers' pictures show where the boresight is adds up to the stream there, but for
+    the airmass.
 
-    Between lattice points, 0.8 of a beam apart, the pictures are interpolated by cubic splines: 0.2 % from what the streams'
-    interpolation gives. The airmass of a curved atmosphere is smaller than 1 / sin(elevation) by less than 0.1 % at 60 deg.
+    Between lattice points, 0.8 of a beam apart, the pictures are interpolated by cubic splines: 0.2
+    % from what the streams' interpolation gives. The airmass of a curved atmosphere is smaller than
+    1 / sin(elevation) by less than 0.1 % at 60 deg.
     """
     from scipy.ndimage import map_coordinates
 
@@ -123,11 +131,18 @@ def test_a_scan_that_is_not_there_is_told_before_any_is_simulated(tmp_path):
         simulated.append(block)
 
     def pipeline(observation):
-        more = [zonda.WhiteNoise(), zonda.Efficiency(), count, AtmosphereScreens(observation=observation)]
+        more = [
+            zonda.WhiteNoise(),
+            zonda.Efficiency(),
+            count,
+            AtmosphereScreens(observation=observation),
+        ]
         return zonda.Pipeline([daisy, zonda.AtmosphereLayers(), *more])
 
     first_look(pipeline(19), scenes.scene(), saved=False)  # looks at some of the scans alone
-    text = "AtmosphereScreens: there is no observation 20: the pipeline makes 20(.|\n)*choose 0 to 19"
+    text = (
+        "AtmosphereScreens: there is no observation 20: the pipeline makes 20(.|\n)*choose 0 to 19"
+    )
     with pytest.raises(PipelineError, match=text):
         first_look(pipeline(20), scenes.scene(), saved=False)
     with pytest.raises(PipelineError, match=text):
@@ -146,7 +161,11 @@ def test_refusals():
 
 def test_the_field_of_one_detector_is_its_beam():
     instrument = scenes.camera(1)
-    steps = [zonda.PointingDaisy(scan_duration="2 s"), zonda.AtmosphereLayers(pwv="5 mm"), AtmosphereScreens(moments=2, pixels=8)]
+    steps = [
+        zonda.PointingDaisy(scan_duration="2 s"),
+        zonda.AtmosphereLayers(pwv="5 mm"),
+        AtmosphereScreens(moments=2, pixels=8),
+    ]
     found = zonda.Pipeline(steps).run(scenes.scene(instrument), threads=1)["screens"]
     assert found.side == instrument.beam_fwhm
     assert np.isfinite(found.pwv[:, 3:5, 3:5]).all()
@@ -154,12 +173,21 @@ def test_the_field_of_one_detector_is_its_beam():
 
 def test_the_log_of_a_campaign_says_that_there_is_no_scan(tmp_path):
     steps = [
-        zonda.PointingDaisy(scan_duration="2 s"), zonda.AtmosphereLayers(pwv="5 mm"), zonda.Efficiency(),
-        zonda.BinMap(pixel="4 arcsec", width="2 arcmin"), AtmosphereScreens(), zonda.SaveMap(),
-    ]  # fmt: skip
+        zonda.PointingDaisy(scan_duration="2 s"),
+        zonda.AtmosphereLayers(pwv="5 mm"),
+        zonda.Efficiency(),
+        zonda.BinMap(pixel="4 arcsec", width="2 arcmin"),
+        AtmosphereScreens(),
+        zonda.SaveMap(),
+    ]
     scene = zonda.Scene(
-        site="green_bank", instrument={"like": "mustang2", "detectors": 7}, time="2024-11-25T07:00", target="05h +20d"
+        site="green_bank",
+        instrument={"like": "mustang2", "detectors": 7},
+        time="2024-11-25T07:00",
+        target="05h +20d",
     )
-    made = zonda.campaign(zonda.Pipeline(steps), scene, output=tmp_path / "out", realizations=2, engine="serial")
+    made = zonda.campaign(
+        zonda.Pipeline(steps), scene, output=tmp_path / "out", realizations=2, engine="serial"
+    )
     assert ("AtmosphereScreens", "not drawn") in {row[1:3] for row in made.tally}
     assert (tmp_path / "out" / "map.fits").is_file()

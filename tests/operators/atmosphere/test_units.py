@@ -1,4 +1,6 @@
-"""Units of the detectors' series: which are kept, in which order they are made, and those of bands in step beside each other."""
+"""Units of the detectors' series: which are kept, in which order they are made, and those of bands
+in step beside each other.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,14 @@ import pytest
 
 from zonda.core.types import Floats
 from zonda.operators.atmosphere import fluctuations
-from zonda.operators.atmosphere.fluctuations import UNIT_DETECTORS, UNIT_SAMPLES, OfDetectors, keeps_all, units_bytes, units_fit
+from zonda.operators.atmosphere.fluctuations import (
+    UNIT_DETECTORS,
+    UNIT_SAMPLES,
+    OfDetectors,
+    keeps_all,
+    units_bytes,
+    units_fit,
+)
 from zonda.operators.atmosphere.turbulence.nodes import Nodes
 
 DETECTORS, SAMPLES, STEP = 3 * UNIT_DETECTORS - 5, 4 * UNIT_SAMPLES - 100, 64
@@ -29,7 +38,9 @@ class Response:
 
 
 class Layers:
-    """Layers that note (name, unit, number) of what they are asked for, and how many bands are asked for together."""
+    """Layers that note (name, unit, number) of what they are asked for, and how many bands are
+    asked for together.
+    """
 
     def __init__(self, made: list[tuple[str, int, int]], name: str, looks: str) -> None:
         self.made, self.name, self.looks = made, name, looks
@@ -38,7 +49,9 @@ class Layers:
     def looks_as(self, other: Layers) -> bool:
         return self.looks == other.looks
 
-    def sums(self, others: list[Layers], xi: Floats, eta: Floats, first: int, count: int) -> tuple[Floats, list[Floats], Floats]:
+    def sums(
+        self, others: list[Layers], xi: Floats, eta: Floats, first: int, count: int
+    ) -> tuple[Floats, list[Floats], Floats]:
         number = round(first * STEP / UNIT_SAMPLES)
         self.made += [(one.name, int(xi[0]) // UNIT_DETECTORS, number) for one in (self, *others)]
         self.together.append(1 + len(others))
@@ -48,7 +61,9 @@ class Layers:
         return np.stack([sums] * bands), [np.zeros((0, *sums.shape))] * bands, np.ones(sums.shape)
 
 
-def series(made: list[tuple[str, int, int]], name: str = "", looks: str = "", shift: float = 0.0) -> OfDetectors:
+def series(
+    made: list[tuple[str, int, int]], name: str = "", looks: str = "", shift: float = 0.0
+) -> OfDetectors:
     """Of `Layers`; ``shift`` of the detectors."""
     rows = np.arange(float(DETECTORS))
     nodes: Any = Nodes.__new__(Nodes)
@@ -109,22 +124,39 @@ def test_bands_in_step_make_units_next_to_each_other(threads: int, looks: str) -
         assert made == [(name, *key) for key in EVERY for name in "ab"]
 
 
-@pytest.mark.parametrize(("looks", "shift", "together"), [("xxx", 0.0, {3}), ("xyx", 0.0, {2, 1}), ("xxx", 1e-9, {2, 1})])
-def test_bands_that_look_alike_are_drawn_together(looks: str, shift: float, together: set[int]) -> None:
-    """Of three bands, of which one may look elsewhere: at another lattice's drift, or with detectors that stand elsewhere."""
-    states = [series([], name, look, shift * (name == "b")) for name, look in zip("abc", looks, strict=True)]
+@pytest.mark.parametrize(
+    ("looks", "shift", "together"), [("xxx", 0.0, {3}), ("xyx", 0.0, {2, 1}), ("xxx", 1e-9, {2, 1})]
+)
+def test_bands_that_look_alike_are_drawn_together(
+    looks: str, shift: float, together: set[int]
+) -> None:
+    """Of three bands, of which one may look elsewhere: at another lattice's drift, or with
+    detectors that stand elsewhere.
+    """
+    states = [
+        series([], name, look, shift * (name == "b"))
+        for name, look in zip("abc", looks, strict=True)
+    ]
     bands: list[weakref.ref[OfDetectors]] = []
     for state in states:
         state.join(bands)
     block(states[0], slice(0, DETECTORS), slice(0, SAMPLES))
     layers: list[Any] = [state._layers for state in states]
     assert set().union(*(one.together for one in layers)) == together
-    assert [len(one.together) for one in layers] == [len(EVERY), len(EVERY) * (len(together) - 1), 0]
+    assert [len(one.together) for one in layers] == [
+        len(EVERY),
+        len(EVERY) * (len(together) - 1),
+        0,
+    ]
 
 
-def test_bands_are_drawn_together_only_where_each_looks_as_every_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_are_drawn_together_only_where_each_looks_as_every_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """a looks as b and as c, which take steps that a has not: b and c need not look alike."""
-    monkeypatch.setattr(Layers, "looks_as", lambda self, other: {self.name, other.name} != {"b", "c"})
+    monkeypatch.setattr(
+        Layers, "looks_as", lambda self, other: {self.name, other.name} != {"b", "c"}
+    )
     states = [series([], name) for name in "abc"]
     bands: list[weakref.ref[OfDetectors]] = []
     for state in states:
@@ -157,7 +189,9 @@ def test_a_unit_that_fails_is_made_again() -> None:
 
 
 def test_all_are_kept_where_they_take_little_of_a_stream() -> None:
-    """1720 detectors for half an hour at 100 Hz: two streams, one value in 16 or 8 samples, are 1/8 and 1/4 of one in float32."""
+    """1720 detectors for half an hour at 100 Hz: two streams, one value in 16 or 8 samples, are 1/8
+    and 1/4 of one in float32.
+    """
     for step, kept in ((16, True), (8, True), (4, False)):
         assert not units_fit(1720, 180_000, step, 2)
         assert keeps_all(1720, 180_000, step, 2) == kept

@@ -26,23 +26,32 @@ def test_neighbours_of_a_hexagon(bench):
     np.testing.assert_array_equal(number, (matrix > 0).sum(axis=1))
     assert sorted(np.unique(number)) == [3, 4, 6]  # corners, sides, inner ones of 37
     x = np.random.default_rng(0).standard_normal((37, 500))
-    found = bench.run([Crosstalk(level="1 %")], observation, {"signal": x}, precision="float64").signal
+    found = bench.run(
+        [Crosstalk(level="1 %")], observation, {"signal": x}, precision="float64"
+    ).signal
     np.testing.assert_allclose(found, x + matrix @ x, rtol=0, atol=1e-14)
 
 
 def test_detectors_in_one_place_are_no_neighbours(bench):
     plane = bench.observation(7, 10).focalplane
     columns = ("xi", "eta", "fwhm", "main_beam_efficiency", "illumination_efficiency", "net")
-    twice = type(plane)([*plane.names, *(f"{n}b" for n in plane.names)], **{k: np.tile(getattr(plane, k), 2) for k in columns})
+    twice = type(plane)(
+        [*plane.names, *(f"{n}b" for n in plane.names)],
+        **{k: np.tile(getattr(plane, k), 2) for k in columns},
+    )
     found = neighbours(twice, 0.01)  # each neighbour counts twice, the partner not at all
     assert len(found.source) == 4 * len(neighbours(plane, 0.01).source)
-    assert not any(s % 7 == d % 7 for d in range(14) for s in found.source[found.first[d] : found.first[d + 1]])
+    assert not any(
+        s % 7 == d % 7 for d in range(14) for s in found.source[found.first[d] : found.first[d + 1]]
+    )
 
 
 def test_samples_that_are_not_finite_stay_alone(bench):
     x = np.random.default_rng(2).standard_normal((7, 100))
     x[3, 50] = np.nan
-    found = bench.run([Crosstalk()], bench.observation(7, 100), {"signal": x}, precision="float64").signal
+    found = bench.run(
+        [Crosstalk()], bench.observation(7, 100), {"signal": x}, precision="float64"
+    ).signal
     np.testing.assert_array_equal(np.isnan(found), np.isnan(x))
 
 
@@ -56,15 +65,23 @@ def test_shares_from_a_file(bench, tmp_path):
     a, b, c = observation.focalplane.names
     path = write(tmp_path / "shares.csv", [f"{a},{c},0.02", f"{a},{b},-0.01", f"{c},{a},0.5"])
     x = np.random.default_rng(1).standard_normal((3, 100))
-    found = bench.run([Crosstalk(file=path)], observation, {"signal": x}, precision="float64").signal
-    np.testing.assert_allclose(found, [x[0] + 0.02 * x[2] - 0.01 * x[1], x[1], x[2] + 0.5 * x[0]], rtol=0, atol=1e-15)
+    found = bench.run(
+        [Crosstalk(file=path)], observation, {"signal": x}, precision="float64"
+    ).signal
+    np.testing.assert_allclose(
+        found, [x[0] + 0.02 * x[2] - 0.01 * x[1], x[1], x[2] + 0.5 * x[0]], rtol=0, atol=1e-15
+    )
 
 
 @pytest.mark.parametrize(
     ("rows", "heading", "match"),
     [
         (["A,B,0.1"], "detector,source", "line 2: has 3 values, not 2"),
-        (["nobody,{1},0.1"], "detector,source,share", "line 2: detector 'nobody' is no detector of the focal plane"),
+        (
+            ["nobody,{1},0.1"],
+            "detector,source,share",
+            "line 2: detector 'nobody' is no detector of the focal plane",
+        ),
         (["{0},{0},0.1"], "detector,source,share", "a detector's share of itself"),
         (["{0},{1},0.1", "{0},{1},0.2"], "detector,source,share", "there twice"),
         (["{0},{1},nan"], "detector,source,share", "line 2: share is 'nan', not a finite number"),
@@ -75,7 +92,11 @@ def test_shares_from_a_file(bench, tmp_path):
 )
 def test_bad_files(bench, tmp_path, rows, heading, match):
     observation = bench.observation(3, 100)
-    path = write(tmp_path / "shares.csv", [row.format(*observation.focalplane.names) for row in rows], heading)
+    path = write(
+        tmp_path / "shares.csv",
+        [row.format(*observation.focalplane.names) for row in rows],
+        heading,
+    )
     with pytest.raises(InputError, match=match) as caught:
         bench.run([Crosstalk(file=path)], observation, {"signal": np.zeros((3, 100))})
     assert "shares.csv" in str(caught.value)

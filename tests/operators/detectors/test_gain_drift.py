@@ -22,7 +22,9 @@ def test_it_keeps_the_contract():
 
 @pytest.mark.parametrize("slope", [0.0, 1.0, 2.0])
 def test_the_rms_is_what_is_asked_for_at_every_instant(bench, slope):
-    """Over detectors, which are independent: sum of squares / rms^2 is chi^2 with n degrees at each instant."""
+    """Over detectors, which are independent: sum of squares / rms^2 is chi^2 with n degrees at each
+    instant.
+    """
     n = 4000
     g = gains(bench, n, 3000, rms="2 %", slope=slope, fastest="0.5 Hz")[:, ::500]
     assert (np.abs((g**2).mean(axis=0) / 0.02**2 - 1) < 4.5 * np.sqrt(2 / n)).all()  # six instants
@@ -47,15 +49,22 @@ def test_the_spectrum_falls_as_it_should(bench, slope):
 
 @pytest.mark.parametrize("slope", [0.0, 2.0])
 def test_the_splines_are_the_series(bench, slope):
-    """Equation (1) summed wave by wave at every sample: within (2 pi / 16)^4 / 384 = 6.2e-5 of each wave's amplitude."""
-    observation, step = bench.observation(3, 3000), GainDrift(rms="1 %", slope=slope, fastest="0.5 Hz")
+    """Equation (1) summed wave by wave at every sample: within (2 pi / 16)^4 / 384 = 6.2e-5 of each
+    wave's amplitude.
+    """
+    observation, step = (
+        bench.observation(3, 3000),
+        GainDrift(rms="1 %", slope=slope, fastest="0.5 Hz"),
+    )
     found = step.prepare(observation).evaluate(slice(0, 3), slice(0, 3000))
     every, nodes, waves = grid(observation, 0.5)
     k = np.arange(1, waves + 1)
     amplitude = 0.01 * np.sqrt(k**-slope / (k**-slope).sum())
     phase = 2 * np.pi * np.outer(k, np.arange(3000)) / (nodes * every)
     for d, row in enumerate(found):
-        drawn = normals(observation.detector_key(step.label), 0, 2 * waves, stream=d).astype(np.float64)
+        drawn = normals(observation.detector_key(step.label), 0, 2 * waves, stream=d).astype(
+            np.float64
+        )
         a, b = amplitude * drawn[:waves], amplitude * drawn[waves:]
         series = a @ np.cos(phase) + b @ np.sin(phase)
         assert np.abs(row - series).max() < 6.2e-5 * (np.abs(a) + np.abs(b)).sum()
@@ -76,7 +85,9 @@ def test_the_mean_emission_drifts_with_the_gain(bench):
     x = np.random.default_rng(0).standard_normal((3, 3000)) * 1e-3
     means = {"signal": SmoothField.constant(np.full(3, 30.0), 3000)}
     step = GainDrift(rms="1 %", fastest="0.1 Hz")
-    found = bench.run([step], bench.observation(3, 3000), {"signal": x}, means=means, precision="float64").signal
+    found = bench.run(
+        [step], bench.observation(3, 3000), {"signal": x}, means=means, precision="float64"
+    ).signal
     g = 1 + gains(bench, 3, 3000, rms="1 %", fastest="0.1 Hz")
     np.testing.assert_allclose(found, (x + 30) * g, rtol=0, atol=1e-12)
     assert found.std() > 0.02

@@ -13,7 +13,11 @@ from zonda.plugins.checks import scenes
 
 def stream(bench, n_det, n_samples, index=0, **parameters):
     step, observation = Glitches(**parameters), bench.observation(n_det, n_samples, index=index)
-    return bench.run([step], observation, precision="float64", keep=("glitches",)).observations[0].detdata["glitches"]
+    return (
+        bench.run([step], observation, precision="float64", keep=("glitches",))
+        .observations[0]
+        .detdata["glitches"]
+    )
 
 
 def test_it_keeps_the_contract():
@@ -26,13 +30,19 @@ def test_arrivals_are_a_poisson_process(bench):
     found = arrivals(Glitches(rate=f"{rate} Hz", decay="1 ms"), bench.observation(n, 2001))
     number, mean = np.diff(found.first), rate * (20 + 0.023)
     assert abs(number.mean() - mean) < 4 * np.sqrt(mean / n)
-    assert abs(number.var() - mean) < 4 * np.sqrt((mean + 2 * mean**2) / n)  # of the variance of Poisson counts
+    assert abs(number.var() - mean) < 4 * np.sqrt(
+        (mean + 2 * mean**2) / n
+    )  # of the variance of Poisson counts
     assert abs(found.time.mean() - (20 - 0.023) / 2) < 4 * 20 / np.sqrt(12 * len(found.time))
-    assert found.amplitude.mean() == pytest.approx(0.1, rel=4 / np.sqrt(len(found.time)))  # rms = mean
+    assert found.amplitude.mean() == pytest.approx(
+        0.1, rel=4 / np.sqrt(len(found.time))
+    )  # rms = mean
 
 
 def test_campbells_theorem(bench):
-    """Mean rate A tau and variance rate A^2 tau (<A^2> = 2 A^2, halved by the decay): from the first sample on."""
+    """Mean rate A tau and variance rate A^2 tau (<A^2> = 2 A^2, halved by the decay): from the
+    first sample on.
+    """
     n, rate, tau = 20000, 5.0, 0.2
     g = stream(bench, n, 130, rate=f"{rate} Hz", amplitude="1 K", decay=f"{tau} s")
     k2, k4 = rate * tau, rate * tau * 6  # cumulants rate tau m! / m
@@ -49,7 +59,9 @@ def test_each_is_an_exponential_from_its_arrival_on(bench):
         expected = np.zeros(3000)
         for k in range(found.first[d], found.first[d + 1]):
             late = t - found.time[k]
-            expected += np.where(late >= 0, found.amplitude[k] * np.exp(-np.maximum(late, 0) / 0.05), 0)
+            expected += np.where(
+                late >= 0, found.amplitude[k] * np.exp(-np.maximum(late, 0) / 0.05), 0
+            )
         np.testing.assert_allclose(g[d], expected, rtol=0, atol=1e-9)
     assert g.max() > 0.05
 
@@ -60,16 +72,22 @@ def test_scans_are_independent(bench):
 
 
 def test_samples_above_a_threshold_are_in_no_map_and_filters_bridge_them():
-    """The map without glitches beside it loses the same samples; without the threshold glitches are in the map."""
+    """The map without glitches beside it loses the same samples; without the threshold glitches are
+    in the map.
+    """
     pointing = zonda.PointingDaisy(scan_duration="20 s", radius="1 arcmin", speed="30 arcsec/s")
     maps, lost = {}, 0
     for threshold in (None, "1 mK"):
         glitches = Glitches(rate="0.5 Hz", amplitude="1 K", decay="30 ms", flag_above=threshold)
         filters = [zonda.HighpassFilter(frequency="0.2 Hz"), zonda.BinMap(pixel="8 arcsec")]
         steps = [pointing, glitches, zonda.WhiteNoise(), zonda.Efficiency(), *filters]
-        data = zonda.Pipeline(steps, runs={"quiet": {"without": ["glitches"]}}).run(scenes.scene(scenes.camera(19)), threads=1)
+        data = zonda.Pipeline(steps, runs={"quiet": {"without": ["glitches"]}}).run(
+            scenes.scene(scenes.camera(19)), threads=1
+        )
         maps[threshold] = data.products["map"], data.products["quiet/map"]
-        text = next((value for who, what, value in data.tally if what == "samples lost to glitches"), "0")
+        text = next(
+            (value for who, what, value in data.tally if what == "samples lost to glitches"), "0"
+        )
         lost = int(str(text).split()[0].replace(",", ""))
     (loud, quiet), (cut, rest) = maps[None], maps["1 mK"]
     assert lost > 500

@@ -14,7 +14,9 @@ RATE, N = 100.0, 6000
 
 
 def act(bench, x, **more):
-    given = {name: f"{value} s" if isinstance(value, float) else value for name, value in more.items()}
+    given = {
+        name: f"{value} s" if isinstance(value, float) else value for name, value in more.items()
+    }
     step, observation = TimeConstant(**given), bench.observation(len(x), x.shape[1])
     return bench.run([step], observation, {"signal": x}, precision="float64").signal
 
@@ -27,7 +29,9 @@ def test_it_keeps_the_contract(tau):
 @pytest.mark.parametrize("tau", [1e-5, 1e-3, 0.003, 0.02, 0.05, 0.5, 10.0])
 @pytest.mark.parametrize("f", [0.1, 2.0, 20.0, 35.0, 46.0])
 def test_waves(bench, tau, f):
-    """1 / (1 + 2 pi i f tau) within 0.5 %, in amplitude and phase, from time constants far below a sample to far above."""
+    """1 / (1 + 2 pi i f tau) within 0.5 %, in amplitude and phase, from time constants far below a
+    sample to far above.
+    """
     n = N if tau < 1 else 60_000
     t = np.arange(n) / RATE
     x = np.stack([np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)])
@@ -42,19 +46,27 @@ def test_waves(bench, tau, f):
 @pytest.mark.parametrize("width", [2.1, 3.0])
 @pytest.mark.parametrize("shift", [0.0, 0.37, 0.5])
 def test_a_source_of_some_samples(bench, tau, width, shift):
-    """A Gaussian of ``width`` samples FWHM: its peak, and all of it, within 0.5 % of the exact response to what is sampled."""
+    """A Gaussian of ``width`` samples FWHM: its peak, and all of it, within 0.5 % of the exact
+    response to what is sampled.
+    """
     sigma = width / np.sqrt(8 * np.log(2)) / RATE
     t = (np.arange(N) - N // 2 - shift) / RATE
     x = np.exp(-(t**2) / 2 / sigma**2)
-    expected = np.fft.irfft(np.fft.rfft(x) / (1 + 2j * np.pi * np.fft.rfftfreq(N, 1 / RATE) * tau), N)
+    expected = np.fft.irfft(
+        np.fft.rfft(x) / (1 + 2j * np.pi * np.fft.rfftfreq(N, 1 / RATE) * tau), N
+    )
     found = act(bench, x[None], tau=tau)[0]
     assert np.abs(found - expected).max() < 0.005 * expected.max()
 
 
 def test_the_peak_of_a_fast_detector(bench):
-    """2.1 samples FWHM, a time constant of a twentieth of a sample: 1 - (tau / sigma)^2 of the peak; straight lines left 0.92."""
+    """2.1 samples FWHM, a time constant of a twentieth of a sample: 1 - (tau / sigma)^2 of the
+    peak; straight lines left 0.92.
+    """
     sigma = 2.1 / np.sqrt(8 * np.log(2))
-    found = act(bench, np.exp(-((np.arange(N) - N // 2) ** 2) / 2 / sigma**2)[None], tau=0.05 / RATE)[0]
+    found = act(
+        bench, np.exp(-((np.arange(N) - N // 2) ** 2) / 2 / sigma**2)[None], tau=0.05 / RATE
+    )[0]
     assert found.max() == pytest.approx(1 - (0.05 / sigma) ** 2, abs=1e-3)
 
 
@@ -92,15 +104,27 @@ def test_same_bits_for_any_blocks(precision):
                 block.detdata["signal"][1::3, lost - block.samples.start] = np.nan
 
     steps = [
-        zonda.PointingDaisy(scan_duration="60 s"), zonda.AtmosphereLayers(pwv="5 mm", layers=1), zonda.WhiteNoise(),
-        zonda.Efficiency(), lose, zonda.TimeConstant(tau="30 ms", scatter="50 %"),
-    ]  # fmt: skip
+        zonda.PointingDaisy(scan_duration="60 s"),
+        zonda.AtmosphereLayers(pwv="5 mm", layers=1),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        lose,
+        zonda.TimeConstant(tau="30 ms", scatter="50 %"),
+    ]
 
     def made(**how):
-        return zonda.Pipeline(steps, precision=precision).run(scene(camera(19)), keep=["signal"], **how).tod()
+        return (
+            zonda.Pipeline(steps, precision=precision)
+            .run(scene(camera(19)), keep=["signal"], **how)
+            .tod()
+        )
 
     one = made(threads=1)
-    for how in ({"threads": 2}, {"threads": 1, "memory": 5_000_000}, {"threads": 3, "memory": 15_000_000}):
+    for how in (
+        {"threads": 2},
+        {"threads": 1, "memory": 5_000_000},
+        {"threads": 3, "memory": 15_000_000},
+    ):
         np.testing.assert_array_equal(made(**how), one)
 
 
@@ -109,7 +133,9 @@ def test_the_mean_beside_the_stream_is_part_of_it(bench):
     x = np.random.default_rng(2).standard_normal((2, N)) * 1e-3
     means = {"signal": SmoothField.constant(level[:, 0], N)}
     step = TimeConstant(tau="0.2 s")
-    beside = bench.run([step], bench.observation(2, N), {"signal": x}, means=means, precision="float64").signal
+    beside = bench.run(
+        [step], bench.observation(2, N), {"signal": x}, means=means, precision="float64"
+    ).signal
     np.testing.assert_allclose(beside, act(bench, x + level, tau="0.2 s"), rtol=0, atol=1e-11)
 
 
@@ -121,7 +147,10 @@ def test_samples_that_are_not_finite_stay_alone(bench):
 
 def test_constants_scatter_between_detectors(bench):
     n = 3000
-    one, other = (TimeConstant(tau="10 ms", scatter="10 %").constants(bench.observation(n, 10, index=k)) for k in (0, 1))
+    one, other = (
+        TimeConstant(tau="10 ms", scatter="10 %").constants(bench.observation(n, 10, index=k))
+        for k in (0, 1)
+    )
     np.testing.assert_array_equal(one, other)  # of the detectors, not of the scan
     spread = np.log(one / 0.01)
     assert spread.std() == pytest.approx(np.log(1.1), rel=4 / np.sqrt(2 * n))

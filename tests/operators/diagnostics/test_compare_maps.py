@@ -32,9 +32,18 @@ SIDE, PIXEL, BEAM = 64, 2.0, 9.0
 
 def world():
     return {
-        "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg", "RADESYS": "ICRS", "CRVAL1": 75.0,
-        "CRVAL2": 20.0, "CRPIX1": 32.5, "CRPIX2": 32.5, "CDELT1": -PIXEL / 3600, "CDELT2": PIXEL / 3600,
-    }  # fmt: skip
+        "CTYPE1": "RA---TAN",
+        "CTYPE2": "DEC--TAN",
+        "CUNIT1": "deg",
+        "CUNIT2": "deg",
+        "RADESYS": "ICRS",
+        "CRVAL1": 75.0,
+        "CRVAL2": 20.0,
+        "CRPIX1": 32.5,
+        "CRPIX2": 32.5,
+        "CDELT1": -PIXEL / 3600,
+        "CDELT2": PIXEL / 3600,
+    }
 
 
 def source(fwhm):
@@ -45,9 +54,16 @@ def source(fwhm):
 def product(signal, half=None, noise=1e-5):
     hits = np.full((SIDE, SIDE), 50)
     return MapProduct(
-        signal, hits, hits * 1e6, np.full((SIDE, SIDE), noise), half, world(), (np.radians(75.0), np.radians(20.0)),
-        PIXEL * ARCSEC, fwhm=BEAM * ARCSEC,
-    )  # fmt: skip
+        signal,
+        hits,
+        hits * 1e6,
+        np.full((SIDE, SIDE), noise),
+        half,
+        world(),
+        (np.radians(75.0), np.radians(20.0)),
+        PIXEL * ARCSEC,
+        fwhm=BEAM * ARCSEC,
+    )
 
 
 def data(tmp_path, products):
@@ -59,7 +75,9 @@ def data(tmp_path, products):
 
 @pytest.fixture
 def products():
-    """The input is what the map shows before the beam; the map has 80 % of it and white noise of 10 uK."""
+    """The input is what the map shows before the beam; the map has 80 % of it and white noise of 10
+    uK.
+    """
     rng = np.random.default_rng(2)
     wide = np.hypot(30.0, BEAM)
     noise, half = 1e-5 * rng.standard_normal((2, SIDE, SIDE))
@@ -78,9 +96,11 @@ def test_contract():
 
 
 def test_the_input_with_the_beam_is_the_reference(tmp_path, products):
-    """A map with 80 % of a source of 30 arcsec: the gain is 0.8 once the input has the map's resolution.
+    """A map with 80 % of a source of 30 arcsec: the gain is 0.8 once the input has the map's
+    resolution.
 
-    White noise of 10 uK averages over the 540 pixels of the source to 1e-5 / 1e-3 / sqrt(540) = 4e-4 of it.
+    White noise of 10 uK averages over the 540 pixels of the source to 1e-5 / 1e-3 / sqrt(540) =
+    4e-4 of it.
     """
     run = data(tmp_path, products)
     CompareMaps().finalize(run)
@@ -98,11 +118,15 @@ def test_the_input_with_the_beam_is_the_reference(tmp_path, products):
     table = Table.read(tmp_path / "comparison_spectra.ecsv")
     assert table.meta["GAIN"] == pytest.approx(found.figures["gain"], rel=1e-6)
     np.testing.assert_allclose(table["difference"], found.spectra.power["difference"], rtol=1e-8)
-    assert {"radius", "map", "map_error"} <= set(Table.read(tmp_path / "comparison_profiles.ecsv").colnames)
+    assert {"radius", "map", "map_error"} <= set(
+        Table.read(tmp_path / "comparison_profiles.ecsv").colnames
+    )
 
 
 def test_noise_of_the_half_difference(products):
-    """Half-difference and noise of the same rms: a factor of 1 within its error; three times the noise: three."""
+    """Half-difference and noise of the same rms: a factor of 1 within its error; three times the
+    noise: three.
+    """
     whole, half = products["map"], (products["map"].half_difference, "half the difference")
     plane = plane_of(whole, "map", half).measured()
     # 4096 pixels: the rms is known to 1 / sqrt(8192) = 1.1 %
@@ -116,7 +140,9 @@ def test_noise_of_the_half_difference(products):
 def test_a_file_as_reference(tmp_path, products):
     path = tmp_path / "ref.fits"
     hdu = fits.PrimaryHDU(1e3 * products["noiseless/map"].signal)
-    hdu.header.update(world() | {"BUNIT": "mK", "TEMPSCAL": "K_RJ", "BMAJ": BEAM / 3600, "BMIN": BEAM / 3600})
+    hdu.header.update(
+        world() | {"BUNIT": "mK", "TEMPSCAL": "K_RJ", "BMAJ": BEAM / 3600, "BMIN": BEAM / 3600}
+    )
     hdu.writeto(path)
     run = data(None, products)
     CompareMaps(map="noiseless/map", file=str(path)).finalize(run)
@@ -137,20 +163,29 @@ def test_map_spectrum(tmp_path, products):
     assert np.abs(score[good]).max() < 4
     assert "source_free_map" in Table.read(tmp_path / "map_spectra.ecsv").colnames
     assert found.names["half_difference"] == "half the difference, even - odd scans"
-    run.products = run.products | {"map": replace(products["map"], difference="even - odd detectors")}
+    run.products = run.products | {
+        "map": replace(products["map"], difference="even - odd detectors")
+    }
     MapSpectrum(bins=8).finalize(run)
-    assert run.products["map_spectra"].names["half_difference"] == "half the difference, even - odd detectors"
+    assert (
+        run.products["map_spectra"].names["half_difference"]
+        == "half the difference, even - odd detectors"
+    )
     MapSpectrum(bins=8, maps=["noiseless/map"]).finalize(run)
     assert set(run.products["map_spectra"].spectra.white) == set()
 
 
 def test_the_white_level_of_a_smoothed_map_is_that_of_its_pixels_before(tmp_path, products):
-    """The noise that a smoothed map states is that behind the smoothing, sqrt(4 pi) sigma / pixel times smaller."""
+    """The noise that a smoothed map states is that behind the smoothing, sqrt(4 pi) sigma / pixel
+    times smaller.
+    """
     noise = np.random.default_rng(5).standard_normal((SIDE, SIDE)) * 1e-5
     run = data(tmp_path, {"map": product(noise).smoothed(BEAM * ARCSEC)})
     MapSpectrum(bins=16).finalize(run)
     s = run.products["map_spectra"].spectra
-    good = (s.modes > 2) & (s.scale > 1.2 * BEAM * ARCSEC)  # beyond, less than 1 % of the power is left
+    good = (s.modes > 2) & (
+        s.scale > 1.2 * BEAM * ARCSEC
+    )  # beyond, less than 1 % of the power is left
     assert np.count_nonzero(good) >= 3
     score = (s.power["map"] / s.white["map"] - 1) * np.sqrt(s.modes)
     assert np.abs(score[good]).max() < 4
@@ -158,8 +193,12 @@ def test_the_white_level_of_a_smoothed_map_is_that_of_its_pixels_before(tmp_path
 
 def test_rings_without_modes_have_no_white_level_and_are_drawn():
     values = np.random.default_rng(2).standard_normal((2, 5))
-    edges = np.array([0.15, 0.22, 0.24, 0.5]) / ARCSEC  # modes of 5 pixels are 0.2 apart, of 2 pixels 0.5
-    found = radial_spectra({"map": values}, np.ones((2, 5)), ARCSEC, edges, {"map": np.ones((2, 5))})
+    edges = (
+        np.array([0.15, 0.22, 0.24, 0.5]) / ARCSEC
+    )  # modes of 5 pixels are 0.2 apart, of 2 pixels 0.5
+    found = radial_spectra(
+        {"map": values}, np.ones((2, 5)), ARCSEC, edges, {"map": np.ones((2, 5))}
+    )
     assert np.isfinite(found.white["map"]).tolist() == [True, False, True]
     ax = plot_radial_spectra(Figure().add_subplot(), found, "K_RJ")
     assert np.isfinite(ax.get_ylim()).all()
@@ -189,10 +228,22 @@ def test_pictures(tmp_path, products):
 @pytest.mark.parametrize(
     ("maps", "step", "message"),
     [
-        ([{"projection": "CAR", "pixel": "4 arcsec"}], MapSpectrum(), "no TAN or HEALPix map of the signal"),
+        (
+            [{"projection": "CAR", "pixel": "4 arcsec"}],
+            MapSpectrum(),
+            "no TAN or HEALPix map of the signal",
+        ),
         ([{"contents": "hits"}], MapSpectrum(maps=["map"]), "no TAN map 'map'"),
-        ([{"nside": 64}, {"nside": 32, "product": "b"}], MapSpectrum(maps=["map", "b"]), "HEALPix maps are of one map at a time"),
-        ([{"nside": 64}, {"product": "b"}], MapSpectrum(maps=["b", "source_free/map"]), "HEALPix maps are of one map at a time"),
+        (
+            [{"nside": 64}, {"nside": 32, "product": "b"}],
+            MapSpectrum(maps=["map", "b"]),
+            "HEALPix maps are of one map at a time",
+        ),
+        (
+            [{"nside": 64}, {"product": "b"}],
+            MapSpectrum(maps=["b", "source_free/map"]),
+            "HEALPix maps are of one map at a time",
+        ),
         ([{"nside": 64}], zonda.TransferFunction(), "needs a TAN map of the signal"),
         ([{"projection": "CAR", "pixel": "4 arcsec"}, {"product": "b"}], MapSpectrum(), ""),
         ([{"nside": 64}, {"product": "b"}], MapSpectrum(maps=["map"]), ""),
@@ -203,7 +254,9 @@ def test_maps_that_do_not_suit_are_refused_before_the_run(maps, step, message):
     sky = zonda.SkyMap(map=source(9.0), wcs=WCS(world()), unit="K_RJ")
     steps = [zonda.PointingDaisy(scan_duration="2 s"), sky, zonda.WhiteNoise(), zonda.Efficiency()]
     steps += [zonda.BinMap(**given) for given in maps]
-    pipeline = zonda.Pipeline([*steps, step], runs={"source_free": {"without": ["sky"], "modes": "full"}})
+    pipeline = zonda.Pipeline(
+        [*steps, step], runs={"source_free": {"without": ["sky"], "modes": "full"}}
+    )
     if not message:
         first_look(pipeline, scenes.scene(), saved=False)
         return
@@ -211,13 +264,19 @@ def test_maps_that_do_not_suit_are_refused_before_the_run(maps, step, message):
         first_look(pipeline, scenes.scene(), saved=False)
 
 
-@pytest.mark.parametrize("binned", [{"pixel": "30 arcsec"}, {"projection": "CAR", "pixel": "30 arcsec"}, {"nside": 8192}])
+@pytest.mark.parametrize(
+    "binned", [{"pixel": "30 arcsec"}, {"projection": "CAR", "pixel": "30 arcsec"}, {"nside": 8192}]
+)
 def test_chi2_against_a_map_without_noise_is_one(tmp_path, binned):
-    """A noiseless map's NOISE is that of the complete map: chi^2 counted it twice, 0.5 a pixel. In a run and of its files."""
+    """A noiseless map's NOISE is that of the complete map: chi^2 counted it twice, 0.5 a pixel. In
+    a run and of its files.
+    """
     camera = {"like": "mustang2", "detectors": 19, "fwhm": "60 arcsec", "sample_rate": "20 Hz"}
     place = {"site": "green_bank", "time": "2024-11-25T07:00", "target": "05h +60d", "seed": 3}
     y, x = np.indices((40, 40)) - 19.5
-    sky = zonda.SkyMap(map=1e-3 * np.exp(-(x**2 + y**2) / 30), pixel_size="20 arcsec", centre="target", unit="K_RJ")
+    sky = zonda.SkyMap(
+        map=1e-3 * np.exp(-(x**2 + y**2) / 30), pixel_size="20 arcsec", centre="target", unit="K_RJ"
+    )
     steps = [
         zonda.PointingDaisy(scan_duration="60 s", radius="4 arcmin", speed="1 arcmin/s"), sky,
         zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(**binned),
@@ -225,7 +284,9 @@ def test_chi2_against_a_map_without_noise_is_one(tmp_path, binned):
     ]  # fmt: skip
     pipeline = zonda.Pipeline(steps, runs={"noiseless": {"only": ["sky"]}})
     found = [pipeline.run(zonda.Scene(instrument=camera, **place), output=tmp_path)["comparison"]]
-    reference, noisy = (read_planes(tmp_path / name).planes["I"] for name in ("noiseless_map.fits", "map.fits"))
+    reference, noisy = (
+        read_planes(tmp_path / name).planes["I"] for name in ("noiseless_map.fits", "map.fits")
+    )
     assert reference.quiet
     assert not noisy.quiet
     found.append(compare(reference, noisy))

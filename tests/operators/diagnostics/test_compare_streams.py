@@ -37,27 +37,40 @@ def test_cross_spectra_are_scipys(length):
     how = {"fs": RATE, "nperseg": length, "noverlap": length - length // 2, "detrend": "linear"}
     other = x[::-1] + 0.3 * x + y
     np.testing.assert_allclose(found.power, scipy.signal.csd(x, x, **how)[1][1:].real, rtol=1e-10)
-    np.testing.assert_allclose(found.reference, scipy.signal.csd(other, other, **how)[1][1:].real, rtol=1e-10)
-    np.testing.assert_allclose(found.cross, scipy.signal.csd(other, x, **how)[1][1:], rtol=0, atol=1e-10 * found.power.max())
+    np.testing.assert_allclose(
+        found.reference, scipy.signal.csd(other, other, **how)[1][1:].real, rtol=1e-10
+    )
+    np.testing.assert_allclose(
+        found.cross,
+        scipy.signal.csd(other, x, **how)[1][1:],
+        rtol=0,
+        atol=1e-10 * found.power.max(),
+    )
 
 
 def test_equal_streams(make_observation, data):
     both = streams()["signal"]
-    found = compare(make_observation(N), data, {"signal": both, "sky": both.copy()}, reference="sky")
+    found = compare(
+        make_observation(N), data, {"signal": both, "sky": both.copy()}, reference="sky"
+    )
     np.testing.assert_allclose(found.coherence, 1, rtol=1e-12)
     assert found.over_detectors("correlation") == pytest.approx((1, 0, 0), abs=1e-9)
     assert found.over_detectors("gain")[:2] == pytest.approx((1, 0), abs=1e-12)
     assert found.over_detectors("rms_difference")[0] < 1e-9
-    # sigma of 19 x 20000 values: 0.11 %; the straight lines and the level of 500 samples take 2 to 3 of 250 frequencies' power
+    # sigma of 19 x 20000 values: 0.11 %; the straight lines and the level of 500 samples take 2 to
+    # 3 of 250 frequencies' power
     assert found.over_detectors("rms")[0] == pytest.approx(1e-3, rel=0.01)
 
 
 def test_independent_noise_has_the_bias_of_the_coherence(make_observation, data):
     found = compare(make_observation(N), data, streams(), reference="sky")
-    # |estimate| of a coherence of zero: mean 1/n, standard deviation 1/n (exponential); 19 detectors x 250 frequencies, of which
-    # 1.5 to 2 are one behind the window: 2 % of 1/n for one standard error
+    # |estimate| of a coherence of zero: mean 1/n, standard deviation 1/n (exponential); 19
+    # detectors x 250 frequencies, of which 1.5 to 2 are one behind the window: 2 % of 1/n for one
+    # standard error
     assert found.segments == pytest.approx(Welch(N, RATE, LENGTH).independent)
-    assert found.coherence.mean() * found.segments == pytest.approx(1, abs=4 * np.sqrt(2 / (19 * 250)))
+    assert found.coherence.mean() * found.segments == pytest.approx(
+        1, abs=4 * np.sqrt(2 / (19 * 250))
+    )
     r, scatter, error = found.over_detectors("correlation")
     assert abs(r) < 4 * error / np.sqrt(19)
     assert error == pytest.approx(N**-0.5, rel=0.1)  # independent samples; the spectra scatter
@@ -87,20 +100,30 @@ def test_a_gain_is_recovered(make_observation, data, gain):
 
 
 def test_the_errors_hold_for_coloured_noise():
-    """Streams with spectra of f^-1 (pole at 0.5 Hz): scatter over 400 series against the standard errors (3.5 %; 4 sigma)."""
+    """Streams with spectra of f^-1 (pole at 0.5 Hz): scatter over 400 series against the standard
+    errors (3.5 %; 4 sigma).
+    """
     rng = np.random.default_rng(3)
     poles = ([1.0], [1.0, -np.exp(-2 * np.pi * 0.5 / RATE)])
     found = []
     for _ in range(400):
         y, e = scipy.signal.lfilter(*poles, rng.normal(size=(2, 8000)))
-        found.append(figures(pair(0.7 * y + 0.5 * e, y, RATE, LENGTH), RATE / LENGTH, Welch(8000, RATE, LENGTH).independent))
+        found.append(
+            figures(
+                pair(0.7 * y + 0.5 * e, y, RATE, LENGTH),
+                RATE / LENGTH,
+                Welch(8000, RATE, LENGTH).independent,
+            )
+        )
     values, errors = (np.array(rows) for rows in zip(*found, strict=True))
     scatter = values[:, 3:].std(axis=0, ddof=1)
     np.testing.assert_allclose(np.sqrt((errors**2).mean(axis=0)), scatter, rtol=0.14)
 
 
 def test_a_mean_beside_the_stream_counts(make_observation, data):
-    """The mean in the stream and beside it; on the calibrated sky as `PowerSpectrum` has it; blocks do not matter."""
+    """The mean in the stream and beside it; on the calibrated sky as `PowerSpectrum` has it; blocks
+    do not matter.
+    """
     observation = make_observation(N)
     made = streams(8)
     slow = SmoothField(np.ones((19, 1)), 1e-3 * np.sin(np.arange(N // 100 + 3))[None, :], 100, N)
@@ -115,7 +138,9 @@ def test_a_mean_beside_the_stream_counts(make_observation, data):
 
 
 def test_a_run_and_its_files(tmp_path):
-    """Spectra are those of `PowerSpectrum`; tables, pictures and the report; streams of other units have no difference."""
+    """Spectra are those of `PowerSpectrum`; tables, pictures and the report; streams of other units
+    have no difference.
+    """
     steps = [
         zonda.AtmosphereLayers(pwv="5 mm", outputs=["pwv"], layer_response="column"),
         zonda.WhiteNoise(),
@@ -129,7 +154,9 @@ def test_a_run_and_its_files(tmp_path):
     data = scenes.run(steps, scenes.scan(7, 2000), output=tmp_path)
     found, spectrum = data.products["stream_comparison"], data.products["spectrum"]
     np.testing.assert_allclose(found.power[0], spectrum.psd["signal"], rtol=1e-9)
-    np.testing.assert_allclose(found.power[1], spectrum.psd["atmosphere"], rtol=1e-6)  # 13 decades below the first
+    np.testing.assert_allclose(
+        found.power[1], spectrum.psd["atmosphere"], rtol=1e-6
+    )  # 13 decades below the first
     table = Table.read(tmp_path / "stream_comparison.ecsv", format="ascii.ecsv")
     np.testing.assert_allclose(table["ratio"], found.power[0] / found.power[1], rtol=1e-7)
     assert str(table["power"].unit) == "K2 / Hz"
@@ -137,7 +164,9 @@ def test_a_run_and_its_files(tmp_path):
     np.testing.assert_allclose(detectors["gain"], found.values[:, FIGURES.index("gain")], rtol=1e-7)
     assert list(detectors["detector"]) == found.names
     emission = data.products["emission"]
-    assert emission.over_detectors("correlation")[0] > 0.999  # linear in the PWV but for the change of elevation
+    assert (
+        emission.over_detectors("correlation")[0] > 0.999
+    )  # linear in the PWV but for the change of elevation
     assert np.isnan(emission.over_detectors("rms_difference")[0])
     assert {"stream_comparison", "emission"} <= {p.name for p in pictures(data, Plots().style())}
     assert (tmp_path / "stream_comparison.png").exists()
@@ -161,40 +190,68 @@ def test_what_cannot_be_compared(tmp_path):
     steps[-1] = zonda.CompareStreams(reference="white")
     data = scenes.run(steps, scenes.scan(7, 20))
     assert "stream_comparison" not in data.products
-    assert ("CompareStreams", "scans too short to compare streams", "1") in [tuple(row) for row in data.tally.told()]
+    assert ("CompareStreams", "scans too short to compare streams", "1") in [
+        tuple(row) for row in data.tally.told()
+    ]
 
 
 def signals(reference, runs):
     daisy = zonda.PointingDaisy(radius="1 arcmin", scan_duration="20 s")
-    made = [zonda.AtmosphereLayers(), zonda.WhiteNoise(), zonda.Efficiency(), zonda.HighpassFilter(frequency="0.2 Hz")]
+    made = [
+        zonda.AtmosphereLayers(),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.HighpassFilter(frequency="0.2 Hz"),
+    ]
     compared = zonda.CompareStreams(stream="signal", reference=reference, segment="2 s")
     pipeline = zonda.Pipeline([daisy, *made, compared], runs=runs)
-    return pipeline.run(scenes.scene(scenes.camera(7)), keep=["signal", *([reference] if "/" in reference else [])], threads=1)
+    return pipeline.run(
+        scenes.scene(scenes.camera(7)),
+        keep=["signal", *([reference] if "/" in reference else [])],
+        threads=1,
+    )
 
 
 def test_the_stream_of_a_signal_as_it_is_filtered():
     """Of both, behind the filter: their difference is the atmosphere's, whatever the noise."""
     data = signals("signal/quiet", {"quiet": {"only": ["white"]}})
-    found, (x, y) = data.products["stream_comparison"], (data.tod(name) for name in ("signal", "signal/quiet"))
+    found, (x, y) = (
+        data.products["stream_comparison"],
+        (data.tod(name) for name in ("signal", "signal/quiet")),
+    )
     assert (found.stream, found.reference) == ("signal", "signal/quiet")
     rate = scenes.camera(7).sample_rate
-    expected = [pair(a, b, rate, round(rate / found.frequency[0])) for a, b in zip(x, y, strict=True)]
-    # tod() holds the float32 streams that the step read, whose means are zero behind the filter: the same spectra
+    expected = [
+        pair(a, b, rate, round(rate / found.frequency[0])) for a, b in zip(x, y, strict=True)
+    ]
+    # tod() holds the float32 streams that the step read, whose means are zero behind the filter:
+    # the same spectra
     for row, name in ((0, "power"), (1, "reference")):
-        np.testing.assert_allclose(found.power[row], np.mean([getattr(p, name) for p in expected], axis=0), rtol=1e-6)
+        np.testing.assert_allclose(
+            found.power[row], np.mean([getattr(p, name) for p in expected], axis=0), rtol=1e-6
+        )
     assert found.power[0].mean() > found.power[1].mean()  # the atmosphere is in one of them alone
 
 
 @pytest.mark.parametrize(
     ("reference", "runs", "said"),
     [
-        ("signal/quite", {"quiet": {"only": ["white"]}}, "no stream 'signal/quite'(.|\\n)*did you mean 'signal/quiet'"),
+        (
+            "signal/quite",
+            {"quiet": {"only": ["white"]}},
+            "no stream 'signal/quite'(.|\\n)*did you mean 'signal/quiet'",
+        ),
         ("signal/none", {}, "streams of signals: signal; of a remainder there are maps alone"),
     ],
 )
 def test_a_signal_that_there_is_not(reference, runs, said):
     daisy = zonda.PointingDaisy(radius="1 arcmin", scan_duration="4 s")
-    steps = [daisy, zonda.WhiteNoise(), zonda.Efficiency(), zonda.CompareStreams(reference=reference, segment="1 s")]
+    steps = [
+        daisy,
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.CompareStreams(reference=reference, segment="1 s"),
+    ]
     with pytest.raises(ZondaError, match=said):
         zonda.Pipeline(steps, runs=runs).run(scenes.scene(scenes.camera(7)), threads=1)
 

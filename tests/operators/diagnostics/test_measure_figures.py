@@ -42,12 +42,18 @@ def test_figures_of_a_run(tmp_path):
     file = loaded(tmp_path, measures, "runs: {free: {without: [sky]}}\n")
     data = file.pipeline().run(file.scene(), output=tmp_path / "out", threads=1)
     figures = data.products["figures"]
-    assert figures["central_rms"].value == data.products["map"].smoothed_rms(data.products["map"].fwhm, np.radians(1 / 60))
+    assert figures["central_rms"].value == data.products["map"].smoothed_rms(
+        data.products["map"].fwhm, np.radians(1 / 60)
+    )
     free = data.products["free/map"].smoothed_rms(data.products["map"].fwhm, np.radians(20 / 3600))
     assert figures["central_rms(signal=free, radius=20 arcsec)"].value == pytest.approx(free)
     rings = data.products["transfer_function"].rings
-    there = figures["transfer_at(scale=20 arcsec)"]  # the same ring: 20 arcsec times and by exp(1/4)
-    assert (there.value, there.error) == pytest.approx((rings.transfer[0], rings.error[0]), rel=1e-6)
+    there = figures[
+        "transfer_at(scale=20 arcsec)"
+    ]  # the same ring: 20 arcsec times and by exp(1/4)
+    assert (there.value, there.error) == pytest.approx(
+        (rings.transfer[0], rings.error[0]), rel=1e-6
+    )
     assert 0.1 < figures["peak_ratio"].value < 1.2
     table = Table.read(tmp_path / "out" / "figures.ecsv", format="ascii.ecsv")
     assert list(table["name"]) == [f.name for f in figures]
@@ -62,21 +68,37 @@ def test_figures_of_a_run(tmp_path):
 def test_it_is_an_output_that_keeps_what_it_reads(tmp_path):
     """`zonda run` omits no signal and no step that a metric reads, and all others."""
     runs = "runs: {free: {without: [sky]}, sky: {only: [sky]}}\n"
-    plain = prune(loaded(tmp_path, "  - MeasureFigures: {metrics: [central_rms]}\n", runs).pipeline())
+    plain = prune(
+        loaded(tmp_path, "  - MeasureFigures: {metrics: [central_rms]}\n", runs).pipeline()
+    )
     assert plain.runs == ()
     assert "BinMap" in plain.operators
-    one = prune(loaded(tmp_path, "  - MeasureFigures: {metrics: [{central_rms: {signal: free}}]}\n", runs).pipeline())
+    one = prune(
+        loaded(
+            tmp_path, "  - MeasureFigures: {metrics: [{central_rms: {signal: free}}]}\n", runs
+        ).pipeline()
+    )
     assert one.runs == ("free",)
-    ratio = prune(loaded(tmp_path, "  - MeasureFigures: {metrics: [peak_ratio]}\n", runs).pipeline())
-    assert "WhiteNoise" not in ratio.operators  # the sky alone takes the place of the complete signal
+    ratio = prune(
+        loaded(tmp_path, "  - MeasureFigures: {metrics: [peak_ratio]}\n", runs).pipeline()
+    )
+    assert (
+        "WhiteNoise" not in ratio.operators
+    )  # the sky alone takes the place of the complete signal
 
 
 def test_the_sky_alone_gives_the_same_ratio(tmp_path):
     """Where the complete signal is narrowed to the sky, that is the signal which a metric reads."""
     file = loaded(tmp_path, "  - MeasureFigures: {metrics: [peak_ratio]}\n")
     whole = file.pipeline().run(file.scene(), threads=1).products["figures"]
-    narrow = zonda.Pipeline(file.operators, only=["sky"]).run(file.scene(), threads=1).products["figures"]
-    assert narrow["peak_ratio"].value == pytest.approx(whole["peak_ratio"].value, rel=1e-5)  # float32
+    narrow = (
+        zonda.Pipeline(file.operators, only=["sky"])
+        .run(file.scene(), threads=1)
+        .products["figures"]
+    )
+    assert narrow["peak_ratio"].value == pytest.approx(
+        whole["peak_ratio"].value, rel=1e-5
+    )  # float32
 
 
 def test_what_cannot_be_measured_is_said_before_the_run(tmp_path):
@@ -89,7 +111,10 @@ def test_what_cannot_be_measured_is_said_before_the_run(tmp_path):
     with pytest.raises(ZondaError, match="listed twice"):
         loaded(tmp_path, "  - MeasureFigures: {metrics: [coverage, coverage]}\n")
     named = "  - MeasureFigures: {metrics: [{central_rms: {signal: fre}}]}\n"
-    with pytest.raises(ZondaError, match=r"(?s)MeasureFigures reads the signal 'fre', which is not among runs.*mean 'free'"):
+    with pytest.raises(
+        ZondaError,
+        match=r"(?s)MeasureFigures reads the signal 'fre', which is not among runs.*mean 'free'",
+    ):
         loaded(tmp_path, named, "runs: {free: {without: [sky]}}\n")
     with pytest.raises(ZondaError, match="add it to runs"):
         loaded(tmp_path, named)
@@ -117,7 +142,11 @@ def test_every_metric_is_a_figure_or_is_refused():
 @pytest.mark.parametrize(
     ("given", "metric", "message"),
     [
-        ("projection: CAR, pixel: 3 arcsec", "{transfer_at: {scale: 20 arcsec}}", "transfer_at needs a TAN map"),
+        (
+            "projection: CAR, pixel: 3 arcsec",
+            "{transfer_at: {scale: 20 arcsec}}",
+            "transfer_at needs a TAN map",
+        ),
         ("nside: 8192", "{transfer_at: {scale: 20 arcsec}}", "transfer_at needs a TAN map"),
         ("contents: hits, pixel: 3 arcsec", "central_rms", "counts samples and has no signal"),
         ("contents: hits, pixel: 3 arcsec", "peak_snr", "counts samples and has no signal"),
@@ -125,9 +154,13 @@ def test_every_metric_is_a_figure_or_is_refused():
         ("projection: CAR, pixel: 3 arcsec", "{peak_ratio: {against: input}}", ""),
     ],
 )
-def test_maps_of_which_there_is_no_figure_are_refused_before_the_run(tmp_path, given, metric, message):
+def test_maps_of_which_there_is_no_figure_are_refused_before_the_run(
+    tmp_path, given, metric, message
+):
     file = loaded(tmp_path, f"  - MeasureFigures: {{metrics: [{metric}]}}\n")
-    (tmp_path / "p.yaml").write_text((tmp_path / "p.yaml").read_text().replace("pixel: 3 arcsec", given))
+    (tmp_path / "p.yaml").write_text(
+        (tmp_path / "p.yaml").read_text().replace("pixel: 3 arcsec", given)
+    )
     file = zonda.load(tmp_path / "p.yaml")
     if not message:
         first_look(file.pipeline(), file.scene(), saved=False)
@@ -137,9 +170,13 @@ def test_maps_of_which_there_is_no_figure_are_refused_before_the_run(tmp_path, g
 
 
 def test_figures_of_one_signal_alone_keep_what_it_is_without(tmp_path):
-    """The plan leaves out what no output depends on; the sky, which the signal is without, is named by it and stays."""
+    """The plan leaves out what no output depends on; the sky, which the signal is without, is named
+    by it and stays.
+    """
     runs = "runs: {free: {without: [sky], modes: full}}\n"
-    file = loaded(tmp_path, "  - MeasureFigures: {metrics: [{central_rms: {signal: free}}]}\n", runs)
+    file = loaded(
+        tmp_path, "  - MeasureFigures: {metrics: [{central_rms: {signal: free}}]}\n", runs
+    )
     planned = zonda.plan(file, threads=1).apply(file)
     data = planned.pipeline().run(planned.scene(), output=tmp_path / "planned", threads=1)
     whole = file.pipeline().run(file.scene(), output=tmp_path / "whole", threads=1)

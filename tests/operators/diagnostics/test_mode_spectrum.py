@@ -16,11 +16,18 @@ T = np.arange(SAMPLES) / 100.0
 
 
 def streams(detectors=6, seed=0):
-    """A common wave of 1 K, another of 0.3 K with a gradient over the detectors, and noise of 0.05 K; on a mean of 30 K."""
+    """A common wave of 1 K, another of 0.3 K with a gradient over the detectors, and noise of 0.05
+    K; on a mean of 30 K.
+    """
     random = np.random.default_rng(seed)
     gradient = np.linspace(-1, 1, detectors)[:, None]
     made = np.sin(2 * np.pi * T / 10) + 0.3 * gradient * np.cos(2 * np.pi * T / 3)
-    return made + 0.05 * random.standard_normal((detectors, SAMPLES)) + 30 + np.arange(detectors)[:, None]
+    return (
+        made
+        + 0.05 * random.standard_normal((detectors, SAMPLES))
+        + 30
+        + np.arange(detectors)[:, None]
+    )
 
 
 def found(signal, observation=None, **parameters):
@@ -43,7 +50,9 @@ def test_singular_values_are_numpys():
     sign = np.sign((modes.vectors * u[:, :3].T).sum(axis=1))[:, None]
     assert modes.streams == pytest.approx(sign * s[:3, None] * v[:3], abs=1e-9)
     whole = found(signal, center=False)
-    assert whole.values[0, 0] == pytest.approx(np.linalg.svd(signal, compute_uv=False)[0] / np.sqrt(signal.size), rel=1e-12)
+    assert whole.values[0, 0] == pytest.approx(
+        np.linalg.svd(signal, compute_uv=False)[0] / np.sqrt(signal.size), rel=1e-12
+    )
     alike = found(signal, normalize=True)
     unit = np.linalg.svd(rest / rest.std(axis=1, keepdims=True), compute_uv=False)
     assert alike.values[0, :6] == pytest.approx(unit / np.sqrt(signal.size), rel=1e-9)
@@ -51,14 +60,16 @@ def test_singular_values_are_numpys():
 
 
 def test_lagged_components_see_what_moves():
-    """A pulse that crosses four detectors, 0.2 s apart: at one instant all see their own; with three delays it is one mode.
+    """A pulse that crosses four detectors, 0.2 s apart: at one instant all see their own; with
+    three delays it is one mode.
 
-    White noise of unit variance, delayed: instantaneous shares are 1/4 each. The embedded matrix holds it at 7 lags, 1 to 4
-    times: its leading eigenvalue is 4 of 16.
+    White noise of unit variance, delayed: instantaneous shares are 1/4 each. The embedded matrix
+    holds it at 7 lags, 1 to 4 times: its leading eigenvalue is 4 of 16.
     """
     noise = np.random.default_rng(1).standard_normal(SAMPLES + 60)
     signal = np.array([noise[60 - 20 * d : 60 - 20 * d + SAMPLES] for d in range(4)])
-    # a covariance of 5000 samples is known to 1.4 %; the largest of equal eigenvalues is 6 % high: (1 + sqrt(4 / 5000))^2
+    # a covariance of 5000 samples is known to 1.4 %; the largest of equal eigenvalues is 6 % high:
+    # (1 + sqrt(4 / 5000))^2
     assert found(signal).shares[0] == pytest.approx(1 / 4, rel=0.08)
     lagged = found(signal, delays=3, delay="0.2 s")
     assert lagged.shares[0] == pytest.approx(4 / 16, rel=0.08)
@@ -93,7 +104,10 @@ def test_flags_are_left_out():
 def test_the_bits_do_not_depend_on_blocks(settings):
     noise = zonda.WhiteNoise()
     steps = [noise, zonda.Efficiency(), zonda.ModeSpectrum()]
-    one, other = (scenes.run(steps, scenes.scan(37, 6000), **more).products["modes"] for more in ({}, settings))
+    one, other = (
+        scenes.run(steps, scenes.scan(37, 6000), **more).products["modes"]
+        for more in ({}, settings)
+    )
     for name in ("values", "energy", "streams", "vectors"):
         assert scenes.differing(getattr(one, name), getattr(other, name)) == 0
 
@@ -101,17 +115,40 @@ def test_the_bits_do_not_depend_on_blocks(settings):
 def test_microkelvins_beside_the_mean():
     """float32 streams with the atmosphere's mean of tens of kelvin beside them: as in float64."""
     steps = [zonda.AtmosphereLayers(pwv="5 mm"), zonda.Efficiency(), zonda.ModeSpectrum()]
-    narrow, wide = (scenes.run(steps, scenes.scan(7, 3000), precision=p).products["modes"] for p in ("float32", "float64"))
+    narrow, wide = (
+        scenes.run(steps, scenes.scan(7, 3000), precision=p).products["modes"]
+        for p in ("float32", "float64")
+    )
     assert narrow.shares[:7] == pytest.approx(wide.shares[:7], rel=1e-4)
     assert wide.shares[0] > 0.9
 
 
 def test_tables_and_scans(tmp_path):
     one = Modes(
-        np.array([[3.0, 4.0]]), np.array([25.0]), T[:4], np.ones((1, 4)), np.ones((1, 2)), ["a", "b"], 0, 0.0, "K_RJ", "s", "m"
+        np.array([[3.0, 4.0]]),
+        np.array([25.0]),
+        T[:4],
+        np.ones((1, 4)),
+        np.ones((1, 2)),
+        ["a", "b"],
+        0,
+        0.0,
+        "K_RJ",
+        "s",
+        "m",
     )
     other = Modes(
-        np.array([[4.0, 2.0]]), np.array([20.0]), T[:4], np.ones((1, 4)), np.ones((1, 2)), ["a", "b"], 0, 0.0, "K_RJ", "t", "m"
+        np.array([[4.0, 2.0]]),
+        np.array([20.0]),
+        T[:4],
+        np.ones((1, 4)),
+        np.ones((1, 2)),
+        ["a", "b"],
+        0,
+        0.0,
+        "K_RJ",
+        "t",
+        "m",
     )
     one += other
     assert one.shares == pytest.approx([(0.36 + 0.8) / 2, (0.64 + 0.2) / 2])
@@ -130,7 +167,10 @@ def test_tables_and_scans(tmp_path):
 
 
 def test_too_many_rows_are_refused():
-    with pytest.raises(ZondaError, match=r"6 detectors with 1000 delays are more than 4096 rows(.|\n)*set detectors to 4"):
+    with pytest.raises(
+        ZondaError,
+        match=r"6 detectors with 1000 delays are more than 4096 rows(.|\n)*set detectors to 4",
+    ):
         found(streams(), delays=1000)
     with pytest.raises(ZondaError, match="there is no mode spectrum 'modes'"):
         measure(scenes.run([zonda.BinMap()], scenes.scan(6, SAMPLES), streams()), "first_component")

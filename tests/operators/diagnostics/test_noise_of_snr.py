@@ -1,4 +1,6 @@
-"""What the signal-to-noise ratio divides by: measured noise where a map of the noise alone is made, and that it says which."""
+"""What the signal-to-noise ratio divides by: measured noise where a map of the noise alone is made,
+and that it says which.
+"""
 
 from __future__ import annotations
 
@@ -21,22 +23,38 @@ SCANS, KNEE = 2, "1 Hz"
 
 def camera(polarization):
     return zonda.Instrument(
-        name="cam", telescope={"name": "dish", "diameter": "100 m"}, band={"name": "b", "low": "80 GHz", "high": "100 GHz"},
-        detectors=38, field_of_view="2 arcmin", fwhm="9 arcsec", main_beam_efficiency=0.3, illumination_efficiency=0.8,
-        net="1 mK s(1/2)", knee=KNEE, sample_rate="50 Hz", polarization=polarization,
-    )  # fmt: skip
+        name="cam",
+        telescope={"name": "dish", "diameter": "100 m"},
+        band={"name": "b", "low": "80 GHz", "high": "100 GHz"},
+        detectors=38,
+        field_of_view="2 arcmin",
+        fwhm="9 arcsec",
+        main_beam_efficiency=0.3,
+        illumination_efficiency=0.8,
+        net="1 mK s(1/2)",
+        knee=KNEE,
+        sample_rate="50 Hz",
+        polarization=polarization,
+    )
 
 
 def run(folder, *more, scans=1, free=True, polarization="none", **of_map):
-    """White and pink noise through a mild filter, with the sky of a faint source: a scene of correlated noise."""
+    """White and pink noise through a mild filter, with the sky of a faint source: a scene of
+    correlated noise.
+    """
     y, x = np.indices((81, 81)) - 40.0
     source = 1e-4 * np.exp(-4 * np.log(2) * (x**2 + y**2) * 9 / 20.0**2)
     sky = {"map": source}
     if "stokes" in of_map:
-        sky = {"map": np.stack([source, source / 2, -source / 3]), "polarization_convention": "cosmo"}
+        sky = {
+            "map": np.stack([source, source / 2, -source / 3]),
+            "polarization_convention": "cosmo",
+        }
     pixel = {} if "nside" in of_map else {"pixel": "3 arcsec"}
     steps = [
-        zonda.PointingDaisy(radius="1.5 arcmin", speed="50 arcsec/s", scan_duration="60 s", scans=scans),
+        zonda.PointingDaisy(
+            radius="1.5 arcmin", speed="50 arcsec/s", scan_duration="60 s", scans=scans
+        ),
         zonda.SkyMap(**sky, pixel_size="3 arcsec", unit="K_RJ", centre="target"),
         zonda.WhiteNoise(),
         zonda.PinkNoise(),
@@ -47,7 +65,11 @@ def run(folder, *more, scans=1, free=True, polarization="none", **of_map):
     ]
     runs = {"source_free": {"without": ["sky"], "modes": "full"}} if free else {}
     scene = zonda.Scene(
-        site="green_bank", instrument=camera(polarization), time="2024-11-25T07:00", target="75 deg +20 deg", seed=11
+        site="green_bank",
+        instrument=camera(polarization),
+        time="2024-11-25T07:00",
+        target="75 deg +20 deg",
+        seed=11,
     )
     return zonda.Pipeline(steps, runs=runs).run(scene, output=folder, threads=1)
 
@@ -60,15 +82,31 @@ def off_source(found):
 
 @pytest.mark.parametrize(
     ("of_map", "plane"),
-    [({}, ""), ({"projection": "CAR"}, ""), ({"smooth": "9 arcsec"}, ""), ({"stokes": "IQU"}, "_Q"), ({"stokes": "IQU"}, "_U")],
+    [
+        ({}, ""),
+        ({"projection": "CAR"}, ""),
+        ({"smooth": "9 arcsec"}, ""),
+        ({"stokes": "IQU"}, "_Q"),
+        ({"stokes": "IQU"}, "_U"),
+    ],
 )
 def test_one_scan_has_a_ratio_of_unit_rms(tmp_path, of_map, plane):
-    """The source-free map is the noise itself: 1 to what the covered edge differs; by white noise alone it is 1.2 to 3."""
+    """The source-free map is the noise itself: 1 to what the covered edge differs; by white noise
+    alone it is 1.2 to 3.
+    """
     polarization = "pairs" if "stokes" in of_map else "none"
-    data = run(None, zonda.CompareMaps(), zonda.CompareMaps(noise="map", name="white"), polarization=polarization, **of_map)
+    data = run(
+        None,
+        zonda.CompareMaps(),
+        zonda.CompareMaps(noise="map", name="white"),
+        polarization=polarization,
+        **of_map,
+    )
     found, white = data[f"comparison{plane}"], data[f"white{plane}"]
     assert off_source(found).std() == pytest.approx(1.0, abs=0.1)
-    assert (np.abs(off_source(found)) > 3).mean() < 0.012  # 0.27 % of a Gaussian, of some hundred independent patches
+    assert (
+        np.abs(off_source(found)) > 3
+    ).mean() < 0.012  # 0.27 % of a Gaussian, of some hundred independent patches
     words, factor = found.noise["snr"]
     assert words == f"{factor:.3g} x white noise, as in {FREE}"
     assert factor == pytest.approx(off_source(white).std(), rel=0.12)
@@ -78,7 +116,14 @@ def test_one_scan_has_a_ratio_of_unit_rms(tmp_path, of_map, plane):
 
 
 def test_without_a_map_of_the_noise_alone_it_says_white_noise_only(tmp_path):
-    data = run(tmp_path, zonda.CompareMaps(), zonda.SaveMap(), zonda.Plots(contours=[-2, 2], dpi=50), zonda.Report(), free=False)
+    data = run(
+        tmp_path,
+        zonda.CompareMaps(),
+        zonda.SaveMap(),
+        zonda.Plots(contours=[-2, 2], dpi=50),
+        zonda.Report(),
+        free=False,
+    )
     assert data["comparison"].noise["snr"] == (WHITE, None)
     assert ("CompareMaps", "noise of the map", WHITE) in list(data.tally.told())
     header = fits.getheader(tmp_path / "map.fits", "NOISE")
@@ -92,8 +137,17 @@ def test_without_a_map_of_the_noise_alone_it_says_white_noise_only(tmp_path):
 
 
 def test_titles_headers_and_the_report_state_the_factor(tmp_path):
-    """Two scans: the source-free map counts first, half the difference where it is not there or where it is wanted."""
-    data = run(tmp_path, zonda.CompareMaps(), zonda.SaveMap(), zonda.Plots(contours=[-2, 2], dpi=50), zonda.Report(), scans=SCANS)
+    """Two scans: the source-free map counts first, half the difference where it is not there or
+    where it is wanted.
+    """
+    data = run(
+        tmp_path,
+        zonda.CompareMaps(),
+        zonda.SaveMap(),
+        zonda.Plots(contours=[-2, 2], dpi=50),
+        zonda.Report(),
+        scans=SCANS,
+    )
     words, factor = data["comparison"].noise["snr"]
     snr = fits.getheader(tmp_path / "comparison.fits", "SNR")
     assert (snr["NOISEFAC"], snr["NOISEOF"]) == (pytest.approx(factor), words)
@@ -112,7 +166,9 @@ def test_titles_headers_and_the_report_state_the_factor(tmp_path):
 
 
 def test_files_that_a_run_saved_are_compared_by_the_same_noise(tmp_path, capsys):
-    """`zonda compare` reads the source-free map beside it, or the factor of the header where that is elsewhere."""
+    """`zonda compare` reads the source-free map beside it, or the factor of the header where that
+    is elsewhere.
+    """
     data = run(tmp_path / "out", zonda.CompareMaps(beam="20 arcsec"), zonda.SaveMap())
     path = tmp_path / "out" / "map.fits"
     plane = read_planes(path).planes["I"]

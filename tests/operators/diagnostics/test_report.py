@@ -69,8 +69,14 @@ def test_it_says_what_was_simulated(data, report):
     data.tally.state("AtmosphereLayers", "mean PWV", "7.7 mm")
     data.provenance["versions"] = {"zonda": "0.1.0", "numpy": "9.9.9"}
     data.provenance["command"] = "zonda run demo"
-    data.provenance["timings"] = [("SkyMap", "exec", 1.5), ("SkyMap", "prepare", 0.25), ("BinMap", "exec", 0.5)]
-    data.provenance["operators"] = [("PinkNoise", "PinkNoise", {"knee": "0.5 Hz", "radius": "0.0011635528346628863 rad"})]
+    data.provenance["timings"] = [
+        ("SkyMap", "exec", 1.5),
+        ("SkyMap", "prepare", 0.25),
+        ("BinMap", "exec", 0.5),
+    ]
+    data.provenance["operators"] = [
+        ("PinkNoise", "PinkNoise", {"knee": "0.5 Hz", "radius": "0.0011635528346628863 rad"})
+    ]
     data.products["pictures"] = [Picture("map", "The map", "What came out.", PNG)]
     page, text, checker = report()
     for part in (
@@ -104,14 +110,21 @@ def test_what_was_counted_follows_the_order_of_the_steps(data, report):
     for step in ("BinMap", "SkyMap"):
         data.tally.count(step, "apples", 1)
     _, text, _ = report()
-    tally = text[text.index("step what value") : text.index("Computing time", text.index("step what value"))]
+    tally = text[
+        text.index("step what value") : text.index("Computing time", text.index("step what value"))
+    ]
     assert tally.index("SkyMap") < tally.index("BinMap")
     assert "signal noiseless only sky" in text
-    assert "BinMap" not in text[text.index("step CPU") : text.index("Provenance", text.index("step CPU"))]  # not timed
+    assert (
+        "BinMap"
+        not in text[text.index("step CPU") : text.index("Provenance", text.index("step CPU"))]
+    )  # not timed
 
 
 def test_every_text_is_escaped(data, report):
-    data.provenance.update(name=EVIL, description=EVIL, command=EVIL, resolved_yaml=EVIL, versions={EVIL: EVIL})
+    data.provenance.update(
+        name=EVIL, description=EVIL, command=EVIL, resolved_yaml=EVIL, versions={EVIL: EVIL}
+    )
     data.provenance["operators"] = [(EVIL, EVIL, {EVIL: EVIL})]
     data.provenance["timings"] = [(EVIL, EVIL, 1.0)]
     data.tally.state(EVIL, EVIL, EVIL)
@@ -171,9 +184,13 @@ def test_quantities_are_readable(text, shown):
 @pytest.mark.parametrize("dec", ["-04d40m00s", "-00d00m00.04s", "89d59m59.96s", "20d"])
 @pytest.mark.parametrize("ra", ["02h32m11s", "23h59m59.996s", "0h"])
 def test_positions_aresexagesimal(ra, dec):
-    """Half of the last figure is the largest error: 0.005 s of right ascension, 0.05 arcsec of declination."""
+    """Half of the last figure is the largest error: 0.005 s of right ascension, 0.05 arcsec of
+    declination.
+    """
     target = Target.parse(f"{ra} {dec}")
-    again = Target.parse(sexagesimal(target.longitude, target.latitude).translate(str.maketrans("−°′″", "-dms")))
+    again = Target.parse(
+        sexagesimal(target.longitude, target.latitude).translate(str.maketrans("−°′″", "-dms"))
+    )
     turn = 2 * np.pi
     assert abs((again.longitude - target.longitude + np.pi) % turn - np.pi) <= 0.0051 * turn / 86400
     assert again.latitude == pytest.approx(target.latitude, abs=0.051 * turn / 1296000)
@@ -186,20 +203,35 @@ def test_targets_are_readable():
 
 
 def test_the_flux_density_of_a_beam(data):
-    """S = 2 k T Omega / c^2 / <nu^-2>, Omega = 1.1331 FWHM^2; of a flat band <nu^-2> = 1 / (nu_1 nu_2)."""
+    """S = 2 k T Omega / c^2 / <nu^-2>, Omega = 1.1331 FWHM^2; of a flat band <nu^-2> = 1 / (nu_1
+    nu_2).
+    """
     band = data.scene.instrument.band
     low, high = band.frequency[0], band.frequency[-1]
     fwhm = np.radians(10 / 3600)
-    expected = 2 * 1.380649e-23 * 1e-3 * 1.13309 * fwhm**2 / 299792458.0**2 * low * high / 1e-26  # Jy for 1 mK
+    expected = (
+        2 * 1.380649e-23 * 1e-3 * 1.13309 * fwhm**2 / 299792458.0**2 * low * high / 1e-26
+    )  # Jy for 1 mK
     shown = flux_density(1e-3, fwhm, band)
     value, unit = shown.split("\u00a0")
-    assert float(value) * {"Jy": 1, "mJy": 1e-3, "µJy": 1e-6}[unit] == pytest.approx(expected, rel=5e-3)  # three figures
+    assert float(value) * {"Jy": 1, "mJy": 1e-3, "µJy": 1e-6}[unit] == pytest.approx(
+        expected, rel=5e-3
+    )  # three figures
 
 
 def test_the_white_noise_that_is_expected():
-    """Beside the map's own smoothing, which weighs every pixel: the formula takes the circle to be covered evenly (5 %)."""
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
-    steps = [zonda.PointingDaisy(scan_duration="20 s"), zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="3 arcsec")]
+    """Beside the map's own smoothing, which weighs every pixel: the formula takes the circle to be
+    covered evenly (5 %).
+    """
+    scene = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1
+    )
+    steps = [
+        zonda.PointingDaisy(scan_duration="20 s"),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.BinMap(pixel="3 arcsec"),
+    ]
     data = zonda.Pipeline(steps).run(scene)
     product, circle = data.products["map"], np.radians(2 / 60)
     ((shown, what),) = expected("map", product, circle)
@@ -207,11 +239,19 @@ def test_the_white_noise_that_is_expected():
     smoothed = product.smoothed(product.fwhm).noise[product.distance() <= circle / 2]
     wanted = np.nanmedian(smoothed)
     assert float(value) * {"µK_RJ": 1e-6, "mK_RJ": 1e-3}[unit] == pytest.approx(wanted, rel=0.05)
-    assert "smoothed with the beam to 12″ (8.5″ beam and as much smoothing, added in quadrature)" in what
+    assert (
+        "smoothed with the beam to 12″ (8.5″ beam and as much smoothing, added in quadrature)"
+        in what
+    )
     assert what in results(data, circle).replace("&#x27;", "'")
     ((shown, what),) = expected("map", dataclasses.replace(product, fwhm=0.0), circle)
     assert "beam" not in what
-    assert expected("map", dataclasses.replace(product, noise=np.full(product.hits.shape, np.nan)), circle) == []
+    assert (
+        expected(
+            "map", dataclasses.replace(product, noise=np.full(product.hits.shape, np.nan)), circle
+        )
+        == []
+    )
 
 
 def test_what_goes_wrong_does_so_after_the_steps_before_it(report, data, monkeypatch):
@@ -232,7 +272,9 @@ def test_what_goes_wrong_does_so_after_the_steps_before_it(report, data, monkeyp
 
 
 def test_long_lists_are_folded(data, make_observation):
-    """Scans, counts, decisions and files beyond a dozen or so are in <details>; each is there, once, under its step's name."""
+    """Scans, counts, decisions and files beyond a dozen or so are in <details>; each is there,
+    once, under its step's name.
+    """
     data.observations += [make_observation(50, index=k) for k in range(40)]
     for k in range(30):
         data.tally.state("Step", f"figure {k:02d}", "1")
@@ -245,7 +287,11 @@ def test_long_lists_are_folded(data, make_observation):
     checker.feed(page)
     assert checker.open == []
     shown = re.sub(r"<details>.*?</details>", "", page, flags=re.S)
-    for what, count, some in (("28 more scans", 40, 12), ("18 more counts and figures", 30, 12), ("8 more decisions", 20, 12)):
+    for what, count, some in (
+        ("28 more scans", 40, 12),
+        ("18 more counts and figures", 30, 12),
+        ("8 more decisions", 20, 12),
+    ):
         assert f"<summary>{what}</summary>" in page
         word = {"scans": "scan_", "figures": "figure ", "decisions": "effect "}[what.split()[-1]]
         assert len(set(re.findall(rf"{word}\d+", page))) == count
@@ -253,7 +299,9 @@ def test_long_lists_are_folded(data, make_observation):
     assert "<summary>all 50 files</summary>" in page
     assert page.count("<li>tod_") == 50
     rest = page[page.index("18 more counts") :]
-    assert rest.index("<th>Step</th>") < rest.index("figure 12")  # the folded table begins with the name
+    assert rest.index("<th>Step</th>") < rest.index(
+        "figure 12"
+    )  # the folded table begins with the name
 
 
 def test_short_lists_are_not_folded(data, make_observation):
@@ -273,10 +321,16 @@ def test_counts_have_their_share(data, report):
 
 
 def test_the_depth_of_a_map_is_told_per_beam():
-    """An area A that N detectors cover evenly for a time t has N t Omega / A per beam; the read-out is slower than usual."""
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
+    """An area A that N detectors cover evenly for a time t has N t Omega / A per beam; the read-out
+    is slower than usual.
+    """
+    scene = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1
+    )
     daisy = zonda.PointingDaisy(scan_duration="20 s", sample_rate="40 Hz")
-    data = zonda.Pipeline([daisy, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="3 arcsec")]).run(scene)
+    data = zonda.Pipeline(
+        [daisy, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="3 arcsec")]
+    ).run(scene)
     product = data.products["map"]
     near = product.distance() <= np.radians(1 / 60)
     seconds = np.median(product.hits[near]) / 40 * np.pi / (4 * np.log(2)) * (8.5 / 3) ** 2
@@ -287,11 +341,24 @@ def test_the_depth_of_a_map_is_told_per_beam():
 
 
 def test_the_central_circle_holds_several_beams(tmp_path):
-    """Beams of 2 arcmin, of which an arcminute is the half: five of them, in the report, its pictures and the files alike."""
+    """Beams of 2 arcmin, of which an arcminute is the half: five of them, in the report, its
+    pictures and the files alike.
+    """
     camera = {"like": "mustang2", "detectors": 61, "field_of_view": "20 arcmin", "fwhm": "2 arcmin"}
-    scene = zonda.Scene(site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=1)
-    daisy = zonda.PointingDaisy(radius="10 arcmin", scan_duration="20 s", scans=2, sample_rate="40 Hz")
-    steps = [daisy, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="30 arcsec"), zonda.SaveMap(), zonda.Report()]
+    scene = zonda.Scene(
+        site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=1
+    )
+    daisy = zonda.PointingDaisy(
+        radius="10 arcmin", scan_duration="20 s", scans=2, sample_rate="40 Hz"
+    )
+    steps = [
+        daisy,
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.BinMap(pixel="30 arcsec"),
+        zonda.SaveMap(),
+        zonda.Report(),
+    ]
     data = zonda.Pipeline(steps).run(scene, output=tmp_path)
     product, text = data.products["map"], (tmp_path / "report.html").read_text(encoding="utf-8")
     radius = np.radians(5 / 60)
@@ -308,7 +375,9 @@ def test_the_central_circle_holds_several_beams(tmp_path):
 
 def test_the_net_is_that_of_all_scans(data, report, make_observation):
     first = make_observation(500)
-    first.focalplane.net = first.focalplane.net * 5  # noise that follows from the load: every scan has its own
+    first.focalplane.net = (
+        first.focalplane.net * 5
+    )  # noise that follows from the load: every scan has its own
     data.observations.append(first)
     assert "1 to 5 mK_RJ √s, mean 3 (no white noise is simulated)" in report()[1]
     data.provenance["operators"] = [("WhiteNoise", "WhiteNoise", {})]

@@ -13,7 +13,12 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCSEC
 from zonda.operators.diagnostics.drawing.plots import plot_transfer
 from zonda.operators.diagnostics.plot_operators import Plots, pictures
-from zonda.operators.diagnostics.transfer_function import Transfer, TransferFunction, compare, window_of
+from zonda.operators.diagnostics.transfer_function import (
+    Transfer,
+    TransferFunction,
+    compare,
+    window_of,
+)
 
 SIDE, PIXEL = 64, 4 * ARCSEC
 EDGES = np.geomspace(1 / (120 * ARCSEC), 1 / (9 * ARCSEC), 5)
@@ -39,14 +44,17 @@ def test_a_constant_share():
     k = np.hypot(*np.meshgrid(np.fft.fftfreq(SIDE, PIXEL), np.fft.fftfreq(SIDE, PIXEL)))
     ring = (k >= EDGES[1]) & (k < EDGES[2])
     assert found.wavenumber[1] == pytest.approx(k[ring].mean())
-    # a Hann window: mean w^4 / (mean w^2)^2 = (35/128 / (3/8)^2)^2 in two dimensions, mean w^2 being 3/8 and w^4 35/128
+    # a Hann window: mean w^4 / (mean w^2)^2 = (35/128 / (3/8)^2)^2 in two dimensions, mean w^2
+    # being 3/8 and w^4 35/128
     assert found.modes[1] == pytest.approx(ring.sum() / 2 / (35 / 128 / (3 / 8) ** 2) ** 2)
 
 
 def test_the_error_is_the_scatter():
-    """b = 0.7 a + 0.5 g, g independent of a: (T - 0.7) / sigma has unit variance, S^2 is 0.49 + 0.25.
+    """b = 0.7 a + 0.5 g, g independent of a: (T - 0.7) / sigma has unit variance, S^2 is 0.49 +
+    0.25.
 
-    80 x 4 deviates, nearly Student's t of N - 1 >= 4 degrees of freedom: the standard deviation of the rms is about 0.06.
+    80 x 4 deviates, nearly Student's t of N - 1 >= 4 degrees of freedom: the standard deviation of
+    the rms is about 0.06.
     """
     scores, sizes = [], []
     for seed in range(80):
@@ -80,7 +88,9 @@ def test_pixels_without_samples_and_rings_without_modes():
     assert np.isnan(found.error[0])
     assert found.modes[0] == 0
     assert np.isfinite(found.transfer[1])
-    assert np.isnan(found.error[1]), "four modes, two of them the others' mirror images, all correlated: no scatter to tell"
+    assert np.isnan(found.error[1]), (
+        "four modes, two of them the others' mirror images, all correlated: no scatter to tell"
+    )
     assert np.isfinite(found.error[2:]).all()
     nothing = compare(np.zeros((SIDE, SIDE)), b, hann(), PIXEL, edges)
     assert np.isnan(nothing.transfer).all()
@@ -96,12 +106,16 @@ def product(hits: np.ndarray, **more) -> MapProduct:
 
 
 def test_windows():
-    """A disc has cos^2(pi/2 r / R); a taper has its width; holes are filled, bare edges left out."""
+    """A disc has cos^2(pi/2 r / R); a taper has its width; holes are filled, bare edges left
+    out.
+    """
     y, x = np.indices((101, 101)) - 50
     r = np.hypot(x, y)
     hits = np.where(r <= 40, 100, 0)
     window = window_of(product(hits))
-    np.testing.assert_allclose(window[50, 50:], np.cos(np.pi / 2 * np.minimum(r[50, 50:] / 40, 1)) ** 2, atol=0.01)  # pixels
+    np.testing.assert_allclose(
+        window[50, 50:], np.cos(np.pi / 2 * np.minimum(r[50, 50:] / 40, 1)) ** 2, atol=0.01
+    )  # pixels
     hits[50, 50] = hits[30, 40] = 0
     assert np.array_equal(window_of(product(hits)), window)
     hits[r > 30] = np.minimum(hits[r > 30], 5)
@@ -118,7 +132,12 @@ def transfer() -> Transfer:
     a = white(5)
     edges = np.append(0.2 / SIDE / PIXEL, EDGES)
     return Transfer(
-        compare(a, 0.5 * a + 0.1 * white(6), hann(), PIXEL, edges), edges, "sky", 8.5 * ARCSEC, "TransferFunction", "map"
+        compare(a, 0.5 * a + 0.1 * white(6), hann(), PIXEL, edges),
+        edges,
+        "sky",
+        8.5 * ARCSEC,
+        "TransferFunction",
+        "map",
     )
 
 
@@ -146,7 +165,10 @@ def test_the_picture(transfer, data):
     low, high = ax.get_xlim()
     assert low == pytest.approx(1 / transfer.edges[0] / ARCSEC)
     assert high == pytest.approx(1 / transfer.edges[-1] / ARCSEC)
-    wild = replace(transfer, rings=replace(transfer.rings, amplitude=np.full_like(transfer.rings.amplitude, 50.0)))
+    wild = replace(
+        transfer,
+        rings=replace(transfer.rings, amplitude=np.full_like(transfer.rings.amplitude, 50.0)),
+    )
     assert plot_transfer(wild).get_ylim()[1] <= 2.2  # T can still be read
     data.products["transfer_function"] = transfer
     made = {p.name: p for p in pictures(data, Plots())}
@@ -160,11 +182,24 @@ def run():
     from zonda.plugins.checks.scenes import sky_file
 
     def made(binning, parameters, with_sky=True):
-        scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
+        scene = zonda.Scene(
+            site="green_bank",
+            instrument="mustang2",
+            time="2024-11-25T07:00",
+            target="05h +20d",
+            seed=1,
+        )
         with sky_file(np.random.default_rng(0).standard_normal((200, 200)), 2.0) as path:
             sky = [zonda.SkyMap(file=path)] if with_sky else []
             point = zonda.PointingDaisy(radius="1 arcmin", scan_duration="6 s", sample_rate="20 Hz")
-            steps = [point, *sky, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(**binning), TransferFunction(**parameters)]
+            steps = [
+                point,
+                *sky,
+                zonda.WhiteNoise(),
+                zonda.Efficiency(),
+                zonda.BinMap(**binning),
+                TransferFunction(**parameters),
+            ]
             return zonda.Pipeline(steps).run(scene)
 
     return made

@@ -1,4 +1,6 @@
-"""Singular modes against numpy by residual; what must never be removed; dead detectors; precision; bits."""
+"""Singular modes against numpy by residual; what must never be removed; dead detectors; precision;
+bits.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +43,18 @@ def numpy_removed(a, modes):
 def run(bench, a, precision="float64", observation=None, threads=1, memory=1 << 30, **parameters):
     observation = observation or bench.observation(*a.shape)
     return bench.run(
-        [CommonModeFilter(**parameters)], observation, {"signal": a}, precision=precision, threads=threads, memory=memory
+        [CommonModeFilter(**parameters)],
+        observation,
+        {"signal": a},
+        precision=precision,
+        threads=threads,
+        memory=memory,
     )
 
 
-@pytest.mark.parametrize("case", [(0.3, 0.0, 0.017), (0.3, 0.03, 0.017), (0.02, 0.01, 0.017), (10.0, 1.0, 0.0)])
+@pytest.mark.parametrize(
+    "case", [(0.3, 0.0, 0.017), (0.3, 0.03, 0.017), (0.02, 0.01, 0.017), (10.0, 1.0, 0.0)]
+)
 @pytest.mark.parametrize("modes", [1, 2])
 def test_equals_numpys_svd_by_residual(bench, case, modes):
     a = atmosphere_like(*case)
@@ -62,17 +71,27 @@ def test_residual_is_reached_and_reported(bench):
     u0 = np.linalg.svd(removed, full_matrices=False)[0][:, 0]
     value = np.linalg.norm(a.T @ u0) ** 2
     assert np.linalg.norm(a @ (a.T @ u0) - value * u0) / s[0] ** 2 < 1.1e-6
-    reported = float(result.tally["CommonModeFilter", "scan0: singular values / sqrt(detectors x samples)"].split(",")[0])
+    reported = float(
+        result.tally[
+            "CommonModeFilter", "scan0: singular values / sqrt(detectors x samples)"
+        ].split(",")[0]
+    )
     assert abs(reported * np.sqrt(a.size) / s[0] - 1) < 1e-3  # four printed digits
-    assert float(result.tally["CommonModeFilter", "scan0: residual of the modes"].split()[0]) <= 1e-6
+    assert (
+        float(result.tally["CommonModeFilter", "scan0: residual of the modes"].split()[0]) <= 1e-6
+    )
 
 
 def test_leading_mode_orthogonal_to_the_mean_is_found(bench):
     rng = np.random.default_rng(3)
-    a = np.outer(np.tile([1.0, -1.0], N_DET // 2), rng.standard_normal(N)) + 0.1 * rng.standard_normal((N_DET, N))
+    a = np.outer(
+        np.tile([1.0, -1.0], N_DET // 2), rng.standard_normal(N)
+    ) + 0.1 * rng.standard_normal((N_DET, N))
     result = run(bench, a)
     assert result.signal.std() < 0.11
-    two = np.array([[1.0], [-1.0]]) * rng.standard_normal(N) * 3 + 1e-3 * rng.standard_normal((2, N))
+    two = np.array([[1.0], [-1.0]]) * rng.standard_normal(N) * 3 + 1e-3 * rng.standard_normal(
+        (2, N)
+    )
     assert run(bench, two).signal.std() < 2e-3
 
 
@@ -84,7 +103,9 @@ def test_mean_method(bench):
         CommonModeFilter(method="mean", modes=2)
 
 
-@pytest.mark.parametrize(("policy", "expected"), [("mean", "mean"), ("skip", "same"), ("remove", "svd")])
+@pytest.mark.parametrize(
+    ("policy", "expected"), [("mean", "mean"), ("skip", "same"), ("remove", "svd")]
+)
 def test_closed_gap(bench, policy, expected):
     a = np.random.default_rng(4).standard_normal((N_DET, N))
     result = run(bench, a, on_undetermined=policy, residual=1e-8)
@@ -96,7 +117,9 @@ def test_closed_gap(bench, policy, expected):
 def test_second_mode_undetermined_is_skipped_and_the_first_removed(bench):
     a = atmosphere_like(0.3, 0.0, 0.017)
     result = run(bench, a, modes=2, residual=1e-8)
-    assert np.linalg.norm(result.signal - numpy_removed(a, 1)) < 1e-5 * np.linalg.norm(result.signal)
+    assert np.linalg.norm(result.signal - numpy_removed(a, 1)) < 1e-5 * np.linalg.norm(
+        result.signal
+    )
     assert result.tally["CommonModeFilter", UNDETERMINED] == "1"
 
 
@@ -109,7 +132,9 @@ def test_dead_constant_and_nan_detectors_are_flagged_and_take_no_part(bench):
     assert result.tally["CommonModeFilter", "detectors flagged: signal constant"] == "2"
     assert result.tally["CommonModeFilter", "detectors flagged: signal not finite"] == "1"
     good = np.setdiff1d(np.arange(N_DET), [3, 7, 11])
-    assert np.linalg.norm(result.signal[good] - numpy_removed(a[good], 1)) < 1e-4 * np.linalg.norm(result.signal[good])
+    assert np.linalg.norm(result.signal[good] - numpy_removed(a[good], 1)) < 1e-4 * np.linalg.norm(
+        result.signal[good]
+    )
 
 
 def test_all_dead_or_nothing_good(bench):
@@ -136,11 +161,23 @@ def test_mean_emission_is_part_of_the_signal_in_float64_and_refused_in_float32(b
     mean = SmoothField.constant(np.linspace(60, 70, N_DET), N)
     whole = a + np.linspace(60, 70, N_DET)[:, None]
     result = bench.run(
-        [CommonModeFilter()], bench.observation(N_DET, N), {"signal": a}, means={"signal": mean}, precision="float64"
+        [CommonModeFilter()],
+        bench.observation(N_DET, N),
+        {"signal": a},
+        means={"signal": mean},
+        precision="float64",
     )
-    assert np.linalg.norm(result.signal - numpy_removed(whole, 1)) < 1e-5 * np.linalg.norm(result.signal)
+    assert np.linalg.norm(result.signal - numpy_removed(whole, 1)) < 1e-5 * np.linalg.norm(
+        result.signal
+    )
     with pytest.raises(PipelineError, match="mean emission") as err:
-        bench.run([CommonModeFilter()], bench.observation(N_DET, N), {"signal": a}, means={"signal": mean}, precision="float32")
+        bench.run(
+            [CommonModeFilter()],
+            bench.observation(N_DET, N),
+            {"signal": a},
+            means={"signal": mean},
+            precision="float32",
+        )
     assert "precision: float64" in str(err.value)
     bench.run(
         [HighpassFilter(), CommonModeFilter()],
@@ -154,13 +191,18 @@ def test_mean_emission_is_part_of_the_signal_in_float64_and_refused_in_float32(b
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_identical_bits_for_threads_and_blocks(bench, precision):
     a = atmosphere_like(0.3, 0.05, 0.017, n_det=37, n=9001)
-    results = [run(bench, a, precision, threads=t, memory=m).signal for t, m in ((1, 1 << 30), (3, 1 << 30), (2, 4 << 20))]
+    results = [
+        run(bench, a, precision, threads=t, memory=m).signal
+        for t, m in ((1, 1 << 30), (3, 1 << 30), (2, 4 << 20))
+    ]
     np.testing.assert_array_equal(results[0], results[1])
     np.testing.assert_array_equal(results[0], results[2])
 
 
 def test_point_source_amplitude_survives_and_is_not_skewed(bench):
-    """A source that each detector sees at another time keeps its amplitude but for its share of the mode, 1 / n_det."""
+    """A source that each detector sees at another time keeps its amplitude but for its share of the
+    mode, 1 / n_det.
+    """
     t = np.arange(N)
     source = np.array([np.exp(-0.5 * ((t - 500 - 100 * d) / 9.0) ** 2) for d in range(N_DET)])
     a = atmosphere_like(0.5, 0.0, 0.0, seed=9) + 1e-3 * source
@@ -211,14 +253,19 @@ def sky_and_noise(filters, sky=True, noise=True, dead=()):
     """``data`` with the signal ``alone`` of the sky; without noise, of a scene of the sky."""
     n_det, n = 12, 3000
     one, two, points = Sky(), Noise(), scenes.Points()
-    one._values, two._values = np.zeros((n_det, n)), np.random.default_rng(6).standard_normal((n_det, n))
+    one._values, two._values = (
+        np.zeros((n_det, n)),
+        np.random.default_rng(6).standard_normal((n_det, n)),
+    )
     if sky:
         one._values[:SEEN] = 0.1 * np.sin(np.arange(n) / 70 + np.arange(SEEN)[:, None] / 9)
     two._values[list(dead)] = 0.0
     points._observation = scenes.scan(n_det, n)
     steps = [points, one, *([two] if noise else []), Sum(), *filters, BinMap(pixel="10 arcsec")]
     runs = {"alone": {"only": ["sky"]}} if noise else {}
-    data = Pipeline(steps, runs=runs, precision="float64").run(scenes.scene(), threads=1, keep=["signal"])
+    data = Pipeline(steps, runs=runs, precision="float64").run(
+        scenes.scene(), threads=1, keep=["signal"]
+    )
     return data, one._values
 
 
@@ -236,13 +283,19 @@ def test_detectors_that_see_no_sky_are_valid_zeros_in_a_signal_of_the_sky_alone(
     np.testing.assert_array_equal(only.signal, companion.signal)
     assert counted(data, "detectors flagged: signal constant", "alone/") == 0
     expected = sky - sky.mean(axis=0) if method == "mean" else numpy_removed(sky, 1)
-    tolerance = 1e-12 if method == "mean" else 1e-6  # svd: modes to a residual of 1e-6 of the leading one
-    np.testing.assert_allclose(alone.observations[0].detdata["signal"], expected, rtol=0, atol=tolerance)
+    tolerance = (
+        1e-12 if method == "mean" else 1e-6
+    )  # svd: modes to a residual of 1e-6 of the leading one
+    np.testing.assert_allclose(
+        alone.observations[0].detdata["signal"], expected, rtol=0, atol=tolerance
+    )
 
 
 @pytest.mark.parametrize("method", ["svd", "mean"])
 def test_a_detector_that_is_dead_is_excluded_from_the_signal_of_the_sky(method):
-    data, _ = sky_and_noise([CommonModeFilter(method=method)], dead=(SEEN + 1,))  # it sees no sky either
+    data, _ = sky_and_noise(
+        [CommonModeFilter(method=method)], dead=(SEEN + 1,)
+    )  # it sees no sky either
     main, companion = data.products["map"], data.products["alone/map"]
     assert counted(data, "detectors flagged: signal constant") == 1
     np.testing.assert_array_equal(companion.hits, main.hits)
@@ -250,17 +303,24 @@ def test_a_detector_that_is_dead_is_excluded_from_the_signal_of_the_sky(method):
 
 @pytest.mark.parametrize("method", ["svd", "mean"])
 def test_the_complete_signal_alone_shows_which_detectors_are_dead(method):
-    """One is not finite in the atmosphere, which another signal does not contain: it is excluded from all."""
+    """One is not finite in the atmosphere, which another signal does not contain: it is excluded
+    from all.
+    """
     n_det, n = 6, 2000
     parts, points = [Sky(), Air(), Noise()], scenes.Points()
-    parts[0]._values, parts[1]._values = np.ones((n_det, 1)) * np.sin(np.arange(n) / 70), np.zeros((n_det, n))
+    parts[0]._values, parts[1]._values = (
+        np.ones((n_det, 1)) * np.sin(np.arange(n) / 70),
+        np.zeros((n_det, n)),
+    )
     parts[2]._values = np.random.default_rng(6).standard_normal((n_det, n))
     parts[1]._values[3] = np.nan
     points._observation = scenes.scan(n_det, n)
     runs = {"airless": {"without": ["atmosphere"]}, "alone": {"only": ["sky"]}}
     steps = [points, *parts, Sum(), CommonModeFilter(method=method), BinMap(pixel="10 arcsec")]
     data = Pipeline(steps, runs=runs, precision="float64").run(scenes.scene(), threads=1)
-    main, airless, alone = (data.products[name].hits for name in ("map", "airless/map", "alone/map"))
+    main, airless, alone = (
+        data.products[name].hits for name in ("map", "airless/map", "alone/map")
+    )
     assert main.sum() == (n_det - 1) * n
     np.testing.assert_array_equal(airless, main)
     np.testing.assert_array_equal(alone, main)
@@ -268,7 +328,9 @@ def test_the_complete_signal_alone_shows_which_detectors_are_dead(method):
 
 @pytest.mark.parametrize("method", ["svd", "mean"])
 def test_a_detector_that_does_not_see_the_atmosphere_is_dead(method):
-    """Also in a scene without noise: a dead one must not dilute the mode, nor write it into the map."""
+    """Also in a scene without noise: a dead one must not dilute the mode, nor write it into the
+    map.
+    """
     n_det, n, points, air, rng = 6, 2000, scenes.Points(), Air(), np.random.default_rng(6)
     air._values = np.cumsum(rng.standard_normal(n)) + 1e-3 * rng.standard_normal((n_det, n))
     air._values[3] = 0.0
@@ -278,7 +340,9 @@ def test_a_detector_that_does_not_see_the_atmosphere_is_dead(method):
     assert counted(data, "detectors flagged: signal constant") == 1
     assert data.products["map"].hits.sum() == (n_det - 1) * n
     left = np.delete(data.observations[0].detdata["signal"], 3, axis=0)
-    assert left.std() == pytest.approx(1e-3 * np.sqrt(4 / 5), rel=0.05)  # 10 000 numbers: 0.8 %; six times that
+    assert left.std() == pytest.approx(
+        1e-3 * np.sqrt(4 / 5), rel=0.05
+    )  # 10 000 numbers: 0.8 %; six times that
 
 
 @pytest.mark.parametrize("method", ["svd", "mean"])
@@ -290,7 +354,9 @@ def test_a_sky_that_no_detector_sees_is_a_map_of_zeros(method):
     assert data.tally.get("CommonModeFilter", "detectors flagged: signal constant") == 0
 
 
-@pytest.mark.parametrize("parameters", [{"on_undetermined": "remove", "residual": 1e-10}, {"method": "mean"}])
+@pytest.mark.parametrize(
+    "parameters", [{"on_undetermined": "remove", "residual": 1e-10}, {"method": "mean"}]
+)
 def test_wafer_by_wafer_each_is_filtered_as_if_it_were_alone(bench, parameters):
     one, two = atmosphere_like(0.3, 0.03, 0.017), atmosphere_like(0.5, 0.01, 0.017, seed=1)
     a, wafer = np.empty((2 * N_DET, N)), np.arange(2 * N_DET) % 2
@@ -317,8 +383,12 @@ def test_wafers_take_the_modes_of_the_complete_signal(bench):
     observation.focalplane.wafer = np.arange(N_DET) // 20
     step = CommonModeFilter(group="wafer", on_undetermined="remove")
     of_all = step.measure(Stream("signal", observation, a, {}, 1))
-    of_part = step.measure(Stream("signal", observation, b, {}, 1, signal="signal/noiseless"), of_all)
+    of_part = step.measure(
+        Stream("signal", observation, b, {}, 1, signal="signal/noiseless"), of_all
+    )
     for wafer, part in enumerate(of_part.parts):
         rows = observation.focalplane.wafer == wafer
-        np.testing.assert_allclose(part.times[0], b[rows].T @ part.detectors[0, rows], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(
+            part.times[0], b[rows].T @ part.detectors[0, rows], rtol=1e-9, atol=1e-12
+        )
         assert not part.detectors[0, ~rows].any()

@@ -1,4 +1,6 @@
-"""What a spilled stream of many detectors takes while it is read, and that its bits are those of one in memory."""
+"""What a spilled stream of many detectors takes while it is read, and that its bits are those of
+one in memory.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ from zonda.core.data import Stream
 from zonda.core.plan.planning import planning_of
 from zonda.operators.filters import gram
 from zonda.operators.filters.common_mode import CommonModeFilter
-from zonda.operators.filters.gram import MOST_COPIED, SHORTEST_TILE, Gram, near_the_mean, tile_length
+from zonda.operators.filters.gram import (
+    MOST_COPIED,
+    SHORTEST_TILE,
+    Gram,
+    near_the_mean,
+    tile_length,
+)
 
 
 def spilled(bench, folder, n_det, n, room=0, threads=1, flagged=slice(0, 0)):
@@ -31,7 +39,13 @@ def everything(stream):
         found = Gram(stream, pool)
         u = near_the_mean(found.use)
         image, time = found.apply(u)
-        return image, time, found.energy, found.left(u[None], time[None]), *found.apply(image / np.linalg.norm(image))
+        return (
+            image,
+            time,
+            found.energy,
+            found.left(u[None], time[None]),
+            *found.apply(image / np.linalg.norm(image)),
+        )
 
 
 def test_tiles_are_as_long_as_a_copy_may_be():
@@ -39,7 +53,9 @@ def test_tiles_are_as_long_as_a_copy_may_be():
     assert tile_length(12208, 4) == tile_length(12207, 8) == 1024
     assert tile_length(10**7, 8) == SHORTEST_TILE
     for n_det in (20_000, 50_000, 100_000):
-        assert n_det * tile_length(n_det, 8) * 8 <= MOST_COPIED < n_det * 2 * tile_length(n_det, 8) * 8
+        assert (
+            n_det * tile_length(n_det, 8) * 8 <= MOST_COPIED < n_det * 2 * tile_length(n_det, 8) * 8
+        )
 
 
 @pytest.mark.parametrize("most", [MOST_COPIED, 200_000])  # as it is, and with tiles of 512 samples
@@ -48,7 +64,9 @@ def test_a_spilled_stream_gives_the_same_bits(bench, tmp_path, monkeypatch, most
     monkeypatch.setattr(gram, "MOST_COPIED", most)
     kept, mapped = spilled(bench, tmp_path, 70, 9001, flagged=flagged)
     assert tile_length(70, 4) == (2048 if most == MOST_COPIED else 512)
-    three = [Stream("signal", mapped.observation, mapped.array, {}, 3, room) for room in (0, 1 << 30)]
+    three = [
+        Stream("signal", mapped.observation, mapped.array, {}, 3, room) for room in (0, 1 << 30)
+    ]
     for stream in (mapped, *three):
         for mine, theirs in zip(everything(stream), everything(kept), strict=True):
             np.testing.assert_array_equal(mine, theirs)
@@ -77,7 +95,9 @@ def test_a_mapping_is_never_touched(bench, tmp_path, monkeypatch, n_det, n):
     assert all(copied)
 
 
-@pytest.mark.parametrize(("room", "most"), [(0, 1), (40 * 2048 * 4 - 1, 1), (40 * 2048 * 4, 2), (1 << 30, 4)])
+@pytest.mark.parametrize(
+    ("room", "most"), [(0, 1), (40 * 2048 * 4 - 1, 1), (40 * 2048 * 4, 2), (1 << 30, 4)]
+)
 def test_copies_at_one_time_are_what_there_is_room_for(bench, tmp_path, monkeypatch, room, most):
     (_, stream), products = spilled(bench, tmp_path, 40, 40 * 2048, room, threads=4), gram._products
     lock, held = threading.Lock(), [0, 0]
@@ -103,8 +123,13 @@ def test_copies_at_one_time_are_what_there_is_room_for(bench, tmp_path, monkeypa
 def test_the_copy_is_announced(bench):
     """`CommonModeFilter.memory` has one copy; more are made where there is room for them."""
     for n_det in (300, 9000, 50_000):
-        few, many = (planning_of(CommonModeFilter()).memory(bench.observation(n_det, n)) for n in (64, 4096))
+        few, many = (
+            planning_of(CommonModeFilter()).memory(bench.observation(n_det, n)) for n in (64, 4096)
+        )
         length = tile_length(n_det, 4)
         assert few >= 4 * n_det * min(64, length)
         assert many >= 4 * n_det * length
-    assert planning_of(CommonModeFilter(method="mean")).memory(bench.observation(9000, 4096)) < 2_000_000
+    assert (
+        planning_of(CommonModeFilter(method="mean")).memory(bench.observation(9000, 4096))
+        < 2_000_000
+    )

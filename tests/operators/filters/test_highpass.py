@@ -24,7 +24,9 @@ WHITE = 1.7e-3 * np.sqrt(RATE)
 def brick_wall(x, cut, degree):
     """Polynomial and DCT, directly, float64."""
     n = x.shape[-1]
-    basis = np.linalg.qr(np.polynomial.legendre.legvander((2 * np.arange(n) + 1) / n - 1, degree))[0]
+    basis = np.linalg.qr(np.polynomial.legendre.legvander((2 * np.arange(n) + 1) / n - 1, degree))[
+        0
+    ]
     spectrum = dct(x - (x @ basis) @ basis.T, type=2)
     spectrum[..., :cut] = 0
     return idct(spectrum, type=2)
@@ -46,12 +48,19 @@ def test_equals_the_full_brick_wall(n):
     expected = brick_wall(x, plan.cut, 3)
     assert np.std(filtered(x) - expected) < 1e-6 * x.std()
     # float32: the row itself is rounded, 2^-24 of 1 K peak to peak
-    assert np.std(filtered(x.astype(np.float32)) - expected) < 1e-6 * x.std() + 6e-8 * np.abs(x).max()
+    assert (
+        np.std(filtered(x.astype(np.float32)) - expected) < 1e-6 * x.std() + 6e-8 * np.abs(x).max()
+    )
 
 
-@pytest.mark.parametrize(("n", "frequency", "taps"), [(20011, 0.08 / 100, 5), (20011, 0.5 / 225, 5), (6007, 0.5 / 110, 6)])
+@pytest.mark.parametrize(
+    ("n", "frequency", "taps"),
+    [(20011, 0.08 / 100, 5), (20011, 0.5 / 225, 5), (6007, 0.5 / 110, 6)],
+)
 def test_rows_side_by_side_and_close_knots(n, frequency, taps):
-    """35 rows: two tiles and a rest; knots 104, 18.7 and 9.1 samples apart; alone or beside others a row has the same bits."""
+    """35 rows: two tiles and a rest; knots 104, 18.7 and 9.1 samples apart; alone or beside others
+    a row has the same bits.
+    """
     x = np.cumsum(np.random.default_rng(3).normal(0, 1.0, (35, n)), axis=1)
     plan = plan_highpass(n, frequency, 3, 24.0)
     assert plan.taps == taps
@@ -67,7 +76,12 @@ def test_rows_side_by_side_and_close_knots(n, frequency, taps):
 
 @pytest.mark.parametrize(
     ("n", "cycles", "degree", "oversampling", "knots"),
-    [(20011, 41.5, 3, 24.0, 1000), (20011, 12.5, 2, 25.0, 315), (20011, 5.0, 1, 35.0, 175), (5000, 2.0, 0, 24.0, 48)],
+    [
+        (20011, 41.5, 3, 24.0, 1000),
+        (20011, 12.5, 2, 25.0, 315),
+        (20011, 5.0, 1, 35.0, 175),
+        (5000, 2.0, 0, 24.0, 48),
+    ],
 )
 def test_few_cosines_are_summed_to_what_transforms_make(n, cycles, degree, oversampling, knots):
     """Both are sums of some 1000 float64 numbers: 1e-13 apart at most."""
@@ -90,12 +104,16 @@ def test_oversampling_buys_accuracy():
 
 @pytest.mark.parametrize("cycles", [20, 35, 42, 45, 60, 400])
 def test_transfer_function_is_a_brick_wall(cycles):
-    """A cosine of the even extension is removed below the cut (K = 82.56 -> 83) and untouched above it."""
+    """A cosine of the even extension is removed below the cut (K = 82.56 -> 83) and untouched above
+    it.
+    """
     n = 51600
     mode = np.cos(np.pi * 2 * cycles * (np.arange(n) + 0.5) / n)
     y = filtered(mode)
     if 2 * cycles < 83:
-        assert np.abs(y).max() < 1e-2  # what the cubic took out of it has a little power above the cut
+        assert (
+            np.abs(y).max() < 1e-2
+        )  # what the cubic took out of it has a little power above the cut
         assert y.std() < 1e-3
     else:
         # the least-squares cubic overlaps a cosine by O(1 / cycles^2)
@@ -132,7 +150,9 @@ def test_linear_idempotent_and_finite(n, frequency, seed):
     rng = np.random.default_rng(seed)
     a, b = rng.standard_normal((2, n))
     fa, fb = filtered(a, frequency), filtered(b, frequency)
-    np.testing.assert_allclose(filtered(2 * a - 3 * b, frequency), 2 * fa - 3 * fb, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        filtered(2 * a - 3 * b, frequency), 2 * fa - 3 * fb, rtol=0, atol=1e-11
+    )
     assert np.isfinite(fa).all()
     assert fa @ fa <= a @ a * (1 + 1e-5)  # removes, never adds
     assert abs(fa.sum()) < 1e-9 * n
@@ -145,15 +165,22 @@ def test_short_scans(bench, n):
     degree = min(1, n - 1)
     cut = 0 if n < 1250 else 3
     # 3e-7: the decimation's 1e-6 of the low part
-    np.testing.assert_allclose(run.signal, brick_wall(x, cut, 2 if cut else degree), rtol=0, atol=3e-7)
+    np.testing.assert_allclose(
+        run.signal, brick_wall(x, cut, 2 if cut else degree), rtol=0, atol=3e-7
+    )
     assert any("shorter" in what for _, what in run.tally) == (n < 1250)
 
 
 @pytest.mark.parametrize("flag", [TRIMMED, TURNAROUND, SUN_UP, SUN_CLOSE])
 def test_samples_with_a_signal_are_not_bridged(bench, flag):
-    """Turnarounds that no map uses, ends that another filter trims, the Sun: the filter takes what they hold."""
+    """Turnarounds that no map uses, ends that another filter trims, the Sun: the filter takes what
+    they hold.
+    """
     x = np.random.default_rng(7).standard_normal((3, 6000))
-    plain, observation = bench.run([HighpassFilter()], bench.observation(3, 6000), {"signal": x}), bench.observation(3, 6000)
+    plain, observation = (
+        bench.run([HighpassFilter()], bench.observation(3, 6000), {"signal": x}),
+        bench.observation(3, 6000),
+    )
     observation.flags[2000:2500] = flag
     run = bench.run([HighpassFilter()], observation, {"signal": x})
     np.testing.assert_array_equal(run.signal, plain.signal)
@@ -172,14 +199,17 @@ def test_modelled_mean_is_dropped_analytically(bench):
 def test_flagged_gap_and_nan_do_not_ring(bench):
     observation = bench.observation(3, 20000)
     x = np.random.default_rng(5).normal(0, WHITE, (3, 20000))
-    clean = bench.run([HighpassFilter()], bench.observation(3, 20000), {"signal": x}, precision="float64").signal
+    clean = bench.run(
+        [HighpassFilter()], bench.observation(3, 20000), {"signal": x}, precision="float64"
+    ).signal
     observation.flags[7000:7050] = 1
     x[:, 7000:7050] = 1e6
     x[1, 100] = np.nan
     x[2] = np.inf
     run = bench.run([HighpassFilter()], observation, {"signal": x}, precision="float64")
     good = np.r_[0:100, 101:7000, 7050:20000]
-    # the bridge replaces 50 samples of white noise by two, so the low part changes by some of its own rms
+    # the bridge replaces 50 samples of white noise by two, so the low part changes by some of its
+    # own rms
     assert np.abs(run.signal - clean)[:2, good].max() < 0.2 * WHITE
     assert np.isnan(run.signal[1, 100])
     assert not np.isfinite(run.signal[2]).any()
@@ -203,8 +233,12 @@ def test_trim_flags_the_ends_and_is_reported(bench):
 
 def test_bits_do_not_depend_on_blocks_or_neighbours(bench):
     x = np.random.default_rng(7).standard_normal((37, 9001))
-    one = bench.run([HighpassFilter()], bench.observation(37, 9001), {"signal": x}, threads=1).signal
-    two = bench.run([HighpassFilter()], bench.observation(37, 9001), {"signal": x}, threads=3).signal
+    one = bench.run(
+        [HighpassFilter()], bench.observation(37, 9001), {"signal": x}, threads=1
+    ).signal
+    two = bench.run(
+        [HighpassFilter()], bench.observation(37, 9001), {"signal": x}, threads=3
+    ).signal
     np.testing.assert_array_equal(one, two)
     lone = bench.run([HighpassFilter()], bench.observation(1, 9001), {"signal": x[20:21]}).signal
     np.testing.assert_array_equal(lone[0], one[20])
@@ -212,7 +246,11 @@ def test_bits_do_not_depend_on_blocks_or_neighbours(bench):
 
 def test_cut_above_nyquist_is_refused(bench):
     with pytest.raises(PipelineError, match="removes everything"):
-        bench.run([HighpassFilter(frequency="50 Hz")], bench.observation(1, 100), {"signal": np.zeros((1, 100))})
+        bench.run(
+            [HighpassFilter(frequency="50 Hz")],
+            bench.observation(1, 100),
+            {"signal": np.zeros((1, 100))},
+        )
     with pytest.raises(ValueError):
         HighpassFilter(frequency="0 Hz")
     with pytest.raises(ValueError):
@@ -225,9 +263,13 @@ def test_a_scan_shorter_than_one_cycle_loses_a_line_and_says_so(bench, n):
     run = bench.run([HighpassFilter()], bench.observation(3, n), {"signal": x}, precision="float64")
     np.testing.assert_allclose(run.signal, brick_wall(x, 0, min(1, n - 1)), rtol=0, atol=1e-12)
     said = run.tally["HighpassFilter", "scan0 is shorter than 1/frequency"]
-    assert said == {1: "nothing is left of 1 sample", 2: "nothing is left of 2 samples"}.get(n, ONLY_A_LINE)
+    assert said == {1: "nothing is left of 1 sample", 2: "nothing is left of 2 samples"}.get(
+        n, ONLY_A_LINE
+    )
     data = Data(None, [bench.observation(3, n)])
-    assert HighpassFilter().check(data) == [f"1 of 1 scans are shorter than 1/frequency, 12.5 s: {ONLY_A_LINE}"]
+    assert HighpassFilter().check(data) == [
+        f"1 of 1 scans are shorter than 1/frequency, 12.5 s: {ONLY_A_LINE}"
+    ]
     if n > 1:  # as a run refuses it
         with pytest.raises(PipelineError, match="removes everything"):
             HighpassFilter(frequency="90 Hz").check(data)
@@ -239,16 +281,27 @@ def test_a_cut_above_the_fastest_wave_of_a_scan_is_refused(bench, n):
     x = np.random.default_rng(4).standard_normal((2, n))
     fastest = (n - 1) / n * 50.0
     with pytest.raises(PipelineError, match="removes everything") as err:
-        bench.run([HighpassFilter(frequency=f"{fastest * 1.001} Hz")], bench.observation(2, n), {"signal": x})
+        bench.run(
+            [HighpassFilter(frequency=f"{fastest * 1.001} Hz")],
+            bench.observation(2, n),
+            {"signal": x},
+        )
     assert f"below {fastest:.6g} Hz" in str(err.value)
-    left = bench.run([HighpassFilter(frequency=f"{fastest * 0.999} Hz", degree=0)], bench.observation(2, n), {"signal": x})
+    left = bench.run(
+        [HighpassFilter(frequency=f"{fastest * 0.999} Hz", degree=0)],
+        bench.observation(2, n),
+        {"signal": x},
+    )
     assert left.signal.std() > 0.05 / np.sqrt(n)  # one cosine of white noise, rms sqrt(2 / n) or so
 
 
 @pytest.mark.parametrize("frequency", [0.08, 0.5, 20.0])
 def test_gaps_at_the_ends_and_inside_of_short_scans_are_bridged(bench, frequency):
-    """Lines between good neighbours, constants at the ends; then as without gaps. The lost samples stay as they are."""
-    n = 700  # 7 s: shorter than a cycle of 0.08 Hz; on a coarse series at 0.5 Hz; with the full DCT at 20 Hz
+    """Lines between good neighbours, constants at the ends; then as without gaps. The lost samples
+    stay as they are.
+    """
+    # 7 s: shorter than a cycle of 0.08 Hz; on a coarse series at 0.5 Hz; with the full DCT at 20 Hz
+    n = 700
     x = np.cumsum(np.random.default_rng(5).standard_normal((4, n)), axis=1)
     lost = [np.arange(30), np.arange(650, n), np.r_[0, 100:140, n - 1], np.arange(1, n)]
     bridged = x.copy()
@@ -257,12 +310,19 @@ def test_gaps_at_the_ends_and_inside_of_short_scans_are_bridged(bench, frequency
         row[gap] = np.interp(gap, good, row[good])
     for d, gap in enumerate(lost):
         x[d, gap] = np.nan
-    run = bench.run([HighpassFilter(frequency=f"{frequency} Hz")], bench.observation(4, n), {"signal": x}, precision="float64")
+    run = bench.run(
+        [HighpassFilter(frequency=f"{frequency} Hz")],
+        bench.observation(4, n),
+        {"signal": x},
+        precision="float64",
+    )
     plan = plan_highpass(n, frequency / 100, 3, 24.0)
     expected = brick_wall(bridged, plan.cut, min(3, plan.cut - 1) if plan.cut else 1)
     for d, gap in enumerate(lost):
         good = np.setdiff1d(np.arange(n), gap)
         # the coarse series errs by some 1e-6 of the low part
-        np.testing.assert_allclose(run.signal[d, good], expected[d, good], rtol=0, atol=1e-5 * np.abs(bridged).max())
+        np.testing.assert_allclose(
+            run.signal[d, good], expected[d, good], rtol=0, atol=1e-5 * np.abs(bridged).max()
+        )
         assert np.isnan(run.signal[d, gap]).all()
     assert run.tally["HighpassFilter", "samples not finite"] == str(sum(map(len, lost)))

@@ -1,4 +1,6 @@
-"""What filters fit to each detector: the least-squares fit of numpy, in float64 whatever the stream is; rows by themselves."""
+"""What filters fit to each detector: the least-squares fit of numpy, in float64 whatever the stream
+is; rows by themselves.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +30,11 @@ def matrix(basis):
 
 
 def fitted(functions, row, use):
-    """The least-squares fit to the samples that are used, and its tolerance: rounding of the normal equations.
+    """The least-squares fit to the samples that are used, and its tolerance: rounding of the normal
+    equations.
 
-    Their coefficients err by about eps cond(B B^T) |c|, the sums by eps |x| for each of some tens of additions in a row.
+    Their coefficients err by about eps cond(B B^T) |c|, the sums by eps |x| for each of some tens
+    of additions in a row.
     """
     solution, _, rank, singular = np.linalg.lstsq(functions[use], row[use], rcond=1e-9)
     condition = (singular[0] / singular[rank - 1]) ** 2
@@ -38,7 +42,9 @@ def fitted(functions, row, use):
 
 
 def rows_of_all_kinds(n, use):
-    """Rows, which of their samples are masked, and which are not finite: whole, spoilt, spoilt where flagged, masked, both."""
+    """Rows, which of their samples are masked, and which are not finite: whole, spoilt, spoilt
+    where flagged, masked, both.
+    """
     rng = np.random.default_rng(8)
     x, masked = 30 + rng.standard_normal((5, n)).cumsum(axis=1), np.zeros((5, n), bool)
     x[1, [0, 700, n - 1]], x[2, np.flatnonzero(~use)[3]] = np.nan, np.inf
@@ -54,7 +60,9 @@ def test_polynomials_are_the_least_squares_fit(order):
     use[1100:1150] = False
     x, masked = rows_of_all_kinds(N, use)
     found, functions = x.copy(), matrix(polynomials(N, order))
-    assert Fit.of(polynomials(N, order), use).remove(Rows.of(found), masked) == np.count_nonzero(~np.isfinite(x))
+    assert Fit.of(polynomials(N, order), use).remove(Rows.of(found), masked) == np.count_nonzero(
+        ~np.isfinite(x)
+    )
     for before, after, inside in zip(x, found, masked, strict=True):
         finite = np.isfinite(before)
         fit, tolerance = fitted(functions, before, use & finite & ~inside)
@@ -62,9 +70,13 @@ def test_polynomials_are_the_least_squares_fit(order):
         np.testing.assert_array_equal(after[~finite], before[~finite])
 
 
-@pytest.mark.parametrize(("spacing", "gap"), [(9.0, 4), (9.0, 150), (3.3, 4), (200.0, 4), (1500.0, 4)])
+@pytest.mark.parametrize(
+    ("spacing", "gap"), [(9.0, 4), (9.0, 150), (3.3, 4), (200.0, 4), (1500.0, 4)]
+)
 def test_splines_are_the_least_squares_fit(spacing, gap):
-    """Also of so many functions that they are solved for by a factor, and where none of the samples in a gap determines some."""
+    """Also of so many functions that they are solved for by a factor, and where none of the samples
+    in a gap determines some.
+    """
     use = np.ones(N, bool)
     use[1100 : 1100 + gap] = False
     assert (len(Fit.of(splines(N, spacing), use).inverse) == 4) == (spacing < 10 and gap < 100)
@@ -76,7 +88,9 @@ def test_splines_are_the_least_squares_fit(spacing, gap):
     for before, after in zip(x, found, strict=True):
         finite = np.isfinite(before)
         fit, tolerance = fitted(functions, before, use & finite)
-        np.testing.assert_allclose(after[finite], (before - fit)[finite], rtol=0, atol=max(tolerance, 1e-9))
+        np.testing.assert_allclose(
+            after[finite], (before - fit)[finite], rtol=0, atol=max(tolerance, 1e-9)
+        )
 
 
 @pytest.mark.parametrize("trend", [0, 1, 7, 20])
@@ -86,11 +100,18 @@ def test_templates_are_the_least_squares_fit(trend):
     use = (np.arange(N) % 97 > 2) & (number != 11)
     x, _ = rows_of_all_kinds(N, use)
     legendre = polynomials(N, trend).functions[1:]
-    found, functions = x.copy(), np.column_stack([number[:, None] == np.arange(40), legendre.T]).astype(float)
-    assert Template.of(number, legendre, use).remove(Rows.of(found)) == np.count_nonzero(~np.isfinite(x))
+    found, functions = (
+        x.copy(),
+        np.column_stack([number[:, None] == np.arange(40), legendre.T]).astype(float),
+    )
+    assert Template.of(number, legendre, use).remove(Rows.of(found)) == np.count_nonzero(
+        ~np.isfinite(x)
+    )
     for before, after in zip(x, found, strict=True):
         finite = np.isfinite(before)
-        fit, tolerance = fitted(functions, before, use & finite)  # of the least norm: 0 in the bin without samples
+        fit, tolerance = fitted(
+            functions, before, use & finite
+        )  # of the least norm: 0 in the bin without samples
         np.testing.assert_allclose(after[finite], (before - fit)[finite], rtol=0, atol=tolerance)
         np.testing.assert_array_equal(after[~finite], before[~finite])
 
@@ -136,7 +157,11 @@ def test_a_row_has_the_same_bits_whatever_rows_stand_beside_it(kind, dtype, besi
 
 @pytest.mark.parametrize(
     "step",
-    [PolynomialFilter(order=3), GroundFilter(bin="10 arcsec", trend=2), Detrend(order=2, mask={"radius": "20 arcsec"})],
+    [
+        PolynomialFilter(order=3),
+        GroundFilter(bin="10 arcsec", trend=2),
+        Detrend(order=2, mask={"radius": "20 arcsec"}),
+    ],
     ids=repr,
 )
 def test_microkelvins_beside_the_mean_are_kept(bench, step):
@@ -150,7 +175,12 @@ def test_microkelvins_beside_the_mean_are_kept(bench, step):
         observation = bench.observation(5, n)
         observation.flags[2000:2100] = INVALID
         means = {"signal": level} if mean else {}
-        return bench.run([step], observation, {"signal": stream}, means=means, precision=precision).signal
+        return bench.run(
+            [step], observation, {"signal": stream}, means=means, precision=precision
+        ).signal
 
-    beside, inside = run(x, True, "float32"), run(x + level.evaluate(slice(0, 5), slice(0, n)), False, "float64")
+    beside, inside = (
+        run(x, True, "float32"),
+        run(x + level.evaluate(slice(0, 5), slice(0, n)), False, "float64"),
+    )
     np.testing.assert_allclose(beside, inside, rtol=1e-6, atol=1e-12)

@@ -19,11 +19,17 @@ def test_a_scan_through_the_air_comes_back(tmp_path: Any, format: str, precision
         zonda.Efficiency(),
         zonda.SaveTOD(format=format, streams=["signal", "atmosphere", "white"]),
     ]
-    camera = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d").instrument
+    camera = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d"
+    ).instrument
     few = camera.model_copy(update={"detectors": 37})
-    scene = zonda.Scene(site="green_bank", instrument=few, time="2024-11-25T07:00", target="05h +20d", seed=2)
+    scene = zonda.Scene(
+        site="green_bank", instrument=few, time="2024-11-25T07:00", target="05h +20d", seed=2
+    )
     keep = ("signal", "atmosphere", "white")
-    data = zonda.Pipeline(steps, precision=precision).run(scene, output=tmp_path, keep=keep, memory=12_000_000)
+    data = zonda.Pipeline(steps, precision=precision).run(
+        scene, output=tmp_path, keep=keep, memory=12_000_000
+    )
     (path,) = data.products["tod_file"]
     tod, observation = load_tod(path), data.observations[0]
     for name in keep:
@@ -31,9 +37,14 @@ def test_a_scan_through_the_air_comes_back(tmp_path: Any, format: str, precision
         np.testing.assert_array_equal(tod.streams[name], observation.detdata[name], err_msg=name)
     signal = tod.streams["signal"]
     assert signal.min() > 20  # kelvin: epsilon T_atm / (zeta e^-tau) is in it
-    zeta, epsilon = observation.focalplane.main_beam_efficiency, observation.focalplane.illumination_efficiency
+    zeta, epsilon = (
+        observation.focalplane.main_beam_efficiency,
+        observation.focalplane.illumination_efficiency,
+    )
     everything = slice(0, signal.shape[0]), slice(0, signal.shape[1])
-    emission, transmission = (observation.smooth[n].evaluate(*everything) for n in ("atmosphere", "transmission"))
+    emission, transmission = (
+        observation.smooth[n].evaluate(*everything) for n in ("atmosphere", "transmission")
+    )
     above = epsilon[:, None] * (emission + tod.streams["atmosphere"]) + tod.streams["white"]
     # float32 streams of 0.3 K are exact to 2e-8 K, M to 1e-7 of its 20 to 60 K (`MEAN_ERROR`)
     np.testing.assert_allclose(signal, above / (zeta[:, None] * transmission), rtol=0, atol=1e-5)

@@ -1,4 +1,6 @@
-"""A written map opens elsewhere with every source where it was, its unit, its beam and its history."""
+"""A written map opens elsewhere with every source where it was, its unit, its beam and its
+history.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +91,8 @@ def test_a_source_is_at_its_world_coordinate(run, shape):
         y, x = np.unravel_index(np.nanargmax(values), values.shape)
         found = wcs.pixel_to_world(x, y)
         assert found.frame.name == "icrs"
-        # The source was put into the pixel nearest to it: at most half a pixel (1 arcsec) off in each direction
+        # The source was put into the pixel nearest to it: at most half a pixel (1 arcsec) off in
+        # each direction
         assert abs(found.ra.deg - source[0]) * np.cos(np.radians(20)) <= 1.0001 / 3600
         assert abs(found.dec.deg - source[1]) <= 1.0001 / 3600
 
@@ -149,15 +152,20 @@ def test_companion_runs_and_the_noise_map(run, data):
         assert [h.name for h in file][:2] == ["HALF_DIFFERENCE", "SOURCE_FREE"]
         np.testing.assert_array_equal(file["SOURCE_FREE"].data, free.signal)
         header = file[0].header
-        # Within 30 arcsec of the centre, 2 arcsec pixels, the centre at a pixel corner: a disc of 15 pixels' radius. Pixels on
-        # the rim may fall either way: 12 of 700, so 1 %
+        # Within 30 arcsec of the centre, 2 arcsec pixels, the centre at a pixel corner: a disc of
+        # 15 pixels' radius. Pixels on the rim may fall either way: 12 of 700, so 1 %
         y, x = np.mgrid[:120, :120] - 59.5
         inside = np.hypot(x, y) <= 15
         w = main.weights[inside]
-        assert header["RMSHALF"] == pytest.approx(np.sqrt((w * main.half_difference[inside] ** 2).sum() / w.sum()), rel=0.01)
+        assert header["RMSHALF"] == pytest.approx(
+            np.sqrt((w * main.half_difference[inside] ** 2).sum() / w.sum()), rel=0.01
+        )
         w = free.weights[inside]
-        assert header["RMSFREE"] == pytest.approx(np.sqrt((w * free.signal[inside] ** 2).sum() / w.sum()), rel=0.01)
-        # White noise smoothed with a beam of sigma s pixels falls by 1 / (2 sqrt(pi) s); 50 independent beams: 10 %, four sigma
+        assert header["RMSFREE"] == pytest.approx(
+            np.sqrt((w * free.signal[inside] ** 2).sum() / w.sum()), rel=0.01
+        )
+        # White noise smoothed with a beam of sigma s pixels falls by 1 / (2 sqrt(pi) s); 50
+        # independent beams: 10 %, four sigma
         sigma = 9 / 2 / 2.3548
         assert header["RMSFREEB"] == pytest.approx(1e-4 / (2 * np.sqrt(np.pi) * sigma), rel=0.4)
     assert len(data.products["map_file"]) == 4
@@ -181,7 +189,9 @@ def test_healpy_reads_a_partial_map(run, n, nest):
     assert values.size == hp.nside2npix(256)
     np.testing.assert_array_equal(values[product.pixels], product.signal)
     assert np.count_nonzero(values != hp.UNSEEN) == n
-    np.testing.assert_array_equal(hp.read_map(path, field=1, nest=nest)[product.pixels], product.hits)
+    np.testing.assert_array_equal(
+        hp.read_map(path, field=1, nest=nest)[product.pixels], product.hits
+    )
     assert header["COORDSYS"] == "C"
     assert header["TUNIT2"] == "K"
     assert header["TEMPSCAL"] == "K_RJ"
@@ -204,7 +214,9 @@ def test_an_earlier_file_is_kept_on_request(run, data):
     assert (data.output / "map.fits").read_bytes() == before
 
 
-@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()]
+)
 def test_a_failure_in_the_middle_leaves_the_old_file(run, data, monkeypatch, error):
     run(map=wcs_map(20, 20))
     before = (data.output / "map.fits").read_bytes()
@@ -238,7 +250,9 @@ def test_a_missing_folder_is_refused_before_the_run(data, tmp_path):
 
 
 def test_healpix_tables_are_copied_one_at_a_time(run):
-    """Tables of 0.5 MB (pixel numbers and four planes): copies of one while it is written, not of all files' at once."""
+    """Tables of 0.5 MB (pixel numbers and four planes): copies of one while it is written, not of
+    all files' at once.
+    """
     maps = {"map": healpix_map(4096), **{f"r{k}__map": healpix_map(4096) for k in range(5)}}
     for made in maps.values():
         for name in ("signal", "hits", "weights", "noise", "pixels"):

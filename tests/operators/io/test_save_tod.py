@@ -1,4 +1,6 @@
-"""Streams in files: every number comes back, TOAST finds what it requires, and a failure leaves nothing."""
+"""Streams in files: every number comes back, TOAST finds what it requires, and a failure leaves
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +40,26 @@ from zonda.operators.io.save_tod import SaveTOD, load_tod, save_tod
 def blocks(observation, streams, mean, detectors=16, samples=2048):
     for d in range(0, observation.n_detectors, detectors):
         for s in range(0, observation.n_samples, samples):
-            ds, ss = slice(d, min(d + detectors, observation.n_detectors)), slice(s, min(s + samples, observation.n_samples))
-            yield Block(observation, ds, ss, {k: v[ds, ss].copy() for k, v in streams.items()}, {"signal": mean})
+            ds, ss = (
+                slice(d, min(d + detectors, observation.n_detectors)),
+                slice(s, min(s + samples, observation.n_samples)),
+            )
+            yield Block(
+                observation,
+                ds,
+                ss,
+                {k: v[ds, ss].copy() for k, v in streams.items()},
+                {"signal": mean},
+            )
 
 
 @pytest.fixture
 def streams():
     noise = np.random.default_rng(1)
-    return {k: noise.normal(0, 1e-3, (19, 5000)).astype(np.float32) for k in ("signal", "sky", "transmission")}
+    return {
+        k: noise.normal(0, 1e-3, (19, 5000)).astype(np.float32)
+        for k in ("signal", "sky", "transmission")
+    }
 
 
 @pytest.fixture
@@ -94,7 +108,8 @@ def test_what_is_written_is_what_was_there(format, threads, make_observation, da
     path = write(operator, observation, data, streams, mean, threads)
     tod = load_tod(path)
     np.testing.assert_array_equal(
-        tod.streams["signal"], streams["signal"].astype(float) + mean.evaluate(slice(0, 19), slice(0, 5000))
+        tod.streams["signal"],
+        streams["signal"].astype(float) + mean.evaluate(slice(0, 19), slice(0, 5000)),
     )
     for name in ("sky", "transmission"):
         np.testing.assert_array_equal(tod.streams[name], streams[name])
@@ -119,24 +134,49 @@ def test_what_is_written_is_what_was_there(format, threads, make_observation, da
 @pytest.mark.parametrize("format", ["hdf5", "fits"])
 def test_the_file_does_not_depend_on_blocks(format, make_observation, data, streams, mean):
     observation = make_observation()
-    first = load_tod(write(SaveTOD(format=format), observation, data, streams, mean, detectors=16, samples=2048))
+    first = load_tod(
+        write(SaveTOD(format=format), observation, data, streams, mean, detectors=16, samples=2048)
+    )
     data.products.clear()
-    second = load_tod(write(SaveTOD(format=format), observation, data, streams, mean, detectors=19, samples=5000))
+    second = load_tod(
+        write(SaveTOD(format=format), observation, data, streams, mean, detectors=19, samples=5000)
+    )
     equal(first, second)
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".fits"])
 def test_load_save_load_is_equal(suffix, make_observation, data, streams, mean, tmp_path):
     format = "hdf5" if suffix == ".h5" else "fits"
-    first = load_tod(write(SaveTOD(format=format, streams=["signal", "sky"]), make_observation(), data, streams, mean))
+    first = load_tod(
+        write(
+            SaveTOD(format=format, streams=["signal", "sky"]),
+            make_observation(),
+            data,
+            streams,
+            mean,
+        )
+    )
     second = load_tod(save_tod(tmp_path / f"again{suffix}", first))
-    for exact in ("seconds", "times", "quats", "boresight_azel", "boresight_radec", "flags", "detector_flags"):
+    for exact in (
+        "seconds",
+        "times",
+        "quats",
+        "boresight_azel",
+        "boresight_radec",
+        "flags",
+        "detector_flags",
+    ):
         np.testing.assert_array_equal(getattr(first, exact), getattr(second, exact))
     for name in first.streams:
         np.testing.assert_array_equal(first.streams[name], second.streams[name])
     for name in first.columns:  # deg <-> rad and GHz <-> Hz may cost a last bit
         np.testing.assert_allclose(first.columns[name], second.columns[name], rtol=4e-16)
-    assert (first.name, first.start, first.names, first.metadata) == (second.name, second.start, second.names, second.metadata)
+    assert (first.name, first.start, first.names, first.metadata) == (
+        second.name,
+        second.start,
+        second.names,
+        second.metadata,
+    )
     assert first.site[0] == second.site[0]
     np.testing.assert_allclose(first.site[1:], second.site[1:], rtol=4e-16)
 
@@ -149,10 +189,23 @@ def test_flags_intervals_and_weather(format, make_observation, data, streams, me
     """What TOAST has no bit for is invalid in the file; intervals and weather come back."""
     observation = make_observation()
     observation.flags[:] = 0
-    observation.flags[:8] = [INVALID, PROCESSING, TURNAROUND, IRREGULAR, SUN_UP, SUN_CLOSE, OPAQUE, NOT_RECORDED | TURNAROUND]
+    observation.flags[:8] = [
+        INVALID,
+        PROCESSING,
+        TURNAROUND,
+        IRREGULAR,
+        SUN_UP,
+        SUN_CLOSE,
+        OPAQUE,
+        NOT_RECORDED | TURNAROUND,
+    ]
     observation.detector_flags[:3] = OPAQUE, DEAD, SOLAR_SYSTEM_OBJECT
     t = observation.seconds
-    observation.intervals = {"scanning": [(t[0], t[70]), (t[90], t[-1])], "turnaround": [(t[70], t[90])], "elnod": []}
+    observation.intervals = {
+        "scanning": [(t[0], t[70]), (t[90], t[-1])],
+        "turnaround": [(t[70], t[90])],
+        "elnod": [],
+    }
     observation.weather = WEATHER
     path = write(SaveTOD(format=format), observation, data, streams, mean)
     tod = load_tod(path)
@@ -204,14 +257,18 @@ def test_weather_of_the_scene_where_no_step_makes_air(make_observation, data, st
         weather = load_tod(write(SaveTOD(), observation, data, streams, mean)).weather
         assert weather is not None
         if expected:
-            assert weather.pwv == pytest.approx(expected, rel=1e-6)  # water is scaled until its column is that
+            assert weather.pwv == pytest.approx(
+                expected, rel=1e-6
+            )  # water is scaled until its column is that
         assert 5.3e4 < weather.pressure < 5.8e4  # Pa: 5060 m above the sea
         assert 0 < weather.humidity < 0.02
         assert weather.time == data.scene.time.posix
 
 
 def test_weather_is_that_of_the_simulated_air(scene, tmp_path):
-    """Its water, and the wind that drives its layers, not what the scene's weather would have had."""
+    """Its water, and the wind that drives its layers, not what the scene's weather would have
+    had.
+    """
     from zonda.core.pipeline import Pipeline
     from zonda.operators.atmosphere.layers import AtmosphereLayers
     from zonda.operators.optics.efficiency import Efficiency
@@ -222,12 +279,16 @@ def test_weather_is_that_of_the_simulated_air(scene, tmp_path):
     Pipeline([stare, air, Efficiency(), SaveTOD()]).run(scene, output=tmp_path, threads=1)
     weather = load_tod(tmp_path / "tod_scan-000.h5").weather
     assert weather.pwv == pytest.approx(1.5e-3, rel=1e-9)
-    assert (weather.wind_east, weather.wind_north) == pytest.approx((10.0, 0.0), abs=1e-12)  # a west wind
+    assert (weather.wind_east, weather.wind_north) == pytest.approx(
+        (10.0, 0.0), abs=1e-12
+    )  # a west wind
     assert weather.time == scene.time.posix
 
 
 def test_xi_and_eta_of_sotodlib():
-    """so3g's rotation_xieta: xi = -sin(theta) sin(phi), eta = -sin(theta) cos(phi), gamma = psi + phi. Ours are tangents."""
+    """so3g's rotation_xieta: xi = -sin(theta) sin(phi), eta = -sin(theta) cos(phi), gamma = psi +
+    phi. Ours are tangents.
+    """
     from zonda.operators.io.time_ordered_data import TimeOrderedData
 
     xi, eta, angle = np.radians([[0.5, 4, -17, 0], [0, -1, 3, 0.2], [0, 30, 100, -45]])
@@ -266,7 +327,8 @@ def test_detector_quaternions_follow_the_frame():
     direction = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
     expected = np.array([-eta, -xi, np.ones(50)])
     np.testing.assert_allclose(direction, expected / np.linalg.norm(expected, axis=0), atol=3e-16)
-    # The polarization axis is X turned about Z by the angle, up to the tilt of the tangent plane (xi^2 = 4e-4)
+    # The polarization axis is X turned about Z by the angle, up to the tilt of the tangent plane
+    # (xi^2 = 4e-4)
     axis = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)])
     np.testing.assert_allclose(axis, [np.cos(angle * 50), np.sin(angle * 50)], atol=5e-4)
 
@@ -335,7 +397,14 @@ def test_the_fits_file_opens_in_astropy(make_observation, data, streams, mean):
     path = write(SaveTOD(format="fits"), make_observation(), data, streams, mean)
     with fits.open(path) as file:
         file.verify("exception")
-        assert [h.name for h in file] == ["PRIMARY", "TOD", "SAMPLES", "DETECTORS", "PROVENANCE", "INTERVALS"]
+        assert [h.name for h in file] == [
+            "PRIMARY",
+            "TOD",
+            "SAMPLES",
+            "DETECTORS",
+            "PROVENANCE",
+            "INTERVALS",
+        ]
         assert file[0].header["TEMPSCAL"] == "K_RJ"
         assert file["TOD"].columns["SIGNAL"].unit == "K"
     table = Table.read(path, hdu="TOD")
@@ -360,7 +429,9 @@ def test_an_interrupted_run_leaves_nothing(format, error, make_observation, data
 
 
 @pytest.mark.parametrize("format", ["hdf5", "fits"])
-def test_a_full_disk_is_an_error_with_a_cure(format, make_observation, data, streams, mean, monkeypatch):
+def test_a_full_disk_is_an_error_with_a_cure(
+    format, make_observation, data, streams, mean, monkeypatch
+):
     observation, operator = make_observation(), SaveTOD(format=format)
     state = operator.prepare(observation)
     real = state.writer._file
@@ -373,7 +444,10 @@ def test_a_full_disk_is_an_error_with_a_cure(format, make_observation, data, str
             raise OSError(errno.ENOSPC, "No space left on device")
 
         def __getitem__(self, _):
-            raise OSError("Can't write data (file write failed: errno = 28, error message = 'No space left on device')")
+            raise OSError(
+                "Can't write data (file write failed: errno = 28, error message = 'No space left on"
+                " device')"
+            )
 
     state.writer._file = Full()
     with pytest.raises(OutputError, match="no space left on the disk") as caught:
@@ -432,7 +506,9 @@ def test_one_detector_one_sample(make_observation, data):
     for format in ("hdf5", "fits"):
         data.products.clear()
         one = {"signal": np.ones((19, 1), np.float32)}
-        path = write(SaveTOD(format=format), observation, data, one, SmoothField.constant(np.zeros(19), 1))
+        path = write(
+            SaveTOD(format=format), observation, data, one, SmoothField.constant(np.zeros(19), 1)
+        )
         assert load_tod(path).streams["signal"].tolist() == [[1.0]] * 19
 
 
@@ -447,7 +523,9 @@ class Fails(Operator):
             raise {"interrupt": KeyboardInterrupt, "fault": RuntimeError}[self.how]("stop")
 
 
-@pytest.mark.parametrize(("how", "error"), [("interrupt", KeyboardInterrupt), ("fault", RuntimeError)])
+@pytest.mark.parametrize(
+    ("how", "error"), [("interrupt", KeyboardInterrupt), ("fault", RuntimeError)]
+)
 def test_a_pipeline_that_stops_leaves_whole_files_only(how, error, scene, tmp_path):
     from zonda.core.pipeline import Pipeline
     from zonda.operators.noise.white import WhiteNoise

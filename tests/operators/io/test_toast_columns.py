@@ -20,8 +20,12 @@ from zonda.operators.io.toast_reading import columns_of
     ],
 )
 def test_polarization_efficiency_is_that_of_toasts_weights(columns, efficiency):
-    """(1 - epsilon) / (1 + epsilon), epsilon 0 where a table with angles states none; zonda's own column stands above."""
-    found = columns_of(QTable(columns | {"name": ["a", "b"]}), np.arange(2)).get("polarization_efficiency")
+    """(1 - epsilon) / (1 + epsilon), epsilon 0 where a table with angles states none; zonda's own
+    column stands above.
+    """
+    found = columns_of(QTable(columns | {"name": ["a", "b"]}), np.arange(2)).get(
+        "polarization_efficiency"
+    )
     assert (found is None) == (efficiency is None)
     if efficiency is not None:
         np.testing.assert_allclose(found, efficiency, rtol=1e-15)

@@ -32,7 +32,9 @@ def jansky(observation):
     """A source of 1 Jy in the middle, in Jy/sr, which each detector sees through its own beam."""
     ra, dec = observation.centre
     centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    d = directions(observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta)
+    d = directions(
+        observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta
+    )
     apart = 2 * np.arcsin(np.linalg.norm(d - centre, axis=-1) / 2)
     sigma = observation.focalplane.fwhm[:, None] / FWHM_PER_SIGMA
     return 1e-6 * np.exp(-(apart**2) / (2 * sigma**2)) / (2 * math.pi * sigma**2)
@@ -50,11 +52,15 @@ def test_peak_times_beam_and_the_integral_are_the_flux(bench, net):
     plane.fwhm[:] = np.array([1.0, 3.0, 3.0]) * ARCMIN
     plane.net *= net
     with pytest.warns(UserWarning, match="beams of 1′ to 3′"):
-        product = bench.run([BinMap(pixel="6 arcsec")], observation, {"signal": jansky}, precision="float64").map
-    # samples lie within half a pixel of 0.1 FWHM of the pixel's centre: 0.1^2 / 12 x 8 ln 2 / 2 = 0.2 % of the peak, and what a
-    # pixel without a sample at the very centre misses is less
+        product = bench.run(
+            [BinMap(pixel="6 arcsec")], observation, {"signal": jansky}, precision="float64"
+        ).map
+    # samples lie within half a pixel of 0.1 FWHM of the pixel's centre: 0.1^2 / 12 x 8 ln 2 / 2 =
+    # 0.2 % of the peak, and what a pixel without a sample at the very centre misses is less
     assert np.nanmax(product.signal) * area(product.fwhm) == pytest.approx(1e-6, rel=0.01)
-    assert float((product.signal * product.areas())[product.hits > 0].sum()) == pytest.approx(1e-6, rel=0.01)
+    assert float((product.signal * product.areas())[product.hits > 0].sum()) == pytest.approx(
+        1e-6, rel=0.01
+    )
     w = np.array(net) ** -2.0
     assert product.fwhm == pytest.approx(math.sqrt(w.sum() / (w / plane.fwhm**2).sum()), rel=1e-3)
     beam = MapFile.of("map", product).beam
@@ -75,7 +81,9 @@ def test_one_beam_is_itself_to_the_bit_and_dead_detectors_count_nothing(bench):
 
 
 def test_scans_of_two_beams(bench):
-    """1.4 arcmin and 40 arcsec, whichever comes first; I, Q and U as well; smoothed with its own beam."""
+    """1.4 arcmin and 40 arcsec, whichever comes first; I, Q and U as well; smoothed with its own
+    beam.
+    """
     first, second = dense(bench), dense(bench, index=1)
     first.focalplane.fwhm[:], second.focalplane.fwhm[:] = 1.4 * ARCMIN, ARCMIN * 2 / 3
     for scan in (first, second):
@@ -90,7 +98,9 @@ def test_scans_of_two_beams(bench):
                 made = bench.run([step], list(order), {"signal": jansky}, precision="float64")
             assert made.map.fwhm == pytest.approx(expected, rel=1e-3)
             assert np.nanmax(made.map.signal) * area(made.map.fwhm) == pytest.approx(1e-6, rel=0.01)
-            assert made.tally["BinMap", "beam of the map (FWHM)"].startswith("51.1″: peak times its area")
+            assert made.tally["BinMap", "beam of the map (FWHM)"].startswith(
+                "51.1″: peak times its area"
+            )
             assert found.setdefault(stokes, made.map.fwhm) == made.map.fwhm  # to the bit
 
 
@@ -98,7 +108,11 @@ def test_sums_of_beams_do_not_depend_on_the_order():
     rng = np.random.default_rng(3)
     parts = [Beams() for _ in range(20)]
     for part in parts:
-        part.add(rng.choice(rng.uniform(1, 2, 5), 30), rng.uniform(0.1, 3, 30), int(rng.integers(1, 10**6)))
+        part.add(
+            rng.choice(rng.uniform(1, 2, 5), 30),
+            rng.uniform(0.1, 3, 30),
+            int(rng.integers(1, 10**6)),
+        )
     results = set()
     for _ in range(5):
         whole = Beams()

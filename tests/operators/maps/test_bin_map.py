@@ -27,8 +27,12 @@ STEP = 2.0**-36
 
 
 def sky_of(observation, function):
-    """``function`` of tangent offsets (east, north) [rad] from the observation's centre, at every sample."""
-    d = directions(observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta)
+    """``function`` of tangent offsets (east, north) [rad] from the observation's centre, at every
+    sample.
+    """
+    d = directions(
+        observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta
+    )
     ra, dec = observation.centre
     centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
@@ -48,7 +52,9 @@ def test_source_at_the_right_world_coordinate(bench, frame, shape):
     x0, y0 = 11 * ARCSEC, -23 * ARCSEC
     nx, ny = shape
     operator = BinMap(width=f"{2 * nx} arcsec", height=f"{2 * ny} arcsec", frame=frame)
-    product = bench.run([operator], observation, {"signal": lambda o: sky_of(o, source(x0, y0))}).map
+    product = bench.run(
+        [operator], observation, {"signal": lambda o: sky_of(o, source(x0, y0))}
+    ).map
     assert product.signal.shape == (ny, nx)
     values = np.nan_to_num(product.signal)
     y, x = np.indices(values.shape)
@@ -66,8 +72,15 @@ def test_source_at_the_right_world_coordinate(bench, frame, shape):
 def test_every_sample_is_in_the_pixel_that_astropy_says(bench):
     observation = bench.observation(7, 3000)
     a = np.arange(7 * 3000.0).reshape(7, 3000) % 97
-    product = bench.run([BinMap(width="90 arcsec", height="70 arcsec")], observation, {"signal": a}, precision="float64").map
-    d = directions(observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta)
+    product = bench.run(
+        [BinMap(width="90 arcsec", height="70 arcsec")],
+        observation,
+        {"signal": a},
+        precision="float64",
+    ).map
+    d = directions(
+        observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta
+    )
     sky = SkyCoord(x=d[..., 0], y=d[..., 1], z=d[..., 2], representation_type="cartesian")
     sky.representation_type = "unitspherical"
     x, y = (np.floor(p + 0.5).astype(int) for p in product.wcs.world_to_pixel(sky))
@@ -89,7 +102,11 @@ def test_outside_flagged_and_nan_are_dropped_and_counted(bench):
     a[3, 301] = -np.inf
     a[:, 100:150] = 1e30
     result = bench.run([BinMap(width="1 arcmin")], observation, {"signal": a})
-    count = {what: int(v) for (who, what), v in result.tally.items() if who == "BinMap" and what.startswith("samples")}
+    count = {
+        what: int(v)
+        for (who, what), v in result.tally.items()
+        if who == "BinMap" and what.startswith("samples")
+    }
     assert count["samples dropped: flagged"] == N + (N_DET - 1) * 50
     assert count["samples dropped: not finite"] == 11
     assert count["samples dropped: outside the map"] > 1000
@@ -104,7 +121,9 @@ def test_outside_flagged_and_nan_are_dropped_and_counted(bench):
 @pytest.mark.parametrize("how", [{"width": "1 arcmin"}, {"nside": 4096}])
 @pytest.mark.parametrize("weights", ["uniform", "inverse_variance"])
 def test_what_is_dropped_is_counted_once_whatever_else_is_wrong_with_it(bench, how, weights):
-    """Outside and not finite or too large, flagged and too large; 9 detectors (a rest beside groups of four), unequal NETs."""
+    """Outside and not finite or too large, flagged and too large; 9 detectors (a rest beside groups
+    of four), unequal NETs.
+    """
     a, observation, whole = np.full((9, N), 0.5), bench.observation(9, N), bench.observation(9, N)
     for o in (observation, whole):
         o.focalplane.net[:] = np.linspace(1e-3, 3e-3, 9)
@@ -114,7 +133,11 @@ def test_what_is_dropped_is_counted_once_whatever_else_is_wrong_with_it(bench, h
     observation.flags[1005:1020] = 1
     a[:, 1005:1020] = 1e20
     result = bench.run([BinMap(weights=weights, **how)], observation, {"signal": a})
-    count = {what: int(v) for (who, what), v in result.tally.items() if who == "BinMap" and what.startswith("samples")}
+    count = {
+        what: int(v)
+        for (who, what), v in result.tally.items()
+        if who == "BinMap" and what.startswith("samples")
+    }
     assert count["samples dropped: flagged"] == 9 * 15
     assert count["samples dropped: not finite"] == 9 * 20 + 5
     assert sum(count.values()) == 9 * N
@@ -123,7 +146,9 @@ def test_what_is_dropped_is_counted_once_whatever_else_is_wrong_with_it(bench, h
     assert 0 <= lost <= 9 * 35 + 5
     if "nside" in how:
         assert lost == 9 * 35 + 5
-    np.testing.assert_allclose(result.map.signal[result.map.hits > 0], 0.5, rtol=1e-9)  # rounded weights, 2^-31 of the smallest
+    np.testing.assert_allclose(
+        result.map.signal[result.map.hits > 0], 0.5, rtol=1e-9
+    )  # rounded weights, 2^-31 of the smallest
 
 
 def test_behind_the_image_is_outside(bench):
@@ -143,10 +168,14 @@ def test_scans_of_the_next_thread_and_pass_begin_with_empty_sums(bench):
 
 
 def test_nothing_is_piled_into_the_edge(bench):
-    """A small map equals the middle of a large one (centre off the scan's, so that no sample lies on a pixel's corner)."""
+    """A small map equals the middle of a large one (centre off the scan's, so that no sample lies
+    on a pixel's corner).
+    """
     maps = [
         bench.run(
-            [BinMap(width=w, centre="75.0001 deg 20.0001 deg")], bench.observation(N_DET, N), {"signal": np.ones((N_DET, N))}
+            [BinMap(width=w, centre="75.0001 deg 20.0001 deg")],
+            bench.observation(N_DET, N),
+            {"signal": np.ones((N_DET, N))},
         ).map
         for w in ("1 arcmin", "7 arcmin")
     ]
@@ -158,17 +187,25 @@ def test_nothing_is_piled_into_the_edge(bench):
 def test_default_map_covers_the_scan_closely(bench):
     observation = bench.observation(61, 20000)
     product = bench.run([BinMap()], observation, {"signal": np.ones((61, 20000))}).map
-    rows, columns = np.flatnonzero(product.hits.any(axis=1)), np.flatnonzero(product.hits.any(axis=0))
-    assert min(rows[0], columns[0]) < 12  # the field of view is a circle around every boresight: at most some pixels too wide
+    rows, columns = (
+        np.flatnonzero(product.hits.any(axis=1)),
+        np.flatnonzero(product.hits.any(axis=0)),
+    )
+    assert (
+        min(rows[0], columns[0]) < 12
+    )  # the field of view is a circle around every boresight: at most some pixels too wide
     assert product.hits.sum() == 61 * 20000
 
 
 def test_uniform_sky_returns_its_value_with_the_mean_beside_the_stream(bench):
     mean = SmoothField.constant(np.full(N_DET, 65.5), N)
     a = np.full((N_DET, N), 1e-6)
-    product = bench.run([BinMap()], bench.observation(N_DET, N), {"signal": a}, means={"signal": mean}).map
+    product = bench.run(
+        [BinMap()], bench.observation(N_DET, N), {"signal": a}, means={"signal": mean}
+    ).map
     hit = product.hits > 0
-    # float32 holds 1e-6 to 6e-14, the mean is a float64 spline (1e-14 of 65), the sums round to 2^-37
+    # float32 holds 1e-6 to 6e-14, the mean is a float64 spline (1e-14 of 65), the sums round to
+    # 2^-37
     assert np.abs(product.signal[hit] - 65.500001).max() < 2e-11
 
 
@@ -184,13 +221,18 @@ def test_noise_of_the_pixels(bench, weights, noise, scattered):
             o.focalplane.net = o.focalplane.net * np.linspace(0.5, 2.0, N_DET)
     sigma = many[0].focalplane.net[:, None] * 10.0
     drawn = {o.name: sigma * rng.standard_normal((N_DET, 30000)) for o in many}
-    product = bench.run([BinMap(pixel="4 arcsec", weights=weights, noise=noise)], many, {"signal": lambda o: drawn[o.name]}).map
+    product = bench.run(
+        [BinMap(pixel="4 arcsec", weights=weights, noise=noise)],
+        many,
+        {"signal": lambda o: drawn[o.name]},
+    ).map
     use = product.hits > 60
     n = int(use.sum())
     assert n > 1000
     ratio = (product.signal / product.noise)[use]
-    # variance of n unit normals: 1 +- sqrt(2 / n); scatter: the t-distribution with > 60 degrees widens it by < 4 %; with
-    # scattered NETs the estimate from the scatter is that of the mean NET only for uniform weights and many detectors
+    # variance of n unit normals: 1 +- sqrt(2 / n); scatter: the t-distribution with > 60 degrees
+    # widens it by < 4 %; with scattered NETs the estimate from the scatter is that of the mean NET
+    # only for uniform weights and many detectors
     if scattered and noise == "scatter":
         assert 0.8 < ratio.std() < 1.3
     else:
@@ -200,7 +242,9 @@ def test_noise_of_the_pixels(bench, weights, noise, scattered):
         / product.noise[use & np.isfinite(product.half_difference)]
     )
     if not (noise == "scatter" and scattered) and weights == "inverse_variance":
-        assert abs(half.var() - 1) < 4 * math.sqrt(2 / half.size) + (0.04 if noise == "scatter" else 0)
+        assert abs(half.var() - 1) < 4 * math.sqrt(2 / half.size) + (
+            0.04 if noise == "scatter" else 0
+        )
     if weights == "uniform":
         np.testing.assert_array_equal(product.weights, product.hits)
     elif noise == "net":
@@ -219,7 +263,9 @@ def test_half_difference_removes_the_sky(bench):
     assert alone.map.half_difference is None
     assert alone.tally["BinMap", "half-difference"].startswith("not made")
     assert (
-        bench.run([BinMap(half_difference=False)], many, {"signal": lambda o: sky_of(o, source(0, 0))}).map.half_difference
+        bench.run(
+            [BinMap(half_difference=False)], many, {"signal": lambda o: sky_of(o, source(0, 0))}
+        ).map.half_difference
         is None
     )
 
@@ -232,11 +278,21 @@ def test_identical_bits_for_blocks_threads_and_order(bench):
         rng = np.random.default_rng(1)
         drawn = {o.name: rng.standard_normal((37, 9001)) for o in many}
         operator = BinMap(half_difference=False, noise=scatter, width="4 arcmin")
-        return bench.run([operator], many[::order], {"signal": lambda o: drawn[o.name]}, threads=threads, memory=memory).map
+        return bench.run(
+            [operator],
+            many[::order],
+            {"signal": lambda o: drawn[o.name]},
+            threads=threads,
+            memory=memory,
+        ).map
 
     for scatter in ("net", "scatter"):
         first = run(1, 1 << 30, scatter=scatter)
-        for other in (run(3, 1 << 30, scatter=scatter), run(2, 8 << 20, scatter=scatter), run(1, 1 << 30, -1, scatter=scatter)):
+        for other in (
+            run(3, 1 << 30, scatter=scatter),
+            run(2, 8 << 20, scatter=scatter),
+            run(1, 1 << 30, -1, scatter=scatter),
+        ):
             for name in ("signal", "hits", "weights", "noise"):
                 np.testing.assert_array_equal(getattr(first, name), getattr(other, name))
 
@@ -251,28 +307,44 @@ def test_maps_are_linear_without_singular_modes(seed, a, b):
 
     def mapped(signal):
         return bench.run(
-            [HighpassFilter(), BinMap()], bench.observation(7, 3000), {"signal": signal}, precision="float64"
+            [HighpassFilter(), BinMap()],
+            bench.observation(7, 3000),
+            {"signal": signal},
+            precision="float64",
         ).map.signal
 
-    np.testing.assert_allclose(mapped(a * one + b * two), a * mapped(one) + b * mapped(two), rtol=0, atol=8 * STEP + 1e-11)
+    np.testing.assert_allclose(
+        mapped(a * one + b * two), a * mapped(one) + b * mapped(two), rtol=0, atol=8 * STEP + 1e-11
+    )
 
 
 def test_filtered_point_source_is_neither_shifted_nor_skewed_and_keeps_its_amplitude(bench):
-    """Zero phase, and no window: what the brick wall takes from a fast crossing is small and known."""
+    """Zero phase, and no window: what the brick wall takes from a fast crossing is small and
+    known.
+    """
     observation = bench.observation(61, 20000)
     signal = sky_of(observation, source(0, 0))
-    operators = [HighpassFilter(frequency="0.02 Hz"), BinMap(pixel="2 arcsec", width="121 arcsec", height="121 arcsec")]
+    operators = [
+        HighpassFilter(frequency="0.02 Hz"),
+        BinMap(pixel="2 arcsec", width="121 arcsec", height="121 arcsec"),
+    ]
     product = bench.run(operators, observation, {"signal": signal}, precision="float64").map
     plain = bench.run([operators[1]], observation, {"signal": signal}, precision="float64").map
     near = product.distance() < 6 * ARCSEC
     offset = np.nanmean((plain.signal - product.signal)[near])
     recovered = (product.signal + offset)[near]
-    assert abs(np.nansum(recovered * plain.signal[near]) / np.nansum(plain.signal[near] ** 2) - 1) < 0.01
+    assert (
+        abs(np.nansum(recovered * plain.signal[near]) / np.nansum(plain.signal[near] ** 2) - 1)
+        < 0.01
+    )
     y, x = np.indices(product.signal.shape)
     ok = near & np.isfinite(product.signal)
     weight, reference = (product.signal + offset)[ok], plain.signal[ok]
     for axis in (x[ok], y[ok]):
-        assert abs((weight * axis).sum() / weight.sum() - (reference * axis).sum() / reference.sum()) < 0.02
+        assert (
+            abs((weight * axis).sum() / weight.sum() - (reference * axis).sum() / reference.sum())
+            < 0.02
+        )
 
 
 @pytest.mark.parametrize("smooth", ["beam", "17 arcsec"])
@@ -281,7 +353,9 @@ def test_smoothing_is_normalized_local_and_states_its_noise(bench, smooth):
     rng = np.random.default_rng(2)
     sigma = many[0].focalplane.net[:, None] * 10.0
     drawn = {o.name: sigma * rng.standard_normal((N_DET, 30000)) for o in many}
-    product = bench.run([BinMap(smooth=smooth, pixel="3 arcsec")], many, {"signal": lambda o: drawn[o.name]}).map
+    product = bench.run(
+        [BinMap(smooth=smooth, pixel="3 arcsec")], many, {"signal": lambda o: drawn[o.name]}
+    ).map
     fwhm = 8.5 * ARCSEC if smooth == "beam" else 17 * ARCSEC
     assert abs(product.smoothed_by - fwhm) < 1e-12
     assert (np.isnan(product.signal) == (product.hits == 0)).all()
@@ -291,12 +365,16 @@ def test_smoothing_is_normalized_local_and_states_its_noise(bench, smooth):
     # independent beams: area over 2 pi sigma^2 * 2 (the noise's own correlation area, 4 pi sigma^2)
     independent = use.sum() * product.pixel**2 / (4 * np.pi * (fwhm / 2.3548) ** 2)
     assert abs(ratio.var() - 1) < 4 * math.sqrt(2 / independent)
-    flat = bench.run([BinMap(smooth=smooth, pixel="3 arcsec")], many, {"signal": np.ones((N_DET, 30000))}).map
+    flat = bench.run(
+        [BinMap(smooth=smooth, pixel="3 arcsec")], many, {"signal": np.ones((N_DET, 30000))}
+    ).map
     np.testing.assert_allclose(flat.signal[flat.hits > 0], 1.0, rtol=1e-12)
 
 
 def test_rms_in_the_central_arcmin(bench):
-    product = bench.run([BinMap()], bench.observation(N_DET, N), {"signal": np.full((N_DET, N), -3.0)}).map
+    product = bench.run(
+        [BinMap()], bench.observation(N_DET, N), {"signal": np.full((N_DET, N), -3.0)}
+    ).map
     assert abs(product.rms() - 3) < 1e-9
     product.signal[product.distance() > 0.5 * ARCMIN] = 1e9
     assert abs(product.rms() - 3) < 1e-9
@@ -311,16 +389,26 @@ def test_rms_in_the_central_arcmin(bench):
 def test_healpix_map(bench, ordering, frame):
     observation = bench.observation(N_DET, N, radius=600 * ARCSEC)
     a = np.arange(N_DET * N, dtype=float).reshape(N_DET, N) % 11
-    product = bench.run([BinMap(nside=1024, ordering=ordering, frame=frame)], observation, {"signal": a}, precision="float64").map
+    product = bench.run(
+        [BinMap(nside=1024, ordering=ordering, frame=frame)],
+        observation,
+        {"signal": a},
+        precision="float64",
+    ).map
     where = (
-        directions(observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta) @ frame_rotation(frame).T
+        directions(
+            observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta
+        )
+        @ frame_rotation(frame).T
     )
     pixel = healpy.vec2pix(1024, *np.moveaxis(where, 2, 0), nest=ordering == "nested").ravel()
     hits = np.bincount(pixel, minlength=12 * 1024**2)
     np.testing.assert_array_equal(product.pixels, np.flatnonzero(hits))
     np.testing.assert_array_equal(product.hits, hits[product.pixels])
     total = np.bincount(pixel, a.ravel(), minlength=12 * 1024**2)
-    np.testing.assert_allclose(product.signal, (total / np.maximum(hits, 1))[product.pixels], rtol=1e-12)
+    np.testing.assert_allclose(
+        product.signal, (total / np.maximum(hits, 1))[product.pixels], rtol=1e-12
+    )
     full = product.healpix_full
     assert (full != healpy.UNSEEN).sum() == len(product.pixels)
     assert math.isfinite(product.rms(5 * ARCMIN))
@@ -328,7 +416,9 @@ def test_healpix_map(bench, ordering, frame):
 
 def test_healpix_smoothing(bench):
     observation = bench.observation(N_DET, N, radius=2400 * ARCSEC)
-    product = bench.run([BinMap(nside=256, smooth="40 arcmin")], observation, {"signal": np.ones((N_DET, N))}).map
+    product = bench.run(
+        [BinMap(nside=256, smooth="40 arcmin")], observation, {"signal": np.ones((N_DET, N))}
+    ).map
     np.testing.assert_allclose(product.signal, 1.0, rtol=1e-9)
 
 
@@ -338,7 +428,11 @@ def test_far_too_large_samples_and_overflow_are_refused(bench):
     with pytest.raises(PipelineError, match="too large"):
         bench.run([BinMap()], bench.observation(N_DET, N), {"signal": a})
     with pytest.raises(PipelineError, match="overflow"):
-        bench.run([BinMap(pixel="1 deg", width="1 deg")], bench.observation(N_DET, N), {"signal": np.full((N_DET, N), 1.2e4)})
+        bench.run(
+            [BinMap(pixel="1 deg", width="1 deg")],
+            bench.observation(N_DET, N),
+            {"signal": np.full((N_DET, N), 1.2e4)},
+        )
 
 
 def test_zero_net_needs_uniform_weights(bench):
@@ -346,7 +440,12 @@ def test_zero_net_needs_uniform_weights(bench):
     observation.focalplane.net[3] = 0
     with pytest.raises(PipelineError, match="NET 0"):
         bench.run([BinMap()], observation, {"signal": np.ones((7, 300))})
-    assert bench.run([BinMap(weights="uniform")], observation, {"signal": np.ones((7, 300))}).map.hits.sum() == 2100
+    assert (
+        bench.run(
+            [BinMap(weights="uniform")], observation, {"signal": np.ones((7, 300))}
+        ).map.hits.sum()
+        == 2100
+    )
     observation.detector_flags[3] = INVALID  # then it does not matter
     found = bench.run([BinMap()], observation, {"signal": np.ones((7, 300))})
     assert found.map.hits.sum() == 1800
@@ -357,18 +456,27 @@ def test_two_maps_need_two_names(bench):
     signal = {"signal": np.ones((7, 300))}
     with pytest.raises(PipelineError, match="two steps make the product"):
         bench.run([BinMap(), BinMap(pixel="4 arcsec")], bench.observation(7, 300), signal)
-    products = bench.run([BinMap(), BinMap(nside=512, product="sphere")], bench.observation(7, 300), signal).data.products
+    products = bench.run(
+        [BinMap(), BinMap(nside=512, product="sphere")], bench.observation(7, 300), signal
+    ).data.products
     assert sorted(products) == ["map", "sphere"]
 
 
 @pytest.mark.parametrize(
     "bad",
     [
-        {"pixel": "0 arcsec"}, {"nside": 100}, {"nside": 64, "pixel": "2 arcsec"}, {"ordering": "nested"}, {"projection": "SIN"},
-        {"centre": "az 180 deg el 60 deg"}, {"smooth": "-1 arcsec"}, {"smooth": "0 arcsec"},
-        {"weights": "best"}, {"product": "a/b"},
+        {"pixel": "0 arcsec"},
+        {"nside": 100},
+        {"nside": 64, "pixel": "2 arcsec"},
+        {"ordering": "nested"},
+        {"projection": "SIN"},
+        {"centre": "az 180 deg el 60 deg"},
+        {"smooth": "-1 arcsec"},
+        {"smooth": "0 arcsec"},
+        {"weights": "best"},
+        {"product": "a/b"},
     ],
-)  # fmt: skip
+)
 def test_bad_parameters(bad):
     with pytest.raises(ValueError):
         BinMap(**bad)
@@ -376,11 +484,15 @@ def test_bad_parameters(bad):
 
 def test_a_map_of_too_many_pixels_is_refused(bench):
     with pytest.raises(InputError, match="too large"):
-        bench.run([BinMap(pixel="0.001 arcsec")], bench.observation(7, 300), {"signal": np.ones((7, 300))})
+        bench.run(
+            [BinMap(pixel="0.001 arcsec")], bench.observation(7, 300), {"signal": np.ones((7, 300))}
+        )
 
 
 @pytest.mark.parametrize("projection", ["TAN", "CAR"])
-@pytest.mark.parametrize("size", [{"pixel": "0.001 arcsec"}, {"pixel": "0.1 arcsec", "width": "2 deg"}])
+@pytest.mark.parametrize(
+    "size", [{"pixel": "0.001 arcsec"}, {"pixel": "0.1 arcsec", "width": "2 deg"}]
+)
 def test_the_check_refuses_a_map_of_too_many_pixels(bench, projection, size):
     data = zonda.Data(None, [bench.observation(7, 300)])
     with pytest.raises(InputError, match="too large"):
@@ -402,11 +514,19 @@ def test_one_detector_one_sample(bench):
 
 def test_noise_that_is_not_known_is_counted(bench):
     signal = {"signal": np.random.default_rng(3).standard_normal((N_DET, N))}
-    run = bench.run([BinMap(noise="scatter", pixel="1 arcsec", smooth="5 arcsec")], bench.observation(N_DET, N), signal)
+    run = bench.run(
+        [BinMap(noise="scatter", pixel="1 arcsec", smooth="5 arcsec")],
+        bench.observation(N_DET, N),
+        signal,
+    )
     alone = int((run.map.hits == 1).sum())
     assert alone > 10
-    assert run.tally["BinMap", "pixels with one sample, whose scatter is unknown: noise NaN"] == str(alone)
-    assert run.tally["BinMap", "of them left out of the smoothed noise, which is too low around them"] == str(alone)
+    assert run.tally[
+        "BinMap", "pixels with one sample, whose scatter is unknown: noise NaN"
+    ] == str(alone)
+    assert run.tally[
+        "BinMap", "of them left out of the smoothed noise, which is too low around them"
+    ] == str(alone)
     observation = bench.observation(7, 300)
     observation.focalplane.net[:] = 0
     run = bench.run([BinMap()], observation, {"signal": np.ones((7, 300))})
@@ -415,41 +535,66 @@ def test_noise_that_is_not_known_is_counted(bench):
 
 def test_equal_samples_have_no_scatter_and_are_counted(bench):
     """A constant signal: what is left of its squares is rounding, of either sign."""
-    run = bench.run([BinMap(pixel="4 arcsec", noise="scatter")], bench.observation(7, 3000), {"signal": np.full((7, 3000), 0.3)})
+    run = bench.run(
+        [BinMap(pixel="4 arcsec", noise="scatter")],
+        bench.observation(7, 3000),
+        {"signal": np.full((7, 3000), 0.3)},
+    )
     several = run.map.hits > 1
-    counted = int(run.tally["BinMap", "pixels whose samples scatter by less than rounding: noise 0"])
+    counted = int(
+        run.tally["BinMap", "pixels whose samples scatter by less than rounding: noise 0"]
+    )
     assert counted == np.count_nonzero(run.map.noise[several] == 0) > 0
     assert np.isfinite(run.map.noise[several]).all()
     assert run.map.noise[several].max() < 1e-6
     rng = np.random.default_rng(1).normal(0, 1e-3, (7, 3000))
-    run = bench.run([BinMap(pixel="4 arcsec", noise="scatter")], bench.observation(7, 3000), {"signal": rng})
+    run = bench.run(
+        [BinMap(pixel="4 arcsec", noise="scatter")], bench.observation(7, 3000), {"signal": rng}
+    )
     assert run.tally["BinMap", "pixels whose samples scatter by less than rounding: noise 0"] == "0"
 
 
 @pytest.mark.parametrize("net", ["1e-3 uK s(1/2)", "1 uK s(1/2)", "5 K s(1/2)", "100 K s(1/2)"])
 def test_noise_far_from_the_instruments(net):
-    """Sums are laid out for the level that the pipeline states, be it 60 000 times the instrument's or a millionth of it.
+    """Sums are laid out for the level that the pipeline states, be it 60 000 times the instrument's
+    or a millionth of it.
 
-    White noise of P pixels with weights 1 / variance: sum w m^2 = P (1 +- sqrt(2 / P)); four standard errors are allowed.
+    White noise of P pixels with weights 1 / variance: sum w m^2 = P (1 +- sqrt(2 / P)); four
+    standard errors are allowed.
     """
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1)
-    steps = [zonda.PointingDaisy(scan_duration="5 s"), zonda.WhiteNoise(net=net), zonda.Efficiency(), BinMap(pixel="8 arcsec")]
+    scene = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d", seed=1
+    )
+    steps = [
+        zonda.PointingDaisy(scan_duration="5 s"),
+        zonda.WhiteNoise(net=net),
+        zonda.Efficiency(),
+        BinMap(pixel="8 arcsec"),
+    ]
     found = zonda.Pipeline(steps).run(scene).products["map"]
     seen = found.hits > 0
     pixels = np.count_nonzero(seen)
-    assert np.sum(found.weights[seen] * found.signal[seen] ** 2) == pytest.approx(pixels, abs=4 * np.sqrt(2 * pixels))
-    assert found.weights.sum() * scene.instrument.sample_rate == pytest.approx(found.hits.sum() / steps[1].net ** 2, rel=1e-6)
+    assert np.sum(found.weights[seen] * found.signal[seen] ** 2) == pytest.approx(
+        pixels, abs=4 * np.sqrt(2 * pixels)
+    )
+    assert found.weights.sum() * scene.instrument.sample_rate == pytest.approx(
+        found.hits.sum() / steps[1].net ** 2, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("how", [{"pixel": "2 arcsec"}, {"pixel": "5 arcsec"}, {"nside": 8192}])
 @pytest.mark.parametrize("rate", [100.0, 37.0])
 def test_seconds_per_beam_add_up_to_what_the_detectors_observed(bench, how, rate):
-    """Summed over pixels, seconds per beam times pixels per beam are the detector-seconds of the scans, at the scans' own rate
-    (the camera's is 100 Hz), whatever the pixels."""
+    """Summed over pixels, seconds per beam times pixels per beam are the detector-seconds of the
+    scans, at the scans' own rate (the camera's is 100 Hz), whatever the pixels."""
     scans = [bench.observation(7, 1500, rate=rate, index=k) for k in range(2)]
     scans[0].flags[:100] = 1  # what is not used is no integration time
     product = bench.run([BinMap(**how)], scans, {"signal": np.zeros((7, 1500))}).map
-    area = healpy.nside2pixarea(how["nside"]) if "nside" in how else float(how["pixel"].split()[0]) ** 2 * ARCSEC**2
+    area = (
+        healpy.nside2pixarea(how["nside"])
+        if "nside" in how
+        else float(how["pixel"].split()[0]) ** 2 * ARCSEC**2
+    )
     beam = np.pi / (4 * np.log(2)) * (8.5 * ARCSEC) ** 2
     seconds = (product.hits * product.seconds_per_beam()).sum() * area / beam
     assert seconds == pytest.approx(7 * (2 * 1500 - 100) / rate, rel=1e-12)
@@ -457,32 +602,60 @@ def test_seconds_per_beam_add_up_to_what_the_detectors_observed(bench, how, rate
 
 def test_seconds_per_beam_of_smoothed_maps_are_those_of_the_telescopes_beam(bench):
     plain, smooth = (
-        bench.run([BinMap(**how)], bench.observation(), {"signal": np.zeros((7, 3000))}).map for how in ({}, {"smooth": "beam"})
+        bench.run([BinMap(**how)], bench.observation(), {"signal": np.zeros((7, 3000))}).map
+        for how in ({}, {"smooth": "beam"})
     )
     assert smooth.seconds_per_beam() == plain.seconds_per_beam()
 
 
 def test_seconds_per_beam_are_not_known_where_scans_have_different_rates(bench):
     scans = [bench.observation(7, 1500, rate=r, index=k) for k, r in enumerate((100.0, 50.0))]
-    assert bench.run([BinMap()], scans, {"signal": np.zeros((7, 1500))}).map.seconds_per_beam() is None
+    assert (
+        bench.run([BinMap()], scans, {"signal": np.zeros((7, 1500))}).map.seconds_per_beam() is None
+    )
 
 
 def test_pixels_far_from_the_centre_are_smaller_and_hold_less_of_a_beam():
-    """A pixel of a tangent plane at the distance c from the centre covers cos(c)^3 of the middle one's part of the sky."""
+    """A pixel of a tangent plane at the distance c from the centre covers cos(c)^3 of the middle
+    one's part of the sky.
+    """
     from astropy.wcs import WCS
 
     from zonda.core.maps.map_product import MapProduct
 
     wcs = WCS(naxis=2)
-    wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [75.0, 20.0], [21, 21], [-1.0, 1.0]
+    wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = (
+        ["RA---TAN", "DEC--TAN"],
+        [75.0, 20.0],
+        [21, 21],
+        [-1.0, 1.0],
+    )
     none = np.zeros((41, 41))
     product = MapProduct(
-        none, none.astype(int), none, none, None, wcs.to_header(), centre=(np.radians(75.0), np.radians(20.0)),
-        pixel=np.radians(1.0), fwhm=np.radians(2.0), sample_rate=10.0,
-    )  # fmt: skip
+        none,
+        none.astype(int),
+        none,
+        none,
+        None,
+        wcs.to_header(),
+        centre=(np.radians(75.0), np.radians(20.0)),
+        pixel=np.radians(1.0),
+        fwhm=np.radians(2.0),
+        sample_rate=10.0,
+    )
     x, y = np.array([[20, 40, 0, 33], [20, 20, 5, 40]], float)
-    corners = [np.radians(wcs.wcs_pix2world(x + a, y + b, 0)) for a, b in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
-    d = [np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]) for lon, lat in corners]
-    area = np.linalg.norm(np.cross(d[2] - d[0], d[3] - d[1], axis=0), axis=0) / 2  # of the flat quadrilateral: 1e-4 less
+    corners = [
+        np.radians(wcs.wcs_pix2world(x + a, y + b, 0))
+        for a, b in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
+    ]
+    d = [
+        np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+        for lon, lat in corners
+    ]
+    area = (
+        np.linalg.norm(np.cross(d[2] - d[0], d[3] - d[1], axis=0), axis=0) / 2
+    )  # of the flat quadrilateral: 1e-4 less
     beam = np.pi / (4 * np.log(2)) * np.radians(2.0) ** 2
-    np.testing.assert_allclose(product.seconds_per_beam()[y.astype(int), x.astype(int)], beam / area / 10.0, rtol=1e-3)
+    np.testing.assert_allclose(
+        product.seconds_per_beam()[y.astype(int), x.astype(int)], beam / area / 10.0, rtol=1e-3
+    )

@@ -1,4 +1,6 @@
-"""How scans cross in pixels, and the hits of each scan: known geometries, TOAST's arithmetic, exact sums, files."""
+"""How scans cross in pixels, and the hits of each scan: known geometries, TOAST's arithmetic, exact
+sums, files.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ def along(bench, angle, index=0, n_det=7, n=2001):
     observation = bench.observation(n_det, n, index=index)
     s = 90 * bench.ARCSEC * np.sin(np.linspace(0, 20, n))
     lat = bench.CENTRE[1] + s * math.sin(angle)
-    observation.boresight_radec = bench.quaternions(bench.CENTRE[0] + s * math.cos(angle) / np.cos(lat), lat, 0.3)
+    observation.boresight_radec = bench.quaternions(
+        bench.CENTRE[0] + s * math.cos(angle) / np.cos(lat), lat, 0.3
+    )
     return observation
 
 
@@ -47,7 +51,9 @@ def test_one_direction_is_one(bench, grid, angle):
     assert product.crosslinking[hit].min() > 1 - 1e-6
     assert np.isnan(product.crosslinking[~hit]).all()
     mean = product.directions[:, hit]
-    np.testing.assert_allclose(mean, np.broadcast_to([[math.cos(2 * angle)], [math.sin(2 * angle)]], mean.shape), atol=1e-3)
+    np.testing.assert_allclose(
+        mean, np.broadcast_to([[math.cos(2 * angle)], [math.sin(2 * angle)]], mean.shape), atol=1e-3
+    )
 
 
 @pytest.mark.parametrize("grid", GRIDS)
@@ -62,43 +68,73 @@ def test_two_directions_that_enclose_an_angle(bench, grid, between):
     expected = abs(a + b * np.exp(2j * between))[crossed] / (a + b)[crossed]
     np.testing.assert_allclose(product.crosslinking[crossed], expected, atol=1e-3)
     alike = a[crossed] == b[crossed]
-    np.testing.assert_allclose(product.crosslinking[crossed][alike], abs(math.cos(between)), atol=1e-3)
+    np.testing.assert_allclose(
+        product.crosslinking[crossed][alike], abs(math.cos(between)), atol=1e-3
+    )
 
 
 def test_eight_directions_evenly_around_are_zero(bench):
-    product = made(bench, [along(bench, k * math.pi / 8, k) for k in range(8)], pixel="20 arcsec", width="20 arcsec")
+    product = made(
+        bench,
+        [along(bench, k * math.pi / 8, k) for k in range(8)],
+        pixel="20 arcsec",
+        width="20 arcsec",
+    )
     counts = np.array([product.hits_of(k)[0, 0] for k in range(8)])
-    left = abs((counts * np.exp(2j * np.pi * np.arange(8) / 8)).sum()) / counts.sum()  # numbers differ a little
+    left = (
+        abs((counts * np.exp(2j * np.pi * np.arange(8) / 8)).sum()) / counts.sum()
+    )  # numbers differ a little
     assert left < 0.1
     assert product.crosslinking[0, 0] == pytest.approx(left, abs=1e-3)
 
 
 def test_daisy_crosses_evenly_in_the_middle_and_a_line_does_not():
-    """95 passes (speed times time over pi radius) in directions that are evenly spread but for the last petals: far below
-    1 / sqrt(95), which random directions leave. A line across it: 1 but for the turning of the field in 20 s."""
+    """95 passes (speed times time over pi radius) in directions that are evenly spread but for the
+    last petals: far below 1 / sqrt(95), which random directions leave. A line across it: 1 but for
+    the turning of the field in 20 s."""
     camera = zonda.Instrument(
-        name="c", telescope=zonda.Telescope(name="dish", diameter="100 m"), detectors=1, field_of_view="1 arcsec",
+        name="c",
+        telescope=zonda.Telescope(name="dish", diameter="100 m"),
+        detectors=1,
+        field_of_view="1 arcsec",
         fwhm="9 arcsec",
-        band=zonda.Band(name="b", low="80 GHz", high="100 GHz"), net="1 mK s(1/2)", main_beam_efficiency=0.3,
-        illumination_efficiency=0.8, sample_rate="50 Hz",
-    )  # fmt: skip
-    scene = zonda.Scene(site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=3)
+        band=zonda.Band(name="b", low="80 GHz", high="100 GHz"),
+        net="1 mK s(1/2)",
+        main_beam_efficiency=0.3,
+        illumination_efficiency=0.8,
+        sample_rate="50 Hz",
+    )
+    scene = zonda.Scene(
+        site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=3
+    )
     found = {}
-    daisy = zonda.PointingDaisy(scan_duration="10 min", offsets="none", radius="2 arcmin", speed="60 arcsec/s")
+    daisy = zonda.PointingDaisy(
+        scan_duration="10 min", offsets="none", radius="2 arcmin", speed="60 arcsec/s"
+    )
     for pointing in (daisy, zonda.PointingBackAndForth(scan_duration="20 s")):
-        steps = [pointing, zonda.BinMap(pixel="40 arcsec", width="2 arcmin", contents="hits", crosslinking=True)]
+        steps = [
+            pointing,
+            zonda.BinMap(pixel="40 arcsec", width="2 arcmin", contents="hits", crosslinking=True),
+        ]
         found[type(pointing).__name__] = zonda.Pipeline(steps).run(scene)["map"].crosslinking
     assert found["PointingDaisy"][1, 1] < 0.3 / math.sqrt(95)
     assert np.nanmin(found["PointingBackAndForth"]) > 0.99
 
 
 def mount(bench, azimuth, start, index):
-    """A scan of the mount to and fro at `ELEVATION` about ``azimuth`` [rad]; ``start``: local sidereal time [rad]."""
+    """A scan of the mount to and fro at `ELEVATION` about ``azimuth`` [rad]; ``start``: local
+    sidereal time [rad].
+    """
     observation = bench.observation(1, 6001, index=index)
     az = azimuth + math.radians(0.5) * np.sin(2 * np.pi * observation.seconds / 4.0)
-    dec = np.arcsin(math.sin(LATITUDE) * math.sin(ELEVATION) + math.cos(LATITUDE) * math.cos(ELEVATION) * np.cos(az))
+    dec = np.arcsin(
+        math.sin(LATITUDE) * math.sin(ELEVATION)
+        + math.cos(LATITUDE) * math.cos(ELEVATION) * np.cos(az)
+    )
     east = -np.sin(az) * math.cos(ELEVATION)
-    north = math.cos(LATITUDE) * math.sin(ELEVATION) - math.sin(LATITUDE) * math.cos(ELEVATION) * np.cos(az)
+    north = math.cos(LATITUDE) * math.sin(ELEVATION) - math.sin(LATITUDE) * math.cos(
+        ELEVATION
+    ) * np.cos(az)
     hour = np.arctan2(east, north)
     lst = start + 7.292e-5 * observation.seconds
     observation.boresight_radec = bench.quaternions(lst - hour, dec, 0.0)
@@ -107,10 +143,11 @@ def mount(bench, azimuth, start, index):
 
 @pytest.mark.parametrize("azimuth", [60.0, 100.0, 130.0])
 def test_rising_and_setting_at_one_elevation(bench, azimuth):
-    """The horizon is at the parallactic angle q from the parallel, -q when it rises and q when it sets: |cos 2q|.
+    """The horizon is at the parallactic angle q from the parallel, -q when it rises and q when it
+    sets: |cos 2q|.
 
-    15 arcsec/s of sky beside 0.5 deg/s of scan change either direction by some 0.01 rad, to and fro alike but for second order;
-    within 6 arcmin q changes by less than 3e-3.
+    15 arcsec/s of sky beside 0.5 deg/s of scan change either direction by some 0.01 rad, to and fro
+    alike but for second order; within 6 arcmin q changes by less than 3e-3.
     """
     east, hour, dec = mount(bench, math.radians(azimuth), 0.0, 0)
     _, late, _ = mount(bench, math.radians(-azimuth), 0.0, 1)
@@ -118,29 +155,44 @@ def test_rising_and_setting_at_one_elevation(bench, azimuth):
     for observation in (east, west):
         observation.centre = (-hour % (2 * math.pi), dec)
     product = made(bench, [east, west], pixel="3 arcmin")
-    both = (product.hits_of(0) > 0) & (product.hits_of(1) > 0) & (product.distance() < math.radians(0.1))
+    both = (
+        (product.hits_of(0) > 0)
+        & (product.hits_of(1) > 0)
+        & (product.distance() < math.radians(0.1))
+    )
     assert both.sum() >= 2
     a, b = product.hits_of(0)[both], product.hits_of(1)[both]
     q = math.asin(math.sin(math.radians(azimuth)) * math.cos(LATITUDE) / math.cos(dec))
-    q = math.pi - q if math.sin(LATITUDE) < math.sin(dec) * math.sin(ELEVATION) and dec < LATITUDE else q
+    q = (
+        math.pi - q
+        if math.sin(LATITUDE) < math.sin(dec) * math.sin(ELEVATION) and dec < LATITUDE
+        else q
+    )
     expected = abs(a * np.exp(2j * q) + b * np.exp(-2j * q)) / (a + b)
     np.testing.assert_allclose(product.crosslinking[both], expected, atol=0.012)
 
 
 def toast_directions(observation):
-    """(n_det, n) angle of motion as TOAST's `CrossLinking` finds it: arctan of half differences in latitude and longitude."""
-    d = directions(observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta)
+    """(n_det, n) angle of motion as TOAST's `CrossLinking` finds it: arctan of half differences in
+    latitude and longitude.
+    """
+    d = directions(
+        observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta
+    )
     lon, lat = np.unwrap(np.arctan2(d[..., 1], d[..., 0])), np.arcsin(d[..., 2])
     return np.arctan2(np.gradient(lat, axis=-1), np.gradient(lon, axis=-1) * np.cos(lat))
 
 
 def test_toasts_angles_of_detectors_that_also_turn(bench):
-    """One pixel for all: means of cosine and sine. Angles instead of vectors: second order in 1e-5 rad a sample."""
+    """One pixel for all: means of cosine and sine. Angles instead of vectors: second order in 1e-5
+    rad a sample.
+    """
     observation = bench.observation(19, 3000)
     observation.boresight_radec = bench.quaternions(
-        bench.CENTRE[0] + 3e-4 * np.sin(observation.seconds), bench.CENTRE[1] + 2e-4 * np.sin(1.7 * observation.seconds),
+        bench.CENTRE[0] + 3e-4 * np.sin(observation.seconds),
+        bench.CENTRE[1] + 2e-4 * np.sin(1.7 * observation.seconds),
         0.3 * observation.seconds,
-    )  # fmt: skip
+    )
     product = made(bench, observation, pixel="20 arcmin", width="20 arcmin")
     angle = toast_directions(observation)
     expected = [np.cos(2 * angle).mean(), np.sin(2 * angle).mean()]
@@ -159,7 +211,9 @@ def test_frames_turn_the_angle_and_not_its_size(bench):
 
 
 def test_detectors_that_do_not_move_and_samples_that_do_not_count(bench):
-    """A stare on the sky has no direction; flagged and not finite samples and dead detectors are left out."""
+    """A stare on the sky has no direction; flagged and not finite samples and dead detectors are
+    left out.
+    """
     still = along(bench, 0.3)
     still.boresight_radec[:] = still.boresight_radec[0]
     product = made(bench, still)
@@ -177,7 +231,9 @@ def test_detectors_that_do_not_move_and_samples_that_do_not_count(bench):
     spoiled = zeros(observation)
     spoiled[:, half - 1 :] = np.nan
     observation.flags[:] = 0
-    product = bench.run([BinMap(pixel="10 arcsec", crosslinking=True)], observation, {"signal": spoiled}).map
+    product = bench.run(
+        [BinMap(pixel="10 arcsec", crosslinking=True)], observation, {"signal": spoiled}
+    ).map
     assert product.crosslinking[product.hits > 0].min() > 1 - 1e-6
 
 
@@ -191,10 +247,12 @@ def test_the_map_keeps_its_bits_and_no_signal_is_needed(bench, grid):
     plain, more, threads, small = (
         bench.run([BinMap(**grid, **options)], many, {"signal": noise}, **how).map
         for options, how in (
-            ({}, {}), ({"crosslinking": True, "scan_hits": True}, {}), ({"crosslinking": True}, {"threads": 2}),
+            ({}, {}),
+            ({"crosslinking": True, "scan_hits": True}, {}),
+            ({"crosslinking": True}, {"threads": 2}),
             ({"crosslinking": True}, {"memory": 6_000_000}),
         )
-    )  # fmt: skip
+    )
     for plane in ("signal", "hits", "weights", "noise", "half_difference"):
         np.testing.assert_array_equal(getattr(plain, plane), getattr(more, plane))
     assert plain.directions is None
@@ -247,7 +305,10 @@ def test_hits_of_scans_are_those_of_each_alone(bench, grid):
 
 
 def test_too_many_hits_of_scans_are_refused(bench, monkeypatch):
-    one, other = (coverage.Coverage(None, [np.arange(600, dtype=np.int32)], [np.ones(600, np.int32)]) for _ in range(2))
+    one, other = (
+        coverage.Coverage(None, [np.arange(600, dtype=np.int32)], [np.ones(600, np.int32)])
+        for _ in range(2)
+    )
     sums, more = MapSums(1000, ["signal"]), MapSums(1000, ["signal"])
     sums.coverage, more.coverage = one, other
     monkeypatch.setattr(coverage, "MOST_ENTRIES", 1000)

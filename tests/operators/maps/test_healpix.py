@@ -1,4 +1,6 @@
-"""HEALPix pixels are healpy's: both orderings, poles, all faces, outside the covered pixels, by pages and by search."""
+"""HEALPix pixels are healpy's: both orderings, poles, all faces, outside the covered pixels, by
+pages and by search.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +22,22 @@ MARGIN = 1e-12
 
 
 def coefficients(directions: Any) -> Any:
-    """(9, n) with which a detector at the boresight looks along ``directions`` (n, 3), others tilted off them."""
+    """(9, n) with which a detector at the boresight looks along ``directions`` (n, 3), others
+    tilted off them.
+    """
     towards = np.eye(3)[np.argmin(abs(directions), axis=1)]
     side = np.cross(directions, towards)
     side /= np.linalg.norm(side, axis=1, keepdims=True)
-    return np.ascontiguousarray(np.stack([side, np.cross(directions, side), directions], axis=2).reshape(-1, 9).T)
+    return np.ascontiguousarray(
+        np.stack([side, np.cross(directions, side), directions], axis=2).reshape(-1, 9).T
+    )
 
 
 def looked_at(h: Any, xi: Any, eta: Any) -> Any:
     """Unit vectors (n_det, n, 3)."""
-    v = np.stack([h[k] * xi[:, None] + h[k + 1] * eta[:, None] + h[k + 2] for k in (0, 3, 6)], axis=2)
+    v = np.stack(
+        [h[k] * xi[:, None] + h[k + 1] * eta[:, None] + h[k + 2] for k in (0, 3, 6)], axis=2
+    )
     return v / np.linalg.norm(v, axis=2, keepdims=True)
 
 
@@ -40,7 +48,8 @@ def well_inside(nside: int, where: Any, nest: bool) -> tuple[NDArray[np.int64], 
     same = np.ones(pixel.shape, bool)
     flat = np.hypot(where[..., 0], where[..., 1])
     for dz, dphi in ((MARGIN, 0), (-MARGIN, 0), (0, MARGIN), (0, -MARGIN)):
-        # a step in z beside a pole is one in the distance from it: sqrt(1 - z^2) - flat dz / z, which keeps its digits there
+        # a step in z beside a pole is one in the distance from it: sqrt(1 - z^2) - flat dz / z,
+        # which keeps its digits there
         r = np.maximum(flat - dz * np.abs(z), 0.0)
         moved = (r * np.cos(phi + dphi), r * np.sin(phi + dphi), z + dz * flat)
         same &= healpy.vec2pix(nside, *moved, nest=nest) == pixel
@@ -52,13 +61,21 @@ def well_inside(nside: int, where: Any, nest: bool) -> tuple[NDArray[np.int64], 
 def test_pixels_are_those_of_healpy(order: int, nest: bool, seed: int) -> None:
     nside, random = 1 << order, np.random.default_rng(seed)
     anywhere = random.normal(size=(300, 3))
-    poles = random.normal(size=(300, 3)) * [1e-3, 1e-3, 1] * 10.0 ** random.uniform(-6, 0, (300, 1)) + [0, 0, 1e-4]
+    poles = random.normal(size=(300, 3)) * [1e-3, 1e-3, 1] * 10.0 ** random.uniform(
+        -6, 0, (300, 1)
+    ) + [0, 0, 1e-4]
     between = random.normal(size=(300, 3))  # |z| = 2/3 within 1e-3
-    between[:, 2] = np.sign(between[:, 2]) * np.hypot(between[:, 0], between[:, 1]) * 2 / math.sqrt(5)
+    between[:, 2] = (
+        np.sign(between[:, 2]) * np.hypot(between[:, 0], between[:, 1]) * 2 / math.sqrt(5)
+    )
     between[:, 2] *= 1 + random.normal(size=300) * 1e-3
     directions = np.concatenate([anywhere, poles, between])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    h, xi, eta = coefficients(directions), random.uniform(-0.1, 0.1, 3), random.uniform(-0.1, 0.1, 3)
+    h, xi, eta = (
+        coefficients(directions),
+        random.uniform(-0.1, 0.1, 3),
+        random.uniform(-0.1, 0.1, 3),
+    )
     xi[0] = eta[0] = 0.0
     expected, inside = well_inside(nside, looked_at(h, xi, eta), nest)
     assert inside.mean() > 0.99
@@ -106,5 +123,8 @@ def test_no_pixel_is_covered_and_pieces_of_a_scan() -> None:
 @given(st.lists(st.lists(st.integers(0, 3000), max_size=30), max_size=4), st.integers(1, 10**9))
 def test_a_footprint_is_all_pixels_of_its_discs(pieces, spread):
     """Whether they are marked in a range or sorted."""
-    discs = [np.array([5 * spread], np.int64), *(spread * np.array(piece, np.int64) for piece in pieces)]
+    discs = [
+        np.array([5 * spread], np.int64),
+        *(spread * np.array(piece, np.int64) for piece in pieces),
+    ]
     np.testing.assert_array_equal(_union(discs), np.unique(np.concatenate(discs)))

@@ -1,4 +1,6 @@
-"""Halves of a map by detectors, time and direction: what is left of what, and sums that add up whatever is combined."""
+"""Halves of a map by detectors, time and direction: what is left of what, and sums that add up
+whatever is combined.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ SPLITS = ["detectors", "halves", "directions", "radii"]
 
 def noise(observation, seed=2):
     rms = observation.focalplane.net[:, None] * math.sqrt(observation.sample_rate)
-    return rms * np.random.default_rng(seed).standard_normal((observation.n_detectors, observation.n_samples))
+    return rms * np.random.default_rng(seed).standard_normal(
+        (observation.n_detectors, observation.n_samples)
+    )
 
 
 @pytest.mark.parametrize("split", ["scans", *SPLITS])
@@ -44,7 +48,9 @@ def test_the_map_itself_keeps_its_bits(bench, split):
         steps = [BinMap(pixel="6 arcsec", half_difference=choice, width="1.5 arcmin")]
         maps[choice] = bench.run(steps, many, {"signal": lambda o, x=x: x[o.name]})
     for plane in ("signal", "hits", "weights", "noise"):
-        np.testing.assert_array_equal(getattr(maps[split].map, plane), getattr(maps[True].map, plane))
+        np.testing.assert_array_equal(
+            getattr(maps[split].map, plane), getattr(maps[True].map, plane)
+        )
     said = {key: value for key, value in maps[split].tally.items() if "samples" in key[1]}
     assert said == {key: value for key, value in maps[True].tally.items() if "samples" in key[1]}
     assert maps[split].tally["BinMap", "half-difference of"] == DIFFERENCES[split]
@@ -52,11 +58,19 @@ def test_the_map_itself_keeps_its_bits(bench, split):
 
 @pytest.mark.parametrize("split", SPLITS)
 def test_of_one_scan_its_variance_is_that_of_the_map(bench, split):
-    """The variance of (m_1 - m_2) sqrt(w_1 w_2) / (w_1 + w_2) is 1 / (w_1 + w_2): four standard errors of n unit normals."""
+    """The variance of (m_1 - m_2) sqrt(w_1 w_2) / (w_1 + w_2) is 1 / (w_1 + w_2): four standard
+    errors of n unit normals.
+    """
     observation = bench.observation(N_DET, N)
     t = np.arange(N) / observation.sample_rate
-    observation.boresight_azel = bench.quaternions(-1.0 - 3e-4 * np.sin(2 * np.pi * t / 9.1), 0.9, 0.0)
-    product = bench.run([BinMap(pixel="6 arcsec", half_difference=split)], observation, {"signal": noise(observation)}).map
+    observation.boresight_azel = bench.quaternions(
+        -1.0 - 3e-4 * np.sin(2 * np.pi * t / 9.1), 0.9, 0.0
+    )
+    product = bench.run(
+        [BinMap(pixel="6 arcsec", half_difference=split)],
+        observation,
+        {"signal": noise(observation)},
+    ).map
     use = np.isfinite(product.half_difference) & (product.hits > 30)
     n = int(use.sum())
     assert n > 300
@@ -65,7 +79,9 @@ def test_of_one_scan_its_variance_is_that_of_the_map(bench, split):
 
 
 def test_each_shows_what_differs_between_its_halves(bench):
-    """A level of the odd detectors, of the second halves, of falling azimuth: each is in one difference and in no other."""
+    """A level of the odd detectors, of the second halves, of falling azimuth: each is in one
+    difference and in no other.
+    """
     observation = bench.observation(N_DET, N)
     t = np.arange(N) / observation.sample_rate
     lon = -1.0 - 3e-4 * np.sin(2 * np.pi * t / 9.1)
@@ -86,7 +102,9 @@ def test_each_shows_what_differs_between_its_halves(bench):
         for split in SPLITS:
             again = bench.observation(N_DET, N)
             again.boresight_azel = observation.boresight_azel
-            product = bench.run([BinMap(pixel="12 arcsec", half_difference=split)], again, {"signal": x - 0.5}).map
+            product = bench.run(
+                [BinMap(pixel="12 arcsec", half_difference=split)], again, {"signal": x - 0.5}
+            ).map
             half, w = product.half_difference, product.hits > 200
             use = w & np.isfinite(half)
             assert use.sum() > 50
@@ -111,7 +129,9 @@ def test_sums_of_parts_are_those_of_all(bench, split):
 
     def sums(indices):
         many = [bench.observation(N_DET, 2000, index=i) for i in indices]
-        step = Kept(pixel="6 arcsec", half_difference=split, width="3 arcmin", centre="icrs 75 deg 20 deg")
+        step = Kept(
+            pixel="6 arcsec", half_difference=split, width="3 arcmin", centre="icrs 75 deg 20 deg"
+        )
         bench.run([step], many, {"signal": lambda o: noise(o, o.index)})
         return MapSums.of(kept.pop().arrays())
 
@@ -124,7 +144,9 @@ def test_sums_of_parts_are_those_of_all(bench, split):
 
 def test_the_file_says_what_was_subtracted(bench, tmp_path):
     product = bench.run(
-        [BinMap(pixel="6 arcsec", half_difference="halves")], bench.observation(N_DET, 3000), {"signal": np.ones((N_DET, 3000))}
+        [BinMap(pixel="6 arcsec", half_difference="halves")],
+        bench.observation(N_DET, 3000),
+        {"signal": np.ones((N_DET, 3000))},
     ).map
     with fits.open(write_map(product, tmp_path / "map.fits", False)) as file:
         assert file["HALF_DIFFERENCE"].header["JACKKNIF"] == "first - second half of each scan"

@@ -1,4 +1,6 @@
-"""Pixels that bands share of a block: taken only where they are the same, and maps as of each band alone."""
+"""Pixels that bands share of a block: taken only where they are the same, and maps as of each band
+alone.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,9 @@ def test_whatever_differs_bands_have_their_own(what: str, where: int, by: float)
         nside, footprint = 512 if what == "nside" else 1024, FOOTPRINT
         if what == "pixels":
             footprint = np.delete(FOOTPRINT, where % FOOTPRINT.size)
-        grid = HealpixGrid(nside, what == "nest", footprint, "galactic" if what == "frame" else "icrs")
+        grid = HealpixGrid(
+            nside, what == "nest", footprint, "galactic" if what == "frame" else "icrs"
+        )
     alone = found(Looking.of(replace(changed, shared=None), grid))
     with shared.block():
         found(Looking.of(plain, GRID))
@@ -79,7 +83,9 @@ BANDS = (
 
 
 class Spoilt(zonda.Operator):
-    """A detector of one band is dead from here on, some samples are flagged, others are not finite or off the map."""
+    """A detector of one band is dead from here on, some samples are flagged, others are not finite
+    or off the map.
+    """
 
     requires = frozenset({"signal"})
     provides = frozenset({"signal"})
@@ -93,38 +99,67 @@ class Spoilt(zonda.Operator):
                 observation.flags[700:900] |= 1
 
     def exec(self, block: zonda.Block, state: Any) -> None:
-        if "nan" in self.what and block.observation.instrument.band.name == "f090" and block.detectors.start == 0:
+        if (
+            "nan" in self.what
+            and block.observation.instrument.band.name == "f090"
+            and block.detectors.start == 0
+        ):
             block.detdata["signal"][2, ::50] = np.nan
 
 
 def scene(bands: Any) -> zonda.Scene:
     camera = zonda.Instrument(
-        name="camera", telescope={"name": "dish", "diameter": "6 m"}, detectors=38, field_of_view="20 arcmin",
-        polarization="pairs", main_beam_efficiency=0.8, illumination_efficiency=0.9, sample_rate="50 Hz",
+        name="camera",
+        telescope={"name": "dish", "diameter": "6 m"},
+        detectors=38,
+        field_of_view="20 arcmin",
+        polarization="pairs",
+        main_beam_efficiency=0.8,
+        illumination_efficiency=0.9,
+        sample_rate="50 Hz",
         bands=[dict(b) for b in bands],
-    )  # fmt: skip
-    return zonda.Scene(site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d", seed=3)
+    )
+    return zonda.Scene(
+        site="llano_de_chajnantor",
+        instrument=camera,
+        time="2022-08-01T23:00",
+        target="260d -10d",
+        seed=3,
+    )
 
 
 def maps(bands: Any, how: Any, steps: Any = (Spoilt(),)) -> Any:
     steps = [
         zonda.PointingDaisy(radius="15 arcmin", speed="10 arcmin/s", scan_duration="70 s"),
-        zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="2 %"), zonda.WhiteNoise(), zonda.Efficiency(), *steps,
+        zonda.AtmosphereLayers(pwv="1 mm", pwv_rms="2 %"),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        *steps,
         zonda.BinMap(stokes="IQU", half_difference="directions", crosslinking=True, **how),
         zonda.BinMap(product="intensity", half_difference="halves", crosslinking=True, **how),
-    ]  # fmt: skip
+    ]
     return zonda.Pipeline(steps).run(scene(bands))
 
 
 def planes(product: Any) -> dict[str, Any]:
-    found = {name: getattr(product, name) for name in ("signal", "hits", "weights", "noise", "half_difference", "crosslinking")}
+    found = {
+        name: getattr(product, name)
+        for name in ("signal", "hits", "weights", "noise", "half_difference", "crosslinking")
+    }
     if product.polarization is not None:
-        found |= {f"{name} of Q, U": getattr(product.polarization, name) for name in ("q", "u", "covariance", "half_difference")}
+        found |= {
+            f"{name} of Q, U": getattr(product.polarization, name)
+            for name in ("q", "u", "covariance", "half_difference")
+        }
     return found
 
 
-@pytest.mark.parametrize("how", [{"nside": 1024}, {"pixel": "3 arcmin"}, {"pixel": "3 arcmin", "projection": "CAR"}])
-def test_maps_of_bands_side_by_side_are_those_of_each_alone(how: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "how", [{"nside": 1024}, {"pixel": "3 arcmin"}, {"pixel": "3 arcmin", "projection": "CAR"}]
+)
+def test_maps_of_bands_side_by_side_are_those_of_each_alone(
+    how: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     taken: list[bool] = []
     of_block = SharedScan.of_block
 
@@ -146,18 +181,24 @@ def assert_as_alone(together: Any, how: Any, steps: Any) -> None:
         for product in ("map", "intensity"):
             expected = planes(alone.products[f"{product}_{one['name']}"])
             for name, plane in planes(together.products[f"{product}_{one['name']}"]).items():
-                np.testing.assert_array_equal(plane, expected[name], err_msg=f"{one['name']} {product} {name}")
+                np.testing.assert_array_equal(
+                    plane, expected[name], err_msg=f"{one['name']} {product} {name}"
+                )
         counted = {(who, what, value) for who, what, value in alone.tally if "BinMap" in who}
         assert counted <= {(who, what, value) for who, what, value in together.tally}
         assert any("dropped" in what for _, what, _ in counted)
 
 
 @pytest.mark.parametrize("weights", ["inverse_variance", "uniform"])
-@pytest.mark.parametrize(("spoilt", "shares"), [("", 1.0), ("nan", 1.0), ("dead", 0.7), ("flagged", 0.0)])
+@pytest.mark.parametrize(
+    ("spoilt", "shares"), [("", 1.0), ("nan", 1.0), ("dead", 0.7), ("flagged", 0.0)]
+)
 def test_samples_of_bands_go_to_their_maps_together(
     spoilt: str, shares: float, weights: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Behind a step that needs whole scans, whose blocks stay. One of five tiles has the detector that is dead in one band."""
+    """Behind a step that needs whole scans, whose blocks stay. One of five tiles has the detector
+    that is dead in one band.
+    """
     taken, add = [], stokes_sums.add_stokes
 
     def noted(signals: Any, *others: Any) -> None:
@@ -165,15 +206,22 @@ def test_samples_of_bands_go_to_their_maps_together(
         add(signals, *others)
 
     monkeypatch.setattr(stokes_sums, "add_stokes", noted)
-    how, steps = {"nside": 1024, "weights": weights}, (Spoilt(what=spoilt), zonda.PolynomialFilter(order=1))
+    how, steps = (
+        {"nside": 1024, "weights": weights},
+        (Spoilt(what=spoilt), zonda.PolynomialFilter(order=1)),
+    )
     together = maps(BANDS, how, steps)
     assert set(taken) <= {1, 2}
     assert taken.count(2) / len(taken) == pytest.approx(shares, abs=0.2 if 0 < shares < 1 else 0)
     assert_as_alone(together, how, steps)
 
 
-def test_what_is_made_again_for_neighbours_is_mapped_before_they_take_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A map before a step that reads its neighbours' samples, from streams that are made again: the block does not stay."""
+def test_what_is_made_again_for_neighbours_is_mapped_before_they_take_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A map before a step that reads its neighbours' samples, from streams that are made again: the
+    block does not stay.
+    """
     put_off, answers = SharedScan.put_off, set()
 
     def noted(self: SharedScan, label: str, *what: Any) -> bool:
@@ -186,10 +234,13 @@ def test_what_is_made_again_for_neighbours_is_mapped_before_they_take_its_place(
     def run(**options: Any) -> Any:
         steps = [
             zonda.PointingDaisy(radius="15 arcmin", speed="10 arcmin/s", scan_duration="1800 s"),
-            zonda.WhiteNoise(), zonda.Efficiency(), zonda.Crosstalk(),
-            zonda.BinMap(product="before", stokes="IQU", nside=256), zonda.TimeConstant(tau="50 ms"),
+            zonda.WhiteNoise(),
+            zonda.Efficiency(),
+            zonda.Crosstalk(),
+            zonda.BinMap(product="before", stokes="IQU", nside=256),
+            zonda.TimeConstant(tau="50 ms"),
             zonda.BinMap(product="after", stokes="IQU", nside=256),
-        ]  # fmt: skip
+        ]
         return zonda.Pipeline(steps).run(scene(BANDS), threads=1, **options)
 
     ample = run()
@@ -198,4 +249,6 @@ def test_what_is_made_again_for_neighbours_is_mapped_before_they_take_its_place(
     assert True in {answer for _, answer in answers}
     for name in ("before_f090", "before_f150", "after_f090", "after_f150"):
         for plane, expected in planes(ample.products[name]).items():
-            np.testing.assert_array_equal(planes(little.products[name])[plane], expected, err_msg=f"{name} {plane}")
+            np.testing.assert_array_equal(
+                planes(little.products[name])[plane], expected, err_msg=f"{name} {plane}"
+            )

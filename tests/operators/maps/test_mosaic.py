@@ -1,4 +1,6 @@
-"""Several targets in one map: in one run, in a campaign, about which centre, and what is too far apart."""
+"""Several targets in one map: in one run, in a campaign, about which centre, and what is too far
+apart.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,12 @@ from zonda.plugins.checks.scenes import sky_file
 
 ARCMIN = math.radians(1 / 60)
 A, B, C = "75 deg 20 deg", "75.10 deg 20 deg", "75.05 deg 20.08 deg"
-GRID = {"pixel": "20 arcsec", "width": "24 arcmin", "height": "20 arcmin", "centre": "75.05 deg 20.04 deg"}
+GRID = {
+    "pixel": "20 arcsec",
+    "width": "24 arcmin",
+    "height": "20 arcmin",
+    "centre": "75.05 deg 20.04 deg",
+}
 CAMERA = instruments.create("mustang2").varied(detectors=19)
 
 
@@ -30,19 +37,25 @@ def scene(**more: Any) -> zonda.Scene:
 
 
 def daisy(**more: Any) -> Any:
-    return zonda.PointingDaisy(**{"radius": "3 arcmin", "scan_duration": "20 s", "sample_rate": "20 Hz", **more})
+    return zonda.PointingDaisy(
+        **{"radius": "3 arcmin", "scan_duration": "20 s", "sample_rate": "20 Hz", **more}
+    )
 
 
 @pytest.fixture(scope="module")
 def sky() -> Any:
     """A map of 20 arcmin about A with structure everywhere, K_RJ."""
     y, x = np.mgrid[:120, :120] * 10.0
-    with sky_file(1e-3 * (1 + 0.5 * np.sin(x / 80) + 0.3 * np.cos(y / 130 + 0.3)), pixel=10.0) as path:
+    with sky_file(
+        1e-3 * (1 + 0.5 * np.sin(x / 80) + 0.3 * np.cos(y / 130 + 0.3)), pixel=10.0
+    ) as path:
         yield path
 
 
 def mapped(sky: Path, pointing: list[Any], scene: zonda.Scene, **grid: Any) -> Any:
-    data = zonda.Pipeline([*pointing, zonda.SkyMap(file=sky), zonda.BinMap(**grid)]).run(scene, threads=1)
+    data = zonda.Pipeline([*pointing, zonda.SkyMap(file=sky), zonda.BinMap(**grid)]).run(
+        scene, threads=1
+    )
     return data.products["map"]
 
 
@@ -50,7 +63,10 @@ def test_the_map_of_a_mosaic_is_the_sum_of_the_maps_of_its_targets(sky: Path) ->
     whole = mapped(sky, [daisy(targets=[A, B, C])], scene(), **GRID)
     # each target alone, at the time at which the mosaic observes it: 20 s and 30 s between scans
     starts = ["2024-11-25T07:00:00", "2024-11-25T07:00:50", "2024-11-25T07:01:40"]
-    alone = [mapped(sky, [daisy(target=t)], scene(time=start), **GRID) for t, start in zip((A, B, C), starts, strict=True)]
+    alone = [
+        mapped(sky, [daisy(target=t)], scene(time=start), **GRID)
+        for t, start in zip((A, B, C), starts, strict=True)
+    ]
     assert np.array_equal(whole.hits, sum(m.hits for m in alone))
     weight = sum(np.nan_to_num(m.weights) for m in alone)
     assert np.nan_to_num(whole.weights) == pytest.approx(weight, rel=1e-6)
@@ -65,13 +81,16 @@ def test_it_is_centred_on_the_whole_and_holds_every_sample(sky: Path) -> None:
     assert int(whole.hits.sum()) == 6 * 400 * 19
     rows, columns = np.nonzero(whole.hits)
     ny, nx = whole.hits.shape
-    # as far from each edge: within what the detectors leave empty at the rim of the field (half the field of view: 2.1 arcmin)
+    # as far from each edge: within what the detectors leave empty at the rim of the field (half the
+    # field of view: 2.1 arcmin)
     assert abs(rows.min() - (ny - 1 - rows.max())) * 20 < 2.1 * 60
     assert abs(columns.min() - (nx - 1 - columns.max())) * 20 < 2.1 * 60
     middle = np.radians([75.05, 20.04])
     assert separation(*whole.centre, tuple(middle)) < 0.3 * ARCMIN
     # two steps with a target each are a mosaic, too
-    other = mapped(sky, [daisy(target=A), daisy(target=B, name="second")], scene(), pixel="20 arcsec")
+    other = mapped(
+        sky, [daisy(target=A), daisy(target=B, name="second")], scene(), pixel="20 arcsec"
+    )
     assert separation(*other.centre, (math.radians(75.05), math.radians(20.0))) < 0.3 * ARCMIN
 
 
@@ -107,9 +126,14 @@ operators:
 
 @pytest.mark.parametrize(
     "axis",
-    ["grid: {target: [75 deg 20 deg, 75.10 deg 20 deg]}", "observations: [{target: 75 deg 20 deg}, {target: 75.10 deg 20 deg}]"],
+    [
+        "grid: {target: [75 deg 20 deg, 75.10 deg 20 deg]}",
+        "observations: [{target: 75 deg 20 deg}, {target: 75.10 deg 20 deg}]",
+    ],
 )
-def test_a_campaign_over_targets_is_one_map_about_the_middle(axis: str, sky: Path, tmp_path: Path) -> None:
+def test_a_campaign_over_targets_is_one_map_about_the_middle(
+    axis: str, sky: Path, tmp_path: Path
+) -> None:
     from astropy.io import fits
 
     from zonda.core.cli import main
@@ -124,11 +148,17 @@ def test_a_campaign_over_targets_is_one_map_about_the_middle(axis: str, sky: Pat
 
 @settings(max_examples=100, deadline=None)
 @given(
-    st.lists(st.tuples(st.floats(0, 0.3), st.floats(-0.2, 0.3), st.floats(0, 0.05), st.floats(0, 0.05)), min_size=2, max_size=5),
+    st.lists(
+        st.tuples(st.floats(0, 0.3), st.floats(-0.2, 0.3), st.floats(0, 0.05), st.floats(0, 0.05)),
+        min_size=2,
+        max_size=5,
+    ),
     st.floats(-1.5, 1.3),
 )
 def test_the_whole_holds_every_field(fields: list[tuple[float, ...]], declination: float) -> None:
-    shifted = [(lon, lat + declination, w, h) for lon, lat, w, h in fields if abs(lat + declination) < 1.5]
+    shifted = [
+        (lon, lat + declination, w, h) for lon, lat, w, h in fields if abs(lat + declination) < 1.5
+    ]
     if len({(f[0], f[1]) for f in shifted}) < 2:
         return
     lon, lat, width, height = whole_of(shifted, "map")
@@ -162,8 +192,12 @@ def test_a_map_that_goes_with_the_target_is_told(sky: Path) -> None:
         zonda.SkyMap(file=sky, centre="target").check(data)
 
 
-def test_its_own_coordinates_place_the_map_for_every_target(sky: Path, recwarn: pytest.WarningsRecorder) -> None:
-    """The same point of the sky is as bright in both fields: within the beam, pixels of 20 arcsec differ by few per cent."""
+def test_its_own_coordinates_place_the_map_for_every_target(
+    sky: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    """The same point of the sky is as bright in both fields: within the beam, pixels of 20 arcsec
+    differ by few per cent.
+    """
     one, other = (mapped(sky, [daisy(target=t)], scene(), **GRID) for t in (A, B))
     both = (one.hits > 3) & (other.hits > 3)
     assert both.sum() > 20

@@ -1,4 +1,6 @@
-"""CAR maps: pixell's pixels, every sample in the right one, maps that fit together, their areas and their smoothing."""
+"""CAR maps: pixell's pixels, every sample in the right one, maps that fit together, their areas and
+their smoothing.
+"""
 
 from __future__ import annotations
 
@@ -35,11 +37,16 @@ def full_sky(degrees: float) -> Any:
 
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0, 360), st.floats(-80, 80), st.integers(1, 30), st.integers(1, 30))
-def test_pixels_are_those_of_the_full_sky(longitude: float, latitude: float, half_width: int, half_height: int) -> None:
+def test_pixels_are_those_of_the_full_sky(
+    longitude: float, latitude: float, half_width: int, half_height: int
+) -> None:
     degrees = 0.5
     pixel = math.radians(degrees)
     box = _box(
-        math.radians(longitude), half_width * pixel, *np.radians([latitude - half_height / 4, latitude + half_height / 4]), pixel
+        math.radians(longitude),
+        half_width * pixel,
+        *np.radians([latitude - half_height / 4, latitude + half_height / 4]),
+        pixel,
     )
     grid = grid_of_box(box, pixel, "icrs")
     y, x = np.indices(grid.shape)
@@ -67,7 +74,9 @@ def test_every_sample_is_in_the_pixel_that_astropy_says(bench: Any, frame: str) 
     a = np.arange(7 * 3000.0).reshape(7, 3000) % 97
     operator = BinMap(projection="CAR", pixel="5 arcsec", frame=frame)
     product = bench.run([operator], observation, {"signal": a}, precision="float64").map
-    d = directions(observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta)
+    d = directions(
+        observation.boresight_radec, observation.focalplane.xi, observation.focalplane.eta
+    )
     sky = SkyCoord(x=d[..., 0], y=d[..., 1], z=d[..., 2], representation_type="cartesian")
     sky.representation_type = "unitspherical"
     places = np.array(product.wcs.world_to_pixel(sky)) + 0.5
@@ -75,7 +84,8 @@ def test_every_sample_is_in_the_pixel_that_astropy_says(bench: Any, frame: str) 
     hits, total = np.zeros(product.hits.shape, int), np.zeros(product.hits.shape)
     np.add.at(hits, (y, x), 1)  # raises where one is beyond the map
     np.add.at(total, (y, x), a)
-    # astropy's trigonometry differs by some 1e-8 of a pixel: samples on an edge may be in either (20 deg is an edge)
+    # astropy's trigonometry differs by some 1e-8 of a pixel: samples on an edge may be in either
+    # (20 deg is an edge)
     on_an_edge = (abs(places - np.rint(places)) < 1e-6).any(axis=0).sum()
     assert on_an_edge < 30
     assert abs(product.hits - hits).sum() <= 2 * on_an_edge
@@ -87,11 +97,17 @@ def test_every_sample_is_in_the_pixel_that_astropy_says(bench: Any, frame: str) 
 
 def test_areas_are_those_of_the_sphere(bench: Any) -> None:
     product = bench.run(
-        [BinMap(projection="CAR", pixel="5 arcsec")], bench.observation(7, 300), {"signal": np.ones((7, 300))}
+        [BinMap(projection="CAR", pixel="5 arcsec")],
+        bench.observation(7, 300),
+        {"signal": np.ones((7, 300))},
     ).map
-    edges = np.append(product.latitudes - product.pixel / 2, product.latitudes[-1] + product.pixel / 2)
+    edges = np.append(
+        product.latitudes - product.pixel / 2, product.latitudes[-1] + product.pixel / 2
+    )
     # the exact area between two latitudes; cancellation leaves 1e-16 / pixel
-    assert product.areas().ravel() == pytest.approx(np.diff(np.sin(edges)) * product.pixel, rel=1e-10)
+    assert product.areas().ravel() == pytest.approx(
+        np.diff(np.sin(edges)) * product.pixel, rel=1e-10
+    )
     assert product.latitudes.mean() == pytest.approx(product.centre[1], abs=20 * ARCSEC)
     jansky = product.to("Jy/pixel").signal / product.to("MJy/sr").signal * 1e-6
     hit = product.hits > 0
@@ -123,15 +139,21 @@ def test_a_map_of_given_size_and_one_across_the_meridian(bench: Any) -> None:
 
 
 @pytest.mark.parametrize("longitudes", [(40.0, 44.0), (359.0, 3.0), (10.0, 150.0)])
-def test_a_map_of_given_size_lies_about_the_middle_of_several_targets(longitudes: tuple[float, float]) -> None:
-    """As in TAN, not about the first target; across the meridian, and for targets too far apart for a tangent plane."""
+def test_a_map_of_given_size_lies_about_the_middle_of_several_targets(
+    longitudes: tuple[float, float],
+) -> None:
+    """As in TAN, not about the first target; across the meridian, and for targets too far apart for
+    a tangent plane.
+    """
     scans = [scenes.scan(3, 50), scenes.scan(3, 50)]
     for scan, longitude in zip(scans, longitudes, strict=True):
         scan.centre = (math.radians(longitude), math.radians(20))
     step = BinMap(projection="CAR", pixel="1 arcmin", width="4 deg")
     layout = layout_of(step, scans, None)
     assert layout is not None
-    middle = (longitudes[0] + longitudes[1] + (360 if longitudes[1] < longitudes[0] else 0)) / 2 % 360
+    middle = (
+        (longitudes[0] + longitudes[1] + (360 if longitudes[1] < longitudes[0] else 0)) / 2 % 360
+    )
     np.testing.assert_allclose(np.degrees(layout["middle"]), (middle, 20), atol=1 / 60)
     grid = grid_of(step, layout)
     ny, nx = grid.shape
@@ -160,7 +182,9 @@ def test_a_joined_box_holds_both(one: tuple[int, ...], other: tuple[int, ...]) -
 
 
 def test_smoothing_keeps_a_gaussian_round_at_high_latitude() -> None:
-    """A Gaussian of 6 arcmin at 60 deg, smoothed by 8 arcmin, is one of 10: right to FWHM tan(latitude), here 0.4 %."""
+    """A Gaussian of 6 arcmin at 60 deg, smoothed by 8 arcmin, is one of 10: right to FWHM
+    tan(latitude), here 0.4 %.
+    """
     from zonda.core.maps.map_product import MapProduct
 
     pixel = math.radians(1 / 60)
@@ -168,7 +192,9 @@ def test_smoothing_keeps_a_gaussian_round_at_high_latitude() -> None:
     grid = grid_of_box(box, pixel, "icrs")
     header = grid.wcs.to_header()
     ones = np.ones(grid.shape)
-    product = MapProduct(ones, ones.astype(int), ones, ones, None, header, centre_of(box, pixel), pixel)
+    product = MapProduct(
+        ones, ones.astype(int), ones, ones, None, header, centre_of(box, pixel), pixel
+    )
     distance = product.distance()
 
     def gaussian(fwhm: float) -> Any:
@@ -184,7 +210,10 @@ def test_smoothing_keeps_a_gaussian_round_at_high_latitude() -> None:
 
 
 def test_a_pixel_that_does_not_divide_the_sky_is_refused() -> None:
-    with pytest.raises(zonda.core.errors.ZondaError, match=r"whole number of pixels; the nearest that fits is 7.0000"):
+    with pytest.raises(
+        zonda.core.errors.ZondaError,
+        match=r"whole number of pixels; the nearest that fits is 7.0000",
+    ):
         BinMap(projection="CAR", pixel="7 arcsec")
     grid = grid_of_box((0, 0, 100_000, 100_000), math.radians(1 / 3600), "icrs")
     with pytest.raises(InputError, match="too large"):
@@ -192,12 +221,22 @@ def test_a_pixel_that_does_not_divide_the_sky_is_refused() -> None:
 
 
 def test_blocks_threads_and_scans_give_the_same_bits() -> None:
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="75 deg 20 deg", seed=3)
-    steps = [zonda.PointingDaisy(scan_duration="6 s", scans=2), zonda.WhiteNoise(), zonda.Efficiency()]
+    scene = zonda.Scene(
+        site="green_bank",
+        instrument="mustang2",
+        time="2024-11-25T07:00",
+        target="75 deg 20 deg",
+        seed=3,
+    )
+    steps = [
+        zonda.PointingDaisy(scan_duration="6 s", scans=2),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+    ]
     maps = [
-        zonda.Pipeline([*steps, zonda.BinMap(projection="CAR", pixel="5 arcsec")]).run(scene, threads=threads, memory=memory)[
-            "map"
-        ]
+        zonda.Pipeline([*steps, zonda.BinMap(projection="CAR", pixel="5 arcsec")]).run(
+            scene, threads=threads, memory=memory
+        )["map"]
         for threads, memory in ((1, None), (2, 3e8))
     ]
     for plane in ("signal", "hits", "weights", "noise", "half_difference"):

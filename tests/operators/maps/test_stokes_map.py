@@ -41,7 +41,9 @@ def observation(n_det=24, n=4000, efficiency=0.9, seed=0):
 
 def angles(o, frame="icrs"):
     found = np.empty((2, o.n_detectors, o.n_samples))
-    PolarizationAngles.of(o, o.boresight_radec, frame_rotation(frame)[2]).fill(np.arange(o.n_detectors), 0, *found)
+    PolarizationAngles.of(o, o.boresight_radec, frame_rotation(frame)[2]).fill(
+        np.arange(o.n_detectors), 0, *found
+    )
     return o.focalplane.polarization_efficiency[:, None] * found
 
 
@@ -60,7 +62,9 @@ def planes(product):
 
 
 @pytest.mark.parametrize("frame", ["icrs", "galactic"])
-@pytest.mark.parametrize("how", [{"pixel": "15 arcsec"}, {"nside": 8192}, {"pixel": "15 arcsec", "projection": "CAR"}])
+@pytest.mark.parametrize(
+    "how", [{"pixel": "15 arcsec"}, {"nside": 8192}, {"pixel": "15 arcsec", "projection": "CAR"}]
+)
 @pytest.mark.parametrize("plate", [False, True])
 def test_noiseless_recovery_to_rounding(how, frame, plate):
     o = observation()
@@ -69,8 +73,8 @@ def test_noiseless_recovery_to_rounding(how, frame, plate):
     product = mapped(o, signal_of(o, frame=frame), frame=frame, **how)
     found, solved = planes(product), product.known
     assert solved.sum() > 40
-    # terms of the matrix and cosines are rounded to 2^-31: as much of I + |Q| + |U|, times the condition number (pixels hit from
-    # all angles have about 2)
+    # terms of the matrix and cosines are rounded to 2^-31: as much of I + |Q| + |U|, times the
+    # condition number (pixels hit from all angles have about 2)
     limit = 4 * UNIT * np.maximum(product.polarization.condition[solved], 2)
     for plane, value in zip(found, (STOKES_I, Q, U), strict=True):
         assert (abs(plane[solved] - value) < limit).all()
@@ -78,12 +82,19 @@ def test_noiseless_recovery_to_rounding(how, frame, plate):
 
 
 def in_the_pixel(o, side):
-    """(1, c, s) of the samples (n, 3) in a pixel of ``side`` arcsec in the middle, their noise (n,), and which they are."""
-    inside, grid = np.zeros((o.n_detectors, o.n_samples), np.int32), TangentGrid(o.centre, np.radians(side / 3600), (1, 1))
+    """(1, c, s) of the samples (n, 3) in a pixel of ``side`` arcsec in the middle, their noise
+    (n,), and which they are.
+    """
+    inside, grid = (
+        np.zeros((o.n_detectors, o.n_samples), np.int32),
+        TangentGrid(o.centre, np.radians(side / 3600), (1, 1)),
+    )
     grid.pixels(grid.pointing(o), 0, o.n_samples, o.focalplane.xi, o.focalplane.eta, inside)
     inside = inside == 0
     cosine, sine = angles(o)
-    sigma = np.broadcast_to((o.focalplane.net * np.sqrt(o.sample_rate))[:, None], inside.shape)[inside]
+    sigma = np.broadcast_to((o.focalplane.net * np.sqrt(o.sample_rate))[:, None], inside.shape)[
+        inside
+    ]
     return np.stack([np.ones(inside.sum()), cosine[inside], sine[inside]], axis=1), sigma, inside
 
 
@@ -98,7 +109,9 @@ def test_the_map_is_the_weighted_least_squares_fit():
     matrix = np.linalg.inv(design.T @ (design / sigma[:, None] ** 2))
     fit = matrix @ design.T @ (noisy[inside] / sigma**2)
     np.testing.assert_allclose(planes(product)[:, 0, 0], fit, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(product.polarization.covariance[:, 0, 0], matrix[np.triu_indices(3)], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        product.polarization.covariance[:, 0, 0], matrix[np.triu_indices(3)], rtol=1e-6, atol=1e-12
+    )
     np.testing.assert_allclose(product.noise, np.sqrt(matrix[0, 0]), rtol=1e-6)
     np.testing.assert_allclose(product.weights, 1 / matrix[0, 0], rtol=1e-6)
 
@@ -111,7 +124,12 @@ def test_uniform_weights_have_the_covariance_of_the_samples():
     design, sigma, _ = in_the_pixel(o, 40.0)
     inverse = np.linalg.inv(design.T @ design)
     expected = inverse @ (design.T @ (design * sigma[:, None] ** 2)) @ inverse
-    np.testing.assert_allclose(product.polarization.covariance[:, 0, 0], expected[np.triu_indices(3)], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        product.polarization.covariance[:, 0, 0],
+        expected[np.triu_indices(3)],
+        rtol=1e-6,
+        atol=1e-12,
+    )
 
 
 def test_noise_of_the_map_is_what_it_states():
@@ -158,7 +176,9 @@ def test_sums_that_are_merged_have_the_bits_of_one_run():
     parts = [StokesSums.of(dict(sums_of(o, signal).arrays())) for signal in (noisy, -2 * noisy)]
     whole = parts[0]
     whole += parts[1]
-    np.testing.assert_array_equal(whole.matrix[0], whole.matrix[1])  # even and odd scans: the same pointing
+    np.testing.assert_array_equal(
+        whole.matrix[0], whole.matrix[1]
+    )  # even and odd scans: the same pointing
     np.testing.assert_array_equal(whole.data["signal"][1], sums_of(o, -2 * noisy).data["signal"][0])
     assert len(whole.scans) == 2
 
@@ -194,13 +214,17 @@ def test_pixels_that_are_not_determined_are_nan_and_counted():
     assert np.isinf(product.polarization.condition[hit]).all()
     assert np.isnan(product.polarization.condition[~hit]).all()
     count = {what: value for who, what, value in data.tally if who == "BinMap"}
-    assert count["pixels whose samples do not determine I, Q and U: NaN"].startswith(str(int(hit.sum())))
+    assert count["pixels whose samples do not determine I, Q and U: NaN"].startswith(
+        str(int(hit.sum()))
+    )
     assert not product.known.any()
     assert not product.weights.any()
 
 
 def pairs_at(degrees, **changes):
-    """One scan of pairs whose first detectors are at these angles [deg], as `BinMap.check` sees it."""
+    """One scan of pairs whose first detectors are at these angles [deg], as `BinMap.check` sees
+    it.
+    """
     o = observation(2 * len(degrees), 400)
     o.focalplane.polarization_angle[:] = np.radians([a + b for a in degrees for b in (0.0, 90.0)])
     return replace(o, **changes)
@@ -215,7 +239,9 @@ def warnings_of(*scans, **parameters):
 
 
 def test_too_few_angles_are_told_beforehand():
-    """One pair determines I and Q of its own axes; behind a plate, or with one at 45 deg, all three."""
+    """One pair determines I and Q of its own axes; behind a plate, or with one at 45 deg, all
+    three.
+    """
     (text,) = warnings_of(pairs_at([0.0, 90.0, 0.0]))
     assert "hardly a pixel will have I, Q and U" in text
     assert "HalfWavePlate" in text
@@ -225,9 +251,13 @@ def test_too_few_angles_are_told_beforehand():
     one_of_two.detector_flags[2:] = 1
     assert len(warnings_of(one_of_two)) == 1
     assert not warnings_of(pairs_at([0.0, 3.0]))
-    assert len(warnings_of(pairs_at([0.0, 3.0]), condition_limit=50.0)) == 1  # 2 / (1 - cos 6 deg), and a little more
+    assert (
+        len(warnings_of(pairs_at([0.0, 3.0]), condition_limit=50.0)) == 1
+    )  # 2 / (1 - cos 6 deg), and a little more
     o = pairs_at([0.0])
-    assert not zonda.HalfWavePlate(frequency="2 Hz").check(Data(scene=scenes.scene(o.instrument), observations=[o]))
+    assert not zonda.HalfWavePlate(frequency="2 Hz").check(
+        Data(scene=scenes.scene(o.instrument), observations=[o])
+    )
     assert not warnings_of(o)
 
 
@@ -241,7 +271,9 @@ def test_angles_that_repeat_from_detector_to_detector_are_seen(n):
 @pytest.mark.parametrize("n", [8, 40, 96])
 def test_angles_that_repeat_from_scan_to_scan_are_seen(n):
     """A plate that is stepped by 22.5 deg and back."""
-    assert not warnings_of(*(pairs_at([0.0], hwp_angle=np.full(400, np.radians(22.5 * (k % 2)))) for k in range(n)))
+    assert not warnings_of(
+        *(pairs_at([0.0], hwp_angle=np.full(400, np.radians(22.5 * (k % 2)))) for k in range(n))
+    )
 
 
 def test_a_map_of_nan_is_told():
@@ -262,9 +294,13 @@ def test_a_lower_limit_of_the_condition_number_leaves_pixels_out():
     condition = product.polarization.condition[product.known]
     limit = float(np.median(condition))
     fewer = mapped(o, signal_of(o), condition_limit=limit)
-    np.testing.assert_array_equal(fewer.known, product.known & (product.polarization.condition <= limit))
+    np.testing.assert_array_equal(
+        fewer.known, product.known & (product.polarization.condition <= limit)
+    )
     np.testing.assert_array_equal(fewer.hits, product.hits)  # the samples are there
-    smooth = fewer.smoothed(np.radians(1 / 60))  # what is not known neither contributes nor is filled
+    smooth = fewer.smoothed(
+        np.radians(1 / 60)
+    )  # what is not known neither contributes nor is filled
     np.testing.assert_array_equal(np.isfinite(planes(smooth)).all(axis=0), fewer.known)
     assert np.array_equal(np.isfinite(smooth.noise), fewer.known)
     assert not (_flat(fewer, "signal").hits[~fewer.known]).any()
@@ -329,7 +365,9 @@ def test_smoothing_units_and_planes():
     assert (smooth.stokes("Q").noise[solved] < product.stokes("Q").noise[solved]).all()
     micro = product.to("uK_RJ")
     np.testing.assert_allclose(micro.polarization.q[solved], Q * 1e6, rtol=1e-5)
-    np.testing.assert_allclose(micro.polarization.covariance, product.polarization.covariance * 1e12, rtol=1e-12)
+    np.testing.assert_allclose(
+        micro.polarization.covariance, product.polarization.covariance * 1e12, rtol=1e-12
+    )
     np.testing.assert_allclose(product.stokes("P").signal[solved], np.hypot(Q, U), rtol=1e-5)
     assert product.smoothed_rms(1e-4) == pytest.approx(product.stokes("I").smoothed_rms(1e-4))
     with pytest.raises(InputError, match="none of I, Q, U and P"):
@@ -341,11 +379,16 @@ def test_smoothing_units_and_planes():
 def test_the_cure_for_detectors_without_angles_names_what_states_them(tmp_path):
     table, data = tmp_path / "plane.csv", Data(scenes.scene())
     data.observations = [scan(7, 500)]
-    with pytest.raises(PipelineError, match=r"is\n  = set polarization: pairs of the instrument, or set stokes: I"):
+    with pytest.raises(
+        PipelineError, match=r"is\n  = set polarization: pairs of the instrument, or set stokes: I"
+    ):
         BinMap(stokes="IQU").check(data)
     for columns, cure in (
         ("", f"add the column polarization_angle to {table}"),
-        (", polarization_angle [deg], polarization_efficiency", "(polarization_efficiency, if it is there, must be above 0)"),
+        (
+            ", polarization_angle [deg], polarization_efficiency",
+            "(polarization_efficiency, if it is there, must be above 0)",
+        ),
     ):
         own = ", 45, 0" if columns else ""
         table.write_text(f"name, xi [arcmin], eta [arcmin]{columns}\na, 0, 0{own}\nb, 1, 0{own}\n")
@@ -360,7 +403,9 @@ def test_what_is_refused():
         run([BinMap(stokes="IQU")], o, np.ones((7, 500)))
     data = Data(scenes.scene(o.instrument))
     data.observations = [o]
-    with pytest.raises(PipelineError, match="needs polarized detectors"):  # `zonda check` says so, too
+    with pytest.raises(
+        PipelineError, match="needs polarized detectors"
+    ):  # `zonda check` says so, too
         BinMap(stokes="IQU").check(data)
     for parameters, text in (
         ({"noise": "scatter"}, "noise: scatter is for maps of I"),
@@ -382,7 +427,11 @@ def test_flagged_and_not_finite_samples_are_dropped_and_counted():
     signal[6, 1000] = np.inf
     signal[:, 100:150] = 1e30
     data = run([BinMap(stokes="IQU", width="1 arcmin", pixel="15 arcsec")], o, signal)
-    count = {what: int(value.split()[0]) for who, what, value in data.tally if who == "BinMap" and what.startswith("samples")}
+    count = {
+        what: int(value.split()[0])
+        for who, what, value in data.tally
+        if who == "BinMap" and what.startswith("samples")
+    }
     assert count["samples dropped: flagged"] == o.n_samples + (o.n_detectors - 1) * 50
     assert count["samples dropped: not finite"] == 11
     assert sum(count.values()) == o.n_detectors * o.n_samples
@@ -395,15 +444,31 @@ def test_flagged_and_not_finite_samples_are_dropped_and_counted():
 def test_a_campaign_of_two_workers_gives_the_bits_of_one_run(tmp_path):
     """With everything that a map of I, Q and U consists of."""
     camera = zonda.Instrument(
-        name="pairs", telescope=zonda.Telescope(name="dish", diameter="6 m"), detectors=24, field_of_view="6 arcmin",
-        band=zonda.Band(name="b", low="130 GHz", high="170 GHz"), fwhm="1.4 arcmin", polarization="pairs", net="1 mK s(1/2)",
-        main_beam_efficiency=0.7, illumination_efficiency=0.9, sample_rate="20 Hz",
-    )  # fmt: skip
-    scene = zonda.Scene(site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=3)
+        name="pairs",
+        telescope=zonda.Telescope(name="dish", diameter="6 m"),
+        detectors=24,
+        field_of_view="6 arcmin",
+        band=zonda.Band(name="b", low="130 GHz", high="170 GHz"),
+        fwhm="1.4 arcmin",
+        polarization="pairs",
+        net="1 mK s(1/2)",
+        main_beam_efficiency=0.7,
+        illumination_efficiency=0.9,
+        sample_rate="20 Hz",
+    )
+    scene = zonda.Scene(
+        site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=3
+    )
     found = []
     for how in ({}, {"engine": "processes", "workers": 2}):
         steps = [
-            zonda.PointingDaisy(radius="5 arcmin", speed="60 arcsec/s", scan_duration="20 s", scans=3, offsets="none"),
+            zonda.PointingDaisy(
+                radius="5 arcmin",
+                speed="60 arcsec/s",
+                scan_duration="20 s",
+                scans=3,
+                offsets="none",
+            ),
             zonda.HalfWavePlate(frequency="1 Hz"),
             zonda.WhiteNoise(),
             zonda.Efficiency(),

@@ -1,4 +1,6 @@
-"""The sums of maps of I, Q and U: every term, whatever runs of samples fall in one pixel, and bands that share their pixels."""
+"""The sums of maps of I, Q and U: every term, whatever runs of samples fall in one pixel, and bands
+that share their pixels.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,37 @@ from hypothesis import strategies as st
 
 from zonda.core.polarization import PolarizationAngles
 from zonda.operators.maps.stokes_kernel import AT_ONCE, DATA, add_stokes
-from zonda.operators.maps.sums import FLAGGED, LARGEST, NOT_FINITE, OUTSIDE, TOO_LARGE, VALUE, WEIGHT
+from zonda.operators.maps.sums import (
+    FLAGGED,
+    LARGEST,
+    NOT_FINITE,
+    OUTSIDE,
+    TOO_LARGE,
+    VALUE,
+    WEIGHT,
+)
 
 N_PIXELS = 7
 
 
-def term_by_term(signals, first, rows, at, cells, angles, which, start, good, window, weight, noise, own, sums, dropped, largest):
+def term_by_term(
+    signals,
+    first,
+    rows,
+    at,
+    cells,
+    angles,
+    which,
+    start,
+    good,
+    window,
+    weight,
+    noise,
+    own,
+    sums,
+    dropped,
+    largest,
+):
     """What `add_stokes` adds up, in plain Python: every term rounded once."""
     m = len(signals)
     turn = np.empty((2, len(rows), cells.shape[1]))
@@ -51,11 +78,16 @@ def term_by_term(signals, first, rows, at, cells, angles, which, start, good, wi
 
 
 def random_tile(seed, *, signals, n, run, own, window, spoilt, dtype, plate=False, n_rows=3):
-    """Arguments of `add_stokes` without what it changes; some ``run`` samples in a pixel, one after the other."""
+    """Arguments of `add_stokes` without what it changes; some ``run`` samples in a pixel, one after
+    the other.
+    """
     rng = np.random.default_rng(seed)
     first, n_cells = int(rng.integers(0, 5)), n_rows + 1
     data = tuple(rng.normal(0, 3, (6, first + n + 2)).astype(dtype) for _ in range(signals))
-    rows, at = np.sort(rng.choice(6, n_rows, replace=False)), np.sort(rng.choice(n_cells, n_rows, replace=False))
+    rows, at = (
+        np.sort(rng.choice(6, n_rows, replace=False)),
+        np.sort(rng.choice(n_cells, n_rows, replace=False)),
+    )
     cells = rng.integers(0, N_PIXELS, (n_cells, n)).astype(np.int32)
     cells = np.repeat(cells, run, axis=1)[:, :n].copy()
     start, which = int(rng.integers(0, 9)), np.sort(rng.choice(8, n_rows, replace=False))
@@ -93,28 +125,57 @@ def added(*of):
 @pytest.mark.parametrize(("own", "window"), [(False, False), (True, False), (True, True)])
 def test_every_term_is_added(signals, dtype, own, window):
     """Also over the ends of what is worked on at once, and where only some of it counts."""
-    for seed, (n, run, spoilt) in enumerate([(2 * AT_ONCE + 3, 1, False), (AT_ONCE + 40, 9, True), (AT_ONCE, 9, False)]):
-        tile = random_tile(seed, signals=signals, n=n, run=run, own=own, window=window, spoilt=spoilt, dtype=dtype)
+    for seed, (n, run, spoilt) in enumerate(
+        [(2 * AT_ONCE + 3, 1, False), (AT_ONCE + 40, 9, True), (AT_ONCE, 9, False)]
+    ):
+        tile = random_tile(
+            seed, signals=signals, n=n, run=run, own=own, window=window, spoilt=spoilt, dtype=dtype
+        )
         for found, expected in zip(results(added, tile), results(term_by_term, tile), strict=True):
             np.testing.assert_array_equal(found, expected)
 
 
 @settings(deadline=None, max_examples=60)
-@given(st.integers(0, 2**31), st.integers(1, 60), st.integers(1, 70), st.integers(1, 2), st.tuples(*[st.booleans()] * 4))
+@given(
+    st.integers(0, 2**31),
+    st.integers(1, 60),
+    st.integers(1, 70),
+    st.integers(1, 2),
+    st.tuples(*[st.booleans()] * 4),
+)
 def test_terms_of_any_tile(seed, n, run, signals, choices):
     spoilt, own, window, plate = choices
-    how = {"own": own or window, "window": window, "spoilt": spoilt, "plate": plate, "dtype": np.float64}
+    how = {
+        "own": own or window,
+        "window": window,
+        "spoilt": spoilt,
+        "plate": plate,
+        "dtype": np.float64,
+    }
     tile = random_tile(seed, signals=signals, n=n, run=run, **how)
     for found, expected in zip(results(added, tile), results(term_by_term, tile), strict=True):
         np.testing.assert_array_equal(found, expected)
 
 
 @settings(deadline=None, max_examples=60)
-@given(st.integers(0, 2**31), st.integers(1, 60), st.integers(1, 70), st.integers(1, 2), st.tuples(*[st.booleans()] * 5))
+@given(
+    st.integers(0, 2**31),
+    st.integers(1, 60),
+    st.integers(1, 70),
+    st.integers(1, 2),
+    st.tuples(*[st.booleans()] * 5),
+)
 def test_bands_have_the_bits_that_they_have_alone(seed, n, run, signals, choices):
     """Of equal weights or others; what is spoilt is so in one of them or in both."""
     alike, spoilt, own, window, other = choices
-    how = {"signals": signals, "n": n, "run": run, "own": own or window, "window": window, "dtype": np.float64}
+    how = {
+        "signals": signals,
+        "n": n,
+        "run": run,
+        "own": own or window,
+        "window": window,
+        "dtype": np.float64,
+    }
     one = random_tile(seed, spoilt=spoilt, **how)
     rng = np.random.default_rng(seed)
     data = tuple(rng.normal(0, 3, array.shape) for array in one[0])
@@ -123,7 +184,10 @@ def test_bands_have_the_bits_that_they_have_alone(seed, n, run, signals, choices
     weight, noise = (one[-3], one[-2]) if alike else rng.uniform(0.1, 3, (2, one[-3].size))
     two = (data, *one[1:-3], weight, noise, one[-1])
     expected = [results(term_by_term, tile) for tile in (one, two)]
-    found = [(np.zeros_like(sums), np.zeros_like(dropped), np.zeros_like(largest)) for sums, dropped, largest in expected]
+    found = [
+        (np.zeros_like(sums), np.zeros_like(dropped), np.zeros_like(largest))
+        for sums, dropped, largest in expected
+    ]
     bands = tuple((tile[-3], tile[-2], *mine) for tile, mine in zip((one, two), found, strict=True))
     add_stokes(one[0] + data, *one[1:-3], one[-1], bands)
     for mine, theirs in zip(found, expected, strict=True):
@@ -136,10 +200,23 @@ def test_bands_have_the_bits_that_they_have_alone(seed, n, run, signals, choices
 def test_where_samples_are_cut_does_not_matter(seed, cut, run):
     """Two tiles, one after the other, add up to the bits of one."""
     n = 2 * AT_ONCE + 1
-    tile = random_tile(seed, signals=1, n=n, run=run, own=False, window=False, spoilt=True, dtype=np.float32)
+    tile = random_tile(
+        seed, signals=1, n=n, run=run, own=False, window=False, spoilt=True, dtype=np.float32
+    )
     signals, first, rows, at, cells, angles, which, start, good, *rest = tile
     one = signals, first, rows, at, cells[:, :cut].copy(), angles, which, start, good[:cut], *rest
-    two = signals, first + cut, rows, at, cells[:, cut:].copy(), angles, which, start + cut, good[cut:], *rest
+    two = (
+        signals,
+        first + cut,
+        rows,
+        at,
+        cells[:, cut:].copy(),
+        angles,
+        which,
+        start + cut,
+        good[cut:],
+        *rest,
+    )
     whole, parts = results(added, tile), [results(added, part) for part in (one, two)]
     np.testing.assert_array_equal(whole[0], parts[0][0] + parts[1][0])
     np.testing.assert_array_equal(whole[1], parts[0][1] + parts[1][1])
@@ -147,7 +224,11 @@ def test_where_samples_are_cut_does_not_matter(seed, cut, run):
 
 
 def test_nothing_counts_in_a_tile_without_good_samples():
-    tile = list(random_tile(1, signals=1, n=600, run=3, own=False, window=False, spoilt=False, dtype=np.float32))
+    tile = list(
+        random_tile(
+            1, signals=1, n=600, run=3, own=False, window=False, spoilt=False, dtype=np.float32
+        )
+    )
     tile[8] = np.zeros(600, np.uint8)
     sums, dropped, largest = results(added, tuple(tile))
     assert not sums.any()
@@ -156,11 +237,37 @@ def test_nothing_counts_in_a_tile_without_good_samples():
 
 
 def test_a_window_enters_the_noise_squared() -> None:
-    """Equation (2) of `stokes_sums`: two samples of window 1/2 add 2 x 1/4 of their w^2 sigma^2 to N, 2 x 1/2 of w to A."""
+    """Equation (2) of `stokes_sums`: two samples of window 1/2 add 2 x 1/4 of their w^2 sigma^2 to
+    N, 2 x 1/2 of w to A.
+    """
     sums, one, index = np.zeros((1, DATA + 3 + 6), np.int64), np.ones(1), np.zeros(1, np.int64)
-    angles = np.ones((3, 2)), np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]]), np.zeros((2, 0)), np.zeros((1, 2))  # psi = 0
-    how = (*angles, 0.8 * one), index, 0, np.ones(2, np.uint8), np.full(2, 0.5), one, 0.8 * one, True
-    added((np.ones((1, 2)),), 0, index, index, np.zeros((1, 2), np.int32), *how, sums, np.zeros(4, np.int64), np.zeros(2))
+    angles = (
+        np.ones((3, 2)),
+        np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]]),
+        np.zeros((2, 0)),
+        np.zeros((1, 2)),
+    )  # psi = 0
+    how = (
+        (*angles, 0.8 * one),
+        index,
+        0,
+        np.ones(2, np.uint8),
+        np.full(2, 0.5),
+        one,
+        0.8 * one,
+        True,
+    )
+    added(
+        (np.ones((1, 2)),),
+        0,
+        index,
+        index,
+        np.zeros((1, 2), np.int32),
+        *how,
+        sums,
+        np.zeros(4, np.int64),
+        np.zeros(2),
+    )
     assert sums[0, 1] == WEIGHT
     expected = np.array([1, 0.8, 0, 0.64, 0, 0]) * 0.4
     np.testing.assert_allclose(sums[0, DATA + 3 :] / WEIGHT, expected, atol=2 / WEIGHT)

@@ -9,7 +9,9 @@ NET = 1.7e-3
 
 @pytest.fixture
 def make_observation():
-    """A scan of an instrument with NET 1.7 mK sqrt(s), zeta = 1 and f_s = 100 Hz unless said otherwise."""
+    """A scan of an instrument with NET 1.7 mK sqrt(s), zeta = 1 and f_s = 100 Hz unless said
+    otherwise.
+    """
 
     def make(n_det=16, n_samp=4096, rate=100.0, index=0, seed=1, zeta=1.0, **instrument):
         values = {
@@ -29,14 +31,29 @@ def make_observation():
         pointing = np.tile([0.0, 0, 0, 1], (n_samp, 1))
         times = np.arange(n_samp) / rate
         scan = f"scan{index}"
-        return Observation(scan, index, None, camera, camera.focalplane(), None, times, rate, pointing, pointing, (0, 0), seed)
+        return Observation(
+            scan,
+            index,
+            None,
+            camera,
+            camera.focalplane(),
+            None,
+            times,
+            rate,
+            pointing,
+            pointing,
+            (0, 0),
+            seed,
+        )
 
     return make
 
 
 @pytest.fixture
 def simulate():
-    """Run operators over an observation in blocks as the executor does; returns the streams, whole."""
+    """Run operators over an observation in blocks as the executor does; returns the streams,
+    whole.
+    """
 
     def run(observation, *operators, blocks=None, dtype=np.float32):
         for operator in operators:
@@ -51,7 +68,9 @@ def simulate():
             for operator, state in zip(operators, states, strict=True):
                 operator.exec(block, state)
             for name, values in block.detdata.items():
-                streams.setdefault(name, np.full((n_det, n_samp), np.nan, dtype))[detectors, samples] = values
+                streams.setdefault(name, np.full((n_det, n_samp), np.nan, dtype))[
+                    detectors, samples
+                ] = values
         for operator, state in zip(operators, states, strict=True):
             operator.collect(Data(scene=None), observation, state)
         return streams

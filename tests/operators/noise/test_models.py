@@ -28,11 +28,15 @@ def test_by_name():
     noise_models.register(lambda: Mine(factor=4), name="made_for_test")
     noise_models.register(lambda: 7, name="wrong_for_test")
     assert noise_model("mine_for_test") == Mine(name="mine_for_test")
-    assert noise_model({"name": "mine_for_test", "factor": 3}) == Mine(name="mine_for_test", factor=3)
+    assert noise_model({"name": "mine_for_test", "factor": 3}) == Mine(
+        name="mine_for_test", factor=3
+    )
     assert noise_model("made_for_test").factor == 4
     with pytest.raises(ValueError, match="is no NoiseModel"):
         noise_model("wrong_for_test")
     operator = WhiteNoise(model={"name": "mine_for_test", "factor": 3})
-    again = WhiteNoise(**operator.model_dump(mode="json", exclude_none=True, exclude={"net", "reference"}))
+    again = WhiteNoise(
+        **operator.model_dump(mode="json", exclude_none=True, exclude={"net", "reference"})
+    )
     assert again.model == operator.model
     WhiteNoise.model_json_schema()

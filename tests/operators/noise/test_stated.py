@@ -1,4 +1,6 @@
-"""What a map and a file of time streams state of the noise is what was simulated, whatever the level follows from."""
+"""What a map and a file of time streams state of the noise is what was simulated, whatever the
+level follows from.
+"""
 
 import h5py
 import numpy as np
@@ -18,9 +20,22 @@ from ...checks.noise import levels, over_stated
 DETECTOR = {"net": "1 mK s(1/2)", "reference": "detector"}
 
 
-def run(white, *, runs=None, output=None, extra=(), pwv="1.5 mm", weights="inverse_variance", after=(), pink=(), duration="10 s"):
+def run(
+    white,
+    *,
+    runs=None,
+    output=None,
+    extra=(),
+    pwv="1.5 mm",
+    weights="inverse_variance",
+    after=(),
+    pink=(),
+    duration="10 s",
+):
     instrument = camera(low="800 GHz", high="900 GHz")
-    scene = zonda.Scene(site="chajnantor", instrument=instrument, time="2024-07-25T03:00", target="17h -20d", seed=1)
+    scene = zonda.Scene(
+        site="chajnantor", instrument=instrument, time="2024-07-25T03:00", target="17h -20d", seed=1
+    )
     steps = [
         zonda.PointingDaisy(radius="4 arcmin", speed="1 arcmin/s", scan_duration=duration),
         *white,  # before the atmosphere: levels are resolved when every step is configured
@@ -31,7 +46,9 @@ def run(white, *, runs=None, output=None, extra=(), pwv="1.5 mm", weights="inver
         *after,
         zonda.BinMap(pixel="10 arcsec", weights=weights, half_difference=False),
     ]
-    return zonda.Pipeline(steps, runs=runs or {}).run(scene, output=output, keep=["white"] if white else [])
+    return zonda.Pipeline(steps, runs=runs or {}).run(
+        scene, output=output, keep=["white"] if white else []
+    )
 
 
 @pytest.mark.parametrize("kind", levels())
@@ -45,16 +62,26 @@ def test_white_noise_of_two_steps_adds_in_quadrature():
     assert abs(ratio - 1) < 4.5 * error
 
 
-@pytest.mark.parametrize("level", [DETECTOR, {"model": "background_limited"}], ids=["detector", "background"])
+@pytest.mark.parametrize(
+    "level", [DETECTOR, {"model": "background_limited"}], ids=["detector", "background"]
+)
 def test_detectors_weigh_by_the_noise_they_have(level):
-    """With levels that scatter, the optimal weights are 1 / NET_d^2, and a map with them is the deeper one."""
-    data = run([WhiteNoise(**level, scatter="60 %")], runs={"quiet": {"without": ["white"], "modes": "full"}})
+    """With levels that scatter, the optimal weights are 1 / NET_d^2, and a map with them is the
+    deeper one.
+    """
+    data = run(
+        [WhiteNoise(**level, scatter="60 %")],
+        runs={"quiet": {"without": ["white"], "modes": "full"}},
+    )
     net = data.observations[0].focalplane.net
     assert net.std() / net.mean() > 0.2
     product = data.products["map"]
-    # each sample adds 1 / (NET_d^2 f_s): its weight; no sample is dropped, so that the total follows
+    # each sample adds 1 / (NET_d^2 f_s): its weight; no sample is dropped, so that the total
+    # follows
     total = data.observations[0].n_samples * (net**-2.0).sum() / data.observations[0].sample_rate
-    assert product.weights.sum() == pytest.approx(total, rel=1e-6)  # weights are rounded to 2^-30 of the quietest's
+    assert product.weights.sum() == pytest.approx(
+        total, rel=1e-6
+    )  # weights are rounded to 2^-30 of the quietest's
     deep = product.hits > 20
     alike = run([WhiteNoise(**level, scatter="60 %")], weights="uniform").products["map"]
     assert np.median(product.noise[deep]) < 0.95 * np.median(alike.noise[deep])
@@ -68,9 +95,17 @@ def test_runs_without_noise_have_the_weights_of_the_main_run():
 
 
 def test_saved_streams_state_the_noise_that_was_simulated(tmp_path):
-    """The file's psd_net, knee and psd against the streams: NET is the rms of 1 s, at the knee pink noise equals white."""
+    """The file's psd_net, knee and psd against the streams: NET is the rms of 1 s, at the knee pink
+    noise equals white.
+    """
     pink = zonda.PinkNoise(knee="2 Hz", slope=2.0)
-    data = run([WhiteNoise(**DETECTOR)], output=tmp_path, pink=[pink], after=[zonda.SaveTOD()], duration="60 s")
+    data = run(
+        [WhiteNoise(**DETECTOR)],
+        output=tmp_path,
+        pink=[pink],
+        after=[zonda.SaveTOD()],
+        duration="60 s",
+    )
     o = data.observations[0]
     tod = load_tod(data.products["tod_file"][0])
     assert np.array_equal(tod.columns["net"], o.focalplane.net)
@@ -84,11 +119,15 @@ def test_saved_streams_state_the_noise_that_was_simulated(tmp_path):
     np.testing.assert_allclose(tod.columns["slope"], 2.0)
     with h5py.File(data.products["tod_file"][0]) as file:
         frequency, psd = file["metadata/noise_model/psds"][:2]
-    assert np.interp(2.0, frequency, psd) == pytest.approx(2 * tod.columns["net"][0] ** 2, rel=0.02)  # 100 frequencies
+    assert np.interp(2.0, frequency, psd) == pytest.approx(
+        2 * tod.columns["net"][0] ** 2, rel=0.02
+    )  # 100 frequencies
 
 
 def test_pink_noise_of_a_level_of_its_own_moves_the_stated_knee(tmp_path):
-    """Pink noise of 4 times the white level with slope 2: its power equals the white noise's at 4 times the knee."""
+    """Pink noise of 4 times the white level with slope 2: its power equals the white noise's at 4
+    times the knee.
+    """
     pink = zonda.PinkNoise(net="4 mK s(1/2)", reference="detector", knee="0.5 Hz", slope=2.0)
     data = run([WhiteNoise(**DETECTOR)], output=tmp_path, pink=[pink], after=[zonda.SaveTOD()])
     np.testing.assert_allclose(load_tod(data.products["tod_file"][0]).columns["knee"], 2.0)
@@ -107,30 +146,42 @@ class Cloud(Operator):
 
     def prepare(self, observation):
         n = observation.n_detectors
-        observation.smooth["atmosphere"] = SmoothField.constant(np.full(n, 300.0), observation.n_samples)
+        observation.smooth["atmosphere"] = SmoothField.constant(
+            np.full(n, 300.0), observation.n_samples
+        )
 
 
 def test_a_load_that_is_set_too_late_is_refused():
-    with pytest.raises(PipelineError, match=r"(?s)WhiteNoise.*mean atmosphere after the noise level.*configure"):
+    with pytest.raises(
+        PipelineError, match=r"(?s)WhiteNoise.*mean atmosphere after the noise level.*configure"
+    ):
         run([WhiteNoise(model="background_limited")], extra=[Cloud()])
     run([WhiteNoise()], extra=[Cloud()])  # a NET on the sky does not follow from it
 
 
 def test_noise_grows_with_the_transmission_at_every_moment():
-    """rms over a scan of 1 / <e^-tau> for a transmission that falls to a third, against the mean of its samples."""
+    """rms over a scan of 1 / <e^-tau> for a transmission that falls to a third, against the mean of
+    its samples.
+    """
     n = 4096
     t = 0.6 - 0.4 * np.arange(-12 * 128, n + 15 * 128, 128) / n
     field = SmoothField.from_values(np.ones((3, 1)), t[None], 128, n)
     exact = np.sqrt(np.mean(field.evaluate(slice(0, 3), slice(0, n)) ** -2.0, axis=1))
-    np.testing.assert_allclose(rms_of_inverse(field, 3), exact, rtol=1e-3)  # midpoints of 32 cells: h^2 f'' / 24
+    np.testing.assert_allclose(
+        rms_of_inverse(field, 3), exact, rtol=1e-3
+    )  # midpoints of 32 cells: h^2 f'' / 24
 
 
 def test_each_scan_has_a_level_of_its_own():
     """Two scans an hour apart: the load differs, and so does the NET that is told of each."""
     instrument = camera(low="800 GHz", high="900 GHz")
-    scene = zonda.Scene(site="chajnantor", instrument=instrument, time="2024-07-25T03:00", target="17h -20d", seed=1)
+    scene = zonda.Scene(
+        site="chajnantor", instrument=instrument, time="2024-07-25T03:00", target="17h -20d", seed=1
+    )
     steps = [
-        zonda.PointingDaisy(radius="4 arcmin", speed="1 arcmin/s", scan_duration="5 s", scans=2, gap="1 h"),
+        zonda.PointingDaisy(
+            radius="4 arcmin", speed="1 arcmin/s", scan_duration="5 s", scans=2, gap="1 h"
+        ),
         zonda.AtmosphereLayers(pwv="1.5 mm", pwv_rms="0 %"),
         WhiteNoise(model="background_limited"),
         zonda.Efficiency(),
@@ -139,7 +190,9 @@ def test_each_scan_has_a_level_of_its_own():
     told = {what: text for who, what, text in data.tally if who == "WhiteNoise"}
     for o in data.observations:
         net = 1e3 * float(np.median(o.focalplane.net))
-        assert float(told[f"{o.name}: NET on the sky, median (range), mK s^1/2"].split()[0]) == pytest.approx(net, rel=1e-3)
+        assert float(
+            told[f"{o.name}: NET on the sky, median (range), mK s^1/2"].split()[0]
+        ) == pytest.approx(net, rel=1e-3)
     first, second = (float(o.focalplane.net.mean()) for o in data.observations)
     assert abs(second / first - 1) > 0.01
 

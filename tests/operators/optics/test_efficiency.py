@@ -20,14 +20,18 @@ N_DET, N = 19, 5000
 def streams():
     rng = np.random.default_rng(1)
     return {
-        "sky": 1e-3 * rng.standard_normal((N_DET, N)), "atmosphere": 0.1 * rng.standard_normal((N_DET, N)),
-        "transmission": 1e-3 * rng.standard_normal((N_DET, N)), "white": 1e-2 * rng.standard_normal((N_DET, N)),
+        "sky": 1e-3 * rng.standard_normal((N_DET, N)),
+        "atmosphere": 0.1 * rng.standard_normal((N_DET, N)),
+        "transmission": 1e-3 * rng.standard_normal((N_DET, N)),
+        "white": 1e-2 * rng.standard_normal((N_DET, N)),
         "pink": 1e-2 * rng.standard_normal((N_DET, N)),
-    }  # fmt: skip
+    }
 
 
 def fields(n=N, step=64):
-    """Emission near 30 K, transmission near 0.8, both varying over time and detectors, as exact values too."""
+    """Emission near 30 K, transmission near 0.8, both varying over time and detectors, as exact
+    values too.
+    """
     margin = 16
     k = (np.arange(-(-n // step) + 3 + 2 * margin) - 1 - margin) * step / n
     nodes = np.linspace(-1, 1, N_DET)
@@ -61,7 +65,10 @@ def test_the_papers_equation_term_by_term(bench, streams, calibration, absent):
     t = everywhere(smooth["transmission"])
     instant = t * (1 + get("transmission"))
     total = (
-        0.7 * (everywhere(smooth["atmosphere"]) + get("atmosphere")) + 0.35 * instant * get("sky") + get("white") + get("pink")
+        0.7 * (everywhere(smooth["atmosphere"]) + get("atmosphere"))
+        + 0.35 * instant * get("sky")
+        + get("white")
+        + get("pink")
     )
     expected = total / (0.35 * (t if calibration == "mean" else instant))
     # the refitted mean is allowed 1e-7 of its 90 K
@@ -80,12 +87,19 @@ def test_float32_stream_keeps_microkelvin_under_the_mean(bench, streams):
 
 def test_without_atmosphere_the_sky_comes_through_and_noise_is_divided_by_zeta(bench, streams):
     sky, white = streams["sky"], streams["white"]
-    run = bench.run([Efficiency()], bench.observation(N_DET, N), {"sky": sky, "white": white}, precision="float64")
+    run = bench.run(
+        [Efficiency()],
+        bench.observation(N_DET, N),
+        {"sky": sky, "white": white},
+        precision="float64",
+    )
     np.testing.assert_allclose(run.signal, sky + white / 0.3, rtol=0, atol=1e-14)
 
 
 def test_efficiencies_reach_the_focal_plane(bench, streams):
-    run = bench.run([Efficiency(main_beam="40 %", illumination=0.9)], bench.observation(N_DET, N), streams)
+    run = bench.run(
+        [Efficiency(main_beam="40 %", illumination=0.9)], bench.observation(N_DET, N), streams
+    )
     plane = run.observations[0].focalplane
     assert (plane.main_beam_efficiency == 0.4).all()
     assert (plane.illumination_efficiency == 0.9).all()
@@ -107,8 +121,9 @@ def test_scatter_changes_noise_and_not_the_sky(bench, streams):
 
 @pytest.mark.parametrize("reference", ["sky", "detector"])
 def test_scatter_changes_noise_at_the_detector_alone(tmp_path, reference):
-    """A NET on the sky is that of the calibrated stream whatever zeta is; one at the detector is divided by it. 20000 samples
-    show a detector's rms to 0.5 %, of which 5 sigma are allowed; zeta scatters by 20 %."""
+    """A NET on the sky is that of the calibrated stream whatever zeta is; one at the detector is
+    divided by it. 20000 samples show a detector's rms to 0.5 %, of which 5 sigma are allowed; zeta
+    scatters by 20 %."""
     (tmp_path / "a.yaml").write_text(
         camera(8)
         + f"""operators:
@@ -127,7 +142,10 @@ def test_scatter_changes_noise_at_the_detector_alone(tmp_path, reference):
 
 def test_calibration_error_scales_each_detector(bench, streams):
     run = bench.run(
-        [Efficiency(calibration_error=0.05)], bench.observation(N_DET, N), {"sky": streams["sky"]}, precision="float64"
+        [Efficiency(calibration_error=0.05)],
+        bench.observation(N_DET, N),
+        {"sky": streams["sky"]},
+        precision="float64",
     )
     gain = run.signal[:, 0] / streams["sky"][:, 0]
     np.testing.assert_allclose(run.signal, gain[:, None] * streams["sky"], rtol=1e-12)
@@ -142,7 +160,12 @@ def test_opaque_detector_is_flagged_and_finite(bench, streams):
     smooth["transmission"] = SmoothField(weights, smooth["transmission"].coefficients, 64, N)
     run = bench.run([Efficiency()], bench.observation(N_DET, N), streams, smooth=smooth)
     assert np.flatnonzero(run.observations[0].detector_flags).tolist() == [3]
-    assert run.tally["Efficiency", f"detectors flagged: band transmission below {LEAST_TRANSMISSION:g}"] == "1"
+    assert (
+        run.tally[
+            "Efficiency", f"detectors flagged: band transmission below {LEAST_TRANSMISSION:g}"
+        ]
+        == "1"
+    )
     assert np.isfinite(run.signal).all()
     clear = bench.run([Efficiency()], bench.observation(N_DET, N), streams, smooth=fields())
     others = np.arange(N_DET) != 3
@@ -182,14 +205,23 @@ def test_quotient_of_short_scans(n):
 def test_bits_do_not_depend_on_blocks(bench, streams):
     smooth = fields()
     runs = [
-        bench.run([Efficiency()], bench.observation(N_DET, N), streams, smooth=smooth, threads=t, memory=m)
+        bench.run(
+            [Efficiency()], bench.observation(N_DET, N), streams, smooth=smooth, threads=t, memory=m
+        )
         for t, m in ((1, 1 << 30), (2, 1 << 23))
     ]
     np.testing.assert_array_equal(runs[0].signal, runs[1].signal)
 
 
 @pytest.mark.parametrize(
-    "bad", [{"main_beam": 0}, {"illumination": 1.2}, {"scatter": -0.1}, {"calibration": "never"}, {"zeta": 0.3}]
+    "bad",
+    [
+        {"main_beam": 0},
+        {"illumination": 1.2},
+        {"scatter": -0.1},
+        {"calibration": "never"},
+        {"zeta": 0.3},
+    ],
 )
 def test_bad_parameters(bad):
     with pytest.raises(ValueError):
@@ -199,7 +231,12 @@ def test_bad_parameters(bad):
 def test_an_instantaneous_calibration_that_cannot_divide_is_counted(bench, streams):
     streams["transmission"][3, 100:130] = -1.0
     streams["transmission"][5, 7] = np.nan
-    run = bench.run([Efficiency(calibration="instantaneous")], bench.observation(N_DET, N), streams, smooth=fields())
+    run = bench.run(
+        [Efficiency(calibration="instantaneous")],
+        bench.observation(N_DET, N),
+        streams,
+        smooth=fields(),
+    )
     assert run.tally["Efficiency", "samples whose fluctuating e^-tau was raised to 1e-06"] == "31"
     mean = bench.run([Efficiency()], bench.observation(N_DET, N), streams, smooth=fields())
     assert ("Efficiency", "samples whose fluctuating e^-tau was raised to 1e-06") not in mean.tally
@@ -209,5 +246,9 @@ def test_an_instantaneous_calibration_that_cannot_divide_is_counted(bench, strea
 def test_spline_has_the_values_and_the_slopes_at_the_ends(cells):
     known = np.random.default_rng(cells).normal(size=(2, cells + 3))
     c = _spline(known)
-    np.testing.assert_allclose((c[:, :-2] + 4 * c[:, 1:-1] + c[:, 2:]) / 6, known[:, 1:-1], rtol=0, atol=1e-14)
-    np.testing.assert_allclose((c[:, [2, -1]] - c[:, [0, -3]]) / 2, known[:, [0, -1]], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        (c[:, :-2] + 4 * c[:, 1:-1] + c[:, 2:]) / 6, known[:, 1:-1], rtol=0, atol=1e-14
+    )
+    np.testing.assert_allclose(
+        (c[:, [2, -1]] - c[:, [0, -3]]) / 2, known[:, [0, -1]], rtol=0, atol=1e-14
+    )

@@ -1,4 +1,6 @@
-"""Ground pickup: it repeats with the azimuth, has the rms and correlation it should, and a ground filter removes it."""
+"""Ground pickup: it repeats with the azimuth, has the rms and correlation it should, and a ground
+filter removes it.
+"""
 
 from __future__ import annotations
 
@@ -28,31 +30,41 @@ def test_it_keeps_the_contract():
 
 
 def test_rms_and_correlation_over_grounds():
-    """A Gaussian process of unit variance whose correlation is that of the lobe with itself: exp(-x^2 / (4 s^2)), less its mean
-    over the horizon."""
+    """A Gaussian process of unit variance whose correlation is that of the lobe with itself:
+    exp(-x^2 / (4 s^2)), less its mean over the horizon."""
     n, fwhm = 3000, np.radians(20)
     s = fwhm / np.sqrt(8 * np.log(2))
     azimuth = np.radians([0.0, 10.0, 25.0, 180.0])
     found = np.array([horizon(azimuth, fwhm, stream_key(k, "test")) for k in range(n)])
     assert (np.abs((found**2).mean(axis=0) - 1) < 4.5 * np.sqrt(2 / n)).all()
-    level = s / np.sqrt(np.pi)  # 2 s sqrt(pi) / (2 pi): the mean of that Gaussian over the circle, taken away (m = 0)
+    level = s / np.sqrt(
+        np.pi
+    )  # 2 s sqrt(pi) / (2 pi): the mean of that Gaussian over the circle, taken away (m = 0)
     for k in (1, 2, 3):
         expected = (np.exp(-(azimuth[k] ** 2) / (4 * s**2)) - level) / (1 - level)
-        assert abs((found[:, 0] * found[:, k]).mean() - expected) < 4.5 * np.sqrt((1 + expected**2) / n)
+        assert abs((found[:, 0] * found[:, k]).mean() - expected) < 4.5 * np.sqrt(
+            (1 + expected**2) / n
+        )
 
 
 def test_it_depends_on_the_azimuth_alone_and_is_that_of_the_seed(bench):
-    """Two scans of one seed at the same azimuth have the same; another elevation scales it; a detector's share is its own."""
+    """Two scans of one seed at the same azimuth have the same; another elevation scales it; a
+    detector's share is its own.
+    """
     first, second = scan(bench), scan(bench, index=1)
     step = GroundPickup(rms="2 mK", scatter="20 %")
     run = bench.run([step], [first, second], precision="float64", keep=("ground",))
     a, b = (o.detdata["ground"] for o in run.observations)
     order = np.argsort(second.azimuth)
-    np.testing.assert_allclose(np.interp(first.azimuth, second.azimuth[order], b[2][order]), a[2], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(
+        np.interp(first.azimuth, second.azimuth[order], b[2][order]), a[2], rtol=0, atol=1e-5
+    )
     ratio = a[:, :1] / a[0, 0]
     np.testing.assert_allclose(a, ratio * a[0], rtol=1e-12)
     assert 0.05 < ratio.std() < 0.6
-    high = bench.run([step], scan(bench, elevation=math.pi / 3), precision="float64", keep=("ground",))
+    high = bench.run(
+        [step], scan(bench, elevation=math.pi / 3), precision="float64", keep=("ground",)
+    )
     np.testing.assert_allclose(high.observations[0].detdata["ground"], 0.75 * a, rtol=0, atol=1e-15)
 
 
@@ -65,8 +77,8 @@ def test_a_realization_is_the_same_for_every_seed(bench):
 
 
 def test_a_ground_filter_removes_it():
-    """Azimuth scan, white noise: with the filter the stream is that of the noise alone, within the bins' width; without it is
-    not."""
+    """Azimuth scan, white noise: with the filter the stream is that of the noise alone, within the
+    bins' width; without it is not."""
     pointing = zonda.PointingBackAndForth(
         target="az 120 deg el 50 deg",
         scan_duration="60 s",
@@ -77,24 +89,43 @@ def test_a_ground_filter_removes_it():
     )
     found = {}
     for label, steps in (("ground", [GroundPickup(rms="50 mK")]), ("alone", [])):
-        chain = [pointing, zonda.WhiteNoise(), *steps, zonda.Efficiency(), GroundFilter(bin="3 arcmin")]
-        data = zonda.Pipeline(chain, precision="float64").run(scenes.scene(scenes.camera(7)), keep=("signal",), threads=1)
+        chain = [
+            pointing,
+            zonda.WhiteNoise(),
+            *steps,
+            zonda.Efficiency(),
+            GroundFilter(bin="3 arcmin"),
+        ]
+        data = zonda.Pipeline(chain, precision="float64").run(
+            scenes.scene(scenes.camera(7)), keep=("signal",), threads=1
+        )
         found[label] = data.observations[0].detdata["signal"]
     left = np.std(found["ground"] - found["alone"])
-    # 50 mK over zeta of 0.3; of a slope T' a bin of width w leaves T' w / sqrt(12), T' = rms / (sqrt(2) s) for a lobe of 10 deg
+    # 50 mK over zeta of 0.3; of a slope T' a bin of width w leaves T' w / sqrt(12), T' = rms /
+    # (sqrt(2) s) for a lobe of 10 deg
     slope = 0.05 / 0.3 / (np.sqrt(2) * np.radians(10) / np.sqrt(8 * np.log(2)))
     assert left < 3 * slope * np.radians(0.05) / np.sqrt(12)
 
 
 def test_it_is_a_component_of_its_own():
     pointing = zonda.PointingDaisy(scan_duration="10 s")
-    steps = [pointing, zonda.WhiteNoise(), GroundPickup(rms="5 mK"), zonda.Efficiency(), zonda.BinMap(pixel="8 arcsec")]
+    steps = [
+        pointing,
+        zonda.WhiteNoise(),
+        GroundPickup(rms="5 mK"),
+        zonda.Efficiency(),
+        zonda.BinMap(pixel="8 arcsec"),
+    ]
     runs = {"ground": {"only": ["ground"]}, "clean": {"without": ["ground"]}}
     data = zonda.Pipeline(steps, runs=runs).run(scenes.scene(scenes.camera(19)), threads=1)
-    whole, ground, clean = (data.products[name].signal for name in ("map", "ground/map", "clean/map"))
+    whole, ground, clean = (
+        data.products[name].signal for name in ("map", "ground/map", "clean/map")
+    )
     use = np.isfinite(whole)
     assert np.nanstd(ground) > 0
-    np.testing.assert_allclose((ground + clean)[use], whole[use], rtol=0, atol=1e-5 * np.nanmax(np.abs(whole)))
+    np.testing.assert_allclose(
+        (ground + clean)[use], whole[use], rtol=0, atol=1e-5 * np.nanmax(np.abs(whole))
+    )
 
 
 @pytest.mark.parametrize("power", [-1.0, 2.0])
@@ -104,7 +135,10 @@ def test_the_plan_bounds_it(power):
     observation = scenes.scan(3, 2000, elevation=40.0)
     step = GroundPickup(rms="1 mK", power=power)
     profile = step.prepare(observation).profile
-    many = [GroundPickup(rms="1 mK", power=power, realization=k).prepare(observation).profile[0] for k in range(400)]
+    many = [
+        GroundPickup(rms="1 mK", power=power, realization=k).prepare(observation).profile[0]
+        for k in range(400)
+    ]
     bound = planning_of(step).traits(observation).rms * 0.3  # at the detector
     assert np.std(many) <= bound * (1 + 4 / np.sqrt(800))
     assert np.isfinite(profile).all()

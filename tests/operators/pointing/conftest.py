@@ -34,7 +34,13 @@ def observe() -> Callable[..., Data]:
     """Run one pointing operator: ``observe(operator, site=..., target=..., telescope={...})``."""
 
     def run(operator: Operator, *, telescope: dict[str, Any] | None = None, **scene: Any) -> Data:
-        whole = {"site": SITE, "instrument": instrument(**telescope or {}), "time": START, "target": TARGET, **scene}
+        whole = {
+            "site": SITE,
+            "instrument": instrument(**telescope or {}),
+            "time": START,
+            "target": TARGET,
+            **scene,
+        }
         data = Data(Scene(**whole))
         operator.observe(data)
         return data
@@ -47,7 +53,10 @@ def astropy_offline() -> Iterator[None]:
     """Let astropy use the same bundled table (IERS C04), and download nothing."""
     from astropy.utils import iers
 
-    with iers.conf.set_temp("auto_download", False), iers.earth_orientation_table.set(iers.IERS_B.open()):
+    with (
+        iers.conf.set_temp("auto_download", False),
+        iers.earth_orientation_table.set(iers.IERS_B.open()),
+    ):
         yield
 
 
@@ -63,7 +72,9 @@ class Reference:
         # by calendar: days with a leap second are longer
         date = f"{start.datetime:%Y-%m-%dT%H:%M:%S}.{start.nanoseconds % 10**9:09d}"
         time = Time(date, scale="utc") + np.asarray(seconds) * u.s
-        location = EarthLocation.from_geodetic(site.longitude * u.rad, site.latitude * u.rad, site.altitude * u.m)
+        location = EarthLocation.from_geodetic(
+            site.longitude * u.rad, site.latitude * u.rad, site.altitude * u.m
+        )
         return AltAz(obstime=time, location=location, pressure=0 * u.hPa)
 
     @classmethod
@@ -73,7 +84,9 @@ class Reference:
 
         x, y, z = np.asarray(icrs).T
         sky = SkyCoord(np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), unit="rad", frame="icrs")
-        there = sky.transform_to(cls.frame(start, seconds, site)).represent_as(UnitSphericalRepresentation)
+        there = sky.transform_to(cls.frame(start, seconds, site)).represent_as(
+            UnitSphericalRepresentation
+        )
         az, el = there.lon.rad, there.lat.rad
         return np.stack([np.cos(el) * np.cos(az), -np.cos(el) * np.sin(az), np.sin(el)], axis=-1)
 
@@ -84,7 +97,9 @@ class Reference:
 
         x, y, z = np.asarray(horizontal).T
         frame = cls.frame(start, seconds, site)
-        there = SkyCoord(np.arctan2(-y, x), np.arctan2(z, np.hypot(x, y)), unit="rad", frame=frame).icrs
+        there = SkyCoord(
+            np.arctan2(-y, x), np.arctan2(z, np.hypot(x, y)), unit="rad", frame=frame
+        ).icrs
         ra, dec = there.ra.rad, there.dec.rad
         return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
 

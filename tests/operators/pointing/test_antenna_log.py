@@ -1,4 +1,6 @@
-"""ASTE's antenna logs: the beam is where the programme wanted it, plus the error of tracking; only scans are used."""
+"""ASTE's antenna logs: the beam is where the programme wanted it, plus the error of tracking; only
+scans are used.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +17,24 @@ from zonda.core.flags import IRREGULAR, TURNAROUND
 
 pytestmark = pytest.mark.filterwarnings("ignore:PointingRecorded")
 
-HEAD = "#time ra-prg dec-prg az-prg el-prg az-real el-real x y z xt yt zt lst az-prg(no-cor) el-prog(no-cor) az-prog(center) type"
+HEAD = (
+    "#time ra-prg dec-prg az-prg el-prg az-real el-real x y z xt yt zt lst az-prg(no-cor)"
+    " el-prog(no-cor) az-prog(center) type"
+)
 END = "20900909090909.9 " + 17 * " 999.00000" + " END\n"
-SITE = {"name": "aste", "latitude": "-22.9715818 deg", "longitude": "-67.7033042 deg", "altitude": "4861.9 m"}
+SITE = {
+    "name": "aste",
+    "latitude": "-22.9715818 deg",
+    "longitude": "-67.7033042 deg",
+    "altitude": "4861.9 m",
+}
 STATES = ["GRAD"] * 5 + ["ACC"] * 3 + ["SCAN"] * 20 + ["TRAN"] * 4 + ["ON"] * 8
 
 
 def rows() -> tuple[list[str], Any, Any]:
-    """A log of 40 rows across north, with corrections of 0.3 deg and errors of tracking of arcsec; where the beam is, deg."""
+    """A log of 40 rows across north, with corrections of 0.3 deg and errors of tracking of arcsec;
+    where the beam is, deg.
+    """
     draw = np.random.default_rng(1)
     azimuth, elevation = 359.98 + 0.002 * np.arange(40), 55 + 0.001 * np.arange(40)
     errors = draw.normal(0, 1e-3, (40, 2))
@@ -33,12 +45,18 @@ def rows() -> tuple[list[str], Any, Any]:
         own = [azimuth[k] % 360, elevation[k]]
         numbers = [264.2, -22.3, *wanted, *real, 3.76, -0.43, -4.2, 0, 0, 0, 17.1, *own, *own]
         moment = datetime(2017, 11, 3, 23, 59, 59) + k * timedelta(seconds=0.1)  # across midnight
-        lines.append(f"{moment:%Y%m%d%H%M%S.%f}"[:16] + "".join(f" {n:.5f}" for n in numbers) + f" {state}\n")
+        lines.append(
+            f"{moment:%Y%m%d%H%M%S.%f}"[:16] + "".join(f" {n:.5f}" for n in numbers) + f" {state}\n"
+        )
     return lines, azimuth + errors[:, 0], elevation + errors[:, 1]
 
 
 def observed(path: Path) -> Any:
-    scene = zonda.Scene(site=zonda.Site(**SITE), instrument={"like": "laboca", "detectors": 7}, time="2017-11-03T23:59:59")
+    scene = zonda.Scene(
+        site=zonda.Site(**SITE),
+        instrument={"like": "laboca", "detectors": 7},
+        time="2017-11-03T23:59:59",
+    )
     data = zonda.Data(scene)
     zonda.PointingRecorded(file=path).observe(data)
     return data.observations
@@ -53,7 +71,9 @@ def test_the_beam_and_what_is_used(tmp_path: Path) -> None:
     assert o.n_samples == 40
     assert o.sample_rate == pytest.approx(10, rel=1e-9)
     # the log has five digits, each of three columns rounded to 5e-6 deg
-    np.testing.assert_allclose((np.degrees(o.azimuth) - azimuth + 180) % 360, 180, rtol=0, atol=1.6e-5)
+    np.testing.assert_allclose(
+        (np.degrees(o.azimuth) - azimuth + 180) % 360, 180, rtol=0, atol=1.6e-5
+    )
     np.testing.assert_allclose(np.degrees(o.elevation), elevation, rtol=0, atol=1.6e-5)
     expected = {"SCAN": 0, "ON": 0, "ACC": TURNAROUND, "TRAN": TURNAROUND, "GRAD": IRREGULAR}
     np.testing.assert_array_equal(o.flags, [expected[state] for state in STATES])
@@ -78,10 +98,16 @@ def with_elevation(line: str, degrees: str) -> str:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda lines: [*lines[:3], lines[3].replace("20171103", "2017111x")], "line 5 is no row of an antenna log"),
+        (
+            lambda lines: [*lines[:3], lines[3].replace("20171103", "2017111x")],
+            "line 5 is no row of an antenna log",
+        ),
         (lambda lines: [*lines[:3], lines[3][:60] + "\n"], "line 5 "),
         (lambda lines: [], "has no row of a scan"),
-        (lambda lines: [*lines[:3], with_elevation(lines[3], "140.00000")], "el is 1[34].* deg in row 3"),
+        (
+            lambda lines: [*lines[:3], with_elevation(lines[3], "140.00000")],
+            "el is 1[34].* deg in row 3",
+        ),
     ],
 )
 def test_bad_logs(tmp_path: Path, change: Any, message: str) -> None:
@@ -98,8 +124,12 @@ def test_a_log_of_other_columns(tmp_path: Path) -> None:
     """Its names are read, too: columns in another order would be other angles."""
     lines, _, _ = rows()
     path = tmp_path / "other.ant"
-    path.write_text(HEAD.replace("az-real el-real", "el-real az-real") + "\n" + "".join(lines) + END)
-    with pytest.raises(InputError, match="column 6 of the antenna log is el-real, where az-real is read"):
+    path.write_text(
+        HEAD.replace("az-real el-real", "el-real az-real") + "\n" + "".join(lines) + END
+    )
+    with pytest.raises(
+        InputError, match="column 6 of the antenna log is el-real, where az-real is read"
+    ):
         observed(path)
     path.write_text(HEAD.replace("az-prg(no-cor)", "az-prog(no-cor)") + "\n" + "".join(lines) + END)
     assert observed(path)

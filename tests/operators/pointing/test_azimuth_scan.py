@@ -19,28 +19,37 @@ SCAN = {"throw": "2 deg", "speed": "0.5 deg/s", "acceleration": "1 deg/s2"}
 
 
 def operator(throw: float, speed: float, acceleration: float) -> PointingBackAndForth:
-    return PointingBackAndForth(throw=f"{throw!r} rad", speed=f"{speed!r} rad/s", acceleration=f"{acceleration!r} rad/s2")
+    return PointingBackAndForth(
+        throw=f"{throw!r} rad", speed=f"{speed!r} rad/s", acceleration=f"{acceleration!r} rad/s2"
+    )
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(1e-4, 3.0), speeds, st.floats(1e-5, 1.0))
-def test_acceleration_is_bounded_and_everything_is_smooth(throw: float, speed: float, acceleration: float) -> None:
+def test_acceleration_is_bounded_and_everything_is_smooth(
+    throw: float, speed: float, acceleration: float
+) -> None:
     scan = operator(throw, speed, acceleration)
     leg, turn = throw / speed, scan.turnaround
-    # one leg's end, the whole turnaround, the next leg's beginning, in steps of a 1/4000 of the turnaround
+    # one leg's end, the whole turnaround, the next leg's beginning, in steps of a 1/4000 of the
+    # turnaround
     t = leg + turn * np.linspace(-0.2, 1.2, 5601)
     t = t[(t > 0) & (t < 2 * leg + turn)]
     x, dt = scan.path(t)[0], turn * 1.4 / 5600
     velocity = np.diff(x) / dt
     a = np.diff(velocity) / dt
     scale = max(abs(x).max(), 1e-300)
-    rounding = 8 * np.finfo(float).eps * scale / dt**2 + 4 * np.finfo(float).eps * t.max() * speed / dt**2
+    rounding = (
+        8 * np.finfo(float).eps * scale / dt**2 + 4 * np.finfo(float).eps * t.max() * speed / dt**2
+    )
     assert np.abs(a).max() <= acceleration * (1 + 1e-9) + rounding
     assert np.abs(a).max() >= acceleration * (1 - 1e-5) - rounding
     assert np.abs(velocity).max() <= speed * (1 + 1e-9) + rounding * dt
     # acceleration is continuous: sin^2(pi u) changes by at most pi per unit u
     assert np.abs(np.diff(a)).max() <= acceleration * math.pi * (dt / turn) * 1.01 + 2 * rounding
-    assert np.abs(x).max() == pytest.approx(throw / 2 + speed**2 / acceleration * (1 + 4 / math.pi**2), rel=1e-6)
+    assert np.abs(x).max() == pytest.approx(
+        throw / 2 + speed**2 / acceleration * (1 + 4 / math.pi**2), rel=1e-6
+    )
 
 
 def test_legs_cross_the_throw_at_constant_speed() -> None:
@@ -83,7 +92,10 @@ def test_celestial_target_is_met_in_the_middle_of_the_scan(observe: Callable[...
 
 def test_offsets_shift_azimuth_on_the_sky_and_elevation(observe: Callable[..., Data]) -> None:
     scan = {**SCAN, "scan_duration": "1 s", "target": "az 90 deg el 60 deg"}
-    ((plain,), (moved,)) = (observe(PointingBackAndForth(**scan, offsets=o)).observations for o in ("none", [("1 deg", "2 deg")]))
+    ((plain,), (moved,)) = (
+        observe(PointingBackAndForth(**scan, offsets=o)).observations
+        for o in ("none", [("1 deg", "2 deg")])
+    )
     assert moved.elevation - plain.elevation == pytest.approx(math.radians(2), abs=1e-13)
     shift = moved.azimuth * math.cos(math.radians(62)) - plain.azimuth * math.cos(math.radians(60))
     centre = math.pi / 2 * (math.cos(math.radians(62)) - math.cos(math.radians(60)))
@@ -92,17 +104,25 @@ def test_offsets_shift_azimuth_on_the_sky_and_elevation(observe: Callable[..., D
 
 @pytest.mark.parametrize("jitter", ["0 s", "1 ms"])
 def test_intervals_are_toasts(jitter: str, observe: Callable[..., Data]) -> None:
-    """Scans and turnarounds share the samples; a throw ends where the azimuth turns; left to right is towards larger azimuth."""
-    step = PointingBackAndForth(**SCAN, scan_duration="70.03 s", flag_turnarounds=True, jitter=jitter)
+    """Scans and turnarounds share the samples; a throw ends where the azimuth turns; left to right
+    is towards larger azimuth.
+    """
+    step = PointingBackAndForth(
+        **SCAN, scan_duration="70.03 s", flag_turnarounds=True, jitter=jitter
+    )
     (o,) = observe(step).observations
     inside = {name: samples_in(spans, o.seconds) for name, spans in o.intervals.items()}
-    ways = [f"{kind}_{way}" for kind in ("scan", "turn", "throw") for way in ("leftright", "rightleft")]
+    ways = [
+        f"{kind}_{way}" for kind in ("scan", "turn", "throw") for way in ("leftright", "rightleft")
+    ]
     assert set(inside) == {"scanning", "turnaround", "throw", *ways}
     np.testing.assert_array_equal(inside["turnaround"], (o.flags & TURNAROUND) != 0)
     np.testing.assert_array_equal(inside["scanning"], ~inside["turnaround"])
     assert inside["throw"].all()
     for whole, kind in (("scanning", "scan"), ("turnaround", "turn"), ("throw", "throw")):
-        assert o.intervals[whole] == sorted(o.intervals[f"{kind}_leftright"] + o.intervals[f"{kind}_rightleft"])
+        assert o.intervals[whole] == sorted(
+            o.intervals[f"{kind}_leftright"] + o.intervals[f"{kind}_rightleft"]
+        )
         assert not (inside[f"{kind}_leftright"] & inside[f"{kind}_rightleft"]).any()
     up = np.diff(np.unwrap(o.azimuth)) > 0
     both = inside["throw_leftright"][1:] & inside["throw_leftright"][:-1]
@@ -116,16 +136,24 @@ def test_intervals_are_toasts(jitter: str, observe: Callable[..., Data]) -> None
 def test_turnarounds_are_counted_and_flagged_on_demand(observe: Callable[..., Data]) -> None:
     (used,) = observe(PointingBackAndForth(**SCAN, scan_duration="12 s")).observations
     assert not used.flags.any()
-    assert used.tally.get("PointingBackAndForth", "samples in turnarounds, used") == pytest.approx(400, abs=4)
-    (flagged,) = observe(PointingBackAndForth(**SCAN, scan_duration="12 s", flag_turnarounds=True)).observations
+    assert used.tally.get("PointingBackAndForth", "samples in turnarounds, used") == pytest.approx(
+        400, abs=4
+    )
+    (flagged,) = observe(
+        PointingBackAndForth(**SCAN, scan_duration="12 s", flag_turnarounds=True)
+    ).observations
     count = flagged.tally.get("PointingBackAndForth", "samples in turnarounds, flagged")
     assert set(np.unique(flagged.flags)) == {0, TURNAROUND}
     assert np.count_nonzero(flagged.flags) == count
     assert flagged.flags.dtype == np.uint8
 
 
-@pytest.mark.parametrize(("throw", "target"), [("10 deg", "az 10 deg el 89 deg"), ("6 rad", "az 0 deg el 30 deg")])
-def test_more_than_a_turn_of_azimuth_is_refused(throw: str, target: str, observe: Callable[..., Data]) -> None:
+@pytest.mark.parametrize(
+    ("throw", "target"), [("10 deg", "az 10 deg el 89 deg"), ("6 rad", "az 0 deg el 30 deg")]
+)
+def test_more_than_a_turn_of_azimuth_is_refused(
+    throw: str, target: str, observe: Callable[..., Data]
+) -> None:
     with pytest.raises(PointingError, match="more than a whole turn of azimuth"):
         observe(PointingBackAndForth(throw=throw), target=target)
 
@@ -133,7 +161,11 @@ def test_more_than_a_turn_of_azimuth_is_refused(throw: str, target: str, observe
 @pytest.mark.parametrize(
     ("limit", "value", "message"),
     [
-        ("speed_max", "0.4 deg/s", r"speed on the sky of 0.5 deg/s .*; GBT's largest speed on the sky is 0.4 deg/s"),
+        (
+            "speed_max",
+            "0.4 deg/s",
+            r"speed on the sky of 0.5 deg/s .*; GBT's largest speed on the sky is 0.4 deg/s",
+        ),
         (
             "acceleration_max",
             "0.5 deg/s2",
@@ -141,8 +173,18 @@ def test_more_than_a_turn_of_azimuth_is_refused(throw: str, target: str, observe
         ),
     ],
 )
-def test_faster_than_the_telescope(limit: str, value: str, message: str, observe: Callable[..., Data]) -> None:
+def test_faster_than_the_telescope(
+    limit: str, value: str, message: str, observe: Callable[..., Data]
+) -> None:
     with pytest.raises(PointingError, match=message):
-        observe(PointingBackAndForth(**SCAN, scan_duration="12 s"), target="az 0 deg el 45 deg", telescope={limit: value})
+        observe(
+            PointingBackAndForth(**SCAN, scan_duration="12 s"),
+            target="az 0 deg el 45 deg",
+            telescope={limit: value},
+        )
     generous = {limit: {"speed_max": "0.51 deg/s", "acceleration_max": "1.01 deg/s2"}[limit]}
-    observe(PointingBackAndForth(**SCAN, scan_duration="12 s"), target="az 0 deg el 45 deg", telescope=generous)
+    observe(
+        PointingBackAndForth(**SCAN, scan_duration="12 s"),
+        target="az 0 deg el 45 deg",
+        telescope=generous,
+    )

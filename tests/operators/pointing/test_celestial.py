@@ -26,7 +26,9 @@ from zonda.operators.pointing.base import Aim
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.stare import PointingStare
 
-GREEN_BANK = Site(name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="818 m")
+GREEN_BANK = Site(
+    name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="818 m"
+)
 POLE = Site(name="South Pole", latitude="-90 deg", longitude="0 deg", altitude="2835 m")
 EQUATOR = Site(name="equator", latitude="0 deg", longitude="200 deg")
 START = Instant.parse("2024-11-25T07:00:00.123456789Z")
@@ -44,12 +46,17 @@ def random_directions(n: int, seed: int = 0) -> Any:
 
 @pytest.mark.parametrize("site", [GREEN_BANK, POLE, EQUATOR], ids=lambda s: s.name)
 @pytest.mark.parametrize("year", [1985, 2000, 2024])
-def test_nodes_are_astropys_full_transformation_over_a_day(site: Site, year: int, reference: Any) -> None:
+def test_nodes_are_astropys_full_transformation_over_a_day(
+    site: Site, year: int, reference: Any
+) -> None:
     start = Instant.parse(f"{year}-11-25T07:00:00.123456789Z")
     transform = CelestialTransform(site, start, 86400.0)
     nodes = np.arange(0, 86401, 6 * transform.spacing)
     sky = random_directions(len(nodes))
-    assert angle(transform.horizontal(sky, nodes), reference.horizontal(sky, start, nodes, site)).max() < 1e-12
+    assert (
+        angle(transform.horizontal(sky, nodes), reference.horizontal(sky, start, nodes, site)).max()
+        < 1e-12
+    )
     assert angle(transform.icrs(sky, nodes), reference.icrs(sky, start, nodes, site)).max() < 1e-12
 
 
@@ -57,7 +64,9 @@ def test_between_nodes_the_error_is_the_stated_one(reference: Any) -> None:
     transform = CelestialTransform(GREEN_BANK, START, 86400.0)
     anywhere = np.random.default_rng(1).uniform(0, 86400, 200)
     sky = random_directions(200)
-    error = angle(transform.horizontal(sky, anywhere), reference.horizontal(sky, START, anywhere)).max()
+    error = angle(
+        transform.horizontal(sky, anywhere), reference.horizontal(sky, START, anywhere)
+    ).max()
     # halfway between nodes is where a spline's error peaks; 1e-13 is astropy's own rounding
     assert error < 2 * transform.error + 1e-13
     assert transform.error < 1e-3 * BEAM / 1000
@@ -94,13 +103,17 @@ def test_a_track_is_there_and_back_at_once(frame: str) -> None:
     _, azel, radec = transform.boresight(track.horizontal, seconds)
     assert np.array_equal(track.azel, azel)
     assert np.abs(track.radec - radec).max() < 5e-15
-    rounding = 2e-15 if frame == "field" else 1e-12  # longitudes of random directions are unwrapped to 1e3 rad
+    rounding = (
+        2e-15 if frame == "field" else 1e-12
+    )  # longitudes of random directions are unwrapped to 1e3 rad
     assert angle(rotation_matrices(track.radec)[:, :, 2], sky).max() < rounding
 
 
 @pytest.mark.parametrize("scan", [PointingDaisy(), PointingBackAndForth()])
 @pytest.mark.parametrize("target", ["05h +20d", "az 180d el 45d"])
-def test_bits_do_not_depend_on_the_chunk(scan: Any, target: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bits_do_not_depend_on_the_chunk(
+    scan: Any, target: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     parsed, seconds = Target.parse(target), np.arange(5000) / 20.0
     transform = CelestialTransform(GREEN_BANK, START, 250.0)
     whole = scan.boresight(Aim(transform, parsed, (1e-4, 2e-4)), seconds)
@@ -109,11 +122,15 @@ def test_bits_do_not_depend_on_the_chunk(scan: Any, target: str, monkeypatch: py
     assert np.array_equal(whole.horizontal, parts.horizontal)
     assert np.array_equal(whole.azel, parts.azel)
     # bent light is inverted by steps that begin at the mean of a chunk
-    assert np.abs(whole.radec - parts.radec).max() <= (0.0 if isinstance(scan, PointingDaisy) and "az" not in target else 1e-15)
+    assert np.abs(whole.radec - parts.radec).max() <= (
+        0.0 if isinstance(scan, PointingDaisy) and "az" not in target else 1e-15
+    )
 
 
 def test_near_the_sun(reference: Any) -> None:
-    """Half a degree from the Sun light is bent by 1 arcsec, 5e-6 rad, which is followed and inverted."""
+    """Half a degree from the Sun light is bent by 1 arcsec, 5e-6 rad, which is followed and
+    inverted.
+    """
     from astropy.coordinates import get_sun
 
     sun = get_sun(reference.frame(START, np.zeros(1)).obstime).icrs
@@ -138,16 +155,25 @@ def test_poles_of_the_sky(reference: Any) -> None:
 
 @pytest.mark.parametrize(
     "target",
-    ["05h00m00s +20d00m00s", "galactic 120.5 deg -30 deg", "0 deg 89 deg", "az 10 deg el 5.1 deg", "az 0 deg el 89.999 deg"],
+    [
+        "05h00m00s +20d00m00s",
+        "galactic 120.5 deg -30 deg",
+        "0 deg 89 deg",
+        "az 10 deg el 5.1 deg",
+        "az 0 deg el 89.999 deg",
+    ],
 )
 def test_position_angle(target: str, observe: Callable[..., Data], reference: Any) -> None:
     """The whole focal plane, not only the boresight, lands where astropy puts it.
 
-    A rigid focal plane cannot follow aberration's change of scale, 1.03e-4 at most; its rotation must be right, so the
-    error is along the offset: the part across it stays below 1e-6 of the offset (light deflection's shear, the second order).
+    A rigid focal plane cannot follow aberration's change of scale, 1.03e-4 at most; its rotation
+    must be right, so the error is along the offset: the part across it stays below 1e-6 of the
+    offset (light deflection's shear, the second order).
     """
     telescope = {"elevation_min": "0 deg"}
-    (o,) = observe(PointingDaisy(scan_duration="60 s", sample_rate="5 Hz"), target=target, telescope=telescope).observations
+    (o,) = observe(
+        PointingDaisy(scan_duration="60 s", sample_rate="5 Hz"), target=target, telescope=telescope
+    ).observations
     offset = math.radians(1 / 60)
     for xi, eta in ((0, offset), (offset, 0), (-offset, offset)):
         ray = np.array([-eta, -xi, 1.0]) / math.sqrt(1 + xi * xi + eta * eta)
@@ -166,7 +192,9 @@ def test_psi_of_azel_is_zero_and_angles_are_toasts(observe: Callable[..., Data])
     (o,) = observe(PointingDaisy(scan_duration="20 s")).observations
     psi = o.derotate("boresight_azel")[2]
     assert np.abs(np.sin(psi)).max() < 1e-14
-    same = np.abs((o.boresight_azel * from_angles(-o.azimuth, o.elevation)).sum(1))  # q and -q are one rotation
+    same = np.abs(
+        (o.boresight_azel * from_angles(-o.azimuth, o.elevation)).sum(1)
+    )  # q and -q are one rotation
     assert np.abs(same - 1).max() < 1e-15
     for q in (o.boresight_azel, o.boresight_radec):
         assert q.dtype == np.float64
@@ -175,23 +203,31 @@ def test_psi_of_azel_is_zero_and_angles_are_toasts(observe: Callable[..., Data])
 
 
 def test_parallactic_angle_is_the_textbook_one(observe: Callable[..., Data]) -> None:
-    """From the triangle pole, zenith, star (Smart 1977, section 12); precession since 2000 turns the pole by 0.14 deg."""
+    """From the triangle pole, zenith, star (Smart 1977, section 12); precession since 2000 turns
+    the pole by 0.14 deg.
+    """
     (o,) = observe(PointingStare(scan_duration="10 s", sample_rate="1 Hz")).observations
     latitude = GREEN_BANK.latitude
     # direction of the zenith seen from the star, east of north
     sin_q = -np.sin(o.azimuth) * math.cos(latitude) / np.cos(o.dec)
-    cos_q = (math.sin(latitude) - np.sin(o.dec) * np.sin(o.elevation)) / (np.cos(o.dec) * np.cos(o.elevation))
+    cos_q = (math.sin(latitude) - np.sin(o.dec) * np.sin(o.elevation)) / (
+        np.cos(o.dec) * np.cos(o.elevation)
+    )
     expected = np.arctan2(sin_q, cos_q)
     # focal-plane up, (-1, 0, 0) in the boresight frame, on the sky
     up = -rotation_matrices(o.boresight_radec)[:, :, 0]
-    north = np.stack([-np.sin(o.dec) * np.cos(o.ra), -np.sin(o.dec) * np.sin(o.ra), np.cos(o.dec)], axis=1)
+    north = np.stack(
+        [-np.sin(o.dec) * np.cos(o.ra), -np.sin(o.dec) * np.sin(o.ra), np.cos(o.dec)], axis=1
+    )
     east = np.stack([-np.sin(o.ra), np.cos(o.ra), 0 * o.ra], axis=1)
     found = np.arctan2((up * east).sum(1), (up * north).sum(1))
     assert np.abs(np.sin(found - expected)).max() < math.radians(0.5)
     assert np.cos(found - expected).min() > 0
 
 
-def test_scan_across_right_ascension_zero_due_north_and_due_south_is_smooth(observe: Callable[..., Data]) -> None:
+def test_scan_across_right_ascension_zero_due_north_and_due_south_is_smooth(
+    observe: Callable[..., Data],
+) -> None:
     daisy = PointingDaisy(scan_duration="60 s", speed="1 arcmin/s")
     for target in ("0 deg 20 deg", "az 180 deg el 40 deg", "az 0 deg el 40 deg"):
         (o,) = observe(daisy, target=target, time="2024-11-25T00:30Z").observations
@@ -203,11 +239,17 @@ def test_scan_across_right_ascension_zero_due_north_and_due_south_is_smooth(obse
 
 
 def test_pass_near_the_zenith(observe: Callable[..., Data], reference: Any) -> None:
-    """A star that culminates 1 arcsec from the zenith: azimuth turns by 180 deg within a second; directions stay right."""
-    overhead = CelestialTransform(GREEN_BANK, START, 0.0).icrs(np.array([0.0, 0.0, 1.0]), np.zeros(1))[0]
+    """A star that culminates 1 arcsec from the zenith: azimuth turns by 180 deg within a second;
+    directions stay right.
+    """
+    overhead = CelestialTransform(GREEN_BANK, START, 0.0).icrs(
+        np.array([0.0, 0.0, 1.0]), np.zeros(1)
+    )[0]
     ra, dec = math.atan2(overhead[1], overhead[0]), math.asin(overhead[2]) + math.radians(1 / 3600)
     target = f"{ra!r} rad {dec!r} rad"
-    (o,) = observe(PointingStare(scan_duration="60 s"), target=target, time=START.shifted(-30)).observations
+    (o,) = observe(
+        PointingStare(scan_duration="60 s"), target=target, time=START.shifted(-30)
+    ).observations
     assert o.elevation.max() > math.radians(90 - 1.1 / 3600)
     sky = unit_vectors(np.full(o.n_samples, ra), np.full(o.n_samples, dec))
     some = slice(None, None, 50)
@@ -217,12 +259,16 @@ def test_pass_near_the_zenith(observe: Callable[..., Data], reference: Any) -> N
     # psi of radec follows: focal-plane up is the direction to the zenith as astropy sees it
     ray = np.array([-1e-4, 0, 1.0])
     ours = rotation_matrices(o.boresight_radec)[some] @ ray
-    truth = reference.icrs(rotation_matrices(o.boresight_azel)[some] @ ray, o.start, o.seconds[some])
+    truth = reference.icrs(
+        rotation_matrices(o.boresight_azel)[some] @ ray, o.start, o.seconds[some]
+    )
     assert angle(ours, truth).max() < 1.2e-4 * 1e-4
 
 
 def test_elevation_five_degrees(observe: Callable[..., Data], reference: Any) -> None:
-    (o,) = observe(PointingStare(scan_duration="10 s", sample_rate="1 Hz"), target="az 123 deg el 5 deg").observations
+    (o,) = observe(
+        PointingStare(scan_duration="10 s", sample_rate="1 Hz"), target="az 123 deg el 5 deg"
+    ).observations
     assert o.elevation == pytest.approx(math.radians(5), abs=1e-15)
     truth = reference.icrs(rotation_matrices(o.boresight_azel)[:, :, 2], o.start, o.seconds)
     assert angle(rotation_matrices(o.boresight_radec)[:, :, 2], truth).max() < 1e-12
@@ -243,7 +289,8 @@ def test_only_the_instant_matters(since_midnight: int, shift: int) -> None:
     sky = random_directions(1, seed=5)
     one = CelestialTransform(GREEN_BANK, early, 500.0).horizontal(sky, np.array([shift / 1e9]))
     two = CelestialTransform(GREEN_BANK, late, 0.0).horizontal(sky, np.zeros(1))
-    # 2e-12 rad of interpolation; a time rounded to the 0.24 us of a float64 POSIX second would move it by 9e-12 rad
+    # 2e-12 rad of interpolation; a time rounded to the 0.24 us of a float64 POSIX second would move
+    # it by 9e-12 rad
     assert angle(one, two).max() < 2e-12
 
 
@@ -253,7 +300,10 @@ def test_a_leap_second_is_a_second(reference: Any) -> None:
     transform = CelestialTransform(GREEN_BANK, start, 20.0)
     seconds = np.array([0.0, 9.5, 10.5, 11.5, 20.0])
     sky = random_directions(5)
-    assert angle(transform.horizontal(sky, seconds), reference.horizontal(sky, start, seconds)).max() < 1e-11
+    assert (
+        angle(transform.horizontal(sky, seconds), reference.horizontal(sky, start, seconds)).max()
+        < 1e-11
+    )
 
 
 def test_tables_agree_where_they_overlap() -> None:
@@ -300,8 +350,12 @@ def test_it_follows_astropy() -> None:
 
 @pytest.mark.filterwarnings("ignore")  # astropy's own, of the same limits
 @pytest.mark.parametrize("year", [1950, 2060])
-def test_dates_beyond_every_table_work_and_say_so(year: int, observe: Callable[..., Data], reference: Any) -> None:
-    (o,) = observe(PointingStare(scan_duration="1 s"), time=f"{year}-11-25T12:00Z", target="az 0 deg el 45 deg").observations
+def test_dates_beyond_every_table_work_and_say_so(
+    year: int, observe: Callable[..., Data], reference: Any
+) -> None:
+    (o,) = observe(
+        PointingStare(scan_duration="1 s"), time=f"{year}-11-25T12:00Z", target="az 0 deg el 45 deg"
+    ).observations
     statement = {what: value for _, what, value in o.tally}["Earth orientation"]
     assert statement == "none for this date: UT1 = UTC (within 0.9 s) and the mean pole assumed"
     truth = reference.icrs(rotation_matrices(o.boresight_azel)[:2, :, 2], o.start, o.seconds[:2])

@@ -15,7 +15,9 @@ ARCSEC = ARCMIN / 60
 
 
 def tangent_offsets(ra: np.ndarray, dec: np.ndarray, ra0: float, dec0: float) -> np.ndarray:
-    """Gnomonic offsets (n,) complex, east + i north (Calabretta & Greisen 2002, equations 54 and 12)."""
+    """Gnomonic offsets (n,) complex, east + i north (Calabretta & Greisen 2002, equations 54 and
+    12).
+    """
     cos_c = math.sin(dec0) * np.sin(dec) + math.cos(dec0) * np.cos(dec) * np.cos(ra - ra0)
     x = np.cos(dec) * np.sin(ra - ra0) / cos_c
     y = (math.cos(dec0) * np.sin(dec) - math.sin(dec0) * np.cos(dec) * np.cos(ra - ra0)) / cos_c
@@ -30,9 +32,13 @@ def closed_form(t: np.ndarray, r: float, v: float) -> np.ndarray:
     return outer + inner
 
 
-@pytest.mark.parametrize("target", ["05h00m00s +20d00m00s", "galactic 120.5 deg 30 deg", "10 deg 88 deg"])
+@pytest.mark.parametrize(
+    "target", ["05h00m00s +20d00m00s", "galactic 120.5 deg 30 deg", "10 deg 88 deg"]
+)
 def test_offsets_are_the_papers_closed_form(target: str, observe: Callable[..., Data]) -> None:
-    (o,) = observe(PointingDaisy(scan_duration="516 s", sample_rate="10 Hz"), target=target).observations
+    (o,) = observe(
+        PointingDaisy(scan_duration="516 s", sample_rate="10 Hz"), target=target
+    ).observations
     found = tangent_offsets(o.ra, o.dec, *Target.parse(target).icrs())
     expected = closed_form(o.seconds, 4 * ARCMIN, 50 * ARCSEC)
     # 1e-15 rad of rounding, amplified by 1 / cos(dec) = 30 where right ascension is compared
@@ -66,7 +72,8 @@ def test_largest_radius_and_coverage() -> None:
     reach = np.hypot(x, y).max() / r
     # sqrt(1 + 0.15^2) = 1.0112 where both daisies are at right angles
     assert 1.010 < reach <= math.hypot(1, 0.15) + 1e-12
-    # after one 8.6 min scan every cell of 1 arcmin within the radius that a 4.2 arcmin field adds to has been visited
+    # after one 8.6 min scan every cell of 1 arcmin within the radius that a 4.2 arcmin field adds
+    # to has been visited
     first = t < 516
     u, w = x[first][:, None] / ARCMIN, y[first][:, None] / ARCMIN
     cells = [(a, b) for a in range(-3, 4) for b in range(-3, 4) if math.hypot(a, b) <= 3]
@@ -75,7 +82,8 @@ def test_largest_radius_and_coverage() -> None:
 
 
 @pytest.mark.parametrize(
-    ("parameter", "changed"), [("petals", 5.0), ("inner", 0.3), ("phase", "1 rad"), ("speed", "20 arcsec/s")]
+    ("parameter", "changed"),
+    [("petals", 5.0), ("inner", 0.3), ("phase", "1 rad"), ("speed", "20 arcsec/s")],
 )
 def test_every_parameter_has_its_effect(parameter: str, changed: object) -> None:
     t = np.linspace(0, 60, 50)
@@ -90,17 +98,25 @@ def test_phase_is_a_later_start() -> None:
 
 
 def test_box_moves_by_its_side(observe: Callable[..., Data]) -> None:
-    operator = PointingDaisy(scans=5, offsets="box", offset_size="1 arcmin", scan_duration="10 s", gap="20 s")
+    operator = PointingDaisy(
+        scans=5, offsets="box", offset_size="1 arcmin", scan_duration="10 s", gap="20 s"
+    )
     data = observe(operator)
     scans = data.observations
-    centres = [tangent_offsets(o.ra, o.dec, *o.centre) - closed_form(o.seconds, operator.radius, operator.speed) for o in scans]
+    centres = [
+        tangent_offsets(o.ra, o.dec, *o.centre)
+        - closed_form(o.seconds, operator.radius, operator.speed)
+        for o in scans
+    ]
     middle = np.array([c.mean() for c in centres])
     assert max(np.abs(c - m).max() for c, m in zip(centres, middle, strict=True)) < 1e-14
     assert np.abs(np.diff(middle)) == pytest.approx(np.full(4, ARCMIN), abs=1e-13)
     assert np.abs(middle[:4].mean()) < 1e-13
     assert middle[4] == pytest.approx(middle[0], abs=1e-13)
     assert [o.name for o in data.observations] == [f"scan-{k:03d}" for k in range(5)]
-    assert [o.start.seconds_since(data.scene.time) for o in data.observations] == [30.0 * k for k in range(5)]
+    assert [o.start.seconds_since(data.scene.time) for o in data.observations] == [
+        30.0 * k for k in range(5)
+    ]
     assert {o.centre for o in data.observations} == {Target.parse("75 deg 20 deg").icrs()}
 
 
@@ -122,11 +138,14 @@ def test_horizontal_target(observe: Callable[..., Data]) -> None:
     assert np.abs(drift).max() > 300 * ARCSEC
 
 
-def test_galactic_and_icrs_names_of_one_place_are_one_pointing(observe: Callable[..., Data]) -> None:
+def test_galactic_and_icrs_names_of_one_place_are_one_pointing(
+    observe: Callable[..., Data],
+) -> None:
     galactic = Target.parse("galactic 120.5 deg 30 deg")
     ra, dec = galactic.icrs()
     (a,), (b,) = (
-        observe(PointingDaisy(scan_duration="5 s"), target=t).observations for t in (galactic, f"{ra!r} rad {dec!r} rad")
+        observe(PointingDaisy(scan_duration="5 s"), target=t).observations
+        for t in (galactic, f"{ra!r} rad {dec!r} rad")
     )
     assert np.array_equal(a.boresight_radec, b.boresight_radec)
 
@@ -140,7 +159,9 @@ def test_stare_tracks_or_stands_still(observe: Callable[..., Data]) -> None:
     (tracked,) = observe(PointingStare(scan_duration="100 s")).observations
     assert np.ptp(tracked.ra) < 1e-14
     assert np.ptp(tracked.elevation) > 60 * ARCSEC
-    (still,) = observe(PointingStare(scan_duration="100 s"), target="az 180 deg el 60 deg").observations
+    (still,) = observe(
+        PointingStare(scan_duration="100 s"), target="az 180 deg el 60 deg"
+    ).observations
     assert np.ptp(still.boresight_azel, axis=0).max() == 0
     # at the meridian 100 s of UT1 are 1504.1 arcsec of hour angle
     middle = [(still.ra[0] + still.ra[-1]) / 2, (still.dec[0] + still.dec[-1]) / 2]
@@ -170,7 +191,9 @@ def test_figures_reach_the_tally(observe: Callable[..., Data]) -> None:
     told = {what: value for _, what, value in o.tally}
     assert "of a beam (nodes every 600 s)" in told["interpolation error of the pointing"]
     assert told["Earth orientation"] == "IERS C04"
-    (finer,) = observe(PointingDaisy(interpolation_error=2e-9)).observations  # 8e-14 rad: 600 s would give 2.7e-13 rad
+    (finer,) = observe(
+        PointingDaisy(interpolation_error=2e-9)
+    ).observations  # 8e-14 rad: 600 s would give 2.7e-13 rad
     told = {what: value for _, what, value in finer.tally}
     assert "nodes every 300 s" in told["interpolation error of the pointing"]
 
@@ -198,5 +221,8 @@ def test_bad_parameters_are_refused(wrong: dict[str, object], message: str) -> N
 
 
 def test_parameters_survive_a_dump() -> None:
-    for operator in (PointingDaisy(), PointingDaisy(offsets=[("1 arcmin", "2 arcsec")], target="galactic 12 deg 3 deg")):
+    for operator in (
+        PointingDaisy(),
+        PointingDaisy(offsets=[("1 arcmin", "2 arcsec")], target="galactic 12 deg 3 deg"),
+    ):
         assert PointingDaisy.model_validate_json(operator.model_dump_json()) == operator

@@ -34,8 +34,12 @@ def recording(seconds: Any, flags: Any = None) -> Recording:
                      np.zeros(len(t), bool) if flags is None else np.asarray(flags))  # fmt: skip
 
 
-def write_csv(path: Path, t: Any, az: Any, el: Any, header: str = "time [s], az [deg], el [deg]") -> Path:
-    np.savetxt(path, np.transpose([t, az, el]), fmt="%.12f", delimiter=",", header=header, comments="")
+def write_csv(
+    path: Path, t: Any, az: Any, el: Any, header: str = "time [s], az [deg], el [deg]"
+) -> Path:
+    np.savetxt(
+        path, np.transpose([t, az, el]), fmt="%.12f", delimiter=",", header=header, comments=""
+    )
     return path
 
 
@@ -50,7 +54,9 @@ def write_csv(path: Path, t: Any, az: Any, el: Any, header: str = "time [s], az 
     st.sets(st.integers(1, 298), max_size=100),
     st.integers(0, 2**31),
 )
-def test_every_row_keeps_its_time_and_direction(n: int, jitter: float, step: float, missing: set[int], seed: int) -> None:
+def test_every_row_keeps_its_time_and_direction(
+    n: int, jitter: float, step: float, missing: set[int], seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     there = np.array([k for k in range(n) if k not in missing or k in (0, n - 1)])
     t = step * (there + jitter * rng.uniform(-1, 1, len(there)))
@@ -80,7 +86,14 @@ def test_nothing_is_repaired_silently() -> None:
     rows.seconds[500] = rows.seconds[499] + 1e-4  # far too early
     rows.flags[[10, 11]] = True
     keep = np.r_[0:1000, 1150:2000]  # a gap of 1.5 s
-    cut = Recording(rows.start, rows.seconds[keep], rows.longitude[keep], rows.latitude[keep], "azel", rows.flags[keep])
+    cut = Recording(
+        rows.start,
+        rows.seconds[keep],
+        rows.longitude[keep],
+        rows.latitude[keep],
+        "azel",
+        rows.flags[keep],
+    )
     found = comb(cut, 60.0, "test")
     (scan,) = found.scans
     assert len(scan.seconds) == 2000
@@ -112,7 +125,13 @@ def test_what_is_no_comb_is_refused() -> None:
     with pytest.raises(InputError, match="1 rows with increasing times"):
         comb(recording([0.0]), 60, "test")
     with pytest.raises(InputError, match="no two consecutive directions"):
-        comb(Recording(None, np.arange(9.0), np.full(9, NAN), np.zeros(9), "azel", np.zeros(9, bool)), 60, "test")
+        comb(
+            Recording(
+                None, np.arange(9.0), np.full(9, NAN), np.zeros(9), "azel", np.zeros(9, bool)
+            ),
+            60,
+            "test",
+        )
 
 
 @settings(max_examples=100, deadline=None)
@@ -130,9 +149,15 @@ def test_as_few_rows_as_possible_are_dropped(values: list[int]) -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.integers(10, 300), st.data())
 def test_stamps_that_jump_are_dropped_alone(n: int, data: st.DataObject) -> None:
-    """However far, ahead or back, as long as there are more good rows than such before and behind them."""
+    """However far, ahead or back, as long as there are more good rows than such before and behind
+    them.
+    """
     jumps = data.draw(
-        st.dictionaries(st.integers(4, n - 5), st.sampled_from([1e9, 3600.0, -3600.0, -1e9]), max_size=min(3, n // 8))
+        st.dictionaries(
+            st.integers(4, n - 5),
+            st.sampled_from([1e9, 3600.0, -3600.0, -1e9]),
+            max_size=min(3, n // 8),
+        )
     )
     t = np.arange(n) / 100
     rows = recording(t)
@@ -145,7 +170,9 @@ def test_stamps_that_jump_are_dropped_alone(n: int, data: st.DataObject) -> None
     assert scan.seconds == pytest.approx(t, abs=1e-9)
 
 
-def test_repeated_rows_are_dropped_without_a_word(observe: Callable[..., Data], tmp_path: Path) -> None:
+def test_repeated_rows_are_dropped_without_a_word(
+    observe: Callable[..., Data], tmp_path: Path
+) -> None:
     t, angle = UNIX + np.repeat(np.arange(600), 2) / 10, np.repeat(np.arange(600), 2) / 6000
     file = write_csv(tmp_path / "twice.csv", t, 200 + angle, 40 + angle)
     with warnings.catch_warnings():
@@ -155,12 +182,16 @@ def test_repeated_rows_are_dropped_without_a_word(observe: Callable[..., Data], 
     assert data.observations[0].tally.get("PointingRecorded", "rows repeated, dropped") == 600
 
 
-def test_a_stamp_ahead_of_its_time_is_dropped_and_said(observe: Callable[..., Data], tmp_path: Path) -> None:
+def test_a_stamp_ahead_of_its_time_is_dropped_and_said(
+    observe: Callable[..., Data], tmp_path: Path
+) -> None:
     """The rest stays: a year ahead, in the third row of 600."""
     t, angle = UNIX + np.arange(600) / 10, np.arange(600) / 600
     t[2] += 3e7
     file = write_csv(tmp_path / "jump.csv", t, 200 + angle, 40 + angle)
-    with pytest.warns(UserWarning, match=r"1 rows of .*jump.csv were dropped: their times jump ahead or back"):
+    with pytest.warns(
+        UserWarning, match=r"1 rows of .*jump.csv were dropped: their times jump ahead or back"
+    ):
         data = observe(PointingRecorded(file=file))
     (observation,) = data.observations
     assert observation.n_samples == 600
@@ -170,26 +201,40 @@ def test_a_stamp_ahead_of_its_time_is_dropped_and_said(observe: Callable[..., Da
 # ---- files
 
 
-def test_a_simulated_scan_read_back_is_the_same_scan(observe: Callable[..., Data], tmp_path: Path) -> None:
-    """SaveTOD's HDF5 and FITS files carry exact times: the boresight comes back to 1e-15, samples to the last bit of time."""
+def test_a_simulated_scan_read_back_is_the_same_scan(
+    observe: Callable[..., Data], tmp_path: Path
+) -> None:
+    """SaveTOD's HDF5 and FITS files carry exact times: the boresight comes back to 1e-15, samples
+    to the last bit of time.
+    """
     import zonda
 
     made = observe(PointingDaisy(scan_duration="30 s"))
     (o,) = made.observations
     for fmt, suffix in (("hdf5", "h5"), ("fits", "fits")):
-        steps = [PointingDaisy(scan_duration="30 s", jitter="0.5 ms"), zonda.WhiteNoise(), zonda.Efficiency()]
+        steps = [
+            PointingDaisy(scan_duration="30 s", jitter="0.5 ms"),
+            zonda.WhiteNoise(),
+            zonda.Efficiency(),
+        ]
         from zonda.operators.io.save_tod import SaveTOD
 
-        data = zonda.Pipeline([*steps, SaveTOD(format=fmt)]).run(made.scene, output=tmp_path / fmt, threads=1)
+        data = zonda.Pipeline([*steps, SaveTOD(format=fmt)]).run(
+            made.scene, output=tmp_path / fmt, threads=1
+        )
         (first,) = data.observations
-        (again,) = observe(PointingRecorded(file=tmp_path / fmt / f"tod_scan-000.{suffix}")).observations
+        (again,) = observe(
+            PointingRecorded(file=tmp_path / fmt / f"tod_scan-000.{suffix}")
+        ).observations
         assert again.start == first.start.shifted(float(first.seconds[0]))
         assert again.seconds == pytest.approx(first.seconds - first.seconds[0], abs=1e-9)
         assert again.jitter == pytest.approx(0.5e-3, rel=0.05)  # of 3000: 1.3 % standard error
         assert again.centre == first.centre
         for name in ("boresight_azel", "boresight_radec"):
             a, b = (rotation_matrices(getattr(x, name)) for x in (again, first))
-            assert np.abs(a - b).max() < 1e-12  # 1 ns of rounding of the start at 58 arcsec/s: 3e-13
+            assert (
+                np.abs(a - b).max() < 1e-12
+            )  # 1 ns of rounding of the start at 58 arcsec/s: 3e-13
         assert not again.flags.any()
     assert first.seconds == pytest.approx(o.seconds, abs=5e-3)
 
@@ -202,14 +247,22 @@ def test_tables(kind: str, observe: Callable[..., Data], tmp_path: Path) -> None
     if kind == "csv":
         write_csv(path, UNIX + t, az, el)
     elif kind == "fits":
-        columns = [fits.Column("TIME", "D", unit="s", array=UNIX + t), fits.Column("AZ", "D", unit="deg", array=az),
-                   fits.Column("EL", "D", unit="deg", array=el), fits.Column("X", "3D", array=np.zeros((500, 3)))]  # fmt: skip
+        columns = [
+            fits.Column("TIME", "D", unit="s", array=UNIX + t),
+            fits.Column("AZ", "D", unit="deg", array=az),
+            fits.Column("EL", "D", unit="deg", array=el),
+            fits.Column("X", "3D", array=np.zeros((500, 3))),
+        ]
         fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]).writeto(path)
     else:
         import h5py
 
         with h5py.File(path, "w") as file:
-            for name, values, unit in (("time", UNIX + t, "s"), ("azimuth", np.radians(az), "rad"), ("elevation", el, "deg")):
+            for name, values, unit in (
+                ("time", UNIX + t, "s"),
+                ("azimuth", np.radians(az), "rad"),
+                ("elevation", el, "deg"),
+            ):
                 file.create_dataset(name, data=values).attrs["units"] = unit
     (o,) = observe(PointingRecorded(file=path), target=None).observations
     assert str(o.start) == "2024-11-25T07:00:00Z"
@@ -224,7 +277,9 @@ def test_tables(kind: str, observe: Callable[..., Data], tmp_path: Path) -> None
 def test_clocks_and_celestial_rows(observe: Callable[..., Data], tmp_path: Path) -> None:
     t = np.arange(200) / 20
     ra, dec = 75 + 0.01 * np.sin(t), 20 + 0.01 * np.cos(t)
-    mjd = write_csv(tmp_path / "mjd.csv", 60639 + (7 * 3600 + t) / 86400, ra, dec, "mjd, ra [deg], dec [deg]")
+    mjd = write_csv(
+        tmp_path / "mjd.csv", 60639 + (7 * 3600 + t) / 86400, ra, dec, "mjd, ra [deg], dec [deg]"
+    )
     (o,) = observe(PointingRecorded(file=mjd, clock="mjd")).observations
     assert abs(o.start.seconds_since(Instant.parse("2024-11-25T07:00Z"))) < 2e-6
     assert np.degrees(o.ra) == pytest.approx(ra, abs=1e-9)
@@ -249,7 +304,9 @@ def test_bad_files(tmp_path: Path) -> None:
         ("time [s], az [deg], el [rad]", r"el is 2578.\d+ deg in row 0"),
     ):
         with pytest.raises(InputError, match=message):
-            read_recording(write_csv(tmp_path / "bad.csv", UNIX + t, 10 * t, 45 + 0 * t, header), "unix")
+            read_recording(
+                write_csv(tmp_path / "bad.csv", UNIX + t, 10 * t, 45 + 0 * t, header), "unix"
+            )
     (tmp_path / "ragged.csv").write_text("time [s], az [deg], el [deg]\n1,2,3\n1,2\n")
     with pytest.raises(InputError, match="cannot be read as CSV"):
         read_recording(tmp_path / "ragged.csv", "unix")
@@ -267,9 +324,16 @@ def test_a_rotated_boresight_is_refused(tmp_path: Path) -> None:
     from zonda.core.numerics.quaternions import from_angles, multiply
 
     t = np.arange(20) / 10
-    turned = multiply(from_angles(-1 + 0 * t, 0.8 + 0 * t), np.tile([0, 0, np.sin(0.05), np.cos(0.05)], (20, 1)))
+    turned = multiply(
+        from_angles(-1 + 0 * t, 0.8 + 0 * t), np.tile([0, 0, np.sin(0.05), np.cos(0.05)], (20, 1))
+    )
     with h5py.File(tmp_path / "turned.h5", "w") as file:
-        for name, values in (("times", UNIX + t), ("azimuth", 1 + 0 * t), ("elevation", 0.8 + 0 * t), ("boresight_azel", turned)):
+        for name, values in (
+            ("times", UNIX + t),
+            ("azimuth", 1 + 0 * t),
+            ("elevation", 0.8 + 0 * t),
+            ("boresight_azel", turned),
+        ):
             file.create_dataset(f"shared/{name}", data=values)
     text = r"rotated by up to 5\.73 deg about itself(.|\n)*LoadTOD: {file: \.\.\., signal: none}"
     with pytest.raises(InputError, match=text):
@@ -277,12 +341,15 @@ def test_a_rotated_boresight_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_step_that_a_rotated_boresight_needs(tmp_path: Path) -> None:
-    """A scheduled scan turned by 45 deg: refused from both formats, and followed by `LoadTOD` without a stream."""
+    """A scheduled scan turned by 45 deg: refused from both formats, and followed by `LoadTOD`
+    without a stream.
+    """
     schedule = tmp_path / "s.txt"
     schedule.write_text(
-        "# Site | Telescope | Latitude [deg] | Longitude [deg] | Elevation [m]\nATACAMA | LAT | -22.958 | -67.786 | 5200.0\n"
-        "# Start time UTC | Stop time UTC | Rotation | Patch name | Az min. | Az max. | Elev. | Pass | Sub\n"
-        "2025-08-01 05:12:30 | 2025-08-01 05:12:50 | 45.0 | field | 73.0 | 82.0 | 50.00 | 0 | 0\n"
+        "# Site | Telescope | Latitude [deg] | Longitude [deg] | Elevation [m]\nATACAMA | LAT |"
+        " -22.958 | -67.786 | 5200.0\n# Start time UTC | Stop time UTC | Rotation | Patch name | Az"
+        " min. | Az max. | Elev. | Pass | Sub\n2025-08-01 05:12:30 | 2025-08-01 05:12:50 | 45.0 |"
+        " field | 73.0 | 82.0 | 50.00 | 0 | 0\n"
     )
     camera = {"like": "act_150ghz", "detectors": 3, "sample_rate": "20 Hz"}
     scene = zonda.Scene(site="atacama", instrument=camera, time="2025-08-01T05:12", seed=1)
@@ -299,7 +366,9 @@ def test_the_step_that_a_rotated_boresight_needs(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one.boresight_azel, other.boresight_azel)
 
 
-def test_outside_the_telescopes_range_is_found_by_check(observe: Callable[..., Data], tmp_path: Path) -> None:
+def test_outside_the_telescopes_range_is_found_by_check(
+    observe: Callable[..., Data], tmp_path: Path
+) -> None:
     t = np.arange(100.0)
     high = PointingRecorded(file=write_csv(tmp_path / "high.csv", UNIX + t, 10 + 0 * t, 45 + 0 * t))
     low = PointingRecorded(file=write_csv(tmp_path / "low.csv", UNIX + t, 10 + 0 * t, 3 + 0 * t))
@@ -313,7 +382,10 @@ def test_outside_the_telescopes_range_is_found_by_check(observe: Callable[..., D
 def test_outside_the_telescopes_range(observe: Callable[..., Data], tmp_path: Path) -> None:
     t = np.arange(100.0)
     path = write_csv(tmp_path / "low.csv", UNIX + t, 10 + 0 * t, np.where(t == 60, 3, 45))
-    with pytest.raises(PointingError, match=r"the boresight is at elevation 3.00 deg, 60 s after .*GBT reaches 5 deg to 90 deg"):
+    with pytest.raises(
+        PointingError,
+        match=r"the boresight is at elevation 3.00 deg, 60 s after .*GBT reaches 5 deg to 90 deg",
+    ):
         observe(PointingRecorded(file=path))
     write_csv(path, UNIX + t, 10 + 0 * t, np.where(t == 60, NAN, 45))
     (o,) = observe(PointingRecorded(file=path)).observations
@@ -325,7 +397,9 @@ def test_outside_the_telescopes_range(observe: Callable[..., Data], tmp_path: Pa
 
 
 def test_jitter_moves_the_pointing_by_speed_times_delay(observe: Callable[..., Data]) -> None:
-    """The direction of every sample is that of the path at its own time, and the delays have the rms asked for."""
+    """The direction of every sample is that of the path at its own time, and the delays have the
+    rms asked for.
+    """
     scan = PointingDaisy(scan_duration="60 s", jitter="1 ms")
     (o,) = observe(scan).observations
     assert o.jitter == pytest.approx(1e-3, rel=0.03)  # of 6000: 0.9 % standard error
@@ -340,20 +414,29 @@ def test_jitter_moves_the_pointing_by_speed_times_delay(observe: Callable[..., D
     )  # fmt: skip
     sky = unit_vectors(ra0, dec0) + x[:, None] * east + y[:, None] * north
     sky /= np.linalg.norm(sky, axis=1)[:, None]
-    assert np.abs(rotation_matrices(o.boresight_azel)[:, :, 2] - transform.horizontal(sky, o.seconds)).max() < 1e-12
+    assert (
+        np.abs(
+            rotation_matrices(o.boresight_azel)[:, :, 2] - transform.horizontal(sky, o.seconds)
+        ).max()
+        < 1e-12
+    )
     said = {what: text for _, what, text in o.tally}
     assert "depart from a comb of 100 Hz by 1" in said["scan-000: times of the samples"]
     assert "of its rms" in said["scan-000: noise and filters take the samples as a comb"]
 
 
 def test_too_much_jitter_is_refused(observe: Callable[..., Data]) -> None:
-    with pytest.raises(PointingError, match="a jitter of 5 ms would reorder samples: they come every 10 ms"):
+    with pytest.raises(
+        PointingError, match="a jitter of 5 ms would reorder samples: they come every 10 ms"
+    ):
         observe(PointingDaisy(scan_duration="60 s", jitter="5 ms"))
 
 
 def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path):
     """Spreadsheets write one."""
-    path = write_csv(tmp_path / "bom.csv", UNIX + np.arange(20) / 10, np.full(20, 150.0), np.full(20, 45.0))
+    path = write_csv(
+        tmp_path / "bom.csv", UNIX + np.arange(20) / 10, np.full(20, 150.0), np.full(20, 45.0)
+    )
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert len(read_recording(path, "unix").seconds) == 20
 
@@ -368,10 +451,17 @@ def saved(observe: Callable[..., Data], tmp_path: Path) -> Callable[[str], Path]
     from zonda.operators.io.save_tod import SaveTOD
     from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 
-    scan = {"throw": "1 deg", "speed": "0.5 deg/s", "acceleration": "1 deg/s2", "scan_duration": "21.5 s"}
+    scan = {
+        "throw": "1 deg",
+        "speed": "0.5 deg/s",
+        "acceleration": "1 deg/s2",
+        "scan_duration": "21.5 s",
+    }
 
     def write(form: str) -> Path:
-        step = PointingBackAndForth(**scan, flag_turnarounds=True, check_limits="warn", target="az 200 deg el 50 deg")
+        step = PointingBackAndForth(
+            **scan, flag_turnarounds=True, check_limits="warn", target="az 200 deg el 50 deg"
+        )
         scene = observe(PointingDaisy(scan_duration="1 s")).scene
         zonda.Pipeline([step, zonda.WhiteNoise(), zonda.Efficiency(), SaveTOD(format=form)]).run(
             scene, output=tmp_path / form, threads=1
@@ -383,14 +473,18 @@ def saved(observe: Callable[..., Data], tmp_path: Path) -> Callable[[str], Path]
 
 
 def change(path: Path, turn: Any = None, flags: Any = None, drop: str = "") -> None:
-    """Edit a file of SaveTOD: directions on the sky turned by ``turn`` [rad] about the poles, flags, an item left out."""
+    """Edit a file of SaveTOD: directions on the sky turned by ``turn`` [rad] about the poles,
+    flags, an item left out.
+    """
     import h5py
 
     with h5py.File(path, "a") as f:
         if turn is not None:
             x, y, z, w = f["shared/boresight_radec"][:].T
             s, c = np.sin(turn / 2), np.cos(turn / 2)
-            f["shared/boresight_radec"][:] = np.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], 1)
+            f["shared/boresight_radec"][:] = np.stack(
+                [c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], 1
+            )
         if flags is not None:
             f["shared/flags"][:] = flags
         if drop:
@@ -426,11 +520,27 @@ def test_only_the_mask_excludes(saved: Any, observe: Callable[..., Data]) -> Non
     assert o.flags[4] == 16
 
 
-def test_any_flag_excludes_in_files_of_other_kinds(observe: Callable[..., Data], tmp_path: Path) -> None:
+def test_any_flag_excludes_in_files_of_other_kinds(
+    observe: Callable[..., Data], tmp_path: Path
+) -> None:
     t = np.arange(200) / 10
-    table = np.transpose([UNIX + t, 120 + 0.01 * t, 45 + 0.01 * t, (np.arange(200) == 5) * 64 + (np.arange(200) == 9)])
+    table = np.transpose(
+        [
+            UNIX + t,
+            120 + 0.01 * t,
+            45 + 0.01 * t,
+            (np.arange(200) == 5) * 64 + (np.arange(200) == 9),
+        ]
+    )
     path = tmp_path / "flagged.csv"
-    np.savetxt(path, table, fmt="%.9f", delimiter=",", header="time [s], az [deg], el [deg], flags", comments="")
+    np.savetxt(
+        path,
+        table,
+        fmt="%.9f",
+        delimiter=",",
+        header="time [s], az [deg], el [deg], flags",
+        comments="",
+    )
     for mask, expected in ((None, [5, 9]), (64, [5]), (1, [9])):
         (o,) = observe(PointingRecorded(file=path, flag_mask=mask)).observations
         assert np.flatnonzero(~o.good_samples).tolist() == expected
@@ -438,7 +548,9 @@ def test_any_flag_excludes_in_files_of_other_kinds(observe: Callable[..., Data],
 
 @pytest.mark.filterwarnings("ignore:Pointing")
 def test_directions_on_the_sky_are_those_recorded(saved: Any, observe: Callable[..., Data]) -> None:
-    """TOAST's own lie 45 arcsec from astropy's: a file that says so is believed, and the distance is stated."""
+    """TOAST's own lie 45 arcsec from astropy's: a file that says so is believed, and the distance
+    is stated.
+    """
     path, turn = saved("hdf5"), np.radians(45 / 3600)
     (plain,) = observe(PointingRecorded(file=path)).observations
     change(path, turn=turn)
@@ -450,15 +562,28 @@ def test_directions_on_the_sky_are_those_recorded(saved: Any, observe: Callable[
     assert said.startswith("as recorded, up to ")
     assert float(said.split()[4]) == pytest.approx(most, rel=5e-3)  # three digits are stated
     (again,) = observe(PointingRecorded(file=path, celestial="recomputed")).observations
-    assert np.abs(rotation_matrices(again.boresight_radec) - rotation_matrices(plain.boresight_radec)).max() < 1e-10
-    assert "recomputed from" in {what: text for _, what, text in again.tally}["scan-000: directions on the sky"]
+    assert (
+        np.abs(
+            rotation_matrices(again.boresight_radec) - rotation_matrices(plain.boresight_radec)
+        ).max()
+        < 1e-10
+    )
+    assert (
+        "recomputed from"
+        in {what: text for _, what, text in again.tally}["scan-000: directions on the sky"]
+    )
 
 
 @pytest.mark.filterwarnings("ignore:PointingBack")
-def test_directions_far_from_azimuth_and_elevation_warn(saved: Any, observe: Callable[..., Data]) -> None:
+def test_directions_far_from_azimuth_and_elevation_warn(
+    saved: Any, observe: Callable[..., Data]
+) -> None:
     path = saved("hdf5")
     change(path, turn=np.radians(1.0))
-    with pytest.warns(UserWarning, match=r"as recorded, up to \d+(e\+03)? ?.*arcsec from .*are site and clock right\?"):
+    with pytest.warns(
+        UserWarning,
+        match=r"as recorded, up to \d+(e\+03)? ?.*arcsec from .*are site and clock right\?",
+    ):
         observe(PointingRecorded(file=path))
     change(path, drop="shared/boresight_radec")
     observe(PointingRecorded(file=path))
@@ -468,7 +593,9 @@ def test_directions_far_from_azimuth_and_elevation_warn(saved: Any, observe: Cal
 
 @pytest.mark.filterwarnings("ignore:Pointing")
 def test_a_gap_parts_the_intervals(saved: Any, observe: Callable[..., Data]) -> None:
-    """Rows between 8 and 10 s are missing: with `split` there are two scans, each with its part; quaternions go on in a gap."""
+    """Rows between 8 and 10 s are missing: with `split` there are two scans, each with its part;
+    quaternions go on in a gap.
+    """
     import h5py
 
     path = saved("hdf5")
@@ -486,7 +613,12 @@ def test_a_gap_parts_the_intervals(saved: Any, observe: Callable[..., Data]) -> 
     apart = rotation_matrices(o.boresight_radec) - rotation_matrices(whole.boresight_radec)
     assert np.abs(apart[o.good_samples]).max() < 1e-14
     assert np.linalg.norm(o.boresight_radec, axis=1) == pytest.approx(1, abs=1e-14)
-    for name, spans in whole.intervals.items():  # a time within the gap has the resolution of POSIX seconds, 0.24 us
+    for (
+        name,
+        spans,
+    ) in (
+        whole.intervals.items()
+    ):  # a time within the gap has the resolution of POSIX seconds, 0.24 us
         np.testing.assert_allclose(o.intervals[name], spans, rtol=0, atol=1e-6)
     first, second = observe(PointingRecorded(file=path, split="1 s")).observations
     assert sum(b - a for a, b in first.intervals["throw"]) == pytest.approx(7.99, abs=1e-9)
@@ -534,7 +666,9 @@ def test_odd_items_in_toasts_layout(saved: Any, observe: Callable[..., Data]) ->
     ],
 )
 def test_logs_as_people_have_them(tmp_path: Path, header: str, comma: str, time: str) -> None:
-    """Dates (ISO 8601), commas, semicolons, tabs and blanks, units in brackets or behind the name: the same pointing."""
+    """Dates (ISO 8601), commas, semicolons, tabs and blanks, units in brackets or behind the name:
+    the same pointing.
+    """
     t = np.arange(30) / 10
     dates = {
         "unix": [f"{UNIX + s:.1f}" for s in t],
@@ -542,19 +676,26 @@ def test_logs_as_people_have_them(tmp_path: Path, header: str, comma: str, time:
         "z": [f"2024-11-25 07:00:{s:04.1f}Z" for s in t],
     }[time]
     rows = [
-        comma.join([d, f"{180 + s:.4f}", "50", *(["ok"] if "remark" in header else [])]) for d, s in zip(dates, t, strict=True)
+        comma.join([d, f"{180 + s:.4f}", "50", *(["ok"] if "remark" in header else [])])
+        for d, s in zip(dates, t, strict=True)
     ]
     path = tmp_path / "log.txt"
     path.write_text("\n".join([header, *rows]) + "\n")
     found = read_recording(path, "unix")
     assert found.start is not None
-    seconds = np.array([(found.start.seconds_since(Instant.parse("2024-11-25T07:00Z"))) + s for s in found.seconds])
-    np.testing.assert_allclose(seconds, t, rtol=0, atol=3e-7 if time == "unix" else 1e-12)  # doubles since 1970
+    seconds = np.array(
+        [(found.start.seconds_since(Instant.parse("2024-11-25T07:00Z"))) + s for s in found.seconds]
+    )
+    np.testing.assert_allclose(
+        seconds, t, rtol=0, atol=3e-7 if time == "unix" else 1e-12
+    )  # doubles since 1970
     np.testing.assert_allclose(np.degrees(found.longitude), 180 + t, rtol=1e-12)
     np.testing.assert_allclose(np.degrees(found.latitude), 50, rtol=1e-12)
 
 
-@pytest.mark.parametrize("text", ["yesterday", "2024-13-25T07:00:00", "2024-11-25T07:00:00+02:00", "25/11/2024 07:00"])
+@pytest.mark.parametrize(
+    "text", ["yesterday", "2024-13-25T07:00:00", "2024-11-25T07:00:00+02:00", "25/11/2024 07:00"]
+)
 def test_what_is_no_date_in_utc_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "log.csv"
     path.write_text("time, az [deg], el [deg]\n" + "".join(f"{text},180,50\n" for _ in range(3)))

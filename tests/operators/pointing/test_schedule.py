@@ -1,4 +1,6 @@
-"""Schedules: azimuths and times of their rows, turnarounds, boresight rotation, nods, what is wrong with files."""
+"""Schedules: azimuths and times of their rows, turnarounds, boresight rotation, nods, what is wrong
+with files.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,28 @@ from zonda.operators.pointing.schedule import PointingSchedule
 from zonda.operators.pointing.schedule_files import read_schedule, read_site
 
 ROWS = [
-    ("2025-03-01T06:00:00+00:00", "2025-03-01T06:02:00+00:00", 0.0, "patch", 120.0, 150.0, 50.0, 0, 0),
-    ("2025-03-01T06:02:47+00:00", "2025-03-01T06:04:00+00:00", 45.0, "patch", 345.0, 15.0, 55.0, 0, 1),
+    (
+        "2025-03-01T06:00:00+00:00",
+        "2025-03-01T06:02:00+00:00",
+        0.0,
+        "patch",
+        120.0,
+        150.0,
+        50.0,
+        0,
+        0,
+    ),
+    (
+        "2025-03-01T06:02:47+00:00",
+        "2025-03-01T06:04:00+00:00",
+        45.0,
+        "patch",
+        345.0,
+        15.0,
+        55.0,
+        0,
+        1,
+    ),
 ]
 HEAD = """# %ECSV 1.0
 # ---
@@ -48,8 +70,16 @@ HEAD = """# %ECSV 1.0
 # schema: astropy-2.0
 start_time stop_time boresight_angle name azmin azmax el scan_index subscan_index
 """
-SITE_LINE = "# Site | Telescope | Latitude [deg] | Longitude [deg] | Elevation [m]\natacama | LAT | -22.960 | -67.790 | 5200.0\n"
-FAST = {"speed": "1.2 deg/s", "acceleration": "0.8 deg/s2", "sample_rate": "40 Hz", "check_limits": "warn"}
+SITE_LINE = (
+    "# Site | Telescope | Latitude [deg] | Longitude [deg] | Elevation [m]\natacama | LAT | -22.960"
+    " | -67.790 | 5200.0\n"
+)
+FAST = {
+    "speed": "1.2 deg/s",
+    "acceleration": "0.8 deg/s2",
+    "sample_rate": "40 Hz",
+    "check_limits": "warn",
+}
 SITE = {"name": "a", "latitude": "-22.96 deg", "longitude": "-67.79 deg", "altitude": "5200 m"}
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*samples per FWHM")
@@ -61,7 +91,10 @@ def version_5(path, rows=ROWS):
 
 
 def version_4(path, bar=" | "):
-    rows = [bar.join([r[0][:19].replace("T", " "), r[1][:19].replace("T", " "), *map(str, r[2:])]) for r in ROWS]
+    rows = [
+        bar.join([r[0][:19].replace("T", " "), r[1][:19].replace("T", " "), *map(str, r[2:])])
+        for r in ROWS
+    ]
     path.write_text(SITE_LINE + "\n".join(rows) + "\n")
     return path
 
@@ -73,7 +106,10 @@ def scans(path, **more):
 
 
 def test_both_versions_are_the_same(tmp_path):
-    five, four = read_schedule(version_5(tmp_path / "a.ecsv")), read_schedule(version_4(tmp_path / "a.txt"))
+    five, four = (
+        read_schedule(version_5(tmp_path / "a.ecsv")),
+        read_schedule(version_4(tmp_path / "a.txt")),
+    )
     assert five == four
     assert [row.label for row in five] == ["patch-0-0", "patch-0-1"]
     assert five[1].azimuth == (pytest.approx(np.radians(345)), pytest.approx(np.radians(375)))
@@ -82,20 +118,26 @@ def test_both_versions_are_the_same(tmp_path):
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_turnarounds_are_continuous_and_as_fast_as_asked_for(smooth):
-    """Position and speed are continuous; the largest acceleration is the one that is given; the reach beyond is `beyond`."""
+    """Position and speed are continuous; the largest acceleration is the one that is given; the
+    reach beyond is `beyond`.
+    """
     sweep = Sweep(0.5, 0.03, 0.02, smooth)
     t = np.arange(0, 2.2 * (sweep.leg + sweep.turnaround), 1e-3)
     x = sweep.path(t)
     v, a = np.diff(x) / 1e-3, np.diff(x, 2) / 1e-6
     assert np.abs(a).max() == pytest.approx(0.02, rel=1e-4)
     assert np.abs(v).max() == pytest.approx(0.03, rel=1e-9)
-    np.testing.assert_allclose(np.abs(v[~sweep.turning(t[:-1]) & ~sweep.turning(t[1:])]), 0.03, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.abs(v[~sweep.turning(t[:-1]) & ~sweep.turning(t[1:])]), 0.03, rtol=1e-9
+    )
     assert x.max() - 0.5 == pytest.approx(sweep.beyond, rel=1e-5)
     assert -x.min() == pytest.approx(sweep.beyond, rel=1e-5)
 
 
 def test_rows_are_scanned_between_their_limits(tmp_path):
-    """Times from the start, azimuths of the mount, constant speed on the sky, 345 to 15 deg through north."""
+    """Times from the start, azimuths of the mount, constant speed on the sky, 345 to 15 deg through
+    north.
+    """
     one, two = scans(version_5(tmp_path / "a.ecsv"), turnaround="constant_acceleration")
     assert str(one.start) == "2025-03-01T06:00:00Z"
     assert str(two.start) == "2025-03-01T06:02:47Z"
@@ -138,10 +180,14 @@ def test_the_focal_plane_is_turned_about_the_boresight(tmp_path):
     )
     about = np.array([0, 0, np.sin(np.pi / 8), np.cos(np.pi / 8)])
     np.testing.assert_allclose(
-        multiply(conjugate(plain.boresight_azel), turned.boresight_azel), np.tile(about, (2920, 1)), atol=1e-12
+        multiply(conjugate(plain.boresight_azel), turned.boresight_azel),
+        np.tile(about, (2920, 1)),
+        atol=1e-12,
     )
     np.testing.assert_allclose(
-        multiply(conjugate(plain.boresight_radec), turned.boresight_radec), np.tile(about, (2920, 1)), atol=1e-12
+        multiply(conjugate(plain.boresight_radec), turned.boresight_radec),
+        np.tile(about, (2920, 1)),
+        atol=1e-12,
     )
     upright = from_angles(-turned.azimuth, turned.elevation)
     same = np.abs((upright * plain.boresight_azel).sum(axis=1))
@@ -150,7 +196,10 @@ def test_the_focal_plane_is_turned_about_the_boresight(tmp_path):
 
 def test_scans_are_called_by_their_rows(tmp_path):
     rows = [(*row[:3], "patch/a", *row[4:]) for row in ROWS]
-    assert [o.name for o in scans(version_5(tmp_path / "a.ecsv"))] == ["scan-000-patch-0-0", "scan-001-patch-0-1"]
+    assert [o.name for o in scans(version_5(tmp_path / "a.ecsv"))] == [
+        "scan-000-patch-0-0",
+        "scan-001-patch-0-1",
+    ]
     assert scans(version_5(tmp_path / "b.ecsv", rows))[0].name == "scan-000-patch_a-0-0"
 
 
@@ -160,7 +209,8 @@ def test_the_site_of_the_schedule_is_compared(tmp_path, version, recwarn):
     path = version_4(tmp_path / "a.txt") if version == 4 else version_5(tmp_path / "a.ecsv")
     if version == 5:
         text = path.read_text().replace(
-            "# schema", "# - site_lon: !astropy.units.Quantity {unit: *id001, value: -67.79}\n# schema"
+            "# schema",
+            "# - site_lon: !astropy.units.Quantity {unit: *id001, value: -67.79}\n# schema",
         )
         path.write_text(text)
     stated = read_site(path)
@@ -170,7 +220,12 @@ def test_the_site_of_the_schedule_is_compared(tmp_path, version, recwarn):
     assert not [w for w in recwarn if "was made for" in str(w.message)]
 
     def elsewhere(latitude):
-        scene = Scene(site=SITE | {"latitude": latitude}, instrument="act_150ghz", time="2025-03-01T06:00", seed=1)
+        scene = Scene(
+            site=SITE | {"latitude": latitude},
+            instrument="act_150ghz",
+            time="2025-03-01T06:00",
+            seed=1,
+        )
         PointingSchedule(schedule=path, **FAST).observe(Data(scene))
 
     with pytest.warns(UserWarning, match=r"made for atacama .*, 11\.12 km from the scene's site"):
@@ -192,18 +247,28 @@ def test_a_schedule_without_a_site_and_a_wrong_one(tmp_path):
         else:
             with pytest.raises(InputError, match=found):
                 read_site(path)
-    unknown = version_4(tmp_path / "a.txt").read_text().replace("atacama | LAT | -22.960 | -67.790", "Unknown | LAT | 0.0 | 0.0")
+    unknown = (
+        version_4(tmp_path / "a.txt")
+        .read_text()
+        .replace("atacama | LAT | -22.960 | -67.790", "Unknown | LAT | 0.0 | 0.0")
+    )
     (tmp_path / "b.txt").write_text(unknown)
     assert read_site(tmp_path / "b.txt") is None
 
 
 def test_nods_come_before_the_scan(tmp_path):
-    nods = {"elevation_nods": ["1 deg", "-1 deg", "0 deg"], "elevation_speed": "0.5 deg/s", "elevation_acceleration": "1 deg/s2"}
+    nods = {
+        "elevation_nods": ["1 deg", "-1 deg", "0 deg"],
+        "elevation_speed": "0.5 deg/s",
+        "elevation_acceleration": "1 deg/s2",
+    }
     one, _ = scans(version_5(tmp_path / "a.ecsv"), **nods)
     # from rest to rest over d at most v: d / v + v / a
     ahead = int((2.5 + 4.5 + 2.5) * 40)
     assert one.n_samples == 4800 + ahead
-    assert one.start.seconds_since(scans(tmp_path / "a.ecsv")[0].start) == pytest.approx(-ahead / 40)
+    assert one.start.seconds_since(scans(tmp_path / "a.ecsv")[0].start) == pytest.approx(
+        -ahead / 40
+    )
     elevation = np.degrees(one.elevation)
     np.testing.assert_array_equal(one.flags[:ahead], IRREGULAR)
     assert not (one.flags[ahead:] & IRREGULAR).any()
@@ -216,13 +281,21 @@ def test_nods_come_before_the_scan(tmp_path):
 
 
 def test_nods_end_where_the_scan_is(tmp_path):
-    """Whatever the rate, the elevation of the scan is reached before it begins; a list that ends elsewhere is refused."""
-    nods = {"elevation_speed": "0.5 deg/s", "elevation_acceleration": "1 deg/s2", "sample_rate": "7.3 Hz"}
+    """Whatever the rate, the elevation of the scan is reached before it begins; a list that ends
+    elsewhere is refused.
+    """
+    nods = {
+        "elevation_speed": "0.5 deg/s",
+        "elevation_acceleration": "1 deg/s2",
+        "sample_rate": "7.3 Hz",
+    }
     one, _ = scans(version_5(tmp_path / "a.ecsv"), elevation_nods=["1 deg", "0 deg"], **nods)
     steps = np.abs(np.diff(one.elevation))
     assert np.degrees(steps).max() <= 0.5 / 7.3 * (1 + 1e-9)
     last = int(np.flatnonzero(one.flags & IRREGULAR)[-1])
-    assert np.degrees(steps[last]) <= 1 / 7.3**2 / 2  # from rest to rest: no more than the last sample's way
+    assert (
+        np.degrees(steps[last]) <= 1 / 7.3**2 / 2
+    )  # from rest to rest: no more than the last sample's way
     assert np.degrees(steps[last - 1]) > 0
     with pytest.raises(ParameterError, match="write 0 deg as the last"):
         PointingSchedule(schedule=tmp_path / "a.ecsv", elevation_nods=["1 deg", "-1 deg"])
@@ -230,7 +303,9 @@ def test_nods_end_where_the_scan_is(tmp_path):
 
 @pytest.mark.parametrize("turnaround", ["smooth", "constant_acceleration"])
 def test_limits_hold_for_nods_and_scans_not_for_what_lies_between_them(tmp_path, turnaround):
-    """The scan begins at full speed, as in TOAST: that step is none that the mount makes; too fast a nod is told."""
+    """The scan begins at full speed, as in TOAST: that step is none that the mount makes; too fast
+    a nod is told.
+    """
     act = instruments.create("act_150ghz")
     limits = {
         "azimuth_speed_max": "5 deg/s",
@@ -239,15 +314,24 @@ def test_limits_hold_for_nods_and_scans_not_for_what_lies_between_them(tmp_path,
         "elevation_jerk_max": "9 deg/s3",
     }
     scene = Scene(site=SITE, instrument=act.varied(telescope=limits), time="2025-03-01T06:00")
-    given = {**FAST, "check_limits": "error", "turnaround": turnaround, "elevation_nods": ["1 deg", "0 deg"]}
+    given = {
+        **FAST,
+        "check_limits": "error",
+        "turnaround": turnaround,
+        "elevation_nods": ["1 deg", "0 deg"],
+    }
     path = version_5(tmp_path / "a.ecsv")
     data = Data(scene)
     PointingSchedule(schedule=path, elevation_acceleration="0.8 deg/s2", **given).observe(data)
-    said = {what: text for _, what, text in data.observations[0].tally}["largest acceleration of the axes"]
+    said = {what: text for _, what, text in data.observations[0].tally}[
+        "largest acceleration of the axes"
+    ]
     assert "azimuth 0.8 deg/s2 (16 %" in said
     assert "elevation 0.8 deg/s2 (88.9 %" in said
     with pytest.raises(PointingError, match="acceleration of the elevation axis of 1 deg/s2"):
-        PointingSchedule(schedule=path, elevation_acceleration="1 deg/s2", **given).observe(Data(scene))
+        PointingSchedule(schedule=path, elevation_acceleration="1 deg/s2", **given).observe(
+            Data(scene)
+        )
 
 
 def test_a_nod_that_never_reaches_its_speed():
@@ -260,11 +344,23 @@ def test_a_nod_that_never_reaches_its_speed():
 
 def test_it_keeps_the_contract(tmp_path):
     rows = [("2024-11-25T07:00:00", "2024-11-25T07:01:00", 10.0, "patch", 120.0, 124.0, 50.0, 0, 0)]
-    zonda.testing.check_operator(PointingSchedule(schedule=version_5(tmp_path / "a.ecsv", rows), speed="0.2 deg/s"))
+    zonda.testing.check_operator(
+        PointingSchedule(schedule=version_5(tmp_path / "a.ecsv", rows), speed="0.2 deg/s")
+    )
 
 
 def change(number, **values):
-    names = ["start_time", "stop_time", "boresight_angle", "name", "azmin", "azmax", "el", "scan_index", "subscan_index"]
+    names = [
+        "start_time",
+        "stop_time",
+        "boresight_angle",
+        "name",
+        "azmin",
+        "azmax",
+        "el",
+        "scan_index",
+        "subscan_index",
+    ]
     rows = [list(row) for row in ROWS]
     for name, value in values.items():
         rows[number][names.index(name)] = value
@@ -274,12 +370,24 @@ def change(number, **values):
 @pytest.mark.parametrize(
     ("rows", "match"),
     [
-        (change(1, stop_time=ROWS[1][0]), "line 21: patch-0-1: stop_time is not later than start_time"),
+        (
+            change(1, stop_time=ROWS[1][0]),
+            "line 21: patch-0-1: stop_time is not later than start_time",
+        ),
         (change(0, el=91.0), "el is 91 deg, not between 0 and 90 deg"),
         (change(0, azmax=600.0), "more than a turn apart"),
-        (change(1, azmin=82.0, azmax=73.0), "line 21: patch-0-1: azmin is 82 deg and azmax 73 deg: that is a sweep of 351 deg"),
-        (change(1, azmin=15.0, azmax=15.0), "line 21: patch-0-1: azmin is 15 deg and azmax 15 deg: there is no sweep"),
-        (change(1, azmin=360.0, azmax=0.0), "line 21: patch-0-1: azmin is 360 deg and azmax 0 deg: there is no sweep"),
+        (
+            change(1, azmin=82.0, azmax=73.0),
+            "line 21: patch-0-1: azmin is 82 deg and azmax 73 deg: that is a sweep of 351 deg",
+        ),
+        (
+            change(1, azmin=15.0, azmax=15.0),
+            "line 21: patch-0-1: azmin is 15 deg and azmax 15 deg: there is no sweep",
+        ),
+        (
+            change(1, azmin=360.0, azmax=0.0),
+            "line 21: patch-0-1: azmin is 360 deg and azmax 0 deg: there is no sweep",
+        ),
         (
             change(1, start_time="2025-03-01T06:01:30+00:00"),
             r"line 21: patch-0-1: begins 30 s before patch-0-0 \(line 20\) stops",
@@ -289,8 +397,14 @@ def change(number, **values):
             r"line 20: patch-0-0: begins 240 s before patch-0-1 \(line 21\) stops",
         ),
         (change(0, azmin="nan"), "line 20: azmin is 'nan', not a finite number"),
-        (change(0, start_time="yesterday"), "line 20: start_time: cannot read 'yesterday' as a time"),
-        (change(0, azmin="nan", start_time="now"), r"2 mistakes\n  = line 20: azmin is 'nan'.*\n  = line 20: start_time: cannot"),
+        (
+            change(0, start_time="yesterday"),
+            "line 20: start_time: cannot read 'yesterday' as a time",
+        ),
+        (
+            change(0, azmin="nan", start_time="now"),
+            r"2 mistakes\n  = line 20: azmin is 'nan'.*\n  = line 20: start_time: cannot",
+        ),
         ([], "has no rows"),
     ],
 )
@@ -331,21 +445,37 @@ def test_rows_that_cannot_be_are_told_together(tmp_path):
     ],
 )
 def test_rows_that_can_be(tmp_path, change_of_the_second):
-    """Rows that touch, or overlap by the second to which times are rounded, sweeps through north, and wide ones that say so."""
-    assert len(read_schedule(version_5(tmp_path / "a.ecsv", change(1, **change_of_the_second)))) == 2
+    """Rows that touch, or overlap by the second to which times are rounded, sweeps through north,
+    and wide ones that say so.
+    """
+    assert (
+        len(read_schedule(version_5(tmp_path / "a.ecsv", change(1, **change_of_the_second)))) == 2
+    )
 
 
 def test_nods_that_begin_before_the_row_before_stops(tmp_path):
-    """They last 2 x (1 s + 1 s): with the second to which times are rounded, a gap of 3 s is enough and one of 2.9 s is not."""
-    nods = {"elevation_nods": ["1 deg", "0 deg"], "elevation_speed": "1 deg/s", "elevation_acceleration": "1 deg/s2"}
+    """They last 2 x (1 s + 1 s): with the second to which times are rounded, a gap of 3 s is enough
+    and one of 2.9 s is not.
+    """
+    nods = {
+        "elevation_nods": ["1 deg", "0 deg"],
+        "elevation_speed": "1 deg/s",
+        "elevation_acceleration": "1 deg/s2",
+    }
     first = ("2025-03-01T06:00:00", "2025-03-01T06:02:00", 0.0, "a", 120.0, 150.0, 50.0, 0, 0)
     for begins, fits in (("06:02:03", True), ("06:02:02.9", False)):
-        path = version_5(tmp_path / "a.ecsv", [first, (f"2025-03-01T{begins}", "2025-03-01T06:04:00", *first[2:8], 1)])
+        path = version_5(
+            tmp_path / "a.ecsv",
+            [first, (f"2025-03-01T{begins}", "2025-03-01T06:04:00", *first[2:8], 1)],
+        )
         assert len(scans(path)) == 2
         if fits:
             assert len(scans(path, **nods)) == 2
             continue
-        with pytest.raises(InputError, match=r"its elevation nods of 4 s begin 1.1 s before a-0-0 \(line 20\) stops"):
+        with pytest.raises(
+            InputError,
+            match=r"its elevation nods of 4 s begin 1.1 s before a-0-0 \(line 20\) stops",
+        ):
             scans(path, **nods)
         data = Data(Scene(site=SITE, instrument="act_150ghz", time="2025-03-01T06:00"))
         with pytest.raises(InputError, match="leave 4 s between the rows"):
@@ -389,7 +519,9 @@ def test_the_schedule_of_a_campaign_is_that_of_its_pointing_step(tmp_path):
     with pytest.raises(ConfigurationError, match="no step takes the schedule"):
         parse(FILE.format(pointing="PointingStare"), folder=tmp_path)
     with pytest.raises(ConfigurationError, match=r"no such file: .none\.ecsv"):
-        parse(FILE.format(pointing="PointingSchedule").replace("a.ecsv", "none.ecsv"), folder=tmp_path)
+        parse(
+            FILE.format(pointing="PointingSchedule").replace("a.ecsv", "none.ecsv"), folder=tmp_path
+        )
 
 
 def test_a_schedule_has_its_own_nights(tmp_path):
@@ -397,21 +529,33 @@ def test_a_schedule_has_its_own_nights(tmp_path):
     text = FILE.format(pointing="PointingSchedule").replace("a.ecsv,", "a.ecsv, nights: 3,")
     with pytest.raises(ConfigurationError, match="nights would repeat the same scans"):
         parse(text, folder=tmp_path)
-    assert parse(text.replace("nights", "realizations"), folder=tmp_path).header.campaign.realizations == 3
+    assert (
+        parse(text.replace("nights", "realizations"), folder=tmp_path).header.campaign.realizations
+        == 3
+    )
 
 
 def test_files_begin_when_the_first_scan_does(tmp_path):
     """DATE-OBS is not the scene's time, which the schedule need not share."""
     from astropy.io import fits
 
-    scene = Scene(site=SITE, instrument={"like": "act_150ghz", "detectors": 7}, time="2025-03-01T05:00", seed=1)
+    scene = Scene(
+        site=SITE,
+        instrument={"like": "act_150ghz", "detectors": 7},
+        time="2025-03-01T05:00",
+        seed=1,
+    )
     step = PointingSchedule(schedule=version_5(tmp_path / "a.ecsv", ROWS[:1]), **FAST)
-    Pipeline([step, zonda.BinMap(contents="hits", pixel="6 arcmin"), zonda.SaveMap()]).run(scene, output=tmp_path / "out")
+    Pipeline([step, zonda.BinMap(contents="hits", pixel="6 arcmin"), zonda.SaveMap()]).run(
+        scene, output=tmp_path / "out"
+    )
     assert fits.getheader(tmp_path / "out" / "map.fits")["DATE-OBS"] == "2025-03-01T06:00:00Z"
 
 
 def test_check_says_where_sun_and_moon_are(tmp_path):
-    """Against astropy's positions of the Sun and the Moon at the first sample, to the 0.1 deg that is printed."""
+    """Against astropy's positions of the Sun and the Moon at the first sample, to the 0.1 deg that
+    is printed.
+    """
     import astropy.units as u
     from astropy.coordinates import AltAz, EarthLocation, get_body
     from astropy.time import Time
@@ -421,7 +565,9 @@ def test_check_says_where_sun_and_moon_are(tmp_path):
     data = Data(Scene(site=SITE, instrument="act_150ghz", time="2025-03-01T06:00", seed=1))
     lines = step.check(data)
     assert lines[0].startswith("1 scan from 2025-03-01T06:00:00Z to 2025-03-01T06:02:00")
-    found = {line.split()[3].rstrip(":"): line for line in lines if line.startswith("distance of the")}
+    found = {
+        line.split()[3].rstrip(":"): line for line in lines if line.startswith("distance of the")
+    }
     place = EarthLocation.from_geodetic(-67.79 * u.deg, -22.96 * u.deg, 5200 * u.m)
     o = data.observations[0]
     with iers.conf.set_temp("auto_download", False):
@@ -429,9 +575,16 @@ def test_check_says_where_sun_and_moon_are(tmp_path):
         frame = AltAz(obstime=when, location=place)
         for body in ("sun", "moon"):
             there = get_body(body, when, place).transform_to(frame)
-            look = AltAz(az=o.azimuth[[0, -1]] * u.rad, alt=o.elevation[[0, -1]] * u.rad, obstime=when, location=place)
+            look = AltAz(
+                az=o.azimuth[[0, -1]] * u.rad,
+                alt=o.elevation[[0, -1]] * u.rad,
+                obstime=when,
+                location=place,
+            )
             apart = there.separation(look).deg
-            low, high = (float(x) for x in (found[body.title()].split()[4], found[body.title()].split()[6]))
+            low, high = (
+                float(x) for x in (found[body.title()].split()[4], found[body.title()].split()[6])
+            )
             assert low - 0.06 <= apart.min()
             assert apart.max() <= high + 0.06
     assert "below the horizon" in found["Sun"]
@@ -446,7 +599,17 @@ def long_schedule(path, number, **odd):
         mine = odd if k == 977 else {}
         end = start + timedelta(minutes=2)
         rows.append(
-            (start.isoformat(), end.isoformat(), 0.0, "patch", 120.0, mine.get("azmax", 150.0), mine.get("el", 50.0), k, 0)
+            (
+                start.isoformat(),
+                end.isoformat(),
+                0.0,
+                "patch",
+                120.0,
+                mine.get("azmax", 150.0),
+                mine.get("el", 50.0),
+                k,
+                0,
+            )
         )
     return version_5(path, rows)
 
@@ -479,7 +642,9 @@ def test_a_row_that_the_telescope_cannot_do_is_found_among_many(tmp_path):
 HEAD_OF_TEXT = "#Site Telescope Latitude Longitude Elevation\nATACAMA SAT -22.958 -67.786 5200.0\n"
 SKY = "10.0 120.0 12.0 121.0 30.0 200.0 31.0 201.0 0.25"
 TEXTS = {
-    "version 4": "2027-06-23 08:01:00 | 2027-06-23 08:11:00 | 45.0 | field_a | 110.0 | 142.0 | 50.0 | 21 | 3",
+    "version 4": (
+        "2027-06-23 08:01:00 | 2027-06-23 08:11:00 | 45.0 | field_a | 110.0 | 142.0 | 50.0 | 21 | 3"
+    ),
     "version 3": " 2027-06-23 08:01:00  2027-06-23 08:11:00 45.0 field_a 110.00 142.00 50.00 21 3",
     "version 2": "|".join(
         [
@@ -492,8 +657,14 @@ TEXTS = {
             "0.5",
         ]
     ),
-    "version 1": f"2027-06-23 08:01:00 2027-06-23 08:11:00 61579.3 61579.4 45.0 field_a 110 142 50 R {SKY} 21 3 0.5",
-    "23 words": f"2027-06-23 08:01:00 2027-06-23 08:11:00 61579.3 61579.4 45.0 field_a 110 142 50 R {SKY} 21 3",
+    "version 1": (
+        f"2027-06-23 08:01:00 2027-06-23 08:11:00 61579.3 61579.4 45.0 field_a 110 142 50 R {SKY}"
+        " 21 3 0.5"
+    ),
+    "23 words": (
+        f"2027-06-23 08:01:00 2027-06-23 08:11:00 61579.3 61579.4 45.0 field_a 110 142 50 R {SKY}"
+        " 21 3"
+    ),
 }
 
 
@@ -506,13 +677,16 @@ def test_every_version_of_text(version, tmp_path):
     assert (row.name, row.number) == ("field_a", ("21", "3"))
     assert row.start.isoformat().startswith("2027-06-23T08:01:00")
     assert row.duration == 600
-    assert np.degrees([*row.azimuth, row.elevation, row.rotation]) == pytest.approx([110, 142, 50, 45])
+    assert np.degrees([*row.azimuth, row.elevation, row.rotation]) == pytest.approx(
+        [110, 142, 50, 45]
+    )
 
 
 def test_special_rows_are_left_out_and_told(tmp_path):
     path = tmp_path / "s.txt"
     path.write_text(
-        f"{HEAD_OF_TEXT}{TEXTS['version 4']}\nSPECIAL|2027-06-23 08:11:00|2027-06-23 09:00:00|0.0|cooler|100|125|48|0|0\n"
+        f"{HEAD_OF_TEXT}{TEXTS['version 4']}\nSPECIAL|2027-06-23 08:11:00|2027-06-23"
+        " 09:00:00|0.0|cooler|100|125|48|0|0\n"
     )
     with pytest.warns(UserWarning, match=r"1 rows are SPECIAL, no scans \(line 4\)"):
         assert len(read_schedule(path)) == 1

@@ -1,4 +1,6 @@
-"""Flags and intervals of the Sun: against astropy, at its rising, at the edge of its neighbourhood."""
+"""Flags and intervals of the Sun: against astropy, at its rising, at the edge of its
+neighbourhood.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,13 @@ from zonda.core.scene import Scene
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 
 SITE = {"name": "a", "latitude": "-22.96 deg", "longitude": "-67.79 deg", "altitude": "5200 m"}
-SCAN = {"throw": "20 deg", "speed": "1 deg/s", "acceleration": "1 deg/s2", "sample_rate": "1 Hz", "check_limits": "warn"}
+SCAN = {
+    "throw": "20 deg",
+    "speed": "1 deg/s",
+    "acceleration": "1 deg/s2",
+    "sample_rate": "1 Hz",
+    "check_limits": "warn",
+}
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*samples per FWHM")
 
@@ -41,10 +49,16 @@ def sun(observation):
     return np.degrees(alt), np.degrees(np.arccos(np.clip((towards * there).sum(axis=0), -1, 1)))
 
 
-@pytest.mark.parametrize(("target", "close"), [("az 118 deg el 45 deg", True), ("az 270 deg el 50 deg", False)])
+@pytest.mark.parametrize(
+    ("target", "close"), [("az 118 deg el 45 deg", True), ("az 270 deg el 50 deg", False)]
+)
 def test_it_rises_and_is_near_as_astropy_says(target, close):
-    """2025-01-10 at 5200 m: it rises between 9:20 and 10:00 UTC. One sample of 1 s is 15 arcsec of the Sun's way."""
-    observation = scan("2025-01-10T09:25", {"az": target.split()[1] + " deg", "el": target.split()[4] + " deg"})
+    """2025-01-10 at 5200 m: it rises between 9:20 and 10:00 UTC. One sample of 1 s is 15 arcsec of
+    the Sun's way.
+    """
+    observation = scan(
+        "2025-01-10T09:25", {"az": target.split()[1] + " deg", "el": target.split()[4] + " deg"}
+    )
     elevation, distance = sun(observation)
     up, near = (observation.flags & bit != 0 for bit in (SUN_UP, SUN_CLOSE))
     assert 0 < up.mean() < 1

@@ -1,4 +1,6 @@
-"""A small observation about any point of the sky, made by hand: these tests need no pointing operator."""
+"""A small observation about any point of the sky, made by hand: these tests need no pointing
+operator.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,9 @@ def quaternions(ra, dec, psi=0.0):
 
 
 def offset(ra0, dec0, east, north):
-    """(ra, dec) at tangent-plane offsets (east, north) [tan rad] from (ra0, dec0): the inverse gnomonic projection."""
+    """(ra, dec) at tangent-plane offsets (east, north) [tan rad] from (ra0, dec0): the inverse
+    gnomonic projection.
+    """
     east, north = np.asarray(east, float), np.asarray(north, float)
     e = np.array([-np.sin(ra0), np.cos(ra0), 0.0])
     n = np.array([-np.sin(dec0) * np.cos(ra0), -np.sin(dec0) * np.sin(ra0), np.cos(dec0)])
@@ -94,7 +98,9 @@ def observation(ra, dec, *, xi=(0.0,), eta=(0.0,), psi=0.0, fwhm=9.0, centre=Non
 
 
 def look(operator, scan, *, dtype=np.float64, cuts=None, state=None):
-    """The sky stream (n_det, n_samp) of a scan; ``cuts`` (detectors, samples): where blocks begin."""
+    """The sky stream (n_det, n_samp) of a scan; ``cuts`` (detectors, samples): where blocks
+    begin.
+    """
     detectors, samples = cuts or ([0], [0])
     state = operator.prepare(scan) if state is None else state
     out = np.empty((scan.n_detectors, scan.n_samples), dtype)
@@ -107,7 +113,9 @@ def look(operator, scan, *, dtype=np.float64, cuts=None, state=None):
     return out
 
 
-def tan_header(shape=(64, 64), *, ra=75.0, dec=20.0, crpix=None, cdelt=(-1.0, 1.0), unit="K_RJ", **more):
+def tan_header(
+    shape=(64, 64), *, ra=75.0, dec=20.0, crpix=None, cdelt=(-1.0, 1.0), unit="K_RJ", **more
+):
     """Cards of a TAN map; ``cdelt`` in arcsec, ``ra`` and ``dec`` in degrees."""
     cards = fits.Header()
     cards["CTYPE1"], cards["CTYPE2"] = "RA---TAN", "DEC--TAN"

@@ -68,7 +68,9 @@ def test_quantities_carry_their_unit():
     where = {"wcs": wcs_of()}
     plain = sky(map=VALUES, unit="MJy/sr", **where)
     np.testing.assert_array_equal(sky(map=VALUES * u.MJy / u.sr, **where), plain)
-    np.testing.assert_allclose(sky(map=(VALUES * u.MJy / u.sr).to("Jy/arcsec2"), **where), plain, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        sky(map=(VALUES * u.MJy / u.sr).to("Jy/arcsec2"), **where), plain, rtol=1e-6, atol=1e-12
+    )
     kelvin = sky(map=VALUES, unit="mK_RJ", **where)
     np.testing.assert_array_equal(sky(map=VALUES * u.mK, unit="mK_RJ", **where), kelvin)
     with pytest.raises(ParameterError, match="a quantity in mK, and unit is K_RJ"):
@@ -84,24 +86,32 @@ def test_quantities_carry_their_unit():
 def test_a_pixel_size_and_a_centre_are_enough(tmp_path):
     hdu = fits.PrimaryHDU(VALUES)
     options = {"pixel_size": "4 arcsec", "centre": "target", "unit": "K_RJ"}
-    np.testing.assert_array_equal(sky(map=VALUES, **options), sky(file=file_of(tmp_path, hdu), **options))
+    np.testing.assert_array_equal(
+        sky(map=VALUES, **options), sky(file=file_of(tmp_path, hdu), **options)
+    )
     with pytest.raises(InputError, match="pixel size is missing"):
         sky(map=VALUES, unit="K_RJ")
     del options["centre"]  # an image without a WCS is put on the target
-    np.testing.assert_array_equal(sky(map=VALUES, **options), sky(map=VALUES, centre="target", **options))
+    np.testing.assert_array_equal(
+        sky(map=VALUES, **options), sky(map=VALUES, centre="target", **options)
+    )
 
 
 def test_missing_pixels_are_an_error_or_zero():
     holes = VALUES.copy()
     holes[3, 4] = np.nan
-    with pytest.raises(InputError, match=r"1 of 3072 pixels are NaN or infinite, the first at row 4, column 5"):
+    with pytest.raises(
+        InputError, match=r"1 of 3072 pixels are NaN or infinite, the first at row 4, column 5"
+    ):
         sky(map=holes, wcs=wcs_of(), unit="K_RJ")
     masked = np.ma.masked_array(VALUES, np.isnan(holes))
     zeroed = VALUES.copy()
     zeroed[3, 4] = 0.0
     expected = sky(map=zeroed, wcs=wcs_of(), unit="K_RJ")
     for given in (holes, masked):
-        np.testing.assert_array_equal(sky(map=given, wcs=wcs_of(), unit="K_RJ", missing="zero"), expected)
+        np.testing.assert_array_equal(
+            sky(map=given, wcs=wcs_of(), unit="K_RJ", missing="zero"), expected
+        )
 
 
 def test_a_healpix_table_in_memory(tmp_path):
@@ -164,9 +174,12 @@ def test_target_map_and_check_know_where_it_is():
         ({"map": "map.fits"}, "a file is given as file='map.fits'"),
         ({"map": VALUES, "wcs": 3}, "expected an astropy WCS or FITS keywords"),
         ({"map": fits.HDUList([fits.PrimaryHDU(VALUES)])}, "map takes one HDU, not a list"),
-        ({"map": fits.BinTableHDU.from_columns([fits.Column("a", "D", array=[1.0])])}, "neither an image nor a HEALPix table"),
+        (
+            {"map": fits.BinTableHDU.from_columns([fits.Column("a", "D", array=[1.0])])},
+            "neither an image nor a HEALPix table",
+        ),
     ],
-)  # fmt: skip
+)
 def test_mistakes_are_said_at_once(options, said):
     with pytest.raises(ParameterError, match=said):
         zonda.SkyMap(**options)
@@ -175,7 +188,9 @@ def test_mistakes_are_said_at_once(options, said):
 def test_a_wcs_of_another_shape():
     wcs = wcs_of()
     wcs.pixel_shape = (48, 64)
-    with pytest.raises(ParameterError, match="the WCS is that of an image of 48 x 64 pixels, the array has 64 x 48"):
+    with pytest.raises(
+        ParameterError, match="the WCS is that of an image of 48 x 64 pixels, the array has 64 x 48"
+    ):
         zonda.SkyMap(map=VALUES, wcs=wcs)
 
 
@@ -197,7 +212,9 @@ operators:
 
 @pytest.mark.parametrize("kind", ["image", "cube", "quantity", "table"])
 def test_in_files(tmp_path, kind):
-    """A step with an array and the one with its file have the same bits; a step with a file stays as it is."""
+    """A step with an array and the one with its file have the same bits; a step with a file stays
+    as it is.
+    """
     import healpy as hp
 
     options = {"map": VALUES, "wcs": wcs_of(), "unit": "K_RJ", "scale": 2.0}
@@ -206,7 +223,12 @@ def test_in_files(tmp_path, kind):
     elif kind == "quantity":
         options |= {"map": VALUES * u.MJy / u.sr, "unit": None}
     elif kind == "table":
-        hp.write_map(tmp_path / "healpix.fits", rng.normal(0, 1e-3, hp.nside2npix(64)), coord="C", column_units="K_CMB")
+        hp.write_map(
+            tmp_path / "healpix.fits",
+            rng.normal(0, 1e-3, hp.nside2npix(64)),
+            coord="C",
+            column_units="K_CMB",
+        )
         with fits.open(tmp_path / "healpix.fits") as hdus:
             options = {"map": hdus[1].copy(), "scale": 2.0}
     written = zonda.SkyMap(**options).in_files(tmp_path / "new" / "map.fits")
@@ -214,5 +236,7 @@ def test_in_files(tmp_path, kind):
     assert written.in_files(tmp_path / "other.fits") is written
     assert not (tmp_path / "other.fits").exists()
     daisy = zonda.PointingDaisy(scan_duration="4 s", radius="1 arcmin")
-    found = zonda.Pipeline([daisy, written]).run(scene(camera(7)), keep=["sky"], threads=1).tod("sky")
+    found = (
+        zonda.Pipeline([daisy, written]).run(scene(camera(7)), keep=["sky"], threads=1).tod("sky")
+    )
     np.testing.assert_array_equal(found, sky(**options))

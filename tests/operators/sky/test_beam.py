@@ -10,7 +10,10 @@ ARCSEC = np.pi / 648000
 def value(convolved, x, y, outside=0.0):
     """The convolved map at input pixels (x, y), 0-based."""
     p = convolved.to_grid @ np.array([x, y, np.ones_like(x)])
-    return map_coordinates(convolved.coefficients["float64"], p[1::-1], order=3, prefilter=False) + outside
+    return (
+        map_coordinates(convolved.coefficients["float64"], p[1::-1], order=3, prefilter=False)
+        + outside
+    )
 
 
 @pytest.mark.parametrize("shape", [(33, 47), (64, 50), (1, 1)])
@@ -22,8 +25,11 @@ def test_one_bright_pixel_is_a_gaussian_of_the_fwhm(shape, pixels):
     dx, dy = np.random.default_rng(1).uniform(-pixels, pixels, (2, 500))
     s = SIGMA * pixels
     exact = np.exp(-(dx**2 + dy**2) / (2 * s * s)) / (2 * np.pi * s * s)
-    # the cubic B-spline's own error at 4 points per FWHM is below 0.3 % of the peak (numerics.md, section 3)
-    np.testing.assert_allclose(value(made, shape[1] // 2 + dx, shape[0] // 2 + dy), exact, atol=3e-3 / (2 * np.pi * s * s))
+    # the cubic B-spline's own error at 4 points per FWHM is below 0.3 % of the peak (numerics.md,
+    # section 3)
+    np.testing.assert_allclose(
+        value(made, shape[1] // 2 + dx, shape[0] // 2 + dy), exact, atol=3e-3 / (2 * np.pi * s * s)
+    )
 
 
 def test_oblong_rotated_pixels():
@@ -40,18 +46,25 @@ def test_oblong_rotated_pixels():
     np.testing.assert_allclose(value(made, 30 + dx, 20 + dy), exact, atol=3e-3 * exact.max())
 
 
-@pytest.mark.parametrize(("pixels", "tolerance"), [(8.0, 1e-9), (3.0, 1e-6), (2.0, 1e-5), (1.0, 1e-5), (0.3, 1e-5)])
+@pytest.mark.parametrize(
+    ("pixels", "tolerance"), [(8.0, 1e-9), (3.0, 1e-6), (2.0, 1e-5), (1.0, 1e-5), (0.3, 1e-5)]
+)
 def test_a_uniform_sky_stays_uniform_for_every_pixel_size(pixels, tolerance):
-    # from 2 pixels per FWHM the ripple is 4 exp(-2 pi^2 sigma^2) = 3e-6 at 2; below, the image is smooth by construction
+    # from 2 pixels per FWHM the ripple is 4 exp(-2 pi^2 sigma^2) = 3e-6 at 2; below, the image is
+    # smooth by construction
     made = convolve(np.full((120, 121), 2.5), np.diag([-ARCSEC, ARCSEC]), pixels * ARCSEC, 0.0)
     x, y = np.random.default_rng(3).uniform(58, 62, (2, 400))
     np.testing.assert_allclose(value(made, x, y), 2.5, rtol=tolerance)
 
 
 def test_a_coarse_image_is_smooth_and_keeps_its_grid():
-    """Fewer than 2 pixels per FWHM: a wave of 12 pixels loses what the beam takes from it and nothing else."""
+    """Fewer than 2 pixels per FWHM: a wave of 12 pixels loses what the beam takes from it and
+    nothing else.
+    """
     x = np.arange(240.0)
-    made = convolve(np.tile(np.cos(2 * np.pi * x / 12), (240, 1)), np.diag([-ARCSEC, ARCSEC]), 1.5 * ARCSEC, 0.0)
+    made = convolve(
+        np.tile(np.cos(2 * np.pi * x / 12), (240, 1)), np.diag([-ARCSEC, ARCSEC]), 1.5 * ARCSEC, 0.0
+    )
     assert made.coarse
     assert made.steps == (1, 1)
     at = np.random.default_rng(5).uniform(100, 140, (2, 300))
@@ -61,7 +74,9 @@ def test_a_coarse_image_is_smooth_and_keeps_its_grid():
 
 
 def test_outside_is_the_padding():
-    """A map whose value is the outside's has no edge at all, and half of a step's edge is seen at the edge."""
+    """A map whose value is the outside's has no edge at all, and half of a step's edge is seen at
+    the edge.
+    """
     flat = convolve(np.full((9, 9), 3.0), np.diag([-ARCSEC, ARCSEC]), 9 * ARCSEC, 3.0)
     assert not np.any(flat.coefficients["float64"])
     step = convolve(np.full((101, 101), 1.0), np.diag([-ARCSEC, ARCSEC]), 8 * ARCSEC, 0.0)
@@ -108,11 +123,16 @@ def test_pixels_far_smaller_than_the_beam_are_refused(pixel):
 
 
 def test_a_faint_map_is_not_set_to_zero() -> None:
-    """What is flushed is a share of the image's own peak: a map of 8e-25 K keeps its shape to the bit."""
+    """What is flushed is a share of the image's own peak: a map of 8e-25 K keeps its shape to the
+    bit.
+    """
     values = np.zeros((41, 41))
     values[20, 20] = 1.0
     jacobian = np.diag([-1.0, 1.0]) * 1e-5
-    bright, faint = (convolve(values * scale, jacobian, 3e-5, 0.0).coefficients["float64"] for scale in (1.0, 2.0**-80))
+    bright, faint = (
+        convolve(values * scale, jacobian, 3e-5, 0.0).coefficients["float64"]
+        for scale in (1.0, 2.0**-80)
+    )
     assert np.array_equal(faint, bright * 2.0**-80)
     size = np.abs(bright[bright != 0])
     assert size.size > 100

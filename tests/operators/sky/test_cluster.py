@@ -34,7 +34,9 @@ def test_the_shipped_map_is_what_the_script_makes(remade):
         assert list(before) == list(after)
         for key, value in before.items():
             # a few operations in float64: other CPUs and libraries may round each otherwise
-            assert after[key] == (pytest.approx(value, rel=1e-14) if isinstance(value, float) else value), key
+            assert after[key] == (
+                pytest.approx(value, rel=1e-14) if isinstance(value, float) else value
+            ), key
         # float32 of float64 sums: other CPUs may round the last bit or two otherwise
         np.testing.assert_allclose(old[0].data, new[0].data, rtol=1e-6, atol=1e-12)
     assert SHIPPED.stat().st_size < 2e6
@@ -74,7 +76,11 @@ def test_projection_against_adaptive_quadrature(radius):
     exact = (
         2
         * quad(
-            lambda depth: float(cluster.pressure(np.array(np.hypot(radius, depth)), mass, z)), 0, edge, limit=400, points=[radius]
+            lambda depth: float(cluster.pressure(np.array(np.hypot(radius, depth)), mass, z)),
+            0,
+            edge,
+            limit=400,
+            points=[radius],
         )[0]
     )
     assert cluster.projected(np.array([radius]), mass, z)[0] == pytest.approx(exact, rel=1e-5)
@@ -84,9 +90,13 @@ def test_pressure_at_r500_is_arnaud_2010():
     # eq. 13 at x = 1 by hand, with h70 = H0 / 70
     mass, z = 3e14, 0.5
     h70 = Planck18.H0.value / 70
-    shape = 8.403 * h70**-1.5 / (1.177**0.3081 * (1 + 1.177**1.0510) ** ((5.4905 - 0.3081) / 1.0510))
+    shape = (
+        8.403 * h70**-1.5 / (1.177**0.3081 * (1 + 1.177**1.0510) ** ((5.4905 - 0.3081) / 1.0510))
+    )
     expected = 1.65e-3 * Planck18.efunc(z) ** (8 / 3) * h70 ** (2 / 3 + 0.12 + 2) * shape
-    assert float(cluster.pressure(np.array([cluster.r500(mass, z)]), mass, z)[0]) == pytest.approx(expected, rel=1e-9)
+    assert float(cluster.pressure(np.array([cluster.r500(mass, z)]), mass, z)[0]) == pytest.approx(
+        expected, rel=1e-9
+    )
 
 
 def test_the_shock_is_an_edge():

@@ -1,4 +1,6 @@
-"""The CMB: its spectra within cosmic variance, the band's conversion, files that are no spectrum."""
+"""The CMB: its spectra within cosmic variance, the band's conversion, files that are no
+spectrum.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def theory(path, polarized=True):
 
 
 def test_the_spectra_within_cosmic_variance(tmp_path):
-    """Over l and skies: sum (2 l + 1) C^ / C is chi^2 with sum (2 l + 1) degrees. anafast of a band-limited map errs by 1e-3."""
+    """Over l and skies: sum (2 l + 1) C^ / C is chi^2 with sum (2 l + 1) degrees. anafast of a
+    band-limited map errs by 1e-3.
+    """
     spectra = read(str(theory(tmp_path / "t.txt"))).values
     number, found = 12, np.zeros((4, LMAX + 1))
     for k in range(number):
@@ -50,23 +54,34 @@ def test_the_spectra_within_cosmic_variance(tmp_path):
 
 def test_another_nside_is_the_same_sky(tmp_path):
     spectra = read(str(theory(tmp_path / "t.txt", polarized=False))).values
-    fine, coarse = (healpy.map2alm(draw(spectra[:, :60], n, stream_key(1, "test"))[0], lmax=40, iter=5) for n in (64, 32))
+    fine, coarse = (
+        healpy.map2alm(draw(spectra[:, :60], n, stream_key(1, "test"))[0], lmax=40, iter=5)
+        for n in (64, 32)
+    )
     assert np.abs(fine - coarse).max() < 1e-3 * np.abs(fine).max()
 
 
 def test_the_stream_is_the_map_in_the_bands_kelvin(tmp_path):
-    """Where the detectors look: the multipoles summed with the beam, times K_RJ per K_CMB of the band."""
+    """Where the detectors look: the multipoles summed with the beam, times K_RJ per K_CMB of the
+    band.
+    """
     path = theory(tmp_path / "t.txt", polarized=False)
     observation = scenes.scan(3, 2000, radius=60.0)
     step = CMBSky(spectrum=path, nside=256)
     found = scenes.run([step], observation, keep=("sky",)).observations[0].detdata["sky"]
     ell = np.arange(LMAX + 1)
     fwhm = float(observation.focalplane.fwhm[0])
-    alm = healpy.map2alm(step.sky(observation.seed, True)[0].map.table.data["I"].astype(np.float64), lmax=LMAX, iter=5)
+    alm = healpy.map2alm(
+        step.sky(observation.seed, True)[0].map.table.data["I"].astype(np.float64),
+        lmax=LMAX,
+        iter=5,
+    )
     beam = np.exp(-ell * (ell + 1) * fwhm**2 / (16 * np.log(2)))
     smooth = healpy.alm2map(healpy.almxfl(alm, beam), 1024)
     ra, dec = observation.ra, observation.dec
-    expected = healpy.get_interp_val(smooth, np.pi / 2 - dec, ra) * to_kelvin_rj("K_CMB", observation.instrument.band)
+    expected = healpy.get_interp_val(smooth, np.pi / 2 - dec, ra) * to_kelvin_rj(
+        "K_CMB", observation.instrument.band
+    )
     # detector 0 is in the middle; both are interpolated, and vary by 1e-2 over a pixel of nside 256
     assert np.std(found[0] - expected) < 0.01 * np.std(expected) + 1e-3 * np.abs(expected).max()
 
@@ -79,9 +94,18 @@ def test_without_polarized_detectors_the_intensity_alone_is_drawn(tmp_path):
     np.testing.assert_array_equal(intensity.data["I"], every.data["I"])
     costs, sizes = [], []
     for polarization in ("none", "pairs"):
-        instrument = instruments.create("act_150ghz").varied(polarization=polarization, detectors=14)
-        scene = zonda.Scene(site="atacama", instrument=instrument, time="2024-06-25T07:00", target="az 180 deg el 50 deg")
-        pipeline = zonda.Pipeline([zonda.PointingStare(scan_duration="5 s"), step, zonda.BinMap(pixel="1 arcmin")])
+        instrument = instruments.create("act_150ghz").varied(
+            polarization=polarization, detectors=14
+        )
+        scene = zonda.Scene(
+            site="atacama",
+            instrument=instrument,
+            time="2024-06-25T07:00",
+            target="az 180 deg el 50 deg",
+        )
+        pipeline = zonda.Pipeline(
+            [zonda.PointingStare(scan_duration="5 s"), step, zonda.BinMap(pixel="1 arcmin")]
+        )
         context = look(pipeline, scene, Structure.of_all(pipeline))
         planning = planning_of(context.operators[1])
         costs.append(planning.estimate(context).cost.once)
@@ -97,8 +121,19 @@ def test_the_forecast_follows_the_highest_multipole(tmp_path):
         path = tmp_path / f"{lmax}.txt"
         ell = np.arange(2, lmax + 1.0)
         np.savetxt(path, np.stack([ell, 1000 + 0 * ell], axis=1))
-        pipeline = zonda.Pipeline([zonda.PointingStare(scan_duration="5 s"), CMBSky(spectrum=path, nside=1024), zonda.BinMap()])
-        scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="75 deg 20 deg")
+        pipeline = zonda.Pipeline(
+            [
+                zonda.PointingStare(scan_duration="5 s"),
+                CMBSky(spectrum=path, nside=1024),
+                zonda.BinMap(),
+            ]
+        )
+        scene = zonda.Scene(
+            site="green_bank",
+            instrument="mustang2",
+            time="2024-11-25T07:00",
+            target="75 deg 20 deg",
+        )
         context = look(pipeline, scene, Structure.of_all(pipeline))
         once.append(planning_of(context.operators[1]).estimate(context).cost.once)
     assert (once[1] - once[0]) == pytest.approx(8e-10 * 1024 * (3000**2 - 1000**2))
@@ -107,15 +142,22 @@ def test_the_forecast_follows_the_highest_multipole(tmp_path):
 
 def test_seeds_and_realizations(tmp_path):
     path = theory(tmp_path / "t.txt", polarized=False)
-    seeded = [CMBSky(spectrum=path, nside=16).sky(seed, True)[0].map.table.data["I"] for seed in (1, 2, 1)]
+    seeded = [
+        CMBSky(spectrum=path, nside=16).sky(seed, True)[0].map.table.data["I"] for seed in (1, 2, 1)
+    ]
     assert not np.array_equal(seeded[0], seeded[1])
     np.testing.assert_array_equal(seeded[0], seeded[2])
-    fixed = [CMBSky(spectrum=path, nside=16, realization=4).sky(seed, True)[0].map.table.data["I"] for seed in (1, 2)]
+    fixed = [
+        CMBSky(spectrum=path, nside=16, realization=4).sky(seed, True)[0].map.table.data["I"]
+        for seed in (1, 2)
+    ]
     np.testing.assert_array_equal(*fixed)
 
 
 def test_scans_of_other_seeds_may_be_prepared_meanwhile(tmp_path):
-    """The state has what `exec` needs: a scan keeps the sky of its seed while another scan's is drawn; none is drawn again."""
+    """The state has what `exec` needs: a scan keeps the sky of its seed while another scan's is
+    drawn; none is drawn again.
+    """
     path, found = theory(tmp_path / "t.txt", polarized=False), []
     for others in (False, True):
         step, observation = CMBSky(spectrum=path, nside=64), scenes.scan(3, 200, radius=60.0)
@@ -194,10 +236,14 @@ def test_files_of_several_codes_are_one_spectrum(tmp_path, heading, order, unit)
     ell, powers = spectra()
     size = 1.0 if unit == "uK^2" else 1e-12 / T_CMB**2
     path = tmp_path / "cl.txt"
-    np.savetxt(path, np.stack([ell, *(powers[name] * size for name in order)], axis=1), header=heading)
+    np.savetxt(
+        path, np.stack([ell, *(powers[name] * size for name in order)], axis=1), header=heading
+    )
     found = read(str(path))
     for k, name in enumerate(("TT", "EE", "BB", "TE")):
-        expected = powers[name] * 2 * np.pi / (ell * (ell + 1)) * 1e-12 if name in order else 0 * ell
+        expected = (
+            powers[name] * 2 * np.pi / (ell * (ell + 1)) * 1e-12 if name in order else 0 * ell
+        )
         np.testing.assert_allclose(found.values[k, 2:], expected, rtol=1e-12)
     assert unit in found.text
 
@@ -205,20 +251,30 @@ def test_files_of_several_codes_are_one_spectrum(tmp_path, heading, order, unit)
 def test_what_is_stated_stands_above_the_file(tmp_path):
     ell, powers = spectra()
     path = tmp_path / "cl.txt"
-    np.savetxt(path, np.stack([ell, powers["TT"], powers["EE"], powers["TE"], powers["BB"]], axis=1))  # CLASS's order, no heading
+    np.savetxt(
+        path, np.stack([ell, powers["TT"], powers["EE"], powers["TE"], powers["BB"]], axis=1)
+    )  # CLASS's order, no heading
     stated = CMBSky(spectrum=path, columns="TT, EE, TE, BB").read().values
-    np.testing.assert_allclose(stated[3, 2:], powers["TE"] * 2 * np.pi / (ell * (ell + 1)) * 1e-12, rtol=1e-12)
+    np.testing.assert_allclose(
+        stated[3, 2:], powers["TE"] * 2 * np.pi / (ell * (ell + 1)) * 1e-12, rtol=1e-12
+    )
     c_l = powers["TT"] * 2 * np.pi / (ell * (ell + 1))
     np.savetxt(path, np.stack([ell, c_l], axis=1))
     with pytest.raises(InputError, match="scaling: none"):
         read(str(path))
-    np.testing.assert_allclose(CMBSky(spectrum=path, scaling="none").read().values[0, 2:], c_l * 1e-12, rtol=1e-12)
+    np.testing.assert_allclose(
+        CMBSky(spectrum=path, scaling="none").read().values[0, 2:], c_l * 1e-12, rtol=1e-12
+    )
     np.savetxt(path, np.stack([ell, powers["TT"] * 1e-12], axis=1))
-    np.testing.assert_allclose(CMBSky(spectrum=path, unit="K^2").read().values[0, 2:], c_l * 1e-12, rtol=1e-12)
+    np.testing.assert_allclose(
+        CMBSky(spectrum=path, unit="K^2").read().values[0, 2:], c_l * 1e-12, rtol=1e-12
+    )
 
 
 def test_the_rms_of_the_sky_is_told(tmp_path):
-    """sum (2 l + 1) C_l / (4 pi), as the map drawn has it: its own multipoles' scatter, 0.5 % for l up to 900."""
+    """sum (2 l + 1) C_l / (4 pi), as the map drawn has it: its own multipoles' scatter, 0.5 % for l
+    up to 900.
+    """
     path = tmp_path / "cl.txt"
     ell, powers = spectra()
     np.savetxt(path, np.stack([ell, powers["TT"]], axis=1))

@@ -1,4 +1,6 @@
-"""Bilinear sampling of the sky against exact Gaussians and its bound, |e| <= h^2 / 12 (|f_xx| + |f_yy|)."""
+"""Bilinear sampling of the sky against exact Gaussians and its bound, |e| <= h^2 / 12 (|f_xx| +
+|f_yy|).
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +15,9 @@ SIGMA = FWHM / np.sqrt(8 * np.log(2))
 
 @pytest.fixture
 def source(made, save):
-    """(a map of one bright pixel of flux 1, a scan at random offsets within 15 arcsec of it, what the beam makes of it)."""
+    """(a map of one bright pixel of flux 1, a scan at random offsets within 15 arcsec of it, what
+    the beam makes of it).
+    """
     values = np.zeros((90, 90))
     values[45, 40] = 1.0
     path = save(values, made.tan_header((90, 90), crpix=(41.0, 46.0)))
@@ -21,7 +25,9 @@ def source(made, save):
     east, north = rng.uniform(-15, 15, (2, 4000))
     east[:2000] /= 15  # many near the peak, where the error is largest
     north[:2000] /= 15
-    lon, lat = made.offset(np.radians(75), np.radians(20), np.tan(east * ARCSEC), np.tan(north * ARCSEC))
+    lon, lat = made.offset(
+        np.radians(75), np.radians(20), np.tan(east * ARCSEC), np.tan(north * ARCSEC)
+    )
     exact = np.exp(-(east**2 + north**2) / (2 * SIGMA**2)) / (2 * np.pi * SIGMA**2)
     return path, made.observation(lon, lat, fwhm=FWHM), exact
 
@@ -29,12 +35,15 @@ def source(made, save):
 @pytest.mark.parametrize("points", [9, 18])
 def test_the_error_is_within_its_bound_and_has_no_mean(made, source, points):
     path, scan, exact = source
-    got = made.look(SkyMap(file=path, interpolation="linear", pixels_per_fwhm=min(points, 16)), scan)[0]
+    got = made.look(
+        SkyMap(file=path, interpolation="linear", pixels_per_fwhm=min(points, 16)), scan
+    )[0]
     error = (got - exact) / exact.max()
     bound = LINEAR / points**2
     assert 0.5 * bound < np.abs(error).max() < bound
-    # regression on the source: without the division by sinc^2 its amplitude would be low by h^2 / 12 x 2 / sigma^2 / 2, that is
-    # a third of the largest error or more; the scatter of 4000 samples of e ~ bound / 3 leaves less than a twentieth
+    # regression on the source: without the division by sinc^2 its amplitude would be low by h^2 /
+    # 12 x 2 / sigma^2 / 2, that is a third of the largest error or more; the scatter of 4000
+    # samples of e ~ bound / 3 leaves less than a twentieth
     amplitude = (got @ exact) / (exact @ exact) - 1
     assert abs(amplitude) < bound / 10
 
@@ -42,14 +51,20 @@ def test_the_error_is_within_its_bound_and_has_no_mean(made, source, points):
 def test_bits_do_not_depend_on_blocks_and_precision_agrees(made, source):
     path, scan, exact = source
     operator = SkyMap(file=path, interpolation="linear")
-    single, double = made.look(operator, scan, dtype=np.float32)[0], made.look(operator, scan, dtype=np.float64)[0]
+    single, double = (
+        made.look(operator, scan, dtype=np.float32)[0],
+        made.look(operator, scan, dtype=np.float64)[0],
+    )
     np.testing.assert_allclose(single, double, atol=3e-5 * exact.max())
 
 
 def test_off_the_grid_is_left_alone(made, save):
     path = save(np.ones((40, 40)), made.tan_header((40, 40), crpix=(20.5, 20.5)))
     lon, lat = made.offset(np.radians(75), np.radians(20), np.array([0.0, 0.05]), np.zeros(2))
-    got = made.look(SkyMap(file=path, interpolation="linear", outside="2 K"), made.observation(lon, lat, fwhm=FWHM))[0]
+    got = made.look(
+        SkyMap(file=path, interpolation="linear", outside="2 K"),
+        made.observation(lon, lat, fwhm=FWHM),
+    )[0]
     assert got[1] == 2.0
     assert got[0] == pytest.approx(1.0, abs=2e-3)
 

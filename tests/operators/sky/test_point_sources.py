@@ -28,7 +28,11 @@ def test_it_keeps_the_contract(tmp_path):
 
 
 def test_columns_that_are_not_read_are_told(tmp_path):
-    path = catalogue(tmp_path / "c.csv", [(75.0, 20.0, 1.0, 0.1, "B1950")], "ra [deg],dec [deg],flux [Jy],q [Jy],epoch")
+    path = catalogue(
+        tmp_path / "c.csv",
+        [(75.0, 20.0, 1.0, 0.1, "B1950")],
+        "ra [deg],dec [deg],flux [Jy],q [Jy],epoch",
+    )
     assert PointSources(catalogue=path).check(None)[1:] == ["not used: q, epoch"]
 
 
@@ -36,30 +40,48 @@ def test_columns_that_are_not_read_are_told(tmp_path):
 def test_the_flux_in_a_map(tmp_path, index):
     """Sum over a map, T dOmega, against S <c^2 (nu / nu_0)^alpha / 2 k nu^2>: to 1e-3.
 
-    Detectors on a square of 1.5 arcsec, so that every pixel of 3 arcsec holds four at the corners of a square: the sum is a
-    quadrature of the Gaussian (FWHM 8.5 arcsec), exact but for exp(-2 pi^2 (sigma / 1.5 arcsec)^2).
+    Detectors on a square of 1.5 arcsec, so that every pixel of 3 arcsec holds four at the corners
+    of a square: the sum is a quadrature of the Gaussian (FWHM 8.5 arcsec), exact but for exp(-2
+    pi^2 (sigma / 1.5 arcsec)^2).
     """
     side = (np.arange(-40, 40) + 0.5) * 1.5 * ARCSEC
     xi, eta = (g.ravel() for g in np.meshgrid(side, side))
-    observation = scenes.scan(6400, 20, radius=0.0, offsets=(xi, eta), instrument=scenes.camera(6400))
+    observation = scenes.scan(
+        6400, 20, radius=0.0, offsets=(xi, eta), instrument=scenes.camera(6400)
+    )
     heading = "ra [deg],dec [deg],flux [Jy],spectral_index"
-    path = catalogue(tmp_path / "c.csv", [(75.0014, 20.0011, 0.3, index), (75.4, 20.0, 5.0, index)], heading)
-    found = scenes.run([PointSources(catalogue=path), zonda.BinMap(pixel="3 arcsec", width="2 arcmin")], observation).products[
-        "map"
-    ]
+    path = catalogue(
+        tmp_path / "c.csv", [(75.0014, 20.0011, 0.3, index), (75.4, 20.0, 5.0, index)], heading
+    )
+    found = scenes.run(
+        [PointSources(catalogue=path), zonda.BinMap(pixel="3 arcsec", width="2 arcmin")],
+        observation,
+    ).products["map"]
     flux = np.nansum(found.signal) * (3 * ARCSEC) ** 2
     band = observation.instrument.band
     assert flux == pytest.approx(0.3 * to_kelvin_rj("Jy/beam", band, None, index, 1.0), rel=1e-3)
 
 
 def test_the_stream_is_the_beam_itself(tmp_path, bench):
-    """At every sample of every detector: T = S c^2 / (2 k nu^2 Omega) exp(-4 ln 2 theta^2 / w^2), narrow band."""
-    observation = scenes.scan(7, 3000, radius=0.8, instrument=scenes.camera(7, low="89.9 GHz", high="90.1 GHz"))
-    path = catalogue(tmp_path / "c.csv", [(75.01, 20.01, 200.0), (74.99, 20.02, -50.0), (180.0, 20.0, 1e6)])
-    found = scenes.run([PointSources(catalogue=path)], observation, keep=("sky",)).observations[0].detdata["sky"]
+    """At every sample of every detector: T = S c^2 / (2 k nu^2 Omega) exp(-4 ln 2 theta^2 / w^2),
+    narrow band.
+    """
+    observation = scenes.scan(
+        7, 3000, radius=0.8, instrument=scenes.camera(7, low="89.9 GHz", high="90.1 GHz")
+    )
+    path = catalogue(
+        tmp_path / "c.csv", [(75.01, 20.01, 200.0), (74.99, 20.02, -50.0), (180.0, 20.0, 1e6)]
+    )
+    found = (
+        scenes.run([PointSources(catalogue=path)], observation, keep=("sky",))
+        .observations[0]
+        .detdata["sky"]
+    )
     plane = observation.focalplane
     rays = np.stack([-plane.eta, -plane.xi, np.ones(7)]) / np.sqrt(1 + plane.xi**2 + plane.eta**2)
-    looks = np.moveaxis(rotation_matrices(observation.boresight_radec) @ rays, 0, 2)  # (3, n_det, n)
+    looks = np.moveaxis(
+        rotation_matrices(observation.boresight_radec) @ rays, 0, 2
+    )  # (3, n_det, n)
     fwhm = float(observation.focalplane.fwhm[0])
     area = np.pi * fwhm**2 / (4 * np.log(2))
     expected = np.zeros((7, 3000))
@@ -74,20 +96,35 @@ def test_the_stream_is_the_beam_itself(tmp_path, bench):
 
 
 def test_a_beam_of_degrees_is_a_gaussian_of_the_angle(tmp_path):
-    """Of 5 deg, a source 5 deg away: the chord in place of the angle would make it brighter by 1e-4 of the peak."""
+    """Of 5 deg, a source 5 deg away: the chord in place of the angle would make it brighter by 1e-4
+    of the peak.
+    """
     streams = []
     for dec in (25.0, 20.0):
         observation = scenes.scan(1, 200, radius=0.0)
         observation.focalplane.fwhm[:] = np.radians(5)
         path = catalogue(tmp_path / "c.csv", [(75.0, dec, 1e9)])
-        streams.append(scenes.run([PointSources(catalogue=path)], observation, keep=("sky",)).observations[0].detdata["sky"])
-    np.testing.assert_allclose(streams[0] / streams[1], 1 / 16, rtol=2e-6)  # float32; the series of the angle ends at 2e-6
+        streams.append(
+            scenes.run([PointSources(catalogue=path)], observation, keep=("sky",))
+            .observations[0]
+            .detdata["sky"]
+        )
+    np.testing.assert_allclose(
+        streams[0] / streams[1], 1 / 16, rtol=2e-6
+    )  # float32; the series of the angle ends at 2e-6
 
 
 def test_fluxes_at_another_frequency(tmp_path):
-    path = catalogue(tmp_path / "c.csv", [(75.0, 20.0, 100.0, 2.0)], "ra [deg],dec [deg],flux [mJy],spectral_index")
+    path = catalogue(
+        tmp_path / "c.csv",
+        [(75.0, 20.0, 100.0, 2.0)],
+        "ra [deg],dec [deg],flux [mJy],spectral_index",
+    )
     band = scenes.camera().band
-    here, there = (Catalogue.read(PointSources(catalogue=path, frequency=f)).brightness(band, 1.0) for f in (None, "46.5 GHz"))
+    here, there = (
+        Catalogue.read(PointSources(catalogue=path, frequency=f)).brightness(band, 1.0)
+        for f in (None, "46.5 GHz")
+    )
     assert there / here == pytest.approx((band.centre / 46.5e9) ** 2)
 
 
@@ -106,6 +143,8 @@ def test_catalogues_that_are_wrong(tmp_path, heading, row, match):
     with pytest.raises(InputError, match=match) as caught:
         Catalogue.read(PointSources(catalogue=path))
     assert "bad.csv" in str(caught.value)
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d")
+    scene = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d"
+    )
     with pytest.raises(InputError, match=match):  # `zonda check` says so too
         PointSources(catalogue=path).check(zonda.Data(scene))

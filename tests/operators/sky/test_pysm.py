@@ -1,6 +1,8 @@
-"""PySM's sky beside analytic laws: over bands, its signs and its frame; what is refused; nothing comes from the network.
+"""PySM's sky beside analytic laws: over bands, its signs and its frame; what is refused; nothing
+comes from the network.
 
-`.ci/pysm` runs these in an environment with PySM (the extra ``pysm``), where none may be skipped (ZONDA_PYSM=required).
+`.ci/pysm` runs these in an environment with PySM (the extra ``pysm``), where none may be skipped
+(ZONDA_PYSM=required).
 """
 
 import importlib
@@ -31,7 +33,9 @@ from zonda.testing import check_operator
 NSIDE = 16
 VALUES = (100e-6, 30e-6, -20e-6)
 """I, Q, U [K_RJ] at the frequency of the template."""
-GAPS = "# GHz, transmission\n80 0\n90 0\n91 1\n104 0.3\n105 0\n120 0\n121 0.5\n130 0.5\n131 0\n150 0\n"
+GAPS = (
+    "# GHz, transmission\n80 0\n90 0\n91 1\n104 0.3\n105 0\n120 0\n121 0.5\n130 0.5\n131 0\n150 0\n"
+)
 
 
 def real(test):
@@ -49,13 +53,27 @@ def template(path, values=VALUES, nside=NSIDE):
 
 
 def synchrotron(path, index=-3.1, **more):
-    return {"class": "PowerLaw", "map_I": template(path), "freq_ref_I": "23 GHz", "freq_ref_P": "30 GHz",
-            "map_pl_index": index, **more}  # fmt: skip
+    return {
+        "class": "PowerLaw",
+        "map_I": template(path),
+        "freq_ref_I": "23 GHz",
+        "freq_ref_P": "30 GHz",
+        "map_pl_index": index,
+        **more,
+    }
 
 
 def dust(path, **more):
-    return {"class": "ModifiedBlackBody", "map_I": template(path), "freq_ref_I": "150 GHz", "freq_ref_P": "353 GHz",
-            "map_mbb_index": 1.54, "map_mbb_temperature": 20, "unit_mbb_temperature": "K", **more}  # fmt: skip
+    return {
+        "class": "ModifiedBlackBody",
+        "map_I": template(path),
+        "freq_ref_I": "150 GHz",
+        "freq_ref_P": "353 GHz",
+        "map_mbb_index": 1.54,
+        "map_mbb_temperature": 20,
+        "unit_mbb_temperature": "K",
+        **more,
+    }
 
 
 def black_body(nu, reference):
@@ -64,7 +82,10 @@ def black_body(nu, reference):
 
 
 LAWS = {
-    "synchrotron": (synchrotron, [lambda nu: (nu / 23e9) ** -3.1] + 2 * [lambda nu: (nu / 30e9) ** -3.1]),
+    "synchrotron": (
+        synchrotron,
+        [lambda nu: (nu / 23e9) ** -3.1] + 2 * [lambda nu: (nu / 30e9) ** -3.1],
+    ),
     "dust": (dust, [lambda nu: black_body(nu, 150e9)] + 2 * [lambda nu: black_body(nu, 353e9)]),
 }
 
@@ -92,8 +113,12 @@ def test_the_weights_average_straight_lines_exactly_and_power_laws_nearly(tmp_pa
     def average(values):
         return np.trapezoid(power * values, nu) / np.trapezoid(power, nu)
 
-    assert average(3 + nu / 1e11) == pytest.approx(band_average(band, lambda x: 3 + x / 1e11), rel=1e-12)
-    exact = band_average(band, lambda x: (x / 23e9) ** -3.1)  # n (n - 1) / 12 of 0.005^2 is 2.6e-5 where lines are longest
+    assert average(3 + nu / 1e11) == pytest.approx(
+        band_average(band, lambda x: 3 + x / 1e11), rel=1e-12
+    )
+    exact = band_average(
+        band, lambda x: (x / 23e9) ** -3.1
+    )  # n (n - 1) / 12 of 0.005^2 is 2.6e-5 where lines are longest
     assert average((nu / 23e9) ** -3.1) == pytest.approx(exact, rel=2.7e-5)
 
 
@@ -113,8 +138,9 @@ def test_what_needs_no_pysm_is_refused_without_it():
 @pytest.mark.parametrize("name", ["delta", "wide", "gaps"])
 @pytest.mark.parametrize("law", LAWS)
 def test_the_bands_emission_is_the_laws_average(tmp_path, law, name):
-    """Equation (1) of radiation.py by scipy's quadrature between the table's frequencies: 2.7e-5 as above. A band of +- 7e-5 of
-    its frequency is the law itself: n (n - 1) / 2 of its square, 2.8e-8."""
+    """Equation (1) of radiation.py by scipy's quadrature between the table's frequencies: 2.7e-5 as
+    above. A band of +- 7e-5 of its frequency is the law itself: n (n - 1) / 2 of its square,
+    2.8e-8."""
     component, laws = LAWS[law]
     band = bands(tmp_path)[name]
     found = emission({"mine": component(tmp_path / "t.fits")}, NSIDE, band, False, "test")
@@ -122,17 +148,26 @@ def test_the_bands_emission_is_the_laws_average(tmp_path, law, name):
 
     def integral(function):
         edges = zip(band.frequency[:-1], band.frequency[1:], strict=True)
-        return sum(quad(lambda nu: np.interp(nu, band.frequency, band.transmission) * function(nu), *pair)[0] for pair in edges)
+        return sum(
+            quad(lambda nu: np.interp(nu, band.frequency, band.transmission) * function(nu), *pair)[
+                0
+            ]
+            for pair in edges
+        )
 
     for got, value, of in zip(found, VALUES, laws, strict=True):
-        np.testing.assert_allclose(got, value * integral(of) / integral(lambda nu: 1.0), rtol=2.7e-5)
+        np.testing.assert_allclose(
+            got, value * integral(of) / integral(lambda nu: 1.0), rtol=2.7e-5
+        )
         if name == "delta":
             np.testing.assert_allclose(got, value * of(150e9), rtol=3e-8)
 
 
 @real
 def test_anisotropy_of_the_cmb_is_that_of_a_map_in_k_cmb(tmp_path):
-    """PySM's 2.7255 K for our 2.72548 K: 1e-5. A component of I alone beside a polarized one adds nothing to Q and U."""
+    """PySM's 2.7255 K for our 2.72548 K: 1e-5. A component of I alone beside a polarized one adds
+    nothing to Q and U.
+    """
     healpy.write_map(tmp_path / "cmb.fits", np.full(12 * NSIDE**2, 50.0), column_units="uK_CMB")
     band = bands(tmp_path)["wide"]
     cmb = {"class": "CMBMap", "map_I": str(tmp_path / "cmb.fits")}
@@ -155,7 +190,9 @@ def a_scan(made, spread=3.0, n=300):
     ra0, dec0 = np.radians([75.0, 20.0])
     ra, dec = made.offset(ra0, dec0, *rng.uniform(-1, 1, (2, n)) * np.radians(spread))
     xi, eta = rng.uniform(-1, 1, (2, 4)) * np.radians(0.5)
-    o = made.observation(ra, dec, xi=xi, eta=eta, psi=rng.uniform(0, 6, n), centre=(ra0, dec0), fwhm=3600.0)
+    o = made.observation(
+        ra, dec, xi=xi, eta=eta, psi=rng.uniform(0, 6, n), centre=(ra0, dec0), fwhm=3600.0
+    )
     o.focalplane.polarization_angle[:] = rng.uniform(0, 6, 4)
     o.focalplane.polarization_efficiency[:] = 0.9
     return o
@@ -174,54 +211,90 @@ def seen(o, values, frame):
 def test_q_and_u_are_those_of_galactic_meridians(made, tmp_path):
     o = a_scan(made)
     step = PySMSky(components={"mine": synchrotron(tmp_path / "t.fits", index=0)}, nside=128)
-    # third order in pixels of 8e-3 rad, over which meridians turn by as much; the beam mixes 7e-3 rad of turned ones
-    np.testing.assert_allclose(made.look(step, o), seen(o, VALUES, "galactic"), rtol=0, atol=1e-4 * VALUES[0])
+    # third order in pixels of 8e-3 rad, over which meridians turn by as much; the beam mixes 7e-3
+    # rad of turned ones
+    np.testing.assert_allclose(
+        made.look(step, o), seen(o, VALUES, "galactic"), rtol=0, atol=1e-4 * VALUES[0]
+    )
     o.focalplane.polarization_efficiency[:] = 0.0
     np.testing.assert_allclose(made.look(step, o), VALUES[0], rtol=1e-6)
 
 
 @real
 def test_the_sky_is_where_and_as_healpys_rotator_has_it(made, tmp_path):
-    """Multipoles up to 12 of a Galactic map, turned by healpy's Rotator to ICRS and smoothed there, against the stream."""
+    """Multipoles up to 12 of a Galactic map, turned by healpy's Rotator to ICRS and smoothed there,
+    against the stream.
+    """
     rng, lmax, fine = np.random.default_rng(3), 12, 1024
     size = healpy.Alm.getsize(lmax)
     alm = 1e-5 * (rng.normal(size=(3, size)) + 1j * rng.normal(size=(3, size)))
     alm[:, : lmax + 1] = alm[:, : lmax + 1].real
     alm[1:, healpy.Alm.getlm(lmax)[0] < 2] = 0
     path = template(tmp_path / "t.fits", healpy.alm2map(alm, 128, lmax=lmax), 128)
-    component = {"class": "PowerLaw", "map_I": path, "freq_ref_I": "23 GHz", "freq_ref_P": "23 GHz", "map_pl_index": 0}
+    component = {
+        "class": "PowerLaw",
+        "map_I": path,
+        "freq_ref_I": "23 GHz",
+        "freq_ref_P": "23 GHz",
+        "map_pl_index": 0,
+    }
     o = a_scan(made)
     found = made.look(PySMSky(components={"mine": component}, nside=128), o)
-    turned = healpy.Rotator(coord=["G", "C"]).rotate_alm(healpy.smoothalm(alm.copy(), fwhm=np.radians(1.0)))
+    turned = healpy.Rotator(coord=["G", "C"]).rotate_alm(
+        healpy.smoothalm(alm.copy(), fwhm=np.radians(1.0))
+    )
     maps = healpy.alm2map(turned, fine, lmax=lmax)
     x, y, z = np.moveaxis(directions(o.boresight_radec, o.focalplane.xi, o.focalplane.eta), -1, 0)
     theta, phi = np.arccos(z), np.arctan2(y, x)
     expected = seen(o, [healpy.get_interp_val(m, theta, phi) for m in maps], "icrs")
-    # third order in l * 8e-3 rad = 0.1, bilinear in 12 * 1e-3 rad, healpy's G to C 0.04 arcsec from astropy's; 1e-4 of the spread
+    # third order in l * 8e-3 rad = 0.1, bilinear in 12 * 1e-3 rad, healpy's G to C 0.04 arcsec from
+    # astropy's; 1e-4 of the spread
     np.testing.assert_allclose(found, expected, rtol=0, atol=5e-4 * np.std(expected))
 
 
 # ---- as a step
 
-CAMERA = {"telescope": {"name": "dish", "diameter": "6 m"}, "name": "c", "field_of_view": "1 deg", "net": "300 uK s(1/2)",
-          "sample_rate": "20 Hz", "polarization": "pairs", "main_beam_efficiency": 1, "illumination_efficiency": 1,
-          "bands": [{"name": "f090", "low": "77 GHz", "high": "106 GHz", "detectors": 80},
-                    {"name": "f150", "low": "127 GHz", "high": "172 GHz", "detectors": 80}]}  # fmt: skip
-SCENE = {"site": "atacama", "instrument": CAMERA, "time": "2024-06-25T07:00", "target": "az 180 deg el 50 deg", "seed": 1}
+CAMERA = {
+    "telescope": {"name": "dish", "diameter": "6 m"},
+    "name": "c",
+    "field_of_view": "1 deg",
+    "net": "300 uK s(1/2)",
+    "sample_rate": "20 Hz",
+    "polarization": "pairs",
+    "main_beam_efficiency": 1,
+    "illumination_efficiency": 1,
+    "bands": [
+        {"name": "f090", "low": "77 GHz", "high": "106 GHz", "detectors": 80},
+        {"name": "f150", "low": "127 GHz", "high": "172 GHz", "detectors": 80},
+    ],
+}
+SCENE = {
+    "site": "atacama",
+    "instrument": CAMERA,
+    "time": "2024-06-25T07:00",
+    "target": "az 180 deg el 50 deg",
+    "seed": 1,
+}
 SCAN = {"PointingBackAndForth": {"scan_duration": "20 s", "check_limits": "warn"}}
 
 
 def file(tmp_path, **step):
     path = tmp_path / "run.yaml"
-    steps = [SCAN, {"PySMSky": step}, {"BinMap": {"pixel": "10 arcmin", "stokes": "IQU"}}, "SaveMap"]
+    steps = [
+        SCAN,
+        {"PySMSky": step},
+        {"BinMap": {"pixel": "10 arcmin", "stokes": "IQU"}},
+        "SaveMap",
+    ]
     path.write_text(yaml.safe_dump(SCENE | {"operators": steps}))
     return path
 
 
 @real
 def test_each_band_has_its_own_map_and_paths_start_beside_the_file(tmp_path, monkeypatch):
-    """A uniform sky: I and the degree of polarization of each map are the law's averages. Galactic meridians turn by 3e-3 rad
-    within a pixel, Q and U by twice that; weights of another convention would make 5e-2 of these bands."""
+    """A uniform sky: I and the degree of polarization of each map are the law's averages. Galactic
+    meridians turn by 3e-3 rad within a pixel, Q and U by twice that; weights of another convention
+    would make 5e-2 of these bands."""
     (tmp_path / "data").mkdir()
     component = synchrotron(tmp_path / "data" / "t.fits") | {"map_I": "data/t.fits"}
     monkeypatch.chdir("/")
@@ -234,7 +307,9 @@ def test_each_band_has_its_own_map_and_paths_start_beside_the_file(tmp_path, mon
         good = np.isfinite(i)
         assert good.sum() > 10
         laws = LAWS["synchrotron"][1][:2]
-        for found, value, law in zip((i, np.hypot(q, u)), (VALUES[0], np.hypot(*VALUES[1:])), laws, strict=True):
+        for found, value, law in zip(
+            (i, np.hypot(q, u)), (VALUES[0], np.hypot(*VALUES[1:])), laws, strict=True
+        ):
             np.testing.assert_allclose(found[good], value * band_average(flat, law), rtol=1e-2)
 
 
@@ -254,7 +329,9 @@ def test_nothing_is_downloaded_unless_it_is_asked_for(tmp_path, capsys, monkeypa
         assert "set download: true" in said
         assert "PYSM_LOCAL_DATA" in said
         assert main(["check", str(path)]) == 2
-        assert {"s0": "pysm_2/synch_t_new.fits", "co1": "co/HFI", "rg3": "001.0.fits"}[of] in capsys.readouterr().err
+        assert {"s0": "pysm_2/synch_t_new.fits", "co1": "co/HFI", "rg3": "001.0.fits"}[
+            of
+        ] in capsys.readouterr().err
 
 
 @real
@@ -268,7 +345,9 @@ def test_nothing_is_downloaded_unless_it_is_asked_for(tmp_path, capsys, monkeypa
         ("cib1", 16, "websky/0.4/cib/cib_0017.0.fits"),
     ],
 )
-def test_templates_whose_names_classes_put_together_are_looked_for(tmp_path, monkeypatch, model, nside, template):
+def test_templates_whose_names_classes_put_together_are_looked_for(
+    tmp_path, monkeypatch, model, nside, template
+):
     """Without reading them: what is there here is no FITS file."""
     monkeypatch.setenv("PYSM_LOCAL_DATA", str(tmp_path))
     with set_temp_cache(tmp_path):
@@ -282,11 +361,18 @@ def test_templates_whose_names_classes_put_together_are_looked_for(tmp_path, mon
 
 @real
 def test_templates_are_found_where_pysm_looks_for_them(tmp_path, monkeypatch):
-    """In PYSM_LOCAL_DATA, in astropy's cache, and where `download` fetches them; a preset is then the component that it names."""
+    """In PYSM_LOCAL_DATA, in astropy's cache, and where `download` fetches them; a preset is then
+    the component that it names.
+    """
     (tmp_path / "pysm_2").mkdir()
     for k, name in enumerate("tqu"):
         values = np.full(12 * NSIDE**2, 1e6 * VALUES[k])
-        healpy.write_map(tmp_path / f"pysm_2/synch_{name}_new.fits", values, column_units="uK_RJ", dtype=np.float64)
+        healpy.write_map(
+            tmp_path / f"pysm_2/synch_{name}_new.fits",
+            values,
+            column_units="uK_RJ",
+            dtype=np.float64,
+        )
     band, found = bands(tmp_path)["wide"], []
     step = PySMSky(models=["s0"], nside=NSIDE)
     monkeypatch.setenv("PYSM_LOCAL_DATA", str(tmp_path))
@@ -320,9 +406,16 @@ def test_templates_are_found_where_pysm_looks_for_them(tmp_path, monkeypatch):
     [
         ({"models": ["d111"]}, "PySM has no model 'd111'.*did you mean 'd11'"),
         ({"components": {"mine": {"class": "PowrLaw"}}}, "PySM: KeyError: 'PowrLaw'"),
-        ({"components": {"mine": {"class": "PowerLaw", "colour": "red"}}}, "unexpected keyword argument 'colour'"),
         (
-            {"components": {"mine": {"class": "PowerLaw", "map_I": "absent.fits", "freq_ref_I": "1 GHz"}}},
+            {"components": {"mine": {"class": "PowerLaw", "colour": "red"}}},
+            "unexpected keyword argument 'colour'",
+        ),
+        (
+            {
+                "components": {
+                    "mine": {"class": "PowerLaw", "map_I": "absent.fits", "freq_ref_I": "1 GHz"}
+                }
+            },
             "absent.fits.*correct the path",
         ),
     ],
@@ -341,7 +434,15 @@ def test_what_pysm_does_not_take_is_refused_with_its_place(made, given, match):
 
 @real
 def test_random_models_have_the_same_bits_and_leave_numpys_generator_alone(tmp_path):
-    config = {"mine": dust(tmp_path / "t.fits") | {"class": "DecorrelatedModifiedBlackBody", "correlation_length": 0.1}}
+    config = {
+        "mine": (
+            dust(tmp_path / "t.fits")
+            | {
+                "class": "DecorrelatedModifiedBlackBody",
+                "correlation_length": 0.1,
+            }
+        )
+    }
     np.random.seed(5)  # noqa: NPY002
     expected = np.random.random()  # noqa: NPY002
     np.random.seed(5)  # noqa: NPY002
@@ -349,7 +450,9 @@ def test_random_models_have_the_same_bits_and_leave_numpys_generator_alone(tmp_p
     assert np.random.random() == expected  # noqa: NPY002
     np.testing.assert_array_equal(one, other)
     drawn = {"mine": {"a": {"class": "PowerLawRealization"}, "b": {"class": "PowerLaw"}}}
-    assert _seeded(drawn, importlib.import_module("pysm3").models)["mine"]["a"]["seeds"]  # without, each run has another sky
+    assert _seeded(drawn, importlib.import_module("pysm3").models)["mine"]["a"][
+        "seeds"
+    ]  # without, each run has another sky
     assert "seeds" not in _seeded(drawn, importlib.import_module("pysm3").models)["mine"]["b"]
 
 
@@ -359,5 +462,7 @@ def test_it_keeps_the_contract_and_a_plan_knows_its_brightness(made, tmp_path):
     check_operator(step)
     o = a_scan(made)
     planning = planning_class(PySMSky)(step)
-    assert planning.traits(o).peak == pytest.approx(np.abs(step.sky(o).map.table.data["I"]).max(), rel=1e-6)
+    assert planning.traits(o).peak == pytest.approx(
+        np.abs(step.sky(o).map.table.data["I"]).max(), rel=1e-6
+    )
     assert planning.memory(o) > 12 * 64**2 * 8 * 6

@@ -25,7 +25,8 @@ def refused(path, *words, **options):
     return str(caught.value)
 
 
-# ------------------------------------------------------------------------------------------------------------- units
+# --------------------------------------------------------------------------------------------------
+# units
 
 
 @pytest.mark.parametrize(
@@ -64,33 +65,48 @@ def test_units(text, expected):
     assert factor == pytest.approx(expected[1])
 
 
-@pytest.mark.parametrize("text", ["W/m2", "furlong", "Jy", "K/s", "K_XX", "counts", "Jy/px/beam", "K_", "MK_RJ", "1"])
+@pytest.mark.parametrize(
+    "text", ["W/m2", "furlong", "Jy", "K/s", "K_XX", "counts", "Jy/px/beam", "K_", "MK_RJ", "1"]
+)
 def test_unknown_units(text):
     with pytest.raises(InputError, match=r"unknown unit|temperature scale"):
         parse_unit(text, place="map")
 
 
-@pytest.mark.parametrize(("scale", "unit"), [("K_RJ", "K_RJ"), ("K_CMB", "K_CMB"), ("RJ", "K_RJ"), ("cmb", "K_CMB")])
+@pytest.mark.parametrize(
+    ("scale", "unit"), [("K_RJ", "K_RJ"), ("K_CMB", "K_CMB"), ("RJ", "K_RJ"), ("cmb", "K_CMB")]
+)
 @pytest.mark.parametrize(("kelvin", "factor"), [("K", 1), ("mK", 1e-3), ("uK", 1e-6)])
 def test_plain_kelvin_with_its_scale(made, save, scale, unit, kelvin, factor):
-    image = read_map(save(np.full((4, 5), 2.0), made.tan_header((4, 5), unit=kelvin, TEMPSCAL=scale)))
+    image = read_map(
+        save(np.full((4, 5), 2.0), made.tan_header((4, 5), unit=kelvin, TEMPSCAL=scale))
+    )
     assert image.unit == unit
     np.testing.assert_allclose(image.values, 2.0 * factor)
 
 
 def test_plain_kelvin_without_scale(made, save):
     refused(save(np.zeros((4, 4)), made.tan_header((4, 4), unit="K")), "TEMPSCAL", "unit: K_RJ")
-    refused(save(np.zeros((4, 4)), made.tan_header((4, 4), unit="K", TEMPSCAL="Celsius")), "Celsius")
+    refused(
+        save(np.zeros((4, 4)), made.tan_header((4, 4), unit="K", TEMPSCAL="Celsius")), "Celsius"
+    )
 
 
 def test_missing_unit_names_the_key_and_the_parameter(made, save):
     path = save(np.zeros((4, 4)), made.tan_header((4, 4), unit=None))
-    refused(path, "unit of the map is missing", "BUNIT", "parameter unit", "Jy/pixel", "K_CMB", "MJy/sr")
+    refused(
+        path, "unit of the map is missing", "BUNIT", "parameter unit", "Jy/pixel", "K_CMB", "MJy/sr"
+    )
     assert read_map(path, unit="mK_RJ").unit == "K_RJ"
 
 
 def test_wrong_unit_names_the_known_ones(made, save):
-    refused(save(np.zeros((4, 4)), made.tan_header((4, 4), unit="furlong")), "unknown unit 'furlong'", "BUNIT", "Jy/pixel")
+    refused(
+        save(np.zeros((4, 4)), made.tan_header((4, 4), unit="furlong")),
+        "unknown unit 'furlong'",
+        "BUNIT",
+        "Jy/pixel",
+    )
 
 
 def test_the_given_unit_overrides_and_is_noted(made, save):
@@ -107,7 +123,8 @@ def test_jansky_per_beam_needs_its_beam(made, save):
     assert image.beam == pytest.approx((10 * ARCSEC, 8 * ARCSEC))
 
 
-# ------------------------------------------------------------------------------------------------------- world coordinates
+# --------------------------------------------------------------------------------------------------
+# world coordinates
 
 
 def radians_header(made, unit="rad"):
@@ -120,9 +137,13 @@ def radians_header(made, unit="rad"):
 
 @pytest.mark.parametrize("unit", ["rad", "radian", "RADIANS"])
 def test_radians_and_degrees_agree(made, save, unit):
-    degrees = read_map(save(np.zeros((20, 30)), made.tan_header((20, 30), crpix=(7.0, 9.0)), "d.fits"))
+    degrees = read_map(
+        save(np.zeros((20, 30)), made.tan_header((20, 30), crpix=(7.0, 9.0)), "d.fits")
+    )
     radians = read_map(save(np.zeros((20, 30)), radians_header(made, unit), "r.fits"))
-    np.testing.assert_allclose(pixel_matrix(radians.wcs), pixel_matrix(degrees.wcs), rtol=1e-11, atol=1e-8)
+    np.testing.assert_allclose(
+        pixel_matrix(radians.wcs), pixel_matrix(degrees.wcs), rtol=1e-11, atol=1e-8
+    )
 
 
 @pytest.mark.parametrize(("unit", "size"), [("arcsec", 3600), ("arcmin", 60), ("mas", 3.6e6)])
@@ -132,22 +153,36 @@ def test_coordinates_in_parts_of_a_degree_are_read(made, save, unit, size):
     for key in ("CRVAL1", "CRVAL2", "CDELT1", "CDELT2"):
         header[key] *= size
     header["CUNIT1"] = header["CUNIT2"] = unit
-    found, right = read_map(save(np.zeros((20, 30)), header, "p.fits")), read_map(save(np.zeros((20, 30)), degrees, "d.fits"))
-    np.testing.assert_allclose(pixel_matrix(found.wcs), pixel_matrix(right.wcs), rtol=1e-11, atol=1e-8)
+    found, right = (
+        read_map(save(np.zeros((20, 30)), header, "p.fits")),
+        read_map(save(np.zeros((20, 30)), degrees, "d.fits")),
+    )
+    np.testing.assert_allclose(
+        pixel_matrix(found.wcs), pixel_matrix(right.wcs), rtol=1e-11, atol=1e-8
+    )
     header["CRVAL1"] = 721.0 * size
-    refused(save(np.zeros((20, 30)), header, "f.fits"), "CRVAL1 =", "no longitude or latitude", "CUNIT1")
+    refused(
+        save(np.zeros((20, 30)), header, "f.fits"), "CRVAL1 =", "no longitude or latitude", "CUNIT1"
+    )
 
 
 def test_cd_pc_and_cdelt_agree(made, save):
     plain = made.tan_header((20, 30), CROTA2=20.0)
     c, s = np.cos(np.radians(20)), np.sin(np.radians(20))
     pc, cd = made.tan_header((20, 30)), made.tan_header((20, 30))
-    pc["PC1_1"], pc["PC1_2"], pc["PC2_1"], pc["PC2_2"] = c, s, -s, c  # equal sizes, so PC = R with CDELT1 < 0: see Paper II
+    pc["PC1_1"], pc["PC1_2"], pc["PC2_1"], pc["PC2_2"] = (
+        c,
+        s,
+        -s,
+        c,
+    )  # equal sizes, so PC = R with CDELT1 < 0: see Paper II
     for key in ("CDELT1", "CDELT2"):
         del cd[key]
     matrix = WCS(plain).pixel_scale_matrix
     cd["CD1_1"], cd["CD1_2"], cd["CD2_1"], cd["CD2_2"] = matrix.ravel()
-    first, second, third = (pixel_matrix(read_map(save(np.zeros((20, 30)), h)).wcs) for h in (plain, pc, cd))
+    first, second, third = (
+        pixel_matrix(read_map(save(np.zeros((20, 30)), h)).wcs) for h in (plain, pc, cd)
+    )
     np.testing.assert_allclose(third, first, rtol=1e-11, atol=1e-8)
     np.testing.assert_allclose(second, first, rtol=1e-11, atol=1e-8)
 
@@ -183,8 +218,12 @@ def test_half_a_wcs_names_the_missing_key(made, save, key):
 
 
 def test_bare_map_with_radians(save):
-    header = fits.Header({"BUNIT": "K_RJ", "CDELT1": ARCSEC, "CDELT2": 2 * ARCSEC, "CUNIT1": "rad", "CUNIT2": "rad"})
-    np.testing.assert_allclose(read_map(save(np.zeros((4, 4)), header), centred=True).scale, np.diag([-ARCSEC, 2 * ARCSEC]))
+    header = fits.Header(
+        {"BUNIT": "K_RJ", "CDELT1": ARCSEC, "CDELT2": 2 * ARCSEC, "CUNIT1": "rad", "CUNIT2": "rad"}
+    )
+    np.testing.assert_allclose(
+        read_map(save(np.zeros((4, 4)), header), centred=True).scale, np.diag([-ARCSEC, 2 * ARCSEC])
+    )
 
 
 @pytest.mark.parametrize(
@@ -193,8 +232,14 @@ def test_bare_map_with_radians(save):
         ({"CDELT1": 0.0}, ["singular"]),
         ({"CUNIT1": "parsec"}, ["CUNIT1", "parsec", "no angle"]),
         ({"CTYPE1": "RA---XYZ", "CTYPE2": "DEC--XYZ"}, ["WCS is broken"]),
-        ({"CTYPE1": "ELON-TAN", "CTYPE2": "ELAT-TAN"}, ["ELON-TAN", "neither equatorial nor Galactic"]),
-        ({"CTYPE1": "RA---TAN", "CTYPE2": "GLAT-TAN"}, ["GLAT-TAN", "neither equatorial nor Galactic"]),
+        (
+            {"CTYPE1": "ELON-TAN", "CTYPE2": "ELAT-TAN"},
+            ["ELON-TAN", "neither equatorial nor Galactic"],
+        ),
+        (
+            {"CTYPE1": "RA---TAN", "CTYPE2": "GLAT-TAN"},
+            ["GLAT-TAN", "neither equatorial nor Galactic"],
+        ),
     ],
 )
 def test_broken_wcs(made, save, change, words):
@@ -205,7 +250,9 @@ def test_broken_wcs(made, save, change, words):
 
 @pytest.mark.parametrize("keys", [{}, {"RADESYS": "ICRS"}, {"RADESYS": "FK5", "EQUINOX": 2000.0}])
 def test_galactic_tan_is_exact(made, save, keys):
-    """Directions through `pixel_matrix` against astropy's own chain, whatever the keys that are meant for equatorial axes."""
+    """Directions through `pixel_matrix` against astropy's own chain, whatever the keys that are
+    meant for equatorial axes.
+    """
     header = made.tan_header((40, 50), crpix=(3.0, 44.0))
     header["CTYPE1"], header["CTYPE2"] = "GLON-TAN", "GLAT-TAN"
     del header["RADESYS"]
@@ -216,7 +263,8 @@ def test_galactic_tan_is_exact(made, save, keys):
     np.testing.assert_allclose(p[:2] / p[2], [31.0, 22.0], atol=1e-6)
 
 
-# ------------------------------------------------------------------------------------------------------------ pixels
+# --------------------------------------------------------------------------------------------------
+# pixels
 
 
 def test_nan_is_an_error_by_default(made, save):
@@ -236,14 +284,21 @@ def test_zeroed_pixels_are_counted(made, save):
     values[2, 3] = np.nan
     scan = made.observation([np.radians(75.0)], np.radians(20.0))
     made.look(SkyMap(file=save(values, made.tan_header((6, 7))), missing="zero"), scan)
-    assert scan.tally.get("SkyMap", "pixels of the input map that are NaN or infinite, taken as zero") == 1
+    assert (
+        scan.tally.get("SkyMap", "pixels of the input map that are NaN or infinite, taken as zero")
+        == 1
+    )
 
 
 @pytest.mark.parametrize("shape", [(1, 5, 6), (1, 1, 5, 6)])
 def test_degenerate_axes_are_squeezed(made, save, shape):
     values = np.random.default_rng(1).standard_normal(shape)
-    header = made.tan_header((5, 6), CTYPE3="FREQ", CRVAL3=9e10, CDELT3=1e9, CRPIX3=1.0, CUNIT3="Hz")
-    np.testing.assert_array_equal(read_map(save(values, header)).values, values[..., :, :].reshape(5, 6))
+    header = made.tan_header(
+        (5, 6), CTYPE3="FREQ", CRVAL3=9e10, CDELT3=1e9, CRPIX3=1.0, CUNIT3="Hz"
+    )
+    np.testing.assert_array_equal(
+        read_map(save(values, header)).values, values[..., :, :].reshape(5, 6)
+    )
 
 
 def test_cubes_are_refused(made, save):
@@ -264,14 +319,22 @@ def test_scaled_integers_and_extensions(made, tmp_path):
 def test_compressed_files(made, save, tmp_path):
     values = np.random.default_rng(2).standard_normal((20, 20)).astype(np.float32)
     for name in ("map.fits.gz", "map.fits"):
-        np.testing.assert_array_equal(read_map(save(values, made.tan_header((20, 20)), name)).values, values)
+        np.testing.assert_array_equal(
+            read_map(save(values, made.tan_header((20, 20)), name)).values, values
+        )
     fits.HDUList(
-        [fits.PrimaryHDU(), fits.CompImageHDU(values, made.tan_header((20, 20)), compression_type="GZIP_1", quantize_level=0)]
+        [
+            fits.PrimaryHDU(),
+            fits.CompImageHDU(
+                values, made.tan_header((20, 20)), compression_type="GZIP_1", quantize_level=0
+            ),
+        ]
     ).writeto(tmp_path / "c.fits")
     np.testing.assert_array_equal(read_map(tmp_path / "c.fits").values, values)
 
 
-# ------------------------------------------------------------------------------------------------------------- files
+# --------------------------------------------------------------------------------------------------
+# files
 
 
 def test_unreadable_files(made, save, tmp_path):

@@ -28,7 +28,10 @@ def strip(made, length=5.0, n=4000, **more):
     return made.observation(lon, lat, centre=CENTRE, **more)
 
 
-@pytest.mark.parametrize(("reach", "step", "message"), [(68.0, 1e-2, "reaches 68 deg"), (29.0, 1e-6, "pixels of 0.206 arcsec")])
+@pytest.mark.parametrize(
+    ("reach", "step", "message"),
+    [(68.0, 1e-2, "reaches 68 deg"), (29.0, 1e-6, "pixels of 0.206 arcsec")],
+)
 def test_grids_too_large(made, reach, step, message):
     lon, lat = made.offset(*CENTRE, np.tan(np.radians([-reach, reach])), 0.0)
     with pytest.raises(InputError, match=message):
@@ -45,7 +48,10 @@ def test_every_sample_and_its_beam_is_in_a_tile(made):
     assert found.points < 0.5 * found.shape[0] * found.shape[1]
     from zonda.core.numerics.projection import directions, pixel_matrix
 
-    p = directions(scan.boresight_radec, xi, eta).reshape(-1, 3) @ pixel_matrix(tangent_wcs(*CENTRE, found.box, step)).T
+    p = (
+        directions(scan.boresight_radec, xi, eta).reshape(-1, 3)
+        @ pixel_matrix(tangent_wcs(*CENTRE, found.box, step)).T
+    )
     x, y = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2]
     margin = reach / step + regions.MARGIN
     for dx in (-margin, 0, margin):
@@ -76,11 +82,15 @@ def test_a_map_that_no_sample_comes_near(made):
 
 @pytest.mark.parametrize("kind", ["healpix", "CAR"])
 def test_tiles_and_blocks_change_nothing(made, save, tmp_path, monkeypatch, kind):
-    """What a strip sees of a map of the whole sky is what it sees when the whole box is worked on."""
+    """What a strip sees of a map of the whole sky is what it sees when the whole box is worked
+    on.
+    """
     rng = np.random.default_rng(3)
     if kind == "healpix":
         path = tmp_path / "h.fits"
-        healpy.write_map(path, rng.standard_normal(12 * 64**2), coord="G", column_units="K_RJ", dtype=np.float64)
+        healpy.write_map(
+            path, rng.standard_normal(12 * 64**2), coord="G", column_units="K_RJ", dtype=np.float64
+        )
     else:
         header = made.tan_header((180, 360), ra=0.0, dec=0.0, cdelt=(-3600.0, 3600.0))
         header["CTYPE1"], header["CTYPE2"] = "RA---CAR", "DEC--CAR"
@@ -93,7 +103,8 @@ def test_tiles_and_blocks_change_nothing(made, save, tmp_path, monkeypatch, kind
     monkeypatch.setattr(regions, "SPARSE", 0.0)
     every = SkyMap(file=path)
     assert grid_of(every, scan).tiles is None
-    # MARGIN points beyond the beam: 0.27^16 = 8e-10 of what is left out there; HEALPix: 1e-9 of the polynomials' rounding
+    # MARGIN points beyond the beam: 0.27^16 = 8e-10 of what is left out there; HEALPix: 1e-9 of the
+    # polynomials' rounding
     np.testing.assert_allclose(parts, made.look(every, scan), atol=1e-8)
 
 
@@ -105,8 +116,18 @@ def test_blocks_are_told(made, save, tmp_path, kind):
     told = []
     target = tangent_wcs(*CENTRE, (-512, 512, -512, 512), ARCMIN)
     if kind == "healpix":
-        healpy.write_map(tmp_path / "h.fits", np.ones(12 * 16**2), coord="C", column_units="K_RJ", dtype=np.float64)
-        resample_healpix(read_map(tmp_path / "h.fits"), target, progress=lambda done, total: told.append((done, total)))
+        healpy.write_map(
+            tmp_path / "h.fits",
+            np.ones(12 * 16**2),
+            coord="C",
+            column_units="K_RJ",
+            dtype=np.float64,
+        )
+        resample_healpix(
+            read_map(tmp_path / "h.fits"),
+            target,
+            progress=lambda done, total: told.append((done, total)),
+        )
     else:
         header = made.tan_header((18, 36), ra=0.0, dec=0.0, cdelt=(-36000.0, 36000.0))
         header["CTYPE1"], header["CTYPE2"] = "RA---CAR", "DEC--CAR"
@@ -117,10 +138,18 @@ def test_blocks_are_told(made, save, tmp_path, kind):
 
 
 def test_planning_interpolates_nothing(made, tmp_path, monkeypatch):
-    """Memory, bounds and costs come from the grid's shape; cost grows with the points that are worked on."""
+    """Memory, bounds and costs come from the grid's shape; cost grows with the points that are
+    worked on.
+    """
     from zonda.operators.sky import brightness
 
-    healpy.write_map(tmp_path / "h.fits", np.full(12 * 64**2, 2.0), coord="C", column_units="K_RJ", dtype=np.float64)
+    healpy.write_map(
+        tmp_path / "h.fits",
+        np.full(12 * 64**2, 2.0),
+        coord="C",
+        column_units="K_RJ",
+        dtype=np.float64,
+    )
 
     def refuse(*arguments):
         raise AssertionError("interpolated")
@@ -134,9 +163,19 @@ def test_planning_interpolates_nothing(made, tmp_path, monkeypatch):
 
 
 def test_the_progress_bar_hears_of_interpolation_and_its_end(made, tmp_path, monkeypatch):
-    healpy.write_map(tmp_path / "h.fits", np.full(12 * 64**2, 2.0), coord="C", column_units="K_RJ", dtype=np.float64)
+    healpy.write_map(
+        tmp_path / "h.fits",
+        np.full(12 * 64**2, 2.0),
+        coord="C",
+        column_units="K_RJ",
+        dtype=np.float64,
+    )
     told = []
-    monkeypatch.setattr(convolved, "_progress", lambda step, what: lambda done, total: told.append((what, done, total)))
+    monkeypatch.setattr(
+        convolved,
+        "_progress",
+        lambda step, what: lambda done, total: told.append((what, done, total)),
+    )
     SkyMap(file=tmp_path / "h.fits").prepare(strip(made, fwhm=3600.0))
     assert {what for what, _, _ in told} == {"interpolating h.fits"}
     assert told[0][1] == 0

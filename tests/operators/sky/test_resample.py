@@ -1,4 +1,6 @@
-"""Maps that are not gnomonic: other projections, distortions and HEALPix, against analytic fields on the sphere."""
+"""Maps that are not gnomonic: other projections, distortions and HEALPix, against analytic fields
+on the sphere.
+"""
 
 import healpy
 import numpy as np
@@ -32,8 +34,12 @@ def unit(ra, dec):
 
 def scan_about(made, ra, dec, reach=20 * ARCMIN, n=300, **more):
     rng = np.random.default_rng(1)
-    lon, lat = made.offset(np.radians(ra), np.radians(dec), *np.tan(rng.uniform(-reach, reach, (2, n))))
-    return made.observation(lon, lat, centre=(np.radians(ra), np.radians(dec)), **more), unit(lon, lat)
+    lon, lat = made.offset(
+        np.radians(ra), np.radians(dec), *np.tan(rng.uniform(-reach, reach, (2, n)))
+    )
+    return made.observation(lon, lat, centre=(np.radians(ra), np.radians(dec)), **more), unit(
+        lon, lat
+    )
 
 
 def pixels(header, shape):
@@ -61,11 +67,14 @@ def test_other_projections(made, save, kind, frame):
         header["RADESYS"], header["EQUINOX"] = "FK4", 1950.0
     if kind in ("CAR", "CEA"):  # the reference of cylindrical projections lies on the equator
         header["CRVAL2"] = 0.0
-        header["CRPIX2"] = 75.5 - (lat if kind == "CAR" else np.degrees(np.sin(np.radians(lat)))) * 120
+        header["CRPIX2"] = (
+            75.5 - (lat if kind == "CAR" else np.degrees(np.sin(np.radians(lat)))) * 120
+        )
     path = save(field(pixels(header, (150, 150))), header)
     scan, directions = scan_about(made, 60.0, 25.0)
     got = made.look(SkyMap(file=path, beam="none"), scan)[0]
-    # waves of 0.02 rad on 30 arcsec pixels: 140 rad per pixel^-1, cubic splines are good to (2 pi / 860)^4; FK4 moves by E-terms
+    # waves of 0.02 rad on 30 arcsec pixels: 140 rad per pixel^-1, cubic splines are good to (2 pi /
+    # 860)^4; FK4 moves by E-terms
     np.testing.assert_allclose(got, field(directions), atol=1e-5)
     assert any("interpolated" in value for _, _, value in scan.tally)
     assert scan.tally.get("SkyMap", "samples outside the input map") == 0
@@ -78,7 +87,9 @@ def test_distorted_tan(made, save):
     header["A_2_0"], header["B_0_2"], header["A_1_1"] = 2e-4, -3e-4, 1e-4
     path = save(field(pixels(header, (150, 150))), header)
     scan, directions = scan_about(made, 60.0, 25.0)
-    np.testing.assert_allclose(made.look(SkyMap(file=path, beam="none"), scan)[0], field(directions), atol=1e-4)
+    np.testing.assert_allclose(
+        made.look(SkyMap(file=path, beam="none"), scan)[0], field(directions), atol=1e-4
+    )
 
 
 def test_the_seam_of_a_whole_sky_map(made, save):
@@ -97,10 +108,14 @@ def test_the_seam_of_a_whole_sky_map(made, save):
 def test_outside_a_resampled_map(made, save):
     header = made.tan_header((60, 60), ra=60.0, dec=25.0, cdelt=(-30.0, 30.0))
     header["CTYPE1"], header["CTYPE2"] = "RA---SIN", "DEC--SIN"
-    lon, lat = made.offset(np.radians(60), np.radians(25), np.tan(np.array([0.0, 14.0, 16.0, 40.0]) * ARCMIN), 0.0)
+    lon, lat = made.offset(
+        np.radians(60), np.radians(25), np.tan(np.array([0.0, 14.0, 16.0, 40.0]) * ARCMIN), 0.0
+    )
     scan = made.observation(lon, lat, centre=(np.radians(60), np.radians(25)))
     got = made.look(SkyMap(file=save(np.ones((60, 60)), header), outside="0.5 K"), scan)[0]
-    np.testing.assert_allclose(got, [1, 1, 0.5, 0.5], atol=1e-4)  # 8 grid points from the edge: 0.27^8
+    np.testing.assert_allclose(
+        got, [1, 1, 0.5, 0.5], atol=1e-4
+    )  # 8 grid points from the edge: 0.27^8
     assert scan.tally.get("SkyMap", "samples outside the input map") == 2
 
 
@@ -108,13 +123,17 @@ def test_outside_a_resampled_map(made, save):
 def test_pixel_areas(made, kind):
     header = made.tan_header((60, 70), cdelt=(-600.0, 600.0))
     header["CTYPE1"], header["CTYPE2"] = f"RA---{kind}", f"DEC--{kind}"
-    areas = ImageOnSky(WcsMap(np.zeros((60, 70)), "K_RJ", WCS(header), None)).areas(*np.meshgrid(np.arange(70), np.arange(60)))
+    areas = ImageOnSky(WcsMap(np.zeros((60, 70)), "K_RJ", WCS(header), None)).areas(
+        *np.meshgrid(np.arange(70), np.arange(60))
+    )
     if kind == "ZEA":  # equal-area by name
         np.testing.assert_allclose(areas, (600 * ARCMIN / 60) ** 2, rtol=1e-5)
     if kind == "TAN":
         from zonda.core.numerics.projection import pixel_matrix
 
-        np.testing.assert_allclose(areas, tangent_areas(pixel_matrix(WCS(header)), (60, 70)), rtol=1e-5)
+        np.testing.assert_allclose(
+            areas, tangent_areas(pixel_matrix(WCS(header)), (60, 70)), rtol=1e-5
+        )
     if kind == "SIN":  # dOmega = dx dy / cos(theta)
         y, x = np.mgrid[0:60, 0:70]
         r = np.hypot(x - 34.5, y - 29.5) * 10 * ARCMIN
@@ -126,27 +145,39 @@ def test_jansky_per_pixel_of_another_projection(made, save):
     header["CTYPE1"], header["CTYPE2"] = "RA---ZEA", "DEC--ZEA"
     scan, _ = scan_about(made, 60.0, 25.0)
     got = made.look(SkyMap(file=save(np.ones((150, 150)), header)), scan)[0]
-    np.testing.assert_allclose(got, to_kelvin_rj("Jy/pixel", made.BAND, (0.5 * ARCMIN) ** 2), rtol=1e-5)
+    np.testing.assert_allclose(
+        got, to_kelvin_rj("Jy/pixel", made.BAND, (0.5 * ARCMIN) ** 2), rtol=1e-5
+    )
 
 
 def test_flux_beyond_a_projection_is_counted(made, save):
-    header = made.tan_header((150, 150), ra=60.0, dec=25.0, cdelt=(-1.2 * 3600, 1.2 * 3600), unit="Jy/pixel")
-    header["CTYPE1"], header["CTYPE2"] = "RA---ZEA", "DEC--ZEA"  # the sphere is a disc of 114.6 deg: the corners are off it
+    header = made.tan_header(
+        (150, 150), ra=60.0, dec=25.0, cdelt=(-1.2 * 3600, 1.2 * 3600), unit="Jy/pixel"
+    )
+    header["CTYPE1"], header["CTYPE2"] = (
+        "RA---ZEA",
+        "DEC--ZEA",
+    )  # the sphere is a disc of 114.6 deg: the corners are off it
     values = np.ones((150, 150))
     values[0, :3], values[75, 75] = 0.0, 2.0
     scan, _ = scan_about(made, 60.0, 25.0)
     made.look(SkyMap(file=save(values, header), beam="none"), scan)
     y, x = np.mgrid[:150, :150] - 74.5
     beyond = (np.hypot(x, y) * np.radians(1.2) > 2) & (values != 0)
-    counted = scan.tally.get("SkyMap", "bright pixels of the input map beyond its projection, whose flux is lost")
+    counted = scan.tally.get(
+        "SkyMap", "bright pixels of the input map beyond its projection, whose flux is lost"
+    )
     assert abs(counted - beyond.sum()) < 0.05 * beyond.sum()  # by the midpoints of edges
 
 
-# ----------------------------------------------------------------------------------------------------------- HEALPix
+# --------------------------------------------------------------------------------------------------
+# HEALPix
 
 
 def healpix(path, nside, nest=False, frame="C", partial=None, scale=0.02, **more):
-    """Write the field as a HEALPix map; ``partial``: only pixels for which it is True of the ICRS vectors."""
+    """Write the field as a HEALPix map; ``partial``: only pixels for which it is True of the ICRS
+    vectors.
+    """
     d = np.stack(healpy.pix2vec(nside, np.arange(12 * nside**2), nest=nest), axis=1)
     if frame == "G":
         sky = SkyCoord(*d.T, representation_type="cartesian", frame="galactic").icrs
@@ -154,21 +185,31 @@ def healpix(path, nside, nest=False, frame="C", partial=None, scale=0.02, **more
     values = field(d, scale)
     if partial is not None:
         values[~partial(d)] = healpy.UNSEEN
-    options = {"nest": nest, "coord": frame, "column_units": "K_RJ", "dtype": np.float64, "partial": partial is not None, **more}
+    options = {
+        "nest": nest,
+        "coord": frame,
+        "column_units": "K_RJ",
+        "dtype": np.float64,
+        "partial": partial is not None,
+        **more,
+    }
     healpy.write_map(path, values, overwrite=True, **options)
     return path
 
 
 @pytest.mark.parametrize("nest", [False, True])
 @pytest.mark.parametrize("frame", ["C", "G"])
-@pytest.mark.parametrize(("ra", "dec"), [(60.0, 25.0), (0.0, 0.0), (45.0, 41.8103), (90.0, 88.0), (270.0, -60.0)])
+@pytest.mark.parametrize(
+    ("ra", "dec"), [(60.0, 25.0), (0.0, 0.0), (45.0, 41.8103), (90.0, 88.0), (270.0, -60.0)]
+)
 def test_healpix_against_the_analytic_field(made, tmp_path, nest, frame, ra, dec):
     """In the equatorial belt, at face edges, at the caps' border and by a pole."""
     nside = 256
     path = healpix(tmp_path / "h.fits", nside, nest, frame, scale=0.1)
     scan, directions = scan_about(made, ra, dec, reach=np.radians(1.0))
     got = made.look(SkyMap(file=path, beam="none"), scan)[0]
-    # waves of 0.1 rad / 1.4 on pixels of 0.004 rad: h k = 0.057, (h k)^4 = 1e-5 times the fit's constant, amplitude 1.8
+    # waves of 0.1 rad / 1.4 on pixels of 0.004 rad: h k = 0.057, (h k)^4 = 1e-5 times the fit's
+    # constant, amplitude 1.8
     np.testing.assert_allclose(got, field(directions, 0.1), atol=3e-5)
     assert scan.tally.get("SkyMap", "samples outside the input map") == 0
 
@@ -176,8 +217,16 @@ def test_healpix_against_the_analytic_field(made, tmp_path, nest, frame, ra, dec
 def test_partial_healpix_and_its_border(made, tmp_path):
     centre = unit(np.radians(60.0), np.radians(25.0))
     for nest in (False, True):
-        path = healpix(tmp_path / "p.fits", 256, nest, partial=lambda d: d @ centre > np.cos(np.radians(2.0)), scale=0.1)
-        east = np.radians([0.0, 1.0, 1.4, 2.6, 3.0])  # away from the jump at 2 deg, where any spline rings
+        path = healpix(
+            tmp_path / "p.fits",
+            256,
+            nest,
+            partial=lambda d: d @ centre > np.cos(np.radians(2.0)),
+            scale=0.1,
+        )
+        east = np.radians(
+            [0.0, 1.0, 1.4, 2.6, 3.0]
+        )  # away from the jump at 2 deg, where any spline rings
         lon, lat = made.offset(np.radians(60), np.radians(25), np.tan(east), 0.0)
         scan = made.observation(lon, lat, centre=(np.radians(60), np.radians(25)))
         got = made.look(SkyMap(file=path, beam="none", outside="7 K"), scan)[0]
@@ -200,7 +249,9 @@ def test_constant_healpix_is_constant(made, tmp_path):
     values[np.random.default_rng(2).random(values.size) < 0.3] = healpy.UNSEEN
     healpy.write_map(tmp_path / "c.fits", values, coord="C", column_units="K_RJ", dtype=np.float64)
     source = read_map(tmp_path / "c.fits")
-    got, covered, poor = resample_healpix(source, tangent_wcs(1.0, 0.4, (-14, 15, -14, 15), np.radians(0.3)))
+    got, covered, poor = resample_healpix(
+        source, tangent_wcs(1.0, 0.4, (-14, 15, -14, 15), np.radians(0.3))
+    )
     assert 0.5 < covered.mean() < 0.9
     np.testing.assert_allclose(got[covered], 3.0, rtol=1e-9)
     assert not got[~covered].any()
@@ -208,8 +259,12 @@ def test_constant_healpix_is_constant(made, tmp_path):
 
 
 def test_grid_points_without_a_fit_are_counted(made, tmp_path):
-    """On a line of pixels no third-order polynomial is determined: the mean of the neighbours, and said so."""
-    ring = healpy.query_strip(512, np.pi / 2 - 1e-4, np.pi / 2 + 1e-4, inclusive=False)  # the equator, straight on the plane
+    """On a line of pixels no third-order polynomial is determined: the mean of the neighbours, and
+    said so.
+    """
+    ring = healpy.query_strip(
+        512, np.pi / 2 - 1e-4, np.pi / 2 + 1e-4, inclusive=False
+    )  # the equator, straight on the plane
     values = np.full(12 * 512**2, healpy.UNSEEN)
     values[ring] = 2.0
     path = tmp_path / "line.fits"
@@ -217,7 +272,13 @@ def test_grid_points_without_a_fit_are_counted(made, tmp_path):
     lon = np.radians(60.0) + np.linspace(-0.03, 0.03, 50)
     scan = made.observation(lon, 0.0, centre=(np.radians(60), 0.0))
     np.testing.assert_allclose(made.look(SkyMap(file=path, beam="none"), scan), 2.0)
-    assert scan.tally.get("SkyMap", "grid points whose neighbours determine no third-order fit, taken as their mean") > 0
+    assert (
+        scan.tally.get(
+            "SkyMap",
+            "grid points whose neighbours determine no third-order fit, taken as their mean",
+        )
+        > 0
+    )
 
 
 @pytest.mark.parametrize("number", [1, 4, 9, 18, 23])
@@ -232,14 +293,20 @@ def test_partial_maps_of_a_few_pixels(made, tmp_path, number):
     healpy.write_map(path, values, coord="C", column_units="K_RJ", dtype=np.float64, partial=True)
     lon, lat = np.arctan2(d[seen, 1], d[seen, 0]), np.arcsin(d[seen, 2])
     scan = made.observation(lon, lat, centre=(np.radians(60.0), np.radians(25.0)))
-    np.testing.assert_allclose(made.look(SkyMap(file=path, beam="none", outside="2 K"), scan), 2.0, rtol=1e-6)
+    np.testing.assert_allclose(
+        made.look(SkyMap(file=path, beam="none", outside="2 K"), scan), 2.0, rtol=1e-6
+    )
     assert scan.tally.get("SkyMap", "samples outside the input map") == 0
 
 
 def test_a_full_map_of_twelve_pixels(made, tmp_path):
-    healpy.write_map(tmp_path / "h.fits", np.full(12, 3.0), coord="C", column_units="K_RJ", dtype=np.float64)
+    healpy.write_map(
+        tmp_path / "h.fits", np.full(12, 3.0), coord="C", column_units="K_RJ", dtype=np.float64
+    )
     scan, _ = scan_about(made, 60.0, 25.0)
-    np.testing.assert_allclose(made.look(SkyMap(file=tmp_path / "h.fits", beam="none"), scan), 3.0, rtol=1e-6)
+    np.testing.assert_allclose(
+        made.look(SkyMap(file=tmp_path / "h.fits", beam="none"), scan), 3.0, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("bad", [-9999.0, -1.0e10, 0.0])
@@ -252,7 +319,9 @@ def test_pixels_that_the_file_marks_as_bad_are_no_sky(made, tmp_path, bad):
         values[near] = value
         extra = [("BAD_DATA", bad)] if name == "bad" else []
         path = tmp_path / f"{name}.fits"
-        healpy.write_map(path, values, coord="C", column_units="K_RJ", dtype=np.float64, extra_header=extra)
+        healpy.write_map(
+            path, values, coord="C", column_units="K_RJ", dtype=np.float64, extra_header=extra
+        )
         assert len(read_map(path).values) == 12 * 64**2 - len(near)
         got.append(made.look(SkyMap(file=path, fwhm="30 arcmin"), scan))
     np.testing.assert_array_equal(*got)
@@ -261,16 +330,31 @@ def test_pixels_that_the_file_marks_as_bad_are_no_sky(made, tmp_path, bad):
 
 def test_bad_data_is_a_number(tmp_path):
     extra = [("BAD_DATA", "none")]
-    healpy.write_map(tmp_path / "m.fits", np.ones(192), coord="C", column_units="K_RJ", dtype=np.float64, extra_header=extra)
+    healpy.write_map(
+        tmp_path / "m.fits",
+        np.ones(192),
+        coord="C",
+        column_units="K_RJ",
+        dtype=np.float64,
+        extra_header=extra,
+    )
     with pytest.raises(InputError, match="BAD_DATA"):
         read_map(tmp_path / "m.fits")
 
 
 def test_healpix_units(made, tmp_path):
-    healpy.write_map(tmp_path / "c.fits", np.full(12 * 64**2, 3.0), coord="C", column_units="Jy/pixel", dtype=np.float64)
+    healpy.write_map(
+        tmp_path / "c.fits",
+        np.full(12 * 64**2, 3.0),
+        coord="C",
+        column_units="Jy/pixel",
+        dtype=np.float64,
+    )
     scan = made.observation(np.full(4, 1.0), 0.3)
     got = made.look(SkyMap(file=tmp_path / "c.fits", beam="none"), scan)
-    np.testing.assert_allclose(got, 3 * to_kelvin_rj("Jy/pixel", made.BAND, healpy.nside2pixarea(64)), rtol=1e-9)
+    np.testing.assert_allclose(
+        got, 3 * to_kelvin_rj("Jy/pixel", made.BAND, healpy.nside2pixarea(64)), rtol=1e-9
+    )
 
 
 def test_observations_of_one_field_share_the_work(made, tmp_path):
@@ -300,8 +384,11 @@ def test_ecliptic_healpix(tmp_path, made):
 
 
 def test_an_image_without_data_is_no_map(tmp_path):
-    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns([fits.Column("a", "E", array=np.zeros(3))])]).writeto(
-        tmp_path / "t.fits"
-    )
+    fits.HDUList(
+        [
+            fits.PrimaryHDU(),
+            fits.BinTableHDU.from_columns([fits.Column("a", "E", array=np.zeros(3))]),
+        ]
+    ).writeto(tmp_path / "t.fits")
     with pytest.raises(InputError, match="no image and no HEALPix table"):
         read_map(tmp_path / "t.fits")

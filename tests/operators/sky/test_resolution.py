@@ -16,7 +16,9 @@ def blob(made, unit="K_RJ", fwhm=120.0, n=121, **more):
     """A source through a beam of ``fwhm`` [arcsec], peak 1, on pixels of 20 arcsec."""
     y, x = np.mgrid[:n, :n] - n // 2
     values = np.exp(-4 * np.log(2) * (x**2 + y**2) * (20 / fwhm) ** 2)
-    return values, made.tan_header((n, n), cdelt=(-20.0, 20.0), unit=unit, BMAJ=fwhm / 3600, BMIN=fwhm / 3600, **more)
+    return values, made.tan_header(
+        (n, n), cdelt=(-20.0, 20.0), unit=unit, BMAJ=fwhm / 3600, BMIN=fwhm / 3600, **more
+    )
 
 
 @pytest.mark.parametrize("unit", UNITS)
@@ -24,7 +26,11 @@ def test_a_second_beam_is_told_in_every_unit(made, save, unit):
     values, header = blob(made, unit)
     scan = made.observation([np.radians(75)], np.radians(20), fwhm=120.0)
     with pytest.warns(
-        UserWarning, match=r"beam of 2′ \(BMAJ\).* 2′ once more.*becomes 2\.83′.*keep 0\.5 of the peak.*`beam: none`"
+        UserWarning,
+        match=(
+            r"beam of 2′ \(BMAJ\).* 2′ once more.*becomes 2\.83′.*keep 0\.5 of the peak.*`beam:"
+            r" none`"
+        ),
     ):
         seen = made.look(SkyMap(file=save(values, header)), scan)[0, 0]
     with warnings.catch_warnings():
@@ -55,13 +61,22 @@ def test_a_beam_far_narrower_than_the_telescope_s_is_stated_alone(made, save):
 
 
 def test_healpix_and_arrays(made, tmp_path):
-    healpy.write_map(tmp_path / "m.fits", np.ones(12 * 64**2), coord="C", column_units="K_RJ", extra_header=[("BMAJ", 2.0)])
+    healpy.write_map(
+        tmp_path / "m.fits",
+        np.ones(12 * 64**2),
+        coord="C",
+        column_units="K_RJ",
+        extra_header=[("BMAJ", 2.0)],
+    )
     scan = made.observation([np.radians(75)], np.radians(20), fwhm=7200.0)
     with pytest.warns(UserWarning, match="BMAJ"):
         made.look(SkyMap(file=tmp_path / "m.fits"), scan)
     values, header = blob(made)
     with pytest.warns(UserWarning, match="BMAJ"):
-        made.look(SkyMap(map=fits.ImageHDU(values, header)), made.observation([np.radians(75)], np.radians(20), fwhm=120.0))
+        made.look(
+            SkyMap(map=fits.ImageHDU(values, header)),
+            made.observation([np.radians(75)], np.radians(20), fwhm=120.0),
+        )
 
 
 def test_a_beam_that_is_given_counts_in_place_of_the_header_s(made, save):

@@ -31,7 +31,9 @@ def stare(made, ra, dec, reach=15.0, n=400, **more):
     rng = np.random.default_rng(5)
     east, north = rng.uniform(-reach, reach, (2, n))
     east[0] = north[0] = 0.0
-    lon, lat = made.offset(np.radians(ra), np.radians(dec), np.tan(east * ARCSEC), np.tan(north * ARCSEC))
+    lon, lat = made.offset(
+        np.radians(ra), np.radians(dec), np.tan(east * ARCSEC), np.tan(north * ARCSEC)
+    )
     return made.observation(lon, lat, **more), east, north
 
 
@@ -40,13 +42,16 @@ def gaussian(east, north, flux=1.0):
     return flux / (2 * np.pi * SIGMA**2) * np.exp(-(east**2 + north**2) / (2 * SIGMA**2))
 
 
-# ------------------------------------------------------------------------------------------------- what comes out
+# -------------------------------------------------------------------------------------------------
+# what comes out
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (63, 65), (80, 51)])
 @pytest.mark.parametrize("cdelt", [(-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0), (-2.0, 1.5)])
 def test_a_source_at_crval_lands_there(made, save, shape, cdelt):
-    """Whatever CRPIX and the signs of CDELT; the offset is found by the centroid of the samples' departure."""
+    """Whatever CRPIX and the signs of CDELT; the offset is found by the centroid of the samples'
+    departure.
+    """
     crpix = (20.0, 41.0)
     path = save(point(shape, (40, 19)), made.tan_header(shape, crpix=crpix, cdelt=cdelt))
     scan, east, north = stare(made, 75.0, 20.0, fwhm=FWHM)
@@ -65,7 +70,9 @@ def test_flux_and_width_of_a_point_source(made, save):
     n = 61
     grid = np.linspace(-30, 30, n)
     east, north = (g.ravel() for g in np.meshgrid(grid, grid))
-    lon, lat = made.offset(np.radians(75), np.radians(20), np.tan(east * ARCSEC), np.tan(north * ARCSEC))
+    lon, lat = made.offset(
+        np.radians(75), np.radians(20), np.tan(east * ARCSEC), np.tan(north * ARCSEC)
+    )
     got = made.look(SkyMap(file=path), made.observation(lon, lat, fwhm=FWHM))[0]
     assert got.sum() * (60 / (n - 1)) ** 2 == pytest.approx(1.0, rel=1e-3)
     width = np.sqrt((got * east**2).sum() / got.sum() * 8 * np.log(2))
@@ -74,7 +81,12 @@ def test_flux_and_width_of_a_point_source(made, save):
 
 
 @pytest.mark.parametrize(
-    "detail", [{"CROTA2": 30.0}, {"PC1_1": 0.6, "PC1_2": -0.8, "PC2_1": 0.8, "PC2_2": 0.6}, {"LONPOLE": 150.0}]
+    "detail",
+    [
+        {"CROTA2": 30.0},
+        {"PC1_1": 0.6, "PC1_2": -0.8, "PC2_1": 0.8, "PC2_2": 0.6},
+        {"LONPOLE": 150.0},
+    ],
 )
 def test_rotated_maps_agree_with_astropy(made, save, detail):
     header = made.tan_header((90, 100), crpix=(31.0, 52.5), **detail)
@@ -83,16 +95,23 @@ def test_rotated_maps_agree_with_astropy(made, save, detail):
     ra, dec = (float(v) for v in WCS(header).wcs_pix2world(where[1], where[0], 0))
     scan, east, north = stare(made, ra, dec, fwhm=FWHM)
     exact = gaussian(east, north)
-    np.testing.assert_allclose(made.look(SkyMap(file=path), scan)[0], exact, atol=3e-3 * exact.max())
+    np.testing.assert_allclose(
+        made.look(SkyMap(file=path), scan)[0], exact, atol=3e-3 * exact.max()
+    )
 
 
 @pytest.mark.parametrize(
-    ("ra", "dec"), [(0.0, 0.0), (359.9999, -30.0), (0.0001, 45.0), (120.0, 89.99), (10.0, -90.0), (200.0, 90.0)]
+    ("ra", "dec"),
+    [(0.0, 0.0), (359.9999, -30.0), (0.0001, 45.0), (120.0, 89.99), (10.0, -90.0), (200.0, 90.0)],
 )
 def test_ra_wrap_and_poles(made, save, ra, dec):
-    path = save(point((71, 71), (30, 41)), made.tan_header((71, 71), ra=ra, dec=dec, crpix=(42.0, 31.0)))
+    path = save(
+        point((71, 71), (30, 41)), made.tan_header((71, 71), ra=ra, dec=dec, crpix=(42.0, 31.0))
+    )
     east, north = np.random.default_rng(6).uniform(-12, 12, (2, 300))
-    lon, lat = made.offset(np.radians(ra), np.radians(dec), np.tan(east * ARCSEC), np.tan(north * ARCSEC))
+    lon, lat = made.offset(
+        np.radians(ra), np.radians(dec), np.tan(east * ARCSEC), np.tan(north * ARCSEC)
+    )
     exact = gaussian(east, north)
     got = made.look(SkyMap(file=path), made.observation(lon, lat, fwhm=FWHM))[0]
     np.testing.assert_allclose(got, exact, atol=3e-3 * exact.max())
@@ -102,12 +121,16 @@ def test_ra_wrap_and_poles(made, save, ra, dec):
 
 
 def test_detector_offsets_and_boresight_angle(made, save):
-    """xi, eta of each detector, rotated by psi, land where TOAST's frame R (-eta, -xi, 1) puts them."""
+    """xi, eta of each detector, rotated by psi, land where TOAST's frame R (-eta, -xi, 1) puts
+    them.
+    """
     path = save(point((64, 64), (32, 32)), made.tan_header((64, 64), crpix=(33.0, 33.0)))
     rng = np.random.default_rng(7)
     xi, eta = rng.uniform(-8, 8, (2, 6)) * ARCSEC
     psi = rng.uniform(0, 2 * np.pi, 50)
-    scan = made.observation(np.full(50, np.radians(75)), np.radians(20), xi=xi, eta=eta, psi=psi, fwhm=FWHM)
+    scan = made.observation(
+        np.full(50, np.radians(75)), np.radians(20), xi=xi, eta=eta, psi=psi, fwhm=FWHM
+    )
     # Rz(psi) turns (-eta, -xi); before it, the frame's x axis points south and its y axis east
     south = -eta[:, None] * np.cos(psi) + xi[:, None] * np.sin(psi)
     east = -eta[:, None] * np.sin(psi) - xi[:, None] * np.cos(psi)
@@ -125,7 +148,9 @@ def test_several_beams(made, save):
     """Each detector sees the source through its own beam."""
     path = save(point((120, 120), (60, 60)), made.tan_header((120, 120), crpix=(61.0, 61.0)))
     fwhm = np.array([9.0, 12.0, 9.0, 20.0])
-    scan = made.observation([np.radians(75)], np.radians(20), xi=np.zeros(4), eta=np.zeros(4), fwhm=fwhm)
+    scan = made.observation(
+        [np.radians(75)], np.radians(20), xi=np.zeros(4), eta=np.zeros(4), fwhm=fwhm
+    )
     got = made.look(SkyMap(file=path), scan)[:, 0]
     np.testing.assert_allclose(got, 8 * np.log(2) / (2 * np.pi * fwhm**2), rtol=3e-3)
     same = made.look(SkyMap(file=path, fwhm="15 arcsec"), scan)[:, 0]
@@ -136,11 +161,16 @@ def test_no_beam(made, save):
     values = np.random.default_rng(8).standard_normal((40, 40))
     header = made.tan_header((40, 40))
     ra, dec = WCS(header).wcs_pix2world([10.0, 20.0, 30.0], [12.0, 20.0, 31.0], 0)
-    got = made.look(SkyMap(file=save(values, header), beam="none"), made.observation(np.radians(ra), np.radians(dec)))[0]
+    got = made.look(
+        SkyMap(file=save(values, header), beam="none"),
+        made.observation(np.radians(ra), np.radians(dec)),
+    )[0]
     np.testing.assert_allclose(got, [values[12, 10], values[20, 20], values[31, 30]], rtol=1e-6)
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(a=st.floats(-3, 3), b=st.floats(-3, 3), seed=st.integers(0, 2**32 - 1))
 def test_linearity(made, save, a, b, seed):
     rng = np.random.default_rng(seed)
@@ -151,10 +181,13 @@ def test_linearity(made, save, a, b, seed):
     def seen(values):
         return made.look(SkyMap(file=save(values, header)), scan)
 
-    np.testing.assert_allclose(seen(a * first + b * second), a * seen(first) + b * seen(second), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        seen(a * first + b * second), a * seen(first) + b * seen(second), rtol=0, atol=1e-12
+    )
 
 
-# --------------------------------------------------------------------------------------------------- blocks, types
+# --------------------------------------------------------------------------------------------------
+# blocks, types
 
 
 def wide_scan(made, n_det=40, n=2048 * 3 + 517):
@@ -188,7 +221,9 @@ def test_float32_far_from_the_map_corner(made, save):
     values[1, 5990] = 1.0
     path = save(values, made.tan_header((3, 6000), crpix=(5991.0, 2.0)))
     scan, east, north = stare(made, 75.0, 20.0, fwhm=FWHM)
-    exact, single = (made.look(SkyMap(file=path), scan, dtype=t)[0] for t in (np.float64, np.float32))
+    exact, single = (
+        made.look(SkyMap(file=path), scan, dtype=t)[0] for t in (np.float64, np.float32)
+    )
     assert np.abs(single - exact).max() < 2e-6 * exact.max()
     np.testing.assert_allclose(exact, gaussian(east, north), atol=3e-3 * exact.max())
 
@@ -216,16 +251,22 @@ def test_two_maps_add(made, save):
     header = made.tan_header((60, 60))
     scan, _, _ = stare(made, 75.0, 20.0)
     rng = np.random.default_rng(13)
-    one, two = (SkyMap(file=save(rng.standard_normal((60, 60)), header, f"{k}.fits"), name=f"m{k}") for k in "ab")
+    one, two = (
+        SkyMap(file=save(rng.standard_normal((60, 60)), header, f"{k}.fits"), name=f"m{k}")
+        for k in "ab"
+    )
     from zonda.core.data import Block
 
     block = Block(scan, slice(0, 1), slice(0, scan.n_samples), dtype=np.float64)
     one.exec(block, one.prepare(scan))
     two.exec(block, two.prepare(scan))
-    np.testing.assert_allclose(block.detdata["sky"], made.look(one, scan) + made.look(two, scan), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        block.detdata["sky"], made.look(one, scan) + made.look(two, scan), rtol=0, atol=1e-15
+    )
 
 
-# ----------------------------------------------------------------------------------------------- outside, tally
+# -----------------------------------------------------------------------------------------------
+# outside, tally
 
 
 def test_samples_outside_take_the_value_and_are_counted(made, save):
@@ -249,8 +290,13 @@ def test_none_outside_is_stated(made, save):
 def test_a_sky_that_no_detector_reaches(made, save):
     path = save(np.ones((20, 20)), made.tan_header((20, 20)))
     for ra, dec in ((75.0, 25.0), (180.0, 0.0), (255.0, -20.0)):  # near, far, exactly behind
-        scan = made.observation(np.full(300, np.radians(ra)), np.radians(dec), xi=[0, 1e-3], eta=[0, 0])
-        with pytest.warns(UserWarning, match="no sample of .* falls on the input map .*`centre: target` moves the map there"):
+        scan = made.observation(
+            np.full(300, np.radians(ra)), np.radians(dec), xi=[0, 1e-3], eta=[0, 0]
+        )
+        with pytest.warns(
+            UserWarning,
+            match="no sample of .* falls on the input map .*`centre: target` moves the map there",
+        ):
             got = made.look(SkyMap(file=path, outside="1 mK"), scan, dtype=np.float32)
         np.testing.assert_array_equal(got, np.float32(1e-3))
         assert scan.tally.get("SkyMap", "samples outside the input map") == 600
@@ -262,25 +308,43 @@ def test_a_sky_that_no_detector_reaches_is_not_convolved(made, save, monkeypatch
 
     path = save(np.ones((20, 20)), made.tan_header((20, 20)))
     calls = []
-    monkeypatch.setattr(convolved, "convolve", lambda *a, **k: calls.append(1) or (_ for _ in ()).throw(RuntimeError))
-    far = made.observation(np.full(300, np.radians(75.0)), np.radians(25.0), xi=[0, 1e-3], eta=[0, 0])
+    monkeypatch.setattr(
+        convolved,
+        "convolve",
+        lambda *a, **k: calls.append(1) or (_ for _ in ()).throw(RuntimeError),
+    )
+    far = made.observation(
+        np.full(300, np.radians(75.0)), np.radians(25.0), xi=[0, 1e-3], eta=[0, 0]
+    )
     assert not SkyMap(file=path).prepare(far).beams
     assert not calls
-    near = made.observation(np.full(300, np.radians(75.0)), np.radians(20.0), xi=[0, 1e-3], eta=[0, 0])
+    near = made.observation(
+        np.full(300, np.radians(75.0)), np.radians(20.0), xi=[0, 1e-3], eta=[0, 0]
+    )
     with pytest.raises(RuntimeError):
         SkyMap(file=path).prepare(near)
 
 
-@pytest.mark.parametrize("axes", [("RA---TAN", "DEC--TAN"), ("DEC--TAN", "RA---TAN"), ("GLON-TAN", "GLAT-TAN")])
+@pytest.mark.parametrize(
+    "axes", [("RA---TAN", "DEC--TAN"), ("DEC--TAN", "RA---TAN"), ("GLON-TAN", "GLAT-TAN")]
+)
 def test_a_map_is_reached_whatever_its_axes(made, save, axes):
     header = made.tan_header((20, 20))
     header["CTYPE1"], header["CTYPE2"] = axes
     if axes[0] == "DEC--TAN":
-        header["CRVAL1"], header["CRVAL2"], header["CDELT1"], header["CDELT2"] = 20.0, 75.0, header["CDELT2"], header["CDELT1"]
+        header["CRVAL1"], header["CRVAL2"], header["CDELT1"], header["CDELT2"] = (
+            20.0,
+            75.0,
+            header["CDELT2"],
+            header["CDELT1"],
+        )
     if axes[0] == "GLON-TAN":
         del header["RADESYS"]
     middle = WCS(header).pixel_to_world(9.5, 9.5).icrs
-    operator, scan = SkyMap(file=save(np.ones((20, 20)), header)), made.observation(np.full(30, middle.ra.rad), middle.dec.rad)
+    operator, scan = (
+        SkyMap(file=save(np.ones((20, 20)), header)),
+        made.observation(np.full(30, middle.ra.rad), middle.dec.rad),
+    )
     np.testing.assert_allclose(made.look(operator, scan), 1.0, rtol=0.05)
     assert scan.tally.get("SkyMap", "samples outside the input map") == 0
 
@@ -298,7 +362,10 @@ def test_a_block_made_twice_is_counted_once(made, save):
 def test_a_map_much_coarser_than_the_beam(made, save):
     """1 arcmin pixels under a 9 arcsec beam: no huge grid, and it is said."""
     x = np.arange(60)
-    path = save(np.tile(np.sin(2 * np.pi * x / 20), (60, 1)), made.tan_header((60, 60), crpix=(30.5, 30.5), cdelt=(-60.0, 60.0)))
+    path = save(
+        np.tile(np.sin(2 * np.pi * x / 20), (60, 1)),
+        made.tan_header((60, 60), crpix=(30.5, 30.5), cdelt=(-60.0, 60.0)),
+    )
     scan, east, _ = stare(made, 75.0, 20.0, reach=300.0, fwhm=FWHM)
     got = made.look(SkyMap(file=path), scan)[0]
     np.testing.assert_allclose(got, np.sin(2 * np.pi * (29.5 - east / 60) / 20), atol=3e-3)
@@ -316,7 +383,8 @@ def test_tiny_maps(made, save, shape):
     assert got.max() > 0
 
 
-# -------------------------------------------------------------------------------------------------- units, place
+# --------------------------------------------------------------------------------------------------
+# units, place
 
 
 @pytest.mark.parametrize("unit", ["K_RJ", "K_CMB", "MJy/sr", "y", "Jy/pixel", "Jy/beam"])
@@ -335,11 +403,15 @@ def test_spectral_index(made, save):
     path = save(np.ones((150, 150)), made.tan_header((150, 150), unit="MJy/sr"))
     scan, _, _ = stare(made, 75.0, 20.0, n=20)
     got = made.look(SkyMap(file=path, spectral_index=3.5), scan)
-    np.testing.assert_allclose(got, to_kelvin_rj("MJy/sr", made.BAND, spectral_index=3.5), rtol=1e-6)
+    np.testing.assert_allclose(
+        got, to_kelvin_rj("MJy/sr", made.BAND, spectral_index=3.5), rtol=1e-6
+    )
 
 
 def test_jansky_per_pixel_keeps_the_flux_off_axis(made, save):
-    """A gnomonic pixel 2 deg off axis spans cos^3 less sky: the flux found there, and the beam, are still those on the sky."""
+    """A gnomonic pixel 2 deg off axis spans cos^3 less sky: the flux found there, and the beam, are
+    still those on the sky.
+    """
     header = made.tan_header((40, 40), unit="Jy/pixel", crpix=(21.0, 21.0 - 7200.0))
     ra, dec = (float(v) for v in WCS(header).wcs_pix2world(20, 20, 0))
     scan = made.observation([np.radians(ra)], np.radians(dec))
@@ -359,8 +431,12 @@ def test_a_map_without_wcs_is_centred_on_the_target(made, save):
     got = made.look(SkyMap(file=path, pixel_size="2 arcsec"), scan)[0, 0]
     assert got == pytest.approx(4 * gaussian(0, 0), rel=3e-3)
     elsewhere = SkyMap(file=path, pixel_size="2 arcsec", centre="10 deg 10 deg")
-    lon, lat = made.offset(np.radians(10), np.radians(10), np.tan(11.5 * 2 * ARCSEC), np.tan(8.5 * 2 * ARCSEC))
-    assert made.look(elsewhere, made.observation([lon], lat, fwhm=FWHM))[0, 0] == pytest.approx(4 * gaussian(0, 0), rel=3e-3)
+    lon, lat = made.offset(
+        np.radians(10), np.radians(10), np.tan(11.5 * 2 * ARCSEC), np.tan(8.5 * 2 * ARCSEC)
+    )
+    assert made.look(elsewhere, made.observation([lon], lat, fwhm=FWHM))[0, 0] == pytest.approx(
+        4 * gaussian(0, 0), rel=3e-3
+    )
 
 
 def test_centre_moves_a_map(made, save):
@@ -372,18 +448,25 @@ def test_centre_moves_a_map(made, save):
     turned = WCS(header).pixel_scale_matrix @ [x, y] * 3600
     lon, lat = made.offset(*centre, np.tan(turned[0] * ARCSEC), np.tan(turned[1] * ARCSEC))
     scan = made.observation([lon], lat, centre=centre, fwhm=FWHM)
-    assert made.look(SkyMap(file=path, centre="target"), scan)[0, 0] == pytest.approx(gaussian(0, 0), rel=3e-3)
+    assert made.look(SkyMap(file=path, centre="target"), scan)[0, 0] == pytest.approx(
+        gaussian(0, 0), rel=3e-3
+    )
 
 
 def test_pixel_size_overrides_the_scale(made, save):
-    path = save(point((64, 64), (32, 42)), made.tan_header((64, 64), crpix=(33.0, 33.0), cdelt=(1.0, 1.0)))
+    path = save(
+        point((64, 64), (32, 42)), made.tan_header((64, 64), crpix=(33.0, 33.0), cdelt=(1.0, 1.0))
+    )
     lon, lat = made.offset(np.radians(75), np.radians(20), np.tan(10 * 2 * ARCSEC), 0.0)
     scan = made.observation([lon], lat, fwhm=FWHM)
-    assert made.look(SkyMap(file=path, pixel_size="2 arcsec"), scan)[0, 0] == pytest.approx(4 * gaussian(0, 0), rel=3e-3)
+    assert made.look(SkyMap(file=path, pixel_size="2 arcsec"), scan)[0, 0] == pytest.approx(
+        4 * gaussian(0, 0), rel=3e-3
+    )
     assert any("overridden" in value for _, _, value in scan.tally)
 
 
-# --------------------------------------------------------------------------------------------- products, manners
+# ---------------------------------------------------------------------------------------------
+# products, manners
 
 
 def test_the_input_map_is_a_product(made, save):
@@ -398,7 +481,9 @@ def test_the_input_map_is_a_product(made, save):
     image = data.products["input"]
     np.testing.assert_allclose(image.values, values * 1e-3, rtol=1e-12)
     assert (image.unit, image.header["BUNIT"], image.header["TEMPSCAL"]) == ("K_RJ", "K", "K_RJ")
-    np.testing.assert_allclose(image.wcs.wcs_pix2world(3, 4, 0), WCS(header).wcs_pix2world(3, 4, 0), rtol=1e-13)
+    np.testing.assert_allclose(
+        image.wcs.wcs_pix2world(3, 4, 0), WCS(header).wcs_pix2world(3, 4, 0), rtol=1e-13
+    )
     second = SkyMap(file=operator.file, name="dust")
     second.collect(data, scan, second.prepare(scan))
     assert sorted(data.products) == ["input", "input.dust"]
@@ -408,7 +493,11 @@ def test_copies_and_pickles_are_equal_after_use(made, save):
     operator = SkyMap(file=save(np.zeros((20, 20)), made.tan_header((20, 20))))
     scan, _, _ = stare(made, 75.0, 20.0, n=4)
     operator.prepare(scan)
-    for other in (copy.deepcopy(operator), pickle.loads(pickle.dumps(operator)), SkyMap(file=operator.file)):
+    for other in (
+        copy.deepcopy(operator),
+        pickle.loads(pickle.dumps(operator)),
+        SkyMap(file=operator.file),
+    ):
         assert other == operator
         other.prepare(scan)
 
@@ -461,7 +550,10 @@ def test_spectral_index_of_a_kelvin_map_is_refused(made, save):
 
 
 def test_of_several_input_images_the_first_stays(made, save):
-    first, second = (SkyMap(file=save(np.full((20, 20), v), made.tan_header((20, 20)), f"{v}.fits")) for v in (1.0, 2.0))
+    first, second = (
+        SkyMap(file=save(np.full((20, 20), v), made.tan_header((20, 20)), f"{v}.fits"))
+        for v in (1.0, 2.0)
+    )
     scan = made.observation(np.full(30, np.radians(75)), np.radians(20))
     states = [o.prepare(scan) for o in (first, second)]
     one, other = (InputImage(state.sky.image("SkyMap", state.grid.axis)) for state in states)

@@ -15,7 +15,19 @@ from zonda.operators.sky.stokes import STOKES, is_polarized
 @pytest.mark.parametrize(
     ("name", "polarized"),
     [("Q_POLARISATION", True), ("U_STOKES", True), ("STOKES_Q", True), ("V", True), ("q-pol", True)]
-    + [(name, False) for name in ("TEMPERATURE", "I_STOKES", "SIGNAL", "UNITS", "QUALITY", "VALUE", "PRIMARY", "")],
+    + [
+        (name, False)
+        for name in (
+            "TEMPERATURE",
+            "I_STOKES",
+            "SIGNAL",
+            "UNITS",
+            "QUALITY",
+            "VALUE",
+            "PRIMARY",
+            "",
+        )
+    ],
 )
 def test_names(name, polarized):
     assert is_polarized(name) is polarized
@@ -31,17 +43,25 @@ def test_healpix_iqu(tmp_path):
     i = healpix_file(tmp_path / "iqu.fits")
     found = read_map(tmp_path / "iqu.fits")
     np.testing.assert_array_equal(found.values, i)
-    expected = "column TEMPERATURE is read as I; Q_POLARISATION, U_POLARISATION are not used: detectors measure total intensity"
+    expected = (
+        "column TEMPERATURE is read as I; Q_POLARISATION, U_POLARISATION are not used: detectors"
+        " measure total intensity"
+    )
     assert found.notes[STOKES] == expected
 
 
 def test_partial_healpix_iqu(tmp_path):
     healpix_file(tmp_path / "iqu.fits", partial=True)
-    assert "Q_POLARISATION, U_POLARISATION are not used" in read_map(tmp_path / "iqu.fits").notes[STOKES]
+    assert (
+        "Q_POLARISATION, U_POLARISATION are not used"
+        in read_map(tmp_path / "iqu.fits").notes[STOKES]
+    )
 
 
 def test_healpix_of_i_alone_has_no_note(tmp_path):
-    healpy.write_map(tmp_path / "i.fits", np.zeros(192), coord="C", column_units="K_RJ", dtype=np.float64)
+    healpy.write_map(
+        tmp_path / "i.fits", np.zeros(192), coord="C", column_units="K_RJ", dtype=np.float64
+    )
     assert STOKES not in read_map(tmp_path / "i.fits").notes
 
 
@@ -56,7 +76,11 @@ def test_healpix_that_begins_with_q_is_read_by_its_names(tmp_path):
 def table(path, names, unit="K_RJ"):
     """Column k holds k; a column PIXEL numbers the pixels."""
     columns = [
-        fits.Column(n, "J", array=np.arange(192)) if n == "PIXEL" else fits.Column(n, "D", unit=unit, array=np.full(192, k))
+        (
+            fits.Column(n, "J", array=np.arange(192))
+            if n == "PIXEL"
+            else fits.Column(n, "D", unit=unit, array=np.full(192, k))
+        )
         for k, n in enumerate(names)
     ]
     hdu = fits.BinTableHDU.from_columns(columns)
@@ -84,7 +108,9 @@ def test_the_column_of_a_table_is_found_by_its_name(tmp_path, names, read):
     found = read_map(table(tmp_path / "t.fits", names))
     assert set(found.values) == {float(read)}
     several = len([name for name in names if name != "PIXEL"]) > 1
-    assert found.notes.get("column", "").startswith(f"{names[read]} ({read + 1} of {len(names)}" if several else "")
+    assert found.notes.get("column", "").startswith(
+        f"{names[read]} ({read + 1} of {len(names)}" if several else ""
+    )
 
 
 @pytest.mark.parametrize(
@@ -123,7 +149,9 @@ def test_a_table_that_contradicts_itself(tmp_path, cards, words):
 @pytest.mark.parametrize(("first", "step", "plane"), [(1, 1, 0), (3, -1, 2)])
 def test_cube_of_i_q_u(made, save, first, step, plane):
     values = np.random.default_rng(2).normal(size=(3, 5, 6))
-    header = made.tan_header((5, 6), CTYPE3="STOKES", CRVAL3=float(first), CDELT3=float(step), CRPIX3=1.0)
+    header = made.tan_header(
+        (5, 6), CTYPE3="STOKES", CRVAL3=float(first), CDELT3=float(step), CRPIX3=1.0
+    )
     found = read_map(save(values, header))
     np.testing.assert_array_equal(found.values, values[plane])
     assert found.notes[STOKES].startswith(f"plane {plane + 1} of 3 is read, I; ")
@@ -144,9 +172,16 @@ def test_one_plane_of_i_has_no_note(made, save):
 
 
 def test_extensions_q_and_u(made, tmp_path):
-    images = [fits.ImageHDU(np.zeros((5, 6)), made.tan_header((5, 6)), name=name) for name in ("I", "Q", "U")]
+    images = [
+        fits.ImageHDU(np.zeros((5, 6)), made.tan_header((5, 6)), name=name)
+        for name in ("I", "Q", "U")
+    ]
     fits.HDUList([fits.PrimaryHDU(), *images]).writeto(tmp_path / "iqu.fits")
-    assert read_map(tmp_path / "iqu.fits").notes[STOKES].startswith("the first image, I, is read as I; Q, U are not used")
+    assert (
+        read_map(tmp_path / "iqu.fits")
+        .notes[STOKES]
+        .startswith("the first image, I, is read as I; Q, U are not used")
+    )
     fits.HDUList([fits.PrimaryHDU(), *images[1:]]).writeto(tmp_path / "qu.fits")
     with pytest.raises(InputError, match="its first image, Q, is no intensity"):
         read_map(tmp_path / "qu.fits")
@@ -154,5 +189,7 @@ def test_extensions_q_and_u(made, tmp_path):
 
 def test_skymap_warns(tmp_path):
     healpix_file(tmp_path / "iqu.fits")
-    with pytest.warns(UserWarning, match=r"SkyMap: .*iqu\.fits: column TEMPERATURE is read as I; .* are not used"):
+    with pytest.warns(
+        UserWarning, match=r"SkyMap: .*iqu\.fits: column TEMPERATURE is read as I; .* are not used"
+    ):
         read_of(SkyMap(file=str(tmp_path / "iqu.fits")))

@@ -60,11 +60,19 @@ def test_two_files(tmp_path, values, capsys):
     b = write(tmp_path / "b.fits", 900 * values + 0.02, unit="mK", axes="SIN")
     assert compare(a, b, "--output", tmp_path / "out", "--format", "png", "--format", "svg") == 0
     found = rows(capsys.readouterr().out)
-    assert float(found["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(0.9, abs=1e-4)
+    assert float(found["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(
+        0.9, abs=1e-4
+    )
     assert found["offset"].startswith("20 ")
     assert found["offset"].endswith("uK_RJ")
     names = {p.name for p in (tmp_path / "out").iterdir()}
-    assert {"comparison.fits", "comparison_spectra.ecsv", "comparison_profiles.ecsv", "comparison.png", "comparison.svg"} <= names
+    assert {
+        "comparison.fits",
+        "comparison_spectra.ecsv",
+        "comparison_profiles.ecsv",
+        "comparison.png",
+        "comparison.svg",
+    } <= names
     assert not list((tmp_path / "out").glob("*.pdf"))
 
 
@@ -90,8 +98,16 @@ def test_units_are_converted_at_a_frequency(tmp_path, values, capsys):
             {"RESTFRQ": 150e9, "BAND": "f150"},
             "a.fits of f093 93 GHz and b.fits of f150",
         ),
-        ({"RESTFREQ": 93e9}, {"RESTFRQ": 150e9, "BAND": "f150"}, "a.fits of 93 GHz and b.fits of f150 150 GHz:"),
-        ({"BAND": "f093"}, {"RESTFRQ": 150e9, "BAND": "f150"}, "a.fits of f093 and b.fits of f150 150 GHz:"),
+        (
+            {"RESTFREQ": 93e9},
+            {"RESTFRQ": 150e9, "BAND": "f150"},
+            "a.fits of 93 GHz and b.fits of f150 150 GHz:",
+        ),
+        (
+            {"BAND": "f093"},
+            {"RESTFRQ": 150e9, "BAND": "f150"},
+            "a.fits of f093 and b.fits of f150 150 GHz:",
+        ),
         ({"RESTFRQ": 93e9, "BAND": "f090"}, {"RESTFRQ": 93.00001e9, "BAND": "f093"}, ""),
         ({"RESTFRQ": 93e9}, {"BAND": "f150"}, ""),
         ({}, {}, ""),
@@ -101,7 +117,11 @@ def test_maps_of_different_bands(tmp_path, values, capsys, first, second, words)
     a, b = write(tmp_path / "a.fits", values, **first), write(tmp_path / "b.fits", values, **second)
     assert compare(a, b, "--output", tmp_path / "out") == 0
     said = capsys.readouterr().err
-    assert (f"warning: the maps are of different bands, {words}" in said) if words else "different bands" not in said
+    assert (
+        (f"warning: the maps are of different bands, {words}" in said)
+        if words
+        else "different bands" not in said
+    )
 
 
 def test_a_sky_gets_the_beam(tmp_path, values, capsys):
@@ -110,11 +130,15 @@ def test_a_sky_gets_the_beam(tmp_path, values, capsys):
     smooth = 1e-3 * (30.0 / wide) ** 2 * np.exp(-4 * np.log(2) * (x**2 + y**2) / wide**2)
     a, b = write(tmp_path / "a.fits", values), write(tmp_path / "b.fits", smooth, beam=12.0)
     assert compare(a, b, "--output", tmp_path / "o", "--sky") == 0
-    assert float(rows(capsys.readouterr().out)["map / reference at that pixel"]) == pytest.approx(1.0, abs=2e-3)
+    assert float(rows(capsys.readouterr().out)["map / reference at that pixel"]) == pytest.approx(
+        1.0, abs=2e-3
+    )
     assert compare(a, b, "--output", tmp_path / "o") == 0
     text = capsys.readouterr().out
     assert "a.fits: its beam is not known" in text
-    assert float(rows(text)["map / reference at that pixel"]) == pytest.approx((30.0 / wide) ** 2, abs=2e-3)
+    assert float(rows(text)["map / reference at that pixel"]) == pytest.approx(
+        (30.0 / wide) ** 2, abs=2e-3
+    )
 
 
 def test_two_runs(tmp_path, values, capsys):
@@ -130,25 +154,45 @@ def test_two_runs(tmp_path, values, capsys):
 
 
 def test_healpix(tmp_path, values, capsys):
-    """A HEALPix map of a smooth source against the image of it: the nearest pixel of 6.4 arcsec is what is compared."""
+    """A HEALPix map of a smooth source against the image of it: the nearest pixel of 6.4 arcsec is
+    what is compared.
+    """
     a = write(tmp_path / "a.fits", values)
     nside = 32768
     world = WCS(fits.getheader(a))
-    pixels = healpy.query_disc(nside, healpy.ang2vec(75.0, 20.0, lonlat=True), np.radians(60 / 3600))
+    pixels = healpy.query_disc(
+        nside, healpy.ang2vec(75.0, 20.0, lonlat=True), np.radians(60 / 3600)
+    )
     x, y = world.wcs_world2pix(*healpy.pix2ang(nside, pixels, lonlat=True), 0)
     signal = 1e-3 * np.exp(-4 * np.log(2) * ((x - 23.5) ** 2 + (y - 23.5) ** 2) * 4 / 60.0**2)
     wide = write(
-        tmp_path / "b.fits", 1e-3 * np.exp(-4 * np.log(2) * ((np.indices((SIDE, SIDE)) - 23.5) ** 2).sum(0) * 4 / 60.0**2)
+        tmp_path / "b.fits",
+        1e-3
+        * np.exp(-4 * np.log(2) * ((np.indices((SIDE, SIDE)) - 23.5) ** 2).sum(0) * 4 / 60.0**2),
     )
-    columns = [fits.Column("PIXEL", "K", array=pixels), fits.Column("SIGNAL", "D", unit="K", array=signal)]
+    columns = [
+        fits.Column("PIXEL", "K", array=pixels),
+        fits.Column("SIGNAL", "D", unit="K", array=signal),
+    ]
     table = fits.BinTableHDU.from_columns(columns)
-    table.header.update({"PIXTYPE": "HEALPIX", "NSIDE": nside, "ORDERING": "RING", "COORDSYS": "C", "TEMPSCAL": "K_RJ"})
+    table.header.update(
+        {
+            "PIXTYPE": "HEALPIX",
+            "NSIDE": nside,
+            "ORDERING": "RING",
+            "COORDSYS": "C",
+            "TEMPSCAL": "K_RJ",
+        }
+    )
     table.writeto(tmp_path / "h.fits")
     assert compare(wide, tmp_path / "h.fits", "--output", tmp_path) == 0
     found = rows(capsys.readouterr().out)
-    # the nearest pixel is 2.4 arcsec (rms) away from a point, where a source of 60 arcsec changes by up to 2.4 % of its peak per
-    # arcsec: an rms of at most 6 % of the peak, beside a scatter of 20 % of it
-    assert float(found["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(1.0, abs=0.05)
+    # the nearest pixel is 2.4 arcsec (rms) away from a point, where a source of 60 arcsec changes
+    # by up to 2.4 % of its peak per arcsec: an rms of at most 6 % of the peak, beside a scatter of
+    # 20 % of it
+    assert float(found["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(
+        1.0, abs=0.05
+    )
     assert float(found["correlation"]) > 0.97
 
 
@@ -183,7 +227,8 @@ def test_a_missing_file(tmp_path, values, capsys):
     wanted = {
         tmp_path / "map_f09.fits": "did you mean 'map_f090.fits'?",
         tmp_path / "none" / "map.fits": f"check the path: there is no folder {tmp_path / 'none'}",
-        tmp_path / "other.fits": "check the path; if it was there before, it has been moved or removed",
+        tmp_path
+        / "other.fits": "check the path; if it was there before, it has been moved or removed",
     }
     for path, cure in wanted.items():
         assert compare(path, a) == 2
@@ -206,9 +251,16 @@ def test_bad_options(tmp_path, values, capsys):
 
 
 def test_a_plane_of_a_cube(tmp_path, values, capsys):
-    """Planes of frequency have to be chosen; one that is chosen once is that of the cube, whichever file it is."""
+    """Planes of frequency have to be chosen; one that is chosen once is that of the cube, whichever
+    file it is.
+    """
     cube = write(
-        tmp_path / "cube.fits", np.stack([3 * values, values, 2 * values]), CTYPE3="FREQ", CRPIX3=1, CRVAL3=9e10, CDELT3=1e9
+        tmp_path / "cube.fits",
+        np.stack([3 * values, values, 2 * values]),
+        CTYPE3="FREQ",
+        CRPIX3=1,
+        CRVAL3=9e10,
+        CDELT3=1e9,
     )
     a = write(tmp_path / "a.fits", values)
     assert compare(a, cube, "--output", tmp_path / "o") == 2
@@ -219,13 +271,19 @@ def test_a_plane_of_a_cube(tmp_path, values, capsys):
         arguments = [x for n in given for x in ("--plane", n)]
         assert compare(a, cube, "--output", tmp_path / "o", *arguments) == 0
         text = capsys.readouterr().out
-        assert float(rows(text)["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(gain, abs=1e-6)
+        assert float(
+            rows(text)["gain: map = gain x reference + offset"].split()[0]
+        ) == pytest.approx(gain, abs=1e-6)
         assert f"cube.fits: plane: {given[0]} of 3 along FREQ" in text
     assert compare(cube, cube, "--output", tmp_path / "o", "--plane", "1", "--plane", "2") == 0
-    assert float(rows(capsys.readouterr().out)["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(
-        1 / 3, abs=1e-4
-    )
-    for wrong, words in (("4", "there is no plane 4 of 3"), ("1,2", "plane has 2 numbers"), ("x", "'x' is not a number")):
+    assert float(
+        rows(capsys.readouterr().out)["gain: map = gain x reference + offset"].split()[0]
+    ) == pytest.approx(1 / 3, abs=1e-4)
+    for wrong, words in (
+        ("4", "there is no plane 4 of 3"),
+        ("1,2", "plane has 2 numbers"),
+        ("x", "'x' is not a number"),
+    ):
         assert compare(a, cube, "--output", tmp_path / "o", "--plane", wrong) == 2
         assert words in capsys.readouterr().err
     bad = write(tmp_path / "bad.fits", values, unit="furlong")
@@ -239,19 +297,47 @@ def test_an_extension_and_a_coordinate_system(tmp_path, values, capsys):
     hdus = [fits.PrimaryHDU(values, header), fits.ImageHDU(0.5 * values, header, name="OTHER")]
     fits.HDUList(hdus).writeto(tmp_path / "two.fits")
     for hdu, gain in (("0", 1.0), ("other", 0.5), ("1", 0.5)):
-        assert compare(a, tmp_path / "two.fits", "--output", tmp_path / "o", "--hdu", "0", "--hdu", hdu) == 0
-        assert float(rows(capsys.readouterr().out)["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(gain)
-    assert compare(a, tmp_path / "two.fits", "--output", tmp_path / "o", "--hdu", "0", "--hdu", "5") == 2
+        assert (
+            compare(
+                a, tmp_path / "two.fits", "--output", tmp_path / "o", "--hdu", "0", "--hdu", hdu
+            )
+            == 0
+        )
+        assert float(
+            rows(capsys.readouterr().out)["gain: map = gain x reference + offset"].split()[0]
+        ) == pytest.approx(gain)
+    assert (
+        compare(a, tmp_path / "two.fits", "--output", tmp_path / "o", "--hdu", "0", "--hdu", "5")
+        == 2
+    )
     assert "set hdu to one of these: 0 PRIMARY, 1 OTHER" in capsys.readouterr().err
-    pixels = healpy.query_disc(16384, healpy.ang2vec(75.0, 20.0, lonlat=True), np.radians(40 / 3600))
-    columns = [fits.Column("PIXEL", "K", array=pixels), fits.Column("HITS", "J", array=np.full(pixels.size, 7))]
+    pixels = healpy.query_disc(
+        16384, healpy.ang2vec(75.0, 20.0, lonlat=True), np.radians(40 / 3600)
+    )
+    columns = [
+        fits.Column("PIXEL", "K", array=pixels),
+        fits.Column("HITS", "J", array=np.full(pixels.size, 7)),
+    ]
     columns += [fits.Column("TEMPERATURE", "D", unit="K", array=np.linspace(1, 2, pixels.size))]
     table = fits.BinTableHDU.from_columns(columns)
-    table.header.update({"PIXTYPE": "HEALPIX", "NSIDE": 16384, "ORDERING": "RING", "TEMPSCAL": "K_RJ", "BAD_DATA": 1.0})
+    table.header.update(
+        {
+            "PIXTYPE": "HEALPIX",
+            "NSIDE": 16384,
+            "ORDERING": "RING",
+            "TEMPSCAL": "K_RJ",
+            "BAD_DATA": 1.0,
+        }
+    )
     table.writeto(tmp_path / "h.fits")
     assert compare(tmp_path / "h.fits", tmp_path / "h.fits", "--output", tmp_path / "o") == 2
     assert "--coordsys C (ICRS)" in capsys.readouterr().err
-    assert compare(tmp_path / "h.fits", tmp_path / "h.fits", "--output", tmp_path / "o", "--coordsys", "C") == 0
+    assert (
+        compare(
+            tmp_path / "h.fits", tmp_path / "h.fits", "--output", tmp_path / "o", "--coordsys", "C"
+        )
+        == 0
+    )
     found = rows(capsys.readouterr().out)
     assert found["pixels with both"].startswith(f"{pixels.size - 1} of")  # the first is BAD_DATA
     assert 1 < float(found["rms of the reference"].split()[0]) < 2  # not the hits
@@ -271,9 +357,14 @@ def test_jansky_per_pixel_and_per_beam_are_brightness(tmp_path, values, capsys):
     for one, other in ((a, b), (b, a), (a, c), (c, b)):
         assert compare(one, other, "--output", tmp_path / "o") == 0
         found = rows(capsys.readouterr().out)
-        assert float(found["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(1.0, abs=2e-3)
+        assert float(found["gain: map = gain x reference + offset"].split()[0]) == pytest.approx(
+            1.0, abs=2e-3
+        )
         if one != c:
             peak, unit = found["peak of the reference"].split()
-            assert (float(peak), unit) == (pytest.approx(1.0, abs=0.02), "Jy/beam")  # of the pixel nearest to the source
+            assert (float(peak), unit) == (
+                pytest.approx(1.0, abs=0.02),
+                "Jy/beam",
+            )  # of the pixel nearest to the source
     assert compare(a, c, "--output", tmp_path / "o", "--unit", "Jy/pixel") == 2
     assert "Jy/pixel depends on the pixel" in capsys.readouterr().err

@@ -34,10 +34,19 @@ def test_other_shells_are_refused(capsys):
 def completed(words: str, folder=None, code: str = RUN) -> list[str]:
     """What bash would offer behind ``zonda ...``, the last word unfinished."""
     parts = words.split(" ")
-    environment = {**os.environ, "_ZONDA_COMPLETE": "bash_complete", "COMP_WORDS": words, "COMP_CWORD": str(len(parts) - 1)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=folder)
+    environment = {
+        **os.environ,
+        "_ZONDA_COMPLETE": "bash_complete",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(parts) - 1),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=folder
+    )
     assert done.stderr == ""
-    return [line.partition(",")[2] for line in done.stdout.splitlines() if line.startswith("plain,")]
+    return [
+        line.partition(",")[2] for line in done.stdout.splitlines() if line.startswith("plain,")
+    ]
 
 
 def test_instruments_are_completed_for_show():
@@ -68,9 +77,17 @@ def test_completion_imports_nothing_heavy(tmp_path):
     heavy = ["numpy", "astropy", "numba", "scipy", "matplotlib", "pydantic"]
     code = (
         "import sys, atexit\n"
-        f"atexit.register(lambda: print('heavy', [m for m in {heavy} if m in sys.modules]))\n" + RUN.replace("; ", "\n")
+        f"atexit.register(lambda: print('heavy', [m for m in {heavy} if m in sys.modules]))\n"
+        + RUN.replace("; ", "\n")
     )
     parts = "zonda new pipeline --instrument mus"
-    environment = {**os.environ, "_ZONDA_COMPLETE": "bash_complete", "COMP_WORDS": parts, "COMP_CWORD": "4"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=tmp_path)
+    environment = {
+        **os.environ,
+        "_ZONDA_COMPLETE": "bash_complete",
+        "COMP_WORDS": parts,
+        "COMP_CWORD": "4",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=tmp_path
+    )
     assert done.stdout.splitlines() == ["plain,mustang2", "heavy []"]

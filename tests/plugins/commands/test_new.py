@@ -72,7 +72,10 @@ def test_nothing_is_overwritten(here, capsys):
         (["pipeline", "nowhere/x"], "there is no such folder"),
         (["pipeline", "x", "--instrument", "mustng2"], "did you mean 'mustang2'"),
         (["pipeline", "x", "--site", "gren_bank"], "green_bank"),
-        (["pipeline", "x", "--target", "mars"], "Invalid value for --target: cannot read 'mars' as a position"),
+        (
+            ["pipeline", "x", "--target", "mars"],
+            "Invalid value for --target: cannot read 'mars' as a position",
+        ),
         (["pipeline", "x", "--target", "nonsense"], "cannot read 'nonsense' as a position"),
         (["pipeline", "x", "--target", "05h -80d"], "it never rises"),
         (["plugin", "3x"], "cannot be the name of a plugin"),
@@ -92,7 +95,9 @@ def test_mistakes_write_nothing(here, capsys, arguments, said):
 
 
 def test_the_tests_of_a_new_plugin_pass_at_once(here, capsys):
-    """Installed from its folder into another one, so that other tests do not see it; without network."""
+    """Installed from its folder into another one, so that other tests do not see it; without
+    network.
+    """
     assert cli.main(["new", "plugin", "zonda-my.camera"]) == 0
     folder = here / "zonda-my.camera"
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
@@ -109,7 +114,12 @@ def test_the_tests_of_a_new_plugin_pass_at_once(here, capsys):
     done = subprocess.run(tests, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "4 passed" in done.stdout
-    listed = subprocess.run([sys.executable, "-m", "zonda.core.cli", "plugins"], env=environment, capture_output=True, text=True)
+    listed = subprocess.run(
+        [sys.executable, "-m", "zonda.core.cli", "plugins"],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
     assert "ZondaMyCameraDrift" in listed.stdout
     assert "zonda_my_camera_camera" in listed.stdout
 
@@ -118,9 +128,9 @@ def test_templates_are_part_of_the_package():
     import tomllib
 
     root = Path(__file__).parents[3]
-    patterns = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"][
-        "zonda.plugins.commands"
-    ]
+    patterns = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"][
+        "package-data"
+    ]["zonda.plugins.commands"]
     folder = root / "plugins" / "commands"
     shipped = {path for pattern in patterns for path in folder.glob(pattern)}
     assert shipped == {path for path in (folder / "templates").rglob("*") if path.is_file()}

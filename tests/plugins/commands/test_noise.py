@@ -20,8 +20,16 @@ CAMERA = {"like": "mustang2", "detectors": 12, "net": "1 mK s(1/2)"}
 def night(tmp_path_factory):
     folder = tmp_path_factory.mktemp("night")
     scan = zonda.PointingDaisy(radius="1 arcmin", scan_duration="5 min", sample_rate="50 Hz")
-    steps = [scan, zonda.WhiteNoise(scatter=0.3), zonda.PinkNoise(knee="1 Hz"), zonda.Efficiency(), zonda.SaveTOD()]
-    data = zonda.Pipeline(steps).run(zonda.Scene(instrument=CAMERA, **SCENE), output=folder, threads=1)
+    steps = [
+        scan,
+        zonda.WhiteNoise(scatter=0.3),
+        zonda.PinkNoise(knee="1 Hz"),
+        zonda.Efficiency(),
+        zonda.SaveTOD(),
+    ]
+    data = zonda.Pipeline(steps).run(
+        zonda.Scene(instrument=CAMERA, **SCENE), output=folder, threads=1
+    )
     (path,) = folder.glob("tod_*.h5")
     return path, data.observations[0].focalplane
 
@@ -40,7 +48,9 @@ def test_the_table_and_the_scan_that_it_belongs_to(night, tmp_path):
     step = zonda.LoadTOD(file=path, noise=table, signal="none")
     steps = [step, zonda.WhiteNoise(), zonda.Efficiency(), zonda.BinMap(pixel="5 arcsec")]
     data = zonda.Pipeline(steps).run(step.scene(), threads=1)
-    np.testing.assert_allclose(data.observations[0].focalplane.net, found["net"], rtol=1e-8)  # nine digits in the table
+    np.testing.assert_allclose(
+        data.observations[0].focalplane.net, found["net"], rtol=1e-8
+    )  # nine digits in the table
 
 
 def test_a_flagged_detector_is_in_no_table(night, tmp_path):
@@ -62,7 +72,9 @@ def test_a_flagged_detector_is_in_no_table(night, tmp_path):
 
 def test_the_mean_over_the_detectors(night, tmp_path):
     path, plane = night
-    done = CliRunner().invoke(noise, [str(path), "--subtract-mean", "--output", str(tmp_path / "t.ecsv")])
+    done = CliRunner().invoke(
+        noise, [str(path), "--subtract-mean", "--output", str(tmp_path / "t.ecsv")]
+    )
     assert done.exit_code == 0, done.output
     found = Table.read(tmp_path / "t.ecsv", format="ascii.ecsv")
     # the mean of detectors of other levels is not quite theirs: 30 % of scatter over 12 of them
@@ -70,7 +82,9 @@ def test_the_mean_over_the_detectors(night, tmp_path):
 
 
 def test_the_mean_is_that_of_a_band(night, tmp_path):
-    """Emission that is ten times as strong in half of the detectors, those of another band, leaves nothing in either band."""
+    """Emission that is ten times as strong in half of the detectors, those of another band, leaves
+    nothing in either band.
+    """
     path, plane = night
     tod = load_tod(path)
     other = np.arange(tod.n_detectors) % 2 == 1
@@ -78,10 +92,15 @@ def test_the_mean_is_that_of_a_band(night, tmp_path):
     common = 0.1 * np.cumsum(np.random.default_rng(1).normal(size=tod.n_samples))
     tod.streams["signal"] = tod.streams["signal"] + np.where(other, 10.0, 1.0)[:, None] * common
     file = save_tod(tmp_path / "two.h5", tod)
-    done = CliRunner().invoke(noise, [str(file), "--subtract-mean", "--output", str(tmp_path / "t.ecsv")])
+    done = CliRunner().invoke(
+        noise, [str(file), "--subtract-mean", "--output", str(tmp_path / "t.ecsv")]
+    )
     assert done.exit_code == 0, done.output
     found = Table.read(tmp_path / "t.ecsv", format="ascii.ecsv")
-    for rows in (other, ~other):  # 30 % of scatter over 6 detectors; one mean for all would leave 0.4 K per sample
+    for rows in (
+        other,
+        ~other,
+    ):  # 30 % of scatter over 6 detectors; one mean for all would leave 0.4 K per sample
         assert abs(np.mean(found["net"][rows]) / np.mean(plane.net[rows]) - 1) < 0.1
 
 
@@ -100,7 +119,10 @@ def test_other_tables_are_refused(night, tmp_path, text, message):
     assert "zonda noise" in caught.value.cure
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [("d03", "d02", "twice"), ("d03", "d99", "not in"), (None, "nan", "is nan")])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [("d03", "d02", "twice"), ("d03", "d99", "not in"), (None, "nan", "is nan")],
+)
 def test_rows_that_cannot_be(night, tmp_path, old, new, message):
     path, table = night[0], tmp_path / "table.ecsv"
     assert CliRunner().invoke(noise, [str(path), "--output", str(table)]).exit_code == 0

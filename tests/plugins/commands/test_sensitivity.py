@@ -9,7 +9,10 @@ from zonda.core import cli
 from zonda.core.errors import InputError
 from zonda.plugins.forecast.lines import duration, in_unit, read_depth
 
-MEAN = "--set", "CommonModeFilter.method=mean"  # noise turns the singular mode of a short scan: no forecast of the atmosphere
+MEAN = (
+    "--set",
+    "CommonModeFilter.method=mean",
+)  # noise turns the singular mode of a short scan: no forecast of the atmosphere
 SHORT = "--set", "PointingDaisy.scans=1", "--set", "PointingDaisy.scan_duration=30 s", *MEAN
 M2 = "--instrument", "mustang2", "--site", "green_bank", "--month", "11"
 
@@ -70,7 +73,10 @@ def test_of_an_instrument_with_files(tmp_path, capsys):
 
 
 def test_json(capsys):
-    assert sensitivity("mustang2_cluster", *SHORT, "--json", "--time", "2 h", "--radius", "1 arcmin") == 0
+    assert (
+        sensitivity("mustang2_cluster", *SHORT, "--json", "--time", "2 h", "--radius", "1 arcmin")
+        == 0
+    )
     found = json.loads(capsys.readouterr().out)
     assert found["radius_arcmin"] == pytest.approx(1)
     row = next(r for r in found["table"] if r["seconds"] == 7200)
@@ -83,10 +89,15 @@ FEW = *SHORT, "--set", "instrument={like: mustang2, detectors: 19}"
 
 
 def test_the_audit_stands_beside_the_forecast_whatever_the_threads(tmp_path, capsys):
-    """Each part with its difference in standard errors; the same bits with one thread and with two."""
+    """Each part with its difference in standard errors; the same bits with one thread and with
+    two.
+    """
     found = []
     for threads in (1, 2):
-        assert sensitivity("mustang2_cluster", *FEW, "--audit", "2", "--threads", threads, "--json") == 0
+        assert (
+            sensitivity("mustang2_cluster", *FEW, "--audit", "2", "--threads", threads, "--json")
+            == 0
+        )
         found.append(json.loads(capsys.readouterr().out))
     assert found[0] == found[1]
     rows = {row["part"]: row for row in found[0]["audit"]}
@@ -102,7 +113,9 @@ def test_the_audit_stands_beside_the_forecast_whatever_the_threads(tmp_path, cap
 
 
 def test_the_audit_in_words(tmp_path, capsys):
-    assert sensitivity("mustang2_cluster", *FEW, "--audit", "2", "--output", tmp_path / "depth") == 0
+    assert (
+        sensitivity("mustang2_cluster", *FEW, "--audit", "2", "--output", tmp_path / "depth") == 0
+    )
     text = " ".join(capsys.readouterr().out.split())
     assert "audit: 2 simulations of the whole pipeline forecast [" in text
     assert "simulated standard error difference z white " in text
@@ -111,9 +124,14 @@ def test_the_audit_in_words(tmp_path, capsys):
 
 
 def test_an_audit_beside_a_part_that_is_not_forecast(tmp_path, capsys):
-    """A scan of 30 s behind a singular mode: the atmosphere is left out, with the reason, and the rest is audited and drawn."""
+    """A scan of 30 s behind a singular mode: the atmosphere is left out, with the reason, and the
+    rest is audited and drawn.
+    """
     singular = *FEW, "--set", "CommonModeFilter.method=svd"
-    assert sensitivity("mustang2_cluster", *singular, "--audit", "2", "--output", tmp_path / "depth") == 0
+    assert (
+        sensitivity("mustang2_cluster", *singular, "--audit", "2", "--output", tmp_path / "depth")
+        == 0
+    )
     text = " ".join(capsys.readouterr().out.split())
     assert "is not forecast, and comes on top: noise turns the singular mode" in text
     assert "audit: 2 simulations of the whole pipeline forecast [" in text
@@ -126,7 +144,9 @@ def test_a_folder_that_takes_no_files_is_told_before_anything_is_forecast(capsys
 
 
 def test_in_python():
-    file = zonda.load("mustang2_cluster", ["PointingDaisy.scans=1", "PointingDaisy.scan_duration=30 s"])
+    file = zonda.load(
+        "mustang2_cluster", ["PointingDaisy.scans=1", "PointingDaisy.scan_duration=30 s"]
+    )
     found = zonda.sensitivity(file)
     assert found.rms(3600, "K_CMB") > found.rms(3600) > found.rms(3600, part="white")
     assert "uK_RJ" in found._repr_html_()
@@ -144,14 +164,20 @@ def test_in_python():
     [
         ((), "neither a pipeline nor --instrument"),
         (("--instrument", "mustang2"), "--site"),
-        (("mustang2_cluster", "--pwv", "3 mm"), "--pwv is part of a pipeline, and cannot be given beside one"),
+        (
+            ("mustang2_cluster", "--pwv", "3 mm"),
+            "--pwv is part of a pipeline, and cannot be given beside one",
+        ),
         (("mustang2", "--pwv", "3 mm"), "mustang2 is an instrument: write --instrument mustang2"),
         (("no_such_pipeline",), "no_such_pipeline"),
         ((*M2, "--target", "nowhere"), "--target"),
         ((*M2, "--quantile", "2"), "--quantile"),
         ((*M2, "--elevation", "20"), "20 has no unit; write an angle such as '60 deg'"),
         ((*M2, "--time", "2"), "2 has no unit; write a time such as '3 h'"),
-        (("mustang2_cluster", "--set", "CommonModeFilter.modes=3"), "the forecast does not cover modes: 3"),
+        (
+            ("mustang2_cluster", "--set", "CommonModeFilter.modes=3"),
+            "the forecast does not cover modes: 3",
+        ),
         (("mustang2_cluster", *SHORT, "--reach", "10 apples"), "'apples' is no unit of a depth"),
         (("mustang2_cluster", *SHORT, "--reach", "100"), "100 has no unit"),
         (("mustang2_cluster", *SHORT, "--reach", "deep"), "cannot read 'deep' as a depth"),
@@ -169,7 +195,15 @@ def test_refusals(arguments, words, capsys):
 
 def test_depths_with_units():
     factors = {"K_RJ": 1.0, "K_CMB": 2.0, "Jy/beam": 4.0, "MJy/sr": 5.0, "Jy": 8.0}
-    given = {"10 uK": 1e-5, "10uK_RJ": 1e-5, "10 µK_CMB": 5e-6, "8 mJy/beam": 2e-3, "5 kJy/sr": 1e-3, "8 uJy": 1e-6, "1 K": 1.0}
+    given = {
+        "10 uK": 1e-5,
+        "10uK_RJ": 1e-5,
+        "10 µK_CMB": 5e-6,
+        "8 mJy/beam": 2e-3,
+        "5 kJy/sr": 1e-3,
+        "8 uJy": 1e-6,
+        "1 K": 1.0,
+    }
     for text, kelvin in given.items():
         assert read_depth(text, factors) == pytest.approx(kelvin)
     assert in_unit(158e-6, "K_RJ") == "158 uK_RJ"

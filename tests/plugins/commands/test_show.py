@@ -18,14 +18,20 @@ from zonda.plugins.commands.show import show
 
 
 def shown(name: str, path: Path) -> str:
-    done = CliRunner().invoke(show, ["instrument", name, "--output", str(path)], catch_exceptions=False)
+    done = CliRunner().invoke(
+        show, ["instrument", name, "--output", str(path)], catch_exceptions=False
+    )
     assert done.exit_code == 0, done.output
     return str(done.stdout)
 
 
 def test_a_camera_of_two_bands(tmp_path: Path) -> None:
     text = shown("act_pa5", tmp_path / "act.png")
-    rows = {line.split()[0]: line.split() for line in text.splitlines() if line.startswith(("f090", "f150"))}
+    rows = {
+        line.split()[0]: line.split()
+        for line in text.splitlines()
+        if line.startswith(("f090", "f150"))
+    }
     assert rows["f090"][:6] == ["f090", "80", "to", "116", "858", "2.1′"]
     assert rows["f150"][-2:] == ["0.1", "1"]
     assert "detectors     1716, hexagon layout, pixels shared, polarized" in text
@@ -43,11 +49,15 @@ def test_stand_ins_are_told_from_sources() -> None:
 
 
 def test_the_instrument_of_a_pipeline_file(tmp_path: Path) -> None:
-    table = "name, xi [arcmin], eta [arcmin], fwhm [arcsec], wafer, dead\na, 0, 0, 8, w1, 0\nb, 1, 0, 9, w2, 1\n"
+    table = (
+        "name, xi [arcmin], eta [arcmin], fwhm [arcsec], wafer, dead\na, 0, 0, 8, w1, 0\nb, 1, 0,"
+        " 9, w2, 1\n"
+    )
     (tmp_path / "array.csv").write_text(table)
     (tmp_path / "my.yaml").write_text(
-        "site: green_bank\ninstrument: {like: mustang2, focalplane: array.csv}\ntime: 2024-11-25T07:00\ntarget: 05h +20d\n"
-        "operators:\n  - PointingDaisy\n  - WhiteNoise\n  - Efficiency\n  - BinMap\n"
+        "site: green_bank\ninstrument: {like: mustang2, focalplane: array.csv}\ntime:"
+        " 2024-11-25T07:00\ntarget: 05h +20d\noperators:\n  - PointingDaisy\n  - WhiteNoise\n  -"
+        " Efficiency\n  - BinMap\n"
     )
     text = shown(str(tmp_path / "my.yaml"), tmp_path / "my.svg")
     assert "detectors     2, from array.csv, 2 wafers, not polarized, 1 dead" in text
@@ -57,10 +67,16 @@ def test_the_instrument_of_a_pipeline_file(tmp_path: Path) -> None:
 
 def of(**more: Any) -> Instrument:
     given = {
-        "name": "camera", "telescope": {"name": "dish", "diameter": "6 m"},
-        "band": {"name": "b150", "low": "140 GHz", "high": "160 GHz"}, "detectors": 42, "field_of_view": "1 deg",
-        "main_beam_efficiency": 0.6, "illumination_efficiency": 0.9, "net": "500 uK s(1/2)", "sample_rate": "20 Hz",
-    }  # fmt: skip
+        "name": "camera",
+        "telescope": {"name": "dish", "diameter": "6 m"},
+        "band": {"name": "b150", "low": "140 GHz", "high": "160 GHz"},
+        "detectors": 42,
+        "field_of_view": "1 deg",
+        "main_beam_efficiency": 0.6,
+        "illumination_efficiency": 0.9,
+        "net": "500 uK s(1/2)",
+        "sample_rate": "20 Hz",
+    }
     return Instrument.model_validate(given | more)
 
 
@@ -70,11 +86,17 @@ def test_beams_and_angles_are_to_scale() -> None:
     whole, middle = focal_plane_figure(camera, plane).axes
     beams = middle.collections[0]
     assert beams.get_offsets().shape[0] <= 42
-    np.testing.assert_allclose(beams.get_widths(), 6 if "arcmin" in middle.get_xlabel() else 0.1)  # the diameter
+    np.testing.assert_allclose(
+        beams.get_widths(), 6 if "arcmin" in middle.get_xlabel() else 0.1
+    )  # the diameter
     segments = np.array(middle.collections[1].get_segments())
-    angles = np.degrees(np.arctan2(*(segments[:, 1] - segments[:, 0]).T)) % 180  # from eta towards xi
+    angles = (
+        np.degrees(np.arctan2(*(segments[:, 1] - segments[:, 0]).T)) % 180
+    )  # from eta towards xi
     expected = np.degrees(plane.polarization_angle) % 180
-    np.testing.assert_allclose(np.sort(np.unique(angles.round(6) % 180)), np.sort(np.unique(expected.round(6))), atol=1e-6)
+    np.testing.assert_allclose(
+        np.sort(np.unique(angles.round(6) % 180)), np.sort(np.unique(expected.round(6))), atol=1e-6
+    )
     assert len(whole.patches) == 3  # the outlines of the wafers
 
 
@@ -88,7 +110,9 @@ def test_the_inner_panel_shows_one_wafer_alone() -> None:
     seen = (left < xi) & (xi < right) & (low < eta) & (eta < high)
     np.testing.assert_array_equal(seen, plane.wafer == plane.wafer[seen][0])
     assert "inside a wafer" in middle.get_title()
-    np.testing.assert_allclose([(left + right) / 2, (low + high) / 2], [xi[seen].mean(), eta[seen].mean()], atol=1e-6)
+    np.testing.assert_allclose(
+        [(left + right) / 2, (low + high) / 2], [xi[seen].mean(), eta[seen].mean()], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("more", [{"detectors": 1, "field_of_view": "0 deg"}, {"detectors": 2}])

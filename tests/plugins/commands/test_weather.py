@@ -42,7 +42,9 @@ def test_site_by_name(tmp_path, capsys):
 
 
 def test_any_place_with_its_water(tmp_path, capsys):
-    assert weather("-46.5 deg, 8 deg, 3500 m", "--pwv", "3 mm", "--output", tmp_path / "air.svg") == 0
+    assert (
+        weather("-46.5 deg, 8 deg, 3500 m", "--pwv", "3 mm", "--output", tmp_path / "air.svg") == 0
+    )
     text = capsys.readouterr().out
     assert "US Standard Atmosphere" in text
     assert "by hour" not in text
@@ -62,13 +64,22 @@ def test_the_figure_has_a_name_of_its_own(tmp_path, monkeypatch):
         (["chiang_mai"], "site 'chiang_mai': has no climatology"),
         (["46 deg, 8 deg, 3500 m"], "site 'place': has no climatology"),
         (["46 deg, 8 deg"], "a place is 'latitude, longitude, altitude'"),
-        (["146 deg, 8 deg, 0 m", "--pwv", "3 mm"], "latitude: 146 deg is outside the limits, -90 to 90 deg"),
-        (["46 deg, 8 deg, -600 m", "--pwv", "3 mm"], "altitude: -600 m is outside the limits, -500 to 9000 m"),
+        (
+            ["146 deg, 8 deg, 0 m", "--pwv", "3 mm"],
+            "latitude: 146 deg is outside the limits, -90 to 90 deg",
+        ),
+        (
+            ["46 deg, 8 deg, -600 m", "--pwv", "3 mm"],
+            "altitude: -600 m is outside the limits, -500 to 9000 m",
+        ),
         (["green_bank", "--pwv", "nan"], "cannot read 'nan' as a length"),
         (["green_bank", "--pwv", "100 %"], "a quantile of 100 % is outside the limits"),
         (["green_bank", "--pwv", "500mm"], "500 mm is outside the limits, 0 to 60 mm"),
         (["green_bank", "--pwv", "-1mm"], "-1 mm is outside the limits, 0 to 60 mm"),
-        (["green_bank", "--time", "1850-01-01"], "outside what the climatology stands for, 1940 to 2100"),
+        (
+            ["green_bank", "--time", "1850-01-01"],
+            "outside what the climatology stands for, 1940 to 2100",
+        ),
         (["green_bank", "--time", "noon"], "cannot read 'noon' as a time"),
         (["green_bank", "--elevation", "0 deg"], "0 deg is outside the limits, "),
         (["green_bank", "--instrument", "mustang"], "did you mean 'mustang2'?"),
@@ -95,5 +106,10 @@ def test_fetch_without_the_package(capsys, monkeypatch, tmp_path):
 
 
 def test_dry_air(tmp_path, capsys):
-    assert weather("chajnantor", "--pwv", "0mm", "--instrument", "atlast", "--output", tmp_path / "dry.png") == 0
+    assert (
+        weather(
+            "chajnantor", "--pwv", "0mm", "--instrument", "atlast", "--output", tmp_path / "dry.png"
+        )
+        == 0
+    )
     assert "PWV    0.00 mm" in capsys.readouterr().out

@@ -1,4 +1,6 @@
-"""Pictures of the weather: spectra to 1 THz, lines named where they are, nothing over anything else."""
+"""Pictures of the weather: spectra to 1 THz, lines named where they are, nothing over anything
+else.
+"""
 
 from __future__ import annotations
 
@@ -31,23 +33,34 @@ def air(site):
 
 @pytest.fixture(scope="module")
 def bands():
-    names = ("so_lat_93ghz", "so_lat_145ghz", "so_lat_225ghz", "so_lat_280ghz", "ccat_280ghz", "ccat_350ghz", "lmt_280ghz")
+    names = (
+        "so_lat_93ghz",
+        "so_lat_145ghz",
+        "so_lat_225ghz",
+        "so_lat_280ghz",
+        "ccat_280ghz",
+        "ccat_350ghz",
+        "lmt_280ghz",
+    )
     return [registry.instruments.create(name).band for name in names]
 
 
-@pytest.mark.parametrize(("species", "name"), [("water", "H₂O"), ("dry_air", "O₂"), ("ozone", "O₃")])
+@pytest.mark.parametrize(
+    ("species", "name"), [("water", "H₂O"), ("dry_air", "O₂"), ("ozone", "O₃")]
+)
 def test_named_lines_are_lines_of_their_species(species, name):
-    """Each is within a cell (0.5 GHz) of a maximum of the species' own cross-section, high up, where lines are narrow: it is the
-    largest within 1.5 GHz, and stands above what is 3 GHz away. O2's at 60 GHz is the middle of many lines."""
+    """Each is within a cell (0.5 GHz) of a maximum of the species' own cross-section, high up,
+    where lines are narrow: it is the largest within 1.5 GHz, and stands above what is 3 GHz away.
+    O2's at 60 GHz is the middle of many lines."""
     table = absorption_table()
     frequency = table.frequency / 1e9
     values = getattr(table.cross_sections(np.array([3e3]), np.array([220.0])), species)[0]
     for line in (f for f in LINES[name] if f != 60.3):
         near, around = abs(frequency - line) < 0.51, abs(frequency - line) <= 1.5
         assert values[near].max() == values[around].max(), line
-        assert values[near].max() > 1.3 * min(np.interp(line - 3, frequency, values), np.interp(line + 3, frequency, values)), (
-            line
-        )
+        assert values[near].max() > 1.3 * min(
+            np.interp(line - 3, frequency, values), np.interp(line + 3, frequency, values)
+        ), line
 
 
 @pytest.mark.parametrize("which", ["brightness", "transmission"])
@@ -70,13 +83,18 @@ def test_names_lie_over_nothing(air, site, bands):
         assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2)), ax.get_ylabel()
     whole = figure.bbox
     texts = [(t, t.get_window_extent()) for ax in figure.axes for t in ax.texts]
-    assert all(box.x0 >= 0 and box.x1 <= whole.width and box.y0 >= 0 and box.y1 <= whole.height for _, box in texts)
+    assert all(
+        box.x0 >= 0 and box.x1 <= whole.width and box.y0 >= 0 and box.y1 <= whole.height
+        for _, box in texts
+    )
     _, water, emission, transmission, *_ = figure.axes
     assert water.get_legend().get_window_extent().y1 <= water.get_window_extent().y0
     assert emission.get_legend() is None
     assert transmission.get_legend() is None
     (legend,) = figure.legends
-    assert not any(legend.get_window_extent().overlaps(ax.get_window_extent()) for ax in figure.axes)
+    assert not any(
+        legend.get_window_extent().overlaps(ax.get_window_extent()) for ax in figure.axes
+    )
 
 
 def test_names_move_as_little_as_they_can():

@@ -41,7 +41,10 @@ MINUTE = 60.0
 def offline() -> Any:
     from astropy.utils import iers
 
-    with iers.conf.set_temp("auto_download", False), iers.earth_orientation_table.set(iers.IERS_B.open()):
+    with (
+        iers.conf.set_temp("auto_download", False),
+        iers.earth_orientation_table.set(iers.IERS_B.open()),
+    ):
         yield
 
 
@@ -51,9 +54,15 @@ def of_astropy(what: str, times: Any, site: Site = GREEN_BANK) -> Track:
     from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_body
     from astropy.time import Time
 
-    place = EarthLocation.from_geodetic(site.longitude * u.rad, site.latitude * u.rad, site.altitude * u.m)
+    place = EarthLocation.from_geodetic(
+        site.longitude * u.rad, site.latitude * u.rad, site.altitude * u.m
+    )
     time = Time(times, format="unix")
-    source = get_body(what, time, place, ephemeris="builtin") if what in BODIES else SkyCoord(what, frame="icrs")
+    source = (
+        get_body(what, time, place, ephemeris="builtin")
+        if what in BODIES
+        else SkyCoord(what, frame="icrs")
+    )
     there = source.transform_to(AltAz(obstime=time, location=place))
     az, el = there.az.rad, there.alt.rad
     return Track(np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=1))
@@ -86,7 +95,9 @@ def test_rise_and_set_within_a_minute_of_astropy(what: str, offline: None) -> No
 
 
 def test_at_the_pole_a_star_keeps_its_elevation(recwarn: pytest.WarningsRecorder) -> None:
-    """At latitude -90 deg the elevation is minus the declination, but for precession (0.14 deg in 2024) and aberration."""
+    """At latitude -90 deg the elevation is minus the declination, but for precession (0.14 deg in
+    2024) and aberration.
+    """
     winter, summer = Instant.parse("2024-06-21"), Instant.parse("2024-12-21")
     up = night_of(SOUTH_POLE, winter, Target.parse("05h -40d"), THIRTY)
     assert up.spans == [(None, None)]
@@ -104,14 +115,20 @@ def test_at_the_pole_a_star_keeps_its_elevation(recwarn: pytest.WarningsRecorder
 
 
 def test_hours_of_a_year_follow_from_the_hour_angle() -> None:
-    """cos H = (sin a - sin phi sin delta) / (cos phi cos delta): 2 H per turn of the Earth is above a."""
+    """cos H = (sin a - sin phi sin delta) / (cos phi cos delta): 2 H per turn of the Earth is above
+    a.
+    """
     ra, dec, phi = math.radians(75), math.radians(20), GREEN_BANK.latitude
-    hour_angle = math.acos((math.sin(THIRTY) - math.sin(phi) * math.sin(dec)) / (math.cos(phi) * math.cos(dec)))
+    hour_angle = math.acos(
+        (math.sin(THIRTY) - math.sin(phi) * math.sin(dec)) / (math.cos(phi) * math.cos(dec))
+    )
     year = list(months(GREEN_BANK, 2023, Target("icrs", ra, dec), THIRTY))
     total = sum(month.hours for month in year)
     # steps of half an hour cut 0.3 % off a curved rise and set; every third day, precession: less
     assert total == pytest.approx(hour_angle / math.pi * 24 * 365, rel=0.01)
-    assert [month.highest for month in year] == pytest.approx([math.pi / 2 - phi + dec] * 12, abs=math.radians(0.3))
+    assert [month.highest for month in year] == pytest.approx(
+        [math.pi / 2 - phi + dec] * 12, abs=math.radians(0.3)
+    )
     # in mid June the Sun stands at 5.6 h: the target is up by day; in December at night
     assert year[5].hours_at_night < 5 < 200 < year[11].hours_at_night
     assert min(month.sun[0] for month in year) == year[5].sun[0] < math.radians(15)
@@ -160,13 +177,19 @@ def test_every_form_of_a_target(text: str, target: Target | str) -> None:
 
 
 def test_a_target_fixed_on_the_ground_stays_there() -> None:
-    (track,) = tracks(GREEN_BANK, EVENING.posix + np.arange(3), Target.parse("az 200 deg el 60 deg"))
-    assert np.degrees([track.azimuth, track.elevation]) == pytest.approx(np.array([[200.0] * 3, [60.0] * 3]))
+    (track,) = tracks(
+        GREEN_BANK, EVENING.posix + np.arange(3), Target.parse("az 200 deg el 60 deg")
+    )
+    assert np.degrees([track.azimuth, track.elevation]) == pytest.approx(
+        np.array([[200.0] * 3, [60.0] * 3])
+    )
 
 
 @pytest.mark.parametrize("text", ["galactic 179.9 deg -13.3 deg", "Mars"])
 def test_json(text: str) -> None:
-    done = CliRunner().invoke(when, [*text.split(), "--site", "green_bank", "--time", "2024-11-25", "--json"])
+    done = CliRunner().invoke(
+        when, [*text.split(), "--site", "green_bank", "--time", "2024-11-25", "--json"]
+    )
     assert done.exit_code == 0, done.output
     found = json.loads(done.output)
     assert found["target"] == text
@@ -179,25 +202,46 @@ def test_json(text: str) -> None:
 
 
 def test_what_is_printed_and_drawn(tmp_path: Path) -> None:
-    options = ["--site", "green_bank", "--time", "2024-11-25", "--instrument", "mustang2", "--output", str(tmp_path / "new")]
+    options = [
+        "--site",
+        "green_bank",
+        "--time",
+        "2024-11-25",
+        "--instrument",
+        "mustang2",
+        "--output",
+        str(tmp_path / "new"),
+    ]
     done = CliRunner().invoke(when, ["05h", "+20d", *options])
     assert done.exit_code == 0, done.output
     lines = done.output.splitlines()
     assert lines[0].startswith("05h +20d from green_bank (38.4331 deg")
-    assert any(line.startswith("above 30 deg: from ") and "highest 71.6 deg" in line for line in lines)
+    assert any(
+        line.startswith("above 30 deg: from ") and "highest 71.6 deg" in line for line in lines
+    )
     assert any(line.startswith("Moon: ") and "deg away" in line for line in lines)
-    assert sum(line[:3] in "JanFebMarAprMayJunJulAugSepOctNovDec" for line in lines if line[:3].isalpha()) == 12
+    assert (
+        sum(
+            line[:3] in "JanFebMarAprMayJunJulAugSepOctNovDec"
+            for line in lines
+            if line[:3].isalpha()
+        )
+        == 12
+    )
     picture = Path(lines[-1])
     assert picture.parent == tmp_path / "new"
     assert picture.read_bytes()[:4] == b"\x89PNG"
-    # transmission at the lowest and the highest elevation of the table: exp(-tau / sin(el)) with one tau, within the PWV's change
+    # transmission at the lowest and the highest elevation of the table: exp(-tau / sin(el)) with
+    # one tau, within the PWV's change
     rows = [line.split() for line in lines if line[2:3] == ":" and line[:2].isdigit()]
     opacity = [-math.log(float(row[-1])) * math.sin(math.radians(float(row[2]))) for row in rows]
     assert np.ptp(opacity) < 0.1 * np.mean(opacity)
 
 
 def test_a_site_without_climatology_has_no_pwv() -> None:
-    done = CliRunner().invoke(when, ["05h", "+20d", "--site", "46.5 deg, 8 deg, 3500 m", "--time", "2024-11-25", "--json"])
+    done = CliRunner().invoke(
+        when, ["05h", "+20d", "--site", "46.5 deg, 8 deg, 3500 m", "--time", "2024-11-25", "--json"]
+    )
     found = json.loads(done.output)
     assert "pwv_mm" not in found["night"]["table"][0]
     assert found["year"]["months"][0]["pwv_mm"] is None
@@ -211,9 +255,15 @@ def test_a_site_without_climatology_has_no_pwv() -> None:
             "names of objects are not looked up, as zonda uses no network: 'M31' is not one of",
         ),
         (["05h", "--site", "green_bank"], "a position needs two"),
-        (["05h", "+20d", "--site", "green_bank", "--above", "95 deg"], "outside the limits, 0 deg to 90 deg"),
+        (
+            ["05h", "+20d", "--site", "green_bank", "--above", "95 deg"],
+            "outside the limits, 0 deg to 90 deg",
+        ),
         (["05h", "+20d", "--site", "green_bank", "--abov", "5 deg"], "--abov"),
-        (["05h", "+20d", "--site", "green_bank", "--above", "20"], "20 has no unit; write an angle such as '30 deg'"),
+        (
+            ["05h", "+20d", "--site", "green_bank", "--above", "20"],
+            "20 has no unit; write an angle such as '30 deg'",
+        ),
         (["05h", "+20d"], "Missing option '--site'"),
         (["05h", "+20d", "--site", "green_bank", "--time", "soon"], "cannot read 'soon' as a time"),
     ],
@@ -225,9 +275,15 @@ def test_mistakes(arguments: list[str], said: str) -> None:
 
 
 def test_a_folder_that_takes_no_files_is_told_before_anything_is_computed() -> None:
-    done = CliRunner().invoke(when, ["05h", "+20d", "--site", "green_bank", "--output", "/proc/zonda"])
+    done = CliRunner().invoke(
+        when, ["05h", "+20d", "--site", "green_bank", "--output", "/proc/zonda"]
+    )
     assert isinstance(done.exception, OutputError)
-    assert str(done.exception) == "/proc/zonda: cannot be made: /proc takes no new folders\n  = choose another output folder"
+    assert (
+        str(done.exception)
+        == "/proc/zonda: cannot be made: /proc takes no new folders\n  = choose another output"
+        " folder"
+    )
     assert done.output == ""
 
 

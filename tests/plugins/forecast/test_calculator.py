@@ -16,7 +16,9 @@ from zonda.plugins.forecast.calculator import calculate, system_flux
 
 
 def layers(pwv):
-    return profile(sites.create("llano_de_chajnantor"), Instant.parse("2022-08-01T23:00"), pwv).layers
+    return profile(
+        sites.create("llano_de_chajnantor"), Instant.parse("2022-08-01T23:00"), pwv
+    ).layers
 
 
 def flat(low, high):
@@ -33,7 +35,9 @@ def test_system_flux_by_hand():
     system = (5 * x + 0.95 * sky + 0.05 * warm) / (0.95 * passed)
     ruze = math.exp(-((4 * math.pi * 25e-6 * 92e9 / 299792458.0) ** 2))
     aperture = 0.8 * 0.95 * 0.995 * 0.94 * ruze * math.pi * 25.0**2
-    assert system_flux(nu, tau, zenith, 50.0, 1.0)[0] == pytest.approx(2 * BOLTZMANN * system / aperture, rel=1e-9)
+    assert system_flux(nu, tau, zenith, 50.0, 1.0)[0] == pytest.approx(
+        2 * BOLTZMANN * system / aperture, rel=1e-9
+    )
 
 
 def test_a_narrow_band_is_its_centre():
@@ -46,13 +50,16 @@ def test_it_falls_with_time_and_dish_and_rises_with_water():
     later = calculate(layers(1e-3), flat(80, 100), 50.0, 1.0, 400.0)
     assert later.centre == pytest.approx(reference.centre / 2)
     assert later.band == pytest.approx(reference.after(400.0).band)
-    assert calculate(layers(1e-3), flat(80, 100), 100.0, 1.0, 100.0).band == pytest.approx(reference.band / 4)
+    assert calculate(layers(1e-3), flat(80, 100), 100.0, 1.0, 100.0).band == pytest.approx(
+        reference.band / 4
+    )
     assert calculate(layers(5e-3), flat(80, 100), 50.0, 1.0, 100.0).band > 1.05 * reference.band
 
 
 def test_figures_of_the_paper():
-    """Version 2.0.0a3 of the calculator gives 12.38 uJy for AtLAST's 66 to 118 GHz in 516 s, at the centre of the band; the paper
-    quotes 13.97. The atmosphere is not the same: am's of the plateau there, the climatology's of that hour here."""
+    """Version 2.0.0a3 of the calculator gives 12.38 uJy for AtLAST's 66 to 118 GHz in 516 s, at the
+    centre of the band; the paper quotes 13.97. The atmosphere is not the same: am's of the plateau
+    there, the climatology's of that hour here."""
     found = calculate(layers(None), flat(66, 118), 50.0, math.radians(57.3), 516.0)
     assert found.centre * 1e6 == pytest.approx(12.38, rel=0.04)
     assert found.band > 1.1 * found.centre
@@ -60,7 +67,9 @@ def test_figures_of_the_paper():
 
 
 def test_beside_the_forecast():
-    file = zonda.load("atlast_reduced", ["PointingDaisy.scans=1", "PointingDaisy.scan_duration=10 s"])
+    file = zonda.load(
+        "atlast_reduced", ["PointingDaisy.scans=1", "PointingDaisy.scan_duration=10 s"]
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the paper's daisy is too fast for the telescope
         found = zonda.sensitivity(file, time="516 s")

@@ -47,14 +47,20 @@ def test_short_and_long_times():
     assert (long.scans, long.duration) == (6, 600)
 
 
-@pytest.mark.parametrize(("site", "elevation"), [("green_bank", 45), ("llano_de_chajnantor", 70), ("south_pole", 50)])
+@pytest.mark.parametrize(
+    ("site", "elevation"), [("green_bank", 45), ("llano_de_chajnantor", 70), ("south_pole", 50)]
+)
 def test_the_target_culminates_at_the_elevation(site, elevation):
     file = make(Asked("atlast", site, month=6, elevation=f"{elevation} deg", time="10 min"))
     pipeline = file.pipeline()
     o = pipeline.point(file.scene(), {}, Path()).observations[0]
-    assert np.degrees(o.elevation[o.n_samples // 2]) == pytest.approx(elevation, abs=0.3)  # the daisy's radius
+    assert np.degrees(o.elevation[o.n_samples // 2]) == pytest.approx(
+        elevation, abs=0.3
+    )  # the daisy's radius
     azimuth = np.degrees(o.azimuth[o.n_samples // 2])
-    towards = {"green_bank": 180, "llano_de_chajnantor": 0}.get(site, azimuth)  # at the pole there is no culmination
+    towards = {"green_bank": 180, "llano_de_chajnantor": 0}.get(
+        site, azimuth
+    )  # at the pole there is no culmination
     assert abs((azimuth - towards + 180) % 360 - 180) < 1  # 0.25 deg / cos 70 deg
 
 

@@ -1,4 +1,6 @@
-"""The forecast against closed forms, against the definition of the noise evaluated sample by sample, and against simulations."""
+"""The forecast against closed forms, against the definition of the noise evaluated sample by
+sample, and against simulations.
+"""
 
 import math
 
@@ -45,54 +47,88 @@ FILTERS = "HighpassFilter: {frequency: 0.1 Hz}", "CommonModeFilter"
 
 def pipeline(*steps, detectors=37, field="3 arcmin"):
     text = CAMERA.replace("DETECTORS", str(detectors)).replace("FIELD", field)
-    return parse(text + "".join(f"  - {step}\n" for step in [*steps, "BinMap: {pixel: 5 arcsec, half_difference: false}"]))
+    return parse(
+        text
+        + "".join(
+            f"  - {step}\n"
+            for step in [*steps, "BinMap: {pixel: 5 arcsec, half_difference: false}"]
+        )
+    )
 
 
 def test_one_detector_that_stares_has_its_net_over_the_root_of_the_time():
-    file = pipeline("PointingStare: {scan_duration: 80 s}", "WhiteNoise", "Efficiency", detectors=1, field="0 deg")
+    file = pipeline(
+        "PointingStare: {scan_duration: 80 s}",
+        "WhiteNoise",
+        "Efficiency",
+        detectors=1,
+        field="0 deg",
+    )
     found = zonda.sensitivity(file, radius="5 arcsec")
-    # every sample has the same weight, whatever the beam; the field's rotation does not move a detector on the boresight
+    # every sample has the same weight, whatever the beam; the field's rotation does not move a
+    # detector on the boresight
     assert found.rms(part="white") == pytest.approx(NET / math.sqrt(80), rel=1e-3)
     assert found.rms(320.0, part="white") == pytest.approx(NET / math.sqrt(320), rel=1e-3)
     assert found.rms(part="1/f") == found.rms(part="atmosphere") == 0
 
 
 def test_pink_noise_of_a_stare_is_that_of_the_mean_of_its_samples():
-    file = pipeline("PointingStare: {scan_duration: 80 s}", "PinkNoise", "Efficiency", detectors=1, field="0 deg")
+    file = pipeline(
+        "PointingStare: {scan_duration: 80 s}",
+        "PinkNoise",
+        "Efficiency",
+        detectors=1,
+        field="0 deg",
+    )
     n = round(80 * RATE)
     law = power_law_filter(0.01 / RATE, 1.0, 8)
     grid = 1 << 18
     covariance = np.fft.irfft(law.response(np.fft.rfftfreq(grid)))[:n] * (0.5 / 0.01)
     weight = np.r_[1.0, 2 * (1 - np.arange(1, n) / n)] / n
     expected = NET * math.sqrt(RATE * float(weight @ covariance))
-    # bins of 1 / (2 T), each with the mean of the spectrum: |W|^2 varies over them by some per cent of the lowest, which has most
-    assert zonda.sensitivity(file, radius="5 arcsec").rms(part="1/f") == pytest.approx(expected, rel=0.03)
+    # bins of 1 / (2 T), each with the mean of the spectrum: |W|^2 varies over them by some per cent
+    # of the lowest, which has most
+    assert zonda.sensitivity(file, radius="5 arcsec").rms(part="1/f") == pytest.approx(
+        expected, rel=0.03
+    )
 
 
 def test_white_noise_falls_with_the_hits_of_a_beam():
     """Where the coverage is even, the variance is NET^2 / (2 Omega x seconds per solid angle)."""
-    one = zonda.sensitivity(pipeline(DAISY, "WhiteNoise", "Efficiency", detectors=397, field="6 arcmin"), radius="20 arcsec")
+    one = zonda.sensitivity(
+        pipeline(DAISY, "WhiteNoise", "Efficiency", detectors=397, field="6 arcmin"),
+        radius="20 arcsec",
+    )
     survey = one.survey
     o = survey.observations[0]
     path = survey.track(0, RATE)
     h = path.matrices
     xi, eta = survey.offsets.T
-    x, y = ((h[:, k : k + 1] * xi + h[:, k + 1 : k + 2] * eta + h[:, k + 2 : k + 3]) / h[:, 8:] for k in (0, 3))
+    x, y = (
+        (h[:, k : k + 1] * xi + h[:, k + 1 : k + 2] * eta + h[:, k + 2 : k + 3]) / h[:, 8:]
+        for k in (0, 3)
+    )
     near = np.hypot(x, y) < 60 * ARCSEC
     density = near.sum() / RATE / (math.pi * (60 * ARCSEC) ** 2)
     omega = 2 * math.pi * (FWHM / FWHM_PER_SIGMA) ** 2
     assert o.n_samples == len(path.index)
-    # the coverage falls by some per cent over 1 arcmin, and beams are sampled at a pitch of 18 arcsec
+    # the coverage falls by some per cent over 1 arcmin, and beams are sampled at a pitch of 18
+    # arcsec
     assert one.rms(part="white") == pytest.approx(NET / math.sqrt(2 * omega * density), rel=0.05)
 
 
 def exact(file, points, law):
-    """White and 1/f variance behind the beam, by weights of every sample and the filters as the run applies them."""
+    """White and 1/f variance behind the beam, by weights of every sample and the filters as the run
+    applies them.
+    """
     survey = survey_of(file)
     o = survey.observations[0]
     h = survey.track(0, RATE).matrices
     xi, eta = survey.offsets.T
-    x, y = ((h[:, k : k + 1] * xi + h[:, k + 1 : k + 2] * eta + h[:, k + 2 : k + 3]) / h[:, 8:] for k in (0, 3))
+    x, y = (
+        (h[:, k : k + 1] * xi + h[:, k + 1 : k + 2] * eta + h[:, k + 2 : k + 3]) / h[:, 8:]
+        for k in (0, 3)
+    )
     plan = plan_highpass(o.n_samples, 0.1 / RATE, 3, 24.0)
     white, pink, weights = [], [], []
     for a, b in points:
@@ -123,7 +159,9 @@ def test_filtered_noise_is_that_of_the_filtered_weights():
 
 def test_shared_pink_noise_is_gone_behind_the_common_mode():
     own, shared = (
-        zonda.sensitivity(pipeline(DAISY, f"PinkNoise: {{shared: {s}}}", "Efficiency", *FILTERS)).rms(part="1/f")
+        zonda.sensitivity(
+            pipeline(DAISY, f"PinkNoise: {{shared: {s}}}", "Efficiency", *FILTERS)
+        ).rms(part="1/f")
         for s in (0, 0.75)
     )
     assert shared == pytest.approx(own / 2, rel=1e-12)
@@ -141,7 +179,9 @@ def test_some_detectors_stand_for_a_large_array(monkeypatch):
 
 
 def test_scans_of_other_noise_are_weighted_by_it():
-    """Two scans at other loads: their weights are those of the map, 1 / NET^2, so the variances add inversely."""
+    """Two scans at other loads: their weights are those of the map, 1 / NET^2, so the variances add
+    inversely.
+    """
     steps = "WhiteNoise: {model: background_limited}", "Efficiency"
     air = "AtmosphereLayers: {pwv_rms: 0 %}"
     daisy = DAISY.replace("}", ", scans: 2, gap: 6000 s}")
@@ -190,7 +230,9 @@ def test_time_before_and_between_scans():
     variance = np.array([4.0, 1.0])
     depth = Depth(np.array([10.0, 20.0]), dict.fromkeys(PARTS, variance), dict.fromkeys(PARTS, 0.1))
     assert depth.part("white", 2.5) == pytest.approx(4.0)  # as time^-1/2 from 2 after 10 s
-    assert depth.part("white", 15.0) == pytest.approx(math.sqrt((40 + 20) / 2 / 15))  # time x variance is linear between
+    assert depth.part("white", 15.0) == pytest.approx(
+        math.sqrt((40 + 20) / 2 / 15)
+    )  # time x variance is linear between
     assert depth.total_error(20.0) == pytest.approx(0.1 / math.sqrt(3))
 
 
@@ -205,7 +247,8 @@ def test_small_audit(found):
     assert list(rows) == [*PARTS, "together"]
     for row in rows.values():
         assert abs(row.z) < 4, row
-    # 8 seeds x 56 beams in the circle: 5 % of the rms at four sigma leaves nothing that is wrong by a third
+    # 8 seeds x 56 beams in the circle: 5 % of the rms at four sigma leaves nothing that is wrong by
+    # a third
     assert abs(rows["white"].difference) < 0.15
     assert abs(rows["1/f"].difference) < 0.25
     parts = sum(rows[p].mean ** 2 for p in PARTS)
@@ -219,7 +262,9 @@ def test_one_simulation_is_refused(found):
         found.audited(1)
 
 
-@pytest.mark.parametrize(("centre", "fwhm"), [(90e9, 20 * ARCSEC), (150e9, 84 * ARCSEC), (345e9, 19 * ARCSEC)])
+@pytest.mark.parametrize(
+    ("centre", "fwhm"), [(90e9, 20 * ARCSEC), (150e9, 84 * ARCSEC), (345e9, 19 * ARCSEC)]
+)
 def test_units_of_a_narrow_band(centre, fwhm):
     band = Band(name="narrow", low=f"{centre - 1e6} Hz", high=f"{centre + 1e6} Hz")
     found = factors(band, fwhm)
@@ -233,13 +278,18 @@ def test_units_of_a_narrow_band(centre, fwhm):
 
 
 def test_a_point_source_is_seen_with_the_depth_that_is_stated(found):
-    """A map with a source of 1 Jy, smoothed with the beam, peaks at 1 / (2 Omega) in surface brightness."""
+    """A map with a source of 1 Jy, smoothed with the beam, peaks at 1 / (2 Omega) in surface
+    brightness.
+    """
     pixel = 2 * ARCSEC
     y, x = np.indices((201, 201)) - 100
     sigma = found.survey.sigma / pixel
     beam = np.exp(-(x**2 + y**2) / (2 * sigma**2))
     source = (
-        beam / (beam.sum() * pixel**2) / found.factors["Jy/beam"] * (found.survey.fwhm**2 * math.pi / math.log(16))
+        beam
+        / (beam.sum() * pixel**2)
+        / found.factors["Jy/beam"]
+        * (found.survey.fwhm**2 * math.pi / math.log(16))
     )  # K_RJ of 1 Jy
     peak = (source * beam).sum() / beam.sum()
     assert peak * found.factors["Jy"] == pytest.approx(1, rel=1e-3)
@@ -270,8 +320,9 @@ operators:
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("method", "forecast"), [("svd", False), ("mean", True)])
 def test_a_mode_that_noise_turns_is_not_forecast(tmp_path, method, forecast):
-    """The camera looks through one beam: what detectors see differently is far below what a turned mode leaves of the common
-    mode, 92 uK of simulations where 9 were forecast. The detectors' mean does not turn."""
+    """The camera looks through one beam: what detectors see differently is far below what a turned
+    mode leaves of the common mode, 92 uK of simulations where 9 were forecast. The detectors' mean
+    does not turn."""
     (tmp_path / "p.yaml").write_text(TURNED)
     file = zonda.load(tmp_path / "p.yaml", overrides=[f"CommonModeFilter.method={method}"])
     found = zonda.sensitivity(file, radius="2.75 arcmin")

@@ -1,4 +1,6 @@
-"""The forecast of I, Q and U against the map's own covariances and against the noise of simulated maps."""
+"""The forecast of I, Q and U against the map's own covariances and against the noise of simulated
+maps.
+"""
 
 import json
 import math
@@ -39,7 +41,10 @@ operators:
 PAIRS = "{detectors: 38, field_of_view: 3 arcmin, polarization: pairs}"
 MAP = "BinMap: {pixel: 5 arcsec, half_difference: false, stokes: IQU, width: 8 arcmin}"
 PLATE = "HalfWavePlate: {frequency: 1 Hz}"
-NOISE, FILTERS = ("WhiteNoise", "PinkNoise", "Efficiency"), ("HighpassFilter: {frequency: 0.1 Hz}", "CommonModeFilter")
+NOISE, FILTERS = (
+    ("WhiteNoise", "PinkNoise", "Efficiency"),
+    ("HighpassFilter: {frequency: 0.1 Hz}", "CommonModeFilter"),
+)
 
 
 def pipeline(folder, *steps, angles=None):
@@ -48,9 +53,13 @@ def pipeline(folder, *steps, angles=None):
     if angles:
         places = [(0.5 * i + 0.25 * (j % 2), 0.433 * j) for j in range(-3, 4) for i in range(-3, 4)]
         rows = [f"d{k}, {x}, {y}, {angles[k % len(angles)]}\n" for k, (x, y) in enumerate(places)]
-        (folder / "plane.csv").write_text("name, xi [arcmin], eta [arcmin], polarization_angle [deg]\n" + "".join(rows))
+        (folder / "plane.csv").write_text(
+            "name, xi [arcmin], eta [arcmin], polarization_angle [deg]\n" + "".join(rows)
+        )
         detectors = f"focalplane: {folder / 'plane.csv'}"
-    text = CAMERA.replace("DETECTORS", detectors) + "".join(f"  - {step}\n" for step in [*steps, MAP])
+    text = CAMERA.replace("DETECTORS", detectors) + "".join(
+        f"  - {step}\n" for step in [*steps, MAP]
+    )
     (folder / "pipeline.yaml").write_text(text)
     return load(folder / "pipeline.yaml")
 
@@ -80,12 +89,16 @@ def test_against_simulated_maps(tmp_path, angles, plate):
     found = zonda.sensitivity(file, radius=RADIUS)
     audit = found.audited(24, threads=1).audit
     rows = {row.part: row for row in audit.rows}
-    assert list(rows) == [f"{plane}{part}" for plane in ("", "Q ", "U ") for part in ("white", "1/f", "together")]
+    assert list(rows) == [
+        f"{plane}{part}" for plane in ("", "Q ", "U ") for part in ("white", "1/f", "together")
+    ]
     for row in rows.values():
-        # what is stated, and four standard errors: of 24 maps with 79 beams in the circle each about 2 % of the rms
+        # what is stated, and four standard errors: of 24 maps with 79 beams in the circle each
+        # about 2 % of the rms
         assert abs(row.difference) < WITHIN["1/f"] + 4 * row.error / row.mean, row
         assert row.error < 0.04 * row.mean
-    # balanced angles make Q and U sqrt(2) noisier than I, pixels with few samples more; those of the table as they are spread
+    # balanced angles make Q and U sqrt(2) noisier than I, pixels with few samples more; those of
+    # the table as they are spread
     over_i = [rows[f"{plane} white"].mean / rows["white"].mean for plane in "QU"]
     if angles and not plate:
         assert over_i[0] > 1.8
@@ -94,7 +107,8 @@ def test_against_simulated_maps(tmp_path, angles, plate):
         assert over_i == pytest.approx([math.sqrt(2)] * 2, rel=0.15)
     share = found.rms(part="1/f", stokes="Q") / found.rms(part="white", stokes="Q")
     usual = found.rms(part="1/f") / found.rms(part="white")
-    # behind the plate Q is at 4 Hz, where 1/f noise of knee 0.5 Hz has (0.5 / 4)^(1/2) of the white noise's rms
+    # behind the plate Q is at 4 Hz, where 1/f noise of knee 0.5 Hz has (0.5 / 4)^(1/2) of the white
+    # noise's rms
     assert share == pytest.approx(math.sqrt(0.5 / 4) if plate else usual, rel=0.1)
 
 
@@ -130,7 +144,12 @@ def test_the_atmosphere_of_single_detectors_is_not_forecast(tmp_path, capsys):
         both = math.hypot(*(found.rms(part=part, stokes=plane) for part in ("white", "1/f")))
         assert found.rms(stokes=plane) == pytest.approx(both)
     assert "-: what is left of the atmosphere is not forecast, and comes on top" in str(found)
-    assert cli.main(["sensitivity", str(tmp_path / "pipeline.yaml"), "--json", "--radius", "1.5 arcmin"]) == 0
+    assert (
+        cli.main(
+            ["sensitivity", str(tmp_path / "pipeline.yaml"), "--json", "--radius", "1.5 arcmin"]
+        )
+        == 0
+    )
     text = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert text["stokes"]["Q"][0]["K_RJ"]["atmosphere"] is None
     assert found.plot().axes[0].get_legend() is not None
@@ -141,7 +160,12 @@ def test_what_is_written_and_said(tmp_path, capsys):
     arguments = "--radius", "1.5 arcmin", "--reach", "100 uK", "--output", str(tmp_path / "depth")
     assert cli.main(["sensitivity", str(tmp_path / "pipeline.yaml"), *arguments]) == 0
     text = capsys.readouterr().out
-    assert text.index("\nI\n") < text.index("\nQ\n") < text.index("\nU\n") < text.index("stated errors")
+    assert (
+        text.index("\nI\n")
+        < text.index("\nQ\n")
+        < text.index("\nU\n")
+        < text.index("stated errors")
+    )
     assert "\nQ: 100 uK after " in text
     from astropy.table import Table
 
@@ -149,7 +173,9 @@ def test_what_is_written_and_said(tmp_path, capsys):
     found = zonda.sensitivity(tmp_path / "pipeline.yaml", radius=RADIUS)
     assert set(found.planes) == set("IQU")
     for part, column in zip(PARTS, ("white", "one_over_f", "atmosphere"), strict=True):
-        assert table[f"Q_{column}"][0] == pytest.approx(found.rms(float(table["time"][0]), part=part, stokes="Q"))
+        assert table[f"Q_{column}"][0] == pytest.approx(
+            found.rms(float(table["time"][0]), part=part, stokes="Q")
+        )
     assert found.reach("100 uK", "Q") > found.reach("100 uK")
     assert cli.main(["sensitivity", str(tmp_path / "pipeline.yaml"), *arguments[:4], "--json"]) == 0
     reach = json.loads(capsys.readouterr().out)["reach"]
@@ -161,10 +187,15 @@ def test_what_is_written_and_said(tmp_path, capsys):
 
 def test_pixels_that_are_not_solved(tmp_path):
     with pytest.raises(InputError, match="determine I, Q and U in no pixel"):
-        zonda.sensitivity(pipeline(tmp_path, "WhiteNoise", "Efficiency", angles=(30,)), radius=20 * ARCSEC)
+        zonda.sensitivity(
+            pipeline(tmp_path, "WhiteNoise", "Efficiency", angles=(30,)), radius=20 * ARCSEC
+        )
 
 
 def test_detectors_that_are_not_polarized():
-    text = CAMERA.replace("DETECTORS", "detectors: 7\n  field_of_view: 1 arcmin") + f"  - WhiteNoise\n  - Efficiency\n  - {MAP}\n"
+    text = (
+        CAMERA.replace("DETECTORS", "detectors: 7\n  field_of_view: 1 arcmin")
+        + f"  - WhiteNoise\n  - Efficiency\n  - {MAP}\n"
+    )
     with pytest.raises(PipelineError, match="needs polarized detectors"):
         zonda.sensitivity(parse(text))

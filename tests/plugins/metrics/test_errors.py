@@ -23,7 +23,11 @@ SIDE = 128
 
 def wcs(side, pixel):
     made = WCS(naxis=2)
-    made.wcs.ctype, made.wcs.crval, made.wcs.crpix = ["RA---TAN", "DEC--TAN"], [75, 20], [side / 2 + 0.5] * 2
+    made.wcs.ctype, made.wcs.crval, made.wcs.crpix = (
+        ["RA---TAN", "DEC--TAN"],
+        [75, 20],
+        [side / 2 + 0.5] * 2,
+    )
     made.wcs.cdelt, made.wcs.cunit = [-pixel / 3600, pixel / 3600], ["deg", "deg"]
     return made.to_header()
 
@@ -32,14 +36,24 @@ def product(signal, noise=0.1, weights=None, **other):
     values = np.asarray(signal, float)
     weights = np.ones(values.shape) if weights is None else weights
     return MapProduct(
-        values, np.full(values.shape, 50), weights, np.full(values.shape, noise), None, wcs(len(values), PIXEL),
-        np.radians((75, 20)), PIXEL * ARCSEC, fwhm=FWHM * ARCSEC, **other,
-    )  # fmt: skip
+        values,
+        np.full(values.shape, 50),
+        weights,
+        np.full(values.shape, noise),
+        None,
+        wcs(len(values), PIXEL),
+        np.radians((75, 20)),
+        PIXEL * ARCSEC,
+        fwhm=FWHM * ARCSEC,
+        **other,
+    )
 
 
 def data(runs=None, observations=(), **products):
     named = {name.replace("__", "/"): p for name, p in products.items()}
-    return SimpleNamespace(products=named, provenance={"runs": runs or {}}, observations=list(observations))
+    return SimpleNamespace(
+        products=named, provenance={"runs": runs or {}}, observations=list(observations)
+    )
 
 
 def blob(size=20.0, amplitude=1.0):
@@ -78,13 +92,17 @@ def test_map_rms_is_the_difference_in_units_of_the_noise():
 
 
 def test_peak_of_the_sky_alone():
-    """A Gaussian of 20 arcsec under a beam of 12: the peak falls by 20^2 / (20^2 + 12^2); no pixel's centre lies on it."""
+    """A Gaussian of 20 arcsec under a beam of 12: the peak falls by 20^2 / (20^2 + 12^2); no
+    pixel's centre lies on it.
+    """
     metric = metrics.get("peak")
     runs = {"noiseless": {"only": ["sky"]}, "free": {"without": ["sky"]}}
     noisy = product(np.random.default_rng(0).standard_normal((SIDE, SIDE)))
 
     def measured(amplitude):
-        return metric.measure(data(runs, map=noisy, noiseless__map=product(blob(amplitude=amplitude))))
+        return metric.measure(
+            data(runs, map=noisy, noiseless__map=product(blob(amplitude=amplitude)))
+        )
 
     reference = measured(-2.0)  # a decrement
     beside = np.exp(-(2 * (PIXEL / 2) ** 2) / 2 / (np.sqrt(544) / FWHM_PER_SIGMA) ** 2)
@@ -92,7 +110,9 @@ def test_peak_of_the_sky_alone():
     assert metric.error(measured(-2.02), reference) == pytest.approx(0.01)
     # white noise of 0.1 per pixel under a beam of sigma pixels: 0.1 / sqrt(4 pi sigma^2)
     sigma = FWHM / FWHM_PER_SIGMA / PIXEL
-    assert metric.floor(reference) == pytest.approx(0.1 / np.sqrt(4 * np.pi) / sigma / abs(reference["I"][0]), rel=0.01)
+    assert metric.floor(reference) == pytest.approx(
+        0.1 / np.sqrt(4 * np.pi) / sigma / abs(reference["I"][0]), rel=0.01
+    )
 
 
 def test_transfer_of_a_map_that_lost_half():
@@ -103,7 +123,9 @@ def test_transfer_of_a_map_that_lost_half():
     seen = blob(beam, (16.0 / beam) ** 2)
 
     def measured(factor):
-        return metric.measure(data(runs, map=product(seen), noiseless__map=product(factor * seen), input=image))
+        return metric.measure(
+            data(runs, map=product(seen), noiseless__map=product(factor * seen), input=image)
+        )
 
     half, whole = measured(0.5), measured(1.0)
     assert whole["I"][0] == pytest.approx(1, abs=0.01)
@@ -117,14 +139,21 @@ def polarized(i, q, u, noise=0.1):
     planes = np.ones((2, *i.shape))
     covariance = np.zeros((6, *i.shape))
     covariance[0], covariance[3], covariance[5] = noise**2, 2 * noise**2, 4 * noise**2
-    found = Polarization(q, u, covariance, planes / [[[2]], [[4]]], 2 * planes[0], np.full(i.shape, 50))
+    found = Polarization(
+        q, u, covariance, planes / [[[2]], [[4]]], 2 * planes[0], np.full(i.shape, 50)
+    )
     return product(i, noise, polarization=found)
 
 
 def test_each_plane_of_a_map_has_its_error():
     """I alone would say that nothing is wrong: what is changed is in Q."""
     runs = {"noiseless": {"only": ["sky"]}}
-    given = Image(blob(16.0), wcs(SIDE, PIXEL), polarization=np.stack([blob(16.0, 0.2), 0 * blob()]), axis=np.array([0, 0, 1.0]))
+    given = Image(
+        blob(16.0),
+        wcs(SIDE, PIXEL),
+        polarization=np.stack([blob(16.0, 0.2), 0 * blob()]),
+        axis=np.array([0, 0, 1.0]),
+    )
     beam = np.hypot(16.0, FWHM)
     seen = blob(beam, (16.0 / beam) ** 2)
 
@@ -135,7 +164,11 @@ def test_each_plane_of_a_map_has_its_error():
     rms = float(np.sqrt((seen**2).mean()))
     # of U there is next to nothing: no relative error; of the input no transfer function
     expected = {
-        "map_rms": {"I": 0.0, "Q": 0.1 * 0.2 * rms / np.sqrt(2) / 0.1, "U": 0.1 * 1e-6 * rms / 2 / 0.1},
+        "map_rms": {
+            "I": 0.0,
+            "Q": 0.1 * 0.2 * rms / np.sqrt(2) / 0.1,
+            "U": 0.1 * 1e-6 * rms / 2 / 0.1,
+        },
         "peak": {"I": 0.0, "Q": 0.1},
         "transfer": {"I": 0.0, "Q": 0.1},
     }
@@ -154,7 +187,11 @@ def test_each_plane_of_a_map_has_its_error():
 def galactic():
     """The header of `wcs` in galactic coordinates."""
     made, middle = WCS(naxis=2), SkyCoord(75, 20, unit="deg").galactic
-    made.wcs.ctype, made.wcs.crval, made.wcs.crpix = ["GLON-TAN", "GLAT-TAN"], [middle.l.deg, middle.b.deg], [SIDE / 2 + 0.5] * 2
+    made.wcs.ctype, made.wcs.crval, made.wcs.crpix = (
+        ["GLON-TAN", "GLAT-TAN"],
+        [middle.l.deg, middle.b.deg],
+        [SIDE / 2 + 0.5] * 2,
+    )
     made.wcs.cdelt, made.wcs.cunit = [-PIXEL / 3600, PIXEL / 3600], ["deg", "deg"]
     return made.to_header()
 
@@ -162,7 +199,12 @@ def galactic():
 def test_transfer_of_q_is_that_of_the_maps_meridians_whatever_the_frame_of_the_input():
     """Q about the ICRS pole in an image with galactic axes: of resampling it loses what I loses."""
     runs = {"noiseless": {"only": ["sky"]}}
-    given = Image(blob(16.0), galactic(), polarization=np.stack([blob(16.0, 0.2), 0 * blob()]), axis=np.array([0, 0, 1.0]))
+    given = Image(
+        blob(16.0),
+        galactic(),
+        polarization=np.stack([blob(16.0, 0.2), 0 * blob()]),
+        axis=np.array([0, 0, 1.0]),
+    )
     beam = np.hypot(16.0, FWHM)
     seen = blob(beam, (16.0 / beam) ** 2)
     reference, found = (
@@ -178,7 +220,9 @@ def test_a_plane_that_is_lost_altogether_has_an_error():
     runs = {"noiseless": {"only": ["sky"]}}
     metric, seen = metrics.get("peak"), blob()
     whole, lost = (polarized(seen, factor * seen, 0 * seen) for factor in (0.2, 0.0))
-    reference, found = (metric.measure(data(runs, map=one, noiseless__map=one)) for one in (whole, lost))
+    reference, found = (
+        metric.measure(data(runs, map=one, noiseless__map=one)) for one in (whole, lost)
+    )
     assert metric.errors(found, reference) == pytest.approx({"I": 0.0, "Q": 1.0})
     assert metric.error(found, reference) == pytest.approx(1.0)
     assert metric.mean_error([found, found], [reference, reference])[0] == pytest.approx(1.0)
@@ -188,7 +232,9 @@ def test_there_is_no_transfer_function_of_an_empty_sky():
     nothing = product(0 * blob())
     image = Image(0 * blob(), wcs(SIDE, PIXEL))
     with pytest.raises(InputError, match="zero everywhere"):
-        metrics.get("transfer").measure(data({"noiseless": {"only": ["sky"]}}, map=nothing, noiseless__map=nothing, input=image))
+        metrics.get("transfer").measure(
+            data({"noiseless": {"only": ["sky"]}}, map=nothing, noiseless__map=nothing, input=image)
+        )
 
 
 def test_psd_is_relative_in_every_bin():
@@ -196,35 +242,47 @@ def test_psd_is_relative_in_every_bin():
     f = np.arange(1, 2001) * 0.01
 
     def measured(psd):
-        return metric.measure(data(spectrum=Spectrum(f, {"signal": psd}, 50.0, 1.0, "PowerSpectrum", 16)))
+        return metric.measure(
+            data(spectrum=Spectrum(f, {"signal": psd}, 50.0, 1.0, "PowerSpectrum", 16))
+        )
 
     law = 1 + 1 / f
     reference = measured(law)
     assert metric.error(measured(1.02 * law), reference) == pytest.approx(0.02)
     top = measured(law * np.where(f > 2, 1.1, 1.0))  # a third of the bins, as ln(20 / 2) / ln(2000)
-    assert metric.error(top, reference) == pytest.approx(0.1 * np.sqrt(np.log(10) / np.log(2000)), rel=0.1)
+    assert metric.error(top, reference) == pytest.approx(
+        0.1 * np.sqrt(np.log(10) / np.log(2000)), rel=0.1
+    )
     assert 0 < metric.floor(reference) < 1 / np.sqrt(50)
     with pytest.raises(InputError, match="streams include signal"):
         metric.measure(data())
 
 
 def test_structure_function_of_white_noise():
-    """Independent samples of variance v: every value is 2 v; the error of 2 % more amplitude is 4 %."""
+    """Independent samples of variance v: every value is 2 v; the error of 2 % more amplitude is 4
+    %.
+    """
     metric = metrics.get("structure")
     random = np.random.default_rng(3)
     stream = np.sqrt(0.5) * random.standard_normal((12, 4096))
     names = [f"d{k}" for k in range(12)]
     efficiency = np.full(12, 0.8)
     plane = SimpleNamespace(
-        names=names, xi=random.uniform(-1, 1, 12), eta=random.uniform(-1, 1, 12), illumination_efficiency=efficiency
+        names=names,
+        xi=random.uniform(-1, 1, 12),
+        eta=random.uniform(-1, 1, 12),
+        illumination_efficiency=efficiency,
     )
 
     def measured(values, **more):
         trace = SimpleNamespace(streams={"atmosphere": values, **more}, names=names)
-        return metric.measure(data(observations=[SimpleNamespace(focalplane=plane)], **{"accuracy-structure": trace}))
+        return metric.measure(
+            data(observations=[SimpleNamespace(focalplane=plane)], **{"accuracy-structure": trace})
+        )
 
     found = measured(stream)
-    # a mean over >= 12 x 3072 squares of variance 2 (2 v)^2, correlated over two lags: 1.5 %; five sigma
+    # a mean over >= 12 x 3072 squares of variance 2 (2 v)^2, correlated over two lags: 1.5 %; five
+    # sigma
     assert found[0] == pytest.approx(1.0, rel=0.08)
     assert metric.error(measured(1.02 * stream), found) == pytest.approx(1.02**2 - 1)
     assert metric.floor(found) is None
@@ -235,20 +293,26 @@ def test_the_uncertainty_of_structure_functions_through_noise():
     metric = metrics.get("structure")
     random = np.random.default_rng(4)
     n_det, n, noise, names = 8, 2048, 0.4, [f"d{k}" for k in range(8)]
-    air = np.cumsum(random.standard_normal((n_det, n)), axis=1) / 30 + random.standard_normal((n_det, 1))
+    air = np.cumsum(random.standard_normal((n_det, n)), axis=1) / 30 + random.standard_normal(
+        (n_det, 1)
+    )
     xi, eta = random.uniform(-1, 1, (2, n_det))
-    plane = SimpleNamespace(names=names, xi=xi, eta=eta, illumination_efficiency=np.full(n_det, 0.8))
+    plane = SimpleNamespace(
+        names=names, xi=xi, eta=eta, illumination_efficiency=np.full(n_det, 0.8)
+    )
 
     def measured(values, white):
         trace = SimpleNamespace(streams={"atmosphere": values, "white": white}, names=names)
-        return metric.measure(data(observations=[SimpleNamespace(focalplane=plane)], **{"accuracy-structure": trace}))
+        return metric.measure(
+            data(observations=[SimpleNamespace(focalplane=plane)], **{"accuracy-structure": trace})
+        )
 
     white = [0.8 * noise * random.standard_normal((n_det, n)) for _ in range(60)]
     reference = measured(air, white[0])
     through = np.array([measured(air + w / 0.8, w)[0] for w in white])
     scatter = np.sqrt(np.mean((through.std(0, ddof=1) / reference[0]) ** 2))
-    # 60 draws know each scatter to 9 %; half the increments, and at most n_det / 2 pairs, counted as independent is safe by up to
-    # sqrt(2)
+    # 60 draws know each scatter to 9 %; half the increments, and at most n_det / 2 pairs, counted
+    # as independent is safe by up to sqrt(2)
     assert 0.7 * metric.floor(reference) < scatter < 1.2 * metric.floor(reference)
 
 
@@ -264,6 +328,8 @@ def test_the_atmosphere_is_traced_behind_the_sum():
 
 def test_a_plain_function():
     metric = metrics.OfFunction(lambda d: d.products["x"])
-    assert metric.error(metric.measure(data(x=[3.0, 4.0])), metric.measure(data(x=[0.0, 5.0]))) == pytest.approx(np.sqrt(10) / 5)
+    assert metric.error(
+        metric.measure(data(x=[3.0, 4.0])), metric.measure(data(x=[0.0, 5.0]))
+    ) == pytest.approx(np.sqrt(10) / 5)
     assert metric.error(np.zeros(2), np.zeros(2)) == 0
     assert metric.floor(np.ones(1)) is None

@@ -12,7 +12,8 @@ RATE = 100.0
 def test_white_noise_passes_as_often_as_it_should():
     draws = np.random.default_rng(1).standard_normal((200, 2000))
     found = np.array([p_value(draw, RATE, None, 1) for draw in draws])
-    # under the null p is uniform: below 0.05 in 5 % of 200 draws, 10 +- 3.1; within 3 sigma. Above the table's end, 0.25, in 75 %
+    # under the null p is uniform: below 0.05 in 5 % of 200 draws, 10 +- 3.1; within 3 sigma. Above
+    # the table's end, 0.25, in 75 %
     assert abs(np.count_nonzero(found < 0.05) - 10) <= 10
     assert abs(np.count_nonzero(found >= 0.25) - 150) <= 3 * 6.2
 
@@ -30,7 +31,10 @@ def test_red_noise_fails_until_it_is_filtered_and_thinned():
 
 def test_halves_of_different_laws_fail():
     rng = np.random.default_rng(3)
-    assert p_value(np.concatenate([rng.normal(0, 1, 3000), rng.normal(0, 1.3, 3000)]), RATE, None, 1) <= 0.001
+    assert (
+        p_value(np.concatenate([rng.normal(0, 1, 3000), rng.normal(0, 1.3, 3000)]), RATE, None, 1)
+        <= 0.001
+    )
 
 
 @pytest.mark.parametrize("stream", [np.zeros(1000), np.arange(12.0)])
@@ -42,6 +46,8 @@ def test_what_cannot_be_tested(stream):
 def test_a_run_without_streams():
     import zonda
 
-    scene = zonda.Scene(site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d")
+    scene = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d"
+    )
     with pytest.raises(InputError, match="there is no stream 'signal'"):
         AndersonDarling().find(zonda.Data(scene), [])

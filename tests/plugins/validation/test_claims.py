@@ -21,14 +21,22 @@ from zonda.plugins.validation.calculations import (
 )
 from zonda.plugins.validation.claims import SHIPPED, read
 
-ROW = {"id": "a", "section": "'1'", "claim": "A is 1.", "paper": "1", "calculate": "{stated: {value: 1}}"}
+ROW = {
+    "id": "a",
+    "section": "'1'",
+    "claim": "A is 1.",
+    "paper": "1",
+    "calculate": "{stated: {value: 1}}",
+}
 
 
 def written(tmp_path, *, leave_out=(), **more):
     """A claims file of one row, changed."""
     row = {k: v for k, v in {**ROW, **more}.items() if k not in leave_out}
     path = tmp_path / "claims.yaml"
-    path.write_text("paper: P\nclaims:\n  - " + "\n    ".join(f"{k}: {v}" for k, v in row.items()) + "\n")
+    path.write_text(
+        "paper: P\nclaims:\n  - " + "\n    ".join(f"{k}: {v}" for k, v in row.items()) + "\n"
+    )
     return path
 
 
@@ -72,11 +80,21 @@ def test_mistakes_are_named_with_their_place(tmp_path, change, message):
     ("change", "message"),
     [
         (
-            {"counter": "[{name: b, shows: x, calculate: {stated: {value: 1}}, expect: {agrees: true}}]"},
+            {
+                "counter": (
+                    "[{name: b, shows: x, calculate: {stated: {value: 1}}, expect: {agrees: true}}]"
+                )
+            },
             "the claim's own experiment",
         ),
-        ({"counter": "[{name: b, shows: x, expect: {agrees: true}}]"}, "the counter-experiment b runs nothing"),
-        ({"counter": "[{name: b, shows: x, pipeline: p, expect: {agrees: true}}]"}, "the counter-experiment b runs nothing"),
+        (
+            {"counter": "[{name: b, shows: x, expect: {agrees: true}}]"},
+            "the counter-experiment b runs nothing",
+        ),
+        (
+            {"counter": "[{name: b, shows: x, pipeline: p, expect: {agrees: true}}]"},
+            "the counter-experiment b runs nothing",
+        ),
     ],
 )
 def test_a_counter_experiment_that_changes_nothing_explains_nothing(tmp_path, change, message):
@@ -86,9 +104,16 @@ def test_a_counter_experiment_that_changes_nothing_explains_nothing(tmp_path, ch
 
 def test_other_seeds_alone_explain_nothing(tmp_path):
     given = {"pipeline": "mustang2", "metric": "central_rms", "because": "It is so."}
-    for more, right in (("seeds: 9", False), ("change: {seed: 9}", True), ("metric: coverage", True)):
+    for more, right in (
+        ("seeds: 9", False),
+        ("change: {seed: 9}", True),
+        ("metric: coverage", True),
+    ):
         path = written(
-            tmp_path, leave_out=("calculate",), **given, counter=f"[{{name: b, shows: x, {more}, expect: {{above: 1 uK}}}}]"
+            tmp_path,
+            leave_out=("calculate",),
+            **given,
+            counter=f"[{{name: b, shows: x, {more}, expect: {{above: 1 uK}}}}]",
         )
         if right:
             assert read(path).claims[0].counter
@@ -104,7 +129,10 @@ def test_a_row_without_a_way_to_measure(tmp_path):
 
 def test_two_rows_of_one_name(tmp_path):
     path = written(tmp_path)
-    path.write_text(path.read_text() + "  - {id: a, section: '2', claim: B., paper: 1, calculate: {stated: {value: 1}}}\n")
+    path.write_text(
+        path.read_text()
+        + "  - {id: a, section: '2', claim: B., paper: 1, calculate: {stated: {value: 1}}}\n"
+    )
     with pytest.raises(ConfigurationError, match="two claims are called 'a'"):
         read(path)
 
@@ -118,9 +146,16 @@ def test_files_that_are_none(tmp_path, text):
 
 def test_counter_experiments_take_over_what_they_do_not_state(tmp_path):
     path = written(
-        tmp_path, leave_out=("calculate",), pipeline="mustang2", metric="central_rms", seeds=5, change="{seed: 3}",
-        counter="[{name: b, shows: x, change: {PinkNoise.shared: 0}, seeds: 2, expect: {above: 1 uK}}]",
-    )  # fmt: skip
+        tmp_path,
+        leave_out=("calculate",),
+        pipeline="mustang2",
+        metric="central_rms",
+        seeds=5,
+        change="{seed: 3}",
+        counter=(
+            "[{name: b, shows: x, change: {PinkNoise.shared: 0}, seeds: 2, expect: {above: 1 uK}}]"
+        ),
+    )
     own = dict(read(path).claims[0].experiments())
     assert own["b"].metric == "central_rms"
     assert own["b"].change == {"seed": 3, "PinkNoise.shared": 0}
@@ -135,7 +170,9 @@ def test_the_paper_s_beam_is_a_gaussian_beam():
     z_r = rayleigh_distance(aperture, frequency)
     assert beam_width(aperture, frequency, z_r) == pytest.approx(math.sqrt(2) * aperture)
     far = 1e9
-    assert beam_width(aperture, frequency, far) / far == pytest.approx(far_field_fwhm(aperture, frequency), rel=1e-4)
+    assert beam_width(aperture, frequency, far) / far == pytest.approx(
+        far_field_fwhm(aperture, frequency), rel=1e-4
+    )
 
 
 @pytest.mark.parametrize("overlap", [disc_overlap, gaussian_overlap])
@@ -155,7 +192,9 @@ def test_overlaps_against_sums_over_a_grid(overlap):
         return np.exp(-square * 4 * math.log(2) / width**2)
 
     shared = np.minimum(shape(0.0), shape(shift)).sum() / shape(0.0).sum()
-    assert overlap(aperture, frequency, distance) == pytest.approx(shared, abs=5e-3)  # pixels of 0.02 m at the discs' edges
+    assert overlap(aperture, frequency, distance) == pytest.approx(
+        shared, abs=5e-3
+    )  # pixels of 0.02 m at the discs' edges
 
 
 def test_flux_of_a_filled_beam_against_astropy():
@@ -164,7 +203,9 @@ def test_flux_of_a_filled_beam_against_astropy():
     beam = u.Quantity(16, "arcsec")
     solid = (math.pi * beam**2 / (4 * math.log(2))).to("sr")
     expected = (12.2 * u.uK).to(u.uJy, u.brightness_temperature(92 * u.GHz, beam_area=solid)).value
-    assert flux_per_beam(12.2e-6, beam.to_value("rad"), 92e9) / 1e-32 == pytest.approx(expected, rel=1e-6)
+    assert flux_per_beam(12.2e-6, beam.to_value("rad"), 92e9) / 1e-32 == pytest.approx(
+        expected, rel=1e-6
+    )
 
 
 def test_the_daisy_of_the_pipelines_reaches_as_far():
@@ -179,15 +220,21 @@ def test_the_daisy_of_the_pipelines_reaches_as_far():
 
 def test_a_spectrum_without_a_beam_has_kolmogorov_s_slope():
     assert spectral_slope(1e-6, 10.0, 0.01, 0.1) == pytest.approx(-8 / 3)
-    assert spectral_slope(100.0, 10.0, 0.016, 0.05) < -4  # the beam takes the more, the higher the frequency
+    assert (
+        spectral_slope(100.0, 10.0, 0.016, 0.05) < -4
+    )  # the beam takes the more, the higher the frequency
 
 
 def test_every_calculation_says_what_it_is():
-    assert all(CALCULATIONS[name].__doc__ or CALCULATIONS[name].__wrapped__.__doc__ for name in CALCULATIONS)
+    assert all(
+        CALCULATIONS[name].__doc__ or CALCULATIONS[name].__wrapped__.__doc__
+        for name in CALCULATIONS
+    )
 
 
 def test_the_white_noise_of_a_stare():
-    # the boresight stays within the field: every detector-second falls on the disc, 4 pi sigma^2 of which a smoothed pixel holds
+    # the boresight stays within the field: every detector-second falls on the disc, 4 pi sigma^2 of
+    # which a smoothed pixel holds
     sigma = 1e-4 / math.sqrt(8 * math.log(2))
     seconds = 100 * 50.0 * 4 * math.pi * sigma**2 / (math.pi * 0.01**2)
     found = white_noise_of_daisy(1e-3, 100, 0.02, 1e-3, 50.0, 1e-4)

@@ -27,5 +27,7 @@ def test_the_stored_table_has_the_rows_of_the_shipped_claims():
     for row, claim in zip(table, claims, strict=True):
         assert row["claim"] == claim.claim
         assert row["unit"] == claim.paper.unit
-        assert abs(row["paper"] * claim.paper.factor - claim.paper.value) <= 1e-8 * abs(claim.paper.value)
+        assert abs(row["paper"] * claim.paper.factor - claim.paper.value) <= 1e-8 * abs(
+            claim.paper.value
+        )
         assert Verdict(row["verdict"]).decided, row["id"]

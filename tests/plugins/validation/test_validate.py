@@ -145,7 +145,9 @@ def test_pictures_of_one_run_are_drawn_once(claims, tmp_path, runs):
     path.write_text(f"{text}\n  - id: noise_again{row}")
     folder = tmp_path / "out"
     assert validate(path, folder, "noise", "noise_again") == 1  # the second explains nothing
-    assert (folder / "noise" / "map.png").read_bytes() == (folder / "noise_again" / "map.png").read_bytes()
+    assert (folder / "noise" / "map.png").read_bytes() == (
+        folder / "noise_again" / "map.png"
+    ).read_bytes()
     assert len(runs) == 13
     validate(path, folder, "noise", "noise_again")
     assert len(runs) == 13
@@ -153,13 +155,18 @@ def test_pictures_of_one_run_are_drawn_once(claims, tmp_path, runs):
 
 def test_pictures_of_another_pipeline(claims, tmp_path, runs, capsys):
     path = claims()
-    seen = PIPELINE.replace("  - BinMap", "  - PowerSpectrum\n  - TimeStreams\n  - BinMap") + "  - SaveMap\n  - Plots\n"
+    seen = (
+        PIPELINE.replace("  - BinMap", "  - PowerSpectrum\n  - TimeStreams\n  - BinMap")
+        + "  - SaveMap\n  - Plots\n"
+    )
     (tmp_path / "seen.yaml").write_text(seen)
     row = "    seeds: 4\n    change: {WhiteNoise.net: 3 mK s(1/2)}\n"
     path.write_text(path.read_text().replace("    seeds: 4\n", row + "    pictures: seen\n", 1))
     folder = tmp_path / "out"
     validate(path, folder, "noise")
-    assert runs.count((('WhiteNoise.net="3 mK s(1/2)"',), 0)) == 2  # measured once, drawn once with the same change
+    assert (
+        runs.count((('WhiteNoise.net="3 mK s(1/2)"',), 0)) == 2
+    )  # measured once, drawn once with the same change
     found = {file.name for file in (folder / "noise").glob("*.png")}
     assert {"values.png", "map.png", "power_spectra.png"} <= found
     assert not list(folder.rglob("*.fits"))  # of the other pipeline only pictures are kept
@@ -170,7 +177,9 @@ def test_pictures_of_another_pipeline(claims, tmp_path, runs, capsys):
     (tmp_path / "seen.yaml").write_text(PIPELINE)
     validate(path, folder, "noise")
     assert len(runs) == made + 1
-    assert not (folder / "noise" / "power_spectra.png").exists()  # the new pipeline does not draw it
+    assert not (
+        folder / "noise" / "power_spectra.png"
+    ).exists()  # the new pipeline does not draw it
     path.write_text(path.read_text().replace("pictures: seen", "pictures: sen"))
     runs.clear()
     capsys.readouterr()
@@ -181,7 +190,9 @@ def test_pictures_of_another_pipeline(claims, tmp_path, runs, capsys):
 
 def test_exit_statuses(claims, tmp_path, capsys):
     folder = tmp_path / "out"
-    assert validate(claims(low="2.005"), folder, "noise") == 1  # a criterion that is not satisfied explains nothing
+    assert (
+        validate(claims(low="2.005"), folder, "noise") == 1
+    )  # a criterion that is not satisfied explains nothing
     assert "its criterion is not satisfied" in (folder / "claims.html").read_text()
     assert validate(claims(), folder, "nosie") == 2
     assert "did you mean 'noise'?" in capsys.readouterr().err
@@ -249,10 +260,15 @@ def test_the_atmosphere_of_a_site_is_drawn(tmp_path):
     from zonda.core.configuration.pipeline_file import load
     from zonda.plugins.validation.atmosphere_figure import atmosphere_figure
 
-    emission, transmission = atmosphere_figure(load(SHIPPED.parent / "mustang2.yaml", ()).scene()).axes
+    emission, transmission = atmosphere_figure(
+        load(SHIPPED.parent / "mustang2.yaml", ()).scene()
+    ).axes
     # several PWVs, in order: at 220 GHz more vapour lets less through
     curves = [line for line in transmission.lines if str(line.get_label()).startswith("PWV")]
     assert len(curves) >= 3
-    found = sorted((float(c.get_label().split()[1]), c.get_ydata()[abs(c.get_xdata() - 220).argmin()]) for c in curves)
+    found = sorted(
+        (float(c.get_label().split()[1]), c.get_ydata()[abs(c.get_xdata() - 220).argmin()])
+        for c in curves
+    )
     assert [passed for _, passed in found] == sorted((passed for _, passed in found), reverse=True)
     assert emission.get_xlim() == (1.0, 1000.0)

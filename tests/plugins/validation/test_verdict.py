@@ -8,7 +8,17 @@ from hypothesis import strategies as st
 
 from zonda.core.errors import ZondaError
 from zonda.plugins.validation.runs import combined
-from zonda.plugins.validation.verdict import LIMIT, Stated, Values, Verdict, clears, compare, contradicted, decide, distance
+from zonda.plugins.validation.verdict import (
+    LIMIT,
+    Stated,
+    Values,
+    Verdict,
+    clears,
+    compare,
+    contradicted,
+    decide,
+    distance,
+)
 
 numbers = st.floats(-1e6, 1e6)
 
@@ -36,7 +46,9 @@ def test_distances_are_of_one_realization_and_of_the_mean():
 
 @pytest.mark.parametrize(("of", "holds"), [("realization", True), ("mean", False)])
 def test_what_is_compared_with_a_mean_must_be_nearer(of, holds):
-    found = Values(tuple(160 + 10 * x for x in (-1.5, -1, -0.5, 0, 0, 0.5, 1, 1.5)))  # scatter 10, standard error 3.7
+    found = Values(
+        tuple(160 + 10 * x for x in (-1.5, -1, -0.5, 0, 0, 0.5, 1, 1.5))
+    )  # scatter 10, standard error 3.7
     assert compare(Stated(148, 3, of=of), found).holds is holds
 
 
@@ -66,7 +78,9 @@ def test_a_comparison_does_not_depend_on_the_zero_point_or_the_sign(value, error
         return Stated(v, error, 1.0).gap(m)
 
     assert gap(-value, -mean) == pytest.approx(gap(value, mean))
-    assert gap(value + shift, mean + shift) == pytest.approx(gap(value, mean), abs=1e-2)  # 1e-9 of the value stays inside
+    assert gap(value + shift, mean + shift) == pytest.approx(
+        gap(value, mean), abs=1e-2
+    )  # 1e-9 of the value stays inside
 
 
 def test_limits_are_cleared_by_two_standard_errors():
@@ -86,13 +100,20 @@ def test_distance():
 @pytest.mark.parametrize(
     ("paper", "other", "relation", "expected"),
     [
-        (72, 74.67, "at_least", True), (75, 74.67, "at_least", False), (74.5, 74.67, "at_least", False),
-        (4, 6.39, "equal", True), (6.4, 6.39, "equal", False),
-        (0.879, 0.375, "at_most", True), (0.3, 0.375, "at_most", False),
+        (72, 74.67, "at_least", True),
+        (75, 74.67, "at_least", False),
+        (74.5, 74.67, "at_least", False),
+        (4, 6.39, "equal", True),
+        (6.4, 6.39, "equal", False),
+        (0.879, 0.375, "at_most", True),
+        (0.3, 0.375, "at_most", False),
     ],
-)  # fmt: skip
+)
 def test_what_other_numbers_of_the_paper_exclude(paper, other, relation, expected):
-    assert contradicted(Stated(paper, 0.0, 0.2 if relation != "at_most" else 0.0), other, relation) is expected
+    assert (
+        contradicted(Stated(paper, 0.0, 0.2 if relation != "at_most" else 0.0), other, relation)
+        is expected
+    )
 
 
 def test_an_error_that_the_paper_states_is_no_contradiction():
@@ -137,6 +158,9 @@ def test_significances_of_pairs():
     # differences 1, 2, 3: mean 2, scatter 1; ((1 + 2^2 / 2) / 3)^(1/2) = 1
     columns = [[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]
     assert combined("paired", columns, 0.0) == (pytest.approx((2.0,)), pytest.approx(1.0))
-    assert combined("paired_mean", columns, 0.0) == (pytest.approx((2 * math.sqrt(3),)), pytest.approx(math.sqrt(3)))
+    assert combined("paired_mean", columns, 0.0) == (
+        pytest.approx((2 * math.sqrt(3),)),
+        pytest.approx(math.sqrt(3)),
+    )
     with pytest.raises(ZondaError, match="seeds that scatter"):
         combined("paired", [[1.0], [0.0]], 0.0)

@@ -25,32 +25,52 @@ def reference(x: float) -> mpmath.mpf:
     """Equation (1) in 50 digits."""
     with mpmath.workdps(50):
         y = mpmath.mpf(x)
-        return mpmath.mpf(2) ** (1 - NU_EXACT) / mpmath.gamma(NU_EXACT) * y**NU_EXACT * mpmath.besselk(NU_EXACT, y)
+        return (
+            mpmath.mpf(2) ** (1 - NU_EXACT)
+            / mpmath.gamma(NU_EXACT)
+            * y**NU_EXACT
+            * mpmath.besselk(NU_EXACT, y)
+        )
 
 
 def test_structure_function_has_no_cancellation() -> None:
     x = np.r_[np.geomspace(1e-12, 50, 200), 1.9999999, 2.0, 2.0000001]
     with mpmath.workdps(50):
-        error = [float(abs(mpmath.mpf(s) / (1 - reference(v)) - 1)) for v, s in zip(x, structure(x), strict=True)]
+        error = [
+            float(abs(mpmath.mpf(s) / (1 - reference(v)) - 1))
+            for v, s in zip(x, structure(x), strict=True)
+        ]
     assert max(error) < 1e-13
 
 
 def test_correlation_to_the_far_tail() -> None:
     x = np.geomspace(1e-12, 600, 150)
-    error = [float(abs(mpmath.mpf(c) / reference(v) - 1)) for v, c in zip(x, correlation(x), strict=True)]
+    error = [
+        float(abs(mpmath.mpf(c) / reference(v) - 1)) for v, c in zip(x, correlation(x), strict=True)
+    ]
     assert max(error) < 1e-13
     assert correlation([0.0, 1e4]).tolist() == [1.0, 0.0]
     assert structure([0.0, 1e4]).tolist() == [0.0, 1.0]
 
 
 @pytest.mark.parametrize(("sigma", "r"), [(21.0, 0.0), (21.0, 30.0), (42.5, 800.0), (700.0, 800.0)])
-def test_beam_convolved_covariance_is_the_hankel_transform_of_the_spectrum(sigma: float, r: float) -> None:
-    # C = int k dk / 2 pi P(k) exp(-sigma^2 k^2) J0(k r) with P of equation (2), in units of r0 = 500 m.
+def test_beam_convolved_covariance_is_the_hankel_transform_of_the_spectrum(
+    sigma: float, r: float
+) -> None:
+    # C = int k dk / 2 pi P(k) exp(-sigma^2 k^2) J0(k r) with P of equation (2), in units of r0 =
+    # 500 m.
     s, x = sigma / 500, r / 500
     edges = sorted({0, 0.3, 1, 3, *(np.arange(1, 9) * max(1.0, 6.5 / s / 8)).tolist()})
 
     def integrand(k: mpmath.mpf) -> mpmath.mpf:
-        return 2 * NU_EXACT * k * (k * k + 1) ** (-NU_EXACT - 1) * mpmath.exp(-((s * k) ** 2)) * mpmath.besselj(0, k * x)
+        return (
+            2
+            * NU_EXACT
+            * k
+            * (k * k + 1) ** (-NU_EXACT - 1)
+            * mpmath.exp(-((s * k) ** 2))
+            * mpmath.besselj(0, k * x)
+        )
 
     with mpmath.workdps(16):
         expected = float(mpmath.quad(integrand, edges))
@@ -58,7 +78,8 @@ def test_beam_convolved_covariance_is_the_hankel_transform_of_the_spectrum(sigma
 
 
 def test_beam_structure_keeps_its_precision_between_neighbours() -> None:
-    # S = int w(s) (1 - exp(-r^2 / 4e)) / (4 pi e) ds of equation (4), to 30 digits, for lines of sight from 1 um to 1 km apart.
+    # S = int w(s) (1 - exp(-r^2 / 4e)) / (4 pi e) ds of equation (4), to 30 digits, for lines of
+    # sight from 1 um to 1 km apart.
     sigma, outer = 42.5, 500.0
     for r in (1e-6, 0.2, 1e3):
         with mpmath.workdps(30):
@@ -68,7 +89,11 @@ def test_beam_structure_keeps_its_precision_between_neighbours() -> None:
                 e = mpmath.exp(u) + b
                 return -mpmath.exp((NU_EXACT + 1) * u - mpmath.exp(u)) * mpmath.expm1(-q / e) / e
 
-            expected = NU_EXACT / mpmath.gamma(NU_EXACT + 1) * mpmath.quad(integrand, np.arange(-45.0, 5.1, 2.5).tolist())
+            expected = (
+                NU_EXACT
+                / mpmath.gamma(NU_EXACT + 1)
+                * mpmath.quad(integrand, np.arange(-45.0, 5.1, 2.5).tolist())
+            )
         assert beam_structure(r, outer, sigma)[0] == pytest.approx(float(expected), rel=1e-12)
 
 

@@ -34,17 +34,29 @@ LAYERS = [Layer(0.8, 500.0, 600.0, 500.0, 2.6), Layer(0.6, 3000.0, 3600.0, 500.0
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 @pytest.mark.parametrize("stretch", [1.0, 1.7])
 def test_focal_plane_error_is_the_expectation_over_the_ensemble(n: int, stretch: float) -> None:
-    # Brute force: mean over detectors of C(0) - 2 W.C(d, nodes) + W C(nodes, nodes) W for the whole weight matrix.
+    # Brute force: mean over detectors of C(0) - 2 W.C(d, nodes) + W C(nodes, nodes) W for the whole
+    # weight matrix.
     nodes = grid(XI, ETA, n)
     total = 0.0
     for layer in LAYERS:
-        a, b = (np.array([x, stretch * y]) * layer.distance for x, y in ((XI, ETA), (nodes.xi, nodes.eta)))
-        cross = beam_correlation(np.hypot(*(a[:, :, None] - b[:, None])), layer.outer_scale, layer.sigma)
-        among = beam_correlation(np.hypot(*(b[:, :, None] - b[:, None])), layer.outer_scale, layer.sigma)
-        error = beam_correlation(0.0, layer.outer_scale, layer.sigma)[0] - 2 * (nodes.weights * cross).sum(1)
+        a, b = (
+            np.array([x, stretch * y]) * layer.distance
+            for x, y in ((XI, ETA), (nodes.xi, nodes.eta))
+        )
+        cross = beam_correlation(
+            np.hypot(*(a[:, :, None] - b[:, None])), layer.outer_scale, layer.sigma
+        )
+        among = beam_correlation(
+            np.hypot(*(b[:, :, None] - b[:, None])), layer.outer_scale, layer.sigma
+        )
+        error = beam_correlation(0.0, layer.outer_scale, layer.sigma)[0] - 2 * (
+            nodes.weights * cross
+        ).sum(1)
         error += np.einsum("dn,nm,dm->d", nodes.weights, among, nodes.weights)
         total += layer.amplitude**2 * error.mean()
-    assert grid_error(nodes.xi[::n], nodes.eta[:n], XI, ETA, LAYERS, stretch) == pytest.approx(np.sqrt(total), rel=1e-3)
+    assert grid_error(nodes.xi[::n], nodes.eta[:n], XI, ETA, LAYERS, stretch) == pytest.approx(
+        np.sqrt(total), rel=1e-3
+    )
 
 
 def test_differential_rms_is_what_the_mean_leaves() -> None:
@@ -58,7 +70,8 @@ def test_differential_rms_is_what_the_mean_leaves() -> None:
 
 @pytest.mark.parametrize("q", [0.2, 0.5, 1.0, 2.0, 5.0, 50.0])
 def test_spline_error_is_the_expectation_over_the_ensemble(q: float) -> None:
-    # The weights of a 61-point cubic spline at the middle interval, averaged over the position inside it.
+    # The weights of a 61-point cubic spline at the middle interval, averaged over the position
+    # inside it.
     knots = np.arange(61.0)
     u = 30 + (np.arange(20) + 0.5) / 20
     weights = make_interp_spline(knots, np.eye(61), k=3)(u)
@@ -76,15 +89,22 @@ def test_spline_error_falls_as_the_eighth_power() -> None:
 
 
 def test_the_table_of_the_spline_error_is_what_its_equation_gives() -> None:
-    path = Path(__file__).resolve().parents[4] / "benchmarks" / "atmosphere_data" / "tabulate_spline_error.py"
+    path = (
+        Path(__file__).resolve().parents[4]
+        / "benchmarks"
+        / "atmosphere_data"
+        / "tabulate_spline_error.py"
+    )
     log_q, log_g = runpy.run_path(str(path))["spline_table"]()
-    # Where q is small the integrand is a difference of numbers near 1: G >= 1e-23 there, of rounding 1e-32.
+    # Where q is small the integrand is a difference of numbers near 1: G >= 1e-23 there, of
+    # rounding 1e-32.
     assert np.allclose(spline_error(np.exp(log_q)), np.exp(log_g), rtol=1e-6, atol=0.0)
 
 
 @pytest.mark.parametrize(("lattice", "error"), [(0.8, 1.2e-4), (0.6, 5e-5), (0.5, 2e-5)])
 def test_the_lattice_itself_is_fine_enough(lattice: float, error: float) -> None:
-    # numerics.md section 3: rms 7e-6 to 3e-5 of the field at 0.5 to 0.7 sigma, per axis; here for both axes together.
+    # numerics.md section 3: rms 7e-6 to 3e-5 of the field at 0.5 to 0.7 sigma, per axis; here for
+    # both axes together.
     e, w = mixture(500.0, 21.0)
     assert np.sqrt(2 * (spline_error(lattice * 21.0 / np.sqrt(e)) @ w)) < error
 
@@ -115,7 +135,9 @@ def test_differences_of_near_detectors_are_those_of_far_ones(radius: float, stre
     total = 0.0
     for layer in LAYERS:
         for e, w in zip(*layer.gaussian(), strict=True):
-            total -= layer.amplitude**2 * w * np.expm1(-(layer.distance**2) * square / (4 * e)).mean()
+            total -= (
+                layer.amplitude**2 * w * np.expm1(-(layer.distance**2) * square / (4 * e)).mean()
+            )
     assert differential_rms(xi, eta, LAYERS, stretch) == pytest.approx(np.sqrt(total), rel=1e-12)
 
 
@@ -126,7 +148,10 @@ def test_the_coarsest_grid_within_tolerance_is_chosen(tolerance: float) -> None:
     assert error <= tolerance
     assert nodes.shape is not None
     coarser = nodes.shape[0] - 1
-    assert coarser == 0 or grid_error(*_sides(XI, ETA, coarser), *spread_evenly(XI, ETA), layers) > tolerance
+    assert (
+        coarser == 0
+        or grid_error(*_sides(XI, ETA, coarser), *spread_evenly(XI, ETA), layers) > tolerance
+    )
 
 
 def test_where_nodes_do_not_pay_the_detectors_are_the_nodes() -> None:
@@ -152,7 +177,12 @@ def test_weights_reproduce_polynomials(n: int) -> None:
     nodes = chebyshev(-1, 3, n)
     points = np.r_[x, nodes]
     for power in range(n):
-        np.testing.assert_allclose(lagrange(nodes, points) @ nodes**power, points**power, atol=1e-13 * 3.0**power, rtol=1e-12)
+        np.testing.assert_allclose(
+            lagrange(nodes, points) @ nodes**power,
+            points**power,
+            atol=1e-13 * 3.0**power,
+            rtol=1e-12,
+        )
     assert np.isfinite(lagrange(nodes, nodes)).all()
 
 

@@ -31,7 +31,13 @@ direct = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(direct)
 
 Floats = NDArray[np.float64]
-SITE = Site(name="here", latitude="-23.0193 deg", longitude="-67.7532 deg", altitude="5050 m", climatology="chajnantor")
+SITE = Site(
+    name="here",
+    latitude="-23.0193 deg",
+    longitude="-67.7532 deg",
+    altitude="5050 m",
+    climatology="chajnantor",
+)
 BAND = Band(name="b", low="140 GHz", high="160 GHz")
 SCANS = {
     "transverse": ("0.1 deg", 50.0, 0.3),
@@ -57,9 +63,19 @@ def observation(field: str, elevation: float, throw: float, samples: int = 1200)
     t = np.arange(samples) / 100
     azimuth = np.radians(100 + throw / 2 * np.sin(2 * np.pi * np.arange(samples) / samples))
     a, b = -azimuth / 2, (np.pi / 2 - np.radians(elevation + 0.1 * np.sin(t))) / 2
-    q = np.stack([-np.sin(a) * np.sin(b), np.cos(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], axis=1)
+    q = np.stack(
+        [
+            -np.sin(a) * np.sin(b),
+            np.cos(a) * np.sin(b),
+            np.sin(a) * np.cos(b),
+            np.cos(a) * np.cos(b),
+        ],
+        axis=1,
+    )
     start = Instant.parse("2022-08-01T23:00:00Z")
-    return Observation("scan", 0, SITE, camera, camera.focalplane(), start, t, 100.0, q, q, (0.0, 0.0), 1)
+    return Observation(
+        "scan", 0, SITE, camera, camera.focalplane(), start, t, 100.0, q, q, (0.0, 0.0), 1
+    )
 
 
 @pytest.mark.parametrize("kind", SCANS)
@@ -72,7 +88,8 @@ def test_positions_and_elevations_are_those_of_the_geometry(kind: str) -> None:
     x, y, sine = path(xi, eta, 0, 150)
     u = rays(axes(o.boresight_azel[:1200:8]), xi, eta)
     expected = track.unroll(crossing(u))
-    # 1e-9 per metre of height from each of the polynomials of equation (1); the quotient on one plane has rounding only.
+    # 1e-9 per metre of height from each of the polynomials of equation (1); the quotient on one
+    # plane has rounding only.
     atol = 1e-8 if track.cone else 1e-13
     np.testing.assert_allclose(x, expected[0], atol=atol)
     np.testing.assert_allclose(y, expected[1], atol=atol)
@@ -98,7 +115,10 @@ def test_layers_are_those_of_the_lattice_at_the_positions(kind: str, spacing: in
     field = Turbulence(1, "air", outer_scale=500.0, sigma=2.6)
     other = Turbulence(1, "more", outer_scale=500.0, sigma=3.1)
     wind = np.array([7.0, -3.0])
-    drifting = [Drifting(field, 800.0, 0.7, wind, 4), Drifting(other, 3000.0, 0.3, 2 * wind, spacing)]
+    drifting = [
+        Drifting(field, 800.0, 0.7, wind, 4),
+        Drifting(other, 3000.0, 0.3, 2 * wind, spacing),
+    ]
     xi, eta = o.focalplane.xi, o.focalplane.eta
     layers = DriftingLayers(o, track, (xi, eta), drifting, 4, (-30, 330))
     assert (layers.cells > 1e4) is True
@@ -114,7 +134,8 @@ def test_layers_are_those_of_the_lattice_at_the_positions(kind: str, spacing: in
             expected += values
         else:
             coarse += values
-    # float32 lattices; a layer with a coarser step is a spline through its own times, which it passes through.
+    # float32 lattices; a layer with a coarser step is a spline through its own times, which it
+    # passes through.
     np.testing.assert_allclose((total - expected - coarse)[:, :: spacing // 4], 0, atol=2e-6)
     if spacing == 4 or kind == "transverse":  # the other scans are so fast that 0.16 s is far apart
         assert np.sqrt(np.mean((total - expected - coarse) ** 2)) < (1e-6 if spacing == 4 else 1e-3)
@@ -128,7 +149,12 @@ def test_a_scan_that_sweeps_over_too_much_is_refused(monkeypatch: pytest.MonkeyP
     field = Turbulence(1, "air", outer_scale=500.0, sigma=2.6)
     with pytest.raises(ZondaError, match=r"sweep over .* lattice points .* limit is 1e\+04"):
         DriftingLayers(
-            o, scan_planes([o])[0], (np.zeros(1), np.zeros(1)), [Drifting(field, 800.0, 1.0, np.zeros(2), 4)], 4, (-30, 330)
+            o,
+            scan_planes([o])[0],
+            (np.zeros(1), np.zeros(1)),
+            [Drifting(field, 800.0, 1.0, np.zeros(2), 4)],
+            4,
+            (-30, 330),
         )
 
 
@@ -172,7 +198,9 @@ def test_the_response_is_that_of_the_band(band: Any, rms: float, low: float) -> 
         assert abs((response(name, y, s) - expected[name]) / y).max() < 2e-5 * largest
         assert not response(name, np.zeros((1, 3)), s[:1, :3]).any()
         far = np.array([[9 * rms, 0.0]])
-        np.testing.assert_allclose(response(name, far, s[:1, :2])[0, 0], _at(band, name, 9 * rms, s[0, 0]), rtol=1e-9)
+        np.testing.assert_allclose(
+            response(name, far, s[:1, :2])[0, 0], _at(band, name, 9 * rms, s[0, 0]), rtol=1e-9
+        )
 
 
 def _at(band: Any, name: str, y: float, s: float) -> float:
@@ -195,18 +223,27 @@ def test_wide_ranges_are_left_to_the_band(band: Any, monkeypatch: pytest.MonkeyP
     response = Response(band, 1e-5, (-1.0, 250.0), (0.3, 0.6), 1500.0, 6.5, ("emission",))
     assert any(c is None for c in response._coefficients.values())
     y, s = np.array([[-0.9, 0.0, 100.0]]), np.array([[0.4, 0.5, 0.55]])
-    np.testing.assert_array_equal(response("emission", y, s), band.emission_difference(1e-5, 1e-5 * y, np.arcsin(s)))
+    np.testing.assert_array_equal(
+        response("emission", y, s), band.emission_difference(1e-5, 1e-5 * y, np.arcsin(s))
+    )
 
 
-@pytest.mark.parametrize(("field", "elevation", "throw"), [("30 deg", 74.0, 20.0), ("12 deg", 83.0, 5.0), ("6 deg", 17.0, 60.0)])
-def test_the_polynomials_hold_near_the_zenith_and_the_horizon(field: str, elevation: float, throw: float) -> None:
+@pytest.mark.parametrize(
+    ("field", "elevation", "throw"),
+    [("30 deg", 74.0, 20.0), ("12 deg", 83.0, 5.0), ("6 deg", 17.0, 60.0)],
+)
+def test_the_polynomials_hold_near_the_zenith_and_the_horizon(
+    field: str, elevation: float, throw: float
+) -> None:
     o = observation(field, elevation, throw, 400)
     track = scan_planes([o])[0]
     if track.kind != "cone":
         pytest.fail(f"{track.kind}: nothing is shown")
     path = LinesOfSight(o, track, 8, 0, 50)
     x, y, _ = path(o.focalplane.xi, o.focalplane.eta, 0, 50)
-    expected = track.unroll(crossing(rays(axes(o.boresight_azel[::8]), o.focalplane.xi, o.focalplane.eta)))
+    expected = track.unroll(
+        crossing(rays(axes(o.boresight_azel[::8]), o.focalplane.xi, o.focalplane.eta))
+    )
     np.testing.assert_allclose(np.stack([x, y]), expected, atol=2e-8)
 
 

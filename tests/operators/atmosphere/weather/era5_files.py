@@ -34,10 +34,20 @@ def grid(latitude, longitude, hours, levels=LEVELS):
 
 
 def new_layout(
-    path, latitude=(41.0, 40.5, 40.0), longitude=(9.75, 10.0, 10.25), hours=(0, 3, 6), levels=LEVELS, without=(), change=None
+    path,
+    latitude=(41.0, 40.5, 40.0),
+    longitude=(9.75, 10.0, 10.25),
+    hours=(0, 3, 6),
+    levels=LEVELS,
+    without=(),
+    change=None,
 ):
-    """NetCDF-4 as of 2024: valid_time, pressure_level, an ensemble number, latitudes from the north."""
-    values = grid(np.array(latitude), np.array(longitude), np.array(hours, float), np.array(levels, float))
+    """NetCDF-4 as of 2024: valid_time, pressure_level, an ensemble number, latitudes from the
+    north.
+    """
+    values = grid(
+        np.array(latitude), np.array(longitude), np.array(hours, float), np.array(levels, float)
+    )
     values = values if change is None else change(values)
     with h5py.File(path, "w") as file:
         axes = {
@@ -61,8 +71,12 @@ def new_layout(
     return path
 
 
-def old_layout(path, latitude=(41.0, 40.5, 40.0), longitude=(9.75, 10.0, 10.25), hours=(0, 3, 6), expver=False):
-    """NetCDF-3 as before 2024: time, level in millibars, values packed in 16 bits, expver as an axis where asked."""
+def old_layout(
+    path, latitude=(41.0, 40.5, 40.0), longitude=(9.75, 10.0, 10.25), hours=(0, 3, 6), expver=False
+):
+    """NetCDF-3 as before 2024: time, level in millibars, values packed in 16 bits, expver as an
+    axis where asked.
+    """
     values = grid(np.array(latitude), np.array(longitude), np.array(hours, float))
     with netcdf_file(path, "w", version=2) as file:
         since = (START - datetime(1900, 1, 1, tzinfo=UTC)).total_seconds() / 3600

@@ -19,7 +19,13 @@ PWV = 7.7e-3
 
 @pytest.fixture(scope="module")
 def air():
-    green_bank = Site(name="gb", latitude="38.43 deg", longitude="-79.84 deg", altitude="825 m", climatology="green_bank")
+    green_bank = Site(
+        name="gb",
+        latitude="38.43 deg",
+        longitude="-79.84 deg",
+        altitude="825 m",
+        climatology="green_bank",
+    )
     return profile(green_bank, Instant.parse("2024-11-25T07:00:00Z"), PWV)
 
 
@@ -40,36 +46,50 @@ def test_band_values_are_the_spectrum_averaged_with_the_passband(air, mustang2):
     frequency[[0, -1]] = 78.125, 107.875
     average = lambda x: np.average(np.interp(frequency * 1e9, s.frequency, x), weights=weight)  # noqa: E731
     assert mustang2.emission(PWV, elevation) == pytest.approx(average(s.brightness), rel=2e-5)
-    assert mustang2.transmission(PWV, elevation) == pytest.approx(average(np.exp(-s.slant_opacity)), rel=2e-5)
+    assert mustang2.transmission(PWV, elevation) == pytest.approx(
+        average(np.exp(-s.slant_opacity)), rel=2e-5
+    )
     assert mustang2.background(PWV, elevation) == pytest.approx(average(s.cmb), rel=2e-5)
-    assert mustang2.opacity(PWV, elevation) == pytest.approx(-math.log(average(np.exp(-s.slant_opacity))), rel=1e-4)
+    assert mustang2.opacity(PWV, elevation) == pytest.approx(
+        -math.log(average(np.exp(-s.slant_opacity))), rel=1e-4
+    )
 
 
 def test_shipped_job_has_the_expected_atmosphere(mustang2):
-    # ERA5's own profile of a like night, at zenith: 28.8 K (am_era5_green_bank_nov_02h.npz); at 60 deg 1.15 times the air
+    # ERA5's own profile of a like night, at zenith: 28.8 K (am_era5_green_bank_nov_02h.npz); at 60
+    # deg 1.15 times the air
     assert mustang2.emission(PWV, math.radians(60)) == pytest.approx(33.1, abs=0.4)
     assert mustang2.transmission(PWV, math.radians(60)) == pytest.approx(0.874, abs=0.003)
 
 
 # the stated interpolation error, also where a water line is saturated
-@pytest.mark.parametrize(("low", "high"), [(78, 108), (66, 118), (130, 170), (175, 195), (200, 270), (540, 575), (92.9, 93.1)])
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [(78, 108), (66, 118), (130, 170), (175, 195), (200, 270), (540, 575), (92.9, 93.1)],
+)
 def test_interpolation_against_radiative_transfer(air, low, high):
     table = BandAtmosphere(band(low, high), air)
     assert table.error < 1e-5
     rng = np.random.default_rng(2)
-    for pwv, elevation in zip(rng.uniform(0, table.pwv_max, 40), np.radians(rng.uniform(5, 90, 40)), strict=True):
+    for pwv, elevation in zip(
+        rng.uniform(0, table.pwv_max, 40), np.radians(rng.uniform(5, 90, 40)), strict=True
+    ):
         emission, log_transmission, log_background = table.direct(pwv, elevation)
         assert table.emission(pwv, elevation) == pytest.approx(emission, rel=1e-4)
         assert table.log_transmission(pwv, elevation) == pytest.approx(log_transmission, rel=1e-4)
         background = table.background(pwv, elevation)
-        assert background == pytest.approx(math.exp(log_background), rel=1e-4 * (1 + abs(log_background)), abs=1e-300)
+        assert background == pytest.approx(
+            math.exp(log_background), rel=1e-4 * (1 + abs(log_background)), abs=1e-300
+        )
 
 
 def test_derivative_against_radiative_transfer(mustang2):
     step, elevation = 1e-3 * PWV, math.radians(60)
     up, down = (mustang2.direct(PWV + s, elevation) for s in (step, -step))
     # a central difference: its own error is (1e-3)^2
-    assert mustang2.emission_difference(PWV, 1e-9, elevation) / 1e-9 == pytest.approx((up[0] - down[0]) / 2 / step, rel=1e-4)
+    assert mustang2.emission_difference(PWV, 1e-9, elevation) / 1e-9 == pytest.approx(
+        (up[0] - down[0]) / 2 / step, rel=1e-4
+    )
     got = mustang2.log_transmission_difference(PWV, 1e-9, elevation) / 1e-9
     assert got == pytest.approx((up[1] - down[1]) / 2 / step, rel=1e-4)
 
@@ -80,7 +100,10 @@ def exact_difference(table, which, pwv, dpwv, elevation):
     with mpmath.workdps(50):
         fixed = _chebyshev(table._y(np.array([elevation])), n_v)[:, 0]
         rows = table._coefficients[which]
-        line = [mpmath.fsum(mpmath.mpf(c) * mpmath.mpf(f) for c, f in zip(row, fixed, strict=True)) for row in rows]
+        line = [
+            mpmath.fsum(mpmath.mpf(c) * mpmath.mpf(f) for c, f in zip(row, fixed, strict=True))
+            for row in rows
+        ]
         x = lambda p: 2 * mpmath.log1p(p / mpmath.mpf(table._scale)) / mpmath.mpf(table._u_max) - 1  # noqa: E731
         value = lambda p: mpmath.fsum(c * mpmath.chebyt(k, x(p)) for k, c in enumerate(line))  # noqa: E731
         return float(value(mpmath.mpf(pwv) + mpmath.mpf(dpwv)) - value(mpmath.mpf(pwv)))
@@ -89,7 +112,10 @@ def exact_difference(table, which, pwv, dpwv, elevation):
 @pytest.mark.parametrize("relative", [0.3, 1e-2, -5e-3, 1e-6, 1e-10, -1e-14])
 def test_differences_do_not_cancel(mustang2, relative):
     elevation, step = 0.9, relative * PWV
-    for which, method in ((0, mustang2.emission_difference), (1, mustang2.log_transmission_difference)):
+    for which, method in (
+        (0, mustang2.emission_difference),
+        (1, mustang2.log_transmission_difference),
+    ):
         want = exact_difference(mustang2, which, PWV, step, elevation)
         assert method(PWV, step, elevation) == pytest.approx(want, rel=1e-11)
     # and a zero step is exactly nothing
@@ -126,7 +152,9 @@ def test_opaque_band_underflows_nowhere(air):
 
 
 def test_monotone_and_physical(mustang2):
-    pwv, elevation = np.meshgrid(np.linspace(0, mustang2.pwv_max, 40), np.radians(np.linspace(5, 90, 30)), indexing="ij")
+    pwv, elevation = np.meshgrid(
+        np.linspace(0, mustang2.pwv_max, 40), np.radians(np.linspace(5, 90, 30)), indexing="ij"
+    )
     t, loss = mustang2.emission(pwv, elevation), mustang2.opacity(pwv, elevation)
     for field in (t, loss):
         assert field.shape == pwv.shape
@@ -138,9 +166,15 @@ def test_monotone_and_physical(mustang2):
 
 def test_a_value_does_not_depend_on_its_neighbours(mustang2):
     rng = np.random.default_rng(3)
-    pwv, elevation = PWV * (1 + 0.05 * rng.standard_normal((9, 300))), np.radians(rng.uniform(40, 60, 300))
+    pwv, elevation = (
+        PWV * (1 + 0.05 * rng.standard_normal((9, 300))),
+        np.radians(rng.uniform(40, 60, 300)),
+    )
     whole = mustang2.emission_difference(PWV, pwv - PWV, elevation)
-    parts = [mustang2.emission_difference(PWV, pwv[:, k : k + 37] - PWV, elevation[k : k + 37]) for k in range(0, 300, 37)]
+    parts = [
+        mustang2.emission_difference(PWV, pwv[:, k : k + 37] - PWV, elevation[k : k + 37])
+        for k in range(0, 300, 37)
+    ]
     np.testing.assert_array_equal(np.concatenate(parts, axis=1), whole)
 
 
@@ -151,20 +185,27 @@ def test_passband_is_integrated_within_cells(tmp_path):
     weights, frequency, cells = _cell_weights(band(77.9, 80.3), absorption_table())
     assert weights.sum() == pytest.approx(2.4e9, rel=1e-12)
     assert cells.stop - cells.start == len(weights) == 6
-    np.testing.assert_allclose(frequency, np.array([78.075, 78.5, 79, 79.5, 80, 80.275]) * 1e9)  # the middles of what is covered
+    np.testing.assert_allclose(
+        frequency, np.array([78.075, 78.5, 79, 79.5, 80, 80.275]) * 1e9
+    )  # the middles of what is covered
     path = tmp_path / "ramp.txt"
     path.write_text("90 0\n91 1\n")
     weights, frequency, _ = _cell_weights(Band(name="ramp", file=path), absorption_table())
     # cells 90 (half), 90.5, 91 (half): integral of nu - 90 from 0 to 1/4, 1/4 to 3/4, 3/4 to 1
     np.testing.assert_allclose(weights, np.array([1 / 32, 1 / 4, 7 / 32]) * 1e9, rtol=1e-9)
-    np.testing.assert_allclose(frequency[[0, 2]], np.array([90 + 1 / 6, 90 + 37 / 42]) * 1e9, rtol=1e-12)
+    np.testing.assert_allclose(
+        frequency[[0, 2]], np.array([90 + 1 / 6, 90 + 37 / 42]) * 1e9, rtol=1e-12
+    )
     path.write_text("0.1 0\n90 0\n91 1\n92 0\n2000 0\n")
     weights, _, _ = _cell_weights(Band(name="padded", file=path), absorption_table())
     assert weights.sum() == pytest.approx(1e9, rel=1e-12)
 
 
 def test_limits_are_named(air, mustang2):
-    with pytest.raises(InputError, match=r"PWV of 30 mm \(value 1 of 2\) is outside the table of band 'test', 0 to 23\.1 mm"):
+    with pytest.raises(
+        InputError,
+        match=r"PWV of 30 mm \(value 1 of 2\) is outside the table of band 'test', 0 to 23\.1 mm",
+    ):
         mustang2.emission([PWV, 30e-3], 1.0)
     with pytest.raises(InputError, match=r"PWV of -1 mm"):
         mustang2.transmission(-1e-3, 1.0)
@@ -172,9 +213,14 @@ def test_limits_are_named(air, mustang2):
         mustang2.transmission(math.nan, 1.0)
     with pytest.raises(InputError, match=r"PWV of 27\.7 mm"):
         mustang2.emission_difference(PWV, 20e-3, 1.0)
-    with pytest.raises(InputError, match=r"elevations of 4\.00 to 4\.00 deg leave the limits .*4.5 to 90 deg"):
+    with pytest.raises(
+        InputError, match=r"elevations of 4\.00 to 4\.00 deg leave the limits .*4.5 to 90 deg"
+    ):
         mustang2.emission(PWV, math.radians(4))
-    with pytest.raises(InputError, match=r"band 'test': 990 to 1010 GHz is not inside .* table, 0\.75 to 1000\.25 GHz"):
+    with pytest.raises(
+        InputError,
+        match=r"band 'test': 990 to 1010 GHz is not inside .* table, 0\.75 to 1000\.25 GHz",
+    ):
         BandAtmosphere(band(990, 1010), air)
     with pytest.raises(InputError, match="outside the limits, 0 to 60 mm"):
         BandAtmosphere(band(78, 108), air, pwv_max=0.1)

@@ -1,4 +1,6 @@
-"""Files of ERA5 as people have them: names, units, time references and calendars; nothing of a text is left unread."""
+"""Files of ERA5 as people have them: names, units, time references and calendars; nothing of a text
+is left unread.
+"""
 
 import importlib.util
 from pathlib import Path
@@ -13,7 +15,9 @@ from zonda.core.site import Site
 from zonda.operators.atmosphere.weather.sources import Era5
 from zonda.operators.atmosphere.weather.time_reference import posix_times
 
-_spec = importlib.util.spec_from_file_location("era5_files", Path(__file__).with_name("era5_files.py"))
+_spec = importlib.util.spec_from_file_location(
+    "era5_files", Path(__file__).with_name("era5_files.py")
+)
 files = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(files)
 
@@ -22,12 +26,17 @@ SITE = Site(name="here", latitude="40.3 deg", longitude="10.1 deg", altitude="60
 GRAVITY = 9.80665
 
 
-def written(path, names=None, units=None, values=None, time=None, drop=(), attributes=None, **given):
-    """A file of `new_layout`, then renamed, converted, annotated; ``time``: (numbers, attributes), a scalar if the number is."""
+def written(
+    path, names=None, units=None, values=None, time=None, drop=(), attributes=None, **given
+):
+    """A file of `new_layout`, then renamed, converted, annotated; ``time``: (numbers, attributes),
+    a scalar if the number is.
+    """
     files.new_layout(path, **given)
     with h5py.File(path, "a") as file:
         variables = {
-            name: (item[()], dict(item.attrs), [d[0].name[1:] for d in item.dims if len(d)]) for name, item in file.items()
+            name: (item[()], dict(item.attrs), [d[0].name[1:] for d in item.dims if len(d)])
+            for name, item in file.items()
         }
     names, new = names or {}, path.with_suffix(".made.nc")
     axes = ["valid_time", "pressure_level", "latitude", "longitude"]
@@ -64,7 +73,9 @@ def column(path, time=NIGHT):
 
 def same(found, expected):
     for name in ("pressure", "height", "temperature", "h2o", "wind_east", "wind_north", "ozone"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=2e-6, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(expected, name), rtol=2e-6, atol=1e-9, err_msg=name
+        )
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +97,10 @@ TIMES = [
     (np.array([0, 10800, 21600]) * 10**9, "nanoseconds since 2024-03-01"),
     (np.array([-0.5, -0.375, -0.25]), "days since 2024-03-01 12:00"),
     (np.array([20240301.0, 20240301.125, 20240301.25]), "day as %Y%m%d.%f"),
-    (np.array([738947.0, 738947.125, 738947.25]), "days since 1-1-1 00:00:00"),  # the Julian 1 January of the year 1
+    (
+        np.array([738947.0, 738947.125, 738947.25]),
+        "days since 1-1-1 00:00:00",
+    ),  # the Julian 1 January of the year 1
 ]
 
 
@@ -96,13 +110,17 @@ def test_time_references_are_read_whole(tmp_path, right, numbers, unit):
 
 
 def test_the_julian_calendar_ends_where_it_ended():
-    """Standard: 4 October 1582 is followed by the 15th; proleptic: the Gregorian calendar has always been."""
+    """Standard: 4 October 1582 is followed by the 15th; proleptic: the Gregorian calendar has
+    always been.
+    """
     from datetime import UTC, datetime
 
     new_year = datetime(2000, 1, 1, tzinfo=UTC).timestamp()
     days = (datetime(2000, 1, 1, tzinfo=UTC) - datetime(1582, 10, 15, tzinfo=UTC)).days
     assert posix_times(days + 1, "days since 1582-10-04", "standard", "time") == new_year
-    assert posix_times(days + 11, "days since 1582-10-04", "proleptic_gregorian", "time") == new_year
+    assert (
+        posix_times(days + 11, "days since 1582-10-04", "proleptic_gregorian", "time") == new_year
+    )
     assert posix_times(days, "days since 1582-10-15", None, "time") == new_year
     # Julian 29 February of a year that the Gregorian calendar takes as common
     assert posix_times(2, "days since 1500-02-28", "gregorian", "time") == posix_times(
@@ -150,17 +168,31 @@ def test_calendars_of_everyday_life_are_read(tmp_path, right, calendar):
 
 
 def test_rounded_times_are_refused(tmp_path):
-    """float32 holds seconds since 1970 in steps of 128 s, and dates as numbers in steps of 2 days."""
-    for numbers, unit in ((files.START.timestamp(), "seconds since 1970-01-01"), (20240301, "day as %Y%m%d.%f")):
-        path = written(tmp_path / "era5.nc", time=(np.float32(numbers) * np.ones(3, np.float32), {"units": unit}))
+    """float32 holds seconds since 1970 in steps of 128 s, and dates as numbers in steps of 2
+    days.
+    """
+    for numbers, unit in (
+        (files.START.timestamp(), "seconds since 1970-01-01"),
+        (20240301, "day as %Y%m%d.%f"),
+    ):
+        path = written(
+            tmp_path / "era5.nc",
+            time=(np.float32(numbers) * np.ones(3, np.float32), {"units": unit}),
+        )
         with pytest.raises(InputError, match="rounds these"):
             column(path)
 
 
 def test_one_time_as_a_scalar(tmp_path):
     """As xarray writes a file after `isel(valid_time=0)`."""
-    path = written(tmp_path / "era5.nc", time=(np.int64(2), {"units": "hours since 2024-03-01"}), hours=(2, 3, 6))
-    assert column(path).temperature[0] == pytest.approx(column(files.new_layout(tmp_path / "b.nc")).temperature[0], abs=1e-4)
+    path = written(
+        tmp_path / "era5.nc",
+        time=(np.int64(2), {"units": "hours since 2024-03-01"}),
+        hours=(2, 3, 6),
+    )
+    assert column(path).temperature[0] == pytest.approx(
+        column(files.new_layout(tmp_path / "b.nc")).temperature[0], abs=1e-4
+    )
     with pytest.raises(InputError, match="covers 2024-03-01T02:00Z to 2024-03-01T02:00Z, not"):
         column(path, Instant.parse("2024-03-01T05:00Z"))
 
@@ -168,11 +200,25 @@ def test_one_time_as_a_scalar(tmp_path):
 CFGRIB = {"valid_time": "time", "pressure_level": "isobaricInhPa"}
 PLEV = {"valid_time": "time", "pressure_level": "plev", "latitude": "lat", "longitude": "lon",
         "t": "ta", "q": "hus", "u": "ua", "v": "va", "z": "zg"}  # fmt: skip
-ARCO = {"valid_time": "time", "pressure_level": "level", "t": "temperature", "q": "specific_humidity", "u": "u_component_of_wind",
-        "v": "v_component_of_wind", "z": "geopotential", "o3": "ozone_mass_mixing_ratio"}  # fmt: skip
+ARCO = {
+    "valid_time": "time",
+    "pressure_level": "level",
+    "t": "temperature",
+    "q": "specific_humidity",
+    "u": "u_component_of_wind",
+    "v": "v_component_of_wind",
+    "z": "geopotential",
+    "o3": "ozone_mass_mixing_ratio",
+}
 OWN = {"t": "T_air", "q": "moisture", "u": "east", "v": "north", "z": "phi", "o3": "ozone"}
-STANDARD = {"t": "air_temperature", "q": "specific_humidity", "u": "eastward_wind", "v": "northward_wind", "z": "geopotential",
-            "o3": "mass_fraction_of_ozone_in_air"}  # fmt: skip
+STANDARD = {
+    "t": "air_temperature",
+    "q": "specific_humidity",
+    "u": "eastward_wind",
+    "v": "northward_wind",
+    "z": "geopotential",
+    "o3": "mass_fraction_of_ozone_in_air",
+}
 SINCE = np.array([0, 3, 6]), {"units": "hours since 2024-03-01"}
 
 
@@ -180,26 +226,53 @@ SINCE = np.array([0, 3, 6]), {"units": "hours since 2024-03-01"}
     "given",
     [
         {"names": CFGRIB, "time": SINCE},
-        {"names": CFGRIB | {"pressure_level": "isobaricInPa"}, "units": {"pressure_level": "Pa"}, "time": SINCE,
-         "values": {"pressure_level": lambda p: 100 * p}},
-        {"names": PLEV, "time": SINCE, "units": {"pressure_level": "Pa", "t": "K", "q": "1", "u": "m s-1", "z": "m"},
-         "values": {"pressure_level": lambda p: 100 * p, "z": lambda z: z / GRAVITY}},
+        {
+            "names": CFGRIB | {"pressure_level": "isobaricInPa"},
+            "units": {"pressure_level": "Pa"},
+            "time": SINCE,
+            "values": {"pressure_level": lambda p: 100 * p},
+        },
+        {
+            "names": PLEV,
+            "time": SINCE,
+            "units": {"pressure_level": "Pa", "t": "K", "q": "1", "u": "m s-1", "z": "m"},
+            "values": {"pressure_level": lambda p: 100 * p, "z": lambda z: z / GRAVITY},
+        },
         {"names": ARCO, "time": SINCE},
         {"names": {k: v.upper() for k, v in zip("tquvz", "tquvz", strict=True)}},
         {"names": OWN, "attributes": {k: {"standard_name": v} for k, v in STANDARD.items()}},
         {"units": {"pressure_level": "millibars"}},
         {"units": {"pressure_level": "kPa"}, "values": {"pressure_level": lambda p: p / 10}},
-        {"units": {"pressure_level": ""}, "values": {"pressure_level": lambda p: 100 * p}},  # none, and plainly Pa
+        # none, and plainly Pa
+        {"units": {"pressure_level": ""}, "values": {"pressure_level": lambda p: 100 * p}},
         {"units": {"t": "degC"}, "values": {"t": lambda t: t - 273.15}},
         {"units": {"q": "g kg**-1", "o3": "kg kg**-1"}, "values": {"q": lambda q: 1e3 * q}},
-        {"units": {"u": "knots", "v": "km/h"}, "values": {"u": lambda u: u * 3600 / 1852, "v": lambda v: 3.6 * v}},
+        {
+            "units": {"u": "knots", "v": "km/h"},
+            "values": {"u": lambda u: u * 3600 / 1852, "v": lambda v: 3.6 * v},
+        },
         {"units": {"z": "m**2 s**-2", "t": "K", "q": "kg kg**-1", "u": "m s**-1", "v": "m s**-1"}},
         {"units": {"z": "gpm"}, "values": {"z": lambda z: z / GRAVITY}},
         {"names": {"z": "gh"}, "values": {"z": lambda z: z / GRAVITY}},
     ],
-    ids=["cfgrib", "isobaricInPa", "plev", "arco", "upper case", "standard names", "millibars", "kPa", "Pa unsaid", "degC",
-         "g/kg", "knots", "cds", "gpm", "gh"],
-)  # fmt: skip
+    ids=[
+        "cfgrib",
+        "isobaricInPa",
+        "plev",
+        "arco",
+        "upper case",
+        "standard names",
+        "millibars",
+        "kPa",
+        "Pa unsaid",
+        "degC",
+        "g/kg",
+        "knots",
+        "cds",
+        "gpm",
+        "gh",
+    ],
+)
 def test_names_and_units_of_others(tmp_path, right, given):
     found = column(written(tmp_path / "era5.nc", **given))
     if "o3" not in given.get("names", {}) and "zg" in given.get("names", {}).values():
@@ -208,8 +281,14 @@ def test_names_and_units_of_others(tmp_path, right, given):
 
 
 def test_valid_time_beside_the_time_axis(tmp_path, right):
-    """cfgrib keeps the axis `time` and the coordinates `step` and `valid_time` beside it; a forecast's time is start and step."""
-    path = written(tmp_path / "era5.nc", names=CFGRIB, time=(np.array([-3, 0, 3]), {"units": "hours since 2024-03-01"}))
+    """cfgrib keeps the axis `time` and the coordinates `step` and `valid_time` beside it; a
+    forecast's time is start and step.
+    """
+    path = written(
+        tmp_path / "era5.nc",
+        names=CFGRIB,
+        time=(np.array([-3, 0, 3]), {"units": "hours since 2024-03-01"}),
+    )
     with h5py.File(path, "a") as file:
         file["step"] = 3
         file["step"].attrs["units"] = "hours"

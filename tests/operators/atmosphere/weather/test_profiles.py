@@ -8,7 +8,12 @@ from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.site import Site
 from zonda.operators.atmosphere.weather import climatology, profiles
-from zonda.operators.atmosphere.weather.climatology import climatologies, coefficients, harmonics, profile
+from zonda.operators.atmosphere.weather.climatology import (
+    climatologies,
+    coefficients,
+    harmonics,
+    profile,
+)
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -23,12 +28,21 @@ def reference(name):
 
 
 def site(climatology="green_bank", altitude=825.0):
-    return Site(name="here", latitude="38 deg", longitude="-80 deg", altitude=f"{altitude} m", climatology=climatology)
+    return Site(
+        name="here",
+        latitude="38 deg",
+        longitude="-80 deg",
+        altitude=f"{altitude} m",
+        climatology=climatology,
+    )
 
 
 def monthly_pwv(where):
     """(12,) mm, mean of four hours on the 15th."""
-    times = [[Instant.parse(f"2023-{m:02d}-15T{h:02d}:00Z") for h in (0, 6, 12, 18)] for m in range(1, 13)]
+    times = [
+        [Instant.parse(f"2023-{m:02d}-15T{h:02d}:00Z") for h in (0, 6, 12, 18)]
+        for m in range(1, 13)
+    ]
     return np.array([[profile(where, t).pwv * 1e3 for t in month] for month in times]).mean(axis=1)
 
 
@@ -49,18 +63,31 @@ def test_annual_median_of_the_water_column(name, altitude, low, high):
 
 
 def test_green_bank_around_the_year():
-    np.testing.assert_allclose(monthly_pwv(site())[::2], [6.5, 7.7, 18.7, 29.3, 23.8, 8.5], rtol=0.11)
+    np.testing.assert_allclose(
+        monthly_pwv(site())[::2], [6.5, 7.7, 18.7, 29.3, 23.8, 8.5], rtol=0.11
+    )
 
 
 @pytest.mark.parametrize("name", ["green_bank", "chajnantor", "south_pole"])
 def test_fit_follows_era5(name):
     era5 = reference(f"weathergen_{name}.npz")
-    keys = {"temperature": "temperature_K", "wind_east": "wind_east_ms", "wind_north": "wind_north_ms", "height": "height_m"}
+    keys = {
+        "temperature": "temperature_K",
+        "wind_east": "wind_east_ms",
+        "wind_north": "wind_north_ms",
+        "height": "height_m",
+    }
     limit = {"temperature": 0.9, "wind_east": 2.0, "wind_north": 2.0, "height": 30.0}
     for quantity, key in keys.items():
         fitted = coefficients(name)[quantity]
-        want = era5[key][..., : fitted.shape[1]] if quantity == "height" else era5[key][..., : fitted.shape[1], 2]
-        got = np.array([[harmonics(d, h) @ fitted for h in era5["utc_hour"]] for d in era5["year_day"]])
+        want = (
+            era5[key][..., : fitted.shape[1]]
+            if quantity == "height"
+            else era5[key][..., : fitted.shape[1], 2]
+        )
+        got = np.array(
+            [[harmonics(d, h) @ fitted for h in era5["utc_hour"]] for d in era5["year_day"]]
+        )
         assert np.sqrt(np.mean((got - want) ** 2)) < limit[quantity]
     vapour = era5["water_vapor_raw_kg_m3"][..., 2] * era5["rh_water_to_mixed_correction"]
     fitted = coefficients(name)["log_vapour_density"]
@@ -70,7 +97,8 @@ def test_fit_follows_era5(name):
 
 @pytest.mark.parametrize(("low", "high"), [(78, 108), (66, 118), (140, 160), (200, 270)])
 def test_brightness_of_the_november_night_agrees_with_am_on_era5(low, high):
-    # ERA5's own profile of that night against our fit of it, at the same water column: 1.5 % allows for the fit's 1.5 K
+    # ERA5's own profile of that night against our fit of it, at the same water column: 1.5 % allows
+    # for the fit's 1.5 K
     file = reference("am_era5_green_bank_nov_02h.npz")
     ours = profile(site(), Instant.parse("2023-11-21T07:30:00Z"), pwv=7.65e-3)
     got = spectrum(ours.layers, math.pi / 2, low=low * 1e9, high=high * 1e9).brightness.mean()
@@ -93,20 +121,29 @@ def test_profile_goes_from_the_ground_to_45_km_and_is_physical():
     assert 15e3 < air.height[np.argmax(air.o3)] < 40e3  # the ozone layer
     # hydrostatic: the pressure's scale height is R T / g M within the climatology's own consistency
     scale = -np.diff(air.height) / np.diff(np.log(air.pressure))
-    np.testing.assert_allclose(scale, 287.05 * (air.temperature[1:] + air.temperature[:-1]) / 2 / 9.80665, rtol=0.02)
+    np.testing.assert_allclose(
+        scale, 287.05 * (air.temperature[1:] + air.temperature[:-1]) / 2 / 9.80665, rtol=0.02
+    )
     # the same water by mass of air and by height
     assert np.trapezoid(air.vapour_density, air.height) / 1e3 == pytest.approx(air.pwv, rel=0.01)
 
 
 def test_layers_converge(monkeypatch):
-    got = spectrum(profile(site(), NOVEMBER, 7.7e-3).layers, math.pi / 2, low=78e9, high=108e9).brightness.mean()
+    got = spectrum(
+        profile(site(), NOVEMBER, 7.7e-3).layers, math.pi / 2, low=78e9, high=108e9
+    ).brightness.mean()
     monkeypatch.setattr(profiles, "LEVELS", 481)
-    fine = spectrum(profile(site(), NOVEMBER, 7.7e-3).layers, math.pi / 2, low=78e9, high=108e9).brightness.mean()
+    fine = spectrum(
+        profile(site(), NOVEMBER, 7.7e-3).layers, math.pi / 2, low=78e9, high=108e9
+    ).brightness.mean()
     assert got == pytest.approx(fine, abs=0.04)
 
 
 def test_year_and_day_close():
-    for a, b in (("2022-12-31T23:59:59Z", "2023-01-01T00:00:01Z"), ("2023-06-01T23:59:59Z", "2023-06-02T00:00:01Z")):
+    for a, b in (
+        ("2022-12-31T23:59:59Z", "2023-01-01T00:00:01Z"),
+        ("2023-06-01T23:59:59Z", "2023-06-02T00:00:01Z"),
+    ):
         before, after = (profile(site(), Instant.parse(t)) for t in (a, b))
         np.testing.assert_allclose(before.temperature, after.temperature, atol=1e-3)
         np.testing.assert_allclose(before.wind_east, after.wind_east, atol=1e-3)
@@ -130,7 +167,9 @@ def test_values_between_heights():
     middle = air.at([[h]])
     assert middle.wind_east.shape == (1, 1)
     assert middle.wind_east[0, 0] == pytest.approx((air.wind_east[3] + air.wind_east[4]) / 2)
-    assert middle.vapour_density[0, 0] == pytest.approx(math.sqrt(air.vapour_density[3] * air.vapour_density[4]))
+    assert middle.vapour_density[0, 0] == pytest.approx(
+        math.sqrt(air.vapour_density[3] * air.vapour_density[4])
+    )
     assert profile(site(), NOVEMBER, 0.0).at(1000.0).vapour_density == 0
     for wrong in (-1.0, 47e3, math.nan):
         with pytest.raises(InputError, match="outside the profile, 0 to 46000 m"):
@@ -147,11 +186,15 @@ def test_every_climatology_gives_air():
 
 
 def test_stratosphere_is_dry_and_its_ozone_has_seasons():
-    # 5 ppm of water is known from satellites; rounded relative humidities would make 50 to 300 ppm at 10 hPa
+    # 5 ppm of water is known from satellites; rounded relative humidities would make 50 to 300 ppm
+    # at 10 hPa
     for name in climatologies():
         air = profile(site(name, max(float(coefficients(name)["height"][0, 0]), 0.0)), NOVEMBER)
         assert air.h2o[air.pressure < 9000].max() < 5.5e-6
-    winter, spring = (profile(site("south_pole", 2835), Instant.parse(f"2023-{m}-10T00:00Z")) for m in ("06", "10"))
+    winter, spring = (
+        profile(site("south_pole", 2835), Instant.parse(f"2023-{m}-10T00:00Z"))
+        for m in ("06", "10")
+    )
     at = np.argmin(abs(winter.pressure - 5000))
     assert spring.o3[at] < 0.5 * winter.o3[at]  # the ozone hole
 
@@ -160,7 +203,9 @@ def test_stratosphere_is_dry_and_its_ozone_has_seasons():
 def test_ice_sheets_have_their_inversion_in_winter(name):
     winter, summer = ("07", "01") if name == "south_pole" else ("01", "07")
     ground = {"south_pole": 2835, "summit_station": 3216}[name]
-    cold, warm = (profile(site(name, ground), Instant.parse(f"2023-{m}-15T00:00Z")) for m in (winter, summer))
+    cold, warm = (
+        profile(site(name, ground), Instant.parse(f"2023-{m}-15T00:00Z")) for m in (winter, summer)
+    )
     assert 5 < cold.at(500.0).temperature - cold.temperature[0] < 20
     assert abs(warm.at(500.0).temperature - warm.temperature[0]) < 7
     # no more vapour than saturates that air over ice, and above the inversion as before
@@ -181,11 +226,18 @@ def test_data_are_small():
 
 
 def test_bad_requests_name_cause_and_cure():
-    with pytest.raises(InputError, match=r"site 'here': has no climatology(.|\n)*zonda plugins(.|\n)*green_bank"):
+    with pytest.raises(
+        InputError, match=r"site 'here': has no climatology(.|\n)*zonda plugins(.|\n)*green_bank"
+    ):
         profile(site(None), NOVEMBER)
-    with pytest.raises(InputError, match=r"climatology 'atlantis' does not exist\n.*choose one of: .*green_bank"):
+    with pytest.raises(
+        InputError, match=r"climatology 'atlantis' does not exist\n.*choose one of: .*green_bank"
+    ):
         profile(site("atlantis"), NOVEMBER)
-    with pytest.raises(InputError, match="lies at 100 m, more than 500 m below the lowest level of climatology 'chajnantor'"):
+    with pytest.raises(
+        InputError,
+        match="lies at 100 m, more than 500 m below the lowest level of climatology 'chajnantor'",
+    ):
         profile(site("chajnantor", 100), NOVEMBER)
     for pwv in (-1e-3, 61e-3, math.nan):
         with pytest.raises(InputError, match="outside the limits, 0 to 60 mm"):
@@ -195,7 +247,9 @@ def test_bad_requests_name_cause_and_cure():
 
 
 def test_the_mean_of_a_layer_where_the_vapour_pressure_does_not_change():
-    """r = r0 p0 / p between p0 and p1: its mean over mass is r0 p0 ln(p0 / p1) / (p0 - p1), and next to it nearly the same."""
+    """r = r0 p0 / p between p0 and p1: its mean over mass is r0 p0 ln(p0 / p1) / (p0 - p1), and
+    next to it nearly the same.
+    """
     pressure, r0 = np.array([900.0, 700.0]), 3e-3
     exact = r0 * 900.0 * math.log(900.0 / 700.0) / 200.0
     for power in (-1.0, -1.0 + 1e-12, -1.0 - 1e-9):

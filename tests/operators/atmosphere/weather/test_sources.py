@@ -1,4 +1,6 @@
-"""The sources of weather: ERA5 files, tables, the standard atmosphere, and what a scene makes of them."""
+"""The sources of weather: ERA5 files, tables, the standard atmosphere, and what a scene makes of
+them.
+"""
 
 import dataclasses
 import importlib.util
@@ -20,9 +22,17 @@ from zonda.core.weather import PWV_MAX, Column, Pwv, WeatherSource
 from zonda.operators.atmosphere.weather import humidity, standard_atmosphere
 from zonda.operators.atmosphere.weather.climatology import profile
 from zonda.operators.atmosphere.weather.profiles import PwvDistribution
-from zonda.operators.atmosphere.weather.sources import Climatology, Era5, Standard, Table, profile_of
+from zonda.operators.atmosphere.weather.sources import (
+    Climatology,
+    Era5,
+    Standard,
+    Table,
+    profile_of,
+)
 
-_spec = importlib.util.spec_from_file_location("era5_files", Path(__file__).with_name("era5_files.py"))
+_spec = importlib.util.spec_from_file_location(
+    "era5_files", Path(__file__).with_name("era5_files.py")
+)
 files = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(files)
 
@@ -43,7 +53,12 @@ def here(**changes):
 
 
 def scene(weather, **changes):
-    given = {"site": "green_bank", "instrument": "mustang2", "time": "2024-11-25T07:00", "weather": weather}
+    given = {
+        "site": "green_bank",
+        "instrument": "mustang2",
+        "time": "2024-11-25T07:00",
+        "weather": weather,
+    }
     return Scene(**(given | changes))
 
 
@@ -52,7 +67,8 @@ def air(weather, **changes):
     return profile_of(s.weather, s.site, s.time, s.seed)
 
 
-# ------------------------------------------------------------------------------------------------------------- what is written
+# --------------------------------------------------------------------------------------------------
+# what is written
 
 
 @pytest.mark.parametrize(
@@ -99,7 +115,10 @@ def test_yaml_names_a_source_and_survives(weather, kind, tmp_path):
     ("weather", "words"),
     [
         ("{pwv: -1 mm}", "a precipitable water vapour of -1 mm is outside the limits, 0 to 60 mm"),
-        ("{pwv: 500 mm}", "a precipitable water vapour of 500 mm is outside the limits, 0 to 60 mm"),
+        (
+            "{pwv: 500 mm}",
+            "a precipitable water vapour of 500 mm is outside the limits, 0 to 60 mm",
+        ),
         ("{pwv: 100 %}", "a quantile of 100 % is outside the limits"),
         ("{pwv: 3}", "3 has no unit"),
         ("{pvw: 3 mm}", r"unknown key 'pvw' for weather[\s\S]*did you mean 'pwv'"),
@@ -132,7 +151,12 @@ def test_schema_takes_every_source():
     from zonda.core.configuration.schema import json_schema
 
     schema = json_schema()
-    base = {"site": "green_bank", "instrument": "mustang2", "time": "2024-11-25", "operators": ["PointingStare"]}
+    base = {
+        "site": "green_bank",
+        "instrument": "mustang2",
+        "time": "2024-11-25",
+        "operators": ["PointingStare"],
+    }
     for weather in (
         {"pwv": "25 %"},
         {"file": "era5.nc"},
@@ -157,14 +181,17 @@ def test_sources_are_plugins():
     assert air({"source": "dry_test", "pwv": "1 mm"}).pwv == pytest.approx(1e-3)
 
 
-# ------------------------------------------------------------------------------------------------------------- water and wind
+# --------------------------------------------------------------------------------------------------
+# water and wind
 
 
 def test_given_water_and_climatology():
     median = profile(sites.create("green_bank"), Instant.parse("2024-11-25T07:00"))
     assert air(None).pwv == median.pwv
     assert air({"pwv": "7.7 mm"}).pwv == pytest.approx(7.7e-3, rel=1e-12)
-    assert air({"pwv": "50 %"}).pwv == pytest.approx(median.pwv, rel=0.01)  # the cut at 60 mm moves it by less
+    assert air({"pwv": "50 %"}).pwv == pytest.approx(
+        median.pwv, rel=0.01
+    )  # the cut at 60 mm moves it by less
     assert air({"pwv": "25 %"}).pwv < median.pwv < air({"pwv": "75 %"}).pwv
 
 
@@ -177,11 +204,16 @@ def test_quantiles_are_log_normal_and_never_beyond_the_limit():
 
 
 def test_random_water_follows_the_distribution_and_the_seed():
-    drawn = np.array([air({"pwv": "random"}, seed=seed, site="chajnantor").pwv for seed in range(200)])
+    drawn = np.array(
+        [air({"pwv": "random"}, seed=seed, site="chajnantor").pwv for seed in range(200)]
+    )
     law = air(None, site="chajnantor").distribution
     assert air({"pwv": "random"}, seed=7).pwv == air({"pwv": "random"}, seed=7).pwv
-    # 200 draws: the mean of the logarithm has standard error sigma / sqrt(200), its width sigma / 20; 4 of them are allowed
-    assert np.log(drawn).mean() == pytest.approx(math.log(law.median), abs=4 * law.sigma / math.sqrt(200))
+    # 200 draws: the mean of the logarithm has standard error sigma / sqrt(200), its width sigma /
+    # 20; 4 of them are allowed
+    assert np.log(drawn).mean() == pytest.approx(
+        math.log(law.median), abs=4 * law.sigma / math.sqrt(200)
+    )
     assert np.log(drawn).std() == pytest.approx(law.sigma, rel=4 / 20)
 
 
@@ -189,9 +221,14 @@ def test_wind_is_typical_median_or_drawn():
     median, typical = air({"wind": "median"}), air(None)
     plain = profile(sites.create("green_bank"), Instant.parse("2024-11-25T07:00"))
     np.testing.assert_array_equal(median.wind_east, plain.wind_east)
-    slow, fast = np.hypot(median.wind_east, median.wind_north), np.hypot(typical.wind_east, typical.wind_north)
+    slow, fast = (
+        np.hypot(median.wind_east, median.wind_north),
+        np.hypot(typical.wind_east, typical.wind_north),
+    )
     assert (fast > slow).all()
-    np.testing.assert_allclose(typical.wind_east * median.wind_north, typical.wind_north * median.wind_east, atol=1e-9)
+    np.testing.assert_allclose(
+        typical.wind_east * median.wind_north, typical.wind_north * median.wind_east, atol=1e-9
+    )
     drawn = [air({"wind": "random"}, seed=seed) for seed in range(100)]
     east = np.array([(d.wind_east - plain.wind_east) / plain.wind_east_spread for d in drawn])
     assert np.ptp(east, axis=1).max() < 1e-9  # the same draw at all heights
@@ -203,7 +240,9 @@ def test_typical_speed_is_the_median_of_normal_components():
     # equation (2) of weather.py against 2e5 draws, whose median has a standard error below 0.4 %
     rng = np.random.default_rng(1)
     for u, v, s in ((0.0, 0.0, 5.0), (3.0, 1.0, 5.0), (10.0, -4.0, 5.0), (30.0, 5.0, 8.0)):
-        truth = np.median(np.hypot(u + s * rng.standard_normal(200_000), v + s * rng.standard_normal(200_000)))
+        truth = np.median(
+            np.hypot(u + s * rng.standard_normal(200_000), v + s * rng.standard_normal(200_000))
+        )
         one = np.ones(2)
         plain = profile(sites.create("green_bank"), NIGHT)
         made = type(plain)(*(one,) * 5, u * one, v * one, 0.0, s * one, s * one).typical_wind
@@ -212,18 +251,26 @@ def test_typical_speed_is_the_median_of_normal_components():
 
 def test_operator_and_scene_may_not_disagree_about_the_water():
     s = scene({"pwv": "25 %"})
-    with pytest.raises(InputError, match=r"given twice: 5 mm by the operator, 25 % by the scene's weather"):
+    with pytest.raises(
+        InputError, match=r"given twice: 5 mm by the operator, 25 % by the scene's weather"
+    ):
         profile_of(s.weather, s.site, s.time, 0, 5e-3)
     s = scene({"pwv": "5 mm"})
     assert profile_of(s.weather, s.site, s.time, 0, 5e-3).pwv == pytest.approx(5e-3)
-    assert profile_of(scene({"wind": "median"}).weather, s.site, s.time, 0, 5e-3).pwv == pytest.approx(5e-3)
+    assert profile_of(
+        scene({"wind": "median"}).weather, s.site, s.time, 0, 5e-3
+    ).pwv == pytest.approx(5e-3)
 
 
 def test_the_scenes_weather_reaches_the_pipeline():
     import zonda
 
     s = scene({"pwv": "3 mm", "wind": "median"}, target="az 180 deg el 60 deg")
-    steps = [zonda.PointingStare(scan_duration="10 s"), zonda.AtmosphereLayers(layers=2), zonda.Efficiency()]
+    steps = [
+        zonda.PointingStare(scan_duration="10 s"),
+        zonda.AtmosphereLayers(layers=2),
+        zonda.Efficiency(),
+    ]
     said = {what: text for _, what, text in zonda.Pipeline(steps).run(s).tally}
     assert said["PWV"] == "3 mm, as given"
     assert said["wind"] == "medians of the components"
@@ -231,11 +278,14 @@ def test_the_scenes_weather_reaches_the_pipeline():
         zonda.Pipeline([steps[0], zonda.AtmosphereLayers(pwv="4 mm"), steps[2]]).run(s)
 
 
-# ------------------------------------------------------------------------------------------------------------- any place
+# --------------------------------------------------------------------------------------------------
+# any place
 
 
 def test_a_place_without_climatology_needs_water_or_a_file():
-    with pytest.raises(InputError, match=r"site 'here': has no climatology[\s\S]*weather: \{pwv: 3 mm\}[\s\S]*ERA5"):
+    with pytest.raises(
+        InputError, match=r"site 'here': has no climatology[\s\S]*weather: \{pwv: 3 mm\}[\s\S]*ERA5"
+    ):
         profile_of(None, here(), NIGHT, 0)
     with pytest.raises(InputError, match="has no climatology"):
         profile_of(Climatology(pwv="50 %"), here(), NIGHT, 0)
@@ -253,25 +303,37 @@ def test_a_place_without_climatology_needs_water_or_a_file():
 def test_standard_atmosphere():
     # US Standard Atmosphere 1976, geopotential heights: 0, 5, 11, 20, 32, 47 km
     want = [101325, 54020, 22632, 5474.9, 868.02, 110.91]
-    np.testing.assert_allclose(standard_atmosphere.pressure([0, 5e3, 11e3, 20e3, 32e3, 47e3]), want, rtol=1e-3)
+    np.testing.assert_allclose(
+        standard_atmosphere.pressure([0, 5e3, 11e3, 20e3, 32e3, 47e3]), want, rtol=1e-3
+    )
     for altitude in (0, 2000, 5600):
         made = profile(here(altitude=f"{altitude} m"), NIGHT, 1e-3)
         want = standard_atmosphere.pressure(altitude + made.height)
-        np.testing.assert_allclose(made.pressure, want, rtol=0.04)  # 61 heights, the topmost km apart
+        np.testing.assert_allclose(
+            made.pressure, want, rtol=0.04
+        )  # 61 heights, the topmost km apart
         np.testing.assert_allclose(made.pressure[want > 500], want[want > 500], rtol=0.01)
         low = made.height < 47e3 - altitude
-        np.testing.assert_allclose(made.temperature[low], standard_atmosphere.temperature(altitude + made.height)[low], atol=2)
+        np.testing.assert_allclose(
+            made.temperature[low],
+            standard_atmosphere.temperature(altitude + made.height)[low],
+            atol=2,
+        )
     # 8 + 30 exp(...) m/s at its jet, to the slope between heights
     assert np.hypot(made.wind_east, made.wind_north).max() == pytest.approx(38, abs=0.3)
 
 
 def test_time_outside_the_climatology():
     for text in ("1850-01-01", "2150-01-01"):
-        with pytest.raises(InputError, match=rf"{text}T00:00:00Z is outside what the climatology stands for, 1940 to 2100"):
+        with pytest.raises(
+            InputError,
+            match=rf"{text}T00:00:00Z is outside what the climatology stands for, 1940 to 2100",
+        ):
             profile(sites.create("green_bank"), Instant.parse(text))
 
 
-# ------------------------------------------------------------------------------------------------------------- ERA5
+# --------------------------------------------------------------------------------------------------
+# ERA5
 
 
 @pytest.mark.parametrize("layout", ["new", "old", "expver", "dateline", "reversed"])
@@ -294,12 +356,16 @@ def test_era5_is_interpolated_in_space_and_time(tmp_path, layout):
     np.testing.assert_allclose(made.wind_east, want["u"], atol=1e-4 + 1e-3 * packed)
     np.testing.assert_allclose(made.wind_north, want["v"], atol=1e-4 + 1e-3 * packed)
     np.testing.assert_allclose(made.height, want["z"] / 9.80665, atol=0.01 + 0.5 * packed)
-    np.testing.assert_allclose(made.h2o, humidity.from_specific(want["q"]), rtol=1e-4, atol=2e-7 * packed)
+    np.testing.assert_allclose(
+        made.h2o, humidity.from_specific(want["q"]), rtol=1e-4, atol=2e-7 * packed
+    )
     np.testing.assert_allclose(made.ozone, 1e-6 * 28.964 / 47.998, rtol=1e-3)
 
 
 def test_era5_gives_air_for_a_scene(tmp_path):
-    path = files.new_layout(tmp_path / "era5.nc", levels=files.LEVELS[files.LEVELS >= 100], without=("o3",))
+    path = files.new_layout(
+        tmp_path / "era5.nc", levels=files.LEVELS[files.LEVELS >= 100], without=("o3",)
+    )
     made = air({"file": str(path)}, site=here(), time="2024-03-01T02:00")
     # all the water of the column, by mass: the integral of q dp / g from the site up
     fine = np.linspace(100e2, made.pressure[0], 20001)
@@ -310,8 +376,13 @@ def test_era5_gives_air_for_a_scene(tmp_path):
     assert 15e3 < made.height[np.argmax(made.o3)] < 40e3
     assert (np.diff(made.pressure) < 0).all()
     assert (made.temperature > 190).all()
-    assert air({"file": str(path), "pwv": "2 mm"}, site=here(), time="2024-03-01T02:00").pwv == pytest.approx(2e-3)
-    with pytest.raises(InputError, match="'25 %' needs a distribution, and source 'era5' has one state of the atmosphere only"):
+    assert air(
+        {"file": str(path), "pwv": "2 mm"}, site=here(), time="2024-03-01T02:00"
+    ).pwv == pytest.approx(2e-3)
+    with pytest.raises(
+        InputError,
+        match="'25 %' needs a distribution, and source 'era5' has one state of the atmosphere only",
+    ):
         air({"file": str(path), "pwv": "25 %"}, site=here(), time="2024-03-01T02:00")
 
 
@@ -323,7 +394,9 @@ def test_era5_relative_humidity_serves(tmp_path):
 
     path = files.new_layout(tmp_path / "era5.nc", without=("q",), change=relative)
     want = files.air(40.5, 10.0, 3.0)
-    made = Era5(file=path).column(here(latitude="40.5 deg", longitude="10 deg"), Instant.parse("2024-03-01T03:00"))
+    made = Era5(file=path).column(
+        here(latitude="40.5 deg", longitude="10 deg"), Instant.parse("2024-03-01T03:00")
+    )
     np.testing.assert_allclose(made.h2o, humidity.from_specific(want["q"]), rtol=1e-4)
 
 
@@ -342,7 +415,10 @@ def nan_at_a_level(values):
         ({"latitude": (38.0, 42.0)}, "too coarse: its latitudes are 4 deg apart"),
         ({"longitude": (9.0, 12.0)}, "too coarse: its longitudes are 3 deg apart"),
         ({"hours": (0, 12)}, "too coarse: its times around 2024-03-01T02:00:00Z are 12 h apart"),
-        ({"hours": (6, 9)}, "covers 2024-03-01T06:00Z to 2024-03-01T09:00Z, not 2024-03-01T02:00:00Z"),
+        (
+            {"hours": (6, 9)},
+            "covers 2024-03-01T06:00Z to 2024-03-01T09:00Z, not 2024-03-01T02:00:00Z",
+        ),
         (
             {"levels": (1000.0, 500.0, 250.0, 100.0)},
             r"too coarse: its 4 pressure levels \(1000, 500, 250, 100 hPa\) lie up to a factor 2",
@@ -362,12 +438,15 @@ def test_bad_era5_files(tmp_path, given, words):
 def test_a_share_is_no_percentage(tmp_path):
     path = tmp_path / "air.csv"
     rows = [
-        f"{z}, {standard_atmosphere.pressure(z)[()] / 100:.5g}, {standard_atmosphere.temperature(z)[()]:.5g}, 0.5"
+        f"{z}, {standard_atmosphere.pressure(z)[()] / 100:.5g},"
+        f" {standard_atmosphere.temperature(z)[()]:.5g}, 0.5"
         for z in (0, 2000, 4000, 6000, 9000)
     ]
     header = "height [m], pressure [hPa], temperature [K], relative humidity "
     path.write_text("\n".join([header + "[%]", *rows]))
-    with pytest.raises(InputError, match=r"the relative humidity is 0[.]005 at most, which no air has"):
+    with pytest.raises(
+        InputError, match=r"the relative humidity is 0[.]005 at most, which no air has"
+    ):
         Table(table=path).column(here(), NIGHT)
     path.write_text("\n".join([header + "[1]", *rows]))
     assert Table(table=path).column(here(), NIGHT).h2o.max() > 1e-3
@@ -375,7 +454,13 @@ def test_a_share_is_no_percentage(tmp_path):
 
 def test_files_that_are_not_netcdf(tmp_path):
     path = tmp_path / "era5.nc"
-    for content in (b"", b"GRIB....", b"CDF\x01", b"PK\x03\x04zip", b"\x89HDF\r\n\x1a\n" + 30 * b"x"):
+    for content in (
+        b"",
+        b"GRIB....",
+        b"CDF\x01",
+        b"PK\x03\x04zip",
+        b"\x89HDF\r\n\x1a\n" + 30 * b"x",
+    ):
         path.write_bytes(content)
         with pytest.raises(InputError, match="cannot be read as NetCDF"):
             Era5(file=path).column(here(), NIGHT)
@@ -389,11 +474,15 @@ def test_files_that_are_not_netcdf(tmp_path):
 
 def test_site_below_or_above_the_air(tmp_path):
     path = files.new_layout(tmp_path / "era5.nc", levels=files.LEVELS[files.LEVELS <= 700])
-    with pytest.raises(InputError, match="site 'here': lies at 600 m, more than 500 m below the lowest level of ERA5"):
+    with pytest.raises(
+        InputError,
+        match="site 'here': lies at 600 m, more than 500 m below the lowest level of ERA5",
+    ):
         profile_of(Era5(file=path), here(), NIGHT, 0)
 
 
-# ------------------------------------------------------------------------------------------------------------- tables
+# --------------------------------------------------------------------------------------------------
+# tables
 
 
 def table(folder, text):
@@ -411,11 +500,15 @@ def test_table_is_read(tmp_path):
     air = profile_of(table(tmp_path, TABLE), here(), NIGHT, 0)
     assert 2e-3 < air.pwv < 15e-3
     # above the table: the standard lapse, hydrostatic; 9000 m and -44 C here, 229.7 K there
-    assert air.temperature[np.argmin(abs(air.height - 14.4e3))] == pytest.approx(216.65 + 229.15 - 229.65, abs=1)
+    assert air.temperature[np.argmin(abs(air.height - 14.4e3))] == pytest.approx(
+        216.65 + 229.15 - 229.65, abs=1
+    )
     scale = -np.diff(air.height) / np.diff(np.log(air.pressure))
     above = air.height[:-1] > 9500
     np.testing.assert_allclose(
-        scale[above], (287.05 * (air.temperature[1:] + air.temperature[:-1]) / 2 / 9.80665)[above], rtol=0.02
+        scale[above],
+        (287.05 * (air.temperature[1:] + air.temperature[:-1]) / 2 / 9.80665)[above],
+        rtol=0.02,
     )
 
 
@@ -430,9 +523,9 @@ def test_table_without_winds_and_with_density(tmp_path):
             (9e3, 308, 244, 0.05),
         )
     )
-    made = table(tmp_path, "height [m], pressure [hPa], temperature [K], vapour density [g/m3]\n" + rows).column(
-        here(altitude="5 km"), NIGHT
-    )
+    made = table(
+        tmp_path, "height [m], pressure [hPa], temperature [K], vapour density [g/m3]\n" + rows
+    ).column(here(altitude="5 km"), NIGHT)
     np.testing.assert_allclose(made.h2o[0] * 54000 / (461.5 * 270), 1e-3, rtol=1e-3)
     np.testing.assert_allclose(made.wind_east, standard_atmosphere.wind_speed(np.arange(5) * 1e3))
     assert "without winds" in made.stated
@@ -447,19 +540,31 @@ def test_table_without_winds_and_with_density(tmp_path):
         ("3.0, 700", "1.2, 700", "line 5: the height does not increase"),
         ("3.0, 700", "3.0, 900", "line 5: the pressure does not fall with height"),
         ("3.0, 700", "3.0, 1e-320", "line 5: the pressure is below 0.001 Pa"),
-        ("pressure [hPa]", "pressure [Pa]", "line 3: a pressure of 9.55 hPa at 500 m: no air has that"),
+        (
+            "pressure [hPa]",
+            "pressure [Pa]",
+            "line 3: a pressure of 9.55 hPa at 500 m: no air has that",
+        ),
         ("height [km]", "height [m]", "line 5: a pressure of 700 hPa at 3 m: no air has that"),
         ("-18, 20", "-18, -20", "line 6: the relative humidity is negative"),
         ("-18, 20", "-18, 200", "line 6: the relative humidity is above 120 %"),
         ("10, 50", "283, 50", "line 3: the temperature is not between 150 and 340 K"),
         ("9, 2", "900, 2", "line 5: the wind is above 200 m/s"),
-        ("9.0, 308, -44, 10, 25, 0", "6.0, 480, -25, 10, 25, 0", "has 5 heights up to 6000 m above sea level"),
+        (
+            "9.0, 308, -44, 10, 25, 0",
+            "6.0, 480, -25, 10, 25, 0",
+            "has 5 heights up to 6000 m above sea level",
+        ),
         ("9.0, 308, -44, 10, 25, 0", "9.0, 308, -44", "line 7 has 3 cells for 6 columns"),
         ("temperature [degC]", "temp [degC]", r"the column 'temp \[degC\]' is not known"),
         ("temperature [degC]", "temperature [F]", r"'temperature' comes in K, degC"),
         ("temperature [degC]", "temperature", "the column 'temperature' is not known"),
         ("wind north [m/s]", "wind east [m/s]", "the column 'wind east' is there twice"),
-        ("wind north [m/s]", "vapour density [g/m3]", "two humidities, or one component of the wind"),
+        (
+            "wind north [m/s]",
+            "vapour density [g/m3]",
+            "two humidities, or one component of the wind",
+        ),
         ("Relative_Humidity [%]", "ozone [ppm]", r"lacks a humidity"),
         ("height [km]", "ozone [ppm]", r"lacks height"),
     ],
@@ -487,7 +592,8 @@ def test_column_needs_no_ozone_nor_spreads():
     assert column.log_vapour_spread is None
 
 
-# ------------------------------------------------------------------------------------------------------------- fetching
+# --------------------------------------------------------------------------------------------------
+# fetching
 
 
 def test_fetch_asks_for_the_cells_around_the_site(monkeypatch, tmp_path):
@@ -501,7 +607,9 @@ def test_fetch_asks_for_the_cells_around_the_site(monkeypatch, tmp_path):
     assert (asked["day"], asked["time"]) == (["01", "02"], ["00:00", "01:00", "02:00", "23:00"])
     assert request(sites.create("amundsen_scott"), NIGHT, 1)["area"] == [-89.75, 0.0, -90.0, 0.25]
     monkeypatch.setitem(sys.modules, "cdsapi", None)
-    with pytest.raises(InputError, match=r"cdsapi is not installed[\s\S]*pip install 'zonda\[weather\]'"):
+    with pytest.raises(
+        InputError, match=r"cdsapi is not installed[\s\S]*pip install 'zonda\[weather\]'"
+    ):
         retrieve(here(), NIGHT, 1, tmp_path / "x.nc")
 
     def client(**options):
@@ -517,13 +625,15 @@ def test_dry_air_keeps_the_shape_of_its_water() -> None:
     dry = profile_of(Climatology(pwv="0 mm"), site, time, 1)
     assert 0 < dry.pwv < 1e-11
     usual = profile_of(None, site, time, 1)
-    # the pressure stays, so that the few per mille of molecules that were water are air: shapes agree to that
+    # the pressure stays, so that the few per mille of molecules that were water are air: shapes
+    # agree to that
     np.testing.assert_allclose(dry.scaled(usual.pwv).h2o, usual.h2o, rtol=1e-6)
     with pytest.raises(InputError, match="no vapour at all"):
         dataclasses.replace(usual, h2o=0 * usual.h2o).scaled(1e-3)
 
 
-# ---------------------------------------------------------------------------------------------------------- what is cut or kept
+# --------------------------------------------------------------------------------------------------
+# what is cut or kept
 
 
 def said(profile, what):
@@ -533,14 +643,18 @@ def said(profile, what):
 def test_water_above_saturation_is_said(tmp_path):
     moist = table(tmp_path, TABLE.replace("-18, 20", "-18, 115"))
     text = said(profile_of(moist, here(), NIGHT, 1), "relative humidity above 100 %")
-    levels, of, most = (int(n) for n in re.match(r"at (\d+) of (\d+) levels, up to (\d+)%", text).groups())
+    levels, of, most = (
+        int(n) for n in re.match(r"at (\d+) of (\d+) levels, up to (\d+)%", text).groups()
+    )
     assert (of, 1 <= levels < 20) == (61, True)
     assert 100 <= most <= 115  # 115 % at one level of the table, between two of the profile
     assert text.endswith("above saturation; taken as it is")
     dry = profile_of(table(tmp_path, TABLE), here(), NIGHT, 1)
     assert said(dry, "relative humidity above 100 %") is None
     # a PWV that is asked for scales the water, past saturation where it must
-    wet = profile_of(table(tmp_path, TABLE).model_copy(update={"pwv": Pwv.parse("50 mm")}), here(), NIGHT, 1)
+    wet = profile_of(
+        table(tmp_path, TABLE).model_copy(update={"pwv": Pwv.parse("50 mm")}), here(), NIGHT, 1
+    )
     assert "taken as it is" in said(wet, "relative humidity above 100 %")
 
 
@@ -550,7 +664,9 @@ def test_water_that_an_inversion_cannot_hold_is_cut_and_said():
     assert over[:8].max() <= 1 + 1e-9
     text = said(cold, "vapour near the ground")
     assert text is None or "cut to saturation at" in text
-    column = Climatology().column(sites.create("amundsen_scott"), Instant.parse("2024-07-01T00:00Z"))
+    column = Climatology().column(
+        sites.create("amundsen_scott"), Instant.parse("2024-07-01T00:00Z")
+    )
     wetter = dataclasses.replace(column, h2o=column.h2o * 3)
     from zonda.operators.atmosphere.weather.profiles import on_heights
 

@@ -13,13 +13,32 @@ from zonda.core.instrument import Band
 from zonda.core.numerics.radiation import rayleigh_jeans
 from zonda.core.site import Site
 from zonda.operators.atmosphere.model import Models
-from zonda.operators.atmosphere.weather.absorption import TABLE, AbsorptionTable, CrossSections, absorption_table
+from zonda.operators.atmosphere.weather.absorption import (
+    TABLE,
+    AbsorptionTable,
+    CrossSections,
+    absorption_table,
+)
 from zonda.operators.atmosphere.weather.bands import BandTransfer
 from zonda.operators.atmosphere.weather.climatology import profile
-from zonda.operators.atmosphere.weather.radiative_transfer import EARTH_RADIUS, Layers, emission, spectrum
+from zonda.operators.atmosphere.weather.radiative_transfer import (
+    EARTH_RADIUS,
+    Layers,
+    emission,
+    spectrum,
+)
 
 ROOT = Path(__file__).resolve().parents[4]
-WINDOWS = ((30, 50), (75, 115), (125, 175), (200, 310), (330, 365), (390, 420), (600, 720), (780, 900))
+WINDOWS = (
+    (30, 50),
+    (75, 115),
+    (125, 175),
+    (200, 310),
+    (330, 365),
+    (390, 420),
+    (600, 720),
+    (780, 900),
+)
 ZENITH = math.pi / 2
 
 
@@ -60,7 +79,8 @@ def windows(frequency):
 
 @pytest.mark.parametrize("site", ["green_bank", "chajnantor", "south_pole"])
 def test_opacity_agrees_with_am_in_every_window(site):
-    # am's spectra here are sampled at points, ours are means of cells: compare medians, which skip the narrow lines
+    # am's spectra here are sampled at points, ours are means of cells: compare medians, which skip
+    # the narrow lines
     file = reference(f"am_{site}.npz")
     for h2o, tau in zip(file["h2o_vmr"], file["tau_zenith"], strict=True):
         got = spectrum(layers(file, h2o), ZENITH)
@@ -84,7 +104,9 @@ def test_cell_means_agree_with_am_run_at_50_mhz(name):
     got = spectrum(layers(file, file["h2o_vmr"]), ZENITH)
     k = at(got.frequency, file)
     for window in windows(got.frequency):
-        assert got.brightness[window].mean() == pytest.approx(file["trj_zenith_cell_K"][k][window].mean(), rel=5e-3)
+        assert got.brightness[window].mean() == pytest.approx(
+            file["trj_zenith_cell_K"][k][window].mean(), rel=5e-3
+        )
         assert np.median(abs(got.opacity[window] / file["tau_zenith_cell"][k][window] - 1)) < 0.01
 
 
@@ -96,7 +118,9 @@ def test_slant_brightness_agrees_with_am():
         assert got.brightness[window].mean() == pytest.approx(want[window].mean(), rel=5e-3)
 
 
-@pytest.mark.parametrize("name", ["am_chajnantor_july_el10.npz", "am_summit_january.npz", "am_green_bank_july_el05.npz"])
+@pytest.mark.parametrize(
+    "name", ["am_chajnantor_july_el10.npz", "am_summit_january.npz", "am_green_bank_july_el05.npz"]
+)
 def test_dry_wet_and_low_air_agrees_with_am_in_every_window(name):
     # 10 deg over 0.3 mm: ozone's lines saturate there, narrower than a cell
     file = reference(name)
@@ -104,21 +128,43 @@ def test_dry_wet_and_low_air_agrees_with_am_in_every_window(name):
     for window in windows(got.frequency):
         assert np.median(abs(got.opacity[window] / file["tau_zenith_cell"][window] - 1)) < 0.005
         assert np.median(abs(got.brightness[window] / file["trj_cell_K"][window] - 1)) < 0.005
-        assert got.brightness[window].mean() == pytest.approx(file["trj_cell_K"][window].mean(), rel=5e-3)
+        assert got.brightness[window].mean() == pytest.approx(
+            file["trj_cell_K"][window].mean(), rel=5e-3
+        )
 
 
-@pytest.mark.parametrize("name", ["am_chajnantor_july_el10.npz", "am_summit_january.npz", "am_green_bank_july_el05.npz"])
 @pytest.mark.parametrize(
-    ("low", "high"), [(78, 108), (66, 118), (128, 172), (175, 192), (180, 187), (200, 270), (315, 335), (330, 370), (540, 574)]
+    "name", ["am_chajnantor_july_el10.npz", "am_summit_january.npz", "am_green_bank_july_el05.npz"]
+)
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        (78, 108),
+        (66, 118),
+        (128, 172),
+        (175, 192),
+        (180, 187),
+        (200, 270),
+        (315, 335),
+        (330, 370),
+        (540, 574),
+    ],
 )
 def test_band_means_agree_with_am(name, low, high):
     file = reference(name)
     air = layers(file, file["h2o_vmr"])
-    transfer = BandTransfer(Band(name="flat", low=f"{low} GHz", high=f"{high} GHz"), replace(air, height=plane(air)))
-    emitted, log_transmission, _ = transfer(air.pwv, [math.radians(float(file["elevation_deg"]))])[0]
+    transfer = BandTransfer(
+        Band(name="flat", low=f"{low} GHz", high=f"{high} GHz"), replace(air, height=plane(air))
+    )
+    emitted, log_transmission, _ = transfer(air.pwv, [math.radians(float(file["elevation_deg"]))])[
+        0
+    ]
     edges = np.append(file["freq_GHz"] - 0.25, file["freq_GHz"][-1] + 0.25)
     running = lambda y: np.interp([low, high], edges, np.append(0, np.cumsum(y)) * 0.5)  # noqa: E731
-    want, passed = (np.diff(running(file[key].astype(float)))[0] / (high - low) for key in ("trj_cell_K", "transmission_cell"))
+    want, passed = (
+        np.diff(running(file[key].astype(float)))[0] / (high - low)
+        for key in ("trj_cell_K", "transmission_cell")
+    )
     assert emitted == pytest.approx(want, rel=5e-3)
     assert math.exp(log_transmission) == pytest.approx(passed, rel=0.02, abs=1e-3)
 
@@ -129,7 +175,13 @@ def plane(air):
 
 
 def test_airmass_of_a_profile_at_5_deg_is_the_ray_integral():
-    site = Site(name="gb", latitude="38.43 deg", longitude="-79.84 deg", altitude="825 m", climatology="green_bank")
+    site = Site(
+        name="gb",
+        latitude="38.43 deg",
+        longitude="-79.84 deg",
+        altitude="825 m",
+        climatology="green_bank",
+    )
     air = profile(site, Instant.parse("2024-07-25T07:00:00Z"))
     e, top = math.radians(5), air.height[-1]
     ground = EARTH_RADIUS + air.altitude
@@ -137,10 +189,18 @@ def test_airmass_of_a_profile_at_5_deg_is_the_ray_integral():
         (lambda h: air.at(h).vapour_density, air.layers.molecules * air.layers.h2o),
         (lambda h: air.at(h).pressure / air.at(h).temperature, air.layers.molecules),
     ):
-        s = np.linspace(0, math.sqrt((ground + top) ** 2 - (ground * math.cos(e)) ** 2) - ground * math.sin(e), 400_001)[:-1]
-        h = np.sqrt(ground**2 + s**2 + 2 * ground * s * math.sin(e)) - ground  # along the straight ray, by the cosine rule
+        s = np.linspace(
+            0,
+            math.sqrt((ground + top) ** 2 - (ground * math.cos(e)) ** 2) - ground * math.sin(e),
+            400_001,
+        )[:-1]
+        h = (
+            np.sqrt(ground**2 + s**2 + 2 * ground * s * math.sin(e)) - ground
+        )  # along the straight ray, by the cosine rule
         vertical = np.linspace(0, top, 400_001)
-        want = np.trapezoid(density(np.minimum(h, top)), s) / np.trapezoid(density(vertical), vertical)
+        want = np.trapezoid(density(np.minimum(h, top)), s) / np.trapezoid(
+            density(vertical), vertical
+        )
         airmass = (got * air.layers.airmass(e)).sum() / got.sum()
         assert airmass == pytest.approx(want, rel=2e-3)
 
@@ -160,19 +220,33 @@ def test_ozone_and_dry_air_are_there():
 
 def simple(n=20, temperature=250.0):
     pressure = np.append(1e5 * 0.7 ** np.arange(n), 0.0)
-    return Layers(pressure, np.full(n + 1, temperature), np.full(n, 2e-3), np.full(n, 1e-7), np.linspace(0, 60e3, n + 1))
+    return Layers(
+        pressure,
+        np.full(n + 1, temperature),
+        np.full(n, 2e-3),
+        np.full(n, 1e-7),
+        np.linspace(0, 60e3, n + 1),
+    )
 
 
 def test_isothermal_air_radiates_as_it_absorbs():
     air = simple()
-    got = spectrum(replace(air, o3=0 * air.o3), math.radians(40))  # without lines that are narrower than cells
+    got = spectrum(
+        replace(air, o3=0 * air.o3), math.radians(40)
+    )  # without lines that are narrower than cells
     want = rayleigh_jeans(got.frequency, 250.0) * -np.expm1(-got.slant_opacity)
     np.testing.assert_allclose(got.brightness, want, rtol=1e-12)
 
 
 @pytest.mark.parametrize("opacity", [1e-9, 1e-3, 0.3, 5.0, 200.0])
 def test_source_linear_in_opacity_is_integrated_exactly(opacity):
-    want = quad(lambda t: (280 - 60 * t / opacity) * math.exp(-t), 0, min(opacity, 60), epsabs=0, epsrel=1e-12)[0]
+    want = quad(
+        lambda t: (280 - 60 * t / opacity) * math.exp(-t),
+        0,
+        min(opacity, 60),
+        epsabs=0,
+        epsrel=1e-12,
+    )[0]
     got = emission(np.full((1, 1), opacity), np.array([[280.0], [220.0]]))
     assert got[0] == pytest.approx(want, rel=1e-9)
     split = emission(np.full((4, 1), opacity / 4), np.linspace(280, 220, 5)[:, None])
@@ -190,7 +264,9 @@ def test_transparent_and_opaque_air_give_no_nan():
 
 def test_background_is_attenuated_planck():
     got = spectrum(simple(), ZENITH, low=89e9, high=91e9)
-    np.testing.assert_allclose(got.cmb, rayleigh_jeans(got.frequency, 2.72548) * np.exp(-got.opacity), rtol=1e-14)
+    np.testing.assert_allclose(
+        got.cmb, rayleigh_jeans(got.frequency, 2.72548) * np.exp(-got.opacity), rtol=1e-14
+    )
     assert got.cmb.max() < 1.12
 
 
@@ -201,12 +277,21 @@ def test_airmass_is_one_at_zenith_and_spherical_below():
         ratio = air.airmass(math.radians(degrees)) * math.sin(math.radians(degrees))
         assert (ratio[:5] < high).all()
         assert (ratio[:5] > low).all()
-    # a shell's path by the sagitta: the chord to height h seen at elevation e is sqrt((R+h)^2 - R^2 cos^2 e) - R sin e
+    # a shell's path by the sagitta: the chord to height h seen at elevation e is sqrt((R+h)^2 - R^2
+    # cos^2 e) - R sin e
     e, h = math.radians(5), np.array([1999.0, 2001.0])
     chord = np.sqrt((EARTH_RADIUS + h) ** 2 - (EARTH_RADIUS * math.cos(e)) ** 2)
-    shell = Layers(np.array([1e5, 9.9e4, 9.8e4]), np.full(3, 280.0), np.zeros(2), np.zeros(2), np.array([0.0, 1999.0, 2001.0]))
+    shell = Layers(
+        np.array([1e5, 9.9e4, 9.8e4]),
+        np.full(3, 280.0),
+        np.zeros(2),
+        np.zeros(2),
+        np.array([0.0, 1999.0, 2001.0]),
+    )
     assert shell.airmass(e)[1] == pytest.approx((chord[1] - chord[0]) / 2, rel=1e-9)
-    assert 1.02 < 1 / math.sin(e) / shell.airmass(e)[1] < 1.07  # the 2-7 % of plane-parallel air at 5 deg
+    assert (
+        1.02 < 1 / math.sin(e) / shell.airmass(e)[1] < 1.07
+    )  # the 2-7 % of plane-parallel air at 5 deg
 
 
 def test_interpolation_passes_through_the_table():
@@ -215,7 +300,13 @@ def test_interpolation_passes_through_the_table():
     code = np.cumsum(file["difference"], axis=-1, dtype=np.uint16)
     for i, k in ((3, 1), (12, 4)):
         got = table.cross_sections(table.pressure[[i]], table.temperature[i, [k]])
-        want = np.exp(file["low"][:, 0, 0] + code[:, i, k] / 65535 * (file["high"] - file["low"])[:, 0, 0].astype(float)) * 1e-4
+        want = (
+            np.exp(
+                file["low"][:, 0, 0]
+                + code[:, i, k] / 65535 * (file["high"] - file["low"])[:, 0, 0].astype(float)
+            )
+            * 1e-4
+        )
         np.testing.assert_allclose(got.dry_air[0], want[0], rtol=1e-5)
         np.testing.assert_allclose(got.water[0], want[1], rtol=1e-5)
         np.testing.assert_allclose(got.water[0] + 0.02 * got.water_self[0], want[2], rtol=1e-5)
@@ -238,12 +329,16 @@ def test_water_scales_to_the_wanted_column(pwv):
 def test_limits_are_named():
     with pytest.raises(InputError, match=r"4\.00 deg is outside .* 4.5 to 90 deg"):
         spectrum(simple(), math.radians(4))
-    with pytest.raises(InputError, match=r"not inside the range of the absorption table, 0\.75 to 1000\.25 GHz"):
+    with pytest.raises(
+        InputError, match=r"not inside the range of the absorption table, 0\.75 to 1000\.25 GHz"
+    ):
         spectrum(simple(), ZENITH, low=900e9, high=1100e9)
     hot = simple(temperature=400.0)
     with pytest.raises(InputError, match=r"temperature of 400\.0 K .* limits there, \d+ to \d+ K"):
         spectrum(hot, ZENITH)
-    deep = Layers(np.array([3e5, 1e5]), np.full(2, 280.0), np.zeros(1), np.zeros(1), np.array([0.0, 1e4]))
+    deep = Layers(
+        np.array([3e5, 1e5]), np.full(2, 280.0), np.zeros(1), np.zeros(1), np.array([0.0, 1e4])
+    )
     with pytest.raises(InputError, match=r"pressure of 2000 hPa is above .* limit of 1158\.7 hPa"):
         spectrum(deep, ZENITH)
 
@@ -253,7 +348,9 @@ class Thin(AbsorptionTable):
 
     def cross_sections(self, pressure, temperature, cells=slice(None)):
         k = super().cross_sections(pressure, temperature, cells)
-        return CrossSections(k.dry_air / 2, k.water / 2, k.water_self / 2, k.ozone / 2, k.ozone_ratio)
+        return CrossSections(
+            k.dry_air / 2, k.water / 2, k.water_self / 2, k.ozone / 2, k.ozone_ratio
+        )
 
 
 def test_spectra_are_plugins(monkeypatch):
@@ -264,9 +361,12 @@ def test_spectra_are_plugins(monkeypatch):
     monkeypatch.setitem(spectra._registered, "thin", lambda: Thin(TABLE))
     monkeypatch.setitem(spectra._registered, "wrong", lambda: "no table")
     observation = SimpleNamespace(
-        site=sites.create("green_bank"), start=Instant.parse("2024-11-25T07:00:00Z"), seed=1, name="scan",
+        site=sites.create("green_bank"),
+        start=Instant.parse("2024-11-25T07:00:00Z"),
+        seed=1,
+        name="scan",
         instrument=instruments.create("mustang2"),
-    )  # fmt: skip
+    )
     depths = {}
     for name in ("am", "thin"):
         _, band = Models().weather(zonda.AtmosphereLayers(pwv="5 mm", spectra=name), observation)

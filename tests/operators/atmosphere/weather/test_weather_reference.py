@@ -1,4 +1,6 @@
-"""PWV, temperature and wind against ERA5 quantiles and TOAST's MERRA-2 statistics (shared/reference)."""
+"""PWV, temperature and wind against ERA5 quantiles and TOAST's MERRA-2 statistics
+(shared/reference).
+"""
 
 import math
 from dataclasses import replace
@@ -30,7 +32,9 @@ def instant(day, hour):
 
 @pytest.mark.parametrize("name", SITES)
 def test_era5_profiles(name):
-    """Errors stated in shared/atmosphere.md: PWV 3.6-11 %, T 0.2-0.5 K, wind 0.7-2 m/s (rms, by site, medians)."""
+    """Errors stated in shared/atmosphere.md: PWV 3.6-11 %, T 0.2-0.5 K, wind 0.7-2 m/s (rms, by
+    site, medians).
+    """
     era5, site = reference(f"weathergen_{name}.npz"), sites.create(name)
     got, want = {"t": [], "u": [], "v": [], "pwv": []}, {"t": [], "u": [], "v": [], "pwv": []}
     for i, day in enumerate(era5["year_day"]):
@@ -44,7 +48,10 @@ def test_era5_profiles(name):
                 wind_east=era5["wind_east_ms"][i, j, :kept, 2],
                 wind_north=era5["wind_north_ms"][i, j, :kept, 2],
             )
-            vapour = (era5["water_vapor_raw_kg_m3"][i, j, :, 2] * era5["rh_water_to_mixed_correction"][i, j])[:kept]
+            vapour = (
+                era5["water_vapor_raw_kg_m3"][i, j, :, 2]
+                * era5["rh_water_to_mixed_correction"][i, j]
+            )[:kept]
             for store, c, density in ((got, column, None), (want, truth, vapour)):
                 if density is None:
                     density = c.h2o * c.pressure / (461.52 * c.temperature)
@@ -55,7 +62,10 @@ def test_era5_profiles(name):
                 store["t"].append(c.temperature[low])
                 store["u"].append(c.wind_east[low])
                 store["v"].append(c.wind_north[low])
-    error = {k: np.concatenate([np.atleast_1d(a) - b for a, b in zip(got[k], want[k], strict=True)]) for k in ("t", "u", "v")}
+    error = {
+        k: np.concatenate([np.atleast_1d(a) - b for a, b in zip(got[k], want[k], strict=True)])
+        for k in ("t", "u", "v")
+    }
     rms = {k: float(np.sqrt(np.mean(e**2))) for k, e in error.items()}
     assert rms["t"] < 0.9  # 0.8 K at the worst site (data/README.md)
     assert max(rms["u"], rms["v"]) < 2.0
@@ -66,39 +76,55 @@ def test_era5_profiles(name):
 
 @pytest.mark.parametrize("name", SITES)
 def test_spread_of_the_water_is_era5s(name):
-    """The log-normal width of ERA5's own columns between their outer quantiles, over the year: within 20 % (docs/weather.md)."""
+    """The log-normal width of ERA5's own columns between their outer quantiles, over the year:
+    within 20 % (docs/weather.md).
+    """
     era5, site = reference(f"weathergen_{name}.npz"), sites.create(name)
     quantiles, tcwv = era5["quantile"], era5["tcwv_mm"]
     width = NormalDist().inv_cdf(float(quantiles[-1])) - NormalDist().inv_cdf(float(quantiles[0]))
     want = np.log(tcwv[..., -1] / tcwv[..., 0]) / width
-    got = [[profile(site, instant(d, h)).distribution.sigma for h in era5["utc_hour"]] for d in era5["year_day"]]
+    got = [
+        [profile(site, instant(d, h)).distribution.sigma for h in era5["utc_hour"]]
+        for d in era5["year_day"]
+    ]
     assert np.mean(got) == pytest.approx(want.mean(), rel=0.2)
 
 
 @pytest.mark.parametrize("name", ["green_bank", "south_pole"])
 def test_quantiles_of_the_water_are_era5s(name):
-    """Of ERA5's own columns, relative to their median, rms over the year and the hours: 12 % at 5 and 95 %, 8 % at 29 and 71 %.
+    """Of ERA5's own columns, relative to their median, rms over the year and the hours: 12 % at 5
+    and 95 %, 8 % at 29 and 71 %.
 
     A log-normal law with one width for both sides misses 16 % at Green Bank.
     """
     era5, site = reference(f"weathergen_{name}.npz"), sites.create(name)
-    laws = [[profile(site, instant(d, h)).distribution for h in era5["utc_hour"]] for d in era5["year_day"]]
+    laws = [
+        [profile(site, instant(d, h)).distribution for h in era5["utc_hour"]]
+        for d in era5["year_day"]
+    ]
     for k, limit in ((0, 0.12), (1, 0.08), (3, 0.08), (4, 0.12)):
         want = np.log(era5["tcwv_mm"][..., k] / era5["tcwv_mm"][..., 2])
-        got = [[np.log(law.at(float(era5["quantile"][k])) / law.median) for law in row] for row in laws]
+        got = [
+            [np.log(law.at(float(era5["quantile"][k])) / law.median) for law in row] for row in laws
+        ]
         assert np.sqrt(np.mean((got - want) ** 2)) < limit
 
 
 def test_air_on_the_antarctic_ground_is_era5s():
     """Within 1 K (rms over the year): the inversion, thinner than pressure levels, is there."""
     era5, site = reference("weathergen_south_pole.npz"), sites.create("south_pole")
-    got = [[profile(site, instant(d, h)).temperature[0] for h in era5["utc_hour"]] for d in era5["year_day"]]
+    got = [
+        [profile(site, instant(d, h)).temperature[0] for h in era5["utc_hour"]]
+        for d in era5["year_day"]
+    ]
     want = era5["surface_temperature_K"][..., 2]
     assert np.sqrt(np.mean((got - want) ** 2)) < 1.0
 
 
 def test_typical_wind_has_era5s_median_speed():
-    """At 96 dates and hours over Chajnantor; the vector of medians is 2 m/s slow there, the typical speed within 1 m/s (rms)."""
+    """At 96 dates and hours over Chajnantor; the vector of medians is 2 m/s slow there, the typical
+    speed within 1 m/s (rms).
+    """
     era5 = reference("era5_chajnantor_quantiles.npz")
     error, plain = [], []
     for i, day in enumerate(era5["year_day"]):
@@ -106,7 +132,11 @@ def test_typical_wind_has_era5s_median_speed():
             air = profile(sites.create("chajnantor"), instant(day, hour))
             heights = era5["height_m"][i, j, 2] - 5064
             low = (heights > 0) & (heights < 15e3)
-            speed = np.interp(heights[low], air.height, np.hypot(air.typical_wind.wind_east, air.typical_wind.wind_north))
+            speed = np.interp(
+                heights[low],
+                air.height,
+                np.hypot(air.typical_wind.wind_east, air.typical_wind.wind_north),
+            )
             median = np.interp(heights[low], air.height, np.hypot(air.wind_east, air.wind_north))
             error.append(speed - era5["wind_speed_ms"][i, j, 2, low])
             plain.append(median - era5["wind_speed_ms"][i, j, 2, low])
@@ -118,11 +148,12 @@ def test_typical_wind_has_era5s_median_speed():
 
 @pytest.mark.parametrize("name", ["atacama", "south_pole"])
 def test_merra2(name):
-    """TOAST's MERRA-2 statistics, at MERRA-2's own ground: for Atacama 588 hPa, lower and wetter than any telescope there.
+    """TOAST's MERRA-2 statistics, at MERRA-2's own ground: for Atacama 588 hPa, lower and wetter
+    than any telescope there.
 
-    The site is put where our profile has that pressure. MERRA-2 and ERA5 differ by 10-20 % in dry air, so PWV is held to 25 % in
-    the mean over the year and 40 % in each month; the 10 m temperature to 4 K in the mean (ERA5's own is 3 K warmer than MERRA-2
-    at the South Pole).
+    The site is put where our profile has that pressure. MERRA-2 and ERA5 differ by 10-20 % in dry
+    air, so PWV is held to 25 % in the mean over the year and 40 % in each month; the 10 m
+    temperature to 4 K in the mean (ERA5's own is 3 K warmer than MERRA-2 at the South Pole).
     """
     merra = reference("toast_merra2_weather.npz")
     half = int(np.argmin(abs(merra["probability"] - 0.5)))
@@ -134,7 +165,11 @@ def test_merra2(name):
         for k, hour in enumerate(range(0, 24, 3)):
             when = Instant.parse(f"2023-{month + 1:02d}-15T{hour:02d}:00Z")
             column = climatology_column(base, when)
-            ground = np.interp(-np.log(merra[f"{name}_PS_Pa"][month, hour]), -np.log(column.pressure), column.height)
+            ground = np.interp(
+                -np.log(merra[f"{name}_PS_Pa"][month, hour]),
+                -np.log(column.pressure),
+                column.height,
+            )
             site = base.model_copy(update={"altitude": float(ground)})
             air = profile(site, when)
             pwv[month, k], cold[month, k] = air.pwv * 1e3, air.temperature[0]

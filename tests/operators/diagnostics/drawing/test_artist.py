@@ -85,7 +85,10 @@ def _two(artist):
     """Their numbers: two tasks at a time, until both have answered."""
     patience, found = time.monotonic() + 30, set()
     while time.monotonic() < patience and len(found) < 2:
-        both = [artist.submit(subprocess.check_output, ["sh", "-c", "sleep 0.2; echo $PPID"]) for _ in range(2)]
+        both = [
+            artist.submit(subprocess.check_output, ["sh", "-c", "sleep 0.2; echo $PPID"])
+            for _ in range(2)
+        ]
         found |= {int(answer.result(30)) for answer in both}
     return found
 

@@ -1,4 +1,6 @@
-"""The map that is drawn is the map: smoothing and noise figures against `MapProduct`'s, in single precision."""
+"""The map that is drawn is the map: smoothing and noise figures against `MapProduct`'s, in single
+precision.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ import numpy as np
 import pytest
 
 from zonda.core.maps.map_product import MapProduct
-from zonda.operators.diagnostics.drawing.pictures import Style, draw_coverage, draw_input, draw_map, draw_noise
+from zonda.operators.diagnostics.drawing.pictures import (
+    Style,
+    draw_coverage,
+    draw_input,
+    draw_map,
+    draw_noise,
+)
 from zonda.operators.diagnostics.drawing.png import png_of
 from zonda.operators.diagnostics.plot_operators import _flat, _input
 from zonda.operators.maps.grid import tangent_wcs
@@ -35,10 +43,15 @@ def product():
 
 
 def test_smoothing_is_that_of_the_map(product):
-    mine, there = _flat(product, "signal", "half_difference").smoothed(9 * ARCSEC), product.smoothed(9 * ARCSEC)
+    mine, there = (
+        _flat(product, "signal", "half_difference").smoothed(9 * ARCSEC),
+        product.smoothed(9 * ARCSEC),
+    )
     for plane in ("signal", "half_difference"):
         # float32: sums of some 300 terms about zero, each rounded at 6e-8 of 1e-4 K
-        np.testing.assert_allclose(mine.planes[plane], getattr(there, plane), rtol=0, atol=3e-10, equal_nan=True)
+        np.testing.assert_allclose(
+            mine.planes[plane], getattr(there, plane), rtol=0, atol=3e-10, equal_nan=True
+        )
     assert mine.smoothed_by == there.smoothed_by
 
 
@@ -49,7 +62,13 @@ def test_the_stated_noise_is_that_of_the_map(product):
 
 
 @pytest.mark.parametrize(
-    ("key", "behind"), [("map", ""), ("map_f150", " (f150)"), ("map_f150_Q", " (f150 Q)"), ("healpix_f090", " (healpix f090)")]
+    ("key", "behind"),
+    [
+        ("map", ""),
+        ("map_f150", " (f150)"),
+        ("map_f150_Q", " (f150 Q)"),
+        ("healpix_f090", " (healpix f090)"),
+    ],
 )
 def test_titles_say_of_which_band_and_stokes_parameter_a_picture_is(product, key, behind):
     flat, style = _flat(product, "signal"), Style(0.0, 60 * ARCSEC, 0.0)
@@ -62,7 +81,10 @@ def test_titles_say_of_which_band_and_stokes_parameter_a_picture_is(product, key
     noise = f"Noise: {half.difference}{behind}, not smoothed"
     assert titles[:2] == [f"Map{behind}, not smoothed", noise]
     assert draw_noise(f"noise_{key}", {"half_difference": half}, style)[0].title == f"Noise{behind}"
-    assert "in 1 pixels of 1″ x 2″." in draw_coverage(f"coverage_{key}", flat, 1, 1, (2 * ARCSEC, ARCSEC))[0].caption
+    assert (
+        "in 1 pixels of 1″ x 2″."
+        in draw_coverage(f"coverage_{key}", flat, 1, 1, (2 * ARCSEC, ARCSEC))[0].caption
+    )
     assert titles[2].endswith(f"per beam{behind}") or titles[2] == f"Samples per pixel{behind}"
 
 
@@ -76,7 +98,9 @@ def test_the_coverage_of_a_map_with_a_pole_in_it_is_drawn(product):
 
 def test_an_input_with_a_pole_in_it_is_drawn():
     wcs = tangent_wcs((1.3, np.pi / 2), 2 * ARCSEC, (30, 40))
-    image: Any = SimpleNamespace(values=np.ones((30, 40)), header=wcs.to_header(), wcs=wcs.astropy())
+    image: Any = SimpleNamespace(
+        values=np.ones((30, 40)), header=wcs.to_header(), wcs=wcs.astropy()
+    )
     assert png_of(draw_input(*_input("input", image))[0].ax).startswith(b"\x89PNG")
 
 
@@ -87,9 +111,18 @@ def test_a_healpix_map_keeps_its_own_noise():
     n = pixels.size
     signal = np.random.default_rng(1).normal(0, 1e-3, n)
     product = MapProduct(
-        signal, np.full(n, 5), np.full(n, 5.0), np.full(n, 1e-3), None, None, centre=(np.radians(75.0), np.radians(20.0)),
-        pixel=healpy.nside2resol(1024), nside=1024, pixels=np.sort(pixels), fwhm=9 * ARCSEC,
-    )  # fmt: skip
+        signal,
+        np.full(n, 5),
+        np.full(n, 5.0),
+        np.full(n, 1e-3),
+        None,
+        None,
+        centre=(np.radians(75.0), np.radians(20.0)),
+        pixel=healpy.nside2resol(1024),
+        nside=1024,
+        pixels=np.sort(pixels),
+        fwhm=9 * ARCSEC,
+    )
     flat = _flat(product, "signal", style=Style(None, np.radians(0.4), 0.1))
     assert not flat.smooth
     assert flat.central_rms("signal", np.radians(0.2)) == product.rms(np.radians(0.2))
@@ -97,11 +130,9 @@ def test_a_healpix_map_keeps_its_own_noise():
 
 def test_the_process_that_draws_imports_little():
     code = (
-        "import sys\n"
-        "from zonda.operators.diagnostics.drawing import artist, pictures\n"
-        "assert 'matplotlib' not in sys.modules\n"
-        "artist._prepare()\n"
-        "heavy = {'numba', 'scipy', 'astropy', 'pydantic', 'healpy', 'yaml', 'matplotlib.pyplot'}\n"
-        "assert 'matplotlib.figure' in sys.modules and not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+        "import sys\nfrom zonda.operators.diagnostics.drawing import artist, pictures\nassert"
+        " 'matplotlib' not in sys.modules\nartist._prepare()\nheavy = {'numba', 'scipy', 'astropy',"
+        " 'pydantic', 'healpy', 'yaml', 'matplotlib.pyplot'}\nassert 'matplotlib.figure' in"
+        " sys.modules and not heavy & set(sys.modules), heavy & set(sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

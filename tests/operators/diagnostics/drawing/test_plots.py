@@ -56,17 +56,30 @@ def values():
 
 @pytest.mark.parametrize(
     ("kind", "steps", "dec"),
-    [("TAN", (8.0, 4.0), 20.0), ("SIN", (3.0, 6.0), 0.0), ("CAR", (4.0, 4.0), 60.0), ("TAN", (4.0, 4.0), 20.0)],
+    [
+        ("TAN", (8.0, 4.0), 20.0),
+        ("SIN", (3.0, 6.0), 0.0),
+        ("CAR", (4.0, 4.0), 60.0),
+        ("TAN", (4.0, 4.0), 20.0),
+    ],
 )
 def test_pictures_have_the_proportions_of_the_sky(kind, steps, dec):
-    """A field as wide as it is high is drawn so, and the beam is a circle on the paper, whatever the pixels' shape."""
+    """A field as wide as it is high is drawn so, and the beam is a circle on the paper, whatever
+    the pixels' shape.
+    """
     dx, dy = steps
     across = dx * (np.cos(np.radians(dec)) if kind == "CAR" else 1.0)
     shape = round(400 / dy), round(400 / across)
     wcs = WCS(naxis=2)
-    wcs.wcs.ctype, wcs.wcs.crval = [f"RA---{kind}", f"DEC--{kind}"], [75.0, 0.0 if kind == "CAR" else dec]
+    wcs.wcs.ctype, wcs.wcs.crval = (
+        [f"RA---{kind}", f"DEC--{kind}"],
+        [75.0, 0.0 if kind == "CAR" else dec],
+    )
     wcs.wcs.cdelt = [-dx / 3600, dy / 3600]
-    wcs.wcs.crpix = [shape[1] / 2 + 0.5, shape[0] / 2 + 0.5 - (dec * 3600 / dy if kind == "CAR" else 0)]
+    wcs.wcs.crpix = [
+        shape[1] / 2 + 0.5,
+        shape[0] / 2 + 0.5 - (dec * 3600 / dy if kind == "CAR" else 0),
+    ]
     ax = plot_map(np.random.default_rng(1).standard_normal(shape), wcs, fwhm=40 * ARCSEC)
     box = ax.get_window_extent()
     assert box.width / box.height == pytest.approx(1.0, rel=0.02)
@@ -80,13 +93,21 @@ def test_pictures_have_the_proportions_of_the_sky(kind, steps, dec):
 def spectrum():
     f = np.linspace(0.01, 50, 2000)
     white, pink = np.full(2000, 6e-6), 6e-6 * 0.5 / f
-    return Spectrum(f, {"signal": white + pink, "white": white, "pink": pink}, 100.0, 6e-6, "PowerSpectrum", 16)
+    return Spectrum(
+        f, {"signal": white + pink, "white": white, "pink": pink}, 100.0, 6e-6, "PowerSpectrum", 16
+    )
 
 
 @pytest.fixture
 def stream():
     seconds = np.arange(1000) / 50
-    return TimeStream(seconds, {"signal": np.array([np.sin(seconds), np.cos(seconds)])}, ["d0", "d1"], "scan", "TimeStreams")
+    return TimeStream(
+        seconds,
+        {"signal": np.array([np.sin(seconds), np.cos(seconds)])},
+        ["d0", "d1"],
+        "scan",
+        "TimeStreams",
+    )
 
 
 @pytest.fixture
@@ -174,7 +195,9 @@ def test_axes_are_named_after_the_frame(values, wcs, plain, kinds, frame, names)
     wcs.wcs.set()
     ax = plot_map(values, wcs, ax=Figure().add_subplot() if plain else None)
     if plain:
-        assert (ax.get_xlabel(), ax.get_ylabel()) == tuple(f"{n} offset [arcmin]" for n in names[:2])
+        assert (ax.get_xlabel(), ax.get_ylabel()) == tuple(
+            f"{n} offset [arcmin]" for n in names[:2]
+        )
     else:
         assert (ax.get_xlabel(), ax.get_ylabel()) == tuple(f"{n} ({names[2]})" for n in names[:2])
 
@@ -192,14 +215,21 @@ def test_a_map_with_the_mean_emission_in_it_shows_its_variation(wcs):
     low, high = drawn(plot_map(values, wcs, limit=78.8)).images[0].get_clim()
     assert 78.59 < low < 78.61
     assert 78.79 < high < 78.81
-    assert drawn(plot_map(np.full((50, 60), 78.7), wcs)).images[0].get_clim() == (0.0, 78.7)  # no variation at all
+    assert drawn(plot_map(np.full((50, 60), 78.7), wcs)).images[0].get_clim() == (
+        0.0,
+        78.7,
+    )  # no variation at all
 
 
 def test_colours_diverge_only_about_zero(wcs):
-    """A sky of one sign has a scale from zero, however small its source; one about zero has white at zero."""
+    """A sky of one sign has a scale from zero, however small its source; one about zero has white
+    at zero.
+    """
     y, x = np.indices((50, 60))
     blob = 1e-3 * np.exp(-((x - 30) ** 2 + (y - 25) ** 2) / 40)
-    noise = 1e-5 * np.random.default_rng(1).normal(size=blob.shape)  # far below a twentieth of the peak
+    noise = 1e-5 * np.random.default_rng(1).normal(
+        size=blob.shape
+    )  # far below a twentieth of the peak
     for sky in (blob, blob + noise, np.where(blob == blob.max(), 1e-3, 0.0)):
         image = drawn(plot_map(sky, wcs)).images[0]
         assert image.cmap.name == "inferno"
@@ -214,7 +244,10 @@ def test_colours_diverge_only_about_zero(wcs):
 
 
 def test_a_repeated_track_does_not_hide_the_first(make_observation):
-    widths = [line.get_linewidth() for line in plot_scan([make_observation(500, k) for k in range(3)]).lines]
+    widths = [
+        line.get_linewidth()
+        for line in plot_scan([make_observation(500, k) for k in range(3)]).lines
+    ]
     assert widths == sorted(widths, reverse=True)
     assert widths[0] > 1.5 * widths[-1]
 
@@ -222,7 +255,12 @@ def test_a_repeated_track_does_not_hide_the_first(make_observation):
 def test_pictures_say_after_which_step_they_were_taken(data, products, spectrum, stream):
     steps = ["Efficiency", "PowerSpectrum", "TimeStreams", "HighpassFilter", "After"]
     data.provenance["operators"] = [(s, {"After": "TimeStreams"}.get(s, s), {}) for s in steps]
-    data.products.update({"spectrum": replace(spectrum, label="PowerSpectrum"), "time_streams": replace(stream, label="After")})
+    data.products.update(
+        {
+            "spectrum": replace(spectrum, label="PowerSpectrum"),
+            "time_streams": replace(stream, label="After"),
+        }
+    )
     Plots().finalize(data)
     by_name = {p.name: p.caption for p in data.products["pictures"]}
     assert "after Efficiency" in by_name["power_spectra"]
@@ -268,20 +306,33 @@ def test_a_track_starts_at_its_offset(make_observation):
 
 def test_no_window_system_and_no_global_state():
     code = (
-        "import numpy as np, sys; from astropy.wcs import WCS; from zonda.operators.diagnostics.drawing.plots import plot_map\n"
-        "assert 'matplotlib' not in sys.modules\n"
-        "w = WCS(naxis=2); w.wcs.ctype = ['RA---TAN', 'DEC--TAN']\n"
-        "plot_map(np.zeros((4, 4)), w).figure.savefig('/dev/null', format='png')\n"
-        "assert 'matplotlib.pyplot' not in sys.modules"
+        "import numpy as np, sys; from astropy.wcs import WCS; from"
+        " zonda.operators.diagnostics.drawing.plots import plot_map\nassert 'matplotlib' not in"
+        " sys.modules\nw = WCS(naxis=2); w.wcs.ctype = ['RA---TAN',"
+        " 'DEC--TAN']\nplot_map(np.zeros((4, 4)), w).figure.savefig('/dev/null',"
+        " format='png')\nassert 'matplotlib.pyplot' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, env={"PATH": "", "MPLBACKEND": "tkagg", "HOME": "/tmp"})
+    subprocess.run(
+        [sys.executable, "-c", code],
+        check=True,
+        env={"PATH": "", "MPLBACKEND": "tkagg", "HOME": "/tmp"},
+    )
 
 
 def test_every_picture_is_written(data, products, make_observation):
     data.products.update(products)
     data.observations.append(make_observation(500))
     Plots().finalize(data)
-    names = {"input", "noiseless_map", "map", "noise_map", "coverage", "power_spectra", "tod", "scan"}
+    names = {
+        "input",
+        "noiseless_map",
+        "map",
+        "noise_map",
+        "coverage",
+        "power_spectra",
+        "tod",
+        "scan",
+    }
     assert {p.name for p in data.output.iterdir()} == {f"{n}.png" for n in names}
     for picture in data.products["pictures"]:
         assert picture.png.startswith(b"\x89PNG")
@@ -318,7 +369,9 @@ def test_a_second_process_draws_the_same(data, products, make_observation):
     assert all(answers.values())
     operator.finalize(data)
     assert operator._artist is None
-    assert sorted(data.products["pictures"], key=lambda p: p.name) == sorted(alone, key=lambda p: p.name)
+    assert sorted(data.products["pictures"], key=lambda p: p.name) == sorted(
+        alone, key=lambda p: p.name
+    )
 
 
 def test_what_the_second_process_fails_at_is_drawn_here(data, products):
@@ -365,7 +418,9 @@ def test_the_pixels_are_those_of_savefig(values, wcs):
     ],
 )
 def test_nothing_is_cut_off(picture, values, wcs, spectrum, stream, make_observation):
-    """Margins are fixed: all that is drawn lies within the picture, and no two tick labels of an axis overlap."""
+    """Margins are fixed: all that is drawn lies within the picture, and no two tick labels of an
+    axis overlap.
+    """
     from zonda.operators.diagnostics.transfer_function import Rings, Transfer
 
     hits = np.geomspace(1, 1e5, 3000).reshape(50, 60)
@@ -375,7 +430,11 @@ def test_nothing_is_cut_off(picture, values, wcs, spectrum, stream, make_observa
     if picture == "turned map":
         wcs.wcs.pc = [[0.7, -0.7], [0.7, 0.7]]
     if picture == "all-sky map":
-        wcs.wcs.ctype, wcs.wcs.cdelt, wcs.wcs.crval = ["RA---AIT", "DEC--AIT"], [-5.0, 5.0], [75.0, 0.0]
+        wcs.wcs.ctype, wcs.wcs.cdelt, wcs.wcs.crval = (
+            ["RA---AIT", "DEC--AIT"],
+            [-5.0, 5.0],
+            [75.0, 0.0],
+        )
     if picture == "strip":
         values = np.tile(values, (1, 20))
     if picture == "wide map":
@@ -385,8 +444,12 @@ def test_nothing_is_cut_off(picture, values, wcs, spectrum, stream, make_observa
     rings = Rings(np.sqrt(edges[1:] * edges[:-1]), ring, ring / 10, ring, ring, ring)
     ax = {
         "spectra": lambda: plot_spectra(spectrum),
-        "streams": lambda: plot_tod(replace(stream, streams={"signal": -1e3 + stream.streams["signal"]})),
-        "transfer function": lambda: plot_transfer(Transfer(rings, edges, "sky", 9 * ARCSEC, "T", "map"), title="T"),
+        "streams": lambda: plot_tod(
+            replace(stream, streams={"signal": -1e3 + stream.streams["signal"]})
+        ),
+        "transfer function": lambda: plot_transfer(
+            Transfer(rings, edges, "sky", 9 * ARCSEC, "T", "map"), title="T"
+        ),
         "scan": lambda: plot_scan([make_observation(500)]),
         "coverage": lambda: plot_coverage(hits, wcs, per_beam=0.3),
     }.get(picture, lambda: plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC))()
@@ -395,7 +458,10 @@ def test_nothing_is_cut_off(picture, values, wcs, spectrum, stream, make_observa
     width, height = canvas.get_width_height()
     everything = [*ax.figure.axes, *(child for axes in ax.figure.axes for child in axes.child_axes)]
     assert not any(
-        a.title.get_window_extent().overlaps(t.get_window_extent()) for a in everything for t in a.texts if a.get_title()
+        a.title.get_window_extent().overlaps(t.get_window_extent())
+        for a in everything
+        for t in a.texts
+        if a.get_title()
     )
     for axes in ax.figure.axes:
         box = axes.get_tightbbox(canvas.get_renderer(), for_layout_only=True)
@@ -404,9 +470,13 @@ def test_nothing_is_cut_off(picture, values, wcs, spectrum, stream, make_observa
             for axis, side in ((axes.xaxis, 0), (axes.yaxis, 1)):
                 labels = [t.get_window_extent() for t in axis.get_ticklabels() if t.get_text()]
                 spans = sorted((b.intervalx if side == 0 else b.intervaly).tolist() for b in labels)
-                assert all(first[1] < second[0] for first, second in itertools.pairwise(spans)), axes
+                assert all(first[1] < second[0] for first, second in itertools.pairwise(spans)), (
+                    axes
+                )
             written = [t.get_window_extent() for t in axes.texts]
-            assert not any(a.overlaps(b) for a, b in itertools.combinations(written, 2)), [t.get_text() for t in axes.texts]
+            assert not any(a.overlaps(b) for a, b in itertools.combinations(written, 2)), [
+                t.get_text() for t in axes.texts
+            ]
     assert "$" not in " ".join(t.get_text() for t in ax.figure.findobj(Text))
 
 
@@ -417,12 +487,21 @@ def test_astropys_own_axes_can_be_drawn_on(values, wcs):
 
 
 @pytest.mark.parametrize(
-    ("shape", "stretched"), [((60, 1500), "Dec stretched 3.1×"), ((600, 40), "stretched 3.7×"), ((50, 200), "")]
+    ("shape", "stretched"),
+    [((60, 1500), "Dec stretched 3.1×"), ((600, 40), "stretched 3.7×"), ((50, 200), "")],
 )
 def test_a_strip_fills_its_frame(shape, stretched, wcs):
-    """Its image is at least an inch high and wide, its colour bar beside the longer edge; the axes say if it is stretched."""
+    """Its image is at least an inch high and wide, its colour bar beside the longer edge; the axes
+    say if it is stretched.
+    """
     wcs.wcs.crpix = [shape[1] / 2, shape[0] / 2]
-    ax = drawn(plot_map(np.random.default_rng(1).normal(size=shape), wcs, title="A title that is longer than the strip is wide"))
+    ax = drawn(
+        plot_map(
+            np.random.default_rng(1).normal(size=shape),
+            wcs,
+            title="A title that is longer than the strip is wide",
+        )
+    )
     box, whole = ax.get_window_extent(), ax.figure.bbox
     assert min(box.width, box.height) >= ax.figure.dpi
     assert max(box.width / whole.width, box.height / whole.height) > 0.75
@@ -439,15 +518,25 @@ def test_a_map_is_shown_where_it_has_samples(values, wcs):
     hits = np.zeros(values.shape, int)
     hits[30:40, 5:20] = 3
     product = MapProduct(
-        values, hits, hits * 1.0, values, None, wcs.to_header(), centre=(np.radians(75.0), np.radians(20.0)),
-        pixel=4 * ARCSEC, fwhm=9 * ARCSEC, sample_rate=50.0,
-    )  # fmt: skip
+        values,
+        hits,
+        hits * 1.0,
+        values,
+        None,
+        wcs.to_header(),
+        centre=(np.radians(75.0), np.radians(20.0)),
+        pixel=4 * ARCSEC,
+        fwhm=9 * ARCSEC,
+        sample_rate=50.0,
+    )
     whole = _flat(product, "signal")
     cut = whole.cropped()
     assert cut.hits.shape == (12, 17)  # a hundredth of 15 pixels is one
     np.testing.assert_array_equal(cut.planes["signal"], values[29:41, 4:21].astype(np.float32))
     np.testing.assert_allclose(cut.axes.world(1, 1), whole.axes.world(5, 30), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(WCS(cut.header).wcs_pix2world(1, 1, 0), whole.axes.world(5, 30), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        WCS(cut.header).wcs_pix2world(1, 1, 0), whole.axes.world(5, 30), rtol=0, atol=1e-9
+    )
 
 
 def test_coverage_in_seconds_per_beam(wcs):
@@ -460,14 +549,18 @@ def test_coverage_in_seconds_per_beam(wcs):
     FigureCanvasAgg(ax.figure).draw()
     assert samples.get_ylabel() == "samples per pixel"
     assert samples.get_ylim() == pytest.approx((0, 3000))
-    each = np.linspace(0.25, 0.3, 3000).reshape(50, 60)  # pixels of different size: no second scale can be true
+    each = np.linspace(0.25, 0.3, 3000).reshape(
+        50, 60
+    )  # pixels of different size: no second scale can be true
     ax = drawn(plot_coverage(hits, wcs, per_beam=each))
     np.testing.assert_allclose(np.ma.getdata(ax.images[0].get_array()), hits * each, rtol=1e-6)
     assert not ax.images[0].colorbar.ax.child_axes
 
 
 def test_many_scans_take_few_points(make_observation):
-    """A track is drawn with a point per pixel or so, however finely it was sampled; it passes where the samples were."""
+    """A track is drawn with a point per pixel or so, however finely it was sampled; it passes where
+    the samples were.
+    """
     observation = make_observation(60000)
     x, y = plot_scan([observation]).lines[0].get_data()
     ra0, dec0 = observation.centre
@@ -522,7 +615,9 @@ def test_a_healpix_map_is_drawn(data):
 
 def healpix(nside, pixels, centre, frame):
     ones, side = np.ones(len(pixels)), np.sqrt(np.pi / 3) / nside
-    return MapProduct(ones, ones, ones, ones, None, None, centre, side, frame, nside=nside, pixels=pixels)
+    return MapProduct(
+        ones, ones, ones, ones, None, None, centre, side, frame, nside=nside, pixels=pixels
+    )
 
 
 def test_a_flat_healpix_map_shows_each_pixel_in_its_place():
@@ -531,7 +626,11 @@ def test_a_flat_healpix_map_shows_each_pixel_in_its_place():
     nside = 512
     pixels = np.sort(hp.query_disc(nside, hp.ang2vec(266.0, -29.0, lonlat=True), np.radians(1.0)))
     centre = (np.radians(266.0), np.radians(-29.0))
-    flat, wcs = on_plane(healpix(nside, pixels, centre, "galactic"), {"signal": pixels * 1.0, "hits": pixels * 0 + 1}, 300)
+    flat, wcs = on_plane(
+        healpix(nside, pixels, centre, "galactic"),
+        {"signal": pixels * 1.0, "hits": pixels * 0 + 1},
+        300,
+    )
     y, x = np.nonzero(flat["hits"])
     lon, lat = wcs.pixel_to_world_values(x, y)
     np.testing.assert_array_equal(flat["signal"][y, x], hp.ang2pix(nside, lon, lat, lonlat=True))
@@ -539,8 +638,12 @@ def test_a_flat_healpix_map_shows_each_pixel_in_its_place():
     assert np.isnan(flat["signal"][flat["hits"] == 0]).all()
     ny, nx = flat["hits"].shape
     assert max(nx, ny) == 300
-    np.testing.assert_allclose(wcs.pixel_to_world_values(nx / 2, ny / 2), (266.0, -29.0), atol=0.1)  # a pixel of the map
-    assert all(flat["hits"].any(axis=axis)[[6, -7]].all() for axis in (0, 1))  # it reaches as far as the pixels
+    np.testing.assert_allclose(
+        wcs.pixel_to_world_values(nx / 2, ny / 2), (266.0, -29.0), atol=0.1
+    )  # a pixel of the map
+    assert all(
+        flat["hits"].any(axis=axis)[[6, -7]].all() for axis in (0, 1)
+    )  # it reaches as far as the pixels
     assert wcs.wcs.ctype[0].startswith("GLON")
 
 
@@ -549,7 +652,9 @@ def test_a_healpix_map_of_half_the_sky_is_drawn():
 
     pixels = np.sort(hp.query_disc(32, hp.ang2vec(10.0, -60.0, lonlat=True), np.radians(100.0)))
     centre = (np.radians(10.0), np.radians(-60.0))
-    flat, wcs = on_plane(healpix(32, pixels, centre, "icrs"), {"signal": pixels * 1.0, "hits": pixels * 0 + 1}, 300)
+    flat, wcs = on_plane(
+        healpix(32, pixels, centre, "icrs"), {"signal": pixels * 1.0, "hits": pixels * 0 + 1}, 300
+    )
     assert set(flat["signal"][flat["hits"] > 0]) == set(pixels)
     assert wcs.wcs.ctype[0] == "RA---ZEA"
 
@@ -557,7 +662,9 @@ def test_a_healpix_map_of_half_the_sky_is_drawn():
 def test_a_healpix_map_without_hits_is_empty_on_the_plane():
     """As of a scan all of whose samples are flagged."""
     empty = np.zeros(0, np.int64)
-    flat, _ = on_plane(healpix(32, empty, (1.0, 0.3), "icrs"), {"signal": empty * 1.0, "hits": empty}, 50)
+    flat, _ = on_plane(
+        healpix(32, empty, (1.0, 0.3), "icrs"), {"signal": empty * 1.0, "hits": empty}, 50
+    )
     assert np.isnan(flat["signal"]).all()
     assert not flat["hits"].any()
 
@@ -581,19 +688,30 @@ def test_time_streams_are_kept_whole(make_observation, data):
     from zonda.core.data import Block
     from zonda.core.numerics.smooth import SmoothField
 
-    observation, operator = make_observation(5000), TimeStreams(streams=["signal", "pink"], detectors=3)
+    observation, operator = (
+        make_observation(5000),
+        TimeStreams(streams=["signal", "pink"], detectors=3),
+    )
     mean = SmoothField.constant(np.arange(19.0), 5000)
     signal = np.random.default_rng(3).normal(size=(19, 5000)).astype(np.float32)
     state = operator.prepare(observation)
     for rows in (slice(0, 16), slice(16, 19)):
         for columns in (slice(0, 2048), slice(2048, 5000)):
-            operator.exec(Block(observation, rows, columns, {"signal": signal[rows, columns]}, {"signal": mean}), state)
+            operator.exec(
+                Block(
+                    observation, rows, columns, {"signal": signal[rows, columns]}, {"signal": mean}
+                ),
+                state,
+            )
     operator.collect(data, observation, state)
     operator.finalize(data)
     kept = data.products["time_streams"]
     assert kept.names == ["d00", "d09", "d18"]
     np.testing.assert_allclose(
-        kept.streams["signal"], signal[[0, 9, 18]] + np.array([0.0, 9, 18])[:, None], rtol=1e-14, atol=1e-14
+        kept.streams["signal"],
+        signal[[0, 9, 18]] + np.array([0.0, 9, 18])[:, None],
+        rtol=1e-14,
+        atol=1e-14,
     )
     assert observation.tally.get("TimeStreams", "stream pink is absent at this step") == 1
     assert TimeStreams(observation=1).prepare(observation) is None

@@ -29,9 +29,15 @@ def figure(kind):
     x = np.linspace(1, 50, 80)
     if kind == "image":
         shown = ax.imshow(
-            np.ma.masked_less(np.outer(x, x), 30), cmap="viridis", vmax=2000, interpolation="nearest", aspect="auto"
+            np.ma.masked_less(np.outer(x, x), 30),
+            cmap="viridis",
+            vmax=2000,
+            interpolation="nearest",
+            aspect="auto",
         )
-        drawn.colorbar(shown, cax=drawn.add_axes((0.78, 0.25, 0.03, 0.5)), extend="max").set_label("value")
+        drawn.colorbar(shown, cax=drawn.add_axes((0.78, 0.25, 0.03, 0.5)), extend="max").set_label(
+            "value"
+        )
     elif kind == "log":
         ax.loglog(x, x**3)
         ax.grid(which="both")

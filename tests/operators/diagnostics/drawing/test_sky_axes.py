@@ -46,7 +46,9 @@ def test_positions_are_astropys(wcs):
     np.testing.assert_allclose((mine[0] - lon + 180) % 360, 180, rtol=0, atol=1e-11)
     np.testing.assert_allclose(mine[1], lat, rtol=0, atol=1e-11)
     assert repr(axes) == repr(SkyAxes.of(wcs.to_header()))
-    np.testing.assert_allclose(np.array(axes.scales), np.sqrt((wcs.pixel_scale_matrix**2).sum(axis=0)), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.array(axes.scales), np.sqrt((wcs.pixel_scale_matrix**2).sum(axis=0)), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("wcs", CASES)
@@ -56,14 +58,19 @@ def test_marks_are_where_the_round_values_are(wcs):
     assert set(marks) == {"bottom", "top", "left", "right"}
     for edge, ticks in marks.items():
         assert 2 <= len(ticks.places) == len(ticks.labels) <= 8
-        along, fixed = ticks.places, {"bottom": -0.5, "left": -0.5, "top": 199.5, "right": 299.5}[edge]
+        along, fixed = (
+            ticks.places,
+            {"bottom": -0.5, "left": -0.5, "top": 199.5, "right": 299.5}[edge],
+        )
         across = np.full(len(along), fixed)
         x, y = (along, across) if edge in ("bottom", "top") else (across, along)
         assert (along >= -0.5).all()
         assert (along <= (299.5 if edge in ("bottom", "top") else 199.5)).all()
         value = wcs.wcs_pix2world(x, y, 0)[0 if edge in ("bottom", "top") else 1]
         for place, text in zip(value, ticks.labels, strict=True):
-            assert _degrees(text) == pytest.approx(place, abs=1e-9) or abs(_degrees(text) - place) == pytest.approx(360, abs=1e-9)
+            assert _degrees(text) == pytest.approx(place, abs=1e-9) or abs(
+                _degrees(text) - place
+            ) == pytest.approx(360, abs=1e-9)
 
 
 def _degrees(text):
@@ -82,12 +89,19 @@ def testlabel_ofs_have_the_digits_of_the_step():
 
 
 def test_what_it_cannot_do_well_is_left_to_astropy():
-    assert SkyAxes.of(made("TAN", [75, 89.99], 0.01)).ticks((200, 300), 60, 25) is None  # a pole in the field
+    assert (
+        SkyAxes.of(made("TAN", [75, 89.99], 0.01)).ticks((200, 300), 60, 25) is None
+    )  # a pole in the field
     assert SkyAxes.of(made("TAN", [75, 20], 0.01, turned=80.0)).ticks((200, 300), 60, 25) is None
     assert SkyAxes.of(made("AIT", [0, 0], 0.5)) is None
     assert SkyAxes.of(made("CAR", [0, 30], 0.1)) is None
     header = made("TAN", [75, 20], 0.01).to_header()
-    header["CTYPE1"], header["CTYPE2"], header["A_ORDER"], header["B_ORDER"] = "RA---TAN-SIP", "DEC--TAN-SIP", 2, 2
+    header["CTYPE1"], header["CTYPE2"], header["A_ORDER"], header["B_ORDER"] = (
+        "RA---TAN-SIP",
+        "DEC--TAN-SIP",
+        2,
+        2,
+    )
     assert SkyAxes.of(header) is None
 
 
@@ -104,5 +118,7 @@ def test_distances_are_angles_on_the_sky(offset):
     centre = np.radians([75 + offset, 20.0])
     y, x = np.indices((20, 30))
     lon, lat = wcs.wcs_pix2world(x.ravel(), y.ravel(), 0)
-    angle = SkyCoord(lon, lat, unit="deg").separation(SkyCoord(*centre, unit="rad")).rad.reshape(20, 30)
+    angle = (
+        SkyCoord(lon, lat, unit="deg").separation(SkyCoord(*centre, unit="rad")).rad.reshape(20, 30)
+    )
     np.testing.assert_allclose(SkyAxes.of(wcs).distance((20, 30), tuple(centre)), angle, rtol=1e-9)

@@ -1,4 +1,6 @@
-"""PDF and SVG files: text as text, fonts embedded, the same bits from run to run; contours of the SNR."""
+"""PDF and SVG files: text as text, fonts embedded, the same bits from run to run; contours of the
+SNR.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def test_the_same_figure_gives_the_same_bytes():
 
 def test_text_stays_text():
     svg = vector_of(drawn(), "svg", 110).decode()
-    texts = [element.text for element in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
+    texts = [
+        element.text for element in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")
+    ]
     assert "a line" in texts
     assert "<dc:date>" not in svg
     pdf = vector_of(drawn(), "pdf", 110)
@@ -48,11 +52,34 @@ def product():
     rng = np.random.default_rng(1)
     noise, half = 1e-3 * rng.standard_normal((2, 48, 48))
     hits = np.full((48, 48), 10)
-    world = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg", "CRVAL1": 75.0, "CRVAL2": 20.0}
-    world |= {"CRPIX1": 24.5, "CRPIX2": 24.5, "CDELT1": -2 / 3600, "CDELT2": 2 / 3600, "RADESYS": "ICRS"}
+    world = {
+        "CTYPE1": "RA---TAN",
+        "CTYPE2": "DEC--TAN",
+        "CUNIT1": "deg",
+        "CUNIT2": "deg",
+        "CRVAL1": 75.0,
+        "CRVAL2": 20.0,
+    }
+    world |= {
+        "CRPIX1": 24.5,
+        "CRPIX2": 24.5,
+        "CDELT1": -2 / 3600,
+        "CDELT2": 2 / 3600,
+        "RADESYS": "ICRS",
+    }
     signal = noise + 3e-3 * np.exp(-4 * np.log(2) * (x**2 + y**2) * 4 / 20.0**2)
     centre = (float(np.radians(75.0)), float(np.radians(20.0)))
-    return MapProduct(signal, hits, hits * 1e5, np.full((48, 48), 1e-3), half, world, centre, 2 * ARCSEC, fwhm=9 * ARCSEC)
+    return MapProduct(
+        signal,
+        hits,
+        hits * 1e5,
+        np.full((48, 48), 1e-3),
+        half,
+        world,
+        centre,
+        2 * ARCSEC,
+        fwhm=9 * ARCSEC,
+    )
 
 
 def test_plots_in_all_formats(tmp_path):
@@ -61,9 +88,14 @@ def test_plots_in_all_formats(tmp_path):
     run.products["map"] = product()
     Plots(contours=[-4, 4, 8], formats=["pdf", "svg", "svg"]).finalize(run)
     written = sorted(path.name for path in tmp_path.iterdir())
-    assert written == [f"{name}.{kind}" for name in ("coverage", "map", "noise_map") for kind in ("pdf", "svg")]
+    assert written == [
+        f"{name}.{kind}" for name in ("coverage", "map", "noise_map") for kind in ("pdf", "svg")
+    ]
     captions = {p.name: p.caption for p in run.products["pictures"]}
-    assert "Contours of the signal-to-noise ratio: −4, 4, 8 σ (negative ones dashed)." in captions["map"]
+    assert (
+        "Contours of the signal-to-noise ratio: −4, 4, 8 σ (negative ones dashed)."
+        in captions["map"]
+    )
     assert "× white noise, as in half the difference, even − odd scans." in captions["map"]
     assert all(p.png.startswith(b"\x89PNG") for p in run.products["pictures"])  # for the report
 
@@ -80,8 +112,8 @@ def test_resolution_of_png_files(tmp_path):
 
 
 def test_contours_are_of_the_smoothed_map():
-    """White noise smoothed with a beam of 4.5 pixels has an SNR of unit rms (some 80 independent patches: 8 %), the source about
-    3 (4 pi sigma^2 / A)^(1/2) 20^2 / (20^2 + 9^2) = 17."""
+    """White noise smoothed with a beam of 4.5 pixels has an SNR of unit rms (some 80 independent
+    patches: 8 %), the source about 3 (4 pi sigma^2 / A)^(1/2) 20^2 / (20^2 + 9^2) = 17."""
     style = Plots(contours=[4.0]).style()
     found = product()
     snr, words = _snr(found, style, noise_alone({"map": found}, "map"))

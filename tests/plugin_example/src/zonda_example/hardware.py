@@ -22,4 +22,10 @@ def example_camera() -> Instrument:
 
 def example_peak() -> Site:
     """A hill near Green Bank, under the same air."""
-    return Site(name="example_peak", latitude="38.5 deg", longitude="-79.5 deg", altitude="1200 m", climatology="green_bank")
+    return Site(
+        name="example_peak",
+        latitude="38.5 deg",
+        longitude="-79.5 deg",
+        altitude="1200 m",
+        climatology="green_bank",
+    )

@@ -8,7 +8,9 @@ from zonda import Operator, Seconds, quantity
 
 
 class ReadoutLag(Operator):
-    """Blur each time stream with exp(-t / tau) / tau for t >= 0, cut off after 8 tau (3e-4 of the response)."""
+    """Blur each time stream with exp(-t / tau) / tau for t >= 0, cut off after 8 tau (3e-4 of the
+    response).
+    """
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"signal"})
