@@ -21,6 +21,8 @@ from zonda.core.pipeline import Pipeline
 from zonda.core.scene import Scene
 from zonda.core.site import Site
 
+from .parameters import write_inputs
+
 ARCSEC = np.radians(1 / 3600)
 CENTRE = (np.radians(75.0), np.radians(20.0))
 
@@ -231,3 +233,17 @@ def data(scene: Scene, tmp_path: Path) -> Data:
         versions={"zonda": "0.1.0"},
     )
     return found
+
+
+@pytest.fixture(scope="session")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Input files of the tests of parameters."""
+    folder = tmp_path_factory.mktemp("maps")
+    write_inputs(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def known() -> dict[str, Any]:
+    """Runs before the change of a parameter, made once each."""
+    return {}

@@ -1,0 +1,60 @@
+"""Each parameter of the maps operators changes what a run makes, or is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zonda.core.errors import ZondaError
+
+from ..parameters import Step, cases, ignored
+
+STEPS = (
+    Step(
+        "BinMap",
+        ignored=(
+            {"nside": 1024, "pixel": "3 arcsec"},
+            {"nside": 1024, "width": "3 arcmin"},
+            {"ordering": "nested"},
+        ),
+        chain=("SkyMap", "WhiteNoise", "Efficiency", "BinMap"),
+        changes={
+            "pixel": ({}, {"pixel": "3 arcsec"}),
+            "width": ({}, {"width": "3 arcmin"}),
+            "height": ({"width": "3 arcmin"}, {"height": "2 arcmin"}),
+            "centre": ({}, {"centre": "05h00m01s +20d00m00s"}),
+            "projection": ({}, {"projection": "CAR"}),
+            "frame": ({}, {"frame": "galactic"}),
+            "nside": ({}, {"nside": 8192}),
+            "ordering": ({"nside": 8192}, {"ordering": "nested"}),
+            "weights": ({}, {"weights": "uniform"}),
+            "noise": ({}, {"noise": "scatter"}),
+            "stokes": ({}, {"stokes": "IQU"}),
+            "condition_limit": ({"stokes": "IQU"}, {"condition_limit": 3.0}),
+            "contents": ({}, {"contents": "hits"}),
+            "half_difference": ({}, {"half_difference": False}),
+            "crosslinking": ({}, {"crosslinking": True}),
+            "scan_hits": ({}, {"scan_hits": True}),
+            "smooth": ({}, {"smooth": "beam"}),
+            "product": ({}, {"product": "chart"}),
+        },
+        polarized=("condition_limit", "stokes"),
+    ),
+)
+
+
+@pytest.mark.parametrize(("step", "field"), cases(STEPS))
+def test_each_parameter_has_an_effect(
+    step: Step, field: str, maps: Path, tmp_path: Path, known: dict[str, Any]
+) -> None:
+    step.check(field, maps, tmp_path, known)
+
+
+@pytest.mark.parametrize(("step", "parameters"), ignored(STEPS))
+def test_what_would_be_ignored_is_refused(
+    step: Step, parameters: dict[str, Any], maps: Path
+) -> None:
+    with pytest.raises(ZondaError):
+        step.made(maps, parameters)
