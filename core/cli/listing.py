@@ -21,6 +21,7 @@ def plugins(check: bool) -> None:
     from .. import hooks
     from ..discovery import discover
     from ..registry import registries
+    from ..tables import aligned
 
     rows: list[tuple[str, ...]] = []
     failures: list[Exception] = []
@@ -41,13 +42,7 @@ def plugins(check: bool) -> None:
     rows += [
         ("hook", found.name, found.origin, found.reference, "") for found in discover(hooks.GROUP)
     ]
-    widths = [max((len(row[k]) for row in rows), default=0) for k in range(4)]
-    for row in rows:
-        click.echo(
-            "  ".join(
-                [*(text.ljust(width) for text, width in zip(row, widths, strict=False)), row[4]]
-            ).rstrip()
-        )
+    click.echo("\n".join(aligned(rows)))
     if check:
         failures += _failing_hooks()
         for failure in failures:
@@ -65,7 +60,7 @@ def plugins(check: bool) -> None:
 
 
 def _failing_hooks() -> list[ZondaError]:
-    """What is said of plugins with hooks while they are loaded."""
+    """Warnings about plugins with hooks while they are loaded."""
     from ..hooks import manager
 
     with warnings.catch_warnings(record=True) as caught:
@@ -79,14 +74,13 @@ def _failing_hooks() -> list[ZondaError]:
 def pipelines() -> None:
     """List the shipped pipelines, to be run by their names."""
     from ..configuration import locate, yaml_places
+    from ..tables import aligned
 
     rows = []
     for name, path in locate.shipped().items():
         value = yaml_places.load(yaml_places.Source(str(path), locate.read(path))).value
         rows.append((name, str(value.get("description", "")) if isinstance(value, dict) else ""))
-    width = max((len(name) for name, _ in rows), default=0)
-    for name, description in rows:
-        click.echo(f"{name.ljust(width)}  {description}")
+    click.echo("\n".join(aligned(rows)))
 
 
 @click.command()

@@ -351,6 +351,7 @@ def _in_one_unit(
 def lines(found: Comparison) -> list[str]:
     """The table as text."""
     from zonda.core.numerics.angles import angle_text
+    from zonda.core.tables import aligned
 
     f, (first, second) = found.figures, found.names
     factor, unit = _readable(f["rms reference"], found.unit)
@@ -371,9 +372,7 @@ def lines(found: Comparison) -> list[str]:
                 f"{f['chi2']:.5g} / {f['chi2 pixels']:.0f} = {_ratio(f):.4g} +- {scatter:.2g}",
             )
         )
-    width = max(len(text) for text, _ in rows)
-    made = [f"{text:<{width}}  {value}" for text, value in rows]
-    return [*made, "", *found.notes]
+    return [*aligned(rows), "", *found.notes]
 
 
 def _ratio(figures: dict[str, Any]) -> float:

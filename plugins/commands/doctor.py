@@ -28,6 +28,7 @@ def doctor(as_json: bool) -> None:
     one_blas_thread()
     ensure_cache()
     from zonda.core.checks import measure, registered
+    from zonda.core.tables import aligned
     from zonda.plugins.checks.cases import MACHINE
     from zonda.plugins.checks.machine import description
 
@@ -37,7 +38,7 @@ def doctor(as_json: bool) -> None:
     about = description()
     results: list[Result] = []
     if not as_json:
-        click.echo("\n".join(f"{what:18s} {text}" for what, text in about.items()) + "\n")
+        click.echo("\n".join([*aligned(about.items()), ""]))
         width = max(len(check.name) for check in chosen)
     for result in measure(chosen):
         results.append(result)

@@ -1,4 +1,4 @@
-"""What ``zonda show instrument`` prints."""
+"""Text that ``zonda show instrument`` prints."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from zonda.core.focalplane import Focalplane
 from zonda.core.instrument import Instrument
 from zonda.core.numerics.angles import angle_text
+from zonda.core.tables import aligned
 from zonda.core.types import Floats
 
 STAND_IN = "stand-in: "
@@ -47,7 +48,7 @@ def lines(instrument: Instrument, plane: Focalplane) -> list[str]:
     found = [
         head,
         "",
-        *(f"{key:<14}{value}" for key, value in rows),
+        *aligned(rows, gap=" "),
         "",
         *_bands(instrument, plane),
     ]
@@ -55,9 +56,9 @@ def lines(instrument: Instrument, plane: Focalplane) -> list[str]:
     for title, texts in (("source", sources), ("stand-ins", stand_ins)):
         if texts:
             found.append("")
-            found += [
-                f"{title if not k else '':<14}{line}" for k, line in enumerate(_wrapped(texts))
-            ]
+            wide = " " * (max(len(key) for key, _ in rows) - len(title))
+            first, *others = _wrapped(texts)
+            found += aligned([(title + wide, first), *(("", line) for line in others)], gap=" ")
     return found
 
 
@@ -108,7 +109,7 @@ def _detectors(instrument: Instrument, plane: Focalplane) -> str:
 
 
 def _bands(instrument: Instrument, plane: Focalplane) -> list[str]:
-    table = [HEAD]
+    table = []
     for k, (name, camera) in enumerate(instrument.cameras.items()):
         rows = plane.of_band(k) if instrument.bands else plane
         nu = camera.band.frequency / 1e9
@@ -123,11 +124,7 @@ def _bands(instrument: Instrument, plane: Focalplane) -> list[str]:
                 _span(rows.slope),
             )
         )
-    widths = [max(len(row[k]) for row in table) for k in range(len(HEAD))]
-    return [
-        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        for row in table
-    ]
+    return aligned(table, HEAD)
 
 
 def _span(values: Floats) -> str:

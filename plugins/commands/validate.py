@@ -1,5 +1,6 @@
-"""``zonda validate``: what the paper that zonda follows states, measured again. Only click is
-imported with this module.
+"""``zonda validate``: measure again what the paper that zonda follows states.
+
+Only click is imported with this module.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ def validate(
     pictures. What DIR holds of the same runs is not run again. Exit status 1 where a claim differs
     and no counter-experiment explains it.
     """
+    from zonda.core.tables import aligned
     from zonda.plugins.validation.claims import SHIPPED, read
 
     path = SHIPPED if path is None else path
@@ -53,8 +55,8 @@ def validate(
     if not chosen:
         raise click.UsageError("none of these claims is a quick one: leave --quick out")
     if listed:
-        for claim in chosen:
-            click.echo(f"{claim.id:32s} {claim.paper!s:>16s}  {claim.claim} ({claim.section})")
+        listing = [(c.id, c.paper, f"{c.claim} ({c.section})") for c in chosen]
+        click.echo("\n".join(aligned(listing, align="<><")))
         return 0
     from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
 
@@ -69,8 +71,7 @@ def validate(
     with lock(output):
         rows = measured(file, chosen, output, path.parent, _say)
     _clear()
-    for row in rows:
-        click.echo(_line(row))
+    click.echo("\n".join(aligned(map(_cells, rows), align="<<><><")))
     click.echo(f"\n{summary(rows)}\n{output}/claims.html")
     return 0 if all(row.verdict.decided for row in rows) else UNDECIDED
 
@@ -89,14 +90,15 @@ def _chosen(claims: list[Claim], ids: tuple[str, ...]) -> list[Claim]:
     return [claim for claim in claims if not ids or claim.id in ids]
 
 
-def _line(row: Row) -> str:
+def _cells(row: Row) -> tuple[str, ...]:
+    """Cells of a line: the claim, the paper's value, zonda's value, the verdict."""
     from zonda.plugins.validation.page import stated
 
     claim = row.claim
     found = stated(row.values, claim.paper.factor, claim.paper.unit) if row.values.values else "-"
     good = row.verdict.decided
     verdict = click.style(row.verdict.value, fg="green" if good else "red", bold=not good)
-    return f"{claim.id:32s} paper {claim.paper!s:>14s}  zonda {found:>24s}  {verdict}"
+    return claim.id, "paper", str(claim.paper), "zonda", found, verdict
 
 
 def _say(text: str) -> None:

@@ -1,6 +1,4 @@
-"""What ``zonda when`` prints: tonight hour by hour, the year month by month, and both as plain
-values.
-"""
+"""Text of ``zonda when``: the night hour by hour, the year by month, and both as plain values."""
 
 from __future__ import annotations
 
@@ -13,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zonda.core.configuration.time import Instant
+from zonda.core.tables import aligned
 from zonda.core.types import Floats
 from zonda.operators.atmosphere.weather import climatology
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere
@@ -28,6 +27,8 @@ if TYPE_CHECKING:
     from zonda.operators.atmosphere.weather.profiles import Profile
 
 QUANTILES = (0.25, 0.5, 0.75)
+PWV_HEAD = ["PWV 25 % [mm]", "50 %", "75 %"]
+"""Columns of the quantiles of the PWV."""
 CELL = 3
 """Hours (UTC) between those at which the PWV is looked up."""
 
@@ -148,7 +149,7 @@ def pwv_at(site: Site, when: Instant) -> Floats:
 
 
 def lines(seen: Seen, year: Sequence[Month]) -> list[str]:
-    """All that is printed."""
+    """All lines of the text."""
     return [*_head(seen), "", *_table(seen), "", *_year(seen, year)]
 
 
@@ -217,23 +218,23 @@ def _table(seen: Seen) -> list[str]:
     rows = seen.hours
     if not rows:
         return ["it is never above the limit in this night"]
-    names = list(seen.bands)
-    widths = [max(len(name) + 2, 10) for name in names] if seen.known else []
-    pwv = "   PWV 25, 50, 75 % [mm]" if seen.known else ""
-    extra = "".join(f"{name:>{w}}" for name, w in zip(names, widths, strict=False))
-    above = " " * (85 if seen.known else 61) + ("  transmission of the band" if extra else "")
-    found = [above.rstrip()] if extra else []
-    found.append(f"  UTC  solar  elevation  azimuth  Sun el.  Sun dist.  Moon dist.{pwv}{extra}")
-    for row in rows:
-        mm = "".join(f"{value:8.2f}" for value in row["pwv_mm"]) if seen.known else ""
-        passed = "".join(
-            f"{row[f'transmission {name}']:{w}.3f}" for name, w in zip(names, widths, strict=False)
+    bands = list(seen.bands) if seen.known else []
+    head = ["UTC", "solar", "elevation", "azimuth", "Sun el.", "Sun dist.", "Moon dist."]
+    head += PWV_HEAD if seen.known else []
+    before = len(aligned([], head)[0])
+    degrees = ("elevation", "azimuth", "sun elevation", "sun distance", "moon distance")
+    cells = [
+        (
+            row["time"][11:16],
+            row["solar"],
+            *(f"{row[name]:.1f}" for name in degrees),
+            *(f"{value:.2f}" for value in row.get("pwv_mm", ())),
+            *(f"{row[f'transmission {name}']:.3f}" for name in bands),
         )
-        found.append(
-            f"{row['time'][11:16]}  {row['solar']}  {row['elevation']:9.1f}  {row['azimuth']:7.1f} "
-            f" {row['sun elevation']:7.1f}  {row['sun distance']:9.1f} "
-            f" {row['moon distance']:10.1f}{mm}{passed}"
-        )
+        for row in rows
+    ]
+    found = [" " * before + "  transmission of the band"] if bands else []
+    found += aligned(cells, [*head, *bands], ">")
     if not seen.known:
         found.append(f"{seen.site.name} has no climatology: no PWV, no transmission")
     return found
@@ -241,33 +242,27 @@ def _table(seen: Seen) -> list[str]:
 
 def _year(seen: Seen, year: Sequence[Month]) -> list[str]:
     above = _deg(seen.night.above)
-    head = f"  highest  h above {above}  of them at night  Sun dist."
-    found = [
-        f"{seen.when.datetime.year:04d}{head}" + ("   PWV 25, 50, 75 % [mm]" if seen.known else "")
-    ]
+    head = [f"{seen.when.datetime.year:04d}", "highest", f"h above {above}", "of them at night"]
+    head += ["Sun dist.", *(PWV_HEAD if seen.known else [])]
+    rows = []
     for number, (name, month) in enumerate(zip(MONTHS, year, strict=True)):
         quantiles = seen.pwv_of_month(number, month)
-        mm = (
-            ""
-            if not seen.known
-            else (
-                f"{'-':>8}" * 3
-                if quantiles is None
-                else "".join(f"{1e3 * q:8.2f}" for q in quantiles)
+        mm = ["-"] * 3 if quantiles is None else [f"{1e3 * q:.2f}" for q in quantiles]
+        rows.append(
+            (
+                name,
+                f"{math.degrees(month.highest):.1f}",
+                f"{month.hours:.0f}",
+                f"{month.hours_at_night:.0f}",
+                f"{math.degrees(month.sun[0]):.0f} to {math.degrees(month.sun[1]):.0f}",
+                *(mm if seen.known else []),
             )
-        )
-        sun = f"{math.degrees(month.sun[0]):.0f} to {math.degrees(month.sun[1]):.0f}"
-        width = len(f"h above {above}")
-        top = math.degrees(month.highest)
-        found.append(
-            f"{name}   {top:7.1f}  {month.hours:{width}.0f}  {month.hours_at_night:16.0f} "
-            f" {sun:>9}{mm}"
         )
     note = (
         "hours in the month; PWV in the hours in which it is above the limit at night, or by day"
         " where it never is at night"
     )
-    return [*found, note if seen.known else "hours in the month"]
+    return [*aligned(rows, head, "<>"), note if seen.known else "hours in the month"]
 
 
 def as_dict(seen: Seen, year: Sequence[Month]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 from zonda.core.numerics.angles import ARCMIN, ARCSEC
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path, check_output_folder, write_text
+from zonda.core.tables import aligned
 
 from . import default_pipeline
 from .depth import PARTS, UNITS, WITHIN, Depth, scatter
@@ -88,7 +89,7 @@ def _table(found: Forecast, depth: Depth) -> list[str]:
         *PARTS,
         *(TITLES.get(u, "") + (" " if u in TITLES else "") + scale[u][1] for u in UNITS[1:]),
     ]
-    rows = [head]
+    rows = []
     for t in found.times.tolist():
         total = float(depth.total(t))
         each = [
@@ -97,8 +98,7 @@ def _table(found: Forecast, depth: Depth) -> list[str]:
         others = [number(total * found.factors[u] * scale[u][0]) for u in UNITS[1:]]
         mark = "" if depth.seconds[0] * (1 - 1e-9) <= t <= depth.seconds[-1] * (1 + 1e-9) else " *"
         rows.append([duration(t) + mark, number(total * kelvin), *each, *others])
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
-    return ["  ".join(c.rjust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
+    return aligned(rows, head, ">")
 
 
 def _errors(found: Forecast) -> list[str]:

@@ -1,4 +1,4 @@
-"""What `zonda weather` prints: the profile, the PWV by month and hour, and what instruments see."""
+"""Text of `zonda weather`: the profile, the PWV by month and hour, and what instruments see."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from zonda.core.configuration.time import Instant
+from zonda.core.tables import aligned
 from zonda.core.types import Floats
 
 from . import climatology
@@ -86,37 +87,34 @@ def place_lines(site: Site, time: Instant, profile: Profile) -> list[str]:
 
 def profile_lines(profile: Profile) -> list[str]:
     """A table of the profile; the wind is that which blows, coming from a direction."""
-    lines = [
-        "  above site   pressure  temperature   vapour     wind      from",
-        "           m        hPa            K     g/m3      m/s       deg",
-    ]
+    rows = [("m", "hPa", "K", "g/m3", "m/s", "deg")]
     for h in HEIGHTS:
         a = profile.at(h)
         east, north = float(a.wind_east), float(a.wind_north)
         direction = math.degrees(math.atan2(-east, -north)) % 360
-        lines.append(
-            f"{h:12.0f} {float(a.pressure) / 100:10.1f} {float(a.temperature):12.1f}"
-            f" {float(a.vapour_density) * 1e3:8.3g} {math.hypot(east, north):8.1f} {direction:9.0f}"
+        rows.append(
+            (
+                f"{h:.0f}",
+                f"{float(a.pressure) / 100:.1f}",
+                f"{float(a.temperature):.1f}",
+                f"{float(a.vapour_density) * 1e3:.3g}",
+                f"{math.hypot(east, north):.1f}",
+                f"{direction:.0f}",
+            )
         )
-    return lines
+    head = ("above site", "pressure", "temperature", "vapour", "wind", "from")
+    return aligned(rows, head, ">", indent="  ")
 
 
 def pwv_lines(water: PwvByMonth) -> list[str]:
     """A table of the PWV by month and hour."""
-    head = (
-        "".join(f"{f'{hour:02d}h':>7}" for hour in HOURS)
-        + "  |"
-        + "".join(f"{f'{100 * q:g} %':>7}" for q in QUANTILES)
-    )
-    lines = ["PWV [mm]: median by hour (UTC), and quantiles of the month", "     " + head]
-    for month, medians, quantiles in zip(MONTHS, water.median, water.quantiles, strict=True):
-        row = (
-            "".join(f"{_short(p)}" for p in medians)
-            + "  |"
-            + "".join(f"{_short(p)}" for p in quantiles)
-        )
-        lines.append(f"{month}  {row}")
-    return lines
+    head = ("", *(f"{hour:02d}h" for hour in HOURS), "|", *(f"{100 * q:g} %" for q in QUANTILES))
+    rows = [
+        (month, *map(_short, medians), "|", *map(_short, quantiles))
+        for month, medians, quantiles in zip(MONTHS, water.median, water.quantiles, strict=True)
+    ]
+    title = "PWV [mm]: median by hour (UTC), and quantiles of the month"
+    return [title, *aligned(rows, head, "<>")]
 
 
 def band_lines(profile: Profile, bands: Iterable[Band], elevation: float) -> list[str]:
@@ -129,17 +127,24 @@ def band_lines(profile: Profile, bands: Iterable[Band], elevation: float) -> lis
         lines.append(
             f"  {band.name} ({band.frequency[0] / 1e9:g} to {band.frequency[-1] / 1e9:g} GHz)"
         )
+        rows = []
         for pwv in steps:
-            mark = "  <" if pwv == profile.pwv else ""
+            mark = "<" if pwv == profile.pwv else ""
             kelvin, passed = (
                 float(seen.emission(pwv, elevation)),
                 float(seen.transmission(pwv, elevation)),
             )
             opacity = float(seen.opacity(pwv, elevation))
-            lines.append(
-                f"    PWV {_short(pwv)} mm: {kelvin:7.2f} K_RJ, {_fraction(passed)},"
-                f" {opacity:.4g}{mark}"
+            rows.append(
+                (
+                    f"PWV {_short(pwv)} mm:",
+                    f"{kelvin:.2f} K_RJ,",
+                    f"{_fraction(passed)},",
+                    f"{opacity:.4g}",
+                    mark,
+                )
             )
+        lines += aligned(rows, align=">", indent="    ")
     return lines
 
 
@@ -148,4 +153,4 @@ def _fraction(passed: float) -> str:
 
 
 def _short(pwv: float) -> str:
-    return f"{pwv * 1e3:7.2f}" if pwv < 10e-3 else f"{pwv * 1e3:7.1f}"
+    return f"{pwv * 1e3:.2f}" if pwv < 10e-3 else f"{pwv * 1e3:.1f}"

@@ -34,7 +34,7 @@ def test_site_by_name(tmp_path, capsys):
         "\nJul ",
         "atlast_92ghz (66 to 118 GHz)",
         "ccat_280ghz",
-        "PWV    1.20 mm:",
+        "PWV 1.20 mm:",
         str(figure),
     ):
         assert words in text
@@ -112,4 +112,4 @@ def test_dry_air(tmp_path, capsys):
         )
         == 0
     )
-    assert "PWV    0.00 mm" in capsys.readouterr().out
+    assert "PWV 0.00 mm" in capsys.readouterr().out

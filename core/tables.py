@@ -1,0 +1,92 @@
+"""Tables as aligned text, ECSV files, JSON records and HTML."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .storage.ecsv import Column, write_ecsv
+
+
+def aligned(
+    rows: Iterable[Sequence[Any]],
+    head: Sequence[str] = (),
+    align: str = "<",
+    *,
+    indent: str = "",
+    gap: str = "  ",
+) -> list[str]:
+    """Lines of a table, each column as wide as its longest cell.
+
+    Parameters
+    ----------
+    rows
+        Cells of each row; a row may be shorter than others.
+    head
+        Names of the columns; none by default.
+    align
+        A character for each column, ``<`` left or ``>`` right; the last one holds for all that
+        follow.
+    indent, gap
+        Text before each line, and between columns.
+    """
+    table = [[str(cell) for cell in row] for row in ([head, *rows] if head else rows)]
+    number = max(map(len, table), default=0)
+    widths = [max(len(row[k]) for row in table if k < len(row)) for k in range(number)]
+    sides = align + align[-1] * number
+
+    def line(row: Sequence[str]) -> str:
+        cells = zip(row, sides, widths, strict=False)
+        return gap.join(f"{cell:{side}{width}}" for cell, side, width in cells)
+
+    return [(indent + line(row)).rstrip() for row in table]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Named columns of equal length, with units and descriptions, and ``meta`` about all of it."""
+
+    columns: Sequence[Column]
+    meta: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def head(self) -> list[str]:
+        """Names of the columns."""
+        return [column.name for column in self.columns]
+
+    @property
+    def rows(self) -> list[tuple[Any, ...]]:
+        """Values of each row."""
+        return list(zip(*(column.values for column in self.columns), strict=True))
+
+    def shown(self) -> list[list[str]]:
+        """Cells of each row as people read them; what is not known is empty."""
+        return [[cell_text(value) for value in row] for row in self.rows]
+
+    def lines(self, align: str = "<") -> list[str]:
+        """Aligned text with a head; ``align`` as in `aligned`."""
+        return aligned(self.shown(), self.head, align)
+
+    def records(self) -> list[dict[str, Any]]:
+        """A dictionary for each row, for JSON; numbers that are not finite are None."""
+        return [dict(zip(self.head, map(_plain, row), strict=True)) for row in self.rows]
+
+    def write(self, path: str | Path) -> Path:
+        """Write an ECSV file; its path. Raises `OutputError`."""
+        return write_ecsv(path, self.columns, self.meta)
+
+
+def cell_text(value: Any, digits: int = 5) -> str:
+    """A text as it is, a number to ``digits``; empty for None and NaN."""
+    if isinstance(value, str):
+        return value
+    return "" if value is None or math.isnan(value) else f"{value:.{digits}g}"
+
+
+def _plain(value: Any) -> Any:
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    return float(value) if math.isfinite(value) else None
