@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from .block import STREAMS, Block
 from .errors import PipelineError
 from .kept import kept, one_scan, product_of
-from .notebook import html_table
 from .observation import Observation
+from .pages import html_table
 from .product import Product
 from .stream import Stream, in_order
 from .tally import Tally, percent

@@ -20,7 +20,7 @@ from .accuracy.metrics import Metric, OfFunction, get
 from .configuration.parameters import Parameters
 from .configuration.values import TextValue, mistake, refusal
 from .errors import InputError, PipelineError, ZondaError
-from .notebook import html_table
+from .pages import html_table
 from .signal import Signal
 from .storage.ecsv import Column, write_ecsv
 from .types import Floats

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .notebook import html_table
+from .pages import html_table
 from .types import Floats
 
 DEFAULTS: dict[str, float] = {

@@ -14,9 +14,9 @@ from .emission import LoadSpectra, mean_emission
 from .flags import DEAD, EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, good
 from .focalplane import Focalplane
 from .intervals import Intervals, runs
-from .notebook import html_table
 from .numerics.random import stream_key
 from .numerics.smooth import SmoothField
+from .pages import html_table
 from .shared import SharedScan
 from .tally import Tally
 from .types import AnyFloats

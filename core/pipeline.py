@@ -16,10 +16,10 @@ from .faults import faults_named
 from .hooks import manager
 from .label import labels
 from .machine import available_memory, available_threads
-from .notebook import html_table
 from .observation import Observation
 from .operator import Operator
 from .output import Output, Progress
+from .pages import html_table
 from .run import arguments
 from .run.bands import (
     data_of_bands,

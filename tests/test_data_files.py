@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("core", "operators", "plugins", "interop", "pipelines", "zonda", "tests/data")
-CODE = {".py", ".md", ".yaml", ".css", ".typed", ".tmpl"}
+CODE = {".py", ".md", ".yaml", ".css", ".html", ".typed", ".tmpl"}
 
 
 def data_files():

@@ -12,7 +12,6 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +20,10 @@ import numpy as np
 from ..configuration.units import read_unit
 from ..errors import InputError
 from ..figures import Figure, Figures
-from ..storage.ecsv import Column, write_ecsv
+from ..pages import render
+from ..storage.ecsv import Column
 from ..storage.files import atomic_path, write_text
+from ..tables import Table
 
 if TYPE_CHECKING:
     from ..data import Data
@@ -104,14 +105,13 @@ def write(job: Job, folder: Path) -> None:
         ),
         Column("realizations", [len(p.values) for p in points], "", "number of realizations"),
     ]
-    write_ecsv(
-        folder / "sweep.ecsv",
-        columns,
-        {"PIPELINE": job.name, "ZONDA": job.version, "COMMAND": job.command},
-    )
+    about = {"PIPELINE": job.name, "ZONDA": job.version, "COMMAND": job.command}
+    table = Table(columns, about)
+    table.write(folder / "sweep.ecsv")
     with atomic_path(folder / "sweep.png") as temporary:
         draw(points).savefig(temporary)
-    write_text(folder / "sweep.html", _html(job.name, columns))
+    page = render("zonda.core", "sweep.html", title=job.name, head=table.head, rows=table.shown())
+    write_text(folder / "sweep.html", page)
 
 
 def collected(job: Job, folder: Path) -> list[Point]:
@@ -251,30 +251,3 @@ def _read(folder: Path, number: int) -> Iterator[Figure]:
         raise InputError(
             f"the figures of a run cannot be read: {err}", place=str(path), cure=cure
         ) from None
-
-
-def _html(title: str, columns: Sequence[Column]) -> str:
-    """One page with the picture and the table."""
-    head = "".join(f"<th>{escape(c.name)}</th>" for c in columns)
-    rows = zip(*(c.values for c in columns), strict=True)
-    body = "\n".join(
-        "<tr>" + "".join(f"<td>{escape(_shown(v))}</td>" for v in row) + "</tr>" for row in rows
-    )
-    style = (
-        "body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem; } td, th { text-align: left;"
-        " padding: .2rem 1rem .2rem 0; }"
-    )
-    return f"""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>
-<style>{style}</style></head>
-<body><h1>{escape(title)}</h1>
-<p><img src="sweep.png" alt="figures against the swept values" style="max-width: 100%"></p>
-<table><thead><tr>{head}</tr></thead>
-<tbody>
-{body}
-</tbody></table></body></html>
-"""
-
-
-def _shown(value: Any) -> str:
-    return value if isinstance(value, str) else "" if math.isnan(value) else f"{value:.5g}"

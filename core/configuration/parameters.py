@@ -17,7 +17,7 @@ from pydantic import (
 )
 
 from ..errors import ZondaError
-from ..notebook import html_table
+from ..pages import html_table
 from .docstrings import described, own_doc, remember_place
 from .values import refusal
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..notebook import html_table
 from ..numerics.angles import FWHM_PER_SIGMA, angle_text, sides_text
+from ..pages import html_table
 from ..types import Floats
 from .central import central_diameter
 from .grid import CUT

@@ -92,7 +92,7 @@ class Plan:
         return text(self)
 
     def _repr_html_(self) -> str:
-        from ..notebook import html_table
+        from ..pages import html_table
 
         return html_table(
             "Plan", [(d.name, f"{d.choice.decision}: {d.choice.what}") for d in self.decided]

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import replace
-from html import escape
-from importlib import resources
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.units import Angle
@@ -20,19 +17,24 @@ from zonda.core.data import Data
 from zonda.core.figures import Figures
 from zonda.core.maps.beams import expected_fwhm
 from zonda.core.numerics.angles import angle_text
-from zonda.core.output import Output, Progress, output_folder
+from zonda.core.output import Output, output_folder
+from zonda.core.pages import render
 from zonda.core.storage.files import write_text
 from zonda.core.types import AnyFloats
 
 from .plot_operators import DRAWN, Picture, Plots, pictures
 from .report_results import class_of, flux_density, has_white_noise, results
-from .report_text import LONG, Html, details, folded, readable, sexagesimal, small, spread, table
+from .report_text import readable, sexagesimal, spread
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
     from zonda.core.data import Observation
     from zonda.core.instrument import Instrument
 
+LONG = 12
+"""Rows of a table that are shown; the rest of a longer one is folded away. Half as many of files,
+in one cell.
+"""
 _WIDE = 1000
 """Pictures wider than this many pixels take a whole row."""
 
@@ -54,146 +56,102 @@ class Report(Output):
     """Diameter of the circle about the map's centre in which the noise is stated; where absent 1
     arcmin, or five beams or pixels where these are wider."""
 
-    _known: dict[str, str] | None = PrivateAttr(None)
-
     def observe(self, data: Data) -> None:
         """Refuse a missing or unwritable output folder before anything is simulated."""
         output_folder(data, self.label)
-
-    def watch(self, data: Data, done: Progress) -> None:
-        """Write what no later step changes while the last pictures are drawn."""
-        if done == "maps":
-            self._known = None
-            with suppress(Exception):  # `finalize` says so, when the maps are written
-                self._known = _known(data, self.central_diameter)
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
         shown = data.products.get("pictures")
         if shown is None:
             shown = pictures(data, replace(Plots().style(), central_diameter=self.central_diameter))
-        known, self._known = self._known, None
         data.products["report"] = write_text(
-            folder / "report.html", page(data, shown, self.central_diameter, known)
+            folder / "report.html", page(data, shown, self.central_diameter)
         )
 
 
-def _known(data: Data, central_diameter: float | None) -> dict[str, str]:
-    """The sections that are settled once all maps are made."""
-    return {
-        "results": results(data, central_diameter),
-        "scene": _scene(data),
-        "scans": _scans(data),
-        "steps": _steps(data),
-    }
+TITLES = {
+    "results": "Results",
+    "figures": "Figures",
+    "pictures": "Pictures",
+    "scene": "Scene",
+    "scans": "Scans",
+    "steps": "Steps",
+    "tally": "Counted and approximated",
+    "plan": "Plan",
+    "time": "Computing time",
+    "provenance": "Provenance",
+}
+"""Sections of the page in their order; one without content is left out."""
 
 
-def page(
-    data: Data,
-    shown: Sequence[Picture],
-    central_diameter: float | None,
-    known: Mapping[str, str] | None = None,
-) -> str:
-    """The whole page. Everything that is not markup of this module is escaped. ``known``: `_known`,
-    where it was made before.
-    """
-    known = _known(data, central_diameter) if known is None else known
-    style = resources.files(__package__).joinpath("data/report.css").read_text(encoding="utf-8")
-    provenance = data.provenance
-    name = str(provenance.get("name") or "zonda run")
-    parts = [
-        ("results", "Results", known["results"]),
-        ("figures", "Figures", _figures(data)),
-        (
-            "pictures",
-            "Pictures",
-            _pictures(shown, [band.name for band in data.scene.instrument.bands]),
-        ),
-        ("scene", "Scene", known["scene"]),
-        ("scans", "Scans", known["scans"]),
-        ("steps", "Steps", known["steps"]),
-        ("tally", "Counted and approximated", _tally(data)),
-        ("plan", "Plan", _plan(data)),
-        ("time", "Computing time", _timings(data)),
-        ("provenance", "Provenance", _provenance(data)),
-    ]
-    parts = [p for p in parts if p[2]]
-    links = "".join(f'<a href="#{key}">{title}</a>' for key, title, _ in parts)
-    sections = "\n".join(
-        f'<section id="{key}"><h2>{title}</h2>{body}</section>' for key, title, body in parts
-    )
-    scene = data.scene
-    version = provenance.get("versions", {}).get("zonda", "")
+def page(data: Data, shown: Sequence[Picture], central_diameter: float | None) -> str:
+    """The whole page. All text is escaped by the template."""
+    provenance, scene = data.provenance, data.scene
+    version = str(provenance.get("versions", {}).get("zonda", ""))
     line = (
         f"{scene.instrument.name} on {scene.instrument.telescope.name} at {scene.site.name},"
         f" {scene.time}, seed {scene.seed}"
     )
-    line += f", zonda {version}" if version else ""
-    description = (
-        f"<p>{escape(str(provenance['description']))}</p>" if provenance.get("description") else ""
+    sections = {
+        "results": results(data, central_diameter),
+        "figures": _figures(data),
+        "pictures": _pictures(shown, [band.name for band in scene.instrument.bands]),
+        "scene": _scene(data),
+        "scans": _scans(data),
+        "steps": _steps(data),
+        "tally": _tally(data),
+        "plan": list(provenance.get("plan", [])),
+        "time": _timings(data),
+        "provenance": _provenance(data),
+    }
+    return render(
+        __package__,
+        "report.html",
+        title=str(provenance.get("name") or "zonda run"),
+        description=str(provenance.get("description") or ""),
+        line=f"{line}, zonda {version}" if version else line,
+        version=version,
+        titles=TITLES,
+        sections=sections,
+        long=LONG,
+        written=[p.name for key in ("map_file", "tod_file") for p in data.products.get(key, [])],
+        resolved=str(provenance.get("resolved_yaml", "")),
     )
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(name)} · zonda</title>
-<style>
-{style}</style>
-</head>
-<body>
-<header><h1>{escape(name)}</h1>{description}<p>{escape(line)}</p></header>
-<nav>{links}</nav>
-<main>
-{sections}
-</main>
-<footer>Simulated, not observed, by zonda {escape(str(version))}.</footer>
-</body>
-</html>
-"""
 
 
-def _pictures(shown: Sequence[Picture], bands: Sequence[str]) -> str:
-    figures = []
+def _pictures(shown: Sequence[Picture], bands: Sequence[str]) -> list[dict[str, Any]]:
+    found = []
     for picture in shown:
-        band = next(
-            (
-                f" ({name})"
-                for name in bands
-                if picture.name.endswith(f"_{name}") and name not in picture.title
-            ),
-            "",
+        band = next((f" ({b})" for b in bands if picture.name.endswith(f"_{b}")), "")
+        title = picture.title if band and band[2:-1] in picture.title else picture.title + band
+        found.append(
+            {
+                "title": title,
+                "caption": picture.caption,
+                "image": base64.b64encode(picture.png).decode(),
+                "wide": int.from_bytes(picture.png[16:20], "big") > _WIDE,
+            }
         )
-        title = picture.title + band
-        width = int.from_bytes(picture.png[16:20], "big")
-        image = base64.b64encode(picture.png).decode()
-        style = ' class="wide"' if width > _WIDE else ""
-        alt = escape(f"{title}: {picture.caption}", quote=True)
-        caption = f"<figcaption><b>{escape(title)}.</b> {escape(picture.caption)}</figcaption>"
-        figures.append(
-            f'<figure{style}><img alt="{alt}"'
-            f' src="data:image/png;base64,{image}">{caption}</figure>'
-        )
-    return f'<div class="pictures">{"".join(figures)}</div>' if figures else ""
+    return found
 
 
-def _figures(data: Data) -> str:
-    """What `MeasureFigures` found."""
-    rows = [
+def _figures(data: Data) -> list[tuple[str, ...]]:
+    """Name, value, standard error and meaning of each figure of `MeasureFigures`."""
+    return [
         (
             f.name,
             f"{f.value:.5g} {f.unit}".strip(),
             f"{f.error:.2g}" if np.isfinite(f.error) else "",
-            small(f.description),
+            f.description,
         )
         for product in data.products.values()
         if isinstance(product, Figures)
         for f in product
     ]
-    return table(rows, ("metric", "value", "standard error", ""), numbers=(1, 2)) if rows else ""
 
 
-def _scene(data: Data) -> str:
+def _scene(data: Data) -> list[tuple[str, Any]]:
     scene = data.scene
     instrument, site, telescope = scene.instrument, scene.site, scene.instrument.telescope
     cameras = instrument.cameras
@@ -246,7 +204,7 @@ def _scene(data: Data) -> str:
     for kind, text in (("Site", site.provenance), ("Instrument", instrument.provenance), *bands):
         if text:
             rows.append((f"{kind}: source of the numbers", text))
-    return table(rows)
+    return rows
 
 
 def _band(camera: Instrument, data: Data, *, several: bool) -> list[tuple[str, Any]]:
@@ -294,17 +252,8 @@ def _target(target: Target) -> str:
     )
 
 
-def _scans(data: Data) -> str:
-    head = (
-        "scan",
-        "start",
-        "duration",
-        "detectors × samples",
-        "target (RA, Dec)",
-        "elevation",
-        "azimuth",
-    )
-    rows = [
+def _scans(data: Data) -> list[tuple[str, ...]]:
+    return [
         (
             o.name,
             str(o.start).replace("T", " "),
@@ -317,37 +266,28 @@ def _scans(data: Data) -> str:
         )
         for o in data.observations
     ]
-    return (
-        "<div"
-        f' class="compact">{folded(rows, (*head, "flagged samples / detectors"), "scans")}</div>'
-    )
 
 
 def _range(angles: AnyFloats) -> str:
     return f"{np.degrees(angles.min()):.2f}° – {np.degrees(angles.max()):.2f}°"
 
 
-def _steps(data: Data) -> str:
-    made = []
+def _steps(data: Data) -> list[dict[str, Any]]:
+    """Each step with its parameters: name, value, value as people read it, meaning."""
+    found = []
     for label, kind, parameters in data.provenance.get("operators", []):
         cls = class_of(kind)
         doc, fields = ("", {}) if cls is None else (own_doc(cls).split("\n\n")[0], described(cls))
-        rows = []
-        for key, text in parameters.items():
-            value = Html(
-                "<span"
-                f' title="{escape(str(text), quote=True)}">{escape(readable(str(text)))}</span>'
-            )
-            rows.append((key, value, small(fields[key].description or "" if key in fields else "")))
-        title = escape(label if label == kind else f"{label} ({kind})")
-        made.append(
-            details(Html(title + small(doc)), table(rows) or '<p class="note">No parameters.</p>')
-        )
-    note = '<p class="note">In the order in which they acted; a step opens to its parameters.</p>'
-    return note + "".join(made) if made else ""
+        title = label if label == kind else f"{label} ({kind})"
+        rows = [
+            (key, text, readable(str(text)), fields[key].description or "" if key in fields else "")
+            for key, text in parameters.items()
+        ]
+        found.append({"title": title, "doc": doc, "parameters": rows})
+    return found
 
 
-def _tally(data: Data) -> str:
+def _tally(data: Data) -> list[tuple[str, str, str]]:
     """The log of counts and figures, in the order of the steps."""
     rows: list[tuple[str, str, str]] = []
     previous = ""
@@ -363,41 +303,26 @@ def _tally(data: Data) -> str:
             ("" if who == previous and len(rows) != LONG else who, what, number)
         )  # a folded table begins with a name
         previous = who
-    table = folded(rows, ("step", "what", "value"), "counts and figures")
-    return f'<div class="steps">{table}</div>' if table else ""
+    return rows
 
 
-def _plan(data: Data) -> str:
-    """What was omitted, dropped or coarsened, and the errors that this may cause (`core.plan`)."""
-    head = ("effect", "decision", "error bound", "formula or reason")
-    table = folded(list(data.provenance.get("plan", [])), head, "decisions")
-    return f'<div class="steps">{table}</div>' if table else ""
-
-
-def _timings(data: Data) -> str:
+def _timings(data: Data) -> list[dict[str, Any]]:
+    """CPU seconds of each step, in all and by stage."""
     by_step: dict[str, dict[str, float]] = {}
     for label, stage, seconds in data.provenance.get("timings", []):
         stages = by_step.setdefault(str(label), {})
         stages[str(stage)] = stages.get(str(stage), 0.0) + float(seconds)
-    if not by_step:
-        return ""
-    total = {label: sum(stages.values()) for label, stages in by_step.items()}
-    longest = max(total.values()) or 1.0
-    rows: list[tuple[Any, ...]] = []
-    for label, stages in by_step.items():
-        if total[label] >= 0.0005:  # the pictures and this page are not done yet
-            detail = ", ".join(f"{k} {v:.2g} s" for k, v in stages.items() if v >= 0.0005)
-            bar = f'<span class="bar" style="width:{100 * total[label] / longest:.1f}%"></span>'
-            rows.append((label, f"{total[label]:.3f} s", Html(bar), small(detail)))
-    what = "CPU seconds before the products were written, added up over threads"
-    note = f'<p class="note">{what}: {sum(total.values()):.2f} s (first use compiles).</p>'
-    return (
-        f"{note}<div"
-        f' class="timings">{table(rows, ("step", "CPU", "", "stages"), numbers=(1,))}</div>'
-    )
+    return [
+        {
+            "label": label,
+            "seconds": sum(stages.values()),
+            "stages": ", ".join(f"{k} {v:.2g} s" for k, v in stages.items() if v >= 0.0005),
+        }
+        for label, stages in by_step.items()
+    ]
 
 
-def _provenance(data: Data) -> str:
+def _provenance(data: Data) -> list[tuple[str, Any]]:
     provenance = data.provenance
     rows: list[tuple[str, Any]] = [("seed", data.scene.seed)]
     if provenance.get("command"):
@@ -411,16 +336,4 @@ def _provenance(data: Data) -> str:
             for how, what in run.items()
         ]
         rows.append((f"signal {name}", ", ".join(parts)))
-    files = [str(p.name) for key in ("map_file", "tod_file") for p in data.products.get(key, [])]
-    if len(files) > LONG // 2 + 2:
-        every = "".join(f"<li>{escape(name)}</li>" for name in files)
-        all_of_them = details(f"all {len(files)} files", f'<ul class="files">{every}</ul>')
-        rows.append(("files", Html(f"{escape(files[0])} to {escape(files[-1])}{all_of_them}")))
-    elif files:
-        rows.append(("files", ", ".join(files)))
-    text = str(provenance.get("resolved_yaml", ""))
-    return table(rows) + (
-        details("Configuration with every default filled in", f"<pre>{escape(text)}</pre>")
-        if text
-        else ""
-    )
+    return rows

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,9 +45,12 @@ def flux_density(kelvin: float, fwhm: float, band: Band) -> str:
     return scaled(jansky, ((1, "\u00a0Jy"), (1e3, "\u00a0mJy"), (1e6, "\u00a0µJy")), least=0.9995)
 
 
-def results(data: Data, given: float | None) -> str:
-    """Cards: how much was observed, how noisy and how deep the maps are. ``given``: diameter [rad]
-    of the circle where that is taken; None: `central_diameter` of each map."""
+def results(data: Data, given: float | None) -> list[Card]:
+    """Cards of how much was observed, how noisy and how deep the maps are.
+
+    ``given`` is the diameter [rad] of the circle in which that is taken; None stands for
+    `central_diameter` of each map.
+    """
     maps = maps_of(data.products)
     wide = {
         name: central_diameter(product.fwhm, product.pixel, given) for name, product in maps.items()
@@ -83,10 +85,7 @@ def results(data: Data, given: float | None) -> str:
     for what, values in strongest.items():
         if values is not None and np.isfinite(values).any():
             cards.append((brightness(_extreme(values)), f"strongest pixel of the {what}"))
-    body = "".join(
-        f"<div class=card><b>{escape(b)}</b><span>{escape(s)}</span></div>" for b, s in cards
-    )
-    return f'<div class="cards">{body}</div>'
+    return cards
 
 
 def _unsolved(name: str, product: MapProduct) -> list[Card]:

@@ -1,82 +1,13 @@
-"""Tables of a report, and numbers as people read them."""
+"""Numbers of a report as people read them."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
-from html import escape
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-
-LONG = 12
-"""Rows of a table that are shown; the rest of a longer one is folded away. Half as many of files,
-in one cell.
-"""
-
-
-class Html(str):
-    """Text that is markup already."""
-
-    __slots__ = ()
-
-
-def table(
-    rows: Iterable[Sequence[Any]], head: Sequence[str] = (), numbers: Sequence[int] = ()
-) -> str:
-    """A table; the first column is a header. Cells are escaped unless they are `Html`; ``numbers``:
-    right-aligned columns.
-    """
-
-    def cell(k: int, value: Any) -> str:
-        text = value if isinstance(value, Html) else escape(str(value))
-        tag, style = ("th" if k == 0 else "td"), (' class="number"' if k in numbers else "")
-        return f"<{tag}{style}>{text}</{tag}>"
-
-    body = "".join(
-        "<tr>" + "".join(cell(k, v) for k, v in enumerate(row)) + "</tr>" for row in rows
-    )
-    top = ""
-    if head:
-        cells = (
-            f"<th{' class=number' if k in numbers else ''}>{escape(h)}</th>"
-            for k, h in enumerate(head)
-        )
-        top = "<thead><tr>" + "".join(cells) + "</tr></thead>"
-    style = "" if head else ' class="pairs"'
-    return (
-        f'<div class="scroll"><table{style}>{top}<tbody>{body}</tbody></table></div>'
-        if body
-        else ""
-    )
-
-
-def folded(rows: Sequence[Sequence[Any]], head: Sequence[str], what: str) -> str:
-    """A table of which the first `LONG` rows are shown, and all others folded away as so many more
-    ``what``.
-    """
-    if len(rows) <= LONG + 3:  # nobody unfolds three rows
-        return table(rows, head)
-    return table(rows[:LONG], head) + details(
-        f"{len(rows) - LONG} more {what}", table(rows[LONG:], head)
-    )
-
-
-def details(summary: str, body: str) -> Html:
-    """``body`` (markup) folded away under ``summary``."""
-    title = summary if isinstance(summary, Html) else escape(summary)
-    return Html(f"<details><summary>{title}</summary>{body}</details>")
-
-
-def small(text: str) -> Html:
-    """Docstring text in small letters: escaped, with single and double backquotes as code."""
-    plain = escape(" ".join(text.split()))
-    return Html(
-        "<small>"
-        + re.sub(r"``(.+?)``|`(.+?)`", lambda m: f"<code>{m[1] or m[2]}</code>", plain)
-        + "</small>"
-    )
 
 
 def scaled(

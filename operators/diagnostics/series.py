@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zonda.core.errors import PipelineError
-from zonda.core.notebook import html_table
+from zonda.core.pages import html_table
 from zonda.core.product import Record
 from zonda.core.storage.ecsv import Column
 from zonda.core.types import Floats

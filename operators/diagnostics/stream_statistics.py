@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.notebook import html_table
+from zonda.core.pages import html_table
 from zonda.core.product import Record
 from zonda.core.storage.ecsv import Column
 from zonda.core.types import Floats

@@ -36,9 +36,9 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.stokes import IQU
-from zonda.core.notebook import html_table
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.output import Output
+from zonda.core.pages import html_table
 from zonda.core.signal import Signal, product_name, stream_of
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import product_path

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
-from zonda.core.notebook import html_table
 from zonda.core.numerics.angles import ARCMIN
+from zonda.core.pages import html_table
 from zonda.core.registry import instruments
 
 from . import calculator, default_pipeline, lines

@@ -7,14 +7,13 @@ from __future__ import annotations
 import math
 from collections import Counter as Count
 from collections.abc import Iterator, Sequence
-from html import escape
-from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from zonda import __version__
+from zonda.core.pages import render
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path, write_text
-from zonda.operators.diagnostics.report_text import Html, table
 
 from .claims import ClaimsFile
 from .figure import draw
@@ -167,38 +166,40 @@ def _write_values(row: Row, path: Path) -> None:
 
 
 def _html(file: ClaimsFile, rows: Sequence[Row], folder: Path) -> str:
-    style = (
-        resources.files("zonda.operators.diagnostics")
-        .joinpath("data/report.css")
-        .read_text(encoding="utf-8")
+    return render(
+        __package__,
+        "claims.html",
+        title=file.paper,
+        version=__version__,
+        summary=summary(rows),
+        rule=RULE,
+        head=HEAD,
+        colours=COLOURS,
+        claims=[_claim(row, folder) for row in rows],
     )
-    cells = [_cells(row) for row in rows]
-    details = "\n".join(_section(row, folder) for row in rows)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Claims · zonda</title>
-<style>
-{style}main {{ max-width: 1400px; }} h3 {{ margin: 0 0 .4rem; }}
-.pill {{ color: #fff; border-radius: 8px; padding: .1rem .5rem; white-space: nowrap; }}
-</style>
-</head>
-<body>
-<header><h1>{escape(file.paper)}</h1>
-<p>What the paper states, and what zonda {escape(__version__)} finds.</p></header>
-<main>
-<section><h2>{escape(summary(rows))}</h2><p class="note">{escape(RULE)}</p>
-{table(cells, HEAD, (1, 2, 3, 4, 5, 6))}</section>
-{details}
-</main>
-</body>
-</html>
-"""
+
+
+def _claim(row: Row, folder: Path) -> dict[str, Any]:
+    """Values of one claim for the page: sentences, numbers, experiments, pictures."""
+    claim = row.claim
+    images = sorted((folder / claim.id).glob("*.png"), key=lambda path: path.name != "values.png")
+    return {
+        "id": claim.id,
+        "states": claim.claim,
+        "section": claim.section,
+        "verdict": row.verdict.value,
+        "numbers": _cells(row),
+        "remark": remark(row),
+        "experiments": [
+            (name or "the claim", ", ".join(described(experiment)))
+            for name, experiment in claim.experiments()
+        ],
+        "pictures": [(image.name, image.stem.replace("_", " ")) for image in images],
+    }
 
 
 def _cells(row: Row) -> list[str]:
+    """Cells of the numbers of one claim: the paper's, zonda's, and the distances between them."""
     claim, n = row.claim, _numbers(row)
     sign = {"equal": "", "at_least": "≥ ", "at_most": "≤ "}[claim.relation]
     error = n["paper_error"] or n["paper_rounding"]
@@ -218,49 +219,9 @@ def _cells(row: Row) -> list[str]:
         if row.values.values
         else [""] * 5
     )
-    name = Html(
-        f'<a href="#{claim.id}">{escape(claim.id)}</a><br>{escape(claim.claim)}'
-        f" <small>({escape(claim.section)})</small>"
-    )
-    return [name, paper, *shown, _pill(row)]
+    return [paper, *shown]
 
 
 def distance_text(distance: float) -> str:
     """Standard deviations; a dash where the values differ and nothing has an error."""
     return f"{distance:.2g}" if math.isfinite(distance) else "–"
-
-
-def _pill(row: Row) -> Html:
-    verdict = row.verdict.value
-    return Html(
-        '<span class="pill" style="background:'
-        f' {COLOURS.get(verdict, "#6b5b95")}">{escape(verdict)}</span>'
-    )
-
-
-def _section(row: Row, folder: Path) -> str:
-    """What is known of one claim: sentences, experiments, pictures."""
-    claim = row.claim
-    parts = [
-        f"<h3>{escape(claim.id)}</h3><p>{escape(claim.claim)} ({escape(claim.section)})"
-        f" {_pill(row)}</p>"
-    ]
-    parts.append(f"<p>{escape(remark(row))}</p>")
-    lines = [
-        (name or "the claim", ", ".join(described(experiment)))
-        for name, experiment in claim.experiments()
-    ]
-    parts.append(table(lines))
-    own = folder / claim.id
-    images = (
-        sorted(own.glob("*.png"), key=lambda path: path.name != "values.png")
-        if own.is_dir()
-        else []
-    )
-    shown = "".join(
-        f'<figure><img src="{claim.id}/{escape(image.name)}" alt="{escape(claim.id)}:'
-        f' {escape(image.stem)}" loading="lazy">'
-        f"<figcaption>{escape(image.stem.replace('_', ' '))}</figcaption></figure>"
-        for image in images
-    )
-    return f'<section id="{claim.id}">{"".join(parts)}<div class="pictures">{shown}</div></section>'

@@ -91,7 +91,7 @@ def u_rad() -> Any:
 
 def test_notebooks_show_defaults_too() -> None:
     html = zonda.PointingDaisy(radius="2 arcmin")._repr_html_()
-    assert "&#x27;2 arcmin&#x27;" in html
+    assert "&#39;2 arcmin&#39;" in html
     assert "50 arcsec/s (default)" in html
 
 

@@ -243,7 +243,7 @@ def test_the_white_noise_that_is_expected():
         "smoothed with the beam to 12″ (8.5″ beam and as much smoothing, added in quadrature)"
         in what
     )
-    assert what in results(data, circle).replace("&#x27;", "'")
+    assert what in [meaning for _, meaning in results(data, circle)]
     ((shown, what),) = expected("map", dataclasses.replace(product, fwhm=0.0), circle)
     assert "beam" not in what
     assert (
@@ -252,23 +252,6 @@ def test_the_white_noise_that_is_expected():
         )
         == []
     )
-
-
-def test_what_goes_wrong_does_so_after_the_steps_before_it(report, data, monkeypatch):
-    """Maps are written before the report is: nothing is lost with it."""
-
-    def broken(*given):
-        raise MemoryError("of a map")
-
-    report()
-    operator = Report()
-    monkeypatch.setattr("zonda.operators.diagnostics.report_results.noise_figures", broken)
-    operator.watch(data, "maps")
-    with pytest.raises(MemoryError):
-        operator.finalize(data)
-    monkeypatch.undo()
-    operator.watch(data, "maps")
-    operator.finalize(data)
 
 
 def test_long_lists_are_folded(data, make_observation):
@@ -334,7 +317,7 @@ def test_the_depth_of_a_map_is_told_per_beam():
     product = data.products["map"]
     near = product.distance() <= np.radians(1 / 60)
     seconds = np.median(product.hits[near]) / 40 * np.pi / (4 * np.log(2)) * (8.5 / 3) ** 2
-    shown = results(data, np.radians(2 / 60))
+    shown = " ".join(" ".join(card) for card in results(data, np.radians(2 / 60)))
     assert f"{seconds:.3g}\u00a0s" in shown
     assert "of all detectors per 8.5″ beam, central 2′ (14 beams); " in shown
     assert f"{np.median(product.hits[near]):.4g} samples per 3″ pixel" in shown
@@ -370,7 +353,8 @@ def test_the_central_circle_holds_several_beams(tmp_path):
     header = fits.getheader(tmp_path / "noise_map.fits")
     assert header["RMSHALF"] == pytest.approx(product.rms(radius, of="half_difference"))
     assert "central 10 arcmin" in header.comments["RMSHALF"]
-    assert "central 3′ (1.5 beams)" in results(data, np.radians(3 / 60))  # as it is asked for
+    asked = results(data, np.radians(3 / 60))
+    assert any("central 3′ (1.5 beams)" in meaning for _, meaning in asked)
 
 
 def test_the_net_is_that_of_all_scans(data, report, make_observation):
