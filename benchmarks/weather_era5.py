@@ -27,7 +27,6 @@ from zonda.core.configuration.time import Instant
 from zonda.core.registry import sites
 from zonda.operators.atmosphere.weather.climatology import climatologies, climatology_column
 from zonda.operators.atmosphere.weather.profiles import on_heights
-from zonda.plugins.sites import table
 
 HOURS = range(0, 24, 3)
 """UTC; each stands in the middle of one of weathergen's."""
@@ -111,7 +110,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     places = sys.argv[1:] or [
-        next(r["name"] for r in table().values() if r["climatology"] == c) for c in climatologies()
+        next(n for n in sites if sites.create(n).climatology == c) for c in climatologies()
     ]
     for place in places:
         print(compare(folder / f"{sites.create(place).climatology}.h5", place), flush=True)

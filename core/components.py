@@ -11,10 +11,15 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
+from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar, overload
 
+from pydantic_core import PydanticCustomError
+
+from .component_files import described, is_file, names_in
 from .discovery import API_VERSION, RAISED, Found, discover
 from .errors import ZondaError
 
@@ -85,9 +90,16 @@ class Registry:
     def _index(self) -> dict[str, list[Found]]:
         if self._found is None:
             self._found = {}
-            for found in dict.fromkeys(found for group in self.groups for found in discover(group)):
+            points = (point for group in self.groups for point in discover(group))
+            for found in dict.fromkeys(found for point in points for found in point.described()):
                 self._found.setdefault(found.name, []).append(found)
         return self._found
+
+    @property
+    def _class(self) -> Any:
+        """What `base` names, imported now."""
+        module, _, attribute = self.base.partition(":")
+        return getattr(import_module(module), attribute)
 
     def refresh(self) -> None:
         """Read the entry points anew (call `zonda.core.discovery.refresh` first); what was
@@ -189,12 +201,16 @@ class Registry:
             )
         return self.load(found[0])
 
-    def create(self, name: str) -> Any:
+    def create(self, name: str, folder: str | Path | None = None) -> Any:
         """The object called ``name``: what the entry point names, or what it returns when called
-        without arguments.
+        without arguments; or the object that the YAML file at the path ``name`` describes, which is
+        looked for in ``folder`` first.
 
-        Raises `RegistryError` as `get`, and where the call fails or returns another kind of thing.
+        Raises `RegistryError` as `get`, and if the call fails or returns another kind of thing;
+        `ConfigurationError` for mistakes in the file.
         """
+        if is_file(name) and self.base and not self.classes:
+            return self._of_file(name, folder)
         name = self.registered(name)
         component = self.get(name)
         if not callable(component):
@@ -214,6 +230,24 @@ class Registry:
             raise _broken(self.kind, found, err) from err
         return self._check(made, found, made=True)
 
+    def _of_file(self, name: str, folder: str | Path | None) -> Any:
+        """The component of a file that holds one."""
+        from .configuration.files import find_in
+
+        try:
+            path = find_in(folder, name)
+        except PydanticCustomError as err:
+            told = err.context or {}
+            raise RegistryError(told["message"], label=told["label"], cure=told["help"]) from None
+        inside = names_in(path)
+        if len(inside) != 1:
+            raise RegistryError(
+                f"describes {len(inside)} {self.kind}s: {', '.join(inside)}",
+                place=str(path),
+                cure=f"keep one {self.kind} in the file",
+            )
+        return described(path, inside[0], self._class, self.create)
+
     def load(self, found: Found) -> Any:
         """Import one candidate. Raises `RegistryError` where that fails or it is written for
         another plugin API.
@@ -222,11 +256,31 @@ class Registry:
             return self._check(self._registered[found.name], found)
         if found not in self._loaded:
             try:
-                component = found.load()
+                component = self._described(found) if found.file else found.load()
+                if isinstance(component, Mapping) and self.base and not self.classes:
+                    component = self._class(**{"name": found.name, **component})
+            except RegistryError:
+                raise
             except RAISED as err:
                 raise _broken(self.kind, found, err) from err
             self._loaded[found] = self._check(component, found)
         return self._loaded[found]
+
+    def _described(self, found: Found) -> Any:
+        """The component that a YAML file describes. Raises `RegistryError` at the first mistake."""
+        from .configuration.diagnostics import ConfigurationError
+
+        try:
+            return described(Path(found.file), found.name, self._class, self.create)
+        except ConfigurationError as err:
+            first, *others = err.diagnostics
+            cures = [first.help, *(f"{other.place}: {other.message}" for other in others)]
+            raise RegistryError(
+                f"{self.kind} '{found.name}' of {found.origin}: {first.message}",
+                label=first.label,
+                place=first.place,
+                cure="\n".join(filter(None, cures)),
+            ) from None
 
     def _same(self, names: list[str]) -> bool:
         """Whether all ``names`` stand for equal things, as a site and its alias do."""
@@ -271,8 +325,7 @@ class Registry:
                 cure=f"pip install -U {found.distribution if older else 'zonda'}",
             )
         if self.base and (made or self.classes or not callable(component)):
-            module, _, attribute = self.base.partition(":")
-            base = getattr(import_module(module), attribute)
+            base, attribute = self._class, self._class.__name__
             if not (
                 isinstance(component, type) and issubclass(component, base)
                 if self.classes
@@ -285,7 +338,11 @@ class Registry:
                 )
                 raise RegistryError(
                     f"{who} is not {noun}",
-                    label=f"it is {component!r:.60}",
+                    label=(
+                        f"the package {component.__name__} has no *.yaml files"
+                        if isinstance(component, ModuleType)
+                        else f"it is {component!r:.60}"
+                    ),
                     cure=f"mend {found.reference}",
                 )
         return component

@@ -32,9 +32,11 @@ class Found(NamedTuple):
 
     name: str
     reference: str
-    """``module:attribute``."""
+    """``module:attribute``, or a package of YAML files (`core.component_files`)."""
     distribution: str
     version: str
+    file: str = ""
+    """Path of the YAML file that describes it, if that is not Python."""
 
     @property
     def qualified(self) -> str:
@@ -51,6 +53,20 @@ class Found(NamedTuple):
         from importlib.metadata import EntryPoint
 
         return EntryPoint(self.name, self.reference, "").load()
+
+    def described(self) -> list[Found]:
+        """The components in the files of the package that the entry point names, found without an
+        import; itself if it names an object.
+        """
+        if ":" in self.reference:
+            return [self]
+        from .component_files import files_of, names_in
+
+        return [
+            self._replace(name=name, reference=f"{self.reference}/{path.name}", file=str(path))
+            for path in files_of(self.reference)
+            for name in names_in(path)
+        ] or [self]
 
 
 def normalized(distribution: str) -> str:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import (
     Field,
+    ModelWrapValidatorHandler,
     SerializerFunctionWrapHandler,
     ValidationError,
     ValidationInfo,
@@ -39,7 +40,7 @@ from .focalplane import Focalplane
 from .layouts import Layout, hexagonal_packing, rings, wafers
 from .registry import RegistryError, bands, instruments, layouts
 from .types import Floats
-from .variants import LIKE, variant
+from .variants import LIKE, is_variant, variant
 
 __all__ = ["SPEED_OF_LIGHT", "Band", "CameraBand", "Instrument", "Telescope", "hexagonal_packing"]
 
@@ -62,6 +63,10 @@ STAND_INS: dict[str, Any] = {
 """Of what an instrument must state, where bands or a table state it and are mistaken: only their
 mistakes are told.
 """
+
+
+STAND_IN = "stand-in: "
+"""Begins the source of a number that is not published or could not be looked up."""
 
 
 class Telescope(Parameters):
@@ -160,7 +165,15 @@ class Instrument(Parameters):
     sample_rate: Hertz = Field(gt=0, le=1e6)
     """Read-out rate."""
     provenance: str = ""
-    """Where these numbers come from."""
+    """Sources of these numbers: a text, or a mapping of what a number is to its source."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _or_variant(
+        cls, value: Any, validate: ModelWrapValidatorHandler[Instrument], info: ValidationInfo
+    ) -> Instrument:
+        made: Instrument = variant(value, info.context) if is_variant(value) else validate(value)
+        return made
 
     def _as_argument(self) -> str:
         return named_or_written(self, instruments)
@@ -356,6 +369,17 @@ class Instrument(Parameters):
     @classmethod
     def _band_by_name(cls, value: Any) -> Any:
         return named(bands, value)
+
+    @field_validator("provenance", mode="before")
+    @classmethod
+    def _sources_as_text(cls, value: Any) -> Any:
+        """Join the sources of numbers to one text: published ones first, then stand-ins."""
+        if not isinstance(value, dict):
+            return value
+        stand_ins = {k: v for k, v in value.items() if str(v).startswith(STAND_IN)}
+        texts = [f"{k}: {v}" for k, v in value.items() if k not in stand_ins]
+        texts += [f"{STAND_IN}{k}: {v.removeprefix(STAND_IN)}" for k, v in stand_ins.items()]
+        return "; ".join(texts)
 
     def varied(self, **changes: Any) -> Instrument:
         """This instrument with fields changed, as ``{like: ..., ...}`` in a pipeline file

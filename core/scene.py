@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
-from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationInfo, field_validator
+from pydantic import BeforeValidator, Field, SerializeAsAny, field_validator
 
 from .configuration.parameters import Parameters, named
 from .configuration.target import Target
@@ -17,7 +17,6 @@ from .errors import ZondaError
 from .instrument import Instrument
 from .registry import instruments, sites
 from .site import Site
-from .variants import is_variant, variant
 from .weather import WeatherSource, weather_source
 
 EARTH = 6371e3
@@ -58,8 +57,8 @@ class Scene(Parameters):
 
     @field_validator("instrument", mode="before")
     @classmethod
-    def _instrument_by_name(cls, value: Any, info: ValidationInfo) -> Any:
-        return variant(value, info.context) if is_variant(value) else named(instruments, value)
+    def _instrument_by_name(cls, value: Any) -> Any:
+        return named(instruments, value)
 
     def replace(self, **changes: Any) -> Scene:
         """The scene with other values, checked: ``scene.replace(seed=8)``. Raises

@@ -31,6 +31,7 @@ ELSEWHERE = {
         ("interop.md", k): "needs TOAST or sotodlib: tests/interop, in the environments of .ci"
         for k in (1, 2, 3, 5, 6, 7, 8)
     },
+    ("plugins.md", 4): "test_the_instrument_that_the_page_for_authors_shows",
     ("sky.md", 3): "needs PySM: tests/operators/sky/test_pysm.py, in the environment of .ci/pysm",
     ("sky.md", 4): "needs PySM: tests/operators/sky/test_pysm.py, in the environment of .ci/pysm",
 }
@@ -429,6 +430,7 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
 
     import zonda
     import zonda.testing
+    from zonda.core.registry import noise_models
 
     first, *others = re.findall(
         r"```python\n(.*?)```", (ROOT / "docs" / "plugins.md").read_text(), re.S
@@ -448,6 +450,10 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     zonda.testing.check_operator(page.Rms())
     zonda.testing.check_operator(page.AzimuthSlope())
     zonda.testing.check_operator(page.Peak())
+    monkeypatch.setitem(noise_models._registered, "my_rings", page.Rings)
+    noise = zonda.WhiteNoise(model={"name": "my_rings", "growth": "50 %"})
+    assert noise.model.growth == page.noise.model.growth == 0.5
+    zonda.testing.check_operator(noise)
 
     def signal(*steps):
         scene = zonda.Scene(
@@ -494,6 +500,50 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     data = zonda.Pipeline(steps, runs={"clean": {"without": ["slope"]}}).run(scene, output=tmp_path)
     assert (tmp_path / "peaks.txt").read_text().split()[::2] == ["peak", "clean/peak"]
     assert abs(data.products["peak"] - data.products["clean/peak"]) > 1
+
+
+def test_the_instrument_that_the_page_for_authors_shows(tmp_path, monkeypatch):
+    """As a file beside a pipeline, and found by its name in an installed package."""
+    from zonda.core import registry
+    from zonda.core.cli import main
+
+    page = (ROOT / "docs" / "plugins.md").read_text()
+    text = re.search(r"```yaml\n(my_camera:.*?)```", page, re.S)[1]
+    (tmp_path / "my_camera.yaml").write_text(text)
+    steps = (SCAN + MAPPED).replace("radius: 10", "radius: 3")
+    (tmp_path / "p.yaml").write_text(
+        PLACE + "instrument: my_camera.yaml\n" + SCENE + "operators:\n" + steps
+    )
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", "p.yaml", "--output", "out", "--threads", "1"]) == 0
+
+    setup = re.search(r'```toml\n(\[project\]\nname = "my-cameras".*?)```', page, re.S)[1]
+    listed = re.search(r"```text\n(pyproject.toml\n.*?)```", page, re.S)[1].split()
+    parts = tomllib.loads(setup)
+    installed = tmp_path / "site-packages"
+    package = installed / "my_cameras"
+    for name in listed[1:]:
+        (installed / name).parent.mkdir(parents=True, exist_ok=True)
+        (installed / name).write_text(text if name.endswith(".yaml") else "")
+    data = parts["tool"]["setuptools"]["package-data"]["my_cameras"]
+    assert {path for pattern in data for path in package.glob(pattern)} == {
+        *package.rglob("*.yaml")
+    }
+    info = installed / "my_cameras-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-cameras\nVersion: 1.0\n")
+    points = parts["project"]["entry-points"]["zonda.instruments"]
+    lines = [f"{key} = {value}\n" for key, value in points.items()]
+    (info / "entry_points.txt").write_text("[zonda.instruments]\n" + "".join(lines))
+    monkeypatch.syspath_prepend(str(installed))
+    registry.refresh()
+    try:
+        made = registry.instruments.create("my_camera")
+    finally:
+        monkeypatch.undo()
+        registry.refresh()
+    assert (made.name, made.detectors, made.telescope.site) == ("my_camera", 38, "chajnantor")
+    assert made.provenance == "detectors: first light, 2025; stand-in: NET: assumed"
 
 
 def test_the_operator_that_contributing_shows_keeps_the_contract(tmp_path, monkeypatch):

@@ -1,7 +1,8 @@
-"""What the shell offers when Tab is pressed: names, found without importing what they stand for."""
+"""Completions of the shell: names, found without importing the components."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,21 +37,19 @@ def pipelines(context: click.Context, parameter: click.Parameter, incomplete: st
 
 def instruments(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[Any]:
     """Registered instruments."""
-    return _names("zonda.instruments", incomplete)
+    from ..registry import instruments
+
+    return _beginning(instruments, incomplete)
 
 
 def sites(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[Any]:
     """Registered sites."""
-    return _names("zonda.sites", incomplete)
+    from ..registry import sites
+
+    return _beginning(sites, incomplete)
 
 
-def _names(group: str, incomplete: str) -> list[Any]:
+def _beginning(names: Iterable[str], incomplete: str) -> list[Any]:
     from click.shell_completion import CompletionItem
 
-    from ..discovery import discover
-
-    return [
-        CompletionItem(name)
-        for name in sorted({found.name for found in discover(group)})
-        if name.startswith(incomplete)
-    ]
+    return [CompletionItem(name) for name in names if name.startswith(incomplete)]

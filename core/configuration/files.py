@@ -18,13 +18,20 @@ MOST_NAMED = 4
 
 
 def find(value: Any, info: ValidationInfo) -> Path:
-    """The absolute path of an existing file. Raises what names the folders tried."""
+    """The absolute path of an existing file, beside the pipeline file or in the working directory.
+
+    Raises PydanticCustomError, which names the folders tried.
+    """
+    return find_in((info.context or {}).get("folder"), value)
+
+
+def find_in(folder: str | Path | None, value: Any) -> Path:
+    """As `find`, beside ``folder``."""
     if not isinstance(value, str | Path) or not str(value).strip():
         raise mistake(f"expected the path of a file, got {value!r:.60}")
     path = Path(value)
     with suppress(RuntimeError):  # nobody of that name: take ~ as it stands
         path = path.expanduser()
-    folder = (info.context or {}).get("folder")
     folders = list(dict.fromkeys(Path(f).resolve() for f in (folder, Path.cwd()) if f is not None))
     tried = [path] if path.is_absolute() else [f / path for f in folders]
     for candidate in tried:

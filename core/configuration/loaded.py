@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from zonda import __version__
 
+from ..component_files import is_file
 from ..errors import ZondaError
 from ..operator import Operator
 from ..pipeline import Pipeline
@@ -141,7 +142,7 @@ class PipelineFile:
         named = {
             kind: scene[kind]
             for kind, value in given.items()
-            if value is None or isinstance(value, str) or is_variant(value)
+            if value is None or is_variant(value) or (isinstance(value, str) and not is_file(value))
         }
         values = header | scene | {kind: given[kind] for kind in named}
         values = {

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from ..components import Registry
 from ..errors import ZondaError
-from .diagnostics import Diagnostic, refused
+from .diagnostics import ConfigurationError, Diagnostic, refused
 from .explain import explain
 from .parameters import Parameters
 from .yaml_places import Document, Span
@@ -61,7 +61,10 @@ class Mistakes:
         if not isinstance(given.get(key), str):
             return True
         try:
-            given[key] = names.create(given[key])
+            given[key] = names.create(given[key], self.context["folder"])
+        except ConfigurationError as err:
+            self.found += err.diagnostics
+            return False
         except ZondaError as err:
             self.refused(err, self.document.mark(at).value)
             return False

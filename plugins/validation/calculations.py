@@ -274,16 +274,15 @@ def calculator_of_atlast(
     with zonda's atmosphere (2022-08-01T23:00, Llano de Chajnantor): ``at`` the band's centre, or
     over the band, W m^-2 Hz^-1."""
     from zonda.core.configuration.time import Instant
+    from zonda.core.registry import instruments, sites
     from zonda.operators.atmosphere.weather.sources import profile_of
-    from zonda.plugins import instruments, sites
     from zonda.plugins.forecast.calculator import calculate
 
     if at not in ("centre", "band"):
         raise ValueError("at is centre or band")
-    camera = instruments.atlast
-    air = profile_of(None, sites.llano_de_chajnantor, Instant.parse("2022-08-01T23:00"), 0).scaled(
-        pwv
-    )
+    camera = instruments.create("atlast")
+    site = sites.create("llano_de_chajnantor")
+    air = profile_of(None, site, Instant.parse("2022-08-01T23:00"), 0).scaled(pwv)
     found = calculate(air.layers, camera.band, camera.telescope.diameter, elevation, seconds)
     return (found.centre if at == "centre" else found.band) * 1e-26
 

@@ -15,7 +15,6 @@ from zonda.core.errors import InputError
 from zonda.core.registry import RegistryError
 from zonda.core.scene import Scene
 from zonda.core.site import Site
-from zonda.plugins import instruments
 
 PIPELINE = """site: {site}
 instrument: {instrument}
@@ -135,7 +134,8 @@ def test_an_instrument_called_by_its_site_or_telescope(
 
 
 def test_every_telescope_has_a_site_that_is_registered() -> None:
-    for telescope in instruments.TELESCOPES.values():
+    for name in registry.instruments:
+        telescope = registry.instruments.create(name).telescope
         assert telescope.name == "generic 6 m" or telescope.site in registry.sites
 
 

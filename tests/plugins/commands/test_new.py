@@ -101,7 +101,7 @@ def test_the_tests_of_a_new_plugin_pass_at_once(here, capsys):
     assert cli.main(["new", "plugin", "zonda-my.camera"]) == 0
     folder = here / "zonda-my.camera"
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-    inside = {"__init__.py", "operator.py", "instrument.py"}
+    inside = {"__init__.py", "operator.py", "instruments/camera.yaml"}
     assert files == {
         "pyproject.toml",
         "README.md",
