@@ -62,14 +62,6 @@ CALLS = {
     "requests.get",
 }
 ALLOWED = {
-    (
-        "core/accuracy/measure.py",
-        "subprocess.run",
-    ): "zonda itself, as a child; no shell; its own arguments",
-    (
-        "core/accuracy/measure.py",
-        "pickle.load",
-    ): "the child's answer, in a folder that only this user can read, made for it",
     ("core/cli/group.py", "import_module"): "names from the table in zonda/commands.py",
     (
         "core/compilation/compile_ahead.py",

@@ -1,10 +1,9 @@
-"""``zonda accuracy``: what accuracy costs in time, for the user's own pipeline and metric. Imports
-click alone.
+"""``zonda accuracy``: error against CPU time for the user's own pipeline and metric. Imports click
+alone.
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,8 +15,7 @@ if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
 
 NOT_MET = 1
-"""Exit status where no setting meets the target, or a stored Pareto front does not hold any more.
-"""
+"""Exit status if no setting meets the target, or a stored Pareto front does not hold any more."""
 
 
 @click.command()
@@ -57,17 +55,25 @@ NOT_MET = 1
 @click.option("--duration", metavar="TIME", help="Length of each scan, e.g. '2 min'.")
 @click.option(
     "--repeats",
-    default=3,
+    default=1,
     show_default=True,
-    type=click.IntRange(2, 100),
+    type=click.IntRange(1, 100),
     help="Timed runs of each setting.",
 )
 @click.option(
     "--seeds",
-    default=4,
+    default=2,
     show_default=True,
     type=click.IntRange(1, 1000),
     help="For scatter, and knobs that redraw.",
+)
+@click.option(
+    "--budget",
+    default=30,
+    show_default=True,
+    type=click.IntRange(2),
+    metavar="RUNS",
+    help="Largest number of runs, and of their CPU time in units of one run.",
 )
 @click.option(
     "--threads",
@@ -105,6 +111,7 @@ def accuracy(
     duration: str | None,
     repeats: int,
     seeds: int,
+    budget: int,
     threads: int,
     output: Path | None,
     store: bool,
@@ -115,9 +122,12 @@ def accuracy(
 
     Every knob that the pipeline's operators declare is turned alone and jointly, with the same
     random numbers, and compared with all knobs at their tightest. Prints the tables, draws the
-    work-precision diagram and writes the setting that meets the target at least cost.
+    work-precision diagram and writes the setting that meets the target at least cost. Ctrl-C ends
+    it with the Pareto front found so far.
     """
+    from ..campaign.job import plural
     from ..configuration.pipeline_file import load
+    from .measure import measuring
     from .metrics import get
     from .settings import knobs_of, shortened
     from .study import Setup, study
@@ -131,30 +141,41 @@ def accuracy(
     turned = knobs_of(file, knobs)
     numbers = tuple(file.scene().seed + k for k in range(seeds))
     shorter = shortened(file, duration, quick)
-    setup = Setup(
-        pipeline,
-        tuple(settings),
-        metric,
-        wanted,
-        shorter,
-        repeats=repeats,
-        seeds=numbers,
-        threads=threads,
-    )
     from ..storage.files import check_output_folder, product_path, write_text
 
     folder = (
         product_path("out/accuracy", f"{file.header.name}.{metric}") if output is None else output
     )
     check_output_folder(folder)
-    found = study(file, setup, turned, say=_progress if sys.stderr.isatty() else lambda what: None)
-    _clear()
+    with measuring(threads) as pool:
+        setup = Setup(
+            pipeline,
+            tuple(settings),
+            metric,
+            wanted,
+            shorter,
+            repeats=repeats,
+            seeds=numbers,
+            threads=threads,
+            budget=budget,
+            pool=pool,
+        )
+        _say(
+            f"{metric} of {file.header.name}: {plural(len(turned), 'knob')}, at most"
+            f" {setup.planned(turned)} runs (--budget {budget}) after a first one that compiles"
+        )
+        found = study(file, setup, turned, say=_say)
+        if found.interrupted and pool.stop is not None:
+            pool.stop()
 
     from . import store as stored
     from .figure import save
     from .table import fragment, lines, not_met, percent
 
     text = "\n".join(lines(found))
+    if found.interrupted:
+        click.echo(text)
+        raise KeyboardInterrupt
     write_text(folder / "accuracy.txt", text + "\n")
     stored.save(found, file, folder / "front.json")
     save(found, folder / "work_precision.png")
@@ -210,10 +231,5 @@ def _fraction(text: str) -> float:
         raise click.BadParameter(message, param_hint="--target") from None
 
 
-def _progress(what: str) -> None:
-    click.echo(f"\r\033[K{what[:100]}", nl=False, err=True)
-
-
-def _clear() -> None:
-    if sys.stderr.isatty():
-        click.echo("\r\033[K", nl=False, err=True)
+def _say(what: str) -> None:
+    click.echo(what, err=True)

@@ -1,44 +1,59 @@
-"""One setting measured: in a process of its own, so that peak memory and first-call costs are that
-setting's.
+"""One setting measured, in a process that stays warm from one setting to the next.
 
-A process loads the pipeline file with the setting's overrides and runs it once: that run pays for
-imports, compiled code and caches and is reported apart. Then the setting and the yardstick (all
-knobs at their tightest) run in turn, each time from the file anew, so what an operator object keeps
-is made again. Costs are ratios to the yardstick's run beside it: what other programs on the machine
-do to both cancels. Operators that act at the end of a run (pictures, reports, files of maps) are
-left out: they cost the same at every setting.
+The first run in the process pays for imports, compiled code and caches and is reported apart. Each
+run after it begins from the file anew, so that what an operator object keeps is made again. The
+reference (all knobs at their tightest) runs again after every `BETWEEN` runs: CPU seconds are
+ratios to its last run, which cancels the load that other programs put on the machine. Operators
+that act at the end of a run (pictures, reports, files of maps) are left out: they cost the same at
+every setting.
 """
 
 from __future__ import annotations
 
-import json
-import pickle
+import contextlib
+import ctypes
+import gc
+import os
+import resource
 import statistics
-import subprocess
+import sys
 import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .. import children
 from ..errors import ZondaError
+from ..faults import faults_named
+
+if TYPE_CHECKING:
+    from ..campaign.engines import Pool
+    from ..configuration.pipeline_file import PipelineFile
+    from ..data import Data
+    from .metrics import Metric
 
 REST = "(rest)"
 """CPU seconds that no operator's stage accounts for."""
 
+BETWEEN = 8
+"""Runs of settings between two of the reference."""
+
 
 @dataclass(frozen=True)
 class Request:
-    """What a process is to do.
+    """A measurement that the process is asked for.
 
     Attributes
     ----------
     pipeline, overrides, yardstick
-        Path or shipped name; overrides of the setting, and of the setting that it is timed against.
+        Path or shipped name; overrides of the setting, and of the reference that it is timed
+        against (empty: none).
     metric, seeds
-        What to measure, at which seeds (None: the file's).
+        Name of the metric, and the seeds at which it is measured (None: the file's).
     repeats, threads
-        Timed runs of each, and threads of every run.
+        Timed runs at the first seed (0: none is timed), and threads of every run.
     """
 
     pipeline: str
@@ -46,30 +61,30 @@ class Request:
     metric: str
     yardstick: tuple[str, ...] = ()
     seeds: tuple[int | None, ...] = (None,)
-    repeats: int = 3
+    repeats: int = 1
     threads: int = 1
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What came out.
+    """The result of a request.
 
     Attributes
     ----------
     found
-        What the metric measured, by seed.
+        Value of the metric at each seed.
     steps
         CPU seconds of each step (label), one for each timed run; `REST` is what else the process
         used.
     yardstick
-        CPU seconds of the yardstick's run beside each; empty: none ran.
+        CPU seconds of the reference's last run before each; empty: none ran.
     first
-        CPU seconds of the first run, compilation and caches included.
+        CPU seconds of the first run of the process, compilation and caches included; 0 where the
+        process was warm.
     memory
-        Peak resident memory of the process, bytes, libraries included.
-    compiled
-        Whether code was compiled on the way, which takes memory of its own; the next process finds
-        it in the cache.
+        Peak resident memory of the process in the timed runs, bytes, libraries included.
+    runs, cpu
+        Number of runs that this took, and their CPU seconds, but for the first run.
     """
 
     found: tuple[Any, ...]
@@ -77,11 +92,17 @@ class Measured:
     yardstick: tuple[float, ...] = ()
     first: float = 0.0
     memory: int = 0
-    compiled: bool = False
+    runs: int = 1
+    cpu: float = 0.0
+
+    @property
+    def timed(self) -> int:
+        """Number of timed runs."""
+        return max((len(seconds) for seconds in self.steps.values()), default=0)
 
     def cost(self, step: str = "") -> tuple[float, float]:
-        """CPU time of a step, or of all, in units of the yardstick's run beside it: (median, half
-        the range) over the runs.
+        """CPU time of a step, or of all, in units of the reference's run: (median, half the range)
+        over the runs.
 
         Medians are added over steps, and half ranges in quadrature: a run that was disturbed in one
         step counts in the others.
@@ -93,37 +114,217 @@ class Measured:
         return middle, sum(((max(r) - min(r)) / 2) ** 2 for r in ratios) ** 0.5
 
 
-def measure(request: Request) -> Measured:
-    """Run a child process, again where it had to compile. Raises `ZondaError` as the run does, or
-    where the process dies.
+@dataclass(frozen=True)
+class Refused:
+    """An error of a run, as it travels between processes."""
+
+    message: str
+    place: str
+    cure: str
+
+
+@contextlib.contextmanager
+def measuring(threads: int) -> Iterator[Pool]:
+    """A pool of one process for `measure`; it ends with the context."""
+    from ..campaign.engines import engine
+
+    with engine("processes", workers=1, threads=threads) as pool:
+        yield pool
+
+
+def measure(request: Request, pool: Pool | None = None) -> Measured:
+    """Measure a setting in the process of ``pool``, or in one of its own.
+
+    Raises `ZondaError` as the run does, or where the process dies; another one takes its place.
     """
-    found = _measure(request)
-    return _measure(request) if found.compiled and request.repeats else found
-
-
-def _measure(request: Request) -> Measured:
-    with tempfile.TemporaryDirectory(prefix="zonda-accuracy-") as folder:
-        ask, answer = Path(folder) / "request.json", Path(folder) / "answer.pickle"
-        ask.write_text(json.dumps(request.__dict__))
-        command = children.command("zonda.core.accuracy.child", "main", str(ask), str(answer))
-        done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        if done.returncode or not answer.exists():
-            place = " ".join(request.overrides) or request.pipeline
-            if done.returncode < 0:
-                cure = "it may have run out of memory: shorten the scans with --duration"
-                raise ZondaError(
-                    f"the measuring process was killed by signal {-done.returncode}",
-                    place=place,
-                    cure=cure,
-                )
-            said = "\n".join(done.stderr.strip().splitlines()[-12:])
-            raise ZondaError(
-                f"the measuring process failed:\n{said}",
-                place=place,
-                cure="`zonda run` shows the same fault",
-            )
-        with answer.open("rb") as file:
-            result = pickle.load(file)  # written by our own child into our own folder
+    if pool is None:
+        with measuring(request.threads) as own:
+            return measure(request, own)
+    place = " ".join(request.overrides) or request.pipeline
+    assert pool.executor is not None
+    try:
+        result = pool.executor.submit(work, request).result()
+    except BrokenExecutor:
+        assert pool.remake is not None
+        pool.executor = pool.remake()
+        raise ZondaError(
+            "the measuring process was killed",
+            place=place,
+            cure="it may have run out of memory: shorten the scans with --duration",
+        ) from None
     if isinstance(result, Measured):
         return result
-    raise ZondaError(result["message"], place=result["place"], cure=result["cure"])
+    raise ZondaError(result.message, place=result.place or place, cure=result.cure)
+
+
+def work(request: Request) -> Measured | Refused:
+    """Carry out a request in this process; an error is returned."""
+    import traceback
+
+    with (
+        open(os.devnull, "w") as nothing,
+        contextlib.redirect_stdout(nothing),
+        contextlib.redirect_stderr(nothing),
+    ):
+        try:
+            with faults_named():
+                return _worker.measured(request)
+        except ZondaError as err:
+            message = str(err) if hasattr(err, "diagnostics") else err.message
+            return Refused(message, err.place, err.cure)
+        except Exception as err:
+            said = "".join(traceback.format_exception(err)).strip().splitlines()[-12:]
+            message = "the measuring process failed:\n" + "\n".join(said)
+            return Refused(message, "", "`zonda run` shows the same fault")
+
+
+class _Worker:
+    """State of a measuring process: the reference's last run and how many runs ago it was."""
+
+    def __init__(self) -> None:
+        self.warm = False
+        self.reference = 0.0
+        self.since = BETWEEN
+        self.runs, self.cpu = 0, 0.0
+
+    def measured(self, request: Request) -> Measured:
+        """See `work`."""
+        from ..configuration.pipeline_file import load
+        from .bands import metric_of
+
+        metric = metric_of(load(request.pipeline, request.overrides), request.metric)
+        first, seed, self.runs, self.cpu = 0.0, request.seeds[0], 0, 0.0
+        if request.repeats and not self.warm:
+            start = time.process_time()
+            run(request.pipeline, request.overrides, metric, seed, request.threads, timed=True)
+            first, self.warm = time.process_time() - start, True
+        timings: list[dict[str, float]] = []
+        yardstick: list[float] = []
+        found: list[Any] = []
+        memory = 0
+        for _ in range(request.repeats):
+            if request.yardstick and request.yardstick != request.overrides:
+                yardstick.append(self._reference(request, metric))
+            data, whole, seconds = self._timed(request, request.overrides, metric, seed)
+            memory = max(memory, peak_memory())
+            timings.append(by_step(data, seconds))
+            if request.yardstick == request.overrides:
+                self.reference, self.since = seconds, 0
+                yardstick.append(seconds)
+            if whole and not found:
+                found = [metric.measure(data)]
+            del data
+        for seed in request.seeds[len(found) :]:
+            start = time.process_time()
+            data, _ = run(
+                request.pipeline, request.overrides, metric, seed, request.threads, timed=False
+            )
+            found.append(metric.measure(data))
+            del data
+            self._count(time.process_time() - start)
+        labels = dict.fromkeys(label for row in timings for label in row)
+        steps = {label: tuple(row.get(label, 0.0) for row in timings) for label in labels}
+        return Measured(tuple(found), steps, tuple(yardstick), first, memory, self.runs, self.cpu)
+
+    def _reference(self, request: Request, metric: Metric) -> float:
+        """CPU seconds of the reference's last run, made where that is too long ago."""
+        if self.since >= BETWEEN:
+            self.reference = self._timed(request, request.yardstick, metric, request.seeds[0])[2]
+            self.since = 0
+        return self.reference
+
+    def _timed(
+        self, request: Request, overrides: tuple[str, ...], metric: Metric, seed: int | None
+    ) -> tuple[Data, bool, float]:
+        """A run as the user's, again where code had to be compiled: its data, whether they hold
+        what the metric needs, and its CPU seconds.
+        """
+        from numba.core.event import install_recorder
+
+        while True:
+            reset_peak_memory()
+            start = time.process_time()
+            with install_recorder("numba:compile") as compiled:
+                data, whole = run(
+                    request.pipeline, overrides, metric, seed, request.threads, timed=True
+                )
+            seconds = time.process_time() - start
+            self._count(seconds)
+            if not compiled.buffer:
+                return data, whole, seconds
+            del data
+
+    def _count(self, seconds: float) -> None:
+        self.runs += 1
+        self.since += 1
+        self.cpu += seconds
+
+
+_worker = _Worker()
+
+
+def by_step(data: Data, used: float) -> dict[str, float]:
+    """CPU seconds of a run by the label of its steps."""
+    row: dict[str, float] = {}
+    for label, _, seconds in data.provenance["timings"]:
+        row[label] = row.get(label, 0.0) + seconds
+    return row | {REST: max(0.0, used - sum(row.values()))}
+
+
+def reset_peak_memory() -> None:
+    """Give back free memory and forget the peak so far, where the system can (Linux)."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_memory() -> int:
+    """Largest resident memory of this process since `reset_peak_memory`, bytes (elsewhere than on
+    Linux: since it began).
+    """
+    with contextlib.suppress(OSError, StopIteration, ValueError, IndexError):
+        status = (
+            Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+        )
+        return 1024 * int(next(line for line in status if line.startswith("VmHWM:")).split()[1])
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
+        1 if sys.platform == "darwin" else 1024
+    )
+
+
+def run(
+    pipeline: str,
+    overrides: tuple[str, ...],
+    metric: Metric,
+    seed: int | None,
+    threads: int | None,
+    timed: bool,
+) -> tuple[Data, bool]:
+    """Run a pipeline file at a seed; see `execute`."""
+    from ..configuration.pipeline_file import load
+
+    more = [f"seed={seed}"] if seed is not None else []
+    return execute(load(pipeline, [*overrides, *more]), metric, threads, timed)
+
+
+def execute(
+    file: PipelineFile, metric: Metric, threads: int | None, timed: bool
+) -> tuple[Data, bool]:
+    """Run a pipeline file without what acts at its end; and whether the data hold what the metric
+    needs. ``timed``: without the steps and signals that the metric adds, too.
+    """
+    from ..output import Output
+    from ..pipeline import Pipeline
+
+    own = [o for o in file.operators if metric.needs_end or not isinstance(o, Output)]
+    more, signals = metric.steps(list(own)), metric.signals(file.runs)
+    steps, runs = (own, file.runs) if timed else (more, {**file.runs, **signals})
+    header = file.header
+    pipeline = Pipeline(
+        steps, runs=runs, only=header.only, name=header.name, precision=header.precision
+    )
+    with tempfile.TemporaryDirectory(prefix="zonda-accuracy-") as folder:
+        data = pipeline.run(file.scene(), output=folder, threads=threads)
+    return data, not timed or (len(more) == len(own) and not signals)

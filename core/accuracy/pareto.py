@@ -73,8 +73,11 @@ def search(bench: Bench, found: Sweep, allowed: float, most: int = 40) -> list[P
         points.append(point(bench, setting, found.reference))
         return points[-1]
 
-    best = _relaxed(turning, tried(found.reference), allowed, tried, lambda: len(points) < most)
-    while len(points) < most:
+    def may_go_on() -> bool:
+        return len(points) < most and bench.may(1)
+
+    best = _relaxed(turning, tried(found.reference), allowed, tried, may_go_on)
+    while may_go_on():
         exchange = _exchange(turning, best, allowed)
         if exchange is None or any(p.setting == exchange for p in points):
             break
@@ -82,7 +85,7 @@ def search(bench: Bench, found: Sweep, allowed: float, most: int = 40) -> list[P
         if now.error > allowed:
             break
         best = now
-    _relaxed(turning, best, math.inf, tried, lambda: len(points) < most)
+    _relaxed(turning, best, math.inf, tried, may_go_on)
     return points
 
 

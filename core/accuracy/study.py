@@ -1,22 +1,30 @@
-"""A whole study of one pipeline and metric: every knob alone, the Pareto front, and the setting
+"""Study of one pipeline and metric: every knob alone, the Pareto front, and the setting
 that is recommended.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
 from .bands import metric_of
-from .measure import Measured, Request, measure
+from .measure import BETWEEN, Measured, Request, measure
 from .pareto import Point, cheapest, pareto, point, search
 from .settings import PipelineKnob, Setting, overrides
 from .sweep import Bench, Run, Sweep, sweep, tightest
 
 if TYPE_CHECKING:
+    from ..campaign.engines import Pool
     from ..configuration.pipeline_file import PipelineFile
+
+
+REFERENCE_RUNS = 2
+"""Timed runs of the reference at the least: their spread is that of all single runs."""
+JOINT = 40
+"""Joint settings at the most."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +40,12 @@ class Setup:
     shorter
         Overrides that shorten the scans (`settings.shortened`).
     repeats, seeds, threads
-        Timed runs of each setting; seeds for the realization scatter and for knobs that redraw;
-        threads of each run.
+        Timed runs of each setting (of the reference `REFERENCE_RUNS`, if that is more); seeds for
+        the realization scatter and for knobs that redraw; threads of each run.
+    budget
+        Largest number of runs, and of CPU seconds in units of one run of the reference.
+    pool
+        The process that measures (`measure.measuring`); None: each setting in one of its own.
     """
 
     pipeline: str
@@ -41,9 +53,11 @@ class Setup:
     metric: str
     target: float
     shorter: Setting
-    repeats: int = 3
+    repeats: int = 1
     seeds: tuple[int | None, ...] = (None,)
     threads: int = 1
+    budget: float = math.inf
+    pool: Pool | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.target > 0:
@@ -53,16 +67,32 @@ class Setup:
                 cure="e.g. 1 %",
             )
 
-    def run(self, setting: Setting, seeds: Sequence[int | None], yardstick: Setting) -> Measured:
-        """Measure a setting in a process of its own."""
+    def run(
+        self, setting: Setting, seeds: Sequence[int | None], yardstick: Setting | None
+    ) -> Measured:
+        """Measure a setting."""
         mine, other = (
-            (*self.settings, *overrides(self.shorter), *overrides(s)) for s in (setting, yardstick)
+            () if s is None else (*self.settings, *overrides(self.shorter), *overrides(s))
+            for s in (setting, yardstick)
         )
-        return measure(
-            Request(
-                self.pipeline, mine, self.metric, other, tuple(seeds), self.repeats, self.threads
-            )
+        repeats = 0 if yardstick is None else self.repeats
+        if setting == yardstick:
+            repeats = max(repeats, REFERENCE_RUNS)
+        request = Request(
+            self.pipeline, mine, self.metric, other, tuple(seeds), repeats, self.threads
         )
+        return measure(request, self.pool)
+
+    def planned(self, knobs: Sequence[PipelineKnob]) -> int:
+        """Largest number of runs: of every rung, of the reference beside them, and of joint
+        settings, within the budget.
+        """
+        seeds = len(self.seeds)
+        turned = sum(len(k.ladder) - 1 for k in knobs if not k.redraws)
+        redrawn = seeds * sum(len(k.ladder) - (k.present in k.ladder) for k in knobs if k.redraws)
+        reference = max(self.repeats, REFERENCE_RUNS) + seeds - 1
+        runs = reference + self.repeats * (turned + JOINT + 1) + redrawn
+        return min(runs + runs // BETWEEN, int(min(self.budget, 10**6)))
 
 
 @dataclass(frozen=True)
@@ -86,6 +116,10 @@ class Study:
         meaning or were not measured.
     first
         CPU seconds of the first run of the reference: compilation, imports and caches included.
+    runs
+        Number of runs that were made.
+    interrupted
+        Whether the study was stopped before its end.
     """
 
     setup: Setup
@@ -97,6 +131,8 @@ class Study:
     floor: float | None
     scatter: float | None
     first: float
+    runs: int = 0
+    interrupted: bool = False
 
     @property
     def front(self) -> list[Point]:
@@ -112,7 +148,9 @@ def study(
     run: Run | None = None,
     say: Callable[[str], None] = lambda what: None,
 ) -> Study:
-    """Sweep, search, choose. ``run`` measures a setting; default: in a process of its own.
+    """Sweep, search, choose. ``run`` measures a setting; default: as ``setup`` says.
+
+    Ctrl-C ends the study with what is measured by then, if the reference is.
 
     Raises
     ------
@@ -129,12 +167,22 @@ def study(
             place=file.place,
             cure="docs/accuracy.md says how an operator does",
         )
-    bench = Bench(run or setup.run, metric, tightest(knobs), setup.seeds, say)
-    found = sweep(bench, knobs)
+    bench = Bench(run or setup.run, metric, tightest(knobs), setup.seeds, say, setup.budget)
+    found = Sweep(bench.yardstick)
     reference = bench.measure(found.reference)
-    present = point(bench, {k.key: k.present for k in knobs if not k.redraws}, found.reference)
-    allowed = setup.target - found.left
-    points = (*search(bench, found, allowed if allowed > 0 else setup.target), present)
+    own = {k.key: k.present for k in knobs if not k.redraws}
+    bench.names.setdefault(frozenset(own.items()), "as in the file")
+    interrupted = False
+    try:
+        bench.measure(own)
+        found = sweep(bench, knobs)
+        allowed = setup.target - found.left
+        search(bench, found, allowed if allowed > 0 else setup.target, JOINT)
+    except KeyboardInterrupt:
+        interrupted = True
+        found.note(bench, knobs)
+    points = tuple(point(bench, s, found.reference) for s in found.joint(bench, own))
+    present = next((p for p in points if p.setting == own), points[0])
     return Study(
         setup,
         metric.says,
@@ -145,4 +193,6 @@ def study(
         metric.floor(reference.found[0]),
         bench.scatter(found.reference),
         reference.first,
+        bench.runs,
+        interrupted,
     )

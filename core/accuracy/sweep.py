@@ -1,12 +1,17 @@
 """Each knob alone, the others at their tightest, against the tightest rung; and how far that rung
 has itself converged.
+
+Runs are limited. Those that a claim rests on come first: the coarsest rung of each knob, which
+tells whether it changes anything, the rung before the tightest, and the file's value of knobs that
+redraw. The other rungs are measured if a share of the runs is left for the joint search.
 """
 
 from __future__ import annotations
 
+import math
 import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -14,12 +19,17 @@ import numpy as np
 from ..errors import ZondaError
 from .measure import Measured
 from .metrics import Metric
-from .settings import PipelineKnob, Setting
+from .settings import PipelineKnob, Setting, overrides
 
-Run = Callable[[Setting, Sequence[int | None], Setting], Measured]
-"""Measures a setting at some seeds, timing it (at the first) beside the setting that is its
-yardstick.
+Run = Callable[[Setting, Sequence[int | None], Setting | None], Measured]
+"""Measures a setting at some seeds, and times it (at the first) against the setting that is its
+yardstick; None: it is not timed.
 """
+
+FOR_SEARCH = 0.25
+"""Share of the runs that is left for joint settings."""
+NOT_MEASURED = "not measured: more --budget"
+UNKNOWN = "not measured, which counts as 100 %"
 
 
 class Bench:
@@ -29,16 +39,18 @@ class Bench:
     ----------
     run
         Measures.
-    yardstick
-        The setting that all are timed beside: costs are ratios to its runs, so that the load of the
-        machine cancels.
     metric
         Compares.
+    yardstick
+        The setting that all are timed against: costs are ratios to its runs, so that the load of
+        the machine cancels.
     seeds
         For knobs that redraw and for the realization scatter; the first is the one all settings
         share.
     say
-        Told what is being measured.
+        Is told after each measurement which it was.
+    budget
+        Runs that may be made, whose CPU time may be that of as many runs of the yardstick.
     """
 
     def __init__(
@@ -48,37 +60,93 @@ class Bench:
         yardstick: Setting,
         seeds: Sequence[int | None] = (None,),
         say: Callable[[str], None] = lambda what: None,
+        budget: float = math.inf,
     ) -> None:
-        self.run, self.metric, self.yardstick, self.seeds, self.say = (
-            run,
-            metric,
-            yardstick,
-            tuple(seeds),
-            say,
-        )
+        self.run, self.metric, self.yardstick, self.say = run, metric, yardstick, say
+        self.seeds, self.budget = tuple(seeds), budget
+        self.runs, self.cpu, self._dearest = 0, 0.0, 0.0
+        self.names = {frozenset(yardstick.items()): "reference"}
+        self._references: list[float] = []
         self._done: dict[frozenset[tuple[str, str]], Measured] = {}
+        self._refused: dict[frozenset[tuple[str, str]], ZondaError] = {}
 
     def measure(self, setting: Setting, all_seeds: bool = False) -> Measured:
-        """The measurement of a setting; made where it is not there yet."""
-        key, wanted = frozenset(setting.items()), self.seeds if all_seeds else self.seeds[:1]
-        if key not in self._done or len(self._done[key].found) < len(wanted):
-            self.say(
-                f"{len(self._done) + 1}:"
-                f" {' '.join(f'{k}={v}' for k, v in setting.items()) or 'as in the file'}"
-            )
-            self._done[key] = self.run(setting, wanted, self.yardstick)
+        """The measurement of a setting; made where it is not there yet. Raises `ZondaError` where
+        the run refuses the setting.
+        """
+        key = frozenset(setting.items())
+        if key in self._refused:
+            raise self._refused[key]
+        for seed in self.seeds[self._seeds(setting) : len(self.seeds) if all_seeds else 1]:
+            before = self._done.get(key)
+            try:
+                new = self.run(setting, (seed,), self.yardstick if before is None else None)
+            except ZondaError as err:
+                self._refused[key] = err
+                self.runs += 1
+                self._report(setting, "refused")
+                raise
+            self.runs += new.runs
+            self.cpu += new.cpu
+            self._dearest = max(self._dearest, new.cpu / new.runs)
+            self._references += [s for s in new.yardstick if s not in self._references]
+            self._done[key] = replace(before, found=before.found + new.found) if before else new
+            self._report(setting, f"{new.cpu:.1f} CPU s" + (f", seed {seed}" if before else ""))
         return self._done[key]
+
+    def may(self, runs: float) -> bool:
+        """Whether so many runs more are within the budget, each as dear as the dearest so far."""
+        first = self._done.get(frozenset(self.yardstick.items()))
+        unit = first.cpu / first.runs if first else 0.0
+        seconds = self.cpu + runs * self._dearest
+        return max(self.runs + runs, seconds / unit if unit > 0 else 0.0) <= self.budget
+
+    def missing(self, setting: Setting, all_seeds: bool) -> int:
+        """Number of runs that `measure` would make."""
+        if self.refusal(setting) is not None:
+            return 0
+        return max((len(self.seeds) if all_seeds else 1) - self._seeds(setting), 0)
+
+    def has(self, setting: Setting) -> bool:
+        """Whether the setting is measured."""
+        return self._seeds(setting) > 0
+
+    def refusal(self, setting: Setting) -> ZondaError | None:
+        """The error of a setting that cannot be run."""
+        return self._refused.get(frozenset(setting.items()))
+
+    def settings(self) -> Iterator[Setting]:
+        """The settings measured so far whose random numbers are the reference's, in order."""
+        keys = self.yardstick.keys()
+        for done in self._done:
+            if (setting := dict(done)).keys() == keys:
+                yield {key: setting[key] for key in keys}
+
+    def _seeds(self, setting: Setting) -> int:
+        done = self._done.get(frozenset(setting.items()))
+        return len(done.found) if done else 0
+
+    def _report(self, setting: Setting, words: str) -> None:
+        what = self.names.get(frozenset(setting.items()), "")
+        what = what or " ".join(overrides(differences(setting, self.yardstick)))
+        of = f" of at most {self.budget:g}" if math.isfinite(self.budget) else ""
+        self.say(f"run {self.runs}{of}: {what}: {words}")
 
     def seconds(self, setting: Setting, step: str = "") -> tuple[float, float]:
         """CPU seconds of a setting, or of one of its steps, and their spread, on the scale of the
-        yardstick's own runs.
+        yardstick's own runs. The spread of a single run is that of all runs of the yardstick (of a
+        step: of its first ones).
         """
-        measured = self.measure(self.yardstick)
-        totals = [sum(run) for run in zip(*measured.steps.values(), strict=True)] + list(
-            measured.yardstick
+        reference, measured = self.measure(self.yardstick), self.measure(setting)
+        totals = [sum(run) for run in zip(*reference.steps.values(), strict=True)] + list(
+            reference.yardstick
         )
-        scale = statistics.median(totals) if measured.yardstick else 1.0
-        middle, spread = self.measure(setting).cost(step)
+        scale = statistics.median(totals) if reference.yardstick else 1.0
+        middle, spread = measured.cost(step)
+        if measured.timed == 1 and step:
+            spread = replace(reference, yardstick=()).cost(step)[1] / scale
+        elif measured.timed == 1 and self._references:
+            spread = (max(self._references) - min(self._references)) / 2 / scale
         return scale * middle, scale * spread
 
     def error(self, setting: Setting, reference: Setting) -> float:
@@ -101,7 +169,7 @@ class Bench:
         """Realization scatter in units of the error: rms over pairs of seeds of their error,
         divided by sqrt(2).
         """
-        found = self.measure(reference, True).found
+        found = self.measure(reference).found
         pairs = [self.metric.error(a, b) ** 2 for a, b in combinations(found, 2)]
         return float(np.sqrt(np.mean(pairs) / 2)) if pairs else None
 
@@ -162,6 +230,11 @@ class Alone:
         """
         return len(self.rungs) == 2 and self.rungs[0].error == 0 and not self.knob.redraws
 
+    @property
+    def unmeasured(self) -> bool:
+        """Whether too few rungs are measured to tell what the tightest is wrong by."""
+        return self.how == UNKNOWN
+
     def rung(self, value: str) -> Rung:
         return next(r for r in self.rungs if r.value == value)
 
@@ -173,13 +246,8 @@ class Alone:
         as the worst rung."""
         measured = [r for r in self.rungs if r.error is not None]
         mine = [r for r in measured if r.value == self.knob.present] or measured
-        return (
-            max(
-                (r.error or 0.0 if (r.error or 0.0) > 2 * r.resolution else 2 * r.resolution)
-                for r in mine
-            )
-            + self.left
-        )
+        errors = (max(r.error or 0.0, 2 * r.resolution) for r in mine)
+        return max(errors, default=0.0) + self.left
 
 
 @dataclass
@@ -188,6 +256,29 @@ class Sweep:
 
     reference: Setting
     alone: list[Alone] = field(default_factory=list)
+
+    def turned(self, knob: PipelineKnob, value: str) -> Setting:
+        """The reference with one knob at another value; a knob that redraws and has the file's
+        value is not mentioned.
+        """
+        if knob.redraws and value == knob.present:
+            return self.reference
+        return self.reference | {knob.key: value}
+
+    def joint(self, bench: Bench, present: Setting) -> list[Setting]:
+        """Settings that are measured, the reference first; knobs that change nothing stay at their
+        tightest, but for ``present``, the file's own.
+        """
+        inert = [a.knob.key for a in self.alone if a.inert]
+        return [
+            setting
+            for setting in bench.settings()
+            if setting == present or all(setting[key] == self.reference[key] for key in inert)
+        ]
+
+    def note(self, bench: Bench, knobs: Sequence[PipelineKnob]) -> None:
+        """Take in what the bench has measured of each knob alone."""
+        self.alone = [_alone(bench, knob, self) for knob in knobs]
 
     @property
     def left(self) -> float:
@@ -218,39 +309,69 @@ def sweep(bench: Bench, knobs: Sequence[PipelineKnob]) -> Sweep:
     """
     found = Sweep(tightest(knobs))
     bench.measure(found.reference, all_seeds=True)
-    found.alone = [_alone(bench, knob, found.reference) for knob in knobs]
+    for knob, value, spare in _in_order(knobs, bench):
+        setting, reference = found.turned(knob, value), found.turned(knob, knob.tightest)
+        first = found.turned(knob, knob.ladder[0])
+        known = value != knob.ladder[0] and not knob.redraws and bench.has(first)
+        if known and bench.error(first, reference) == 0:
+            continue  # the coarsest changes no bit: nor will the others
+        if not bench.may(bench.missing(setting, knob.redraws) + spare):
+            continue
+        try:
+            bench.measure(setting, all_seeds=knob.redraws)
+        except ZondaError:
+            if value == knob.tightest:
+                raise
+    found.note(bench, knobs)
     return found
 
 
-def _alone(bench: Bench, knob: PipelineKnob, others: Setting) -> Alone:
-    reference = others | {knob.key: knob.tightest}
-    rungs: list[Rung] = []
+def _in_order(
+    knobs: Sequence[PipelineKnob], bench: Bench
+) -> Iterator[tuple[PipelineKnob, str, float]]:
+    """Knobs, values, and the runs to leave for others: what claims rest on first, then the other
+    rungs of all knobs in turn, fine to coarse.
+    """
+    turned, redrawn = ([k for k in knobs if k.redraws is which] for which in (False, True))
+    yield from ((k, k.ladder[0], 0.0) for k in turned)
+    yield from ((k, k.ladder[-2], 0.0) for k in turned)
+    for k in redrawn:
+        yield k, k.tightest, 0.0
+        yield from ((k, v, 0.0) for v in k.ladder if v == k.present or k.present not in k.ladder)
+    spare = FOR_SEARCH * bench.budget if math.isfinite(bench.budget) else 0.0
+    for place in range(2, max((len(k.ladder) for k in knobs), default=0) + 1):
+        yield from ((k, k.ladder[-place], spare) for k in knobs if len(k.ladder) >= place)
 
-    def rung(value: str, error: float, resolution: float) -> Rung:
-        setting = others | {knob.key: value}
+
+def _alone(bench: Bench, knob: PipelineKnob, found: Sweep) -> Alone:
+    """What is measured of a knob so far."""
+    reference = found.turned(knob, knob.tightest)
+    compare: Callable[[Setting, Setting], tuple[float, float]] = (
+        bench.mean_error if knob.redraws else lambda a, b: (bench.error(a, b), 0.0)
+    )
+
+    def rung(value: str) -> Rung:
+        setting = found.turned(knob, value)
+        if (refusal := bench.refusal(setting)) is not None:
+            return Rung(value, None, note=f"refused: {refusal.message}".splitlines()[0])
+        if any(bench.missing(s, knob.redraws) for s in (setting, reference)):
+            return Rung(value, None, note=NOT_MEASURED)
+        error = (0.0, 0.0) if value == knob.tightest else compare(setting, reference)
         total, own = bench.seconds(setting), bench.seconds(setting, knob.step)
-        return Rung(value, error, resolution, *total, bench.measure(setting).memory, *own)
+        return Rung(value, *error, *total, bench.measure(setting).memory, *own)
 
-    for value in knob.ladder[:-1]:
-        setting = others | {knob.key: value}
-        try:
-            error, resolution = (
-                bench.mean_error(setting, reference)
-                if knob.redraws
-                else (bench.error(setting, reference), 0.0)
-            )
-        except ZondaError as err:
-            rungs.append(Rung(value, None, note=f"refused: {err.message}".splitlines()[0]))
-            continue
-        rungs.append(rung(value, error, resolution))
-        if error == 0 and not knob.redraws and len(rungs) == 1:
-            break  # the coarsest changes no bit: nor will the others
-    bench.measure(reference, all_seeds=knob.redraws)
-    rungs.append(rung(knob.tightest, 0.0, 0.0))
-    good = [others | {knob.key: r.value} for r in rungs if r.error is not None]
-    compare = (lambda a, b: bench.mean_error(a, b)[0]) if knob.redraws else bench.error
-    steps = tuple(compare(a, b) for a, b in pairwise(good))
-    left, how = convergence(steps, [r.resolution for r in rungs if r.error is not None])
+    rungs = [rung(value) for value in knob.ladder]
+    if rungs[0].error == 0 and not knob.redraws:
+        rungs = [rungs[0], rungs[-1]]
+    open_ended = [k for k, r in enumerate(rungs) if r.note == NOT_MEASURED]
+    good = [r for r in rungs[max(open_ended, default=-1) + 1 :] if r.error is not None]
+    if len(good) < 2:  # the step across what is not measured
+        good = [r for r in rungs if r.error is not None][-2:]
+    settings = [found.turned(knob, r.value) for r in good]
+    steps = tuple(compare(a, b)[0] for a, b in pairwise(settings))
+    if len(good) < 2 and open_ended:
+        return Alone(knob, tuple(rungs), (), 1.0, UNKNOWN)
+    left, how = convergence(steps, [r.resolution for r in good])
     return Alone(knob, tuple(rungs), steps, left, how)
 
 

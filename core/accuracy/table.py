@@ -16,6 +16,8 @@ def lines(study: Study, width: int = 130) -> Iterator[str]:
     """The whole report, top down: what was measured, each knob alone, the Pareto front, the
     recommendation.
     """
+    if study.interrupted:
+        yield f"interrupted after {study.runs} runs: what follows is the Pareto front so far"
     yield from _heading(study)
     for alone in study.sweep.alone:
         yield ""
@@ -76,10 +78,13 @@ def _heading(study: Study) -> Iterator[str]:
             f"shortened scans: {shorter}. Per-scan costs weigh more, slow modes and coverage less"
             " than in whole scans."
         )
+    threads = f"{setup.threads} thread{'s' if setup.threads > 1 else ''}"
+    several = setup.repeats > 1
+    runs = f"medians of {setup.repeats} runs" if several else "of one run"
+    spread = "half their range" if several else "half the range of the reference's runs"
     yield (
-        f"CPU seconds are medians of {setup.repeats} runs on {setup.threads}"
-        f" thread{'s' if setup.threads > 1 else ''}, ± half their range, each against a run of the"
-        " reference beside it;"
+        f"CPU seconds are {runs} on {threads}, ± {spread}, in proportion to the reference's run"
+        f" before it; {study.runs} runs in all;"
     )
     yield "steps that act at the end (pictures, reports, files) are left out."
     yield (
@@ -191,7 +196,11 @@ def not_met(study: Study) -> Iterator[str]:
     )
     worst = max(study.sweep.alone, key=lambda a: a.stays if a.knob.redraws else a.left)
     key, cures = worst.knob.key, []
-    if not worst.knob.redraws:
+    unmeasured = [a.knob.key for a in study.sweep.alone if a.unmeasured]
+    if unmeasured:
+        yield f"  cause: not measured within {setup.budget:g} runs: {', '.join(unmeasured)}"
+        cures.append("more --budget")
+    elif not worst.knob.redraws:
         yield f"  cause: {key}, {percent(worst.left)}: {worst.how}"
     elif any(r.resolution and (r.error or 0.0) <= 2 * r.resolution for r in worst.rungs):
         seeds = len(setup.seeds)

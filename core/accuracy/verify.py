@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from .bands import metric_of
-from .child import run
-from .measure import Request, measure
+from .measure import Request, measure, run
 from .settings import knobs_of, overrides
 from .store import StoredFront, fingerprint
 from .sweep import tightest
@@ -92,8 +91,8 @@ def retest(
     base = (*overrides(front.shorter), f"seed={front.seed}")
 
     def found(setting: dict[str, str]) -> Any:
-        request = Request(pipeline, (*base, *overrides(setting)), front.metric, repeats=0)
-        return metric.measure(run(request, metric, None, timed=False)[0])
+        given = (*base, *overrides(setting))
+        return metric.measure(run(pipeline, given, metric, None, 1, timed=False)[0])
 
     reference = found(front.reference)
     chosen = sorted((p for p in front.points if p.error > 0), key=lambda p: -p.error)[:points]

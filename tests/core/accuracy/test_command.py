@@ -112,7 +112,11 @@ def test_the_whole_command(toy_file, tmp_path, capsys):
         "--store",
     )
     assert command("accuracy", toy_file, *options, "--output", tmp_path / "out") == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr()
+    said, told = printed.out, printed.err.splitlines()
+    assert told[0].startswith("integral of toy: 1 knob, at most 30 runs")
+    assert len(told) > 5
+    assert all(line.startswith("run ") and " of at most 30: " in line for line in told[1:])
     assert "refused: two is no number" in said
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
         "accuracy.txt",

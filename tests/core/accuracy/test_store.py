@@ -9,6 +9,7 @@ import zonda
 from zonda.core.accuracy import store
 from zonda.core.accuracy.settings import knobs_of
 from zonda.core.accuracy.study import Setup, study
+from zonda.core.accuracy.table import lines
 from zonda.core.accuracy.verify import Retest
 from zonda.core.errors import InputError
 
@@ -210,3 +211,24 @@ def test_a_retest_fails_where_the_error_grew():
     assert good.good
     assert not dataclasses.replace(good, now=0.013).good
     assert Retest({}, 0.0, 5e-6).good
+
+
+def test_ctrl_c_leaves_the_front_so_far(made):
+    path, file, whole = made
+    calls = 0
+
+    def run(setting, seeds, yardstick):
+        nonlocal calls
+        calls += 1
+        if calls == 5:
+            raise KeyboardInterrupt
+        return toy_run(setting, seeds, yardstick)
+
+    setup, knobs = Setup(str(path), (), "map_rms", 0.005, {}), knobs_of(file)[-3:-1]
+    found = study(file, setup, knobs, run=run)
+    assert found.interrupted
+    assert [p.setting for p in found.points] == [p.setting for p in whole.points][:4]
+    assert "interrupted after 4 runs" in "\n".join(lines(found))
+    calls = 4
+    with pytest.raises(KeyboardInterrupt):  # nothing is found yet
+        study(file, setup, knobs, run=run)

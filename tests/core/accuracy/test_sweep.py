@@ -1,9 +1,12 @@
 """Knobs alone: errors, convergence of the tightest rung, knobs that redraw, refused rungs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from zonda.core.accuracy.measure import Measured
+from zonda.core.accuracy.pareto import search
 from zonda.core.accuracy.sweep import Bench, convergence, sweep, tightest
 from zonda.core.errors import ZondaError
 
@@ -151,3 +154,52 @@ def test_seconds_are_on_the_scale_of_the_yardsticks_own_runs(toy, metric):
         for rung in alone.rungs:
             setting = {k.key: "32" for k in toy.knobs()} | {alone.knob.key: rung.value}
             assert rung.seconds == pytest.approx(toy.seconds(setting))
+
+
+def test_the_budget_holds_and_claims_come_first(toy, metric):
+    """16 runs: the reference, the coarsest and the last rung but one of each of three knobs, and
+    other rungs while a quarter is left.
+    """
+    said = []
+    bench = Bench(toy.run, metric, tightest(toy.knobs()), budget=16, say=said.append)
+    found = sweep(bench, toy.knobs())
+    assert toy.calls == bench.runs == len(said) == 12
+    assert said[0].startswith("run 1 of at most 16: reference: ")
+    assert [[r.error is not None for r in a.rungs] for a in found.alone] == [
+        [True, True, True, True, True],
+        [True, True, True, True, True],
+        [True, False, True, True, True],
+    ]
+    search(bench, found, 0.01)
+    assert toy.calls == 16
+
+
+def test_a_knob_that_the_budget_does_not_reach_counts_as_a_hundred_percent(toy, metric):
+    bench = Bench(toy.run, metric, tightest(toy.knobs()), budget=3)
+    found = sweep(bench, toy.knobs())
+    assert toy.calls == 3
+    assert [a.unmeasured for a in found.alone] == [False, False, True]
+    assert found.left > 1
+    assert found.alone[0].left == pytest.approx(found.alone[0].rungs[0].error)  # its one step
+
+
+def test_runs_that_cost_more_than_the_reference_count_as_more(toy, metric):
+    def run(setting, seeds, yardstick):
+        return replace(toy.run(setting, seeds, yardstick), cpu=1.0 if toy.calls == 1 else 4.0)
+
+    bench = Bench(run, metric, tightest(toy.knobs()), budget=10)
+    sweep(bench, toy.knobs())
+    assert bench.cpu <= 10
+
+
+def test_the_spread_of_single_runs_is_that_of_the_reference(toy, metric):
+    def run(setting, seeds, yardstick):
+        steps = {"a": (2.0, 2.2) if setting == yardstick else (1.0,)}
+        return Measured((1.0,), steps, (2.0, 2.2) if setting == yardstick else (2.2,))
+
+    reference = tightest(toy.knobs())
+    bench = Bench(run, metric, reference)
+    assert bench.seconds(reference)[0] == pytest.approx(2.1)
+    seconds, spread = bench.seconds(reference | {"Step0.n": "2"})
+    assert seconds == pytest.approx(2.1 / 2.2)
+    assert spread == pytest.approx(0.1)

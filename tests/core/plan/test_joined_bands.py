@@ -10,7 +10,7 @@ import pytest
 
 import zonda
 from zonda.core.accuracy.bands import metric_of
-from zonda.core.accuracy.child import execute
+from zonda.core.accuracy.measure import execute
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import PipelineError
 from zonda.core.plan.audit import Audit, audit_of_bands
