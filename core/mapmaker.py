@@ -27,13 +27,6 @@ class MapMaker(Operator):
     """
 
 
-class _Reads:
-    """The ``requires`` of a `CalibratedSignal`: the streams that there are."""
-
-    def __get__(self, operator: CalibratedSignal | None, owner: type) -> frozenset[str]:
-        return frozenset({"sky"}) if operator is None else operator._reads
-
-
 class CalibratedSignal(Operator):
     """Adds up the sky and the components that enter calibrated, where no step makes anything else:
     nothing is to be calibrated.
@@ -42,13 +35,17 @@ class CalibratedSignal(Operator):
     and nothing else is provided up to there. It is not one of the pipeline's own steps.
     """
 
-    requires: ClassVar[Any] = _Reads()
     provides: ClassVar[frozenset[str]] = frozenset({MAIN})
     linear: ClassVar[bool] = True
     knows_means: ClassVar[bool] = True
 
     _reads: frozenset[str] = PrivateAttr(frozenset({"sky"}))
     _means: FieldSums = PrivateAttr(default_factory=FieldSums)
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """Streams that are added up."""
+        return self._reads
 
     @property
     def label(self) -> str:

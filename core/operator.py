@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from .block import Block
 from .data import Data
@@ -45,6 +45,8 @@ class Operator(Labelled):
         products are named by their makers.
     optional
         Names it uses when an earlier or later operator provides them.
+    on_request
+        Names that it provides only if its parameters ask for them.
     couples
         What one output sample depends on: ``sample`` (itself alone, plus `halo` neighbours),
         ``detectors`` (all detectors at that instant), ``time`` (one detector's whole scan),
@@ -59,14 +61,29 @@ class Operator(Labelled):
         it declares has a mean, a float64 block with the mean in it, and no entry in `Block.means`;
         the same mean is subtracted from what it leaves there (`core.run.whole`). `measure`
         likewise. A class that overrides `exec` or `measure` must say so anew.
+
+    Each may be a property, if it depends on the parameters.
     """
 
     zonda_api: ClassVar[int] = API_VERSION
-    requires: ClassVar[frozenset[str]] = frozenset()
-    provides: ClassVar[frozenset[str]] = frozenset()
-    optional: ClassVar[frozenset[str]] = frozenset()
+    if TYPE_CHECKING:  # a subclass may have a constant or a property
+
+        @property
+        def requires(self) -> frozenset[str]: ...
+        @property
+        def provides(self) -> frozenset[str]: ...
+        @property
+        def optional(self) -> frozenset[str]: ...
+        @property
+        def linear(self) -> bool: ...
+
+    else:
+        requires: ClassVar[frozenset[str]] = frozenset()
+        provides: ClassVar[frozenset[str]] = frozenset()
+        optional: ClassVar[frozenset[str]] = frozenset()
+        linear: ClassVar[bool] = False
+    on_request: ClassVar[frozenset[str]] = frozenset()
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "sample"
-    linear: ClassVar[bool] = False
     knows_means: ClassVar[bool] = False
 
     def observe(self, data: Data) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from . import discovery, hints
 from .components import Registry
@@ -95,17 +95,27 @@ def operators_that(test: Callable[[Any], bool]) -> list[str]:
     return found
 
 
+def declared(step: Any, what: Literal["requires", "provides", "optional"]) -> frozenset[str]:
+    """Names that an operator's class states as ``what``, for tools that have no operator.
+
+    A property is that of an operator with the default parameters, empty if that fails; ``provides``
+    includes `Operator.on_request`.
+    """
+    names = getattr(step, what)
+    if isinstance(names, property):
+        names = frozenset()
+        with suppress(Exception):  # a parameter has no default, or a plugin is broken
+            names = getattr(step.model_construct(), what)
+    more = step.on_request if what == "provides" else frozenset()
+    return frozenset(names) | more
+
+
 def makers(what: str) -> list[str]:
     """Installed operators that provide ``what`` and do not need it themselves."""
 
     def makes(step: Any) -> bool:
-        declared = (step.provides, step.requires, step.optional)
-        provides, requires, optional = (
-            n if isinstance(n, frozenset) else frozenset() for n in declared
-        )
-        return (
-            what in provides - requires - optional
-        )  # a property says nothing before there is an operator
+        needed = declared(step, "requires") | declared(step, "optional")
+        return what in declared(step, "provides") - needed
 
     return operators_that(makes)
 

@@ -1,8 +1,8 @@
-"""Which block streams an operator reads, when that is one of its parameters."""
+"""Names of block streams that an operator reads, if they are one of its parameters."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from .observation import Observation
 
 StreamName = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
-"""What a parameter ``streams`` may list: ``signal``, a component (``sky``, or one of a plugin), or
-what else a step makes (``pwv``)."""
+"""A name that a parameter ``streams`` may list: ``signal``, a component (``sky``, or one of a
+plugin), or another stream that a step makes (``pwv``)."""
 
 AnyStream = Annotated[
     str, Field(pattern=rf"^([A-Za-z_][A-Za-z0-9_]*|{MAIN}/[A-Za-z][A-Za-z0-9_]*)$")
@@ -31,34 +31,21 @@ UNITS = {"transmission": "", "opacity": "", "flags": "", "pwv": "m", "path_delay
 """Units of streams that are not in K."""
 
 
-class StreamsAsked:
-    """The ``optional`` of an operator with a parameter ``streams``: all components for the class,
-    those asked for in an object, and the streams of signals among them.
-
-    So the executor keeps no stream that nobody reads, see `core.run.execution`.
+def streams_asked(streams: Iterable[str] | None) -> frozenset[str]:
+    """Components of zonda's own and streams of signals among ``streams`` (None: all components),
+    for `Operator.optional`: the executor keeps no stream that nobody reads (`core.run.execution`).
     """
-
-    def __get__(self, operator: Any, owner: type) -> frozenset[str]:
-        asked = getattr(operator, "streams", None)
-        return (
-            COMPONENTS
-            if asked is None
-            else frozenset(name for name in asked if name in COMPONENTS or f"{MAIN}/" in name)
-        )
+    if streams is None:
+        return COMPONENTS
+    return frozenset(name for name in streams if name in COMPONENTS or f"{MAIN}/" in name)
 
 
-class StreamsNeeded:
-    """The ``requires`` of such an operator: ``signal``, and streams that are no components of
-    zonda's own.
-
-    Nobody makes these by default: a name that no step provides is an error.
+def streams_needed(streams: Iterable[str] | None) -> frozenset[str]:
+    """``signal``, and those of ``streams`` that are no components of zonda's own, for
+    `Operator.requires`: no step makes these by default, so that a name without a maker is an error.
     """
-
-    def __get__(self, operator: Any, owner: type) -> frozenset[str]:
-        asked = (
-            MAIN if is_signal(name) else name for name in getattr(operator, "streams", None) or ()
-        )
-        return frozenset({MAIN, *asked}) - COMPONENTS
+    asked = (MAIN if is_signal(name) else name for name in streams or ())
+    return frozenset({MAIN, *asked}) - COMPONENTS
 
 
 def check_signals(streams: Iterable[str], observation: Observation, place: str) -> None:

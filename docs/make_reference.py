@@ -13,7 +13,7 @@ from zonda.core.configuration.docstrings import described, own_doc
 from zonda.core.configuration.units import Unit
 from zonda.core.instrument import Band, CameraBand, Instrument, Telescope
 from zonda.core.plan.planning import planning_class
-from zonda.core.registry import noise_models, operators
+from zonda.core.registry import declared, noise_models, operators
 from zonda.core.site import Site
 
 PAGE = Path(__file__).with_name("operators.md")
@@ -69,7 +69,7 @@ def page() -> str:
             lines += ["", f"### {cls.__name__}", "", own_doc(cls), ""]
             needs, gives = (
                 ", ".join(f"`{n}`" for n in sorted(names)) or "nothing"
-                for names in (cls.requires, cls.provides)
+                for names in (declared(cls, "requires"), declared(cls, "provides"))
             )
             lines += [f"Requires {needs}; provides {gives}.", "", *table(cls, but="name")]
             for knob in planning_class(cls).knobs or getattr(cls, "knobs", ()):

@@ -13,7 +13,7 @@ from ..configuration.diagnostics import Diagnostic
 from ..configuration.header import KEYS, Header
 from ..configuration.mistakes import Mistakes
 from ..configuration.section import Section
-from ..registry import makers, operators, operators_that
+from ..registry import declared, makers, operators, operators_that
 from .entries import setting
 from .settings import MOST_TASKS, Campaign, Sweep
 
@@ -162,7 +162,7 @@ class SweepSection(Section):
 
 def _measures(document: Document) -> bool:
     """Whether a step of a document without mistakes makes figures."""
-    return any("figures" in operators.get(name).provides for name in _names(document))
+    return any("figures" in declared(operators.get(name), "provides") for name in _names(document))
 
 
 def _names(document: Document) -> list[str]:
@@ -177,9 +177,8 @@ def _names(document: Document) -> list[str]:
 
 
 def _takes_schedule(step: type[Operator]) -> bool:
-    """Whether an operator's class makes scans of a schedule."""
-    provides = step.provides if isinstance(step.provides, frozenset) else frozenset()
-    return "schedule" in step.model_fields and "boresight" in provides
+    """True if an operator's class makes scans of a schedule."""
+    return "schedule" in step.model_fields and "boresight" in declared(step, "provides")
 
 
 def _mistakes(

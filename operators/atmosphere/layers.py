@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from pydantic import PrivateAttr
@@ -36,21 +36,6 @@ from .parameters import LayerParameters
 from .weather.radiative_transfer import ELEVATION_MIN
 
 
-class _Provides:
-    """The streams of an `AtmosphereLayers`: those of every one, and its `outputs`; of the class:
-    all that there may be.
-    """
-
-    def __get__(self, operator: AtmosphereLayers | None, owner: type) -> frozenset[str]:
-        return frozenset(
-            {
-                "atmosphere",
-                "transmission",
-                *(operator.outputs if operator else ("pwv", "opacity", "path_delay")),
-            }
-        )
-
-
 class AtmosphereLayers(LayerParameters):
     """Turbulent layers of water vapour seen through near-field beams: their emission and
     transmission in the band.
@@ -63,10 +48,15 @@ class AtmosphereLayers(LayerParameters):
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[Any] = _Provides()
+    on_request: ClassVar[frozenset[str]] = frozenset({"pwv", "opacity", "path_delay"})
     knows_means: ClassVar[bool] = True
 
     _models: Models = PrivateAttr(default_factory=Models)
+
+    @property
+    def provides(self) -> frozenset[str]:
+        """Streams of every atmosphere, and `outputs`."""
+        return frozenset({"atmosphere", "transmission", *self.outputs})
 
     def model(self, observation: Observation) -> AtmosphereModel:
         """What an observation sees of the atmosphere, before any of it is drawn."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Self, cast
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.storage.ecsv import write_ecsv
 from zonda.core.storage.files import product_path
-from zonda.core.stream_names import AnyStream, StreamsAsked, StreamsNeeded, check_signals
+from zonda.core.stream_names import AnyStream, check_signals, streams_asked, streams_needed
 
 from .power_spectrum import Welch, calibration, on_sky
 from .series import about, check_streams, key_of
@@ -55,10 +55,8 @@ class CompareStreams(Operator):
     Raises `PipelineError` where a stream is absent at this step.
     """
 
-    requires: ClassVar[frozenset[str]] = cast(Any, StreamsNeeded())
     provides: ClassVar[frozenset[str]] = frozenset({"stream_comparison"})
     knows_means: ClassVar[bool] = True
-    optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     stream: AnyStream = "signal"
@@ -72,6 +70,16 @@ class CompareStreams(Operator):
     """Length of Welch's segments, at most an eighth of the scan. Shortened to a number of samples
     that transforms quickly.
     """
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """`signal`, and streams of other steps."""
+        return streams_needed(self.streams)
+
+    @property
+    def optional(self) -> frozenset[str]:
+        """Components among the streams."""
+        return streams_asked(self.streams)
 
     @model_validator(mode="after")
     def _two(self) -> Self:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, ClassVar, Self, cast
+from typing import ClassVar, Self
 
 from pydantic import Field, model_validator
 
@@ -16,15 +16,6 @@ from zonda.core.signal import Signal
 from zonda.core.storage.files import product_path
 
 from .series import about, key_of, kinds_of_maps
-
-
-class ProductsRead:
-    """The ``requires`` of `MeasureFigures`: none for the class, what its metrics read in an
-    object.
-    """
-
-    def __get__(self, operator: Any, owner: type) -> frozenset[str]:
-        return frozenset[str]().union(*(m.reads for m in _metrics(operator)))
 
 
 class MeasureFigures(Output):
@@ -40,7 +31,6 @@ class MeasureFigures(Output):
     Raises `PipelineError` or `InputError` where a metric cannot be measured on what the run made.
     """
 
-    requires: ClassVar[frozenset[str]] = cast(Any, ProductsRead())
     provides: ClassVar[frozenset[str]] = frozenset({"figures"})
     one_band: ClassVar[bool] = True
 
@@ -53,6 +43,11 @@ class MeasureFigures(Output):
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(f"{twice} is listed twice")
         return self
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """Products that the metrics read."""
+        return frozenset[str]().union(*(metric.reads for metric in _metrics(self)))
 
     def signals(self) -> tuple[Signal, ...]:
         """Those that the metrics need."""
@@ -109,6 +104,6 @@ def _figure(choice: Choice, data: Data, names: list[str]) -> Figure:
         )
 
 
-def _metrics(operator: Any) -> list[FigureMetric]:
-    chosen = [] if operator is None else getattr(operator, "metrics", [])
+def _metrics(step: MeasureFigures) -> list[FigureMetric]:
+    chosen = getattr(step, "metrics", ())  # a mistaken step of a pipeline file has none
     return [choice.metric for choice in chosen if isinstance(choice.metric, FigureMetric)]

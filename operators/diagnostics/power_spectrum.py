@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.flags import has_a_signal
 from zonda.core.operator import Operator
 from zonda.core.signal import BUILT_IN, MAIN, TRANSMISSION, Component
-from zonda.core.stream_names import StreamName, StreamsAsked, StreamsNeeded
+from zonda.core.stream_names import StreamName, streams_asked, streams_needed
 from zonda.core.types import Floats
 
 from .series import Spectrum, check_streams, key_of
@@ -194,10 +194,8 @@ class PowerSpectrum(Operator):
     ``spectrum`` (a `Spectrum`), or one under this step's own name where it has one.
     """
 
-    requires: ClassVar[frozenset[str]] = cast(Any, StreamsNeeded())
     provides: ClassVar[frozenset[str]] = frozenset({"spectrum"})
     knows_means: ClassVar[bool] = True
-    optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     streams: list[StreamName] | None = Field(None, min_length=1)
@@ -208,6 +206,16 @@ class PowerSpectrum(Operator):
     segment: Seconds = quantity("128 s", gt=0)
     """Length of Welch's segments (at most the scan): the inverse of the frequency resolution.
     Shortened to a number of samples that has no prime factor above 5."""
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """`signal`, and streams of other steps."""
+        return streams_needed(self.streams)
+
+    @property
+    def optional(self) -> frozenset[str]:
+        """Components among the streams."""
+        return streams_asked(self.streams)
 
     def check(self, data: Data) -> list[str]:
         """Refuse streams that no step makes."""

@@ -16,6 +16,7 @@ from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures
 from zonda.core.numerics.angles import angle_text, sides_text
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.operator import Operator
+from zonda.core.registry import declared
 
 from .report_text import scaled
 
@@ -129,7 +130,7 @@ def _central(diameter: float, product: MapProduct) -> str:
 def has_white_noise(data: Data) -> bool:
     """Whether a step of the pipeline makes white noise."""
     classes = (class_of(kind) for _, kind, _ in data.provenance.get("operators", []))
-    return any(cls is not None and "white" in cls.provides for cls in classes)
+    return any(cls is not None and "white" in declared(cls, "provides") for cls in classes)
 
 
 def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, cast
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.operator import Operator
-from zonda.core.stream_names import StreamName, StreamsAsked, StreamsNeeded
+from zonda.core.stream_names import StreamName, streams_asked, streams_needed
 from zonda.core.types import Floats
 
 from .series import TimeStream, key_of
@@ -24,10 +24,8 @@ class TimeStreams(Operator):
     `opacity` and `path_delay` (`AtmosphereLayers.outputs`).
     """
 
-    requires: ClassVar[frozenset[str]] = cast(Any, StreamsNeeded())
     provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
     knows_means: ClassVar[bool] = True
-    optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
 
     streams: list[StreamName] = Field(["signal"], min_length=1)
     """Streams to keep; components that are absent at this step are skipped and counted."""
@@ -35,6 +33,16 @@ class TimeStreams(Operator):
     """Number of detectors, chosen evenly."""
     observation: int = Field(0, ge=0)
     """Which scan, counted from 0."""
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """`signal`, and streams of other steps."""
+        return streams_needed(self.streams)
+
+    @property
+    def optional(self) -> frozenset[str]:
+        """Components among the streams."""
+        return streams_asked(self.streams)
 
     def check(self, data: Data) -> list[str]:
         """Refuse a scan that is not there, once the telescope is pointed."""

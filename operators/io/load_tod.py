@@ -58,17 +58,6 @@ class _Band:
     rows: NDArray[np.intp]
 
 
-class _Provides:
-    """What a `LoadTOD` makes: no stream where none is wanted."""
-
-    def __get__(self, operator: LoadTOD | None, owner: type) -> frozenset[str]:
-        return frozenset(
-            {"boresight"}
-            if operator is not None and operator.signal is None
-            else {"boresight", RECORDED}
-        )
-
-
 class LoadTOD(RecordedFiles):
     """Recorded scans with their streams: TOAST's HDF5 (what `SaveTOD` writes, too) or `SaveTOD`'s
     FITS.
@@ -86,8 +75,12 @@ class LoadTOD(RecordedFiles):
     'zonda[flac]'``).
     """
 
-    provides: ClassVar[Any] = _Provides()
     knows_means: ClassVar[bool] = True
+
+    @property
+    def provides(self) -> frozenset[str]:
+        """The pointing, and the recorded stream if it is wanted."""
+        return frozenset({"boresight"} if self.signal is None else {"boresight", RECORDED})
 
     def check(self, data: Data) -> list[str]:
         """What is in the files."""

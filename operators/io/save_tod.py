@@ -9,7 +9,7 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -20,7 +20,7 @@ from zonda.core.output import StreamOutput, output_folder
 from zonda.core.product import Record
 from zonda.core.registry import ground_weather
 from zonda.core.storage.files import atomic_path, discard, product_path, publish, temporary_sibling
-from zonda.core.stream_names import UNITS, StreamName, StreamsAsked, StreamsNeeded
+from zonda.core.stream_names import UNITS, StreamName, streams_asked, streams_needed
 
 from . import fits_table, toast_hdf5, toast_reading
 from .time_ordered_data import TimeOrderedData
@@ -93,8 +93,6 @@ class SaveTOD(StreamOutput):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    requires: ClassVar[frozenset[str]] = cast(Any, StreamsNeeded())
-    optional: ClassVar[frozenset[str]] = cast(Any, StreamsAsked())
     knows_means: ClassVar[bool] = True
 
     format: Literal["hdf5", "fits"] = "hdf5"
@@ -105,6 +103,16 @@ class SaveTOD(StreamOutput):
     """
     dtype: Literal["float64", "float32"] = "float64"
     """Number type in the file. TOAST wants float64; float32 rounds a mean of 30 K to 2 uK."""
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """`signal`, and streams of other steps."""
+        return streams_needed(self.streams)
+
+    @property
+    def optional(self) -> frozenset[str]:
+        """Components among the streams."""
+        return streams_asked(self.streams)
 
     def observe(self, data: Data) -> None:
         """Refuse a missing or unwritable output folder before anything is simulated."""

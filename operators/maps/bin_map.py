@@ -62,37 +62,27 @@ LIGHT = "instants that count as flagged: a window leaves less than a tenth of th
 """A count of the log."""
 
 
-class _Requires:
-    """What a `BinMap` reads: no signal where only the hits are wanted."""
-
-    def __get__(self, operator: BinMap | None, owner: type) -> frozenset[str]:
-        return frozenset(
-            {"boresight"}
-            if operator is not None and operator.contents == "hits"
-            else {"signal", "boresight"}
-        )
-
-
-class _Linear:
-    """The map of a `BinMap` is linear in the signal, noise from the samples' scatter is not."""
-
-    def __get__(self, operator: BinMap | None, owner: type) -> bool:
-        return operator is None or operator.noise == "net"
-
-
 class BinMap(MapParameters):
     """Weighted mean of the samples in each pixel, equation (1), as a FITS image or a HEALPix map;
     or I, Q and U (`stokes`).
     """
 
-    requires: ClassVar[Any] = _Requires()
     provides: ClassVar[frozenset[str]] = frozenset({"map"})
-    linear: ClassVar[Any] = _Linear()
     knows_means: ClassVar[bool] = True
 
     _layout: Mapping[str, Any] = PrivateAttr(default_factory=dict)
     _grid: Grid | None = PrivateAttr(None)
     _spare: list[Sums] = PrivateAttr(default_factory=list)
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """No signal if the hits alone are wanted."""
+        return frozenset({"boresight"} if self.contents == "hits" else {"signal", "boresight"})
+
+    @property
+    def linear(self) -> bool:
+        """The map is linear in the signal; noise from the samples' scatter is not."""
+        return self.noise == "net"
 
     def check(self, data: Data) -> list[str]:
         """The share of the samples outside a map of a given width. `Data.layouts` has what kind of

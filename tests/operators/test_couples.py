@@ -17,7 +17,7 @@ from pydantic import PrivateAttr
 from zonda.core.data import Block, Data, Observation
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
-from zonda.core.registry import operators
+from zonda.core.registry import declared, operators
 from zonda.core.scene import Scene
 from zonda.core.testing import STREAMS
 
@@ -120,8 +120,8 @@ def test_every_operator_that_couples_is_looked_at() -> None:
     for candidate in operators.candidates():
         if candidate.distribution == "zonda":
             cls = operators.get(candidate.name)
-            optional = cls.optional if isinstance(cls.optional, frozenset) else frozenset()
-            acting = (cls.requires | optional) & set(STREAMS) and cls.provides & set(STREAMS)
+            needs = declared(cls, "requires") | declared(cls, "optional")
+            acting = needs & set(STREAMS) and declared(cls, "provides") & set(STREAMS)
             assert bool(acting) == (candidate.name in {*ACTING, *NEED_OTHERS}), candidate.name
 
 
