@@ -1,6 +1,4 @@
-"""Mistakes in a call in Python, shown as those in a file are: the call written out, with carets
-under what is wrong.
-"""
+"""Mistakes in a call in Python: each with the parameter, the cause and the cure."""
 
 from __future__ import annotations
 
@@ -26,25 +24,23 @@ class ParameterError(ConfigurationError, ValueError):
     Attributes
     ----------
     diagnostics
-        One per mistake; their spans lie in the call, written out on one line.
+        One per mistake.
     """
 
     def render(self, colour: bool = False) -> str:
-        """The mistakes, each with the call and a caret."""
-        return "\n".join(self._one(d, colour) for d in self.diagnostics)
-
-    def _one(self, diagnostic: Diagnostic, colour: bool) -> str:
-        first, _, _, call, caret, *rest = diagnostic.render(colour).splitlines()
-        return "\n".join(
-            [first.replace("error: ", "", 1), f"    {call[4:]}", f"    {caret[4:]}", *rest]
-        )
+        """Each mistake with its cure, indented."""
+        rows = []
+        for found in self.diagnostics:
+            cures = [text for text in (found.label, *found.help.splitlines()) if text]
+            rows += [found.message, *(f"  = {text}" for text in cures)]
+        return "\n".join(rows)
 
 
 def mistakes_of(
     error: ValidationError, model: type[BaseModel], given: Mapping[str, Any]
 ) -> ParameterError:
     """``error``, which a call ``model(**given)`` met, as what a user reads."""
-    document = written(model.__name__, given)
+    document = _as_document(model.__name__, given)
     found = explain(error, model, document, (), model.__name__, python=True)
     return ParameterError(found, f"{model.__name__}(...)")
 
@@ -52,74 +48,36 @@ def mistakes_of(
 def positional(model: type[BaseModel], values: tuple[Any, ...]) -> ParameterError:
     """A call with values that have no names."""
     fields = list(model.model_fields)
-    text = f"{model.__name__}({', '.join(_short(value) for value in values)})"
-    span = Span(Source("the call", text), 0, len(model.__name__) + 1, 0, len(text) - 1)
-    message = f"{model.__name__} takes its parameters by their names"
     example = next((name for name in fields if name != "name"), "name")
     label = f"name {'it' if len(values) == 1 else 'each'}, as in {example}={_short(values[0])}"
-    return ParameterError(
-        [Diagnostic(message, span, label, f"{model.__name__} takes: {', '.join(fields)}")], text
-    )
+    message = f"{model.__name__} takes its parameters by their names"
+    return _one(message, label, f"{model.__name__} takes: {', '.join(fields)}")
 
 
 def changed(model: type[BaseModel], name: str) -> ParameterError:
     """An attribute that somebody tried to change."""
-    text = f"{model.__name__}.{name} = ..."
-    span = Span(Source("the assignment", text), 0, 0, 0, len(text))
-    message = f"a {model.__name__} is not changed once it is made"
-    return ParameterError(
-        [Diagnostic(message, span, "", f"make another: {model.__name__}({name}=..., ...)")], text
-    )
+    cure = f"make another: {model.__name__}({name}=..., ...)"
+    return _one(f"a {model.__name__} is not changed once it is made", "", cure)
 
 
-def written(name: str, given: Mapping[str, Any]) -> Document:
-    """The text ``name(key=value, ...)`` on one line, as a document that knows where each value
-    stands in it.
-    """
-    text = ""
-    places: dict[Path, tuple[int, int, int]] = {}
+def _one(message: str, label: str, cure: str) -> ParameterError:
+    return ParameterError([Diagnostic(message, Span(Source("", "")), label, cure)], "")
 
-    def write(value: Any, path: Path) -> None:
-        nonlocal text
-        begin = len(text)
-        if isinstance(value, Mapping) and value:
-            for k, (key, inner) in enumerate(value.items()):
-                text += ", " if k else "{"
-                at = len(text)
-                text += f"{key!r}: "
-                write(inner, (*path, key))
-                places[*path, key] = (at, *places[*path, key][1:])
-            text += "}"
-        elif isinstance(value, list | tuple) and value:
-            for k, inner in enumerate(value):
-                text += ", " if k else "["
-                write(inner, (*path, k))
-            text += "]"
-        else:
-            text += _short(value)
-        places[path] = (begin, begin, len(text))
 
-    text = f"{name}("
-    for k, (key, value) in enumerate(given.items()):
-        text += ", " if k else ""
-        at = len(text)
-        text += f"{key}="
-        write(value, (key,))
-        places[key,] = (at, *places[key,][1:])
-    text += ")"
-    places[()] = (0, 0, len(text))
-    source = Source(f"{name}(...)", text)
-    marks = {
-        path: Mark(
-            Span(source, 0, begin, 0, end),
-            (
-                Span(source, 0, key, 0, key + len(text[key:begin].rstrip("=: ")))
-                if key < begin
-                else None
-            ),
-        )
-        for path, (key, begin, end) in places.items()
-    }
+def _as_document(name: str, given: Mapping[str, Any]) -> Document:
+    """The arguments of a call as a document; places are numbered in the order of the call."""
+    marks: dict[Path, Mark] = {}
+    source = Source(f"{name}(...)", "")
+
+    def mark(value: Any, path: Path) -> None:
+        place = len(marks)
+        marks[path] = Mark(Span(source, place, 0, place))
+        if isinstance(value, Mapping | list | tuple):
+            pairs = value.items() if isinstance(value, Mapping) else enumerate(value)
+            for key, inner in pairs:
+                mark(inner, (*path, key))
+
+    mark(given, ())
     return Document(dict(given), marks, [])
 
 

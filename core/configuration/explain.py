@@ -196,9 +196,8 @@ class _Validated:
         ):  # a call within
             first = inner.diagnostics[0]
             return Diagnostic(f"{self.name(loc)}: {first.message}", span, first.label, first.help)
-        if caret := context.get("caret"):
-            quoted = self.python and isinstance(e["input"], str)
-            span = span.inner(caret[0] + 1, caret[1]) if quoted else span.part(*caret)
+        if (caret := context.get("caret")) and not self.python:
+            span = span.part(*caret)
         message, label = self.message(e, unit_of(field) if field else None, path)
         message = (
             message[:1].lower() + message[1:] if re.match(r"[A-Z][a-z]+\b", message) else message

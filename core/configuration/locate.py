@@ -96,50 +96,19 @@ def read(path: Path) -> str:
 
 
 SHIPPED = "`zonda pipelines` lists those that have names"
-_DATA = "give the path of a YAML file; `zonda pipelines` lists examples"
-_KINDS = (
-    (b"SIMPLE  =", "a FITS file", "to observe it, name it in a pipeline: <sky>"),
-    (
-        b"\x89HDF\r\n",
-        "an HDF5 file",
-        "to observe with its pointing, name it in a pipeline: <boresight>",
-    ),
-    (b"\x93NUMPY", "a NumPy array", _DATA),
-    (b"CDF\x01", "a NetCDF file", "a reanalysis is named in a pipeline: weather: {file: <name>}"),
-    (b"CDF\x02", "a NetCDF file", "a reanalysis is named in a pipeline: weather: {file: <name>}"),
-    (b"\x1f\x8b", "compressed (gzip)", "unpack it; an image is named in a pipeline: <sky>"),
-    (b"BZh", "compressed (bzip2)", "unpack it"),
-    (b"\xfd7zXZ", "compressed (xz)", "unpack it"),
-    (b"PK\x03\x04", "a ZIP archive", "unpack it"),
-    (b"\x89PNG", "a picture (PNG)", _DATA),
-    (b"\xff\xd8\xff", "a picture (JPEG)", _DATA),
-    (b"%PDF", "a PDF document", _DATA),
-    (b"\xff\xfe", "UTF-16 text", "save it as UTF-8"),
-    (b"\xfe\xff", "UTF-16 text", "save it as UTF-8"),
-    (b"<!doctype", "a web page", "download the file itself, not the page that shows it"),
-    (b"<html", "a web page", "download the file itself, not the page that shows it"),
-    (b"<?xml", "an XML file", _DATA),
-)
-"""How files begin that are no pipeline files, what they are, and what to do with them; ``<sky>``:
-the step that reads it.
-"""
+_DATA = (b"SIMPLE  =", b"\x89HDF", b"\x1f\x8b", b"\xff\xfe", b"\xfe\xff")
+"""How files of data, compressed files and UTF-16 text begin."""
 
 
 def _check_kind(path: Path, content: bytes) -> None:
-    """Raise InputError for a file of another kind, by its name."""
-    start = content.lstrip()[:20]
-    for begins, kind, cure in _KINDS:
-        if start.startswith(begins) or start.lower().startswith(begins):
-            for what in ("sky", "boresight"):
-                if f"<{what}>" in cure:
-                    cure = cure.replace(f"<{what}>", _reader(what))
-            raise InputError(
-                f"is {kind}, not a pipeline file",
-                place=str(path),
-                cure=cure.replace("<name>", path.name),
-            )
-    if b"\0" in content:
-        raise InputError("is a binary file, not a pipeline file", place=str(path), cure=_DATA)
+    """Raise InputError for a file that is not YAML text."""
+    if content.startswith(_DATA) or b"\0" in content:
+        raise InputError(
+            "is a binary or data file, not a pipeline file",
+            place=str(path),
+            cure="give the path of a YAML file in UTF-8; data are named in a pipeline, e.g."
+            f" - {_reader('sky')}: {{file: {path.name}}}",
+        )
     if path.suffix == ".py":
         raise InputError(
             "is a Python script, not a pipeline file",
@@ -149,11 +118,8 @@ def _check_kind(path: Path, content: bytes) -> None:
 
 
 def _reader(what: str) -> str:
-    """How a step that reads ``what`` from a file is written in a pipeline."""
+    """Name of the first step that reads ``what`` from a file."""
     from ..registry import makers, operators
 
     names = [name for name in makers(what) if "file" in operators.get(name).model_fields]
-    return (
-        " or ".join(f"- {name}: {{file: <name>}}" for name in names)
-        or f"a step that provides {what}"
-    )
+    return next(iter(names), f"a step that provides {what}")

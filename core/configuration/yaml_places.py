@@ -56,10 +56,6 @@ class Span:
         first = rows[self.line][self.column : self.column + 1] if self.line < len(rows) else ""
         if self.line != self.end_line or first in ("'", '"'):
             return self
-        return self.inner(offset, length)
-
-    def inner(self, offset: int, length: int) -> Span:
-        """``length`` characters from ``offset`` on, on the first line."""
         return Span(
             self.source, self.line, self.column + offset, self.line, self.column + offset + length
         )

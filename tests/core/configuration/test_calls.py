@@ -30,178 +30,114 @@ def scene(**changes: Any) -> zonda.Scene:
 
 
 @pytest.mark.parametrize(
-    ("call", "message", "under", "words"),
+    ("call", "message", "words"),
     [
         (
             lambda: zonda.BinMap(pixle="2 arcsec"),
             "unknown parameter 'pixle' for BinMap",
-            "pixle",
             "did you mean 'pixel'?",
         ),
-        (lambda: zonda.BinMap(pixel=2), "BinMap, pixel: 2 has no unit", "2", "add a unit"),
-        (lambda: zonda.BinMap(pixel="2 K"), "'K' is a unit of temperature", "K", "not an angle"),
-        (
-            lambda: zonda.BinMap(pixel=2 * u.K),
-            "'K' is a unit of temperature",
-            "<Quantity 2. K>",
-            "not an angle",
-        ),
+        (lambda: zonda.BinMap(pixel=2), "BinMap, pixel: 2 has no unit", "add a unit"),
+        (lambda: zonda.BinMap(pixel="2 K"), "'K' is a unit of temperature", "not an angle"),
+        (lambda: zonda.BinMap(pixel=2 * u.K), "'K' is a unit of temperature", "not an angle"),
         (
             lambda: zonda.BinMap(pixel="-2 arcsec"),
             "must be greater than 0 arcsec, got -2 arcsec",
-            "'-2 arcsec'",
             "Side of a pixel",
         ),
-        (
-            lambda: zonda.BinMap(pixel=np.zeros(3)),
-            "expected an angle such as",
-            "array([0., 0., 0.])",
-            "",
-        ),
+        (lambda: zonda.BinMap(pixel=np.zeros(3)), "expected an angle such as", ""),
         (
             lambda: zonda.BinMap("2 arcsec"),
             "takes its parameters by their names",
-            "'2 arcsec'",
             "as in pixel='2 arcsec'",
         ),
         (
             lambda: zonda.BinMap(projection="tan"),
             "must be 'TAN' or 'CAR', got 'tan'",
-            "'tan'",
             "did you mean 'TAN'?",
         ),
-        (
-            lambda: zonda.BinMap(half_difference="maybe"),
-            "expected True or False, got 'maybe'",
-            "'maybe'",
-            "",
-        ),
+        (lambda: zonda.BinMap(half_difference="maybe"), "expected True or False, got 'maybe'", ""),
         (
             lambda: zonda.PointingDaisy(scans=1.5),
             "scans: expected a whole number, got 1.5",
-            "1.5",
             "Number of scans",
         ),
-        (lambda: zonda.PointingDaisy(scans=0), "scans: must be at least 1, got 0", "0", ""),
+        (lambda: zonda.PointingDaisy(scans=0), "scans: must be at least 1, got 0", ""),
         (
             lambda: zonda.PointingDaisy(radius="1 furlong"),
             "unknown unit 'furlong'",
-            "furlong",
             "e.g. '4 arcmin'",
         ),
         (
             lambda: zonda.PointingDaisy(offsets=[("1 arcmin", "2 K")]),
             "offsets.0.1: expected an angle",
-            "K",
             "not an angle",
         ),
         (
             lambda: zonda.PointingDaisy(target="M31"),
             "target: cannot read 'M31' as a position",
-            "'M31'",
             "e.g. 05h00m00s",
         ),
-        (
-            lambda: zonda.PointingRecorded(),
-            "PointingRecorded needs 'file'",
-            "PointingRecorded()",
-            "add file=...",
-        ),
+        (lambda: zonda.PointingRecorded(), "PointingRecorded needs 'file'", "add file=..."),
         (
             lambda: zonda.SkyMap(),
             "give either file, the path of a FITS map, or in Python map, an array",
-            "SkyMap()",
             "",
         ),
-        (
-            lambda: zonda.WhiteNoise(model="foo"),
-            "model: unknown noise model 'foo'",
-            "'foo'",
-            "fixed_net",
-        ),
+        (lambda: zonda.WhiteNoise(model="foo"), "model: unknown noise model 'foo'", "fixed_net"),
         (
             lambda: zonda.WhiteNoise(model={"name": "background_limited", "mods": 1}),
             "model: unknown parameter 'mods' for BackgroundLimited",
-            "{'name': 'background_limited', 'mods': 1}",
             "did you mean 'modes'?",
         ),
-        (
-            lambda: zonda.AtmosphereLayers(spectra="x"),
-            "unknown spectra 'x'",
-            "'x'",
-            "installed: am",
-        ),
+        (lambda: zonda.AtmosphereLayers(spectra="x"), "unknown spectra 'x'", "installed: am"),
         (
             lambda: zonda.Scene(),
             "Scene needs 'site', 'instrument', 'time'",
-            "Scene()",
             "time: Start of the first scan",
         ),
-        (
-            lambda: scene(site="lmt"),
-            "site: unknown site 'lmt'",
-            "'lmt'",
-            "did you mean 'sierra_negra'?",
-        ),
+        (lambda: scene(site="lmt"), "site: unknown site 'lmt'", "did you mean 'sierra_negra'?"),
         (
             lambda: scene(instrument="mustng2"),
             "instrument: unknown instrument 'mustng2'",
-            "'mustng2'",
             "did you mean 'mustang2'?",
         ),
         (
             lambda: scene(intrument="mustang2"),
             "unknown parameter 'intrument' for Scene",
-            "intrument",
             "did you mean 'instrument'?",
         ),
-        (
-            lambda: scene(time="yesterday"),
-            "time: cannot read 'yesterday' as a time",
-            "'yesterday'",
-            "YYYY-MM-DD",
-        ),
-        (lambda: scene(seed=-1), "seed: must be at least 0, got -1", "-1", ""),
-        (lambda: scene(site=3), "site: expected a dict, got 3", "3", "a registered name"),
+        (lambda: scene(time="yesterday"), "time: cannot read 'yesterday' as a time", "YYYY-MM-DD"),
+        (lambda: scene(seed=-1), "seed: must be at least 0, got -1", ""),
+        (lambda: scene(site=3), "site: expected a dict, got 3", "a registered name"),
         (
             lambda: scene(weather="1.2 mm"),
             "'1.2 mm' is no source of weather",
-            "'1.2 mm'",
             "weather: {pwv: 1.2 mm}",
         ),
         (
             lambda: scene(weather={"pvw": "1 mm"}),
             "unknown parameter 'pvw' for Scene, weather",
-            "'pvw'",
             "did you mean 'pwv'?",
         ),
         (
             lambda: scene(site={"name": "x", "latitude": "95 deg", "longitude": "0 deg"}),
             "site.latitude: must be",
-            "'95 deg'",
             "90 deg",
         ),
-        (
-            lambda: zonda.Band(name="x", low="90 GHz"),
-            "a band needs 0 < low < high",
-            "Band(name='x', low='90 GHz')",
-            "",
-        ),
+        (lambda: zonda.Band(name="x", low="90 GHz"), "a band needs 0 < low < high", ""),
         (
             lambda: zonda.Telescope(name="x", diameter="0 m"),
             "diameter: must be greater than 0 m",
-            "'0 m'",
             "",
         ),
     ],
 )
-def test_a_mistake_in_a_call(call: Callable[[], Any], message: str, under: str, words: str) -> None:
+def test_a_mistake_in_a_call(call: Callable[[], Any], message: str, words: str) -> None:
     with pytest.raises(ParameterError) as caught:
         call()
     (found,) = caught.value.diagnostics
     assert message in found.message
-    line = found.span.source.text
-    assert line[found.span.column : found.span.end_column] == under
     assert words in str(caught.value)
     for jargon in ("pydantic", "validation error", "input_value", "Input should"):
         assert jargon not in str(caught.value)
