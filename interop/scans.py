@@ -97,7 +97,7 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
 def _read(
     path: str | os.PathLike[str], stream: str
 ) -> tuple[TimeOrderedData, NDArray[np.float64], NDArray[np.bool_] | None]:
-    """All of a file but other streams; which single samples it flags."""
+    """Read a file without its other streams, and the single samples that it flags."""
     opened = reader(path)
     try:
         tod = opened.tod

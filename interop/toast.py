@@ -260,7 +260,7 @@ def from_toast(ob: Any, stream: str | None = "signal") -> TimeOrderedData:
 
 
 def _metadata(ob: Any) -> dict[str, Any]:
-    """What `to_toast`, or a file of `SaveTOD`, says of where the data come from."""
+    """Metadata of `to_toast` and of files of `SaveTOD` on the origin of the data."""
     return {key: value for key, value in ob.items() if str(key).startswith("zonda_")}
 
 

@@ -93,8 +93,8 @@ class ToastOperator(Operator):
         _check_needs(self, observation)
 
     def measure(self, stream: Stream, model: Any = None) -> Changed:
-        """What TOAST's operator makes of a signal. ``model`` is not used: each signal is acted on
-        by itself.
+        """Apply TOAST's operator to a signal. ``model`` is not used: each signal is acted on by
+        itself.
         """
         return _changed(self, stream)
 

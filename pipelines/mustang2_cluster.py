@@ -11,7 +11,7 @@ import zonda
 
 
 def scene() -> zonda.Scene:
-    """What exists."""
+    """Scene: the telescope, its site, the time and the target."""
     return zonda.Scene(
         site="green_bank",
         instrument="mustang2",
@@ -22,7 +22,7 @@ def scene() -> zonda.Scene:
 
 
 def pipeline() -> zonda.Pipeline:
-    """What is done."""
+    """Pipeline of the observation, from the scan to the report."""
     return zonda.Pipeline(
         [
             zonda.PointingDaisy(

@@ -116,7 +116,7 @@ class Wafers:
 
     @property
     def wafers(self) -> int:
-        """How many share the pixels equally."""
+        """Number of wafers that share the pixels equally."""
         return len(self.places)
 
     def __call__(self, number: int) -> Layout:

@@ -179,12 +179,12 @@ class _Moments:
 
     @classmethod
     def of(cls, frequency: Floats, width: Floats, square: Floats, load: Floats) -> _Moments:
-        """Of loads (k, n) in cells (n,) with the integrals of t and t^2."""
+        """Moments of loads (k, n) in cells (n,) with the integrals of t and t^2."""
         sums = load @ (frequency * width), load @ square, load**2 @ square
         return cls(*sums, float(frequency @ width), float(square.sum()), float(width.sum()))
 
     def at(self, known: Floats, wanted: Floats) -> _Moments:
-        """Of loads between those at the rising places ``known`` (k,), at ``wanted`` (m,)."""
+        """Moments between the loads at the rising places ``known`` (k,), at ``wanted`` (m,)."""
         one, two, three = (
             np.interp(wanted, known, v) for v in (self.photons, self.means, self.squares)
         )

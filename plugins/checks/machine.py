@@ -38,7 +38,7 @@ FUNCTIONS = (
 
 
 def description() -> dict[str, str]:
-    """What this machine is: interpreter, libraries, CPU, memory, threads."""
+    """Describe this machine: interpreter, libraries, CPU, memory, threads."""
     from zonda.core.machine import available_memory, available_threads
     from zonda.core.versions import versions
 
@@ -141,7 +141,7 @@ def writable_cache() -> Measured:
 
 
 def _cache_folder() -> Path:
-    """Where numba keeps compiled code: beside the source, else in the user's cache."""
+    """Folder of numba's compiled code: beside the source, else in the user's cache."""
     if named := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(named)
     beside = Path(sys.modules["zonda.core"].__path__[0]) / "__pycache__"

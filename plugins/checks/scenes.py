@@ -178,7 +178,7 @@ def largest(*figures: float) -> float:
 
 
 def differing(one: Any, other: Any) -> int:
-    """How many values of two arrays are not the same bits (NaN equals NaN)."""
+    """Number of values of two arrays that are not the same bits (NaN equals NaN)."""
     a, b = np.asarray(one), np.asarray(other)
     if a.shape != b.shape or a.dtype != b.dtype:
         return max(a.size, b.size, 1)

@@ -1,5 +1,4 @@
-"""What the filters leave of the atmosphere in a map: an indicative figure, without drawing any
-turbulence.
+"""Atmosphere that filters leave in a map: an indicative figure, without drawing any turbulence.
 
 Layer l of the frozen atmosphere is a sum of plane waves q with the spectrum P_l (behind the
 telescope's beam in that layer). The boresight crosses it along the path X(t), a detector at
@@ -89,8 +88,8 @@ class Left:
 
 
 def step_of_modes(survey: Survey) -> bool:
-    """Whether what detectors have in common is found in the data: equation (1), which takes their
-    mean off, need not hold.
+    """True if the common signal of the detectors is found in the data: equation (1), which takes
+    their mean off, need not hold.
     """
     return survey.common and survey.steps.common is not None and survey.steps.common.method == "svd"
 

@@ -50,7 +50,7 @@ class Row:
 
     @property
     def difference(self) -> float:
-        """Of the forecast, relative to what was simulated."""
+        """Difference of the forecast from the simulation, relative to the simulation."""
         return self.forecast / self.mean - 1 if self.mean > 0 else math.nan
 
     @property
@@ -61,13 +61,13 @@ class Row:
 
 @dataclass(frozen=True)
 class Audited:
-    """All parts, and all noise together."""
+    """Table of the parts, and of the total noise."""
 
     rows: tuple[Row, ...]
 
     @property
     def together(self) -> Row | None:
-        """All noise; None: a part of it is not forecast."""
+        """Row of the total noise; None if a part of it is not forecast."""
         return next((r for r in self.rows if r.part == TOGETHER), None)
 
     def as_dict(self) -> list[dict[str, Any]]:
@@ -98,7 +98,7 @@ class Audited:
 
 @dataclass(frozen=True)
 class Forecasted:
-    """What is beside the simulations: the depths of a map's planes, the radius of its circle and
+    """Forecast beside the simulations: the depths of a map's planes, the radius of its circle and
     its beam's FWHM, rad.
     """
 
@@ -164,7 +164,7 @@ def _audited(of: Forecasted, made: list[dict[str, MapProduct]]) -> Audited:
 def _maps(
     file: PipelineFile, parts: Sequence[str], bands: Sequence[str], seed: int, threads: int | None
 ) -> dict[str, dict[str, MapProduct]]:
-    """By band the maps of each part, and of all noise."""
+    """Maps of each part, and of the total noise, by band."""
     operators = [
         o.model_copy(update={"smooth": None, "half_difference": False})
         if isinstance(o, BinMap)

@@ -1,4 +1,4 @@
-"""Which pipelines a forecast covers, and the steps of them that matter for the noise."""
+"""Pipelines that a forecast covers, and their steps that matter for the noise."""
 
 from __future__ import annotations
 
@@ -77,14 +77,14 @@ class Steps:
 
     @classmethod
     def among(cls, operators: Sequence[Operator]) -> Steps:
-        """Those steps, which have one map and at most one of each filter."""
+        """Select the steps that matter; they have one map and at most one of each filter."""
         binning = next(o for o in operators if isinstance(o, BinMap))
         highpass = next((o for o in operators if isinstance(o, HighpassFilter)), None)
         common = next((o for o in operators if isinstance(o, CommonModeFilter)), None)
         return cls(tuple(operators), binning, highpass, common)
 
     def of(self, kind: type[Any]) -> list[Any]:
-        """Those of one class."""
+        """Steps of one class."""
         return [o for o in self.operators if isinstance(o, kind)]
 
 

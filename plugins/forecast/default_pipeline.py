@@ -62,7 +62,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Asked:
-    """What an observer says, as text with units; None: not said.
+    """An observer's request, as text with units; None: not stated.
 
     Attributes
     ----------
@@ -307,7 +307,7 @@ def positive(place: str, unit: Unit, given: str | None, usual: float) -> float:
 
 
 def parsed(place: str, parse: Callable[[Any], T], given: str) -> T:
-    """What ``parse`` makes of a text; its refusal as an InputError about ``place``."""
+    """Parse a text; InputError about ``place`` if ``parse`` refuses it."""
     from pydantic_core import PydanticCustomError
 
     try:

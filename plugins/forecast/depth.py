@@ -86,7 +86,7 @@ class Depth:
         return np.asarray(np.sqrt(variance / wanted))
 
     def total(self, seconds: Floats | float) -> Floats:
-        """All parts that are forecast in quadrature, K_RJ."""
+        """Quadratic sum of the parts that are forecast, K_RJ."""
         return np.asarray(np.sqrt(sum(self.part(name, seconds) ** 2 for name in self.known)))
 
     def total_error(self, seconds: float) -> float:

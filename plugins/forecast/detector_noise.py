@@ -137,7 +137,8 @@ def _kernels(
 
 
 class Filtered:
-    """What the filters leave of each noise, <> / <> of equation (2), and of what is before it.
+    """Share of each noise that the filters leave, <> / <> of equation (2), and of the noise before
+    them.
 
     Parameters
     ----------
@@ -179,7 +180,7 @@ class Filtered:
             self._all[k] += before * noise.sample**2
 
     def share(self, noise: int) -> float:
-        """Of one of the noises."""
+        """Share of one of the noises that is left."""
         if not self._all[noise] > 0:
             return 0.0
         found = float(self._left[noise] / self._all[noise])

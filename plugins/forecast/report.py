@@ -1,4 +1,4 @@
-"""What `zonda sensitivity` prints and writes."""
+"""Text, tables and files of `zonda sensitivity`."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def reached(found: Forecast, wanted: str, seconds: float) -> str:
 
 
 def reached_by_all(wanted: str, seconds: float) -> str:
-    """How long a depth takes in all bands."""
+    """Time to a depth in every band."""
     return f"{wanted} in all bands after {duration(seconds)} of integration"
 
 
@@ -228,7 +228,7 @@ def as_dict(found: Forecast) -> dict[str, Any]:
 
 
 def _rows(found: Forecast, depth: Depth) -> list[dict[str, Any]]:
-    """Of a plane's table, for JSON; null: not forecast."""
+    """Rows of a plane's table, for JSON; null: not forecast."""
     return [
         {
             "seconds": t,

@@ -1,4 +1,4 @@
-"""What is forecast of a map: its depth against time, in the units that observers use."""
+"""Forecast of a map: its depth against time, in the units that observers use."""
 
 from __future__ import annotations
 

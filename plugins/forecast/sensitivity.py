@@ -1,4 +1,4 @@
-"""How deep a map becomes: `zonda.sensitivity`, without a run."""
+"""Depth of a map without a run: `zonda.sensitivity`."""
 
 from __future__ import annotations
 

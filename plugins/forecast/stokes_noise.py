@@ -58,8 +58,9 @@ FOLLOWED = 24
 
 
 def variances(survey: Survey, radius: float) -> dict[str, dict[str, Floats]]:
-    """By plane of the map, ``white`` and ``1/f``: (n_scan,) variance [K^2] after each scan,
-    averaged over a circle of ``radius`` [rad]; NaN where no pixel there is solved."""
+    """Variances [K^2] after each scan, (n_scan,), ``white`` and ``1/f`` by plane of the map,
+    averaged over a circle of ``radius`` [rad]; NaN where no pixel there is solved.
+    """
     grid = _window(survey, radius)
     number, taps = len(survey.observations), gaussian_taps(survey.sigma / grid.pixel)
     after = np.unique(np.geomspace(1, number, min(number, FOLLOWED)).round().astype(int)) - 1
@@ -111,7 +112,7 @@ def _window(survey: Survey, radius: float) -> TangentGrid:
 
 
 def _scans(survey: Survey, grid: TangentGrid) -> Iterator[Floats]:
-    """Of each scan the sum of r r^T in all pixels, (n_pixels, 6)."""
+    """Sum of r r^T in all pixels, (n_pixels, 6), for each scan."""
     rng = np.random.default_rng(5)
     plane = survey.focalplane
     share = min(1.0, SAMPLES / sum(o.n_samples * len(plane) for o in survey.observations))
@@ -193,8 +194,8 @@ class _Looks:
 def _signed(
     looks: _Looks, grid: TangentGrid, row: Floats, weight: Floats, taps: Floats, chosen: list[Comb]
 ) -> list[Series]:
-    """As `detector_noise._signed`, from ``row`` (n_pixels, 3), (A^-1)_S, and ``weight`` (ny, nx),
-    w.
+    """Same as `detector_noise._signed`, from ``row`` (n_pixels, 3), (A^-1)_S, and ``weight`` (ny,
+    nx), w.
     """
     rng = np.random.default_rng(2)
     draws: list[Series] = []
@@ -223,6 +224,6 @@ def _weight(spread: Floats) -> Floats:
 
 
 def _distance(grid: TangentGrid) -> Floats:
-    """Of the pixels from the map's centre, rad."""
+    """Distance of the pixels from the map's centre, rad."""
     rows, columns = ((np.arange(n) - (n - 1) / 2) * grid.pixel for n in grid.shape)
     return np.asarray(np.hypot(rows[:, None], columns[None]))

@@ -81,7 +81,7 @@ class Noise:
 
     @property
     def part(self) -> str:
-        """Which part of the map's noise it makes."""
+        """Part of the map's noise that the step makes."""
         return "white" if self.spectrum is None else "1/f"
 
 
@@ -125,7 +125,7 @@ class Track:
 
 @dataclass
 class Survey:
-    """What a pipeline does to noise, see `survey_of`.
+    """Effect of a pipeline on noise, see `survey_of`.
 
     Attributes
     ----------
@@ -159,8 +159,8 @@ class Survey:
 
     @cached_property
     def fwhm(self) -> float:
-        """Of the map's beam [rad], `core.maps.beams`: by the weights of the detectors of the first
-        scan.
+        """FWHM of the map's beam [rad], `core.maps.beams`: by the weights of the detectors of the
+        first scan.
         """
         good = self.observations[0].good_detectors
         fwhm, net = self.focalplane.fwhm[good], self.focalplane.net[good]
@@ -179,12 +179,12 @@ class Survey:
 
     @property
     def common(self) -> bool:
-        """Whether what detectors have in common is removed: of one detector it is not."""
+        """True if the common signal of the detectors is removed; a single detector has none."""
         return self.steps.common is not None and len(self.focalplane) > 1
 
     @property
     def polarized(self) -> bool:
-        """Whether the map is one of I, Q and U."""
+        """True for a map of I, Q and U."""
         return self.steps.binning.stokes == "IQU"
 
     @cached_property
@@ -197,9 +197,10 @@ class Survey:
 
     @property
     def cancels(self) -> bool:
-        """Whether what is not polarized and the same for detectors that look at one place, such as
-        the atmosphere, is in I alone: alike detectors there have angles of which cos 2 psi and sin
-        2 psi add up to zero."""
+        """True if unpolarized signals that are the same for detectors at one place, such as the
+        atmosphere, are in I alone: alike detectors there have angles of which cos 2 psi and sin 2
+        psi add up to zero.
+        """
         plane, good = self.focalplane, self.observations[0].good_detectors
         seen = np.stack(
             [
@@ -341,7 +342,7 @@ def survey_of(file: PipelineFile, band: str = "") -> Survey:
 
 
 def polarization_angles(survey: Survey, observation: Observation, index: Any) -> PolarizationAngles:
-    """Those of the samples ``index`` (n,), from the meridians of the map's frame."""
+    """Polarization angles of the samples ``index`` (n,), from the meridians of the map's frame."""
     for plate in survey.steps.of(HalfWavePlate):
         plate.configure(observation)
     pole = frame_rotation(survey.steps.binning.frame)[2]

@@ -1,4 +1,4 @@
-"""What several metrics need of the products of a run."""
+"""Access to the products of a run that several metrics need."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def at_beam(product: MapProduct, fwhm: float | None = None) -> MapProduct:
 
 
 def covered(product: MapProduct) -> NDArray[np.bool_]:
-    """Where a map has a value and at least `COVERED` of the usual samples."""
+    """Pixels that have a value and at least `COVERED` of the usual samples."""
     seen = product.hits[product.known]
     least = COVERED * float(np.percentile(seen, 99)) if seen.size else 1.0
     return np.asarray(np.isfinite(product.signal) & (product.hits >= max(least, 1e-9)))

@@ -70,7 +70,7 @@ class Fidelity(FigureMetric):
         return float(np.median(found.planes["fidelity"][size >= self.least * peak])), math.nan
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         where = (
             "at the reference's peak"
             if self.least == 1
@@ -148,7 +148,7 @@ class MapPower(FigureMetric):
         return value, value * math.sqrt(float(number @ level**2)) / float(number @ level)
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         return (
             f"power of {self.of} over that of white noise by NET and samples, scales"
             f" {self._range()}"

@@ -195,8 +195,8 @@ class Transfer(OfPlanes):
         )
 
     def measure(self, data: Data) -> dict[str, Floats]:
-        """By plane (2, n): T_i, and its standard deviation from the instrument's noise in the main
-        map.
+        """Transfer (2, n) by plane: T_i, and its standard deviation from the instrument's noise in
+        the main map.
         """
         sky, main = _map(data, _sky_alone(data.provenance.get("runs", {}))), _map(data)
         if sky.projection != "TAN":
@@ -244,7 +244,7 @@ class Transfer(OfPlanes):
 
 
 class _Binned(Metric):
-    """What is measured in bins: (2, n) values and their relative standard errors."""
+    """Metric in bins: (2, n) values and their relative standard errors."""
 
     def error(self, found: Floats, reference: Floats) -> float:
         return float(np.sqrt(np.mean((found[0] / reference[0] - 1) ** 2)))

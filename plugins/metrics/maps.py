@@ -118,7 +118,7 @@ class CentralRms(_OfSmoothMap):
 
     @property
     def unit(self) -> str:
-        """Of a brightness."""
+        """Unit of a brightness."""
         return "K_RJ"
 
     def named_signals(self) -> tuple[str, ...]:
@@ -132,7 +132,7 @@ class CentralRms(_OfSmoothMap):
         )
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         what = self.signal or "the map"
         if self.of == "half_difference":
             what = (
@@ -198,7 +198,7 @@ class PeakRatio(_OfSmoothMap):
         return peak_ratio(before, seen), math.nan
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         other = (
             "the map without filters"
             if self.against == "unfiltered"
@@ -244,7 +244,7 @@ class PeakSnr(_OfSmoothMap):
     """Look for the peak only this near to the map's centre."""
 
     def needs(self) -> tuple[Signal, ...]:
-        """All but the sky, where that is the noise."""
+        """Signal of all but the sky, if that is the noise."""
         return (Signal(without=["sky"], modes="full"),) if self.noise == "source_free" else ()
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
@@ -283,7 +283,7 @@ class PeakSnr(_OfSmoothMap):
         return value, math.hypot(1.0, value * error)
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         return (
             f"largest |map| / noise ({WHITE if self.noise == 'white' else self.noise}),"
             f" {self.how()}"
@@ -291,8 +291,8 @@ class PeakSnr(_OfSmoothMap):
 
 
 class Coverage(_OfMap):
-    """How long the centre of the map was observed, per beam, equation (4), or how large the field
-    is, equation (5).
+    """Time on the centre of the map per beam, equation (4), or solid angle of the field, equation
+    (5).
     """
 
     of: Literal["time", "area"] = "time"
@@ -306,7 +306,7 @@ class Coverage(_OfMap):
 
     @property
     def unit(self) -> str:
-        """Of a time, or of a solid angle."""
+        """Unit of a time, or of a solid angle."""
         return "s" if self.of == "time" else "arcmin2"
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
@@ -317,7 +317,7 @@ class Coverage(_OfMap):
         return coverage(product, self.radius, None if self.of == "time" else self.least), math.nan
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         centre = f"within {angle_text(self.radius)} of the centre"
         if self.of == "time":
             return f"seconds of all detectors per beam, median {centre}"

@@ -92,7 +92,7 @@ class TransferAt(FigureMetric):
         return value, float(rings.error[0]) if self.kind == "in_phase" else math.nan
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         window = (
             f"window within {angle_text(self.radius)}" if self.radius else "window of the coverage"
         )

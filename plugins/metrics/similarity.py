@@ -1,4 +1,4 @@
-"""Whether two parts of a time stream have the same distribution: the Anderson-Darling test.
+"""Anderson-Darling test of two parts of a time stream for the same distribution.
 
 The p-value is that of the k-sample test (Scholz & Stephens 1987, JASA 82, 918) between the first
 and the second half of one detector's stream, as scipy tabulates it: from 0.001 to 0.25. A small p

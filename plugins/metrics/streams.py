@@ -111,7 +111,7 @@ class PsdSlope(_OfSpectrum):
         return slope(np.log(spectrum.frequency[use]), np.log(psd[use]))
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         return f"d ln P / d ln f of {self.stream} from {self.low:g} to {self.high:g} Hz"
 
 
@@ -131,7 +131,7 @@ class Crossing(_OfSpectrum):
 
     @property
     def unit(self) -> str:
-        """Of a frequency."""
+        """Unit of a frequency."""
         return "Hz"
 
     stream: str = "atmosphere"
@@ -153,7 +153,7 @@ class Crossing(_OfSpectrum):
         return crossing(spectrum.frequency, psd, level)
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         other = f"2 NET^2 with {self.net:.4g} K s(1/2)" if self.net else self.other
         return f"highest frequency at which {self.stream} exceeds {other}"
 
@@ -210,7 +210,7 @@ class FirstComponent(FigureMetric):
         return float(found.shares[0]), float(found.error[0])
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         found = self._product(data)
         if found.delays == 0:
             return (
@@ -239,7 +239,7 @@ class MeanTScan(FigureMetric):
 
     @property
     def unit(self) -> str:
-        """Of a brightness."""
+        """Unit of a brightness."""
         return "K_RJ"
 
     reads: ClassVar[frozenset[str]] = frozenset({"atmosphere", "signal"})
@@ -265,6 +265,6 @@ class MeanTScan(FigureMetric):
         )
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured."""
+        """Describe the figure in words."""
         what = "epsilon T_atm / (zeta e^-tau)" if self.of == "scan" else "T_atm"
         return f"mean of {what} over detectors and time"
