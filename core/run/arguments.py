@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from ..configuration.diagnostics import nearest
+from ..contract import broken
 from ..errors import PipelineError
 from ..operator import Operator
 from ..scene import Scene
 from ..signal import Signal, needed_name
-from .contract import broken
 
 PRECISIONS = ("float32", "float64")
 

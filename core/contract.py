@@ -8,9 +8,9 @@ import inspect
 from collections.abc import Set
 from typing import Any
 
-from ..configuration.diagnostics import nearest
-from ..operator import Operator
-from ..signal import is_stream
+from .configuration.diagnostics import nearest
+from .operator import Operator
+from .signal import is_stream
 
 STAGES = {
     "observe": "data",
