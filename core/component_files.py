@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import ValidationError
 
 from .errors import InputError
 
@@ -54,6 +53,8 @@ def described(path: Path, name: str, base: type[Any], create: Callable[[str], An
     ``create`` makes the component that ``like`` names. Raises `ConfigurationError` with every
     mistake at its place, and InputError if the file cannot be read or has no such component.
     """
+    from pydantic import ValidationError
+
     from .configuration import yaml_places
     from .configuration.diagnostics import ConfigurationError, Diagnostic
     from .configuration.explain import explain

@@ -17,8 +17,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar, overload
 
-from pydantic_core import PydanticCustomError
-
 from .component_files import described, is_file, names_in
 from .discovery import API_VERSION, RAISED, Found, discover
 from .errors import ZondaError
@@ -116,8 +114,8 @@ class Registry:
         entry points instead.
 
         Its name is ``name``, or the component's own ``name``, or its ``__name__``. Registering a
-        name again replaces the component (cells are run twice). Raises `RegistryError` where a
-        plugin provides that name.
+        name again replaces the component (cells are run twice). Raises `RegistryError` if a plugin
+        provides that name, or the component is of another kind.
         """
         if component is None:
             return lambda c: self.register(c, name=name)
@@ -125,6 +123,10 @@ class Registry:
         key = (
             name or (own if isinstance(own, str) else None) or getattr(component, "__name__", None)
         )
+        if self.classes and self.base:
+            self._check(
+                component, Found(key or repr(component), _reference(component), SESSION, "")
+            )
         if not key:
             raise RegistryError(
                 f"this {self.kind} has no name", cure="give one: register(component, name='...')"
@@ -232,6 +234,8 @@ class Registry:
 
     def _of_file(self, name: str, folder: str | Path | None) -> Any:
         """The component of a file that holds one."""
+        from pydantic_core import PydanticCustomError
+
         from .configuration.files import find_in
 
         try:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from .block import Block
+from .contract import fault_of_class
 from .data import Data
 from .discovery import API_VERSION
+from .errors import ZondaError
 from .label import Labelled
 from .observation import Observation
 from .stream import Stream
@@ -85,6 +87,13 @@ class Operator(Labelled):
     on_request: ClassVar[frozenset[str]] = frozenset()
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "sample"
     knows_means: ClassVar[bool] = False
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **options: Any) -> None:
+        """Raise ZondaError for a class that breaks the contract."""
+        super().__pydantic_init_subclass__(**options)
+        if fault := fault_of_class(cls, Operator):
+            raise ZondaError(fault[0], place=cls.__name__, cure=fault[1])
 
     def observe(self, data: Data) -> None:
         """Append observations to ``data`` (pointing operators), or look at those that are there

@@ -7,6 +7,7 @@ from types import FunctionType
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from ..errors import ZondaError
 from .diagnostics import ConfigurationError, Diagnostic
@@ -97,7 +98,7 @@ def without_a_type(
     plain = {
         k: v
         for k, v in namespace.items()
-        if not k.startswith("_") and k not in typed and not isinstance(v, kinds)
+        if not k.startswith("_") and k not in (*typed, "model_config") and not isinstance(v, kinds)
     }
     fields = {field for base in bases for field in getattr(base, "model_fields", {})}
     methods = {k for k in plain if any(callable(getattr(base, k, None)) for base in bases)}
@@ -121,6 +122,10 @@ def without_a_type(
                 f"{text}: the label of a step is no constant of its class", place=name, cure=cure
             )
         kind = type(value).__name__ if value is not None else "Any"
+        if isinstance(value, FieldInfo):
+            written = f"quantity({value.default!r:.40})"
+            cure = f"write {attribute}: TYPE = {written} with a type, e.g. zonda.Seconds"
+            return ZondaError(f"{attribute} = {written} has no type", place=name, cure=cure)
         cure = (
             f"write {attribute}: {kind} = {value!r:.40} for a parameter, {attribute}:"
             f" ClassVar[{kind}] = ... for a constant"
@@ -129,5 +134,5 @@ def without_a_type(
     return ZondaError(
         f"its parameters cannot be used: {str(error).splitlines()[0]}",
         place=name,
-        cure="give each a type",
+        cure="give each the type of a number, a text or a list, or one of zonda's (zonda.Seconds)",
     )

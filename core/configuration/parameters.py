@@ -130,6 +130,10 @@ class Parameters(BaseModel, metaclass=_Shown):
                 from .calls import mistakes_of
 
                 raise mistakes_of(err, type(self), given) from None
+            except PydanticUserError as err:  # a type of an annotation does not exist
+                from .calls import without_a_type
+
+                raise without_a_type(type(self).__name__, (), {}, err) from None
 
         __init__.__pydantic_base_init__ = (
             True  # what is validated as a field is not made by it: contexts and places are kept

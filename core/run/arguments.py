@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..configuration.diagnostics import nearest
-from ..contract import broken
+from ..contract import fault_of_step
 from ..errors import PipelineError
 from ..operator import Operator
 from ..scene import Scene
@@ -37,7 +37,9 @@ def steps(operators: Any, name: str) -> list[Operator]:
     if wrong:
         raise PipelineError("; ".join(wrong), place=name, cure="\n".join(dict.fromkeys(cures)))
     faults = [
-        (k, operator, found) for k, operator in enumerate(made, 1) if (found := broken(operator))
+        (k, operator, found)
+        for k, operator in enumerate(made, 1)
+        if (found := fault_of_step(operator, Operator))
     ]
     if faults:
         text = "\n".join(

@@ -1,6 +1,4 @@
-"""A class that would do nothing, or whose declarations are none, is refused when the pipeline is
-built.
-"""
+"""A class that breaks the contract is refused when it is made, or when the pipeline is built."""
 
 from __future__ import annotations
 
@@ -66,6 +64,22 @@ def test_a_method_that_takes_no_self_is_a_method() -> None:
             "provides dust",
         ),
         ({"couples": "all"}, "couples all samples, but overrides no measure"),
+    ],
+)
+def test_a_broken_class_is_refused(attributes: Any, said: str) -> None:
+    with pytest.raises(PipelineError, match=f"(?s)step 4, Mine: .*{said}"):
+        zonda.Pipeline([*STEPS, made(**attributes)(), zonda.BinMap()])
+
+
+@pytest.mark.parametrize(
+    ("attributes", "said"),
+    [
+        ({"name": "mine"}, r"Mine: name = 'mine': the label.*Mine\(name='mine'\)"),
+        ({"rate": 3.0}, r"Mine: rate = 3.0 has no type.*rate: float = 3.0.*ClassVar\[float\]"),
+        ({"rate": zonda.quantity("3 Hz")}, r"rate = quantity\('3 Hz'\) has no type"),
+        ({"__annotations__": {"rate": "object()"}}, "its parameters cannot be used"),
+        ({"requires": frozenset(), "__annotations__": {"requires": frozenset}}, "makes it a param"),
+        ({"exec": 3}, "exec is a method"),
         (
             {"requires": ("signal",)},
             r'requires is a frozenset of names, not \(.*write requires = frozenset\(\{"signal"\}\)',
@@ -86,19 +100,6 @@ def test_a_method_that_takes_no_self_is_a_method() -> None:
         ({"prepare": method()}, "prepare does not take observation"),
         ({"halo": method()}, "halo does not take observation"),
         ({"collect": method("data")}, "collect does not take data, observation, state"),
-    ],
-)
-def test_a_broken_class_is_refused(attributes: Any, said: str) -> None:
-    with pytest.raises(PipelineError, match=f"(?s)step 4, Mine: .*{said}"):
-        zonda.Pipeline([*STEPS, made(**attributes)(), zonda.BinMap()])
-
-
-@pytest.mark.parametrize(
-    ("attributes", "said"),
-    [
-        ({"name": "mine"}, r"Mine: name = 'mine': the label.*Mine\(name='mine'\)"),
-        ({"rate": 3.0}, r"Mine: rate = 3.0 has no type.*rate: float = 3.0.*ClassVar\[float\]"),
-        ({"exec": 3}, "exec is a method"),
         ({"halo": 5}, "halo is a method"),
     ],
 )
