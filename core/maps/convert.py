@@ -29,18 +29,8 @@ def converted(product: Map, unit: str, spectral_index: float) -> Map:
     factor = _kelvin_per(product, product.unit, spectral_index) / _kelvin_per(
         product, name, spectral_index
     )
-    known = {plane: getattr(product, plane) for plane in ("signal", "noise", "half_difference")}
-    weights = (
-        product.weights / factor**2 if product.weighting == "inverse_variance" else product.weights
-    )
-    planes: dict[str, Any] = {
-        plane: None if values is None else values * factor for plane, values in known.items()
-    }
-    if product.polarization is not None:
-        planes["polarization"] = product.polarization.scaled(
-            factor, product.weighting == "inverse_variance"
-        )
-    return replace(product, unit=name, weights=weights, **planes)
+    planes = {key: plane.scaled(factor) for key, plane in product.planes.items()}
+    return replace(product, unit=name, planes=planes)
 
 
 def _kelvin_per(product: MapArrays, unit: str, spectral_index: float) -> float | Floats:

@@ -3,45 +3,76 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..configuration.diagnostics import nearest
 from ..errors import InputError
 from ..types import Floats
 from .grid import HealpixPixels, ImagePixels, healpix_grid, image_grid
+from .planes import IQU, KNOWN, Plane, Polarization
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
     from ..instrument import Band
     from ..storage.fits_image import Cards
-    from .polarized import Polarization
     from .scan_hits import ScanHits
 
 
-@dataclass
+T = TypeVar("T")
+
+
+class _Row(Generic[T]):
+    """An attribute of a map that is the first row of a plane (of a polarized map: of I); None
+    without the plane.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, product: MapArrays | None, owner: type) -> T:
+        if product is None:
+            return self  # type: ignore[return-value]  # of the class, for documentation
+        plane = product.planes.get(self.name)
+        return None if plane is None else plane.values[0]  # type: ignore[return-value]
+
+    def __set__(self, product: MapArrays, values: T) -> None:
+        product.hold(self.name, values)
+
+
+@dataclass(init=False)
 class MapArrays:
     """A map in the TAN or CAR projection, arrays (ny, nx), or in HEALPix, arrays (n_pixel,) for the
     pixels ``pixels``.
 
     Attributes
     ----------
+    planes
+        What each pixel holds, by name (`core.maps.planes`); each has rows of the shape of the map.
     signal
-        Weighted mean of the samples, `unit`; NaN where there is no value (`known`).
+        Weighted mean of the samples, `unit`; NaN where there is no value (`known`). Of a polarized
+        map I, as of the following.
     hits
         Number of samples, int64.
     weights
-        Sum of the samples' weights: K^-2 (inverse variance), or a plain count (uniform).
+        Sum of the samples' weights: K^-2 (inverse variance), or a plain count (uniform). 0 where I,
+        Q and U are wanted and not determined.
     noise
         Standard deviation of ``signal`` (after smoothing, where it is smoothed), `unit`; NaN where
         unknown.
     half_difference
         Noise map from the difference of two halves of the samples (``difference``: which, ``even -
         odd scans``), (m_1 - m_2) sqrt(w_1 w_2) / (w_1 + w_2): its variance is that of ``signal``
-        where both have a value; NaN elsewhere.
+        where both have a value; NaN elsewhere. None: not made.
+    crosslinking
+        How one-sided the scan directions in each pixel are: 0 where they cross evenly, 1 where all
+        are along one line; NaN where no detector moved. None: not kept (`BinMap: {crosslinking:
+        true}`).
     header
         Keywords of the WCS (images), else None; a dict that `astropy.io.fits.Header` takes.
     centre
@@ -59,16 +90,20 @@ class MapArrays:
         Names of the observations in it.
     sample_rate
         Of all scans [Hz]; 0 where it is unknown or they differ.
+    contents
+        ``hits``: nothing else was made, ``signal`` and ``noise`` are NaN.
+    scan_hits
+        Hits of each scan (`BinMap: {scan_hits: true}`); None: not kept.
+    band
+        Band of the run, with which `to` converts units; None: not known.
+    beams
+        FWHM [rad] of the narrowest and the widest beam in the map; zeros: not known.
     """
 
-    signal: Floats
-    hits: NDArray[np.int64]
-    weights: Floats
-    noise: Floats
-    half_difference: Floats | None
-    header: Cards | Header | None
-    centre: tuple[float, float]
-    pixel: float
+    planes: dict[str, Plane]
+    header: Cards | Header | None = None
+    centre: tuple[float, float] = (0.0, 0.0)
+    pixel: float = 0.0
     frame: str = "icrs"
     unit: str = "K_RJ"
     weighting: Literal["uniform", "inverse_variance"] = "uniform"
@@ -78,25 +113,156 @@ class MapArrays:
     pixels: NDArray[np.int64] | None = None
     fwhm: float = 0.0
     smoothed_by: float = 0.0
-    scans: list[str] = field(default_factory=list)
+    scans: Sequence[str] = ()
     sample_rate: float = 0.0
     contents: Literal["all", "hits"] = "all"
-    """``hits``: nothing else was made, ``signal`` and ``noise`` are NaN."""
     difference: str = "even - odd scans"
-    polarization: Polarization | None = None
-    """Q and U; ``signal`` and the others are of I then, and ``weights`` 0 where I, Q and U are not
-    determined.
-    """
-    directions: Floats | None = None
-    """(2, ...) mean cosine and sine of twice the angle, from east to north, in which detectors
-    moved through each pixel; NaN where none did. None: not kept (`BinMap: {crosslinking:
-    true}`)."""
     scan_hits: ScanHits | None = None
-    """Hits of each scan (`BinMap: {scan_hits: true}`)."""
     band: Band | None = None
-    """Band of the run, with which `to` converts units; None: not known."""
     beams: tuple[float, float] = (0.0, 0.0)
-    """FWHM [rad] of the narrowest and the widest beam in the map; zeros: not known."""
+
+    signal = _Row[Floats]()
+    hits = _Row[NDArray[np.int64]]()
+    weights = _Row[Floats]()
+    noise = _Row[Floats]()
+    half_difference = _Row["Floats | None"]()
+    crosslinking = _Row["Floats | None"]()
+
+    def __init__(
+        self,
+        signal: Any = ...,
+        hits: Any = ...,
+        weights: Any = ...,
+        noise: Any = ...,
+        half_difference: Any = ...,
+        header: Any = None,
+        centre: tuple[float, float] = (0.0, 0.0),
+        pixel: float = 0.0,
+        frame: str = "icrs",
+        **more: Any,
+    ) -> None:
+        """A map of planes; further attributes and planes by name.
+
+        Planes are arrays of the shape of the map, or one such row for each of I, Q and U; None: the
+        map has no such plane. They take the place of those among ``planes``.
+        """
+        self.planes = dict(more.pop("planes", {}))
+        self.header, self.centre, self.pixel, self.frame = header, centre, pixel, frame
+        planes = {"hits": hits, "signal": signal, "weights": weights, "noise": noise}
+        planes["half_difference"] = half_difference
+        for name, value in more.items():
+            if name in KNOWN:
+                planes[name] = value
+            elif name in self.__dataclass_fields__:
+                setattr(self, name, value)
+            else:
+                raise TypeError(f"a map has no attribute {name!r}")
+        for name, value in planes.items():
+            if value is not ...:
+                self.hold(name, value)
+        self.planes = {n: self.planes[n] for n in (*KNOWN, *self.planes) if n in self.planes}
+
+    def hold(self, name: str, values: Any) -> None:
+        """Set a plane of `planes.KNOWN`: arrays as of the constructor; of a polarized map
+        also those of I alone.
+        """
+        if values is None:
+            self.planes.pop(name, None)
+            return
+        values = np.asarray(values)
+        shape = values.shape if name == "hits" else self.hits.shape
+        if values.shape == shape and len(before := self._rows(name)) > 1:
+            values = np.concatenate([values[None], before[1:]])
+        values = values if values.ndim > len(shape) else values[None]
+        plane = replace(KNOWN[name], values=values)
+        if name == "weights" and self.weighting == "inverse_variance":
+            plane = replace(plane, scale=-2)
+        if self.contents == "hits" and name != "hits":
+            plane = replace(plane, names={})  # is in no file
+        self.planes[name] = plane
+
+    def with_planes(self, **planes: Any) -> Self:
+        """The map with other planes, as `hold` takes them."""
+        made = replace(self)
+        for name, values in planes.items():
+            made.hold(name, values)
+        return made
+
+    def _rows(self, name: str) -> Any:
+        """(n, *shape) rows of a plane; none without it."""
+        return self.planes[name].values if name in self.planes else ()
+
+    def plane(self, name: str) -> Plane:
+        """The plane ``name`` (of a polarized map that of I), or one of its rows by the name that
+        files have. InputError for one that the map has not.
+        """
+        found = {
+            row: replace(plane, values=values[None])
+            for plane in self.planes.values()
+            for row, _, values in plane.rows
+        } | {key: plane.row(0) for key, plane in self.planes.items()}
+        if name not in found:
+            cure = nearest(name, found) or f"choose from: {', '.join(found)}"
+            raise InputError(f"the map has no plane {name!r}", place="map", cure=cure)
+        return found[name]
+
+    @property
+    def polarization(self) -> Polarization | None:
+        """Q and U, and what belongs to them; None of a map of I alone."""
+        return None if len(self._rows("signal")) == 1 else Polarization(self.planes)
+
+    def stokes(self, which: str) -> Self:
+        """I, Q or U of a polarized map as a map of its own, or P = sqrt(Q^2 + U^2) (which noise
+        makes larger on the average).
+
+        Its weights are 1 over the diagonal of A^-1. Raises InputError for a map without Q and U,
+        and for other names.
+        """
+        found = self.polarization
+        if found is None:
+            raise InputError(
+                "the map has no Q and U",
+                place="map.stokes",
+                cure="set stokes: IQU of the map maker",
+            )
+        if which not in (*IQU, "P"):
+            raise InputError(
+                f"{which!r} is none of I, Q, U and P",
+                place="map.stokes",
+                cure="write map.stokes('Q')",
+            )
+        k = max("IQU".find(which), 0)
+        planes = {
+            name: plane if plane.stokes is None else plane.row(k)
+            for name, plane in self.planes.items()
+            if not plane.joint
+        }
+        plain = replace(self, planes=planes)
+        if which != "P":
+            return plain
+        p = np.hypot(found.q, found.u)
+        qq, qu, uu = found.covariance[3:]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            variance = (found.q**2 * qq + 2 * found.q * found.u * qu + found.u**2 * uu) / p**2
+        return plain.with_planes(
+            signal=p,
+            noise=np.sqrt(variance),
+            weights=found.weights.mean(axis=0),
+            half_difference=None,
+        )
+
+    def by_stokes(self) -> dict[str, Self]:
+        """I, or I, Q and U as maps of their own."""
+        if self.polarization is None:
+            return {"I": self}
+        return {which: self.stokes(which) for which in IQU}
+
+    @property
+    def directions(self) -> Floats | None:
+        """(2, ...) mean cosine and sine of twice the angle, from east to north, in which detectors
+        moved through each pixel; NaN where none did. None: not kept.
+        """
+        return self.planes["directions"].values if "directions" in self.planes else None
 
     @property
     def wcs(self) -> Any:
@@ -108,17 +274,6 @@ class MapArrays:
                 "a HEALPix map has no WCS", place="map", cure="use nside, pixels and healpy"
             )
         return WCS(self.header)
-
-    @property
-    def crosslinking(self) -> Floats | None:
-        """How one-sided the scan directions in each pixel are: 0 where they cross evenly, 1 where
-        all are along one line.
-
-        The modulus of the mean of exp(2 i psi), psi the direction of motion, as of ACT's maps
-        (Aiola et al. 2020, `xlink`) and TOAST's `CrossLinking`. NaN where no detector moved; None
-        where it was not kept.
-        """
-        return None if self.directions is None else np.hypot(*self.directions)
 
     @property
     def known(self) -> NDArray[np.bool_]:

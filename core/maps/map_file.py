@@ -17,30 +17,13 @@ from ..errors import OutputError
 from ..numerics import tangent
 from ..storage.files import atomic_path
 from ..storage.fits_image import BLOCK, Cards, image_pieces
-from ..types import AnyFloats
 from .map_arrays import MapArrays
 from .measured_noise import stated
-from .stokes import CONVENTION, MEANINGS, file_planes, planes_of
+from .planes import Plane
 from .units import scale_of
 
-PLANES = ("signal", "hits", "weights", "noise", "half_difference")
-"""Planes a map product may have; `signal` always, but for a map of hits alone."""
-_MEANING = {
-    "signal": "brightness",
-    "hits": "samples per pixel",
-    "weights": "sum of weights",
-    "noise": "standard error per pixel",
-    "half_difference": "noise from the difference of two halves",
-    "source_free": "map of all but the sky",
-    "crosslinking": "0: scans cross evenly, 1: one direction",
-    "mean_cos_2psi": "mean of cos 2 psi, psi the scan direction",
-    "mean_sin_2psi": "mean of sin 2 psi, psi from east to north",
-    **MEANINGS,
-}
-CROSSING = ("crosslinking", "mean_cos_2psi", "mean_sin_2psi")
-"""Planes that tell in which directions the scans go."""
-COUNTS = ("hits", "condition", *CROSSING)
-"""Planes without unit."""
+CONVENTION = "COSMO"
+"""In which Q and U of maps are: angles from south to east."""
 LONGEST = 66
 """Letters of a text in a card."""
 _SCALES = {"K_RJ": "Rayleigh-Jeans brightness", "K_CMB": "temperature of the CMB"}
@@ -93,8 +76,7 @@ class MapFile:
     product
         Whose pixels, frame and beam these are.
     planes
-        ``signal``, ``hits`` ...: (ny, nx) each on a WCS grid, (n_pix,) on HEALPix; NaN where
-        nothing is known.
+        Those that are written, by name; NaN where nothing is known.
     cards
         More of the header of the first image, or of the table.
     noise
@@ -103,7 +85,7 @@ class MapFile:
 
     name: str
     product: MapArrays
-    planes: dict[str, AnyFloats]
+    planes: Mapping[str, Plane]
     cards: Cards = field(default_factory=Cards)
     noise: Mapping[str, tuple[float | None, str]] = field(default_factory=dict)
 
@@ -115,34 +97,14 @@ class MapFile:
         noise: Mapping[str, tuple[float | None, str]] | None = None,
     ) -> MapFile:
         """With the planes that a product has."""
-        found: dict[str, Any]
-        if product.polarization is not None:
-            found = file_planes(product)
-        else:
-            found = {
-                plane: getattr(product, plane)
-                for plane in (PLANES if product.contents == "all" else ("hits",))
-            }
-        if product.directions is not None:
-            found = found | dict(
-                zip(CROSSING, (product.crosslinking, *product.directions), strict=True)
-            )
-        return cls(
-            name,
-            product,
-            {plane: values for plane, values in found.items() if values is not None},
-            noise=noise or {},
-        )
+        return cls(name, product, product.planes, noise=noise or {})
 
-    def unit(self, plane: str) -> str:
-        """FITS unit; none for counts."""
-        unit = scale_of(self.product.unit)[0]
-        if plane == "weights":
-            inverse = f"{unit}-2" if unit.isalpha() else f"({unit})-2"
-            return inverse if self.product.weighting == "inverse_variance" else ""
-        if plane.startswith("cov_"):
-            return f"{unit}2" if unit.isalpha() else f"({unit})2"
-        return "" if plane in COUNTS else unit
+    @property
+    def rows(self) -> Iterator[tuple[str, str, Plane, Any]]:
+        """Name, meaning, plane and values of each row of the planes."""
+        for plane in self.planes.values():
+            for name, meaning, values in plane.rows:
+                yield name, meaning, plane, values
 
     @property
     def beam(self) -> Cards:
@@ -169,7 +131,7 @@ class MapFile:
     def convention(self) -> Cards:
         """In which Q and U are, where there are some."""
         stated = ("POLCCONV", CONVENTION, "Q, U: angles from south to east")
-        return Cards([stated] if {"q", "u"} & self.planes.keys() else ())
+        return Cards([stated] if any(name in "qu" for name, *_ in self.rows) else ())
 
     @property
     def halves(self) -> Cards:
@@ -234,18 +196,19 @@ class MapFile:
 
     def _images(self, about: Provenance) -> Iterator[bytes]:
         world = (tangent.plain(self.product.header) or self.product.wcs).to_header(relax=True)
-        for k, (name, plane) in enumerate(self.planes.items()):
+        unit, scale = scale_of(self.product.unit)
+        for k, (name, meaning, plane, values) in enumerate(self.rows):
             header = Cards(
                 (key, world[key], world.comments[key])
                 for key in world
                 if key not in ("", "COMMENT", "HISTORY")
             )
             header["EXTNAME"] = name.upper(), "extension name"
-            if unit := self.unit(name):
-                header["BUNIT"] = unit, _MEANING[name]
-            if (scale := scale_of(self.product.unit)[1]) and name not in (*COUNTS, "weights"):
-                header["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
-            if name not in (*COUNTS, "weights"):
+            if own := plane.fits_unit(unit):
+                header["BUNIT"] = own, meaning
+            if plane.scale > 0:
+                if scale:
+                    header["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
                 header.add(self.beam)
             if name.startswith("half_difference"):
                 header.add(self.halves)
@@ -254,7 +217,7 @@ class MapFile:
             ).add(self.convention)
             if k == 0:
                 header.add(self.first(about)).add(self.cards)
-            yield from image_pieces(header, plane, extension=k > 0, dtype=_type(name, plane))
+            yield from image_pieces(header, values, extension=k > 0, dtype=_type(values))
 
     def _write_table(self, path: Path, about: Provenance) -> None:
         """A partial map, pixel numbers explicit; the cards are those of Gorski et al. (2005) that
@@ -264,11 +227,12 @@ class MapFile:
 
         product = self.product
         columns = [fits.Column("PIXEL", "K", array=product.pixels)]
-        for name, plane in self.planes.items():
-            values: NDArray[Any] = np.asarray(plane, _type(name, plane))
+        unit, scale = scale_of(product.unit)
+        for name, _, plane, row in self.rows:
+            values: NDArray[Any] = np.asarray(row, _type(row))
             code = "D" if values.dtype.kind == "f" else "K" if values.dtype.itemsize == 8 else "J"
             columns.append(
-                fits.Column(name.upper(), code, unit=self.unit(name) or None, array=values)
+                fits.Column(name.upper(), code, unit=plane.fits_unit(unit) or None, array=values)
             )
         table = fits.BinTableHDU.from_columns(columns, name="MAP")
         made = Cards(
@@ -281,7 +245,7 @@ class MapFile:
                 ("OBJECT", "PARTIAL", "not all of the sky"),
             ]
         )
-        if scale := scale_of(product.unit)[1]:
+        if scale:
             made["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
         made.add(self.beam).add(self.halves if "half_difference" in self.planes else Cards()).add(
             self.convention
@@ -304,7 +268,7 @@ def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
             "exists already", place=str(path), cure="choose another name, or write overwrite=True"
         )
     noise = {}
-    for key, plane in zip("IQU", planes_of(product, "map").values(), strict=False):
+    for key, plane in product.by_stokes().items():
         half = plane.half_difference
         if np.isfinite(plane.noise).any():
             noise[key] = stated(
@@ -314,10 +278,10 @@ def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
     return MapFile.of("map", product, noise).write(path, Provenance.of_a_map(product))
 
 
-def _type(name: str, plane: Any) -> np.dtype[Any]:
-    """Type of numbers as they are written: hits as integers, everything else as float64."""
-    if name == "hits" and (plane.dtype.kind in "iu" or np.array_equal(plane, np.rint(plane))):
-        return np.dtype(np.int64 if np.max(plane, initial=0) > 2**31 - 1 else np.int32)
+def _type(values: NDArray[Any]) -> np.dtype[Any]:
+    """Type of numbers as they are written: counts as integers, everything else as float64."""
+    if values.dtype.kind in "iu":
+        return np.dtype(np.int64 if np.max(values, initial=0) > 2**31 - 1 else np.int32)
     return np.dtype(np.float64)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@dataclass(repr=False)
+@dataclass(init=False, repr=False)
 class MapProduct(MapArrays):
     """`MapArrays`, and what is done with them."""
 
@@ -47,25 +47,14 @@ class MapProduct(MapArrays):
 
         return self.smoothed(smoothing_width(fwhm, self.fwhm))
 
-    def stokes(self, which: str) -> MapProduct:
-        """I, Q or U of a polarized map as a map of its own, or P = sqrt(Q^2 + U^2) (which noise
-        makes larger on the average).
-
-        Its weights are 1 over the diagonal of A^-1. Raises InputError for a map without Q and U,
-        and for other names.
-        """
-        from .stokes import stokes_plane
-
-        return stokes_plane(self, which)
-
     def plot(
         self, ax: Any = None, *, plane: str = "signal", title: str = "", limit: float | None = None
     ) -> Any:
         """Draw a plane; the matplotlib Axes.
 
-        Planes are ``signal``, ``noise``, ``hits``, ``weights``, ``half_difference``,
-        ``crosslinking``; of a polarized map also ``Q``, ``U``, ``P``. Raises InputError for a plane
-        that the map has not.
+        Planes are those of the map (``signal``, ``hits``, ``noise`` ...), their rows as files
+        name them, and of a polarized map ``Q``, ``U``, ``P``. Raises InputError for a plane that
+        the map has not.
 
         Parameters
         ----------
@@ -94,23 +83,20 @@ class MapProduct(MapArrays):
         """Of the circle in which `rms` is taken, rad: `central.central_diameter`."""
         return central_diameter(self.fwhm, self.pixel) / 2
 
-    def rms(
-        self, radius: float | None = None, of: Literal["signal", "half_difference"] = "signal"
-    ) -> float:
-        """Weighted root mean square, sqrt(sum w m^2 / sum w), within ``radius`` [rad] of the centre
-        (`central_radius`).
+    def rms(self, radius: float | None = None, of: str = "signal") -> float:
+        """Weighted root mean square, sqrt(sum w m^2 / sum w), of the plane ``of`` within ``radius``
+        [rad] of the centre (`central_radius`).
 
         NaN where no pixel there has a value.
         """
-        values = getattr(self, of)
-        if values is None:
+        if of == "half_difference" and self.half_difference is None:
             raise InputError(
                 "the map has no half-difference",
                 place="map",
                 cure="set half_difference and make two scans",
             )
         return _rms(
-            values,
+            self.plane(of).values[0],
             self.weights,
             self.distance() <= (self.central_radius if radius is None else radius),
         )
@@ -119,7 +105,7 @@ class MapProduct(MapArrays):
         self,
         fwhm: float,
         radius: float | None = None,
-        of: Literal["signal", "half_difference"] = "signal",
+        of: str = "signal",
     ) -> float:
         """``smoothed(fwhm).rms(radius, of)``; of an image, only what the circle sees is
         smoothed.
@@ -135,13 +121,12 @@ class MapProduct(MapArrays):
             _around(np.flatnonzero(near.any(axis=axis)), more)
             for axis, more in zip((1, 0), reach, strict=True)
         )
-        names = ("signal", "hits", "weights", "noise", "half_difference")
-        planes: dict[str, Any] = {
-            n: None if getattr(self, n) is None else getattr(self, n)[window] for n in names
+        planes = {
+            name: replace(plane, values=plane.values[:, *window])
+            for name, plane in self.planes.items()
         }
-        cut = replace(
-            self, header=_cut(self.header, window[0].start or 0, window[1].start or 0), **planes
-        )
+        header = _cut(self.header, window[0].start or 0, window[1].start or 0)
+        cut = replace(self, header=header, planes=planes)
         return _rms(getattr(cut.smoothed(fwhm), of), cut.weights, near[window])
 
     def smoothed(self, fwhm: float) -> MapProduct:
@@ -162,10 +147,7 @@ class MapProduct(MapArrays):
                 message, place="map", cure="smooth it before: map.smooth(...).to('Jy/beam')"
             )
         if self.polarization is not None:
-            from .stokes import smoothed_polarization
-
-            i, q, u = (self.stokes(which).smoothed(fwhm) for which in "IQU")
-            return replace(i, polarization=smoothed_polarization(self.polarization, i, q, u))
+            return self._with_parts([one.smoothed(fwhm) for one in self.by_stokes().values()])
         convolve = self.grid.smoother(fwhm)
         known = self.known
         weights = np.where(known, self.weights, 0.0)
@@ -177,23 +159,40 @@ class MapProduct(MapArrays):
             with np.errstate(invalid="ignore", divide="ignore"):
                 return np.where(use, convolve(w * np.where(use, values, 0.0), 1.0) / below, np.nan)
 
-        quiet = known & np.isfinite(self.noise)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            variance = convolve((weights * np.where(quiet, self.noise, 0.0)) ** 2, 2.0) / total**2
-        with np.errstate(
-            invalid="ignore"
-        ):  # where the transform's rounding is all there is, the noise is not known
-            noise = np.where(quiet & (variance >= 0), np.sqrt(variance), np.nan)
-        half = self.half_difference
-        if half is not None:
-            half = mean(half, np.isfinite(half))
-        return replace(
-            self,
-            signal=mean(self.signal, known),
-            noise=noise,
-            half_difference=half,
-            smoothed_by=math.hypot(self.smoothed_by, fwhm),
-        )
+        def error(noise: Floats) -> Floats:
+            quiet = known & np.isfinite(noise)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                square = convolve((weights * np.where(quiet, noise, 0.0)) ** 2, 2.0) / total**2
+                # the noise is not known where the transform's rounding is all there is
+                return np.where(quiet & (square >= 0), np.sqrt(square), np.nan)
+
+        planes = dict(self.planes)
+        for name, plane in planes.items():
+            values = plane.values[0]
+            if plane.smoothing == "mean":
+                found = mean(values, known if name == "signal" else np.isfinite(values))
+            elif plane.smoothing == "error":
+                found = error(values)
+            else:
+                continue
+            planes[name] = replace(plane, values=found[None])
+        return replace(self, planes=planes, smoothed_by=math.hypot(self.smoothed_by, fwhm))
+
+    def _with_parts(self, parts: list[MapProduct]) -> MapProduct:
+        """A polarized map whose I, Q and U were changed one by one: of the covariance the variances
+        are known.
+        """
+        covariance = np.full((6, *self.hits.shape), np.nan)
+        for row, part in zip((0, 3, 5), parts, strict=True):
+            covariance[row] = part.noise**2
+        planes = {
+            name: plane
+            if plane.stokes is None
+            else replace(plane, values=np.stack([part.planes[name].values[0] for part in parts]))
+            for name, plane in self.planes.items()
+        }
+        made = replace(self, planes=planes, smoothed_by=parts[0].smoothed_by)
+        return made.with_planes(covariance=covariance)
 
     @property
     def healpix_full(self) -> Floats:

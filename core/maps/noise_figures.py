@@ -14,7 +14,6 @@ from ..types import Floats
 from .central import central_diameter
 from .map_product import MapProduct
 from .measured_noise import ELSEWHERE, stated
-from .stokes import planes_of
 
 Noise = Literal["half_difference", "source_free"]
 """What holds noise alone: half the difference of two halves of the samples, the map of the signal
@@ -26,14 +25,16 @@ def maps_of(products: Mapping[str, Any], *, split: bool = True) -> dict[str, Map
     """Every map among ``data.products``, by name, of ``signal`` first; not of signals that a step
     has for itself (_NAME).
 
-    ``split``: I, Q and U of a polarized map are maps of their own (`stokes.planes_of`).
+    ``split``: Q and U of a polarized map are maps of their own, ``NAME_Q`` and ``NAME_U``.
     """
     found = (n for n, p in products.items() if isinstance(p, MapProduct) and not n.startswith("_"))
     names = sorted(found, key=lambda n: ("/" in n, n))
     if not split:
         return {name: products[name] for name in names}
     return {
-        shown: plane for name in names for shown, plane in planes_of(products[name], name).items()
+        name if which == "I" else f"{name}_{which}": one
+        for name in names
+        for which, one in products[name].by_stokes().items()
     }
 
 

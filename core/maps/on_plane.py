@@ -21,7 +21,7 @@ def on_plane(
 
     The plane is the tangent plane, or for maps of more than 60 deg the equal-area one (ZEA); the
     grid reaches as far as the pixels with hits (of a HEALPix map, its pixels). Each point takes the
-    value of the pixel it lies in; elsewhere ``hits`` are 0, other planes NaN.
+    value of the pixel it lies in; elsewhere counts (integers) are 0, other planes NaN.
     """
     wcs, (nx, ny) = _plane(product, size)
     x, y = np.meshgrid(np.arange(nx), np.arange(ny))
@@ -32,8 +32,8 @@ def on_plane(
     there = known & (place >= 0)
     found = {}
     for name, values in planes.items():
-        flat = values.ravel() if values.size else np.zeros(1)
-        found[name] = np.where(there, flat[place], 0 if name == "hits" else np.nan)
+        flat = values.ravel() if values.size else np.zeros(1, values.dtype)
+        found[name] = np.where(there, flat[place], 0 if flat.dtype.kind in "iu" else np.nan)
     return found, wcs
 
 

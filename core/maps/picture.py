@@ -8,20 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..configuration.diagnostics import nearest
-from ..errors import InputError
 from ..types import AnyFloats
 from .grid import wcs_grid
 from .map_arrays import MapArrays
-from .stokes import stokes_plane
 
-PLANES = ("signal", "noise", "hits", "weights", "half_difference", "crosslinking")
-UNITS = {
-    "hits": "samples per pixel",
-    "weights": "weight",
-    "crosslinking": "0: evenly crossed, 1: one direction",
-}
-"""What the colours of planes that are no brightness mean."""
 SHOWN = 99.5
 """Per cent of the pixels that the colours cover by default."""
 FAR = 0.1
@@ -48,13 +38,9 @@ class Shown:
 def draw_map(product: MapArrays, ax: Any, plane: str, title: str, limit: float | None) -> Any:
     """`MapProduct.plot`."""
     if product.polarization is not None and plane in ("I", "Q", "U", "P"):
-        return draw_map(stokes_plane(product, plane), ax, "signal", title or plane, limit)
-    values: AnyFloats | None = getattr(product, plane, None) if plane in PLANES else None
-    if values is None:
-        have = [name for name in PLANES if getattr(product, name) is not None]
-        cure = nearest(plane, have) or f"choose from: {', '.join(have)}"
-        raise InputError(f"the map has no plane {plane!r}", place="map.plot", cure=cure)
-    values = np.where(product.hits > 0, values, np.nan)
+        return draw_map(product.stokes(plane), ax, "signal", title or plane, limit)
+    found = product.plane(plane)
+    values = np.where(product.hits > 0, found.values[0], np.nan)
     if product.projection != "TAN":
         from .on_plane import on_plane
 
@@ -62,8 +48,8 @@ def draw_map(product: MapArrays, ax: Any, plane: str, title: str, limit: float |
         values = flat[plane]
     else:
         wcs = product.wcs
-    unit = UNITS.get(plane, product.unit)
-    around_zero = plane in ("signal", "half_difference")
+    unit = found.unit or found.fits_unit(product.unit)
+    around_zero = found.smoothing == "mean"
     fwhm = product.resolution if plane == "signal" else 0.0
     shown = Shown(values, wcs, unit, title or plane.replace("_", " "), around_zero, fwhm)
     return draw(shown, ax, limit)

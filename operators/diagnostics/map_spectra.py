@@ -14,7 +14,6 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_sources
-from zonda.core.maps.stokes import IQU
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.output import Output
 from zonda.core.storage.ecsv import Column, write_ecsv
@@ -200,7 +199,7 @@ def _of_planes(
             planes.update(zip(polarized[name], on_the_plane(product, q_and_u), strict=True))
 
     def add_noise(name: str, product: MapProduct) -> None:
-        own = [product] if name not in polarized else [product.stokes(which) for which in IQU]
+        own = [product] if name not in polarized else list(product.by_stokes().values())
         noise.update(
             zip((name, *polarized.get(name, ())), (each.noise for each in own), strict=True)
         )

@@ -36,12 +36,12 @@ from .drawing.pictures import (
     Picture,
     Style,
     draw_coverage,
-    draw_crosslinking,
     draw_input,
     draw_map,
     draw_modes,
     draw_noise,
     draw_own,
+    draw_plane,
     draw_scan,
     draw_spectra,
     draw_streams,
@@ -263,11 +263,8 @@ def _drawings(data: Data, style: Style) -> Iterator[Drawing]:
     for name, product in maps.items():
         if "/" not in name and name in data.products:  # Q and U have the hits of I
             yield Drawing(f"coverage {name}", draw_coverage, partial(_coverage, name, product))
-        if "/" not in name and name in data.products and product.directions is not None:
-            file = f"crosslinking{'' if name == 'map' else f'_{name}'}"
-            yield Drawing(
-                f"crosslinking {name}", draw_crosslinking, partial(_crosslinking, file, product)
-            )
+            for key in (key for key, plane in product.planes.items() if plane.colours is not None):
+                yield Drawing(f"{key} {name}", draw_plane, partial(_plane, name, product, key))
         if sources := noise_sources(maps, name):
             yield Drawing(f"noise {name}", draw_noise, partial(_noise, name, sources, style))
     if data.observations:
@@ -361,13 +358,13 @@ def _input(name: str, image: Image, plane: str = "") -> tuple[Any, ...]:
 
 def _flat(
     product: MapProduct,
-    *planes: Literal["signal", "half_difference", "crosslinking"],
+    *planes: str,
     style: Style | None = None,
     per_beam: AnyFloats | float | None = None,
 ) -> FlatMap:
     """What pictures need of a map; a HEALPix or CAR map on a plane about its centre."""
     found = {"hits": product.known_hits} | {
-        plane: getattr(product, plane) for plane in ("weights", *planes)
+        plane: product.plane(plane).values[0] for plane in ("weights", *planes)
     }
     header, is_flat = product.header, product.projection == "TAN"
     rms: dict[str, float] = {}
@@ -381,11 +378,7 @@ def _flat(
         radius = (
             None if style is None or style.central_diameter is None else style.central_diameter / 2
         )
-        rms = (
-            {}
-            if style is None
-            else {p: product.rms(radius, of=p) for p in planes if p != "crosslinking"}
-        )
+        rms = {} if style is None else {p: product.rms(radius, of=p) for p in planes}
     arrays = {plane: np.asarray(values, np.float32) for plane, values in found.items()}
     return FlatMap(
         {plane: arrays[plane] for plane in planes},
@@ -480,8 +473,9 @@ def _coverage(name: str, product: MapProduct) -> tuple[Any, ...]:
     )
 
 
-def _crosslinking(file: str, product: MapProduct) -> tuple[Any, ...]:
-    return file, _flat(product, "crosslinking")
+def _plane(name: str, product: MapProduct, key: str) -> tuple[Any, ...]:
+    file = key if name == "map" else f"{key}_{name}"
+    return file, _flat(product, key), replace(product.planes[key], values=None)
 
 
 def _streams(file: str, stream: TimeStream, before: dict[str, str]) -> tuple[Any, ...]:

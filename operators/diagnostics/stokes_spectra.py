@@ -20,7 +20,6 @@ import numpy as np
 
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.stokes import IQU
 from zonda.core.numerics.projection import frame_rotation, pixel_matrix
 from zonda.core.numerics.sphere import local_axes
 from zonda.core.polarization import between_meridians, turned_by
@@ -68,7 +67,7 @@ def sphere_spectra(
             place=place,
             cure=cure,
         )
-    planes = [product] if product.polarization is None else [product.stokes(which) for which in IQU]
+    planes = list(product.by_stokes().values())
     number = healpy.nside2npix(product.nside)
     seen = product.hits[product.known]
     share = product.hits / (float(np.percentile(seen, 99)) if seen.size else 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -19,10 +20,16 @@ from zonda.core.maps.noise_figures import (
     noise_sources,
     noise_stated,
 )
+from zonda.core.maps.planes import Plane
 from zonda.core.output import Output, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, product_path
 from zonda.core.storage.fits_image import Cards
-from zonda.core.types import AnyFloats
+
+MEANINGS = {
+    "half_difference": "noise from the difference of two halves",
+    "source_free": "map of all but the sky",
+}
+"""Of the planes of a noise map."""
 
 
 class SaveMap(Output):
@@ -75,8 +82,9 @@ class SaveMap(Output):
         figures = noise_figures(maps, self.central_diameter)
         for name, product in maps.items():
             if sources := noise_sources(maps, name):
-                alone: dict[str, AnyFloats] = {
-                    of: getattr(found, plane) for of, (found, plane) in sources.items()
+                alone: dict[str, Plane] = {
+                    of: replace(found.plane(plane), names={of: MEANINGS[of]})
+                    for of, (found, plane) in sources.items()
                 }
                 cards = noise_cards([f for f in figures if f.product == name])
                 files[product_path(folder, f"noise_{name}", ".fits")] = MapFile(

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from zonda.core.block import Block
 from zonda.core.compilation.jit import nb
 from zonda.core.errors import PipelineError
+from zonda.core.maps.planes import Plane
 from zonda.core.types import Floats
 
 from .image_grid import rays
@@ -41,6 +42,24 @@ SLOWEST = 1e-10
 """Radians per sample below which a detector does not move: far below sidereal motion, far above the
 rounding of directions.
 """
+CROSSLINKING = Plane(
+    None,
+    {"crosslinking": "0: scans cross evenly, 1: one direction"},
+    unit="0: directions cross evenly, 1: one direction",
+    colours=(0.0, 1.0),
+    title="Crosslinking",
+    caption=(
+        "The size of the mean of exp(2iψ), ψ the direction in which detectors move through a pixel."
+    ),
+)
+DIRECTIONS = Plane(
+    None,
+    {
+        "mean_cos_2psi": "mean of cos 2 psi, psi the scan direction",
+        "mean_sin_2psi": "mean of sin 2 psi, psi from east to north",
+    },
+    unit="mean of cos or sin 2 psi",
+)
 MOST_ENTRIES = 1 << 27
 """Pixels of all scans together whose hits are kept: 1 GB."""
 
@@ -219,9 +238,15 @@ class Coverage:
             made.pixels, made.hits = list(arrays["pixels_of_scans"]), list(arrays["hits_of_scans"])
         return made
 
-    def mean_directions(self) -> Floats | None:
-        """(2, n_pixels) means of cos 2 psi and sin 2 psi; NaN where no sample has a direction."""
+    def planes(self) -> dict[str, Plane]:
+        """Planes (n, n_pixels) of the map: equation (1), and the means of cos 2 psi and sin 2 psi;
+        NaN where no sample has a direction.
+        """
         if self.directions is None:
-            return None
+            return {}
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(self.directions[:, 1:].T / (self.directions[:, 0] * WEIGHT))
+            means = np.asarray(self.directions[:, 1:].T / (self.directions[:, 0] * WEIGHT))
+        return {
+            "crosslinking": replace(CROSSLINKING, values=np.hypot(*means)[None]),
+            "directions": replace(DIRECTIONS, values=means),
+        }

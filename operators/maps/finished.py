@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -141,17 +142,18 @@ def map_of(
 def _with_coverage(product: MapProduct, grid: Grid, sums: MapSums | StokesSums) -> None:
     """Give a map how its scans cross, and their hits, where these were asked for."""
     coverage = sums.coverage
-    planes, pixels = coverage.mean_directions(), coverage.pixels
+    planes, pixels = coverage.planes(), coverage.pixels
     if isinstance(grid, HealpixGrid):  # the product's pixels are those with hits
         keep = np.flatnonzero(sums.hits.any(axis=0))
-        planes = None if planes is None else planes[:, keep]
+        planes = {key: replace(p, values=p.values[:, keep]) for key, p in planes.items()}
         pixels = (
             None
             if pixels is None
             else [np.searchsorted(keep, some).astype(np.int32) for some in pixels]
         )
-    if planes is not None:
-        product.directions = planes.reshape(2, *product.hits.shape)
+    for key, plane in planes.items():
+        values = plane.values.reshape(-1, *product.hits.shape)
+        product.planes[key] = replace(plane, values=values)
     if pixels is not None:
         product.scan_hits = ScanHits(list(sums.scans), pixels, coverage.hits)
 

@@ -14,7 +14,6 @@ import numpy as np
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.polarized import Polarization
 from zonda.core.numerics.projection import frame_rotation
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import Floats
@@ -181,22 +180,15 @@ def stokes_map_of(
         rest = (-1,) if isinstance(grid, HealpixGrid) else grid.shape
         return plane[..., keep].reshape(*plane.shape[:-1], *rest)
 
-    polarization = Polarization(
-        shaped(values[1]),
-        shaped(values[2]),
-        shaped(covariance),
-        shaped(weights[1:]),
-        shaped(condition),
-        shaped(hits),
-        shaped(half[1:]) if halves else None,
-    )
+    noise = np.sqrt(covariance[[0, 3, 5]])
     return MapProduct(
-        shaped(values[0]),
+        shaped(values),
         shaped(hits),
-        shaped(weights[0]),
-        shaped(np.sqrt(covariance[0])),
-        shaped(half[0]) if halves else None,
-        polarization=polarization,
+        shaped(weights),
+        shaped(noise),
+        shaped(half) if halves else None,
+        covariance=shaped(covariance),
+        condition=shaped(condition),
         **_common(step, grid, layout, sums, keep),
     )
 

@@ -67,7 +67,7 @@ from zonda.operators.diagnostics.time_streams import TimeStreams
 from zonda.operators.diagnostics.transfer_function import compare
 
 from .common import COVERED, as_seen, at_beam, covered, extreme, input_of
-from .planes import OfPlanes, planes_of
+from .planes import OfPlanes
 
 RINGS, BINS, LAGS, SEPARATIONS = 8, 24, 12, 6
 POLARIZED = 1e-3
@@ -94,7 +94,7 @@ class MapRms(OfPlanes):
     def measure(self, data: Data) -> dict[str, dict[str, Floats]]:
         return {
             plane: {"signal": one.signal, "weights": one.weights, "noise": one.noise}
-            for plane, one in planes_of(_map(data)).items()
+            for plane, one in _map(data).by_stokes().items()
         }
 
     def between(self, found: dict[str, Floats], reference: dict[str, Floats]) -> float:
@@ -137,8 +137,8 @@ class Peak(OfPlanes):
 
     def measure(self, data: Data) -> dict[str, Floats]:
         main, sky = _map(data), _map(data, _sky_alone(data.provenance.get("runs", {})))
-        noises, found = planes_of(at_beam(main)), {}
-        for plane, smooth in planes_of(at_beam(sky)).items():
+        noises, found = at_beam(main).by_stokes(), {}
+        for plane, smooth in at_beam(sky).by_stokes().items():
             where, peak = extreme(smooth.signal, covered(smooth), "peak")
             size = peak if plane == "I" else abs(peak)
             found[plane] = np.array([size, noises[plane].noise.flat[where]])
@@ -210,8 +210,8 @@ class Transfer(OfPlanes):
         window = np.where(window >= COVERED, np.minimum(window, 1.0), 0.0)
         side = np.array(window.shape) * sky.pixel
         edges = np.geomspace(1 / side.min(), 1 / max(sky.fwhm, 2 * sky.pixel), RINGS + 1)
-        noises, found, pole = planes_of(main), {}, wcs_frame_rotation(sky.wcs)[2]
-        for plane, one in planes_of(sky).items():
+        noises, found, pole = main.by_stokes(), {}, wcs_frame_rotation(sky.wcs)[2]
+        for plane, one in sky.by_stokes().items():
             given = (
                 image
                 if plane == "I"

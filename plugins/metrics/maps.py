@@ -215,7 +215,9 @@ def without_filters(image: Image, product: MapProduct, smoothing: float) -> Floa
     weights, as the map is.
     """
     plain = product if product.polarization is None else product.stokes("I")
-    seen = replace(plain, signal=as_seen(image, plain), half_difference=None, smoothed_by=0.0)
+    seen = replace(plain, smoothed_by=0.0).with_planes(
+        signal=as_seen(image, plain), half_difference=None
+    )
     return (seen.smoothed(smoothing) if smoothing > 0 else seen).signal
 
 

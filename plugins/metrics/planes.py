@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from zonda.core.accuracy.metrics import Metric
-from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.stokes import IQU
+from zonda.core.maps.planes import IQU
 
 
 class OfPlanes(Metric):
@@ -62,12 +61,3 @@ class OfPlanes(Metric):
             for plane in self.counted(reference)
             if plane in found
         }
-
-
-def planes_of(product: MapProduct) -> dict[str, MapProduct]:
-    """I, or I, Q and U of a map as maps of their own."""
-    return (
-        {"I": product}
-        if product.polarization is None
-        else {plane: product.stokes(plane) for plane in IQU}
-    )

@@ -20,7 +20,7 @@ from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.measured_noise import ELSEWHERE
 from zonda.core.maps.noise_figures import FREE
-from zonda.core.maps.stokes import IQU
+from zonda.core.maps.planes import IQU
 from zonda.core.maps.stokes_names import (
     along_axis,
     columns_of_q_and_u,

@@ -438,7 +438,7 @@ def on_a_plane(
         None,
         (centre[0], centre[1]),
         pixels.pixel,
-        pixels.frame,
+        frame=pixels.frame,
         nside=pixels.nside,
         nest=pixels.nest,
         pixels=pixels.pixels,

@@ -20,7 +20,7 @@ import numpy as np
 
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.stokes import IQU
+from zonda.core.maps.planes import IQU
 from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.types import Floats
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.maps.planes import Plane
 from zonda.core.numerics.angles import ARCMIN, angle_text
 from zonda.core.types import AnyFloats
 
@@ -223,20 +224,20 @@ def plot_coverage(
     return ax  # type: ignore[no-any-return]
 
 
-def plot_crosslinking(values: AnyFloats, wcs: Any, *, ax: Any = None, title: str = "") -> Axes:
-    """How scan directions cross: `MapArrays.crosslinking` (ny, nx), NaN in grey. Other arguments as
-    `plot_map`.
+def plot_plane(
+    values: AnyFloats, wcs: Any, plane: Plane, *, ax: Any = None, title: str = ""
+) -> Axes:
+    """Numbers (ny, nx) without unit, NaN in grey, in the colours of their ``plane``. Other
+    arguments as `plot_map`.
     """
     import matplotlib as mpl
 
     axes = located(wcs)
     ax = map_axes(values.shape, axes)[0] if ax is None else ax
     colours = mpl.colormaps["cividis_r"].with_extremes(bad="0.85")
-    label = "0: directions cross evenly, 1: one direction"
-    _show(
-        ax, axes, np.ma.masked_invalid(values), label, cmap=colours, norm=mpl.colors.Normalize(0, 1)
-    )
-    _head(ax, title or "Crosslinking")
+    scale = mpl.colors.Normalize(*(plane.colours or (None, None)))
+    _show(ax, axes, np.ma.masked_invalid(values), plane.unit, cmap=colours, norm=scale)
+    _head(ax, title or plane.title)
     return ax  # type: ignore[no-any-return]
 
 

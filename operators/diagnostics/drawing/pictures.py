@@ -13,6 +13,7 @@ import numpy as np
 
 from zonda.core.drawable import Drawable, Sketch
 from zonda.core.maps.central import central_diameter, in_beams
+from zonda.core.maps.planes import Plane
 from zonda.core.numerics.angles import angle_text, sides_text
 from zonda.core.types import AnyFloats
 
@@ -27,9 +28,9 @@ from .map_plots import (
     plot_circle,
     plot_contours,
     plot_coverage,
-    plot_crosslinking,
     plot_map,
     plot_plain,
+    plot_plane,
 )
 from .plot_modes import plot_modes
 from .plots import ScanTrack, plot_scan, plot_spectra, plot_tod, plot_transfer
@@ -196,20 +197,11 @@ def draw_coverage(
     return [Sketch(file, "Coverage", text, ax)]
 
 
-def draw_crosslinking(file: str, product: FlatMap) -> list[Sketch]:
-    """How evenly scan directions cross in each pixel."""
+def draw_plane(file: str, product: FlatMap, plane: Plane) -> list[Sketch]:
+    """A plane of numbers, which says itself how it is shown. ``plane``: without its values."""
     product = product.cropped()
-    text = (
-        "The size of the mean of exp(2iψ), ψ the direction in which detectors move through a pixel."
-    )
-    return [
-        Sketch(
-            file,
-            "Crosslinking",
-            text,
-            plot_crosslinking(product.planes["crosslinking"], product.sky),
-        )
-    ]
+    (values,) = product.planes.values()
+    return [Sketch(file, plane.title, plane.caption, plot_plane(values, product.sky, plane))]
 
 
 def draw_scan(tracks: Sequence[ScanTrack]) -> list[Sketch]:

@@ -8,7 +8,6 @@ import pytest
 
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.polarized import Polarization
 from zonda.operators.diagnostics.comparison.files import read_planes
 from zonda.operators.diagnostics.comparison.stokes import on_meridians_of, planes_of
 from zonda.operators.diagnostics.map_spectra import Wanted, map_spectra
@@ -29,17 +28,17 @@ def sky():
 
 def polarized(i, q, u, noise=None, **how):
     ones = np.ones(i.shape)
+    levels = noise or (np.nan, 0.0, 0.0)
     covariance = np.zeros((6, *i.shape))
     for row, level in zip((0, 3, 5), noise or (0.0, 0.0, 0.0), strict=True):
         covariance[row] = level**2
-    planes = Polarization(q, u, covariance, np.stack([ones, ones]), ones, ones.astype(np.int64))
     return MapProduct(
-        i,
+        np.stack([i, q, u]),
         ones.astype(np.int64),
-        ones,
-        ones * (noise[0] if noise else np.nan),
+        np.stack([ones] * 3),
+        np.stack([level * ones for level in levels]),
         None,
-        polarization=planes,
+        covariance=covariance,
         fwhm=1e-9,
         **how,
     )

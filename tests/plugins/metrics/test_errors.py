@@ -12,7 +12,6 @@ from zonda.core.accuracy import metrics
 from zonda.core.errors import InputError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.polarized import Polarization
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.operators.diagnostics.power_spectrum import Spectrum
 
@@ -136,13 +135,13 @@ def test_transfer_of_a_map_that_lost_half():
 
 def polarized(i, q, u, noise=0.1):
     """A map whose Q and U have noise and weights of their own."""
-    planes = np.ones((2, *i.shape))
-    covariance = np.zeros((6, *i.shape))
-    covariance[0], covariance[3], covariance[5] = noise**2, 2 * noise**2, 4 * noise**2
-    found = Polarization(
-        q, u, covariance, planes / [[[2]], [[4]]], 2 * planes[0], np.full(i.shape, 50)
-    )
-    return product(i, noise, polarization=found)
+    variances = np.ones(i.shape) * [[[1]], [[2]], [[4]]]
+    planes = {
+        "signal": np.stack([i, q, u]),
+        "noise": noise * np.sqrt(variances),
+        "weights": 1 / variances,
+    }
+    return product(i, noise).with_planes(**planes)
 
 
 def test_each_plane_of_a_map_has_its_error():

@@ -1,0 +1,178 @@
+"""Planes of a map: what its pixels hold, in which unit, and how it changes with the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import Floats
+
+IQU = ("I", "Q", "U")
+COVARIANCES = ("ii", "iq", "iu", "qq", "qu", "uu")
+"""Rows of the plane ``covariance``."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """One quantity in the pixels of a map.
+
+    Files, pictures, units and sums of maps walk through the planes of a product and know none by
+    its name: a step that adds a plane says here all that they need.
+
+    Attributes
+    ----------
+    values
+        (n, *shape of the map): one row, or several.
+    names
+        Each row that files have (FITS extension or column), and its meaning; rows beyond are in no
+        file.
+    scale
+        Power of the brightness that the values have: 1 in the unit of the map, -2 an inverse
+        variance, 0 a number without unit.
+    unit
+        Label of the colours in pictures; empty: the unit of the map.
+    stokes
+        Names as above of the three rows I, Q and U of a polarized map; None: the plane is no
+        property of a Stokes parameter.
+    joint
+        The plane belongs to I, Q and U together, and goes where one of them is taken.
+    smoothing
+        Smoothed maps hold the weighted ``mean``, or the standard ``error`` of it; or the plane is
+        ``kept``.
+    colours
+        Lowest and highest value of the picture that `Plots` makes of the plane (None: those of the
+        plane); None: no picture.
+    title, caption
+        Of that picture.
+    """
+
+    values: Any
+    names: Mapping[str, str]
+    scale: int = 0
+    unit: str = ""
+    stokes: Mapping[str, str] | None = None
+    joint: bool = False
+    smoothing: Literal["mean", "error", "kept"] = "kept"
+    colours: tuple[float | None, float | None] | None = None
+    title: str = ""
+    caption: str = ""
+
+    @property
+    def rows(self) -> Iterator[tuple[str, str, Any]]:
+        """Name, meaning and values of each row that files have."""
+        names = self.names if self.stokes is None or len(self.values) == 1 else self.stokes
+        return ((*name, row) for name, row in zip(names.items(), self.values, strict=False))
+
+    def row(self, k: int) -> Plane:
+        """One row as a plane."""
+        return replace(self, values=self.values[k : k + 1])
+
+    def scaled(self, factor: float | Floats) -> Plane:
+        """In a unit of which one of the old has ``factor``: a number, or one for each pixel."""
+        if not self.scale:
+            return self
+        power = factor ** abs(self.scale)
+        return replace(self, values=self.values * power if self.scale > 0 else self.values / power)
+
+    def fits_unit(self, unit: str) -> str:
+        """FITS unit of the plane of a map in ``unit``; none of numbers."""
+        if self.scale == 1:
+            return unit
+        return f"{unit if unit.isalpha() else f'({unit})'}{self.scale}" if self.scale else ""
+
+
+NOTHING = np.zeros((0, 0))
+KNOWN = {
+    "signal": Plane(
+        NOTHING,
+        {"signal": "brightness"},
+        1,
+        stokes={"i": "Stokes I", "q": "Stokes Q", "u": "Stokes U"},
+        smoothing="mean",
+    ),
+    "hits": Plane(NOTHING, {"hits": "samples per pixel"}, unit="samples per pixel"),
+    "weights": Plane(
+        NOTHING,
+        {"weights": "sum of weights"},
+        unit="weight",
+        stokes={"weights": "sum of weights"},
+    ),
+    "noise": Plane(NOTHING, {"noise": "standard error per pixel"}, 1, stokes={}, smoothing="error"),
+    "covariance": Plane(
+        NOTHING,
+        {f"cov_{ab}": f"covariance of {ab[0].upper()} and {ab[1].upper()}" for ab in COVARIANCES},
+        2,
+        joint=True,
+    ),
+    "condition": Plane(
+        NOTHING,
+        {"condition": "condition number of the angles in a pixel"},
+        unit="condition number",
+        joint=True,
+    ),
+    "half_difference": Plane(
+        NOTHING,
+        {"half_difference": "noise from the difference of two halves"},
+        1,
+        stokes={
+            "half_difference": "noise from the difference of two halves",
+            "half_difference_q": "Q of the difference of two halves",
+            "half_difference_u": "U of the difference of two halves",
+        },
+        smoothing="mean",
+    ),
+}
+"""Planes of every map, of polarized ones, and of maps of two halves, without values."""
+
+
+class Polarization:
+    """Q and U beside the I of a map: rows of its ``planes``, as arrays of the shape of the map."""
+
+    def __init__(self, planes: Mapping[str, Plane]) -> None:
+        self._planes = planes
+
+    @property
+    def q(self) -> Floats:
+        """Q, COSMO, from the meridians of the map's frame, in the unit of the map; NaN where the
+        angles of the samples do not determine I, Q and U.
+        """
+        return np.asarray(self._planes["signal"].values[1])
+
+    @property
+    def u(self) -> Floats:
+        """U, as Q."""
+        return np.asarray(self._planes["signal"].values[2])
+
+    @property
+    def covariance(self) -> Floats:
+        """(6, ...) of (I, Q, U), `COVARIANCES`, unit^2. After smoothing, which takes I, Q and U one
+        by one, only the variances are known, and the others NaN.
+        """
+        return np.asarray(self._planes["covariance"].values)
+
+    @property
+    def weights(self) -> Floats:
+        """(2, ...) of Q and of U: 1 / (A^-1)_QQ and 1 / (A^-1)_UU; those of the map are of I."""
+        return np.asarray(self._planes["weights"].values[1:])
+
+    @property
+    def condition(self) -> Floats:
+        """Condition number of the samples' angles in each pixel, largest over smallest eigenvalue:
+        2 at best, infinite where they do not determine I, Q and U; NaN where there are no samples.
+        """
+        return np.asarray(self._planes["condition"].values[0])
+
+    @property
+    def hits(self) -> NDArray[np.int64]:
+        """Samples in each pixel, also in those that are not solved."""
+        return np.asarray(self._planes["hits"].values[0])
+
+    @property
+    def half_difference(self) -> Floats | None:
+        """(2, ...) of Q and U, each with the variance of the map there; None: not made."""
+        plane = self._planes.get("half_difference")
+        return None if plane is None else np.asarray(plane.values[1:])
