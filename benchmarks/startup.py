@@ -65,18 +65,18 @@ def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dic
     import zonda.core.plan.remembered as remembered
     from zonda.core.output import Output
     from zonda.core.pipeline import Pipeline
-    from zonda.core.run.execution import Execution
+    from zonda.core.run import execute
 
     mark("import zonda, numpy, numba, pydantic")
     after(remembered, "summary", "plan")
-    usual = Execution.run
+    usual = execute.run
 
-    def observe(self: Any, *arguments: Any) -> None:
+    def observe(*arguments: Any) -> None:
         mark("point the telescope, lay out the map")
-        usual(self, *arguments)
+        usual(*arguments)
         mark("observe")
 
-    Execution.run = observe  # type: ignore[method-assign]
+    execute.run = observe
     timed = Pipeline._timed
 
     def finish(self: Any, timer: Any, operator: Any, stage: str, *arguments: Any) -> None:

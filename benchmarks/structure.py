@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PARTS = ("core", "operators", "plugins", "interop", "pipelines", "zonda")
 LONGEST_MODULE, LONGEST_FUNCTION, MOST_PARAMETERS, LONGEST_OPERATOR = 400, 60, 7, 60
 WORK = {"observe", "check", "configure", "prepare", "measure", "exec", "collect", "finalize"}
-WORK |= {"requires", "provides", "optional", "linear"}
+WORK |= {"requires", "provides", "optional", "linear", "all_bands", "exec_bands"}
 """Methods in which an operator does its work and properties that state what it needs; other public
 methods are there for the framework only.
 """

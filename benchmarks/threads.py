@@ -95,7 +95,7 @@ def profile(name: str) -> None:
         return plain, timed
 
     kept = {}
-    for method in ("_map", "_measure", "_execute", "run"):
+    for method in ("prepare", "measure", "collect"):
         kept[method], timed = watched(method)
         setattr(Execution, method, timed)
     wall, cpu = time.perf_counter(), time.process_time()

@@ -61,11 +61,6 @@ class Block:
     memory: an operator makes the same bits and counts nothing (what it tells ``observation.tally``
     is thrown away)."""
 
-    stays: bool = False
-    """Its streams stay as they are until all bands in step have worked on these samples
-    (`core.shared.SharedScan.put_off`).
-    """
-
     components: frozenset[Component] = frozenset()
     """What ``signal`` is the sum of."""
     suffix: str = ""

@@ -27,7 +27,7 @@ STAGES = {
 OTHERS = {"halo": "observation", "discard": "observation, state"}
 COUPLES = ("sample", "detectors", "time", "all")
 NAMES = ("requires", "provides", "optional", "on_request")
-SWITCHES = ("linear", "knows_means")
+SWITCHES = ("linear", "knows_means", "all_bands")
 
 Fault = tuple[str, str]
 """A mistake and its cure."""

@@ -1,11 +1,11 @@
-"""Kinds of steps that the executor treats in a way of their own: map makers, and the step that adds
-up what is calibrated.
+"""Kinds of steps that the executor treats in a way of their own: map makers, steps that measure all
+bands together, and the step that adds up what is calibrated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from pydantic import PrivateAttr
 
@@ -23,8 +23,40 @@ class MapMaker(Operator):
     What is not finite in one of them is NaN in all.
 
     Where it is `linear`, the product of a remainder is subtracted
-    (`core.product.Product.subtract`), not simulated.
+    (`core.product.Product.subtract`), not simulated. With `all_bands` it has `exec_bands`.
     """
+
+    def exec_bands(self, blocks: Sequence[Block], states: Sequence[Any]) -> None:
+        """Act on the blocks of several bands, of the same detectors and samples, each with what
+        `prepare` of its band's own copy of this step returned.
+
+        Called in place of `exec` where the detectors of all bands look through the same pixels.
+        """
+        raise NotImplementedError
+
+
+@runtime_checkable
+class JoinsBands(Protocol):
+    """A step with ``couples = "all"`` that may measure the detectors of all bands together.
+
+    Attributes
+    ----------
+    all_bands
+        True where it does.
+    """
+
+    all_bands: bool
+
+    def of_rows(self, measured: Any, rows: slice) -> Any:
+        """Of what ``measure`` returned for the detectors of all bands, what ``exec`` needs for some
+        of them.
+        """
+        ...
+
+
+def joins(operator: Operator) -> bool:
+    """Tell whether a step measures the detectors of all bands together."""
+    return operator.couples == "all" and isinstance(operator, JoinsBands) and operator.all_bands
 
 
 class CalibratedSignal(Operator):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from .intervals import Intervals, runs
 from .numerics.random import stream_key
 from .numerics.smooth import SmoothField
 from .pages import html_table
-from .shared import SharedScan
 from .tally import Tally
 from .types import AnyFloats
 
@@ -26,6 +25,9 @@ if TYPE_CHECKING:
     from .instrument import Instrument
     from .site import Site
     from .weather import GroundWeather
+
+
+T = TypeVar("T")
 
 
 class WhiteLevel(Protocol):
@@ -115,8 +117,9 @@ class Observation:
     recorded_azimuth
         (n_samp,) rad, of the mount, as a file states it beside the boresight; None: it follows from
         ``boresight_azel``.
-    shared
-        What the bands of a camera share of the scan; None: there is one band.
+    common
+        What is the same for all views of a scan that are made with the same key (`once`); None:
+        there is one band.
     output
         Folder (Path) for files that are written while the scan runs (see `Data.output`).
     seen_of
@@ -158,7 +161,7 @@ class Observation:
     hwp_angle: NDArray[np.float64] | None = None
     pointed_radec: NDArray[np.float64] | None = None
     recorded_azimuth: NDArray[np.float64] | None = None
-    shared: SharedScan | None = None
+    common: dict[Hashable, Any] | None = None
     seen_of: tuple[int, float] | None = None
 
     def __post_init__(self) -> None:
@@ -228,6 +231,22 @@ class Observation:
             replace(self, instrument=c, focalplane=self.focalplane.of_band(k), detector_flags=none)
             for k, c in cameras
         ]
+
+    def looks_as(self, other: Observation) -> bool:
+        """Tell whether the detectors are where those of another band of the scan are."""
+        one, two = self.focalplane, other.focalplane
+        return np.array_equal(one.xi, two.xi) and np.array_equal(one.eta, two.eta)
+
+    def once(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Make something that is the same for all bands with this ``key``; it is made by the first
+        of them that asks, and released when the last has observed the scan.
+        """
+        if self.common is None:
+            return make()
+        if key not in self.common:
+            self.common[key] = make()
+        found: T = self.common[key]
+        return found
 
     @property
     def departures(self) -> NDArray[np.float64]:

@@ -63,6 +63,10 @@ class Operator(Labelled):
         it declares has a mean, a float64 block with the mean in it, and no entry in `Block.means`;
         the same mean is subtracted from what it leaves there (`core.run.whole`). `measure`
         likewise. A class that overrides `exec` or `measure` must say so anew.
+    all_bands
+        True where it is given all bands of a camera at once, instead of one after the other: a
+        step that measures, the stream of all detectors (`core.mapmaker.JoinsBands`); a map
+        maker, their blocks (`core.mapmaker.MapMaker.exec_bands`).
 
     Each may be a property, if it depends on the parameters.
     """
@@ -78,12 +82,15 @@ class Operator(Labelled):
         def optional(self) -> frozenset[str]: ...
         @property
         def linear(self) -> bool: ...
+        @property
+        def all_bands(self) -> bool: ...
 
     else:
         requires: ClassVar[frozenset[str]] = frozenset()
         provides: ClassVar[frozenset[str]] = frozenset()
         optional: ClassVar[frozenset[str]] = frozenset()
         linear: ClassVar[bool] = False
+        all_bands: ClassVar[bool] = False
     on_request: ClassVar[frozenset[str]] = frozenset()
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "sample"
     knows_means: ClassVar[bool] = False

@@ -16,6 +16,7 @@ from .faults import faults_named
 from .hooks import manager
 from .label import labels
 from .machine import available_memory, available_threads
+from .mapmaker import joins
 from .observation import Observation
 from .operator import Operator
 from .output import Output, Progress
@@ -31,8 +32,7 @@ from .run.bands import (
     use_recorded,
 )
 from .run.budget import held_of, least_memory, longest_of
-from .run.in_step import joins
-from .run.in_turn import Band, Budget, execute
+from .run.execute import Band, Budget, execute
 from .run.order import check_order
 from .run.schedule import Chain
 from .run.settings import Settings, Timer

@@ -142,9 +142,7 @@ def _added(predictions: list[Prediction]) -> Prediction:
     return dataclasses.replace(
         predictions[0],
         seconds=seconds,
-        bytes=max(max(p.bytes - p.products, BASE) for p in predictions)
-        + products
-        + max(p.shared for p in predictions),
+        bytes=max(max(p.bytes - p.products, BASE) for p in predictions) + products,
         products=products,
         unknown=tuple(dict.fromkeys(label for p in predictions for label in p.unknown)),
         startup=max(p.startup for p in predictions),

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data import Observation
+from ..mapmaker import joins
 from ..numerics.radiation import LEAST_TRANSMISSION
 from ..operator import Operator
-from ..run.in_step import joins
 from ..scene import Scene
 from ..signal import MAIN, Component, Formed
 from .estimate import Traits, add
@@ -124,6 +124,8 @@ class Context:
     """The budget by metric: a coarser form whose bound alone exceeds it need not be looked into."""
     depth: Depth = Depth(0.0, 0.0)
     """The white noise that the run will have."""
+    bands_alike: int = 1
+    """Number of the camera's bands, where all look through the same pixels."""
     readers: frozenset[str] = frozenset()
     """Labels of the operators that make a product of the time streams themselves
     (`Planning.reads_streams`).

@@ -16,13 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from ..mapmaker import makes_products
+from ..mapmaker import joins, makes_products
 from ..output import Output
 from ..run.budget import BASE, share_in_step
-from ..run.in_step import joins
 from ..run.schedule import Chain, schedule
 from ..run.settings import Settings
-from ..shared import room_for
 from ..storage import user_cache
 from .context import Context
 from .estimate import Cost
@@ -133,7 +131,7 @@ def predict(
     work = context.work
     chain = Chain(work.steps, work.signals, work.components)
     products = sum(planning_of(o).memory(longest) for o in during if makes_products(o))
-    bands = 1 if longest.shared is None else longest.shared.bands
+    bands = context.bands_alike
     in_step = None
     if bands > 1:
         alone = replace(settings, memory=max(settings.memory - (bands - 1) * products, 1))
@@ -159,6 +157,5 @@ def predict(
         products = (
             held + found.bytes + item * longest.n_samples * longest.n_detectors
         )  # its part of the stream of all bands
-    shared = room_for(longest.n_detectors, longest.n_samples)
     size = BASE + max(held + found.bytes, after)
-    return Prediction(seconds, size, unknown, startup, work.times, factors, products, shared)
+    return Prediction(seconds, size, unknown, startup, work.times, factors, products)

@@ -91,7 +91,8 @@ class Cost:
     kernel
         Which calibration kernel scales it: ``random``, ``stream`` or ``python``.
     shared
-        Share of it that is done once for all bands in step (`Planning.shares_blocks`).
+        Share of it that is done once for all bands that are executed together
+        (`Planning.shares_blocks`).
     """
 
     fixed: float = 0.0

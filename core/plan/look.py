@@ -75,6 +75,7 @@ def look(pipeline: Pipeline, scene: Scene, structure: Structure, band: str = "")
         readers=readers,
         kept_streams=streams,
         band=band,
+        bands_alike=scene.instrument.focalplane().bands_alike if band else 1,
     )
     context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
     context.depth = _depth(operators, shown, context)

@@ -27,9 +27,7 @@ class Prediction:
     factors: Mapping[str, float] = field(default_factory=dict)
     products: float = 0.0
     """Bytes that are held while another band of the camera acts: what steps add up over all scans,
-    and all where bands are in step."""
-    shared: float = 0.0
-    """Bytes that may be kept for another band of the camera, not part of ``bytes``."""
+    and all where bands are executed together."""
 
     @property
     def total(self) -> float:

@@ -8,19 +8,15 @@ turbulence above the telescope. What belongs to detectors is keyed by instrument
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from ..data import Data
 from ..errors import InputError, PipelineError
-from ..focalplane import Focalplane
 from ..observation import Observation
 from ..operator import Operator
 from ..scene import WithScene
-from ..shared import SharedScan, room_for
 from ..signal import MAIN, product_name, stream_of
 from ..tally import Tally
 
@@ -77,29 +73,14 @@ def use_recorded(data: Data, operators: Sequence[Operator]) -> None:
 
 def distribute(data: Data, bands: Sequence[Data]) -> None:
     """Give each band its detectors of all scans, and what is laid out for it."""
-    shared = [
-        SharedScan(
-            room_for(scan.n_detectors // len(bands), scan.n_samples),
-            _alike(scan.focalplane, len(bands)),
-        )
-        for scan in data.observations
-    ]
+    common: list[dict[Hashable, Any]] = [{} for _ in data.observations]
     for number, own in enumerate(bands):
         own.observations = [
             _of_band(scan, number, own, part)
-            for scan, part in zip(data.observations, shared, strict=True)
+            for scan, part in zip(data.observations, common, strict=True)
         ]
         own.layouts = _of(data.layouts, own.band)
     data.pointed = data.observations
-
-
-def _alike(plane: Focalplane, bands: int) -> int:
-    """Number of bands whose detectors look through the same pixels; 1 where not all do."""
-    first, *others = (plane.band == number for number in range(bands))
-    same = all(
-        np.array_equal(of[first], of[other]) for other in others for of in (plane.xi, plane.eta)
-    )
-    return bands if same else 1
 
 
 def hand_over(data: Data, bands: Sequence[Data]) -> None:
@@ -160,7 +141,7 @@ def _key(band: str) -> str:
     return f"@{band}"
 
 
-def _of_band(scan: Observation, number: int, own: Data, shared: SharedScan) -> Observation:
+def _of_band(scan: Observation, number: int, own: Data, common: dict[Hashable, Any]) -> Observation:
     """A scan with one band's detectors."""
     band = own.band
     plane = scan.focalplane.of_band(number)
@@ -190,5 +171,5 @@ def _of_band(scan: Observation, number: int, own: Data, shared: SharedScan) -> O
         expected_load=None,
         load_spectra=None,
         tally=Tally(),
-        shared=shared,
+        common=common,
     )

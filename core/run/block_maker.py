@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,9 +38,17 @@ Measured = dict[tuple[str, str], Any]
 """By label and signal: what `Operator.measure` found."""
 
 
+class Due(NamedTuple):
+    """A map maker that is to act on a block together with those of the other bands."""
+
+    step: MapMaker
+    block: Block
+    state: Any
+
+
 @dataclass(frozen=True)
 class Window:
-    """What a block is to hold: ``samples``, and with its margins ``reach``."""
+    """Extent of a block: ``samples``, and with its margins ``reach``."""
 
     detectors: slice
     samples: slice
@@ -114,14 +122,20 @@ class BlockMaker:
         *,
         again: bool,
         signals: Sequence[Formed] | None = None,
+        due: list[Due] | None = None,
     ) -> Block:
         """A block with the segment's steps, and those of the stages before it, carried out.
 
-        ``signals``: those that are of use in it; None: all that are not made again where they are
-        mapped.
+        Parameters
+        ----------
+        signals
+            Those that are of use in it; None: all that are not made again where they are mapped.
+        due
+            Takes the map makers at the segment's end that act on all bands at once; they do not
+            act here. None: all steps act. The block is then one piece, or the segment has a step
+            that needs more (`blocks.Segment.split`).
         """
         segment, again = stage.segment, again or stage.swept
-        outermost = signals is None
         if signals is None:
             signals = [s for s in self._chain.signals if s.stream not in self._apart]
         n_samples = self._observation.n_samples
@@ -147,17 +161,11 @@ class BlockMaker:
         if self._apart and any(isinstance(o, MapMaker) for o in segment.operators):
             self._add_unfiltered(block)
         if first:
-            self._in_pieces(first, block, passed_on, signals)
-        self._exec(rest[:1], block, signals)
+            self._in_pieces(first, block, passed_on, signals, None if rest else due)
+        self._exec(rest[:1], block, signals, due if len(rest) == 1 else None)
         if reach != samples:
             block = trimmed(block, samples)
-        last = next(
-            (k for k, o in enumerate(rest) if all(isinstance(step, MapMaker) for step in rest[k:])),
-            len(rest),
-        )
-        self._exec(rest[1 : max(last, 1)], block, signals)
-        block.stays = outermost  # of one that is made for another, the next may take the place
-        self._exec(rest[max(last, 1) :], block, signals)
+        self._exec(rest[1:], block, signals, due)
         held = self._local.__dict__
         buffers = [*held.get("blocks", {}).values(), held.get("pieces", {}), held.get("whole", {})]
         size = sum(array.nbytes for held in buffers for array in held.values())
@@ -184,13 +192,28 @@ class BlockMaker:
 
     # ---- steps
 
-    def _exec(self, steps: list[Operator], block: Block, signals: Sequence[Formed]) -> None:
+    def _exec(
+        self,
+        steps: list[Operator],
+        block: Block,
+        signals: Sequence[Formed],
+        due: list[Due] | None = None,
+    ) -> None:
+        """Let steps act on a block; ``due`` takes the last ones of them as in `make`."""
         start = time.thread_time()
-        for step in steps:
+        last = next(
+            (k for k, o in enumerate(steps) if all(map(maps_all_bands, steps[k:]))), len(steps)
+        )
+        for number, step in enumerate(steps):
             if self._stopped():
                 return
             label = self._labels[id(step)]
-            if forms(step):
+            if due is not None and number >= last:
+                assert isinstance(step, MapMaker)
+                if self._masks_maps:
+                    share_mask(block, block.signals)
+                due.append(Due(step, block, self._states[label]))
+            elif forms(step):
                 self._form(step, label, block, signals)
             elif filters(step):
                 self._filter(step, label, block)
@@ -331,7 +354,12 @@ class BlockMaker:
                 block.means[name] = found.means[name]
 
     def _in_pieces(
-        self, steps: list[Operator], block: Block, passed_on: set[str], signals: Sequence[Formed]
+        self,
+        steps: list[Operator],
+        block: Block,
+        passed_on: set[str],
+        signals: Sequence[Formed],
+        due: list[Due] | None = None,
     ) -> None:
         """Let steps that couple nothing work on copies of parts of a block; put the streams
         ``passed_on`` into it.
@@ -352,7 +380,7 @@ class BlockMaker:
             for name, stream in given.items():
                 piece.detdata[name] = piece.buffer(name, piece.shape)
                 piece.detdata[name][...] = stream[where]
-            self._exec(steps, piece, signals)
+            self._exec(steps, piece, signals, due)
             for name in passed_on & piece.detdata.keys():
                 if name not in made:
                     made[name] = (
@@ -363,6 +391,11 @@ class BlockMaker:
                 made[name][where] = piece.detdata[name]
             block.means = piece.means  # the same fields in every piece
         block.detdata = {**given, **made}
+
+
+def maps_all_bands(step: Operator) -> bool:
+    """Tell whether a step maps the blocks of all bands at once, and knows of means."""
+    return isinstance(step, MapMaker) and step.all_bands and knows_means(step)
 
 
 def share_mask(block: Block, streams: Sequence[str]) -> None:

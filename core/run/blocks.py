@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,17 +42,27 @@ class Segment:
 
 
 def cut(
-    operators: Sequence[Operator], observation: Observation, ordered: Collection[str] = ()
+    operators: Sequence[Operator],
+    observation: Observation,
+    ordered: Collection[str] = (),
+    halos: Mapping[str, int] | None = None,
 ) -> list[Segment]:
-    """Cut a chain into segments. ``ordered``: labels of the operators that want their blocks in
-    order of time.
+    """Cut a chain into segments where the coupling changes.
+
+    Parameters
+    ----------
+    ordered
+        Labels of the operators that want their blocks in order of time.
+    halos
+        By label, least neighbours that are given on each side, whatever `Operator.halo` says.
     """
+    least = halos or {}
     segments = [Segment([])]
     for operator in operators:
         last = segments[-1]
         couples, halo, in_order = (
             operator.couples,
-            operator.halo(observation),
+            max(operator.halo(observation), least.get(operator.label, 0)),
             operator.label in ordered,
         )
         if (in_order and last.span == "time") or (last.in_time_order and couples == "time"):

@@ -20,7 +20,7 @@ BASE = 230_000_000
 
 
 KEPT = "kept streams"
-OTHERS = "maps of other bands, and what all share"
+OTHERS = "maps of other bands"
 FEWER = "keep fewer streams, of fewer or shorter scans"
 
 
@@ -57,7 +57,7 @@ def divided(
     """
     budget = settings.asked or resident_memory() + available_memory() // 2
     parts = {"zonda and its libraries": max(resident_memory(), BASE) if fresh else BASE}
-    parts |= {KEPT: settings.kept, OTHERS: settings.others + shared_bytes(observation)}
+    parts |= {KEPT: settings.kept, OTHERS: settings.others}
     parts.update((o.label, planning_of(o).memory(observation)) for o in chain.steps)
     fixed = sum(parts.values())
     left = replace(settings, memory=max(budget - fixed, 1))
@@ -90,11 +90,6 @@ def held_of(chain: Chain, observation: Observation, in_step: bool = False) -> in
     )
 
 
-def shared_bytes(observation: Observation) -> int:
-    """Bytes that may be kept for the bands that observe a scan after another (`core.shared`)."""
-    return observation.shared.room if observation.shared is not None else 0
-
-
 def with_scan_ahead(chain: Chain, observation: Observation, settings: Settings) -> Settings | None:
     """The settings without what a scan holds that is prepared while another is executed; None where
     there is no room for it.
@@ -109,7 +104,7 @@ def with_scan_ahead(chain: Chain, observation: Observation, settings: Settings) 
 def share_in_step(
     chain: Chain, observation: Observation, settings: Settings, bands: int, beside: int
 ) -> Settings | None:
-    """The settings of one of several ``bands`` that work on a scan at the same time (`in_step`).
+    """The settings of one of several ``bands`` that work on a scan at the same time (`scan`).
 
     None where no step saves time so, or less would be kept in memory than where it works alone.
     ``beside``: bytes that the steps of the others hold.
@@ -138,11 +133,7 @@ def least_memory(chain: Chain, observation: Observation, settings: Settings) -> 
     """Bytes with which a process runs these steps over an observation on one thread, libraries
     included.
     """
-    held = (
-        sum(planning_of(o).memory(observation) for o in chain.steps)
-        + settings.others
-        + shared_bytes(observation)
-    )
+    held = sum(planning_of(o).memory(observation) for o in chain.steps) + settings.others
     return _with_margin(
         BASE + held + schedule(chain, observation, replace(settings, threads=1)).least
     )

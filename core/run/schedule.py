@@ -211,11 +211,20 @@ class Schedule:
 
     # ---- made once
 
-    def make(self, cost: Callable[[Planned], float] | None) -> None:
-        """Walk through the segments. ``cost`` as in `schedule`."""
+    def make(
+        self,
+        cost: Callable[[Planned], float] | None,
+        ordered: Collection[str] = (),
+        halos: Mapping[str, int] | None = None,
+    ) -> None:
+        """Walk through the segments.
+
+        ``cost`` as in `schedule`; ``ordered`` and ``halos``: of the other bands that are executed
+        together with this one, see `blocks.cut`.
+        """
         steps = self.chain.steps
-        ordered = [o.label for o in steps if planning_of(o).in_time_order(self.observation)]
-        segments = cut(steps, self.observation, ordered)
+        every = {*ordered, *ordered_in(steps, self.observation)}
+        segments = cut(steps, self.observation, every, halos or {})
         self.made_again = self._made_again(segments)
         apart = {s.stream for s in self.made_again}
         source, held, elsewhere, again = Source(), 0, list[str](), dict[str, int]()
@@ -420,6 +429,11 @@ class Schedule:
         settings = self.settings
         fixed = max(settings.asked - settings.memory, 0) if settings.asked else 0
         return f"{-(-(need + fixed) * 21 // 20_000_000)}MB"
+
+
+def ordered_in(steps: Sequence[Operator], observation: Observation) -> list[str]:
+    """Labels of the steps that are much cheaper in order of time."""
+    return [o.label for o in steps if planning_of(o).in_time_order(observation)]
 
 
 def schedule(

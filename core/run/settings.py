@@ -49,7 +49,7 @@ class Settings:
         Bytes of the products of the other bands of a camera, which grow scan by scan beside those
         of this one.
     bands
-        Bands that hold streams and blocks at a time (`core.run.in_step`): ``memory`` is the part of
+        Bands that hold streams and blocks at a time (`core.run.scan`): ``memory`` is the part of
         one of them.
     """
 

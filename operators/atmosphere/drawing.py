@@ -5,7 +5,7 @@ both.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from .layer_terms import NAMES
 from .model import AtmosphereModel, ExpectedLoad
 from .response import Response, delay_per_vapour
 from .turbulence.beams import rayleigh_distance, widened
+from .turbulence.geometry import looking
 from .turbulence.lines_of_sight import LinesOfSight
 from .turbulence.sampling import Drifting, DriftingLayers, share_tiles
 
@@ -70,9 +71,9 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     arguments = chosen.nodes, turbulence, pwv, response, chosen.step, observation.n_samples
     if chosen.nodes.shape:
         return AtNodes.make(*arguments)
-    made, shared = OfDetectors(*arguments), observation.shared
-    if shared is not None and shared.bands > 1:
-        made.join(shared.once((label, "units"), list))
+    made = OfDetectors(*arguments)
+    if observation.common is not None:
+        made.join(observation.once((label, "units", *looking(observation)), list))
     return made
 
 
@@ -88,14 +89,15 @@ def _layers_of(model: AtmosphereModel, label: str) -> DriftingLayers:
 
     A band takes what was made for it, so that tiles are released with the last that needs them.
     """
-    shared = model.observation.shared
-    if shared is None:
+    observation = model.observation
+    if observation.common is None:
         return drifting_layers(model)
+    loads: dict[str, ExpectedLoad] = observation.once((label, "loads"), dict)
 
-    def make(announced: Mapping[str, ExpectedLoad]) -> dict[str, DriftingLayers]:
-        return _of_bands([load.model() for load in announced.values()], label)
+    def make() -> dict[str, DriftingLayers]:
+        return _of_bands([load.model() for load in loads.values()], label)
 
-    return shared.made(label, make).pop(model.observation.name)
+    return observation.once((label, "layers"), make).pop(observation.name)
 
 
 def _of_bands(models: Sequence[AtmosphereModel], label: str) -> dict[str, DriftingLayers]:

@@ -4,7 +4,8 @@ where no nodes pay.
 At nodes everything is drawn once, before the blocks: few nodes stand for all detectors. Where each
 detector is its own node its series are made on demand, a unit of detectors and samples at a time,
 so that a scan of any length needs little memory; a unit has the same bits whenever it is made.
-Where all units of a scan are kept they are made in order of time, those of bands in step together:
+Where all units of a scan are kept they are made in order of time, those of bands that are executed
+together side by side:
 tiles of the turbulence serve all detectors of that moment.
 """
 
@@ -156,7 +157,7 @@ class OfDetectors:
         """The number that bands have in common whose detectors look along the same lines."""
 
     def join(self, bands: list[weakref.ref[OfDetectors]]) -> None:
-        """Let bands that are in step make units together; ``bands``: a list that all of them are
+        """Let bands that look alike make units together; ``bands``: a list that all of them are
         given.
         """
         if self._keeps_all:

@@ -384,10 +384,11 @@ class ExpectedLoad:
         return expected_load(self.models, self.parameters, self.observation)
 
     def announce(self) -> None:
-        """Let other steps know, and the other bands of the camera (`core.shared`)."""
-        self.observation.expected_load, self.observation.load_spectra = self, self.spectra
-        if self.observation.shared is not None:
-            self.observation.shared.announce(self.parameters.label, self.observation.name, self)
+        """Let other steps know, and the other bands of the camera (`Observation.common`)."""
+        scan = self.observation
+        scan.expected_load, scan.load_spectra = self, self.spectra
+        loads: dict[str, ExpectedLoad] = scan.once((self.parameters.label, "loads"), dict)
+        loads[scan.name] = self
 
     def spectra(self) -> LoadSpectra:
         """The atmosphere over the passband at elevations that the scan sees, before its model is

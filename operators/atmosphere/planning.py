@@ -59,8 +59,8 @@ lattice point: a band alone takes a fifth more than this, one of two, whose tile
 a tenth less."""
 
 SHARED = 0.4
-"""Share of it that bands in step do once, where each detector is evaluated by itself: two cost 1.5
-to 1.6 times one.
+"""Share of it that bands executed together do once, where each detector is evaluated by itself:
+two cost 1.5 to 1.6 times one.
 """
 
 CHOICE = 0.02, 2e-5

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.numerics.smooth import SmoothField
-from zonda.core.shared import once
 from zonda.core.types import Floats
 
 from .fluctuations import units_fit
@@ -114,9 +113,7 @@ def choose_resolution(
     most = _most_nodes(len(xi), observation.n_samples)
     nodes, error = choose_nodes(xi, eta, layers, tolerance * rms, plane.stretch, most)
 
-    path = once(
-        observation.shared, ("path", *looking(observation)), lambda: _Path(observation, xi, eta)
-    )
+    path = observation.once(("path", *looking(observation)), lambda: _Path(observation, xi, eta))
     elevations = np.quantile(path.elevation, [0.0, 0.5, 1.0])
     # What the mean emission may be wrong by, K_RJ (as if 0.01 % of the PWV fluctuated where none
     # does).

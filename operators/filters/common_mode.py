@@ -71,8 +71,8 @@ class CommonModeFilter(CommonModeParameters):
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
 
     @property
-    def joins_bands(self) -> bool:
-        """Whether the modes are those of all bands' detectors (`core.run.in_step`)."""
+    def all_bands(self) -> bool:
+        """True where the modes are those of all bands' detectors."""
         return self.group == "all"
 
     def of_rows(self, measured: Modes, rows: slice) -> Modes:

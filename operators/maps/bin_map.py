@@ -13,9 +13,9 @@ The sums are kept in fixed point (`sums`), so that they are exact; each sample i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +30,13 @@ from .few_angles import warn_before
 from .finished import finish
 from .grid import Grid, TangentGrid
 from .halves import halves_of
-from .looking import Looking
+from .looking import Cells, Looking
 from .map_layout import check_size, grid_of, layout_of, outside
 from .map_sums import MapSums
 from .parameters import MapParameters
 from .stokes_map import check_polarized, stokes_binnings
 from .stokes_product import StokesSums
-from .stokes_sums import StokesBinning
-from .stokes_sums import add_block as add_polarized
+from .stokes_sums import Part, StokesBinning, add_blocks
 from .sums import (
     FLAGGED,
     NOT_FINITE,
@@ -69,6 +68,7 @@ class BinMap(MapParameters):
 
     provides: ClassVar[frozenset[str]] = frozenset({"map"})
     knows_means: ClassVar[bool] = True
+    all_bands: ClassVar[bool] = True
 
     _layout: Mapping[str, Any] = PrivateAttr(default_factory=dict)
     _grid: Grid | None = PrivateAttr(None)
@@ -121,7 +121,11 @@ class BinMap(MapParameters):
 
     def exec(self, block: Block, state: Prepared) -> None:
         """Add one block to this thread's sums."""
-        add_signals(self, block, state, self._layout["variance"])
+        add_bands(self, [block], [state])
+
+    def exec_bands(self, blocks: Sequence[Block], states: Sequence[Prepared]) -> None:
+        """Add the blocks of several bands, each to its own sums; what is the same is found once."""
+        add_bands(self, blocks, states)
 
     def collect(self, data: Data, observation: Observation, state: Prepared) -> None:
         """Add this observation to the even or the odd scans' sums."""
@@ -141,12 +145,13 @@ class Prepared:
 
     ``looking``: in which pixels its detectors look. ``binnings``: of each half (`halves_of`), one
     for all signals or one for each with noise of its own. ``directions``: where the map tells how
-    scans cross.
+    scans cross. ``reference``: unit of the variance, K^2.
     """
 
     looking: Looking
     binnings: list[Binning] | list[StokesBinning]
     directions: Directions | None
+    reference: float
 
 
 def prepared(
@@ -178,7 +183,7 @@ def prepared(
     how = step, looking, (weight, noise, window), seen, spare
     made: list[Any] = stokes_binnings(*how) if step.stokes == "IQU" else binnings(*how)
     directions = Directions.of(looking, seen) if step.crosslinking else None
-    return Prepared(looking, made, directions)
+    return Prepared(looking, made, directions, reference)
 
 
 def binnings(
@@ -248,33 +253,42 @@ def weights_of(step: BinMap, observation: Observation, reference: float) -> tupl
     return weight, weight**2 * variance
 
 
-def add_signals(step: BinMap, block: Block, state: Prepared, reference: float) -> None:
-    """Add all signals of a block to this thread's sums; zeros where only the hits are wanted."""
-    signals: list[Any]
+def add_bands(step: BinMap, blocks: Sequence[Block], states: Sequence[Prepared]) -> None:
+    """See `BinMap.exec_bands`."""
+    every = [signals_of(step, *one) for one in zip(blocks, states, strict=True)]
+    parts, cells = list(zip(every, blocks, states, strict=True)), Cells()
+    for signals, block, state in parts:
+        if state.directions is not None:
+            state.directions.add(signals, block, cells)
+    if step.stokes == "IQU":
+        add_blocks(
+            [Part(cast(Any, s.binnings), signals, block) for signals, block, s in parts], cells
+        )
+        return
+    alike: dict[Hashable, list[tuple[Any, Block, Prepared]]] = {}
+    for number, part in enumerate(parts):
+        looking = part[2].looking
+        image = looking.key is None or isinstance(looking.grid, TangentGrid)
+        alike.setdefault(number if image else looking.key, []).append(part)
+    for together in alike.values():
+        add_together(step, together)
+
+
+def signals_of(step: BinMap, block: Block, state: Prepared) -> tuple[Any, ...]:
+    """All signals of a block, (n_det, n) each; zeros where only the hits are wanted."""
     if step.contents == "hits":
         nothing = block.buffer("nothing", block.shape)
         nothing.fill(0)
-        signals = [nothing]
-    else:
-        window, unfiltered = state.binnings[0].window[block.samples], block.observation.unfiltered
-        whole = any(name in block.means for name in block.signals) or (window.size and unfiltered)
-        signals = [block.total(name) if whole else block.detdata[name] for name in block.signals]
-        if window.size:  # no filter, no window, acted on these
-            signals = [
-                signal * window if name in unfiltered else signal
-                for name, signal in zip(block.signals, signals, strict=True)
-            ]
-    if state.directions is not None:
-        state.directions.add(signals, block)
-    if step.stokes == "IQU":
-        add_polarized(step.label, state.binnings, tuple(signals), block)  # type: ignore[arg-type]
-        return
-    for half in halves(step, list(state.binnings)):
-        left = signals
-        for binning in half:
-            count = 1 + binning.n_others
-            add_block(step, block, tuple(left[:count]), (state.looking, binning), reference)
-            left = left[count:]
+        return (nothing,)
+    window, unfiltered = state.binnings[0].window[block.samples], block.observation.unfiltered
+    whole = any(name in block.means for name in block.signals) or (window.size and unfiltered)
+    signals = [block.total(name) if whole else block.detdata[name] for name in block.signals]
+    if window.size:  # no filter, no window, acted on these
+        signals = [
+            signal * window if name in unfiltered else signal
+            for name, signal in zip(block.signals, signals, strict=True)
+        ]
+    return tuple(signals)
 
 
 def halves(step: BinMap, state: list[Any]) -> list[Any]:
@@ -285,53 +299,57 @@ def halves(step: BinMap, state: list[Any]) -> list[Any]:
     return [state] if step.split == "scans" else [state[:middle], state[middle:]]
 
 
-def add_block(
-    step: BinMap,
-    block: Block,
-    signals: tuple[Any, ...],
-    where: tuple[Looking, Binning],
-    reference: float,
-) -> None:
-    """Add the signals of a block to this thread's sums."""
-    looking, binning = where
-    sums, dropped, largest = binning.of_thread()
-    plane, begin, end, rows = (
-        block.observation.focalplane,
-        block.samples.start,
-        block.samples.stop,
-        block.detectors,
-    )
-    use = block.observation.good_detectors[rows] & binning.use[rows]
-    how = (
-        use,
-        binning.good[begin:end],
-        binning.window[begin:end],
+def add_together(step: BinMap, parts: Sequence[tuple[Any, Block, Prepared]]) -> None:
+    """Add the signals of blocks, of bands that look in the same pixels, to this thread's sums."""
+    todo = []
+    for signals, block, state in parts:
+        for half in halves(step, list(state.binnings)):
+            left = signals
+            for binning in half:
+                count = 1 + binning.n_others
+                todo.append(
+                    (tuple(left[:count]), binning, *_how(step, block, binning, state.reference))
+                )
+                left = left[count:]
+    block, looking = parts[0][1], parts[0][2].looking
+    begin, end, rows = block.samples.start, block.samples.stop, block.detectors
+    if isinstance(looking.grid, TangentGrid):
+        plane = block.observation.focalplane
+        for signals, binning, *how in todo:
+            add_image(
+                signals,
+                binning.pointing,
+                begin,
+                plane.xi[rows],
+                plane.eta[rows],
+                *looking.grid.shape,
+                *how,
+            )
+        return
+    which = np.arange(rows.start, rows.stop)
+    for start in range(begin, end, TILE_SAMPLES):
+        stop, index = min(start + TILE_SAMPLES, end), None
+        for signals, binning, *how in todo:
+            if binning.good[start:stop].any():
+                index = looking.pixels(which, start, stop) if index is None else index
+                add_list(signals, start - begin, index, *how)
+            else:
+                how[-2][FLAGGED] += (stop - start) * which.size
+
+
+def _how(step: BinMap, block: Block, binning: Binning, reference: float) -> tuple[Any, ...]:
+    """Which samples of a block count with which weights, and this thread's sums."""
+    rows, samples = block.detectors, block.samples
+    return (
+        block.observation.good_detectors[rows] & binning.use[rows],
+        binning.good[samples],
+        binning.window[samples],
         binning.weight[rows],
         binning.noise[rows],
         step.noise == "scatter",
         1 / reference,
-        sums,
-        dropped,
-        largest,
+        *binning.of_thread(),
     )
-    if isinstance(binning.grid, TangentGrid):
-        add_image(
-            signals,
-            binning.pointing,
-            begin,
-            plane.xi[rows],
-            plane.eta[rows],
-            *binning.grid.shape,
-            *how,
-        )
-        return
-    which = np.arange(rows.start, rows.stop)
-    for start in range(begin, end, TILE_SAMPLES):
-        stop = min(start + TILE_SAMPLES, end)
-        if binning.good[start:stop].any():
-            add_list(signals, start - begin, looking.pixels(which, start, stop), *how)
-        else:
-            dropped[FLAGGED] += (stop - start) * which.size
 
 
 def note_beams(

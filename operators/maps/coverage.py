@@ -21,7 +21,7 @@ pole. Cosine and sine are rounded to 2^-30: as int64 the sums are exact.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -35,7 +35,7 @@ from zonda.core.maps.planes import Plane
 from zonda.core.types import Floats
 
 from .image_grid import rays
-from .looking import Looking, tiles
+from .looking import Cells, Looking, tiles
 from .sums import WEIGHT, Sums
 
 SLOWEST = 1e-10
@@ -91,7 +91,7 @@ class Directions:
         motion = np.gradient(towards, axis=1) if towards.shape[1] > 1 else np.zeros_like(towards)
         return cls(looking, towards, motion, good.astype(np.uint8))
 
-    def add(self, signals: list[Any], block: Block) -> None:
+    def add(self, signals: Sequence[Any], block: Block, cells: Cells) -> None:
         """Add a block's samples that are finite in all ``signals``, each (n_det, n)."""
         finite = np.isfinite(signals[0])
         for signal in signals[1:]:
@@ -105,7 +105,7 @@ class Directions:
         for rows, start, stop in tiles(block, block.observation.good_detectors[block.detectors]):
             which = rows + block.detectors.start
             xi, eta = plane.xi[which], plane.eta[which]
-            index = self.looking.pixels(which, start, stop)
+            index = cells.of(self.looking, which, start, stop)
             add_directions(
                 self.rays,
                 self.motion,

@@ -1,7 +1,7 @@
-"""In which pixels detectors look: tile by tile, and once for all bands that look at the same.
+"""Pixels in which detectors look, tile by tile.
 
-Pixels are known by a fingerprint of all numbers that they are made of, not by where these come
-from: two bands take one another's only where each would make the same bits by itself.
+Two bands take one another's where each would make the same bits by itself: `Looking.key` is a
+fingerprint of all numbers that pixels are made of.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from zonda.core.block import Block
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.observation import Observation
-from zonda.core.shared import of_block
 from zonda.core.types import Floats
 
 from .grid import Grid, HealpixGrid
+
+MOST = 16 << 20
+"""Bytes of pixels that a thread holds while it adds a block to maps."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Looking:
     @cached_property
     def key(self) -> Hashable:
         """Fingerprint of what pixels are made of; None where there is no other band."""
-        if self.observation.shared is None:
+        if self.observation.common is None:
             return None
         grid, plane = self.grid, self.observation.focalplane
         known = (
@@ -57,22 +59,32 @@ class Looking:
         return "pixels", known, fingerprint(self.pointing, plane.xi, plane.eta)
 
     def pixels(self, which: NDArray[np.intp], start: int, stop: int) -> NDArray[np.int32]:
-        """(n, stop - start) pixels of the detectors ``which`` (n,), -1 outside. Read only."""
-        plane, shape = self.observation.focalplane, (which.size, stop - start)
+        """(n, stop - start) pixels of the detectors ``which`` (n,), -1 outside."""
+        plane, index = self.observation.focalplane, np.empty((which.size, stop - start), np.int32)
+        self.grid.pixels(self.pointing, start, stop, plane.xi[which], plane.eta[which], index)
+        return index
 
-        def make() -> NDArray[np.int32]:
-            index = np.empty(shape, np.int32)
-            self.grid.pixels(self.pointing, start, stop, plane.xi[which], plane.eta[which], index)
-            return index
 
-        if self.key is None:
-            return make()
-        return of_block(
-            self.observation.shared,
-            (self.key, which.tobytes(), start, stop),
-            4 * shape[0] * shape[1],
-            make,
-        )
+class Cells:
+    """Pixels of one block, found once for all bands and sums that look at the same; up to `MOST`
+    bytes are held.
+    """
+
+    def __init__(self) -> None:
+        self._found: dict[Hashable, NDArray[np.int32]] = {}
+        self._left = MOST
+
+    def of(
+        self, looking: Looking, which: NDArray[np.intp], start: int, stop: int
+    ) -> NDArray[np.int32]:
+        """`Looking.pixels`. Read only."""
+        key = looking.key or id(looking), which.tobytes(), start, stop
+        if key in self._found:
+            return self._found[key]
+        found = looking.pixels(which, start, stop)
+        if found.nbytes <= self._left:
+            self._found[key], self._left = found, self._left - found.nbytes
+        return found
 
 
 def fingerprint(*arrays: NDArray[Any]) -> bytes:

@@ -33,7 +33,7 @@ from zonda.core.block import Block
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 
-from .looking import Looking, tiles
+from .looking import Cells, Looking, tiles
 from .stokes_kernel import DATA, FIRST, HIT, add_stokes
 from .sums import FLAGGED, Sums
 
@@ -110,8 +110,8 @@ class StokesBinning:
 
 
 class Part(NamedTuple):
-    """What a block adds to the sums of one band: ``signals`` (n_det, n) each, ``binnings`` of the
-    halves of its observation.
+    """A block of one band: ``signals`` (n_det, n) each, ``binnings`` of the halves of its
+    observation.
     """
 
     binnings: Sequence[StokesBinning]
@@ -126,33 +126,25 @@ class Part(NamedTuple):
         ]
 
 
-def add_block(
-    label: str, binnings: Sequence[StokesBinning], signals: tuple[AnyFloats, ...], block: Block
-) -> None:
-    """Add a block's ``signals``, each (n_det, n), to this thread's sums of the ``binnings`` of one
-    observation.
-
-    It is done for all bands in step at once whose samples fall in the same pixels at the same
-    angles (`StokesBinning.key`).
+def add_blocks(parts: Sequence[Part], cells: Cells) -> None:
+    """Add the blocks of one band, or of several, to this thread's sums: together those of bands
+    whose samples fall in the same pixels at the same angles (`StokesBinning.key`).
     """
-    part, shared, key = Part(binnings, signals, block), block.observation.shared, binnings[0].key
-    same = key, len(signals), signals[0].dtype.str
-    if (
-        key is None
-        or not block.stays
-        or shared is None
-        or not shared.put_off(label, same, part, add_parts)
-    ):
-        add_parts([part])
+    alike: dict[Hashable, list[Part]] = {}
+    for part in parts:
+        key = part.binnings[0].key, len(part.signals), part.signals[0].dtype.str
+        alike.setdefault(key, []).append(part)
+    for together in alike.values():
+        add_parts(together, cells)
 
 
-def add_parts(parts: Sequence[Part]) -> None:
+def add_parts(parts: Sequence[Part], cells: Cells) -> None:
     """Add the parts of bands that have the same key."""
     used = [part.used() for part in parts]
     for k in range(1, len(parts)):
         if not np.array_equal(used[k], used[0]):  # detectors that a filter has flagged
             for part in parts:
-                add_parts([part])
+                add_parts([part], cells)
             return
     block, looking, a = parts[0].block, parts[0].binnings[0].looking, parts[0].binnings[0].angles
     detectors, samples, halves = (
@@ -174,9 +166,8 @@ def add_parts(parts: Sequence[Part]) -> None:
                 for _, dropped, _ in mine:
                     dropped[FLAGGED] += (stop - start) * at.size
             elif at.size:
-                index = (
-                    looking.pixels(rows + detectors.start, start, stop) if index is None else index
-                )
+                if index is None:
+                    index = cells.of(looking, rows + detectors.start, start, stop)
                 which = rows[at] + detectors.start
                 where = start - samples.start, rows[at], at, index, angles, which, start
                 bands = tuple(

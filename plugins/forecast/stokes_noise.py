@@ -32,8 +32,8 @@ from zonda.core.numerics.transforms import convolved, gaussian_taps
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.maps.grid import TangentGrid
-from zonda.operators.maps.looking import Looking
-from zonda.operators.maps.stokes_sums import MATRIX, PLACES, Part, StokesBinning, add_parts
+from zonda.operators.maps.looking import Cells, Looking
+from zonda.operators.maps.stokes_sums import MATRIX, PLACES, Part, StokesBinning, add_blocks
 from zonda.operators.maps.sums import WEIGHT
 
 from .beams import Comb, combs
@@ -130,7 +130,8 @@ def _scans(survey: Survey, grid: TangentGrid) -> Iterator[Floats]:
                 detectors = slice(first, min(first + DETECTORS, len(plane)))
                 block = Block(o, detectors, slice(start, min(start + INSTANTS, index.size)))
                 n_det, n = block.shape
-                add_parts([Part([binning], (np.ascontiguousarray(signal[:n_det, :n]),), block)])
+                signals = (np.ascontiguousarray(signal[:n_det, :n]),)
+                add_blocks([Part([binning], signals, block)], Cells())
         total = np.zeros((grid.n_pixels, 6))
         for pixels, found, *_ in binning.taken():
             total[pixels] += found[:, MATRIX] * (o.n_samples / index.size / WEIGHT)

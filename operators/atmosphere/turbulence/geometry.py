@@ -45,7 +45,6 @@ from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
-from zonda.core.shared import once
 from zonda.core.types import Floats
 
 from ..weather.radiative_transfer import EARTH_RADIUS
@@ -391,9 +390,7 @@ def scan_planes(observations: Sequence[Observation]) -> list[ScanPlane]:
     """
     out: list[ScanPlane] = []
     for k, observation in enumerate(observations):
-        here = once(
-            observation.shared, ("plane", *looking(observation)), partial(scan_plane, observation)
-        )
+        here = observation.once(("plane", *looking(observation)), partial(scan_plane, observation))
         if not out:
             out.append(replace(here, alpha=here.matrix @ here.centre))
             continue

@@ -17,6 +17,7 @@ from zonda.core.plan.planning import Planning
 from zonda.core.registry import planning
 from zonda.core.run.blocks import PIECE, cut
 from zonda.core.run.execution import Execution
+from zonda.core.run.scan import run as run_scan
 from zonda.core.run.schedule import Chain, Schedule
 from zonda.core.run.settings import Settings, Timer
 from zonda.core.run.streams import Store, choose
@@ -184,7 +185,7 @@ def execute(operators, obs, room=None, **settings):
             stack.enter_context(
                 mock.patch.object(Store, "fits", lambda self, size: self._in_use + size <= room)
             )
-        execution.run(data)
+        run_scan([execution], [data])
     return execution, obs.detdata["signal"], data
 
 

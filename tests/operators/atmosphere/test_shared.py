@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.core.shared import SharedScan
+from zonda.core.run import execute
 from zonda.operators.atmosphere.turbulence import lattice, tiles
 from zonda.operators.atmosphere.turbulence.tiles import Tiles
 
@@ -215,18 +215,18 @@ def test_tiles_are_released_with_the_last_band_that_needs_them(
     forecast counts.
     """
     alive: WeakSet[Tiles] = WeakSet()
-    begin, forget, left = Tiles.__init__, SharedScan.forget, []
+    begin, done, left = Tiles.__init__, execute._done, []
 
     def born(self: Tiles) -> None:
         begin(self)
         alive.add(self)
 
-    def watched(self: SharedScan) -> None:
+    def watched(execution: Any, band: Any, last: bool) -> None:
         gc.collect()
-        left.append(len(alive))
-        forget(self)
+        left.extend([len(alive)] if last else [])
+        done(execution, band, last)
 
     monkeypatch.setattr(Tiles, "__init__", born)
-    monkeypatch.setattr(SharedScan, "forget", watched)
+    monkeypatch.setattr(execute, "_done", watched)
     run(scene(field, "f090", "f150", dish=dish, pixels=pixels), threads=1)
     assert left == [0, 0]

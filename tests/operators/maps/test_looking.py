@@ -1,5 +1,5 @@
-"""Pixels that bands share of a block: taken only where they are the same, and maps as of each band
-alone.
+"""Pixels that bands have in common: found once only where they are the same, and maps as of each
+band alone.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zonda
-from zonda.core.shared import SharedScan
 from zonda.operators.maps import stokes_sums
+from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.grid import HealpixGrid
 from zonda.operators.maps.looking import Looking
 from zonda.plugins.checks.scenes import scan
@@ -24,30 +24,16 @@ GRID = HealpixGrid(1024, False, FOOTPRINT)
 N_DET, N = 5, 300
 
 
-def band(shared: SharedScan | None) -> Any:
-    return replace(scan(N_DET, N), shared=shared)
-
-
-def found(one: Looking, which: Any = (0, 2, 4)) -> Any:
-    return one.pixels(np.array(which), 10, 200)
-
-
-def test_a_band_takes_what_another_one_made_within_a_block() -> None:
-    shared = SharedScan(10**6)
-    one, other = (Looking.of(band(shared), GRID) for _ in range(2))
-    with shared.block():
-        first = found(one)
-        assert (first >= 0).all()
-        assert found(other) is first
-        assert found(other, (0, 2, 3)) is not first
-    again = found(other)
-    assert again is not first
-    np.testing.assert_array_equal(again, first)
-    assert shared.claim(10**6)
+def band() -> Any:
+    return replace(scan(N_DET, N), common={})
 
 
 def test_there_is_no_key_without_other_bands() -> None:
-    assert Looking.of(band(None), GRID).key is None
+    assert Looking.of(replace(band(), common=None), GRID).key is None
+
+
+def test_bands_that_look_alike_have_one_key() -> None:
+    assert Looking.of(band(), GRID).key == Looking.of(band(), GRID).key
 
 
 @settings(deadline=None, max_examples=60)
@@ -56,8 +42,7 @@ def test_there_is_no_key_without_other_bands() -> None:
     st.integers(0, 10**6), st.floats(1e-3, 1e-1),
 )  # fmt: skip
 def test_whatever_differs_bands_have_their_own(what: str, where: int, by: float) -> None:
-    shared = SharedScan(10**6)
-    plain, changed, grid = band(shared), band(shared), GRID
+    plain, changed, grid = band(), band(), GRID
     if what in ("xi", "eta"):
         getattr(changed.focalplane, what)[where % N_DET] -= by
     elif what == "boresight_radec":
@@ -70,10 +55,7 @@ def test_whatever_differs_bands_have_their_own(what: str, where: int, by: float)
         grid = HealpixGrid(
             nside, what == "nest", footprint, "galactic" if what == "frame" else "icrs"
         )
-    alone = found(Looking.of(replace(changed, shared=None), grid))
-    with shared.block():
-        found(Looking.of(plain, GRID))
-        np.testing.assert_array_equal(found(Looking.of(changed, grid)), alone)
+    assert Looking.of(changed, grid).key != Looking.of(plain, GRID).key
 
 
 BANDS = (
@@ -160,19 +142,18 @@ def planes(product: Any) -> dict[str, Any]:
 def test_maps_of_bands_side_by_side_are_those_of_each_alone(
     how: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    taken: list[bool] = []
-    of_block = SharedScan.of_block
+    found: list[int] = []
+    pixels = Looking.pixels
 
-    def noted(self: SharedScan, key: Any, size: int, make: Any) -> Any:
-        made: list[int] = []
-        answer = of_block(self, key, size, lambda: made.append(1) or make())
-        taken.append(not made)
-        return answer
+    def noted(self: Looking, which: Any, start: int, stop: int) -> Any:
+        found.append(len(which) * (stop - start))
+        return pixels(self, which, start, stop)
 
-    monkeypatch.setattr(SharedScan, "of_block", noted)
+    monkeypatch.setattr(Looking, "pixels", noted)
     together = maps(BANDS, how)
-    assert 0.2 < np.mean(taken) < 0.9  # not in the tile where a detector is dead in one band
+    both, found[:] = sum(found), []
     assert_as_alone(together, how, (Spoilt(),))
+    assert both < 0.9 * sum(found)  # not in the tile where a detector is dead in one band
 
 
 def assert_as_alone(together: Any, how: Any, steps: Any) -> None:
@@ -220,16 +201,15 @@ def test_what_is_made_again_for_neighbours_is_mapped_before_they_take_its_place(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A map before a step that reads its neighbours' samples, from streams that are made again: the
-    block does not stay.
+    block does not stay until the other band's is made.
     """
-    put_off, answers = SharedScan.put_off, set()
+    together, of_bands = set(), BinMap.exec_bands
 
-    def noted(self: SharedScan, label: str, *what: Any) -> bool:
-        answer = put_off(self, label, *what)
-        answers.add((label, answer))
-        return answer
+    def noted(self: BinMap, blocks: Any, states: Any) -> None:
+        together.add((self.product, len(blocks)))
+        of_bands(self, blocks, states)
 
-    monkeypatch.setattr(SharedScan, "put_off", noted)
+    monkeypatch.setattr(BinMap, "exec_bands", noted)
 
     def run(**options: Any) -> Any:
         steps = [
@@ -246,7 +226,7 @@ def test_what_is_made_again_for_neighbours_is_mapped_before_they_take_its_place(
     ample = run()
     little = run(memory=24_000_000)
     assert any("made again" in f"{what} {text}" for _, what, text in little.tally)
-    assert True in {answer for _, answer in answers}
+    assert {("before", 1), ("after", 2)} <= together
     for name in ("before_f090", "before_f150", "after_f090", "after_f150"):
         for plane, expected in planes(ample.products[name]).items():
             np.testing.assert_array_equal(

@@ -1,8 +1,7 @@
-"""Executes all scans of a run, each with all bands of the camera; what these share of a scan is
-released after the last.
+"""Executes all scans of a run, each with all bands of the camera.
 
-Bands that share pixels, or that a filter measures together, are in step (`in_step`); others follow
-each other.
+Bands that share pixels, or that a filter measures together, are executed together (`scan`), if
+their streams fit in memory side by side; others follow each other, scan by scan.
 """
 
 from __future__ import annotations
@@ -14,11 +13,12 @@ from dataclasses import dataclass, replace
 from ..data import Data
 from ..hooks import manager
 from ..machine import available_memory
+from ..mapmaker import joins
 from ..output import Progress
 from .ahead import Ahead
 from .budget import check_kept_memory, divided, held_of, longest_of, share_in_step, with_scan_ahead
 from .execution import Execution
-from .in_step import joins, run_in_step
+from .scan import run
 from .schedule import Chain
 from .settings import Settings, Timer
 
@@ -85,51 +85,19 @@ def execute(bands: Sequence[Band], settings: Settings, timer: Timer, budget: Bud
         [Execution(band.chain, o, own, timer, *hooks) for o in band.data.observations]
         for band, own in zip(bands, shares or alone, strict=True)
     ]
+    numbers = list(range(len(bands)))
+    groups = [[k] for k in numbers] if shares is None else [numbers]
+    blockwise = sum(own.memory for own in shares or ()) <= alone[0].memory
     scans = list(zip(*executions, strict=True))
+    turns = [(scan, group) for scan in scans for group in groups]
+    together = [[scan[k] for k in group] for scan, group in turns]
     try:
-        if shares is None:
-            _run_in_turn(scans, bands, ahead)
-        else:
-            memory, threads = alone[0].memory, min(own.threads for own in shares)
-            blocks = _alike(bands) and sum(own.memory for own in shares) <= memory
-            _run_in_step(
-                scans,
-                bands,
-                ahead,
-                replace(alone[0], memory=memory // 2, threads=threads),
-                timer,
-                blocks,
-            )
+        for (scan, group), these, then in zip(turns, together, [*together[1:], []], strict=True):
+            run(these, [bands[k].data for k in group], ahead, then, blockwise)
+            for k in group:
+                _done(scan[k], bands[k], k == numbers[-1])
     finally:
         ahead.close()
-
-
-def _run_in_turn(scans: Sequence[Sequence[Execution]], bands: Sequence[Band], ahead: Ahead) -> None:
-    """Run all observations in order, with one band after the other."""
-    turns = [turn for scan in scans for turn in zip(scan, bands, strict=True)]
-    for (execution, band), (following, _) in zip(turns, [*turns[1:], (None, None)], strict=True):
-        execution.run(band.data, ahead, following)
-        _done(execution, band, band is bands[-1])
-
-
-def _run_in_step(
-    scans: Sequence[Sequence[Execution]],
-    bands: Sequence[Band],
-    ahead: Ahead,
-    settings: Settings,
-    timer: Timer,
-    blocks: bool,
-) -> None:
-    """Run all observations in order, each with all bands in step; ``blocks``: block by block."""
-    datas = [band.data for band in bands]
-    for scan, following in zip(scans, [*scans[1:], [None] * len(bands)], strict=True):
-        turns = [
-            one.turns(data, ahead, then, in_step=True)
-            for one, data, then in zip(scan, datas, following, strict=True)
-        ]
-        run_in_step(turns, settings, timer, scan[0].observation.shared if blocks else None)
-        for execution, band in zip(scan, bands, strict=True):
-            _done(execution, band, band is bands[-1])
 
 
 def _joined_shares(alone: Sequence[Settings]) -> list[Settings]:
@@ -164,17 +132,16 @@ def _shares(bands: Sequence[Band], alone: Sequence[Settings], ahead: bool) -> li
 
 def _alike(bands: Sequence[Band]) -> bool:
     """Whether the detectors of all bands look through the same pixels."""
-    return all(
-        o.shared is not None and o.shared.bands == len(bands) for o in bands[0].data.observations
-    )
+    scans = zip(*(band.data.observations for band in bands), strict=True)
+    return all(one.looks_as(scan[0]) for scan in scans for one in scan)
 
 
 def _done(execution: Execution, band: Band, last: bool) -> None:
-    """Tell that a band has observed a scan; release what bands share of it after the last."""
+    """Tell that a band has observed a scan; release what its views share after the last."""
     observation = execution.observation
     band.data.tally.update(observation.tally)
-    if observation.shared is not None and last:
-        observation.shared.forget()
+    if observation.common is not None and last:
+        observation.common.clear()
     band.watch(band.data, "scan")
 
 
