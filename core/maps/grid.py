@@ -26,14 +26,20 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
+from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..numerics import tangent
 from ..numerics.angles import FWHM_PER_SIGMA, angle_text
-from ..numerics.projection import central, frame_rotation, wcs_frame_rotation
+from ..numerics.projection import (
+    central,
+    frame_rotation,
+    tangent_coordinates,
+    wcs_frame_rotation,
+)
 from ..numerics.sphere import angles, separation, unit_vectors
 from ..numerics.transforms import convolved, convolved_rows, gaussian_taps
+from ..storage.fits_files import header_of
 from ..types import AnyFloats, Floats
 
 Smoother = Callable[..., Floats]
@@ -185,7 +191,7 @@ class ImagePixels(MapGrid):
     Attributes
     ----------
     wcs
-        A `TangentWcs` or an `astropy.wcs.WCS` of two celestial axes.
+        An `astropy.wcs.WCS` of two celestial axes.
     nominal
         Steps (y, x) [rad] where the header's degrees, which are rounded, are not to be taken; None:
         those.
@@ -366,9 +372,9 @@ class ImagePixels(MapGrid):
         kept = self.__dict__.setdefault("_distances", {})
         if centre in kept:
             return kept[centre]  # type: ignore[no-any-return]
-        if isinstance(self.wcs, tangent.TangentWcs):
-            y, x = np.indices(self.shape)
-            world = self.wcs.wcs_pix2world(x.ravel(), y.ravel(), 0)
+        if self.kind == "TAN":
+            y, x = np.indices(self.shape, np.float64)
+            world = tangent_coordinates(self.wcs, x.ravel(), y.ravel())
             longitude, latitude = np.radians(np.array(world)).reshape(2, *self.shape)
         else:
             longitude, latitude = angles(self.directions())
@@ -422,13 +428,7 @@ class ImagePixels(MapGrid):
             s.indices(n) for s, n in zip((rows, columns), self.shape, strict=True)
         )
         shape = max(y1 - y0, 0), max(x1 - x0, 0)
-        if isinstance(self.wcs, tangent.TangentWcs):
-            x, y = self.wcs.crpix
-            world: Any = tangent.TangentWcs(
-                self.wcs.frame, self.wcs.crval, (x - x0, y - y0), self.wcs.cdelt
-            )
-        else:
-            world = self.wcs.slice((slice(y0, None), slice(x0, None)))
+        world = self.wcs.slice((slice(y0, None), slice(x0, None)))
         return ImagePixels(world, shape, self.nominal)
 
     # ----------------------------------------------------------------------------------------------
@@ -767,7 +767,7 @@ class HealpixPixels(MapGrid):
 
 
 def image_grid(header: Any, shape: tuple[int, int], nominal: float | None = None) -> ImagePixels:
-    """The grid of an image by its FITS header (any mapping that astropy's `WCS` takes).
+    """The grid of an image by its FITS header, or any mapping of its keywords.
 
     ``nominal``: side of a pixel at the reference point [rad], where it is known better than by the
     header's degrees.
@@ -776,15 +776,14 @@ def image_grid(header: Any, shape: tuple[int, int], nominal: float | None = None
     cards = tuple(
         (key, value) for key, value in known if isinstance(value, bool | int | float | str)
     )
-    return _image(tangent.plain(header) or cards, (int(shape[0]), int(shape[1])), nominal)
+    return _image(cards, (int(shape[0]), int(shape[1])), nominal)
 
 
 def wcs_grid(wcs: Any, shape: tuple[int, int]) -> ImagePixels:
-    """The grid of an image by its world coordinates, a `TangentWcs` or an `astropy.wcs.WCS`."""
-    if not isinstance(wcs, tangent.TangentWcs):
-        wcs = wcs.celestial
-        if str(wcs.wcs.ctype[0])[-3:] in CYLINDERS:
-            wcs = wcs.deepcopy()  # `_unbounded` changes it
+    """The grid of an image by its `astropy.wcs.WCS`."""
+    wcs = wcs.celestial
+    if str(wcs.wcs.ctype[0])[-3:] in CYLINDERS:
+        wcs = wcs.deepcopy()  # `_unbounded` changes it
     return ImagePixels(wcs, (int(shape[0]), int(shape[1])))
 
 
@@ -798,10 +797,8 @@ def healpix_grid(
 @lru_cache(
     maxsize=4
 )  # the maps of all signals of a run share one, with its solid angles and distances
-def _image(world: Any, shape: tuple[int, int], nominal: float | None) -> ImagePixels:
-    if not isinstance(world, tangent.TangentWcs):
-        from astropy.wcs import WCS
-
-        world = WCS(dict(world), naxis=2)
-    found = wcs_grid(world, shape)
+def _image(
+    cards: tuple[tuple[str, Any], ...], shape: tuple[int, int], nominal: float | None
+) -> ImagePixels:
+    found = wcs_grid(WCS(header_of(cards), naxis=2), shape)
     return found if nominal is None else ImagePixels(found.wcs, found.shape, (nominal, nominal))

@@ -1,5 +1,5 @@
-"""Cards of FITS headers from elsewhere, checked for their type where they are read, for maps, masks
-and comparisons alike.
+"""Cards of FITS headers from elsewhere, checked for their type at reading, for maps, masks and
+comparisons alike; headers of world coordinates.
 """
 
 from __future__ import annotations
@@ -9,9 +9,11 @@ import re
 from typing import Any
 
 import numpy as np
+from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..storage.fits_files import COMMENTARY, header_of
 from ..types import AnyFloats
 
 FRAMES = ("ICRS", "FK5", "FK4", "FK4-NO-E")
@@ -28,6 +30,7 @@ _NUMBERS = re.compile(
     r"(CRPIX|CRVAL|CDELT|CROTA)[12]|(CD|PC)[12]_[12]|LONPOLE|LATPOLE|PV[12]_\d+|EQUINOX|EPOCH"
 )
 """Cards of world coordinates that are numbers: astropy takes a default for one that is none."""
+_OBSERVED = re.compile("DATE|MJD-|REST")
 _IN_DEGREES = {"rad": math.degrees(1.0), "arcmin": 1 / 60, "arcsec": 1 / 3600, "mas": 1 / 3.6e6}
 _EQUATORIAL = ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH")
 
@@ -146,3 +149,27 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
     if equinox is not None and stated is None:
         made["EQUINOX"] = equinox
     return made, f"{frame}: {key} = '{written}'"
+
+
+def exact_header(wcs: Any) -> Header:
+    """World coordinates of an `astropy.wcs.WCS` with all digits, of which `to_header` writes 14.
+
+    Time and rest frequency of the observation are left out.
+    """
+    header, numbers = wcs.to_header(relax=True), wcs.wcs
+    exact: dict[str, float] = {}
+    for i in range(numbers.naxis):
+        for key, values in (
+            ("CRPIX", numbers.crpix),
+            ("CRVAL", numbers.crval),
+            ("CDELT", numbers.get_cdelt()),
+        ):
+            exact[f"{key}{i + 1}"] = float(values[i])
+        for j in range(numbers.naxis):
+            exact[f"PC{i + 1}_{j + 1}"] = float(numbers.get_pc()[i, j])
+    exact["LONPOLE"], exact["LATPOLE"] = float(numbers.lonpole), float(numbers.latpole)
+    return header_of(
+        (card.keyword, exact.get(card.keyword, card.value), card.comment)
+        for card in header.cards
+        if card.keyword not in COMMENTARY and not _OBSERVED.match(card.keyword)
+    )

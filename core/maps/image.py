@@ -16,8 +16,6 @@ from ..types import Floats
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
-    from ..storage.fits_image import Cards
-
 ROWS = 256
 """Of an image whose Q and U are turned at a time."""
 
@@ -31,8 +29,7 @@ class Image:
     values
         (ny, nx) float64, NaN where nothing is known; row 0 is the FITS file's first row.
     header
-        FITS keywords with a two-dimensional celestial WCS; a dict that `astropy.io.fits.Header`
-        takes.
+        FITS keywords with a two-dimensional celestial WCS.
     unit
         Unit of ``values``, e.g. ``K_RJ``.
     polarization, axis
@@ -41,7 +38,7 @@ class Image:
     """
 
     values: Floats
-    header: Cards | Header
+    header: Header
     unit: str = "K_RJ"
     polarization: Floats | None = None
     axis: Floats | None = None

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from astropy.io.fits import Header
 
     from ..instrument import Band
-    from ..storage.fits_image import Cards
     from .scan_hits import ScanHits
 
 
@@ -74,7 +73,7 @@ class MapArrays:
         are along one line; NaN where no detector moved. None: not kept (`BinMap: {crosslinking:
         true}`).
     header
-        Keywords of the WCS (images), else None; a dict that `astropy.io.fits.Header` takes.
+        Keywords of the WCS (images), else None.
     centre
         (lon, lat) [rad] of the map's centre in ``frame``.
     pixel
@@ -101,7 +100,7 @@ class MapArrays:
     """
 
     planes: dict[str, Plane]
-    header: Cards | Header | None = None
+    header: Header | None = None
     centre: tuple[float, float] = (0.0, 0.0)
     pixel: float = 0.0
     frame: str = "icrs"

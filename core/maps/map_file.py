@@ -7,16 +7,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+from astropy.io import fits
+from astropy.io.fits import Header
 from numpy.typing import NDArray
 
 from ..data import Data
 from ..errors import OutputError
-from ..numerics import tangent
 from ..storage.files import atomic_path
-from ..storage.fits_image import BLOCK, Cards, image_pieces
+from ..storage.fits_files import header_of, joined, table_bytes, write_image
+from .header import exact_header
 from .map_arrays import MapArrays
 from .measured_noise import stated
 from .planes import Plane
@@ -43,7 +45,7 @@ class Provenance:
         stand at a file's end.
     """
 
-    cards: Cards
+    cards: Header
     tables: bytes
 
     @classmethod
@@ -51,13 +53,14 @@ class Provenance:
         """What is known of a map apart from its run."""
         from zonda import __version__
 
-        cards = Cards(
+        cards = header_of(
             [
                 ("ORIGIN", "zonda", "simulated, not observed"),
                 ("CREATOR", f"zonda {__version__}", "software"),
+                ("NSCANS", len(product.scans), "scans"),
             ]
         )
-        return cls(cards.add(Cards([("NSCANS", len(product.scans), "scans")])), b"")
+        return cls(cards, b"")
 
     @classmethod
     def of(cls, data: Data) -> Provenance:
@@ -86,7 +89,7 @@ class MapFile:
     name: str
     product: MapArrays
     planes: Mapping[str, Plane]
-    cards: Cards = field(default_factory=Cards)
+    cards: Header = field(default_factory=Header)
     noise: Mapping[str, tuple[float | None, str]] = field(default_factory=dict)
 
     @classmethod
@@ -107,7 +110,7 @@ class MapFile:
                 yield name, meaning, plane, values
 
     @property
-    def beam(self) -> Cards:
+    def beam(self) -> Header:
         """The resolution of the map."""
         product = self.product
         degrees = float(np.degrees(product.resolution))
@@ -116,35 +119,33 @@ class MapFile:
             if product.smoothed_by
             else "[deg] FWHM of the beam"
         )
-        cards = Cards(
-            [("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")]
-            if degrees
-            else ()
-        )
+        cards = [("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")]
         narrow, wide = (float(np.degrees(fwhm)) for fwhm in product.beams)
-        if degrees and narrow < wide:
-            cards["BEAMLOW"] = narrow, "[deg] narrowest FWHM of the beams in BMAJ"
-            cards["BEAMHIGH"] = wide, "[deg] widest; BMAJ: peak x beam is the flux"
-        return cards
+        if narrow < wide:
+            cards += [
+                ("BEAMLOW", narrow, "[deg] narrowest FWHM of the beams in BMAJ"),
+                ("BEAMHIGH", wide, "[deg] widest; BMAJ: peak x beam is the flux"),
+            ]
+        return header_of(cards if degrees else ())
 
     @property
-    def convention(self) -> Cards:
+    def convention(self) -> Header:
         """In which Q and U are, where there are some."""
         stated = ("POLCCONV", CONVENTION, "Q, U: angles from south to east")
-        return Cards([stated] if any(name in "qu" for name, *_ in self.rows) else ())
+        return header_of([stated] if any(name in "qu" for name, *_ in self.rows) else ())
 
     @property
-    def halves(self) -> Cards:
+    def halves(self) -> Header:
         """What `half_difference` is the difference of."""
-        return Cards(
+        return header_of(
             [("JACKKNIF", ascii_text(self.product.difference), "halves that were subtracted")]
         )
 
-    def noise_cards(self, plane: str = "") -> Cards:
+    def noise_cards(self, plane: str = "") -> Header:
         """What stands behind the noise, for the header of a ``plane`` of it; of a table, for all
         its columns together.
         """
-        cards = Cards()
+        cards: dict[str, tuple[Any, ...]] = {}
         for key, (factor, words) in self.noise.items():
             if (
                 plane
@@ -152,23 +153,22 @@ class MapFile:
             ):
                 continue
             if factor is not None:
-                cards["NOISEFAC" if plane else f"NOISFAC{key}"] = (
-                    factor,
-                    "measured noise / this white noise",
-                )
+                name = "NOISEFAC" if plane else f"NOISFAC{key}"
+                cards[name] = factor, "measured noise / this white noise"
             if plane or key == "I":
                 cards["NOISEOF"] = ascii_text(words), "what the noise was measured in"
-        return cards
+        return header_of((key, *card) for key, card in cards.items())
 
-    def first(self, about: Provenance) -> Cards:
-        """Cards of the first header: the name, where it comes from, and its own cards."""
-        own = Cards([("PRODUCT", ascii_text(self.name), "product of the pipeline")]).add(
-            about.cards
+    def first(self, about: Provenance) -> Header:
+        """Cards of the first header: the name, its origin and its band."""
+        found = joined(
+            header_of([("PRODUCT", ascii_text(self.name), "product of the pipeline")]), about.cards
         )
         if (band := self.product.band) is not None:
-            own["RESTFRQ"] = float(f"{band.centre:.12g}"), "[Hz] centre of the band"
-            own["BAND"] = ascii_text(band.name), "name of the band"
-        return own
+            named = ("BAND", ascii_text(band.name), "name of the band")
+            centre = ("RESTFRQ", float(f"{band.centre:.12g}"), "[Hz] centre of the band")
+            found = joined(found, header_of([centre, named]))
+        return found
 
     def write(self, path: Path, about: Provenance) -> Path:
         """Write it atomically; its path. Raises `OutputError` where it cannot be written."""
@@ -176,8 +176,8 @@ class MapFile:
             if self.product.header is None:
                 self._write_table(temporary, about)
             with open(temporary, "ab") as file:
-                for piece in self._images(about) if self.product.header is not None else ():
-                    file.write(piece)
+                if self.product.header is not None:
+                    self._write_images(file, about)
                 for table in self._scan_tables():
                     file.write(table)
                 file.write(about.tables)
@@ -194,37 +194,31 @@ class MapFile:
             yield _table("SCAN_HITS", columns)
             yield _text_table("SCANS", {"NAME": found.scans})
 
-    def _images(self, about: Provenance) -> Iterator[bytes]:
-        world = (tangent.plain(self.product.header) or self.product.wcs).to_header(relax=True)
+    def _write_images(self, file: IO[bytes], about: Provenance) -> None:
+        world = exact_header(self.product.wcs)
         unit, scale = scale_of(self.product.unit)
         for k, (name, meaning, plane, values) in enumerate(self.rows):
-            header = Cards(
-                (key, world[key], world.comments[key])
-                for key in world
-                if key not in ("", "COMMENT", "HISTORY")
-            )
-            header["EXTNAME"] = name.upper(), "extension name"
+            cards = [("EXTNAME", name.upper(), "extension name")]
             if own := plane.fits_unit(unit):
-                header["BUNIT"] = own, meaning
+                cards.append(("BUNIT", own, meaning))
+            if plane.scale > 0 and scale:
+                cards.append(("TEMPSCAL", scale, f"temperature scale: {_SCALES[scale]}"))
+            parts = [world, header_of(cards)]
             if plane.scale > 0:
-                if scale:
-                    header["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
-                header.add(self.beam)
+                parts.append(self.beam)
             if name.startswith("half_difference"):
-                header.add(self.halves)
-            header.add(
-                self.noise_cards(name) if name == "noise" or name.startswith("cov_") else Cards()
-            ).add(self.convention)
+                parts.append(self.halves)
+            if name == "noise" or name.startswith("cov_"):
+                parts.append(self.noise_cards(name))
+            parts.append(self.convention)
             if k == 0:
-                header.add(self.first(about)).add(self.cards)
-            yield from image_pieces(header, values, extension=k > 0, dtype=_type(values))
+                parts += [self.first(about), self.cards]
+            write_image(file, joined(*parts), values, _type(values))
 
     def _write_table(self, path: Path, about: Provenance) -> None:
         """A partial map, pixel numbers explicit; the cards are those of Gorski et al. (2005) that
         healpy reads.
         """
-        from astropy.io import fits
-
         product = self.product
         columns = [fits.Column("PIXEL", "K", array=product.pixels)]
         unit, scale = scale_of(product.unit)
@@ -235,29 +229,24 @@ class MapFile:
                 fits.Column(name.upper(), code, unit=plane.fits_unit(unit) or None, array=values)
             )
         table = fits.BinTableHDU.from_columns(columns, name="MAP")
-        made = Cards(
-            [
-                ("PIXTYPE", "HEALPIX", "HEALPix pixelization"),
-                ("ORDERING", "NESTED" if product.nest else "RING", "pixel ordering"),
-                ("COORDSYS", _COORDSYS[product.frame], f"{product.frame}"),
-                ("NSIDE", product.nside, "resolution"),
-                ("INDXSCHM", "EXPLICIT", "pixel numbers are in the column PIXEL"),
-                ("OBJECT", "PARTIAL", "not all of the sky"),
-            ]
-        )
+        cards = [
+            ("PIXTYPE", "HEALPIX", "HEALPix pixelization"),
+            ("ORDERING", "NESTED" if product.nest else "RING", "pixel ordering"),
+            ("COORDSYS", _COORDSYS[product.frame], f"{product.frame}"),
+            ("NSIDE", product.nside, "resolution"),
+            ("INDXSCHM", "EXPLICIT", "pixel numbers are in the column PIXEL"),
+            ("OBJECT", "PARTIAL", "not all of the sky"),
+        ]
         if scale:
-            made["TEMPSCAL"] = scale, f"temperature scale: {_SCALES[scale]}"
-        made.add(self.beam).add(self.halves if "half_difference" in self.planes else Cards()).add(
-            self.convention
-        )
-        made.add(self.noise_cards()).add(self.first(about)).add(self.cards)
-        hdus = [fits.PrimaryHDU(), table]
-        for hdu, more in zip(hdus, (self.first(about), made), strict=True):
-            for key, value in more.items():
-                hdu.header[key] = value, more.comments.get(key, "")
-            for line in more.history:
-                hdu.header.add_history(line or " ")
-        fits.HDUList(hdus).writeto(path, output_verify="exception")
+            cards.append(("TEMPSCAL", scale, f"temperature scale: {_SCALES[scale]}"))
+        parts = [header_of(cards), self.beam]
+        if "half_difference" in self.planes:
+            parts.append(self.halves)
+        parts += [self.convention, self.noise_cards(), self.first(about), self.cards]
+        primary = fits.PrimaryHDU()
+        primary.header.extend(self.first(about))
+        table.header.extend(joined(*parts))
+        fits.HDUList([primary, table]).writeto(path, output_verify="exception")
 
 
 def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
@@ -285,29 +274,22 @@ def _type(values: NDArray[Any]) -> np.dtype[Any]:
     return np.dtype(np.float64)
 
 
-def _origin(data: Data) -> Cards:
+def _origin(data: Data) -> Header:
     """Where the data come from; the command and the resolved YAML as history."""
     import zonda
 
     scene, provenance = data.scene, data.provenance
-    cards = Cards(
-        [
-            ("ORIGIN", "zonda", "simulated, not observed"),
-            (
-                "CREATOR",
-                f"zonda {provenance.get('versions', {}).get('zonda', zonda.__version__)}",
-                "software",
-            ),
-            ("PIPELINE", ascii_text(str(provenance.get("name", ""))), "pipeline"),
-            ("SEED", int(scene.seed), "root of all random numbers"),
-            (
-                "DATE-OBS",
-                str(min((o.start for o in data.scans), default=scene.time)),
-                "start of the first scan, UTC",
-            ),
-            ("NSCANS", len(data.scans), "scans"),
-        ]
-    )
+    version = provenance.get("versions", {}).get("zonda", zonda.__version__)
+    start = str(min((o.start for o in data.scans), default=scene.time))
+    cards: list[tuple[Any, ...]] = [
+        ("ORIGIN", "zonda", "simulated, not observed"),
+        ("CREATOR", f"zonda {version}", "software"),
+        ("PIPELINE", ascii_text(str(provenance.get("name", ""))), "pipeline"),
+        ("SEED", int(scene.seed), "root of all random numbers"),
+        ("DATE-OBS", start, "start of the first scan, UTC"),
+        ("NSCANS", len(data.scans), "scans"),
+    ]
+    history: list[str] = []
     names = (scene.instrument.telescope.name, scene.instrument.name, scene.site.name)
     found = (
         zip(*(o.origin for o in data.scans), strict=True)
@@ -315,12 +297,13 @@ def _origin(data: Data) -> Cards:
         else ((name,) for name in names)
     )
     for key, every in zip(("TELESCOP", "INSTRUME", "SITE"), found, strict=True):
-        cards[key], more = _names(every)
-        cards.history += [f"{key}: {name}" for name in more]
+        name, more = _names(every)
+        cards.append((key, name))
+        history += [f"{key}: {name}" for name in more]
     if command := str(provenance.get("command", "")):
-        cards.history.append(ascii_text(command))
-    cards.history += map(ascii_text, str(provenance.get("resolved_yaml", "")).splitlines())
-    return cards
+        history.append(ascii_text(command))
+    history += map(ascii_text, str(provenance.get("resolved_yaml", "")).splitlines())
+    return header_of(cards, history)
 
 
 def _names(every: Iterable[str]) -> tuple[str, list[str]]:
@@ -361,34 +344,7 @@ def _text_table(name: str, columns: dict[str, list[str]]) -> bytes:
 
 
 def _table(name: str, columns: Mapping[str, NDArray[Any]]) -> bytes:
-    """Columns of texts (``S``), int32 or int64: FITS 4.0, section 7.3; see
-    `core.storage.fits_image` for why not astropy.
-    """
-    plain = {
-        title: values.astype(values.dtype.newbyteorder(">")) for title, values in columns.items()
-    }
-    rows = np.rec.fromarrays(
-        list(plain.values()), dtype=[(title, values.dtype) for title, values in plain.items()]
-    )
-    cards = Cards([("XTENSION", "BINTABLE", "binary table extension"), ("BITPIX", 8), ("NAXIS", 2)])
-    sizes = {
-        "NAXIS1": rows.dtype.itemsize,
-        "NAXIS2": len(rows),
-        "PCOUNT": 0,
-        "GCOUNT": 1,
-        "TFIELDS": len(plain),
-    }
-    for key, size in sizes.items():
-        cards[key] = size
-    for k, (title, values) in enumerate(plain.items(), 1):
-        form = (
-            f"{values.dtype.itemsize}A"
-            if values.dtype.kind == "S"
-            else "J"
-            if values.dtype.itemsize == 4
-            else "K"
-        )
-        cards[f"TTYPE{k}"], cards[f"TFORM{k}"] = title, form
-    cards["EXTNAME"] = name
-    body = rows.tobytes()
-    return cards.tostring().encode("ascii") + body + bytes(-len(body) % BLOCK)
+    """Columns of texts (``S``), int32 or int64 as a binary table."""
+    kinds = [(title, values.dtype) for title, values in columns.items()]
+    rows = np.rec.fromarrays(list(columns.values()), dtype=kinds)
+    return table_bytes(fits.BinTableHDU(rows, name=name))

@@ -14,13 +14,16 @@ exact, without trigonometry. ``w`` is the cosine to the image centre times the l
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import InputError
 from ..types import Floats
 from .chunks import chunks, empty
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 GALACTIC = (
     (-0.05487565771259163, -0.8734370519556159, -0.48383507361671546),
@@ -30,28 +33,6 @@ GALACTIC = (
 """The rotation from ICRS to Galactic coordinates as astropy makes it, which takes half a second to
 import.
 """
-
-
-class Wcs(Protocol):
-    """What is asked of world coordinates: those of `astropy.wcs.WCS` and of
-    `core.numerics.tangent.TangentWcs`.
-    """
-
-    @property
-    def naxis(self) -> int:
-        """Number of axes."""
-
-    @property
-    def has_distortion(self) -> bool:
-        """Whether it is more than a projection."""
-
-    @property
-    def wcs(self) -> Any:
-        """FITS's parameters: crval, crpix, ctype, lng, lat, lonpole."""
-
-    @property
-    def pixel_scale_matrix(self) -> Floats:
-        """(2, 2) deg per pixel."""
 
 
 def rotation_matrices(quaternions: Floats) -> Floats:
@@ -122,10 +103,8 @@ def frame_rotation(frame: str) -> Floats:
     return _rotation_into(frame, frame, "frame")
 
 
-def wcs_frame_rotation(wcs: Wcs) -> Floats:
+def wcs_frame_rotation(wcs: WCS) -> Floats:
     """Matrix (3, 3) from ICRS directions to directions in the frame of ``wcs``."""
-    if (frame := getattr(wcs, "frame", None)) is not None:
-        return frame_rotation(frame)
     from astropy.wcs.utils import wcs_to_celestial_frame
 
     try:
@@ -134,8 +113,8 @@ def wcs_frame_rotation(wcs: Wcs) -> Floats:
         raise InputError(
             "the WCS has no celestial frame", place="WCS", cure="set CTYPE1, CTYPE2 and RADESYS"
         ) from None
-    if frame.name == "icrs":
-        return np.eye(3)
+    if frame.name in ("icrs", "galactic"):
+        return frame_rotation(frame.name)
     return _rotation_into(frame, f"the WCS's frame {frame.name}", "WCS")
 
 
@@ -153,7 +132,7 @@ def _rotation_into(frame: Any, called: str, place: str) -> Floats:
     return matrix
 
 
-def pixel_matrix(wcs: Wcs) -> Floats:
+def pixel_matrix(wcs: WCS) -> Floats:
     """Matrix P (3, 3): an ICRS direction d has the 0-based pixel (x, y) = ((P d)_0, (P d)_1) / (P
     d)_2.
 
@@ -174,6 +153,34 @@ def pixel_matrix(wcs: Wcs) -> Floats:
         )
     wcs.wcs.set()
     return central(wcs) @ wcs_frame_rotation(wcs)
+
+
+def tangent_wcs(
+    frame: str,
+    crval: tuple[float, float],
+    crpix: tuple[float, float],
+    cdelt: tuple[float, float],
+) -> WCS:
+    """World coordinates of a TAN image in ``icrs`` or ``galactic`` coordinates, parameters as in a
+    FITS header [deg].
+    """
+    from astropy.wcs import WCS
+
+    wcs = WCS(naxis=2)
+    axes = ("GLON-TAN", "GLAT-TAN") if frame == "galactic" else ("RA---TAN", "DEC--TAN")
+    wcs.wcs.ctype, wcs.wcs.cunit = axes, ("deg", "deg")
+    wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = crval, crpix, cdelt
+    if frame == "icrs":
+        wcs.wcs.radesys = "ICRS"
+    wcs.wcs.lonpole = 180.0
+    wcs.wcs.set()
+    return wcs
+
+
+def tangent_coordinates(wcs: WCS, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Longitudes in [0, 360) and latitudes [deg] of 0-based pixels of a TAN image, in its frame."""
+    a, b, c = np.tensordot(np.linalg.inv(central(wcs)), np.stack([x, y, np.ones_like(x)]), 1)
+    return np.degrees(np.arctan2(b, a)) % 360.0, np.degrees(np.arctan2(c, np.hypot(a, b)))
 
 
 LOOKED_AT = 256, 37
@@ -207,7 +214,7 @@ def share_outside(
     return beyond / looked if looked else 0.0
 
 
-def central(wcs: Wcs) -> Floats:
+def central(wcs: WCS) -> Floats:
     """`pixel_matrix` for directions in the frame of ``wcs`` itself."""
     lng, lat = wcs.wcs.lng, wcs.wcs.lat
     lon0, lat0 = np.radians([wcs.wcs.crval[lng], wcs.wcs.crval[lat]])
@@ -223,7 +230,7 @@ def central(wcs: Wcs) -> Floats:
     return np.vstack([pixel, centre])
 
 
-def homographies(quaternions: Floats, wcs: Wcs) -> Floats:
+def homographies(quaternions: Floats, wcs: WCS) -> Floats:
     """Equation (1): coefficients h (n, 9) float64 for boresight quaternions (n, 4) in ICRS and a
     TAN image.
 

@@ -1,4 +1,4 @@
-"""FITS files from elsewhere: opened for reading, and as long as their headers promise."""
+"""FITS files: headers and images to be written, files from elsewhere opened for reading."""
 
 from __future__ import annotations
 
@@ -8,133 +8,181 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 from typing import IO, Any
+
+import numpy as np
+from astropy.io import fits
+from astropy.utils.exceptions import AstropyWarning
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from . import packed
 from .files import check_memory, reading
 
-COMPRESSED = (".gz", ".bz2", ".xz", ".z", ".zip")
-"""Suffixes of files whose length says nothing about what is in them."""
-
 FIELDS_MAX = 999
 """Axes of an array, and columns of a table, that FITS 4.0 allows (4.4.1, 7.3.1); astropy loops over
-what is claimed.
+every claimed one.
 """
 HEADER_MAX = 10_000_000
 """Bytes of one header: 125 000 cards."""
+BLOCK, CARD = 2880, 80
+COMMENTARY = {"", "COMMENT", "HISTORY"}
+"""Keys of cards without a value."""
+PIECE = 1 << 20
+"""Bytes of an image that are converted at a time."""
+
+# --------------------------------------------------------------------------------------------------
+# writing
+
+
+def card(key: str, value: Any, comment: str = "") -> fits.Card:
+    """A card with all digits of a number; astropy cuts it after 20 letters.
+
+    Raises ValueError for NaN, infinity and text outside printable ASCII.
+    """
+    digits = repr(float(value)) if isinstance(value, float) and math.isfinite(value) else ""
+    text = f"{key:8}= {digits.upper()}" + (f" / {comment}" if comment else "")
+    if len(digits) > 20:
+        return fits.Card.fromstring(text[:CARD])
+    room = CARD - 3 - max(30, len(str(fits.Card(key, value)).rstrip()))
+    return fits.Card(key, value, comment[:room] if room > 0 else comment)
+
+
+def header_of(cards: Iterable[tuple[Any, ...]] = (), history: Iterable[str] = ()) -> fits.Header:
+    """A header of (key, value) and (key, value, comment), and lines of HISTORY."""
+    made = fits.Header([card(*one) for one in cards])
+    for line in history:
+        made.add_history(line or " ")
+    return made
+
+
+def joined(*headers: fits.Header) -> fits.Header:
+    """All cards of some headers; the last of each key holds."""
+    made = fits.Header()
+    for header in headers:
+        for key in set(header.keys()) - COMMENTARY:
+            made.remove(key, ignore_missing=True)
+        made.extend(header.copy(), unique=False)
+    return made
+
+
+def write_image(
+    file: IO[bytes], header: fits.Header, values: NDArray[Any], dtype: Any = None
+) -> None:
+    """Append an image to an open file: the primary one, or an extension.
+
+    ``values`` (ny, nx), or with more axes, are converted piece by piece to ``dtype`` (default:
+    their own).
+    """
+    kind = np.dtype(values.dtype if dtype is None else dtype).newbyteorder(">")
+    form = np.broadcast_to(np.zeros((), kind), values.shape)
+    image = (fits.ImageHDU if file.tell() else fits.PrimaryHDU)(form, header)
+    if not file.tell():
+        image.header.set("EXTEND", True, after=f"NAXIS{values.ndim}")
+    file.write(image.header.tostring().encode("ascii"))
+    rows = max(1, PIECE // max(1, kind.itemsize * math.prod(values.shape[1:])))
+    for k in range(0, values.shape[0], rows):
+        file.write(values[k : k + rows].astype(kind).tobytes())
+    file.write(bytes(-values.size * kind.itemsize % BLOCK))
+
+
+def table_bytes(table: fits.BinTableHDU) -> bytes:
+    """A table as it stands in a file behind the primary header."""
+    stream = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(stream)
+    return stream.getvalue()[BLOCK:]
+
+
+# --------------------------------------------------------------------------------------------------
+# reading
 
 
 @contextlib.contextmanager
 def opened(
     path: str | os.PathLike[str], place: str, cure: str, kind: str = "FITS"
 ) -> Iterator[Any]:
-    """An `astropy.io.fits.HDUList` to read from; whatever goes wrong in the body is an `InputError`
-    about ``place``.
+    """An `astropy.io.fits.HDUList` to read from; each failure of the body is an `InputError` about
+    ``place``.
+
+    A compressed file is unpacked into memory, up to `packed.UNPACKED_MAX`. Headers that would keep
+    astropy busy without end are refused.
     """
-    with reading(place, kind, cure):
-        from astropy.io import fits
-        from astropy.utils.exceptions import AstropyWarning
+    with reading(place, kind, cure), warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyWarning)
+        content = None
+        if packed.is_packed(path):
+            content = packed.unpacked(path, place, packed.UNPACKED_MAX)
+        with io.BytesIO(content) if content is not None else open(path, "rb") as file:
+            while (size := _next_header(file, place)) is not None:
+                file.seek(-(-size // BLOCK) * BLOCK, os.SEEK_CUR)
+        source = path if content is None else io.BytesIO(content)
+        with fits.open(source, memmap=False, ignore_missing_simple=False) as hdus:
+            yield hdus
 
-        source = _survey(path, place)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AstropyWarning)
-            with fits.open(source, memmap=False, ignore_missing_simple=False) as hdus:
-                yield hdus
 
-
-def check_size(path: str | os.PathLike[str], hdu: Any, place: str, *, whole: bool = True) -> None:
-    """Before data are read: OSError where the file ends before them, `InputError` where, read
-    ``whole``, they need more memory than is free."""
+def check_size(hdu: Any, place: str, *, whole: bool = True) -> None:
+    """Before data are read: OSError if the file ends before them, `InputError` if, read ``whole``,
+    they need more memory than is free."""
     size = _data_bytes(hdu.header)
     tiled = hdu.header.get("ZIMAGE") or type(hdu).__name__ == "CompImageHDU"
     if tiled and size > packed.UNPACKED_MAX:
-        raise packed.too_large(size, packed.UNPACKED_MAX, place, least=False)
+        most = f"reading stops at {packed.UNPACKED_MAX / 1e9:.4g} GB"
+        raise packed.too_large(f"unpacks to {size / 1e9:.4g} GB; {most}", place)
     if whole:
         check_memory(size, "the array or table", place)
     info = hdu.fileinfo()
-    if info is None or tiled or Path(path).suffix.lower() in COMPRESSED:
+    if info is None or tiled:
         return
-    needed, found = info["datLoc"] + size, os.path.getsize(path)
+    needed, found = info["datLoc"] + size, info["file"].size
     if found < needed:
         raise OSError(
             f"the file is truncated: {found} bytes, its header promises at least {needed}"
         )
 
 
-def _survey(path: str | os.PathLike[str], place: str) -> Any:
-    """What astropy may open: the path, or what was in an xz file or a zip archive (astropy would
-    unpack it to a temporary file).
-
-    Refused are headers that would keep a reader busy without end, and compressed files whose
-    headers lead beyond `packed.UNPACKED_MAX` (`InputError`); what else is wrong is left to astropy.
-    """
-    content, compressed = packed.stream(path, place)
-    with content as file:
-        while size := _next_header(file, place):
-            end = file.tell() - (-size // 2880) * 2880 - 2880
-            if compressed and end > packed.UNPACKED_MAX:
-                raise packed.too_large(end, packed.UNPACKED_MAX, place, least=True)
-            file.seek(end)
-        if type(file).__name__ == "LZMAFile":  # astropy 6 does not know xz
-            file.seek(0)
-            return io.BytesIO(file.read(packed.UNPACKED_MAX))
-        return io.BytesIO(file.getvalue()) if isinstance(file, io.BytesIO) else path
-
-
 _END = re.compile(rb"END( {0,76}[^A-Z0-9_-]|$)")
-"""What astropy takes for the end of a header."""
+"""The end of a header, as astropy recognizes it."""
 _NUMBER = re.compile(rb"(NAXIS\d{0,3}|TFIELDS|BITPIX|PCOUNT|GCOUNT) *= *(-?\d+)")
 
 
-def _next_header(file: IO[bytes], place: str) -> int:
-    """Read one header; 2880 bytes more than the data behind it, 0 at the end of the file."""
+def _next_header(file: IO[bytes], place: str) -> int | None:
+    """Read one header; the bytes of the data behind it, None at the end of the file."""
     found: dict[bytes, int] = {}
-    for _ in range(0, HEADER_MAX, 2880):
-        block = file.read(2880)
-        for card in (block[k : k + 80] for k in range(0, len(block), 80)):
-            if match := _NUMBER.match(card):
+    for _ in range(0, HEADER_MAX, BLOCK):
+        block = file.read(BLOCK)
+        for line in (block[k : k + CARD] for k in range(0, len(block), CARD)):
+            if match := _NUMBER.match(line):
                 key, value = match[1], int(match[2][:20])
                 found.setdefault(key, value)
                 if key in (b"NAXIS", b"TFIELDS") and value > FIELDS_MAX:
-                    message = (
-                        f"{key.decode()} = {value}, more than the {FIELDS_MAX} that FITS allows"
+                    raise _corrupt(
+                        f"{key.decode()} = {value}, more than the {FIELDS_MAX} that FITS allows",
+                        place,
                     )
-                    raise InputError(
-                        message, place=place, cure="the file is corrupt: copy or make it again"
-                    )
-            if _END.match(card):
-                size = math.prod(
-                    found.get(b"NAXIS%d" % k, 0) for k in range(1, found.get(b"NAXIS", 0) + 1)
-                )
-                size = size if found.get(b"NAXIS", 0) > 0 else 0
-                size = (
-                    abs(found.get(b"BITPIX", 8))
-                    // 8
-                    * found.get(b"GCOUNT", 1)
-                    * (size + found.get(b"PCOUNT", 0))
-                )
+            if _END.match(line):
+                axes = range(1, found.get(b"NAXIS", 0) + 1)
+                size = math.prod(found.get(b"NAXIS%d" % k, 0) for k in axes) if axes else 0
+                each = abs(found.get(b"BITPIX", 8)) // 8 * found.get(b"GCOUNT", 1)
+                size = each * (size + found.get(b"PCOUNT", 0))
                 if size < 0:  # astropy would go back in the file and never come to its end
-                    message = "a header claims data of a negative length (NAXISn, PCOUNT, GCOUNT)"
-                    raise InputError(
-                        message, place=place, cure="the file is corrupt: copy or make it again"
+                    raise _corrupt(
+                        "a header claims data of a negative length (NAXISn, PCOUNT, GCOUNT)", place
                     )
-                return 2880 + size if size < 2**62 else 0
-        if len(block) < 2880:
-            return 0
-    raise InputError(
-        f"a header is longer than {HEADER_MAX / 1e6:g} MB",
-        place=place,
-        cure="the file is corrupt: copy or make it again",
-    )
+                return size if size < 2**62 else None
+        if len(block) < BLOCK:
+            return None
+    raise _corrupt(f"a header is longer than {HEADER_MAX / 1e6:g} MB", place)
+
+
+def _corrupt(message: str, place: str) -> InputError:
+    return InputError(message, place=place, cure="the file is corrupt: copy or make it again")
 
 
 def _data_bytes(header: Any) -> int:
     size = abs(int(header.get("BITPIX", 8))) // 8
     for k in range(1, int(header.get("NAXIS", 0)) + 1):
         size *= int(header.get(f"NAXIS{k}", 0))
-    if size < 0 or int(header.get("NAXIS", 0)) > 999:
+    if size < 0 or int(header.get("NAXIS", 0)) > FIELDS_MAX:
         raise ValueError("the axes have impossible lengths")
     return size

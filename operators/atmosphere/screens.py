@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.output import Output, Progress
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path, product_path
-from zonda.core.storage.fits_image import Cards, image_pieces
+from zonda.core.storage.fits_files import header_of, write_image
 from zonda.core.types import Floats
 
 from .drawing import drifting_layers, height_of_vapour
@@ -208,40 +208,33 @@ def write(found: Screens, stem: Path) -> list[Path]:
     with atomic_path(images) as temporary, open(temporary, "wb") as file:
         step = math.degrees(found.side) / (found.pwv.shape[1] - 1)
         middle = (found.pwv.shape[1] + 1) / 2
-        cards = Cards(
-            [
-                ("EXTNAME", "PWV", "fluctuation along the line of sight"),
-                ("BUNIT", "m"),
-                ("CTYPE1", "XI"),
-                ("CTYPE2", "ETA"),
-            ]
-        )
-        cards = cards.add(Cards((f"CRPIX{k}", middle) for k in (1, 2))).add(
-            Cards((f"CDELT{k}", step) for k in (1, 2))
-        )
+        cards: list[tuple[Any, ...]] = [
+            ("EXTNAME", "PWV", "fluctuation along the line of sight"),
+            ("BUNIT", "m"),
+            ("CTYPE1", "XI"),
+            ("CTYPE2", "ETA"),
+            *((f"CRPIX{k}", middle) for k in (1, 2)),
+            *((f"CDELT{k}", step) for k in (1, 2)),
+        ]
         for k, second in enumerate(found.seconds):
-            cards[f"TIME{k + 1}"] = float(second), "[s] since the start of the scan"
-        for piece in image_pieces(cards, found.pwv, dtype=np.float64):
-            file.write(piece)
+            cards.append((f"TIME{k + 1}", float(second), "[s] since the start of the scan"))
+        write_image(file, header_of(cards), found.pwv, np.float64)
         for k, layer in enumerate(found.layers):
-            cards = Cards(
-                [
-                    ("EXTNAME", f"LAYER{k}"),
-                    ("BUNIT", "m"),
-                    ("HEIGHT", layer.height, "[m]"),
-                    ("TIME", found.moment, "[s]"),
-                ]
-            )
+            cards = [
+                ("EXTNAME", f"LAYER{k}"),
+                ("BUNIT", "m"),
+                ("HEIGHT", layer.height, "[m]"),
+                ("TIME", found.moment, "[s]"),
+            ]
             for axis, (name, n) in enumerate(
                 zip(("ACROSS", "ALONG"), layer.values.shape[::-1], strict=True), 1
             ):
-                cards[f"CTYPE{axis}"], cards[f"CDELT{axis}"] = (
-                    (name, "the wind"),
-                    (layer.spacing, "[m]"),
-                )
-                cards[f"CRPIX{axis}"] = (n + 1) / 2
-            for piece in image_pieces(cards, layer.values, extension=True, dtype=np.float64):
-                file.write(piece)
+                cards += [
+                    (f"CTYPE{axis}", name, "the wind"),
+                    (f"CDELT{axis}", layer.spacing, "[m]"),
+                    (f"CRPIX{axis}", (n + 1) / 2),
+                ]
+            write_image(file, header_of(cards), layer.values, np.float64)
     rows = found.layers
     columns = [
         Column("height", [r.height for r in rows], "m", "above the telescope"),

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.maps.header import with_known_frame
-from zonda.core.numerics import tangent
 from zonda.core.numerics.projection import pixel_matrix, ray_coefficients
 from zonda.core.observation import Observation
 from zonda.core.storage.files import reading
@@ -88,7 +87,7 @@ def _read(path: Path, changed: int) -> MaskImage:
         hdu = next((h for h in hdus if h.is_image and len(h.shape) == 2), None)
         if hdu is None:
             raise InputError("has no two-dimensional image", place=place, cure=CURE)
-        check_size(path, hdu, place)
+        check_size(hdu, place)
         values, header = np.array(hdu.data), hdu.header.copy()
     if np.isnan(values).any():
         raise InputError(
@@ -104,15 +103,8 @@ def _read(path: Path, changed: int) -> MaskImage:
         )
     header, _ = with_known_frame(header, place)
     try:
-        return MaskImage(
-            values != 0, pixel_matrix(tangent.plain(header) or _astropy(header, place))
-        )
+        with reading(place, "a FITS image with world coordinates", CURE):
+            wcs = WCS(header, naxis=2)
+        return MaskImage(values != 0, pixel_matrix(wcs))
     except InputError as err:
         raise InputError(err.message, place=place, cure=err.cure or CURE) from None
-
-
-def _astropy(header: Any, place: str) -> Any:
-    from astropy.wcs import WCS
-
-    with reading(place, "a FITS image with world coordinates", CURE):
-        return WCS(header, naxis=2)

@@ -17,8 +17,9 @@ from zonda.core.errors import InputError
 from zonda.core.flags import PROCESSING, TRIMMED_INTERVALS, of_before
 from zonda.core.intervals import Intervals, runs
 from zonda.core.maps.map_file import ascii_text
+from zonda.core.storage import packed
 from zonda.core.storage.files import writing
-from zonda.core.storage.fits_files import COMPRESSED, check_size, opened
+from zonda.core.storage.fits_files import check_size, opened, table_bytes
 from zonda.core.stream_names import UNITS
 from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
@@ -114,7 +115,7 @@ class Writer:
                     _provenance_table,
                     _intervals_table,
                 ):
-                    self._file.write(_bytes_of(table(self._tod)))
+                    self._file.write(table_bytes(table(self._tod)))
             finally:
                 self._file.close()
 
@@ -226,16 +227,6 @@ def _provenance_table(tod: TimeOrderedData) -> Any:
     return fits.BinTableHDU.from_columns(columns, name="PROVENANCE")
 
 
-def _bytes_of(table: Any) -> bytes:
-    import io
-
-    from astropy.io import fits
-
-    stream = io.BytesIO()
-    fits.HDUList([fits.PrimaryHDU(), table]).writeto(stream)
-    return stream.getvalue()[2880:]  # without the primary header, which the file has already
-
-
 class Reader:
     """An open file, as `toast_reading.Reader`; streams are read from their bytes.
 
@@ -249,7 +240,7 @@ class Reader:
         self.place = f"time-ordered data {path}"
         with opened(path, self.place, CURE) as file:
             for hdu in file:
-                check_size(path, hdu, self.place, whole=hdu.name != "TOD")
+                check_size(hdu, self.place, whole=hdu.name != "TOD")
             missing = [name for name in TABLES if name not in file]
             if missing:
                 raise InputError(f"has no table {missing[0]}", place=self.place, cure=CURE)
@@ -274,7 +265,7 @@ class Reader:
                     np.dtype(kind),
                 )
         self._row, self._lock = row, threading.Lock()
-        if Path(path).suffix.lower() in COMPRESSED:
+        if packed.is_packed(path):
             raise InputError(
                 "is compressed: its streams cannot be read in parts",
                 place=self.place,
@@ -324,7 +315,7 @@ def read(path: str | os.PathLike[str]) -> TimeOrderedData:
     place = f"time-ordered data {path}"
     with opened(path, place, CURE) as file:
         for hdu in file:
-            check_size(path, hdu, place)
+            check_size(hdu, place)
         tod = _read(file)
         table = file["TOD"]
         shape = tod.n_detectors, tod.n_samples

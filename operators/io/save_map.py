@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from astropy.io.fits import Header
 from pydantic import Field
 
 from zonda.core.configuration.units import Angle
@@ -23,7 +24,7 @@ from zonda.core.maps.noise_figures import (
 from zonda.core.maps.planes import Plane
 from zonda.core.output import Output, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, product_path
-from zonda.core.storage.fits_image import Cards
+from zonda.core.storage.fits_files import header_of
 
 MEANINGS = {
     "half_difference": "noise from the difference of two halves",
@@ -104,15 +105,16 @@ class SaveMap(Output):
         data.products["map_file"] = [file.result() for file in written]
 
 
-def noise_cards(figures: list[NoiseFigure]) -> Cards:
+def noise_cards(figures: list[NoiseFigure]) -> Header:
     """Header cards of a noise map: weighted rms about zero in the central circle; undefined where
     no pixel is there.
     """
-    cards = Cards()
+    cards: list[tuple[Any, ...]] = []
     for figure in figures:
         keyword = {"half_difference": "RMSHALF", "source_free": "RMSFREE"}[figure.of]
         where = f"central {np.degrees(figure.diameter) * 60:.3g} arcmin"
-        cards[keyword] = (figure.rms if np.isfinite(figure.rms) else None, f"[K] rms, {where}")
+        rms = figure.rms if np.isfinite(figure.rms) else None
+        cards.append((keyword, rms, f"[K] rms, {where}"))
         if np.isfinite(figure.smoothed):
-            cards[f"{keyword}B"] = (figure.smoothed, "[K] the same smoothed with the beam")
-    return cards
+            cards.append((f"{keyword}B", figure.smoothed, "[K] the same smoothed with the beam"))
+    return header_of(cards)

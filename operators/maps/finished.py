@@ -120,7 +120,7 @@ def map_of(
         "sample_rate": min(sums.rates) if len(sums.rates) == 1 else 0.0,
     }
     if not isinstance(grid, HealpixGrid):
-        header = grid.wcs.to_header(relax=True)
+        header = grid.header
         return MapProduct(
             planes[0], planes[1], planes[2], planes[3], header=header, pixel=grid.pixel, **common
         )

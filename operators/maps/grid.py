@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from zonda.core.compilation.jit import nb
 from zonda.core.errors import InputError
+from zonda.core.maps.header import exact_header
+from zonda.core.numerics import projection
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import (
     boresights,
@@ -23,7 +25,6 @@ from zonda.core.numerics.projection import (
     homographies,
     pixel_matrix,
 )
-from zonda.core.numerics.tangent import TangentWcs
 from zonda.core.types import Floats
 
 from .healpix import Lookup, healpix_pixels, lookup
@@ -31,6 +32,9 @@ from .image_grid import ImageGrid, rays
 from .plate_carree import PlateCarreeGrid
 
 if TYPE_CHECKING:
+    from astropy.io.fits import Header
+    from astropy.wcs import WCS
+
     from zonda.core.data import Observation
 
 MOST_PIXELS = 1 << 28
@@ -43,11 +47,16 @@ class TangentGrid(ImageGrid):
     """
 
     @property
-    def wcs(self) -> TangentWcs:
+    def wcs(self) -> WCS:
         """World coordinates whose reference point is the middle of the image, for odd and even
         sizes alike.
         """
         return tangent_wcs(self.origin, self.pixel, self.shape, self.frame)
+
+    @property
+    def header(self) -> Header:
+        """The FITS keywords of `wcs`."""
+        return exact_header(self.wcs)
 
     def pointing(self, observation: Observation) -> Floats:
         """Homographies (9, n_samp), see `core.numerics.projection`."""
@@ -110,15 +119,15 @@ Grid = TangentGrid | PlateCarreeGrid | HealpixGrid
 
 def tangent_wcs(
     centre: tuple[float, float], pixel: float, shape: tuple[int, int], frame: str = "icrs"
-) -> TangentWcs:
+) -> WCS:
     """World coordinates of a TAN image: (ny, nx) pixels of side ``pixel`` [rad] around ``centre``
     [rad, in ``frame``].
     """
     if frame not in ("icrs", "galactic"):
         raise InputError(f"unknown frame {frame!r}", place="map grid", cure="use icrs or galactic")
     step = math.degrees(pixel)
-    return TangentWcs(
-        frame=frame,
+    return projection.tangent_wcs(
+        frame,
         crval=(math.degrees(centre[0]) % 360.0, math.degrees(centre[1])),
         crpix=((shape[1] + 1) / 2, (shape[0] + 1) / 2),
         cdelt=(-step, step),

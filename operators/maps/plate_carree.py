@@ -29,6 +29,8 @@ from zonda.core.types import Floats
 from .image_grid import ImageGrid, rays
 
 if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
     from zonda.core.data import Observation
 
     from .parameters import MapParameters
@@ -64,6 +66,11 @@ class PlateCarreeGrid(ImageGrid):
             wcs.wcs.radesys = "ICRS"
         wcs.wcs.set()
         return wcs
+
+    @property
+    def header(self) -> Header:
+        """The FITS keywords of `wcs`, with 14 digits."""
+        return self.wcs.to_header(relax=True)
 
     def pointing(self, observation: Observation) -> Floats:
         """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame."""

@@ -209,7 +209,7 @@ def _common(
         "sample_rate": min(sums.rates) if len(sums.rates) == 1 else 0.0,
     }
     if not isinstance(grid, HealpixGrid):
-        return found | {"header": grid.wcs.to_header(relax=True), "pixel": grid.pixel}
+        return found | {"header": grid.header, "pixel": grid.pixel}
     side = math.sqrt(4 * math.pi / (12 * grid.nside**2))
     pixels = grid.pixels_covered[keep]
     return found | {

@@ -227,7 +227,7 @@ def _fits(path: Path, place: str) -> RecordedTable:
 
     with fits_files.opened(path, place, CURE) as file:
         for table in file:
-            fits_files.check_size(path, table, place)
+            fits_files.check_size(table, place)
             names = (
                 {name.lower() for name in getattr(table.columns, "names", [])}
                 if isinstance(table, fits.BinTableHDU)

@@ -16,14 +16,17 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from astropy.io import fits
+from astropy.io.fits import Header
 from numpy.typing import NDArray
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import core_schema
 
 from zonda.core.configuration.values import mistake
 from zonda.core.errors import InputError
+from zonda.core.maps.header import exact_header
 from zonda.core.maps.units import parse_unit
-from zonda.core.storage.fits_image import Cards
+from zonda.core.storage.fits_files import joined
 
 from .healpix import is_healpix
 
@@ -51,7 +54,7 @@ _STRUCTURE = frozenset(
 )
 """Keys that say how an array lies in a file, or nothing about the map."""
 
-STOKES = Cards([("CTYPE3", "STOKES"), ("CRPIX3", 1.0), ("CRVAL3", 1.0), ("CDELT3", 1.0)])
+STOKES = (("CTYPE3", "STOKES"), ("CRPIX3", 1.0), ("CRVAL3", 1.0), ("CDELT3", 1.0))
 """Three images without a header are I, Q and U."""
 
 _TYPES = [np.dtype(kind) for kind in ("u1", "i2", "i4", "i8", "f4", "f8")]
@@ -77,7 +80,7 @@ class ArrayMap:
     NOUN: ClassVar[str] = "an array"
 
     values: NDArray[Any]
-    header: Cards
+    header: Header
     table: Any = None
     given: str = ""
 
@@ -96,11 +99,11 @@ class ArrayMap:
             )
         if hasattr(value, "header") and hasattr(value, "data"):
             return cls._of_hdu(value)
-        header = Cards()
+        cards: list[tuple[str, Any]] = []
         if hasattr(value, "unit") and hasattr(value, "value"):
             value, unit = _in_known_unit(value)
             if unit:
-                header["BUNIT"] = unit
+                cards.append(("BUNIT", unit))
         if isinstance(value, np.ma.MaskedArray):
             value = np.ma.filled(value.astype(np.float64), np.nan)
         values = np.array(value)  # a copy: what becomes of the user's array does not matter
@@ -117,8 +120,8 @@ class ArrayMap:
         if values.ndim < 2 or not values.size:
             raise mistake(f"expected an image (ny, nx), got an array of shape {values.shape}")
         if values.ndim == 3 and len(values) == 3:
-            header.add(STOKES)
-        return cls._image(values, header)
+            cards += STOKES
+        return cls._image(values, Header(cards))
 
     @classmethod
     def _of_hdu(cls, hdu: Any) -> ArrayMap:
@@ -134,7 +137,7 @@ class ArrayMap:
         return cls._image(values, _cards(hdu.header))
 
     @classmethod
-    def _image(cls, values: NDArray[Any], header: Cards) -> ArrayMap:
+    def _image(cls, values: NDArray[Any], header: Header) -> ArrayMap:
         if values.dtype.newbyteorder("=") not in _TYPES:
             values = values.astype(np.float64)  # types that FITS does not know
         values = np.ascontiguousarray(values, values.dtype.newbyteorder("="))
@@ -164,11 +167,10 @@ class ArrayMap:
     def nbytes(self) -> int:
         return self.values.nbytes
 
-    def with_wcs(self, header: Cards) -> ArrayMap:
+    def with_wcs(self, wcs: WorldCoordinates) -> ArrayMap:
         """The image with these world coordinates."""
-        return ArrayMap(
-            self.values, self.header.copy().add(header), self.table, self.given or self.digest
-        )
+        header = joined(self.header, Header(wcs.items()))
+        return ArrayMap(self.values, header, self.table, self.given or self.digest)
 
     @property
     def text(self) -> str:
@@ -192,12 +194,8 @@ class ArrayMap:
 
         The key `GIVEN` says what it was.
         """
-        from astropy.io import fits
-
         made = (
-            fits.PrimaryHDU(self.values, fits.Header(dict(self.header.items())))
-            if self.table is None
-            else self.table.copy()
+            fits.PrimaryHDU(self.values, self.header) if self.table is None else self.table.copy()
         )
         made.header[GIVEN] = self.text
         made.writeto(path, overwrite=True)
@@ -227,27 +225,28 @@ class ArrayMap:
         return {"type": "null"}
 
 
-class WorldCoordinates(Cards):
+class WorldCoordinates(dict[str, Any]):
     """The FITS keywords of an astropy `WCS`, a header or a mapping."""
 
     NOUN: ClassVar[str] = "an astropy WCS"
 
-    @classmethod
-    def parse(cls, value: Any) -> WorldCoordinates:
-        """Raises what `mistake` makes where it is none of these."""
-        if isinstance(value, cls):
-            return value
-        made = cls()
-        if hasattr(value, "to_header") and hasattr(value, "wcs"):
-            shape = getattr(value, "pixel_shape", None)
-            value, made.shape = _exact(value), None if shape is None else tuple(reversed(shape))
-        elif not isinstance(value, Mapping) and not hasattr(value, "cards"):
-            raise mistake(f"expected an astropy WCS or FITS keywords, got {value!r:.60}")
-        made.add(_cards(value))
-        return made
-
     shape: tuple[int, ...] | None = None
     """(ny, nx) of the image that they are made for; None: not known."""
+
+    @classmethod
+    def parse(cls, value: Any) -> WorldCoordinates:
+        """Raises the error of `mistake` for anything else."""
+        if isinstance(value, cls):
+            return value
+        shape = None
+        if hasattr(value, "to_header") and hasattr(value, "wcs"):
+            shape = getattr(value, "pixel_shape", None)
+            value, shape = exact_header(value), None if shape is None else tuple(reversed(shape))
+        elif not isinstance(value, Mapping) and not hasattr(value, "cards"):
+            raise mistake(f"expected an astropy WCS or FITS keywords, got {value!r:.60}")
+        made = cls(_cards(value))
+        made.shape = shape
+        return made
 
     @classmethod
     def __get_pydantic_core_schema__(
@@ -297,11 +296,9 @@ def checked_unit(array: ArrayMap, given: str | None) -> None:
         )
 
 
-def _cards(header: Any) -> Cards:
-    """A header without what says how the numbers lie in a file. Values that FITS cannot hold are
-    left out by FITS itself.
-    """
-    made = Cards()
+def _cards(header: Any) -> Header:
+    """A header without the keys that say how the numbers lie in a file."""
+    made: dict[str, Any] = {}
     for key in dict.fromkeys(header):
         if (
             not key
@@ -316,24 +313,7 @@ def _cards(header: Any) -> Cards:
             if not isinstance(value, str) and not math.isfinite(value):
                 continue
             made[key.upper()] = value.item() if isinstance(value, np.generic) else value
-    return made
-
-
-def _exact(wcs: Any) -> dict[str, Any]:
-    """The header of a WCS with all digits: `to_header` writes 14."""
-    header = dict(wcs.to_header(relax=True))
-    numbers = wcs.wcs
-    for i in range(numbers.naxis):
-        exact = {"CRPIX": numbers.crpix, "CRVAL": numbers.crval, "CDELT": numbers.get_cdelt()}
-        header |= {
-            f"{key}{i + 1}": float(values[i])
-            for key, values in exact.items()
-            if f"{key}{i + 1}" in header
-        }
-        for j in range(numbers.naxis):
-            if f"PC{i + 1}_{j + 1}" in header:
-                header[f"PC{i + 1}_{j + 1}"] = float(numbers.get_pc()[i, j])
-    return header
+    return Header(made.items())
 
 
 def _in_known_unit(quantity: Any) -> tuple[NDArray[Any], str]:

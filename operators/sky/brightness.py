@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.maps.header import exact_header
 from zonda.core.maps.image import Image
 from zonda.core.numerics.projection import pixel_matrix
 from zonda.core.numerics.radiation import to_kelvin_rj
@@ -143,7 +144,7 @@ class Brightness:
         """For pictures and comparisons; NaN where nothing is known. ``label``: the operator's;
         ``axis``: the grid's.
         """
-        header = self.wcs.to_header(relax=True)
+        header = exact_header(self.wcs)
         header["BUNIT"], header["TEMPSCAL"], header["OPERATOR"] = "K", "K_RJ", label
         if self.resolution:
             header["BMAJ"] = header["BMIN"] = float(np.degrees(self.resolution))

@@ -16,7 +16,6 @@ from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
 from zonda.core.numerics.sphere import angle_between, angles, unit_vectors
 from zonda.core.storage.files import reading
 from zonda.core.storage.fits_files import opened
-from zonda.core.storage.fits_image import read_image
 from zonda.core.types import Floats
 
 from .geometry import geometry, is_plain_tan, placed, turned
@@ -127,9 +126,6 @@ def header_of(
     """Header and (ny, nx) of a file's first image, or of the extension ``wanted``; None: a HEALPix
     table.
     """
-    plain = read_image(path) if wanted in (None, 0) else None
-    if plain is not None and plain[1].ndim == 2:
-        return plain[0], (plain[1].shape[0], plain[1].shape[1])
     with opened(
         path, place, "check the file, e.g. with fitsinfo or fitsverify, or copy it again"
     ) as hdus:

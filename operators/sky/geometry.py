@@ -10,10 +10,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
 from zonda.core.maps.header import number, text, with_known_frame
-from zonda.core.numerics import tangent
 from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.numerics.sphere import angles, local_axes
 from zonda.core.storage.files import first_line
@@ -126,12 +126,8 @@ def _with_frame(header: Any, place: str) -> tuple[Any, str]:
 def _wcs(header: Any, place: str) -> tuple[Any, Floats]:
     """The WCS of a header and its pixel scale matrix (2, 2) [deg]."""
     try:
-        wcs = tangent.plain(header)
-        if wcs is None:
-            from astropy.wcs import WCS
-
-            wcs = WCS(header, naxis=2)
-            wcs.wcs.set()
+        wcs = WCS(header, naxis=2)
+        wcs.wcs.set()
         matrix = np.asarray(wcs.pixel_scale_matrix)
     except Exception as err:  # wcslib has a dozen exception classes of its own
         raise InputError(
@@ -154,8 +150,6 @@ def rescaled(wcs: Any, matrix: Floats) -> Any:
     """A copy of a plain TAN ``wcs`` with the pixel scale matrix (2, 2) [deg], whether it had CD,
     PC, CDELT or CROTA.
     """
-    from astropy.wcs import WCS
-
     made = WCS(naxis=2)
     for key in ("ctype", "crval", "crpix", "radesys", "equinox", "lonpole", "latpole"):
         setattr(made.wcs, key, getattr(wcs.wcs, key))
@@ -252,8 +246,6 @@ def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
         return None
     if centre is None:
         return image.wcs
-    from astropy.wcs import WCS
-
     rows, columns = image.values.shape
     middle = np.array([(columns + 1) / 2, (rows + 1) / 2])
     wcs = WCS(naxis=2)

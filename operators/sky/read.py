@@ -14,10 +14,8 @@ import numpy as np
 from zonda.core.errors import InputError
 from zonda.core.maps.header import text
 from zonda.core.maps.stokes_names import columns_of_q_and_u
-from zonda.core.numerics import tangent
-from zonda.core.storage.files import check_memory, reading
+from zonda.core.storage.files import reading
 from zonda.core.storage.fits_files import check_size, opened
-from zonda.core.storage.fits_image import read_image
 from zonda.core.types import Floats
 
 from . import stokes
@@ -50,18 +48,9 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
     wanted = Wanted(**options)
     place = f"sky map {path}"
     cure = "check the file, e.g. with fitsinfo or fitsverify, or copy it again"
-    plain = read_image(path) if wanted.hdu in (None, 0) and not wanted.header_alone else None
-    if (
-        plain is not None and plain[1].ndim > 1 and tangent.plain(plain[0]) is not None
-    ):  # nothing that astropy need be asked
-        with reading(place, "FITS", cure):
-            check_memory(8 * plain[1].size, "the array or table", place)
-            return _told(
-                _image(place, plain[1].astype(np.float64), plain[0], wanted), plain[0].get(GIVEN)
-            )
     with opened(path, place, cure) as hdus:
         hdu, notes = chosen(hdus, wanted.hdu, place)
-        check_size(path, hdu, place, whole=not wanted.header_alone)
+        check_size(hdu, place, whole=not wanted.header_alone)
         if is_healpix(hdu):
             found: WcsMap | HealpixMap = read_healpix(hdu, place, wanted)
         else:
@@ -70,7 +59,7 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
                 notes |= stokes.of_extensions(
                     hdu.name, [other.name for other in hdus if other.is_image], place
                 )
-                q_and_u = _extensions(path, hdus, hdu, wanted, place) if wanted.polarized else None
+                q_and_u = _extensions(hdus, hdu, wanted, place) if wanted.polarized else None
             found = _image(place, _pixels(hdu, wanted), hdu.header, wanted, q_and_u)
         found.notes = notes | found.notes
         if found.polarization is not None:
@@ -101,7 +90,7 @@ def _pixels(hdu: Any, wanted: Wanted) -> Floats:
     )
 
 
-def _extensions(path: Path, hdus: Any, first: Any, wanted: Wanted, place: str) -> Floats | None:
+def _extensions(hdus: Any, first: Any, wanted: Wanted, place: str) -> Floats | None:
     """(2, ny, nx) Q and U of a file that has them as extensions beside its ``first`` image; None
     where it has none.
     """
@@ -116,7 +105,7 @@ def _extensions(path: Path, hdus: Any, first: Any, wanted: Wanted, place: str) -
             cure="give three images of one grid",
         )
     for k in found:
-        check_size(path, images[k], place, whole=not wanted.header_alone)
+        check_size(images[k], place, whole=not wanted.header_alone)
         _check_extension(images[k], first, wanted, place)
     return np.stack([np.asarray(_pixels(images[k], wanted), np.float64) for k in found])
 

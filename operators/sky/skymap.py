@@ -12,7 +12,7 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.maps.image import Image
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.product import Product
-from zonda.core.storage.fits_image import Cards
+from zonda.core.storage.fits_files import header_of
 
 from .convolved import beam_widths, brightness_on, grid_of, looked_at, warn_of_beams, with_beam
 from .inputs import HealpixMap
@@ -45,7 +45,7 @@ class InputImage(Product):
     def of(cls, arrays: Mapping[str, Any]) -> InputImage:
         """See `Product.of`."""
         polarized = {key: arrays[key] for key in POLARIZED if key in arrays}
-        return cls(Image(arrays["values"], Cards(arrays["header"].items()), **polarized))
+        return cls(Image(arrays["values"], header_of(arrays["header"].items()), **polarized))
 
 
 class SkyMap(SkyParameters):

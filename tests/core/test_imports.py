@@ -10,14 +10,7 @@ import sys
 from pathlib import Path
 
 HEAVY = {
-    "astropy",
-    "astropy.coordinates",
-    "astropy.io.fits",
-    "astropy.table",
-    "astropy.time",
-    "astropy.units",
     "astropy.visualization",
-    "astropy.wcs",
     "h5py",
     "healpy",
     "matplotlib",
@@ -68,4 +61,4 @@ def test_a_run_imports_nothing_heavy_before_its_first_block(tmp_path: Path) -> N
         assert done.returncode == 0, done.stderr
     found = set(done.stdout.split())
     assert "zonda.operators.maps.bin_map" in found
-    assert not found & HEAVY
+    assert not sorted(found & HEAVY)

@@ -16,7 +16,7 @@ with guided_by(
     "zonda.operators.sky",
     "zonda.operators.io",
     "zonda.core.numerics.projection",
-    "zonda.core.storage.fits_image",
+    "zonda.core.storage.fits_files",
     "astropy.io.fits",
 ):
     import numpy as np
@@ -24,7 +24,6 @@ with guided_by(
     from fuzz_hdf5 import tiny_scan, whole
 
     from zonda.core.errors import ZondaError
-    from zonda.core.storage.fits_image import read_image
     from zonda.operators.io import fits_table
     from zonda.operators.io.save_tod import save_tod
     from zonda.operators.sky.read import HealpixMap, read_map
@@ -44,7 +43,6 @@ def target(data: bytes) -> None:
             return
         whole(tod)
         return
-    plain_as_astropy_reads_it()
     by_header = {"header_alone": True}
     for options in (
         {},
@@ -69,18 +67,6 @@ def target(data: bytes) -> None:
         else:
             assert found.values.ndim == 2
             assert (found.wcs is None) == (found.scale is not None)
-
-
-def plain_as_astropy_reads_it() -> None:
-    """What our own reader takes for a plain image is the same for astropy: keys, values, pixels."""
-    if (found := read_image(FILE)) is not None:
-        with fits.open(FILE, memmap=False) as hdus:
-            header = {
-                k: v for k, v in hdus[0].header.items() if k not in ("", "COMMENT", "HISTORY")
-            }
-            assert list(found[0].items()) == list(header.items())
-            assert found[1].dtype == hdus[0].data.dtype
-            assert np.array_equal(found[1], hdus[0].data, equal_nan=found[1].dtype.kind == "f")
 
 
 VALUES = [

@@ -17,6 +17,7 @@ from zonda.core.maps.beams import check_width
 from zonda.core.maps.grid import healpix_grid
 from zonda.core.maps.header import marked_bad, number, text, with_known_frame
 from zonda.core.maps.image import Image
+from zonda.core.maps.map_file import ascii_text
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.measured_noise import ELSEWHERE
 from zonda.core.maps.noise_figures import FREE
@@ -32,8 +33,7 @@ from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path
-from zonda.core.storage.fits_files import check_size, opened
-from zonda.core.storage.fits_image import Cards, image_pieces
+from zonda.core.storage.fits_files import check_size, header_of, joined, opened, write_image
 from zonda.core.types import Floats
 
 from .planes import Plane
@@ -194,7 +194,7 @@ def _read(path: Path, name: str, wanted: Wanted) -> ReadMap:
     place = str(path)
     with opened(path, place, "check the file, e.g. with fitsverify, or copy it again") as hdus:
         hdu = _chosen(hdus, wanted.hdu, place)
-        check_size(path, hdu, place)
+        check_size(hdu, place)
         if not _is_healpix(hdu):
             if wanted.coordsys is not None and not wanted.shared:
                 raise InputError(
@@ -647,31 +647,25 @@ def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> 
     paths = [
         stem.with_name(stem.name + end) for end in (".fits", "_spectra.ecsv", "_profiles.ecsv")
     ]
-    world = Cards(
-        (k, v)
-        for k, v in found.header.items()
-        if k not in ("COMMENT", "HISTORY", "SIMPLE", "EXTEND", "BITPIX")
-    )
+    structure = ("COMMENT", "HISTORY", "SIMPLE", "EXTEND", "BITPIX")
+    world = header_of((k, v) for k, v in found.header.items() if k not in structure)
     with atomic_path(paths[0]) as temporary, open(temporary, "wb") as file:
         for k, (name, values) in enumerate(found.planes.items()):
-            header = world.copy()
-            header["EXTNAME"] = name.upper(), "extension name"
+            cards: list[tuple[Any, ...]] = [("EXTNAME", name.upper(), "extension name")]
             if name in ("reference", "map", "difference"):
-                header.add(_unit_cards(found.unit))
+                cards += _unit_cards(found.unit)
             if found.fwhm:
-                for key in ("BMAJ", "BMIN"):
-                    header[key] = math.degrees(found.fwhm), "[deg] FWHM"
+                cards += [(key, math.degrees(found.fwhm), "[deg] FWHM") for key in ("BMAJ", "BMIN")]
             if name in found.noise:
                 words, factor = found.noise[name]
                 if factor is not None:
-                    header["NOISEFAC"] = factor, "noise of the SNR / white noise"
-                header["NOISEOF"] = _ascii(words), "noise of the SNR"
+                    cards.append(("NOISEFAC", factor, "noise of the SNR / white noise"))
+                cards.append(("NOISEOF", ascii_text(words), "noise of the SNR"))
             if k == 0:
-                header["REFERENC"], header["COMPARED"] = (_ascii(name) for name in found.names)
-                header["ORIGIN"] = "zonda", "comparison of two maps"
-                header.history.extend(map(_ascii, found.notes))
-            for piece in image_pieces(header, values, extension=k > 0, dtype=np.float64):
-                file.write(piece)
+                names = zip(("REFERENC", "COMPARED"), map(ascii_text, found.names), strict=True)
+                cards += [*names, ("ORIGIN", "zonda", "comparison of two maps")]
+            header = header_of(cards, map(ascii_text, found.notes if k == 0 else ()))
+            write_image(file, joined(world, header), values, np.float64)
     about = {key: value for key, value in meta.items() if value not in ("", None)}
     about |= {"REFERENCE": found.names[0], "MAP": found.names[1]}
     about |= {key.upper(): value for key, value in found.figures.items() if math.isfinite(value)}
@@ -729,13 +723,9 @@ def fits_unit(unit: str) -> str:
     }.get(unit, "")
 
 
-def _unit_cards(unit: str) -> Cards:
+def _unit_cards(unit: str) -> list[tuple[str, str, str]]:
     plain = fits_unit(unit)
-    cards = Cards([("BUNIT", plain or unit, "brightness")] if unit else ())
+    cards = [("BUNIT", plain or unit, "brightness")] if unit else []
     if plain:
-        cards["TEMPSCAL"] = unit.lstrip("mun"), "temperature scale"
+        cards.append(("TEMPSCAL", unit.lstrip("mun"), "temperature scale"))
     return cards
-
-
-def _ascii(text: str) -> str:
-    return text.encode("ascii", "backslashreplace").decode()

@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
@@ -33,7 +34,6 @@ from zonda.core.maps.grid import HealpixPixels, ImagePixels, MapGrid, image_grid
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.measured_noise import ELSEWHERE, WHITE, noise_factor
 from zonda.core.maps.on_plane import on_plane
-from zonda.core.numerics import tangent
 from zonda.core.numerics.angles import FWHM_PER_SIGMA, angle_text
 from zonda.core.numerics.projection import pixel_matrix
 from zonda.core.numerics.sphere import angles, local_axes
@@ -120,12 +120,7 @@ class Plane:
 
     @property
     def wcs(self) -> Any:
-        """A `TangentWcs` or an `astropy.wcs.WCS`, of an image."""
-        found = tangent.plain(self.header)
-        if found is not None:
-            return found
-        from astropy.wcs import WCS
-
+        """The `astropy.wcs.WCS` of an image."""
         return WCS(self.header, naxis=2).celestial
 
     @property
@@ -231,11 +226,8 @@ def _by_astropy(target: Any, source: Any, shape: tuple[int, ...]) -> tuple[Float
     from astropy.wcs.utils import pixel_to_pixel
 
     y, x = np.indices(shape, np.float64)
-    whole = [
-        wcs.astropy() if isinstance(wcs, tangent.TangentWcs) else wcs for wcs in (target, source)
-    ]
     try:
-        return pixel_to_pixel(*whole, x, y)  # type: ignore[no-any-return]
+        return pixel_to_pixel(target, source, x, y)  # type: ignore[no-any-return]
     except Exception as error:
         raise InputError(
             f"the two projections cannot be compared: {error}",

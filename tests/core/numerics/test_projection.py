@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
+from astropy.wcs.utils import wcs_to_celestial_frame
 from scipy.spatial.transform import Rotation
 
 from zonda.core.errors import InputError
+from zonda.core.maps.header import exact_header
 from zonda.core.numerics.projection import (
     directions,
     frame_rotation,
@@ -16,6 +18,8 @@ from zonda.core.numerics.projection import (
     pixel_matrix,
     rotation_matrices,
     share_outside,
+    tangent_coordinates,
+    tangent_wcs,
 )
 
 
@@ -140,3 +144,25 @@ def test_share_of_the_samples_outside_an_image():
     many = [(along(0 * inside), 0 * across, across), (along(0 * inside + np.pi), one, one)]
     assert share_outside(many[:1], matrix, (100, 100)) == pytest.approx(0.25, abs=1 / 30)
     assert share_outside(many[1:], matrix, (100, 100)) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("frame", "crval", "crpix", "cdelt"),
+    [
+        ("icrs", (75.0, 20.0), (300.5, 300.5), (-1 / 3600, 1 / 3600)),
+        ("icrs", (0.001, -89.9), (1.0, 77.25), (2 / 3600, 3 / 3600)),
+        ("galactic", (359.9, -30.0), (-1e4, 20.0), (-1e-3, -2e-3)),
+    ],
+)
+def test_tangent_images_are_astropys(frame, crval, crpix, cdelt):
+    wcs = tangent_wcs(frame, crval, crpix, cdelt)
+    header = exact_header(wcs)
+    assert (header["CRVAL1"], header["CRPIX2"], header["CDELT1"]) == (crval[0], crpix[1], cdelt[0])
+    np.testing.assert_array_equal(pixel_matrix(WCS(header)), pixel_matrix(wcs))
+    assert wcs_to_celestial_frame(wcs).name == frame
+    y, x = np.indices((5, 7)) * 100.0
+    for ours, theirs in zip(
+        tangent_coordinates(wcs, x, y), wcs.wcs_pix2world(x, y, 0), strict=True
+    ):
+        # degrees; rounding of 360, beside a pole
+        assert np.abs((ours - theirs + 180) % 360 - 180).max() < 1e-10

@@ -79,7 +79,7 @@ def test_a_small_file_that_unpacks_to_much_is_refused(
     assert read_map(path).values.shape == (1200, 1200)
     monkeypatch.setattr(packed, "UNPACKED_MAX", 5_000_000)
     with pytest.raises(
-        InputError, match=r"unpacks to (at least )?0\.0057\d+ GB; reading stops at 0\.005 GB"
+        InputError, match="unpacks to more than 5 MB, where reading stops"
     ) as caught:
         read_map(path)
     assert path.name in caught.value.place
@@ -90,8 +90,7 @@ def test_a_small_file_that_unpacks_to_much_is_refused(
     )  # the limit is of compressed files
 
 
-def test_what_a_header_promises_beyond_the_limit_is_not_unpacked(tmp_path: Path) -> None:
-    """9 PB: not one byte after the header is read."""
+def test_a_header_that_promises_petabytes_is_refused(tmp_path: Path) -> None:
     header = fits.Header(
         [
             ("SIMPLE", True),
@@ -103,9 +102,7 @@ def test_what_a_header_promises_beyond_the_limit_is_not_unpacked(tmp_path: Path)
     )
     path = tmp_path / "bomb.fits.gz"
     path.write_bytes(gzip.compress(header.tostring().encode() + bytes(2880)))
-    with pytest.raises(
-        InputError, match=r"unpacks to at least 9\.025e\+06 GB; reading stops at 4 GB"
-    ):
+    with pytest.raises(InputError, match=r"needs 9\.0\de\+06 GB of memory"):
         read_map(path)
 
 

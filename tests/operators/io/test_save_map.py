@@ -221,11 +221,11 @@ def test_a_failure_in_the_middle_leaves_the_old_file(run, data, monkeypatch, err
     run(map=wcs_map(20, 20))
     before = (data.output / "map.fits").read_bytes()
 
-    def half(*_):
-        yield b"SIMPLE"
+    def half(file, *_):
+        file.write(b"SIMPLE")
         raise error
 
-    monkeypatch.setattr(map_file.MapFile, "_images", half)
+    monkeypatch.setattr(map_file, "write_image", half)
     expected = KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else OutputError
     with pytest.raises(expected):
         SaveMap().finalize(data)
