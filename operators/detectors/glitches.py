@@ -57,7 +57,7 @@ class Glitches(Operator):
 
     def prepare(self, observation: Observation) -> Arrivals:
         """All pulses of the scan."""
-        found = arrivals(self, observation)
+        found = self.arrivals(observation)
         inside = int(np.count_nonzero(found.time >= 0))
         observation.tally.count(self.label, "glitches", inside)
         return found
@@ -83,6 +83,39 @@ class Glitches(Operator):
         hit = int(np.count_nonzero(np.diff(state.first)))
         observation.tally.count(self.label, "detectors with glitches", hit, observation.n_detectors)
 
+    def arrivals(self, observation: Observation) -> Arrivals:
+        """Pulses of all detectors from `REACH` decay times before the scan to its end."""
+        begin, end = -REACH * self.decay, float(observation.seconds[-1])
+        times, sizes, count = [], [], [0]
+        for d in range(observation.n_detectors):
+            when, u = self._of_detector(observation, d, end - begin)
+            times.append(begin + when)
+            sizes.append(-self.amplitude * np.log(u))
+            count.append(len(when))
+        return Arrivals(
+            np.cumsum(count, dtype=np.int64), np.concatenate(times), np.concatenate(sizes)
+        )
+
+    def _of_detector(
+        self, observation: Observation, detector: int, span: float
+    ) -> tuple[Floats, Floats]:
+        """(arrival times within ``span``, uniform deviates of the amplitudes): waiting times are
+        exponential.
+        """
+        if self.rate == 0:
+            return np.zeros(0), np.zeros(0)
+        key, mean = observation.detector_key(self.label), self.rate * span
+        number = int(mean + 6 * math.sqrt(mean) + 16)
+        while True:
+            u = uniforms(key, 0, 2 * number, stream=detector).reshape(
+                -1, 2
+            )  # pairs, so that more of them begin with the same
+            when = np.cumsum(-np.log(u[:, 0])) / self.rate
+            if when[-1] > span:
+                kept = int(np.searchsorted(when, span))
+                return when[:kept], u[:kept, 1]
+            number *= 2
+
 
 @dataclass(frozen=True)
 class Arrivals:
@@ -99,39 +132,6 @@ class Arrivals:
     first: NDArray[np.int64]
     time: Floats
     amplitude: Floats
-
-
-def arrivals(step: Glitches, observation: Observation) -> Arrivals:
-    """Pulses of all detectors from `REACH` decay times before the scan to its end."""
-    begin, end = -REACH * step.decay, float(observation.seconds[-1])
-    times, sizes, count = [], [], [0]
-    for d in range(observation.n_detectors):
-        when, u = _of_detector(step, observation, d, end - begin)
-        times.append(begin + when)
-        sizes.append(-step.amplitude * np.log(u))
-        count.append(len(when))
-    return Arrivals(np.cumsum(count, dtype=np.int64), np.concatenate(times), np.concatenate(sizes))
-
-
-def _of_detector(
-    step: Glitches, observation: Observation, detector: int, span: float
-) -> tuple[Floats, Floats]:
-    """(arrival times within ``span``, uniform deviates of the amplitudes): waiting times are
-    exponential.
-    """
-    if step.rate == 0:
-        return np.zeros(0), np.zeros(0)
-    key, mean = observation.detector_key(step.label), step.rate * span
-    number = int(mean + 6 * math.sqrt(mean) + 16)
-    while True:
-        u = uniforms(key, 0, 2 * number, stream=detector).reshape(
-            -1, 2
-        )  # pairs, so that more of them begin with the same
-        when = np.cumsum(-np.log(u[:, 0])) / step.rate
-        if when[-1] > span:
-            kept = int(np.searchsorted(when, span))
-            return when[:kept], u[:kept, 1]
-        number *= 2
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

@@ -79,11 +79,11 @@ class Efficiency(Operator):
         if self.main_beam is not None:
             plane.main_beam_efficiency = np.full(len(plane), self.main_beam)
         if self.scatter > 0:
-            _scatter(self, observation)
+            self._scatter(observation)
 
     def prepare(self, observation: Observation) -> Calibration:
         """Coefficients of equation (2); flags what is opaque."""
-        found = _coefficients(self, observation)
+        found = self._coefficients(observation)
         what = f"{found.zeta.mean():.4g}, {found.epsilon.mean():.4g}"
         observation.tally.state(self.label, "zeta and epsilon (mean)", what)
         observation.tally.state(self.label, "calibrated by", f"zeta e^-tau, {self.calibration}")
@@ -106,6 +106,40 @@ class Efficiency(Operator):
             what = f"samples whose fluctuating e^-tau was raised to {LEAST_TRANSMISSION:g}"
             block.observation.tally.count(self.label, what, clipped)
 
+    def _scatter(self, observation: Observation) -> None:
+        """Scatter zeta."""
+        plane = observation.focalplane
+        nominal = plane.main_beam_efficiency
+        if self.main_beam is None:  # from the instrument, so that configuring twice scatters once
+            own = observation.instrument.focalplane()
+            known = dict(zip(own.names, own.main_beam_efficiency, strict=True))
+            nominal = np.array([known.get(d, z) for d, z in zip(plane.names, nominal, strict=True)])
+        drawn = nominal * (1 + self.scatter * _normals(observation, self.label, "zeta"))
+        plane.main_beam_efficiency = np.clip(drawn, 0.01 * nominal, 1.0)
+        clipped = int(np.count_nonzero(plane.main_beam_efficiency != drawn))
+        observation.tally.count(self.label, "detectors whose scattered zeta was clipped", clipped)
+
+    def _coefficients(self, observation: Observation) -> Calibration:
+        zeta, epsilon = (
+            observation.focalplane.main_beam_efficiency,
+            observation.focalplane.illumination_efficiency,
+        )
+        gain, transmission, mean = np.ones(len(zeta)), observation.smooth.get("transmission"), None
+        if self.calibration_error > 0:
+            gain += self.calibration_error * _normals(observation, self.label, "gain")
+        if transmission is not None:
+            _flag_opaque(self.label, observation, transmission)
+        if (ratio := observation.smooth.get("atmosphere")) is not None:
+            share, error = gain * epsilon / zeta, 0.0
+            if transmission is not None:
+                ratio, error = quotient(
+                    ratio, transmission, np.flatnonzero(observation.good_detectors)
+                )
+            mean = ratio.scaled(share)
+            text = f"{error * np.abs(share).max():.1e} K_RJ"
+            observation.tally.state(self.label, "largest error of the smooth mean emission", text)
+        return Calibration(zeta, epsilon, gain, transmission, mean)
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -120,40 +154,6 @@ class Calibration:
     mean: SmoothField | None
     means: FieldSums = field(default_factory=FieldSums)
     """M with the means of what enters calibrated."""
-
-
-def _scatter(step: Efficiency, observation: Observation) -> None:
-    """Scatter zeta."""
-    plane = observation.focalplane
-    nominal = plane.main_beam_efficiency
-    if step.main_beam is None:  # from the instrument, so that configuring twice scatters once
-        own = observation.instrument.focalplane()
-        known = dict(zip(own.names, own.main_beam_efficiency, strict=True))
-        nominal = np.array([known.get(d, z) for d, z in zip(plane.names, nominal, strict=True)])
-    drawn = nominal * (1 + step.scatter * _normals(observation, step.label, "zeta"))
-    plane.main_beam_efficiency = np.clip(drawn, 0.01 * nominal, 1.0)
-    clipped = int(np.count_nonzero(plane.main_beam_efficiency != drawn))
-    observation.tally.count(step.label, "detectors whose scattered zeta was clipped", clipped)
-
-
-def _coefficients(step: Efficiency, observation: Observation) -> Calibration:
-    zeta, epsilon = (
-        observation.focalplane.main_beam_efficiency,
-        observation.focalplane.illumination_efficiency,
-    )
-    gain, transmission, mean = np.ones(len(zeta)), observation.smooth.get("transmission"), None
-    if step.calibration_error > 0:
-        gain += step.calibration_error * _normals(observation, step.label, "gain")
-    if transmission is not None:
-        _flag_opaque(step.label, observation, transmission)
-    if (ratio := observation.smooth.get("atmosphere")) is not None:
-        share, error = gain * epsilon / zeta, 0.0
-        if transmission is not None:
-            ratio, error = quotient(ratio, transmission, np.flatnonzero(observation.good_detectors))
-        mean = ratio.scaled(share)
-        text = f"{error * np.abs(share).max():.1e} K_RJ"
-        observation.tally.state(step.label, "largest error of the smooth mean emission", text)
-    return Calibration(zeta, epsilon, gain, transmission, mean)
 
 
 def _make_signal(block: Block, state: Calibration, instantaneous: bool) -> int:

@@ -7,7 +7,7 @@ import pytest
 
 import zonda
 import zonda.testing
-from zonda.operators.detectors.glitches import Glitches, arrivals
+from zonda.operators.detectors.glitches import Glitches
 from zonda.plugins.checks import scenes
 
 
@@ -27,7 +27,7 @@ def test_it_keeps_the_contract():
 def test_arrivals_are_a_poisson_process(bench):
     """Counts have mean and variance rate T; times are uniform; amplitudes exponential."""
     n, rate = 4000, 0.5
-    found = arrivals(Glitches(rate=f"{rate} Hz", decay="1 ms"), bench.observation(n, 2001))
+    found = Glitches(rate=f"{rate} Hz", decay="1 ms").arrivals(bench.observation(n, 2001))
     number, mean = np.diff(found.first), rate * (20 + 0.023)
     assert abs(number.mean() - mean) < 4 * np.sqrt(mean / n)
     assert abs(number.var() - mean) < 4 * np.sqrt(
@@ -53,7 +53,7 @@ def test_campbells_theorem(bench):
 
 def test_each_is_an_exponential_from_its_arrival_on(bench):
     observation = bench.observation(30, 3000)
-    found = arrivals(Glitches(rate="20 mHz", decay="50 ms"), observation)
+    found = Glitches(rate="20 mHz", decay="50 ms").arrivals(observation)
     g, t = stream(bench, 30, 3000, rate="20 mHz", decay="50 ms"), observation.seconds
     for d in range(30):
         expected = np.zeros(3000)
