@@ -92,7 +92,7 @@ class PointingRecorded(Operator):
         """What is in the file, and whether the telescope can look there."""
         recording, found = self._read()
         for scan in found.scans:
-            data.observations.append(_observation(self, data, _thinned(scan), recording))
+            data.observations.append(self._observation(data, _thinned(scan), recording))
             data.observations[-1].seen_of = len(scan.seconds), scan.rate
         lines = [_summary(scan, recording.frame) for scan in found.scans]
         return lines + [f"{what}: {number}" for what, number in found.counts.items() if number]
@@ -105,7 +105,7 @@ class PointingRecorded(Operator):
             warnings.warn(f"{self.label}: {text}", stacklevel=2)
         sampled = SamplesPerBeam()
         for scan in found.scans:
-            observation = _observation(self, data, scan, recording)
+            observation = self._observation(data, scan, recording)
             sampled.add(observation, observation.sample_rate)
             data.observations.append(observation)
         for what, number in found.counts.items():
@@ -118,6 +118,44 @@ class PointingRecorded(Operator):
             read_recording(self.file, self.clock, self.flag_mask), self.celestial, place
         )
         return recording, comb(recording, self.split, place)
+
+    def _observation(self, data: Data, scan: Scan, recording: Recording) -> Observation:
+        """The observation of one scan. Raises PointingError if the telescope cannot look there."""
+        scene = data.scene
+        start = (recording.start or scene.time).shifted(float(scan.seconds[0]))
+        seconds = scan.seconds - scan.seconds[0]
+        beam = float(scene.instrument.focalplane().fwhm.min())
+        transform = CelestialTransform(
+            scene.site, start, seconds[-1], self.interpolation_error * beam
+        )
+        if recording.frame == "azel":
+            horizontal = unit_vectors(-scan.longitude, scan.latitude)
+        else:
+            horizontal = transform.horizontal(unit_vectors(scan.longitude, scan.latitude), seconds)
+        good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
+        _check_elevation(
+            horizontal,
+            seconds,
+            good,
+            scene.instrument.telescope,
+            f"{self.label}, {self.file}",
+            start,
+        )
+        _, azel, computed = transform.boresight(horizontal, seconds)
+        radec = computed if scan.radec is None else scan.radec
+        target = self.target or scene.target
+        centre = centre_of(transform, target, seconds) if target else _middle(radec, good)
+        parts = part(recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1]))
+        samples = Samples(seconds, scan.rate, (azel, radec), scan.flags.copy(), parts)
+        observation = observed(
+            self.label, scene, len(data.observations), transform, centre, samples
+        )
+        if recording.frame == "azel":
+            observation.recorded_azimuth = scan.longitude
+        state_times(self.label, observation)
+        if recording.frame == "azel":
+            _state_celestial(self.label, observation, computed, good)
+        return observation
 
 
 def _on_the_sky(recording: Recording, celestial: str | None, place: str) -> Recording:
@@ -171,38 +209,6 @@ def _summary(scan: Scan, frame: str) -> str:
         low, high = np.degrees([scan.latitude[good].min(), scan.latitude[good].max()])
         text += f", elevation {low:.2f} to {high:.2f} deg"
     return text
-
-
-def _observation(
-    step: PointingRecorded, data: Data, scan: Scan, recording: Recording
-) -> Observation:
-    """The observation of one scan. Raises PointingError where the telescope cannot look there."""
-    scene = data.scene
-    start = (recording.start or scene.time).shifted(float(scan.seconds[0]))
-    seconds = scan.seconds - scan.seconds[0]
-    beam = float(scene.instrument.focalplane().fwhm.min())
-    transform = CelestialTransform(scene.site, start, seconds[-1], step.interpolation_error * beam)
-    if recording.frame == "azel":
-        horizontal = unit_vectors(-scan.longitude, scan.latitude)
-    else:
-        horizontal = transform.horizontal(unit_vectors(scan.longitude, scan.latitude), seconds)
-    good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
-    _check_elevation(
-        horizontal, seconds, good, scene.instrument.telescope, f"{step.label}, {step.file}", start
-    )
-    _, azel, computed = transform.boresight(horizontal, seconds)
-    radec = computed if scan.radec is None else scan.radec
-    target = step.target or scene.target
-    centre = centre_of(transform, target, seconds) if target else _middle(radec, good)
-    parts = part(recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1]))
-    samples = Samples(seconds, scan.rate, (azel, radec), scan.flags.copy(), parts)
-    observation = observed(step.label, scene, len(data.observations), transform, centre, samples)
-    if recording.frame == "azel":
-        observation.recorded_azimuth = scan.longitude
-    state_times(step.label, observation)
-    if recording.frame == "azel":
-        _state_celestial(step.label, observation, computed, good)
-    return observation
 
 
 def _check_elevation(

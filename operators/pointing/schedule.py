@@ -15,7 +15,7 @@ from .limits import LargestMotion
 from .observed import report
 from .samples_per_beam import SamplesPerBeam
 from .schedule_files import Row, read_schedule, read_site
-from .scheduled import ScheduleParameters, scan_of
+from .scheduled import ScheduleParameters
 from .sun_and_moon import distances
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class PointingSchedule(ScheduleParameters):
             warnings.warn(f"{self.label}: {text}", stacklevel=3)
         moved, sampled = LargestMotion(scene.instrument.telescope), SamplesPerBeam()
         for row in rows:
-            observation = scan_of(self, data, row, rate, moved)
+            observation = self._observation(data, row, rate, moved)
             sampled.add(observation, self.sample_rate or scene.instrument.sample_rate)
             data.observations.append(observation)
         report(self.label, data.observations[before:], moved, sampled)

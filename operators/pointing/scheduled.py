@@ -86,64 +86,63 @@ class ScheduleParameters(Operator):
         """The motion before each scan."""
         return Nod(tuple(self.elevation_nods), self.elevation_speed, self.elevation_acceleration)
 
-
-def scan_of(
-    step: ScheduleParameters, data: Data, row: Row, rate: float, moved: LargestMotion
-) -> Observation:
-    """The observation of a row, sampled at ``rate`` [Hz]."""
-    scene, place = data.scene, f"{step.label}, {step.schedule}, {row.label}"
-    mount = step.speed / math.cos(row.elevation)
-    sweep = Sweep(
-        row.azimuth[1] - row.azimuth[0], mount, step.acceleration, step.turnaround == "smooth"
-    )
-    nod = step.nod
-    ahead = math.ceil(nod.duration * rate * (1 - 1e-12))
-    seconds = np.arange(ahead + max(int(row.duration * rate * (1 + 1e-12)), 1)) / rate
-    delay = ahead / rate
-    start = row.start.shifted(-delay)
-
-    def track(at: Floats) -> Floats:
-        azimuth = row.azimuth[0] + np.where(
-            at >= delay, sweep.path(np.maximum(at - delay, 0.0)), 0.0
+    def _observation(self, data: Data, row: Row, rate: float, moved: LargestMotion) -> Observation:
+        """The observation of a row, sampled at ``rate`` [Hz]."""
+        scene, place = data.scene, f"{self.label}, {self.schedule}, {row.label}"
+        mount = self.speed / math.cos(row.elevation)
+        sweep = Sweep(
+            row.azimuth[1] - row.azimuth[0], mount, self.acceleration, self.turnaround == "smooth"
         )
-        elevation = row.elevation + np.where(at < delay, nod.path(at), 0.0)
-        return unit_vectors(-azimuth, elevation)
+        nod = self.nod
+        ahead = math.ceil(nod.duration * rate * (1 - 1e-12))
+        seconds = np.arange(ahead + max(int(row.duration * rate * (1 + 1e-12)), 1)) / rate
+        delay = ahead / rate
+        start = row.start.shifted(-delay)
 
-    horizontal = track(seconds)
-    _check_elevation(horizontal, scene.instrument.telescope, place)
-    beam = float(scene.instrument.focalplane().fwhm.min())
-    transform = CelestialTransform(scene.site, start, seconds[-1], step.interpolation_error * beam)
-    _, azel, radec = transform.boresight(horizontal, seconds)
-    boresight = (_turned(azel, row.rotation), _turned(radec, row.rotation))
-    scanning = seconds >= delay
-    intervals = sweep.intervals(seconds - delay, scanning)
-    intervals = {
-        name: [(a + delay, b + delay) for a, b in spans] for name, spans in intervals.items()
-    }
-    flags = np.where(scanning, 0, IRREGULAR).astype(np.uint8)
-    if ahead:
-        intervals["elnod"] = runs(~scanning, seconds)
-    turning = sweep.turning(seconds - delay) & scanning
-    if step.flag_turnarounds:
-        flags |= np.where(turning, TURNAROUND, 0).astype(np.uint8)
-    lit, suns = sunlit(scene.site, start, seconds, azel, step.sun_close)
-    centre = _centre(data, row, transform, delay)
-    samples = Samples(seconds, rate, boresight, flags | lit, intervals | suns)
-    observation = observed(
-        step.label, scene, len(data.observations), transform, centre, samples, row.label
-    )
-    _check_motion(step, observation.name, track, (0.0, delay), False, place, moved)
-    _check_motion(
-        step, observation.name, track, (delay, len(seconds) / rate), sweep.smooth, place, moved
-    )
-    observation.tally.state(step.label, f"{observation.name}: row of the schedule", row.label)
-    what = "samples in turnarounds" + (", flagged" if step.flag_turnarounds else ", used")
-    observation.tally.count(step.label, what, int(turning.sum()), len(seconds))
-    if ahead:
-        observation.tally.count(
-            step.label, "samples in elevation nods, flagged", ahead, len(seconds)
+        def track(at: Floats) -> Floats:
+            azimuth = row.azimuth[0] + np.where(
+                at >= delay, sweep.path(np.maximum(at - delay, 0.0)), 0.0
+            )
+            elevation = row.elevation + np.where(at < delay, nod.path(at), 0.0)
+            return unit_vectors(-azimuth, elevation)
+
+        horizontal = track(seconds)
+        _check_elevation(horizontal, scene.instrument.telescope, place)
+        beam = float(scene.instrument.focalplane().fwhm.min())
+        transform = CelestialTransform(
+            scene.site, start, seconds[-1], self.interpolation_error * beam
         )
-    return observation
+        _, azel, radec = transform.boresight(horizontal, seconds)
+        boresight = (_turned(azel, row.rotation), _turned(radec, row.rotation))
+        scanning = seconds >= delay
+        intervals = sweep.intervals(seconds - delay, scanning)
+        intervals = {
+            name: [(a + delay, b + delay) for a, b in spans] for name, spans in intervals.items()
+        }
+        flags = np.where(scanning, 0, IRREGULAR).astype(np.uint8)
+        if ahead:
+            intervals["elnod"] = runs(~scanning, seconds)
+        turning = sweep.turning(seconds - delay) & scanning
+        if self.flag_turnarounds:
+            flags |= np.where(turning, TURNAROUND, 0).astype(np.uint8)
+        lit, suns = sunlit(scene.site, start, seconds, azel, self.sun_close)
+        centre = _centre(data, row, transform, delay)
+        samples = Samples(seconds, rate, boresight, flags | lit, intervals | suns)
+        observation = observed(
+            self.label, scene, len(data.observations), transform, centre, samples, row.label
+        )
+        refused = place if self.check_limits == "error" else None
+        end = len(seconds) / rate
+        _check_motion(moved, observation.name, track, (0.0, delay), False, refused)
+        _check_motion(moved, observation.name, track, (delay, end), sweep.smooth, refused)
+        observation.tally.state(self.label, f"{observation.name}: row of the schedule", row.label)
+        what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
+        observation.tally.count(self.label, what, int(turning.sum()), len(seconds))
+        if ahead:
+            observation.tally.count(
+                self.label, "samples in elevation nods, flagged", ahead, len(seconds)
+            )
+        return observation
 
 
 def _centre(
@@ -175,28 +174,27 @@ def _check_elevation(horizontal: Floats, telescope: Telescope, place: str) -> No
 
 
 def _check_motion(
-    step: ScheduleParameters,
+    moved: LargestMotion,
     name: str,
     track: Track,
     part: tuple[float, float],
     smooth: bool,
-    place: str,
-    moved: LargestMotion,
+    place: str | None,
 ) -> None:
     """Compare a part of the track, from begin to end [s], with the telescope's limits.
 
     A scan begins at full speed: from the nod to the scan there is no motion to compare. Not
-    ``smooth``: its jerk has no bound.
+    ``smooth``: its jerk has no bound. Raises PointingError at ``place`` for a scan beyond a limit;
+    None: that is a warning.
     """
     begin, end = part
     if end <= begin:
         return
     limits = {q: limit for q, limit in moved.limits.items() if smooth or q[1] < 3}
 
-    def at(step: float) -> Floats:
-        return track(
-            begin + np.arange(max(round((end - begin) / step), 1), dtype=np.float64) * step
-        )
+    def at(interval: float) -> Floats:
+        number = max(round((end - begin) / interval), 1)
+        return track(begin + np.arange(number, dtype=np.float64) * interval)
 
     coarse = POINTS / (end - begin)
     found = motion(at(1 / coarse), coarse, limits, at)
@@ -206,7 +204,7 @@ def _check_motion(
         if smooth or q[1] < 3
     }
     over = excess(found, limits)
-    if over and step.check_limits == "error":
+    if over and place is not None:
         cure = "lower speed or acceleration, or set check_limits: warn"
         raise PointingError(moved.too_fast(next(iter(over)), found), place=place, cure=cure)
     moved.add(name, found)
