@@ -285,9 +285,9 @@ def near_the_mean(use: NDArray[np.bool_]) -> Floats:
     return np.asarray(start / max(float(np.sqrt(start @ start)), 1e-300), np.float64)
 
 
-def directions(step: int, n_detectors: int) -> Floats:
+def directions(number: int, n_detectors: int) -> Floats:
     """Fixed pseudo-random numbers over detectors (n_det,)."""
-    return normals(stream_key(0, "CommonModeFilter", step), 0, n_detectors).astype(np.float64)
+    return normals(stream_key(0, "CommonModeFilter", number), 0, n_detectors).astype(np.float64)
 
 
 @nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")

@@ -59,8 +59,8 @@ class HighpassFilter(HighpassParameters):
         """
         for observation in data.observations:
             place = f"{self.label}, {observation.name}"
-            _trimmed(self, *observation.sampling, place)
-            _check_cut(self, *observation.sampling, place)
+            self._trimmed(*observation.sampling, place)
+            self._check_cut(*observation.sampling, place)
         check_masks(self.mask, data, self.label)
         short, every = (
             sum(o.duration * self.frequency < 1 for o in data.observations),
@@ -68,14 +68,14 @@ class HighpassFilter(HighpassParameters):
         )
         text = (
             f"{short} of {every} scans are shorter than 1/frequency, {1 / self.frequency:g} s:"
-            f" {_short(self)}"
+            f" {self._short()}"
         )
         return [text] if short else []
 
     def prepare(self, observation: Observation) -> State:
         """Tables for this observation's length, flagged samples; flags the trimmed ends."""
         fine = has_a_signal(observation.flags)
-        _trim(self, observation)
+        self._trim(observation)
         observation.tally.count(
             self.label, "flagged samples bridged before filtering", int((~fine).sum()), fine.size
         )
@@ -83,10 +83,10 @@ class HighpassFilter(HighpassParameters):
         if inside is not None:
             check_mask(inside, observation, f"{self.label}, {observation.name}")
         if self.response == "bessel":
-            return State(_bessel(self, observation, fine), np.flatnonzero(~fine), inside)
+            return State(self._bessel(observation, fine), np.flatnonzero(~fine), inside)
         if observation.smooth.get("atmosphere") is not None and inside is None:
             observation.tally.state(self.label, "smooth mean emission", "removed analytically")
-        return State(_planned(self, observation), np.flatnonzero(~fine), inside)
+        return State(self._planned(observation), np.flatnonzero(~fine), inside)
 
     def exec(self, block: Block, state: State) -> None:
         """Filter the block's rows in place."""
@@ -99,6 +99,78 @@ class HighpassFilter(HighpassParameters):
             return
         act = plan.apply if isinstance(plan, BesselPlan) else partial(_brick_wall, plan)
         in_double(self.label, block, lambda rows, masked: act(rows, bad, masked), inside)
+
+    def _check_cut(self, n: int, rate: float, place: str) -> None:
+        """Raise PipelineError for a cut at which nothing is left of a scan of ``n`` samples."""
+        text = (
+            f"a cut at {self.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz"
+            " contain no higher frequency"
+        )
+        if self.response == "bessel":
+            if self.frequency >= rate / 2:
+                raise PipelineError(
+                    text, place=place, cure=f"choose a frequency below {rate / 2:.6g} Hz"
+                )
+        elif first_kept(n, self.frequency / rate) >= n:
+            cure = f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan"
+            raise PipelineError(text, place=place, cure=cure)
+
+    def _bessel(self, observation: Observation, fine: NDArray[np.bool_]) -> BesselPlan:
+        """The causal filter of a scan.
+
+        Raises PipelineError for a cutoff at the Nyquist frequency or above.
+        """
+        rate = observation.sample_rate
+        self._check_cut(observation.n_samples, rate, f"{self.label}, {observation.name}")
+        trend = (
+            None
+            if self.degree is None
+            else Fit.of(polynomials(observation.n_samples, self.degree), fine)
+        )
+        return BesselPlan(sections(self.frequency, rate), trend)
+
+    def _trimmed(self, n: int, rate: float, place: str) -> int:
+        """Samples at either end that are trimmed of ``n``. Raises PipelineError where nothing is
+        left.
+        """
+        trimmed = min(round(self.trim * rate), n)
+        if 2 * trimmed >= n and trimmed:
+            text = (
+                f"trimming {self.trim:g} s at either end leaves nothing of a scan of {n / rate:g} s"
+            )
+            raise PipelineError(text, place=place, cure="shorten trim or lengthen the scan")
+        return trimmed
+
+    def _trim(self, observation: Observation) -> None:
+        """Flag the ends of a scan."""
+        n = observation.n_samples
+        trimmed = self._trimmed(n, observation.sample_rate, f"{self.label}, {observation.name}")
+        observation.flags[:trimmed] |= TRIMMED
+        observation.flags[n - trimmed :] |= TRIMMED
+        observation.tally.count(self.label, "samples trimmed", 2 * trimmed, n)
+
+    def _planned(self, observation: Observation) -> HighpassPlan:
+        """The plan for a scan's length; says, or refuses, where nothing or little is left."""
+        n, rate = observation.n_samples, observation.sample_rate
+        self._check_cut(n, rate, f"{self.label}, {observation.name}")
+        degree = self.degree or 0
+        plan = plan_highpass(n, self.frequency / rate, degree, self.oversampling)
+        if plan.cut == 0:
+            text = (
+                self._short()
+                if n > 1 + min(degree, 1)
+                else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
+            )
+            observation.tally.state(
+                self.label, f"{observation.name} is shorter than 1/frequency", text
+            )
+        return plan
+
+    def _short(self) -> str:
+        """What happens to a short scan."""
+        if self.response == "bessel":
+            return "all of it is within the filter's transient"
+        return ONLY_A_LINE if self.degree else ONLY_THE_MEAN
 
 
 def _brick_wall(
@@ -115,76 +187,3 @@ def _brick_wall(
         filter_outside(row, bad, None if masked is None else masked[d], act)
         for d, row in enumerate(rows)
     )
-
-
-def _check_cut(step: HighpassFilter, n: int, rate: float, place: str) -> None:
-    """Raise PipelineError for a cut at which nothing is left of a scan of ``n`` samples."""
-    text = (
-        f"a cut at {step.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz contain no"
-        " higher frequency"
-    )
-    if step.response == "bessel":
-        if step.frequency >= rate / 2:
-            raise PipelineError(
-                text, place=place, cure=f"choose a frequency below {rate / 2:.6g} Hz"
-            )
-    elif first_kept(n, step.frequency / rate) >= n:
-        cure = f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan"
-        raise PipelineError(text, place=place, cure=cure)
-
-
-def _bessel(step: HighpassFilter, observation: Observation, fine: NDArray[np.bool_]) -> BesselPlan:
-    """The causal filter of a scan. Raises PipelineError for a cutoff at the Nyquist frequency or
-    above.
-    """
-    rate = observation.sample_rate
-    _check_cut(step, observation.n_samples, rate, f"{step.label}, {observation.name}")
-    trend = (
-        None
-        if step.degree is None
-        else Fit.of(polynomials(observation.n_samples, step.degree), fine)
-    )
-    return BesselPlan(sections(step.frequency, rate), trend)
-
-
-def _trimmed(step: HighpassFilter, n: int, rate: float, place: str) -> int:
-    """Samples at either end that are trimmed of ``n``. Raises PipelineError where nothing is
-    left.
-    """
-    trimmed = min(round(step.trim * rate), n)
-    if 2 * trimmed >= n and trimmed:
-        text = f"trimming {step.trim:g} s at either end leaves nothing of a scan of {n / rate:g} s"
-        raise PipelineError(text, place=place, cure="shorten trim or lengthen the scan")
-    return trimmed
-
-
-def _trim(step: HighpassFilter, observation: Observation) -> None:
-    """Flag the ends of a scan."""
-    n = observation.n_samples
-    trimmed = _trimmed(step, n, observation.sample_rate, f"{step.label}, {observation.name}")
-    observation.flags[:trimmed] |= TRIMMED
-    observation.flags[n - trimmed :] |= TRIMMED
-    observation.tally.count(step.label, "samples trimmed", 2 * trimmed, n)
-
-
-def _planned(step: HighpassFilter, observation: Observation) -> HighpassPlan:
-    """The plan for a scan's length; says, or refuses, where nothing or little is left."""
-    n, rate = observation.n_samples, observation.sample_rate
-    _check_cut(step, n, rate, f"{step.label}, {observation.name}")
-    degree = step.degree or 0
-    plan = plan_highpass(n, step.frequency / rate, degree, step.oversampling)
-    if plan.cut == 0:
-        text = (
-            _short(step)
-            if n > 1 + min(degree, 1)
-            else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
-        )
-        observation.tally.state(step.label, f"{observation.name} is shorter than 1/frequency", text)
-    return plan
-
-
-def _short(step: HighpassFilter) -> str:
-    """What happens to a short scan."""
-    if step.response == "bessel":
-        return "all of it is within the filter's transient"
-    return ONLY_A_LINE if step.degree else ONLY_THE_MEAN
