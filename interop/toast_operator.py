@@ -90,17 +90,91 @@ class ToastOperator(Operator):
 
     def prepare(self, observation: Observation) -> None:
         """Raises PipelineError where the scan lacks what the operator needs."""
-        _check_needs(self, observation)
+        self._check_needs(observation)
 
     def measure(self, stream: Stream, model: Any = None) -> Changed:
         """Apply TOAST's operator to a signal. ``model`` is not used: each signal is acted on by
         itself.
         """
-        return _changed(self, stream)
+        return self._changed(stream)
 
     def exec(self, block: Block, state: Changed) -> None:
         """Replace the signal by what TOAST made of it."""
         state.put(block, "signal")
+
+    def _check_needs(self, observation: Observation) -> None:
+        """Raises PipelineError where the scan lacks what the operator needs."""
+        ob = _unfilled(observation)
+        operator = made(self.operator, self.traits)
+        try:
+            wanted, makes = operator.requires(), operator.provides()
+        except Exception:  # SimAtmosphere of TOAST 3.0.6 cannot say it
+            return
+        for kind, there in {
+            "shared": ob.shared,
+            "intervals": ob.intervals,
+            "detdata": ("signal", "flags"),
+            "meta": ob,
+        }.items():
+            for name in wanted[kind]:
+                if name is not None and name not in there and name not in makes[kind]:
+                    names = [
+                        n for n in there if not (kind == "intervals" and n == ob.intervals.all_name)
+                    ]
+                    raise PipelineError(
+                        f"toast.ops.{self.operator} needs {name!r} of {WHAT[kind]}, which the scan"
+                        " does not have",
+                        place=f"{self.label}, {observation.name}",
+                        cure=(
+                            "name another in its traits:"
+                            f" {', '.join(map(str, names)) or 'there is none'}"
+                        ),
+                    )
+
+    def _apply(self, ob: Any, observation: Observation) -> None:
+        """Let it act. Raises PipelineError with what it says where it cannot."""
+        import toast
+
+        shape, place = ob.detdata["signal"].data.shape, f"{self.label}, {observation.name}"
+        data = toast.Data(ob.comm)
+        data.obs.append(ob)
+        try:
+            made(self.operator, self.traits).apply(data)
+        except Exception as err:  # of any kind, also mistakes of TOAST's own
+            cure = "see the description of its traits in TOAST's documentation"
+            raise PipelineError(
+                f"toast.ops.{self.operator}: {type(err).__name__}: {err}", place=place, cure=cure
+            ) from err
+        finally:
+            there = list(data.obs)
+            data.obs.clear()  # else they are emptied with it
+        same = len(there) == 1 and there[0] is ob and "signal" in ob.detdata
+        if not same or ob.detdata["signal"].data.shape != shape:
+            cure = "save the streams (SaveTOD) and go on in TOAST"
+            raise PipelineError(
+                f"toast.ops.{self.operator} leaves other detectors, samples or streams than it was"
+                " given",
+                place=place,
+                cure=cure,
+            )
+
+    def _changed(self, stream: Stream) -> Changed:
+        """See `ToastOperator.measure`."""
+        observation, mean = stream.observation, stream.means.get("signal")
+        with ALONE:
+            ob, spoilt = _filled(stream, mean)
+            before, sums = ob.detdata["flags"].data.copy(), _sums(ob)
+            self._apply(ob, observation)
+            if np.array_equal(sums, _sums(ob)) and np.array_equal(before, ob.detdata["flags"].data):
+                observation.tally.state(
+                    self.label,
+                    "no effect",
+                    f"{self.operator} left the signal and its flags as they were",
+                )
+            values = np.array(ob.detdata["signal"].data)
+            values[spoilt] = np.nan
+            values[_newly_flagged(self.label, stream, ob, before)] = np.nan
+        return Changed.of(values, stream)
 
 
 WHAT = {
@@ -109,83 +183,6 @@ WHAT = {
     "detdata": "detector data",
     "meta": "metadata",
 }
-
-
-def _check_needs(step: ToastOperator, observation: Observation) -> None:
-    """Raises PipelineError where the scan lacks what the operator needs."""
-    ob = _unfilled(observation)
-    operator = made(step.operator, step.traits)
-    try:
-        wanted, makes = operator.requires(), operator.provides()
-    except Exception:  # SimAtmosphere of TOAST 3.0.6 cannot say it
-        return
-    for kind, there in {
-        "shared": ob.shared,
-        "intervals": ob.intervals,
-        "detdata": ("signal", "flags"),
-        "meta": ob,
-    }.items():
-        for name in wanted[kind]:
-            if name is not None and name not in there and name not in makes[kind]:
-                names = [
-                    n for n in there if not (kind == "intervals" and n == ob.intervals.all_name)
-                ]
-                raise PipelineError(
-                    f"toast.ops.{step.operator} needs {name!r} of {WHAT[kind]}, which the scan does"
-                    " not have",
-                    place=f"{step.label}, {observation.name}",
-                    cure=(
-                        "name another in its traits:"
-                        f" {', '.join(map(str, names)) or 'there is none'}"
-                    ),
-                )
-
-
-def _apply(step: ToastOperator, ob: Any, observation: Observation) -> None:
-    """Let it act. Raises PipelineError with what it says where it cannot."""
-    import toast
-
-    shape, place = ob.detdata["signal"].data.shape, f"{step.label}, {observation.name}"
-    data = toast.Data(ob.comm)
-    data.obs.append(ob)
-    try:
-        made(step.operator, step.traits).apply(data)
-    except Exception as err:  # of any kind, also mistakes of TOAST's own
-        cure = "see the description of its traits in TOAST's documentation"
-        raise PipelineError(
-            f"toast.ops.{step.operator}: {type(err).__name__}: {err}", place=place, cure=cure
-        ) from err
-    finally:
-        there = list(data.obs)
-        data.obs.clear()  # else they are emptied with it
-    same = len(there) == 1 and there[0] is ob and "signal" in ob.detdata
-    if not same or ob.detdata["signal"].data.shape != shape:
-        cure = "save the streams (SaveTOD) and go on in TOAST"
-        raise PipelineError(
-            f"toast.ops.{step.operator} leaves other detectors, samples or streams than it was"
-            " given",
-            place=place,
-            cure=cure,
-        )
-
-
-def _changed(step: ToastOperator, stream: Stream) -> Changed:
-    """See `ToastOperator.measure`."""
-    observation, mean = stream.observation, stream.means.get("signal")
-    with ALONE:
-        ob, spoilt = _filled(stream, mean)
-        before, sums = ob.detdata["flags"].data.copy(), _sums(ob)
-        _apply(step, ob, observation)
-        if np.array_equal(sums, _sums(ob)) and np.array_equal(before, ob.detdata["flags"].data):
-            observation.tally.state(
-                step.label,
-                "no effect",
-                f"{step.operator} left the signal and its flags as they were",
-            )
-        values = np.array(ob.detdata["signal"].data)
-        values[spoilt] = np.nan
-        values[_newly_flagged(step.label, stream, ob, before)] = np.nan
-    return Changed.of(values, stream)
 
 
 def made(name: str, traits: Mapping[str, Any]) -> Any:
