@@ -27,32 +27,16 @@ terms of order sigma_2 / sigma_1.
 from __future__ import annotations
 
 import copy
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from zonda.core.compilation.jit import nb
-from zonda.core.data import Block, Data, Observation, Stream
-from zonda.core.errors import PipelineError
+from zonda.core.data import Block, Data, Stream
 from zonda.core.flags import DEAD
-from zonda.core.signal import MAIN
-from zonda.core.types import Floats
 
-from . import focal_plane_mean
-from .gram import Gram, Usable
-from .lanczos import NOTHING, Ritz, lanczos
+from .mode_search import Modes, ModeSearch
 from .parameters import CommonModeParameters
-from .source_mask import MASKED, Inside, counts
-
-ROUNDING = 2.0**-24 / np.sqrt(3.0)
-"""rms of float32's relative rounding error."""
-
-KEPT = "modes kept because the data do not determine them (rank)"
-UNDETERMINED = "degenerate modes (the next singular value is nearly as large)"
-"""Counts of the log. Degenerate: the next singular value is more than `gap` times the mode's own.
-"""
 
 
 class CommonModeFilter(CommonModeParameters):
@@ -91,11 +75,9 @@ class CommonModeFilter(CommonModeParameters):
         """Find the modes; given those of the complete signal (``model``), their times in this
         one.
         """
-        return (
-            _wafer_by_wafer(self, stream, model)
-            if self.group == "wafer"
-            else _modes(self, stream, model)
-        )
+        if self.group == "wafer":
+            return self._wafer_by_wafer(stream, model)
+        return self._modes(stream, model)
 
     def exec(self, block: Block, state: Modes) -> None:
         """Equation (1) on one block."""
@@ -108,200 +90,28 @@ class CommonModeFilter(CommonModeParameters):
             if not state.parts or u[block.detectors].any():
                 _remove(signal, u[block.detectors], v[block.samples])
 
+    def _modes(self, stream: Stream, model: Modes | None) -> Modes:
+        """The modes of all detectors that are not flagged; see `measure`."""
+        search = ModeSearch(self, stream, self.mask.of(stream.observation) if self.mask else None)
+        return search.found() if model is None else search.of(model)
 
-def _wafer_by_wafer(step: CommonModeFilter, stream: Stream, model: Modes | None) -> Modes:
-    """The modes of each wafer's detectors: all others count as flagged."""
-    whole, parts = stream.observation, []
-    for k, wafer in enumerate(np.unique(whole.focalplane.wafer).tolist()):
-        part, others = copy.copy(stream), whole.focalplane.wafer != wafer
-        part.observation = copy.copy(whole)
-        part.observation.name = f"{whole.name}, wafer {wafer}"
-        part.observation.detector_flags = whole.detector_flags | np.where(others, DEAD, 0).astype(
-            np.uint8
+    def _wafer_by_wafer(self, stream: Stream, model: Modes | None) -> Modes:
+        """The modes of each wafer's detectors: all others count as flagged."""
+        whole, parts = stream.observation, []
+        for k, wafer in enumerate(np.unique(whole.focalplane.wafer).tolist()):
+            part, others = copy.copy(stream), whole.focalplane.wafer != wafer
+            part.observation = copy.copy(whole)
+            part.observation.name = f"{whole.name}, wafer {wafer}"
+            part.observation.detector_flags = whole.detector_flags | np.where(
+                others, DEAD, 0
+            ).astype(np.uint8)
+            parts.append(self._modes(part, model.parts[k] if model else None))
+            whole.detector_flags[~others] |= part.observation.detector_flags[~others]
+        detectors, times = (
+            np.concatenate(found)
+            for found in zip(*((p.detectors, p.times) for p in parts), strict=True)
         )
-        parts.append(_modes(step, part, model.parts[k] if model else None))
-        whole.detector_flags[~others] |= part.observation.detector_flags[~others]
-    detectors, times = (
-        np.concatenate(found)
-        for found in zip(*((p.detectors, p.times) for p in parts), strict=True)
-    )
-    return Modes(detectors, times, None, tuple(parts))
-
-
-def _modes(step: CommonModeFilter, stream: Stream, model: Modes | None) -> Modes:
-    """The modes of all detectors that are not flagged; see `CommonModeFilter.measure`."""
-    inside = step.mask.of(stream.observation) if step.mask else None
-    if model is not None:
-        return Modes(model.detectors, _times(stream, model, step.method, inside), model.scale)
-    place = f"{step.label}, {stream.observation.name}"
-    if stream.means.get("signal") is not None and stream.dtype != np.float64:
-        raise PipelineError(
-            "the mean emission, tens of kelvin, is still part of the signal and float32 cannot"
-            " carry it",
-            place=place,
-            cure="put a HighpassFilter before, or set precision: float64",
-        )
-    find = _mean_mode if step.method == "mean" else _singular_modes
-    detectors, found = find(step, stream, inside)
-    _tell(step, stream, detectors, found, inside)
-    _check_precision(found, detectors, stream, place)
-    scale = np.ones(detectors.use.size) if detectors.scale is None else detectors.scale
-    return Modes(
-        found.detectors[: found.count] * scale, found.times[: found.count], detectors.scale
-    )
-
-
-def _singular_modes(
-    step: CommonModeFilter, stream: Stream, inside: Inside | None
-) -> tuple[Usable, Ritz]:
-    """The leading singular modes, with the number of those to remove."""
-    with ThreadPoolExecutor(max(1, stream.threads)) as pool:
-        gram = Gram(stream, pool, None, _sees_nothing(stream), inside, step.scale == "rms")
-        found = lanczos(
-            gram, step.modes, step.residual, None if step.on_undetermined == "remove" else step.gap
-        )
-        found.count = _choose(step, found, gram, stream.observation)
-    return gram, found
-
-
-def _mean_mode(
-    step: CommonModeFilter, stream: Stream, inside: Inside | None
-) -> tuple[Usable, Ritz]:
-    """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
-    observation = stream.observation
-    good = observation.good_samples
-    detectors = Usable(observation.good_detectors, int(good.sum()))
-    reading = focal_plane_mean.read(stream, detectors.use, good, inside)
-    if detectors.judge(reading.sums, reading.squares, _sees_nothing(stream)):
-        reading = focal_plane_mean.read(stream, detectors.use, good, inside)
-    if detectors.n_good == 0:
-        found = Ritz.nothing(detectors.use.size, stream.shape[1])
-    else:
-        root = np.sqrt(detectors.n_good)
-        v = reading.total / root
-        rank = 1 + (reading.least_left > NOTHING * detectors.energy)
-        found = Ritz(
-            np.array([v @ v]),
-            (detectors.use / root)[None],
-            v[None],
-            np.zeros(1),
-            rank,
-            1,
-            "detector mean",
-        )
-    found.count = min(1, max(0, found.rank - 1))
-    observation.tally.count(step.label, KEPT, 1 - found.count)
-    return detectors, found
-
-
-def _choose(step: CommonModeFilter, found: Ritz, gram: Gram, observation: Observation) -> int:
-    """Number of modes to remove; may replace the modes by the detectors' mean."""
-    wanted = min(step.modes, max(0, found.rank - 1))
-    size = np.append(np.sqrt(np.maximum(found.values, 0.0)), 0.0)
-    determined = max((i + 1 for i in range(wanted) if size[i + 1] <= step.gap * size[i]), default=0)
-    observation.tally.count(step.label, KEPT, step.modes - wanted)
-    observation.tally.count(step.label, UNDETERMINED, wanted - determined)
-    if determined == wanted or step.on_undetermined == "remove":
-        return wanted
-    if step.on_undetermined == "mean" and determined == 0:
-        u = gram.use / np.sqrt(gram.n_good)
-        found.detectors, found.times, found.residuals = u[None], gram.apply(u)[1][None], np.zeros(1)
-        found.what = "detector mean, because the first mode is degenerate"
-        return 1
-    return determined
-
-
-def _times(stream: Stream, model: Modes, method: str, inside: Inside | None) -> Floats:
-    """Equation (3): v_i = B^T u_i, or B^T R^-1 u_i."""
-    modes = model.detectors if model.scale is None else model.detectors / model.scale
-    use, good = np.asarray(modes.any(axis=0)), stream.observation.good_samples
-    if method == "mean":
-        total = focal_plane_mean.read(stream, use, good, inside).total
-        times = [total * u.max(initial=0.0) for u in modes]
-    else:
-        with ThreadPoolExecutor(max(1, stream.threads)) as pool:
-            gram = Gram(stream, pool, use, inside=inside)
-            gram.scale = model.scale
-            times = [gram.apply(u)[1] for u in modes]
-    return np.array(times).reshape(len(modes), stream.shape[1])
-
-
-def _tell(
-    step: CommonModeFilter, stream: Stream, detectors: Usable, found: Ritz, inside: Inside | None
-) -> None:
-    """State what was found; flag the dead detectors, which the complete signal shows."""
-    observation, tally, who = stream.observation, stream.observation.tally, step.label
-    if inside is not None:
-        masked, covered = counts(inside, observation.n_samples)
-        tally.count(who, MASKED, masked, observation.n_detectors * observation.n_samples)
-        tally.count(
-            who,
-            "instants with all detectors in the source mask: no mode removed",
-            covered,
-            observation.n_samples,
-        )
-    if stream.signal == MAIN:
-        for name, dead in (("not finite", detectors.not_finite), ("constant", detectors.constant)):
-            tally.count(who, f"detectors flagged: signal {name}", int(dead.sum()))
-            observation.detector_flags[dead] |= DEAD
-    sizes = np.sqrt(
-        np.maximum(found.values[: step.modes + 1], 0.0)
-        / max(1, detectors.n_good * detectors.n_used)
-    )
-    values = ", ".join(f"{s:.4g}" for s in sizes)
-    worst = found.residuals[: found.count].max(initial=0.0)
-    unit = "K" if detectors.scale is None else "of the detectors' rms"
-    tally.state(
-        who,
-        f"{observation.name}: singular values / sqrt(detectors x samples)",
-        f"{values or 'none'} {unit}",
-    )
-    tally.state(
-        who, f"{observation.name}: residual of the modes", f"{worst:.1e} after {found.steps} steps"
-    )
-    tally.state(who, f"{observation.name}: modes removed", f"{found.count} ({found.what})")
-
-
-def _check_precision(found: Ritz, detectors: Usable, stream: Stream, place: str) -> None:
-    if stream.dtype != np.float32 or not found.count or detectors.energy <= 0:
-        return
-    left = (
-        max(detectors.energy - float(found.energies[: found.count].sum()), 0.0) / detectors.energy
-    )
-    if 0.01 * np.sqrt(left) < ROUNDING:
-        unit = 1.0 if detectors.scale is None else float(np.median(detectors.scale[detectors.use]))
-        rms, ratio = (
-            unit * np.sqrt(detectors.energy / (detectors.n_good * detectors.n_used)),
-            1 / max(np.sqrt(left), 1e-30),
-        )
-        raise PipelineError(
-            f"the common mode, {rms:.3g} K rms, is {ratio:.1e} times what is left, more than"
-            " float32 can carry",
-            place=place,
-            cure="set precision: float64",
-        )
-
-
-def _sees_nothing(stream: Stream) -> bool:
-    """Whether a constant signal may be that of a detector in order: where it is the sky alone, or
-    not the complete signal, which shows what is dead."""
-    of_the_sky = bool(stream.components) and all(
-        c.enters == "above the atmosphere" for c in stream.components
-    )
-    return stream.signal != MAIN or of_the_sky
-
-
-@dataclass
-class Modes:
-    """Modes to remove: u (k, n_det), unit vectors, and v (k, n_samp), K_RJ; with a ``scale``
-    (n_det,), K_RJ, R u and v / K_RJ.
-    """
-
-    detectors: Floats
-    times: Floats
-    scale: Floats | None = None
-    parts: tuple[Modes, ...] = ()
-    """Those of each wafer, where modes are found wafer by wafer."""
+        return Modes(detectors, times, None, tuple(parts))
 
 
 @nb.njit(
