@@ -106,7 +106,7 @@ class SkyMap(SkyParameters):
             stream += stream.dtype.type(self.outside)
 
     def collect(self, data: Data, observation: Observation, state: SkyState) -> None:
-        _count(self, observation, state)
+        self._count(observation, state)
         if self.label not in data.partial:
             image = state.sky.image(self.label, state.grid.axis)
             data.add(self.label, InputImage(image))
@@ -119,28 +119,27 @@ class SkyMap(SkyParameters):
         """
         show_input(self.label, data)
 
-
-def _count(step: SkyMap, observation: Observation, state: SkyState) -> None:
-    """Count the samples that see no sky, and warn where all of them are."""
-    beyond, behind = state.totals()
-    total = observation.n_detectors * observation.n_samples
-    observation.tally.count(step.label, "samples outside the input map", beyond, total)
-    if beyond == total:
-        ra, dec = np.degrees(observation.centre)
-        cure = (
-            ""
-            if isinstance(state.grid.source, HealpixMap)
-            else "; `centre: target` moves the map there"
-        )
-        warnings.warn(
-            f"{step.label}: no sample of {observation.name} around RA {ra:.4f} deg, Dec {dec:.4f}"
-            f" deg falls on the input map {step.source}{cure}",
-            stacklevel=3,
-        )
-    if behind:
-        observation.tally.count(
-            step.label, "samples more than 90 deg from the input map's centre", behind, total
-        )
+    def _count(self, observation: Observation, state: SkyState) -> None:
+        """Count the samples that see no sky, and warn where all of them are."""
+        beyond, behind = state.totals()
+        total = observation.n_detectors * observation.n_samples
+        observation.tally.count(self.label, "samples outside the input map", beyond, total)
+        if beyond == total:
+            ra, dec = np.degrees(observation.centre)
+            cure = (
+                ""
+                if isinstance(state.grid.source, HealpixMap)
+                else "; `centre: target` moves the map there"
+            )
+            warnings.warn(
+                f"{self.label}: no sample of {observation.name} around RA {ra:.4f} deg,"
+                f" Dec {dec:.4f} deg falls on the input map {self.source}{cure}",
+                stacklevel=3,
+            )
+        if behind:
+            observation.tally.count(
+                self.label, "samples more than 90 deg from the input map's centre", behind, total
+            )
 
 
 def show_input(label: str, data: Data) -> None:
