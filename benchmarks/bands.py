@@ -17,7 +17,7 @@ import warnings
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from zonda.core.compilation.compiled import one_blas_thread
+from zonda.core.machine import one_blas_thread
 
 one_blas_thread()
 

@@ -33,10 +33,9 @@ SCENES = {
 
 def one(scene, folder, prune):
     """Run one scene in this process; figures as JSON."""
-    from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
+    from zonda.core.machine import one_blas_thread
 
     one_blas_thread()
-    ensure_cache()
     import zonda
 
     file = zonda.load(str(SCENES[scene]))

@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 
-from zonda.core.compilation.compiled import one_blas_thread
+from zonda.core.machine import one_blas_thread
 
 one_blas_thread()  # as `zonda run` does: idle threads of BLAS take CPU time
 

@@ -4,8 +4,6 @@ by stage.
 python benchmarks/startup.py             first run with empty caches, then the best of three further
 runs, and of
                                          three that have the compiled kernels but plan anew
-python benchmarks/startup.py --kernels   write the packages' kernels.py, the lists of what a first
-run compiles in two processes
 """
 
 from __future__ import annotations
@@ -24,10 +22,8 @@ from typing import Any
 PIPELINE = "mustang2_cluster"
 
 
-def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dict[str, Any]:
-    """Run the command in this process; (wall, CPU of this process) by stage. ``compiled``: see
-    `listen`.
-    """
+def stages(folder: str, pipeline: str) -> dict[str, Any]:
+    """Run the command in this process; (wall, CPU of this process) by stage."""
     start, begun = (
         float(os.environ["ZONDA_STARTED"]),
         0.0,
@@ -56,8 +52,6 @@ def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dic
 
         setattr(module, name, call)
 
-    if compiled is not None:
-        listen(compiled)
     from zonda.core.cli import run
 
     after(run, "load", "read the pipeline file")
@@ -92,46 +86,7 @@ def stages(folder: str, pipeline: str, compiled: list[Any] | None = None) -> dic
     return {"stages": rows}
 
 
-def listen(compiled: list[Any]) -> None:
-    """Note every kernel of zonda that is compiled: module, name, types, CPU seconds (own, all),
-    whether within another.
-    """
-    import numba.core.event as events
-
-    from zonda.core.compilation.compile_ahead import text_of
-
-    class Listener(events.Listener):  # type: ignore[misc]
-        def __init__(self) -> None:
-            self.open: list[list[Any]] = []
-
-        def on_start(self, event: Any) -> None:
-            self.open.append([time.process_time(), 0.0])
-
-        def on_end(self, event: Any) -> None:
-            begun, inside = self.open.pop()
-            took = time.process_time() - begun
-            if self.open:
-                self.open[-1][1] += took
-            function = event.data["dispatcher"].py_func
-            if function.__module__.startswith("zonda."):
-                types = [text_of(t) for t in event.data["args"]]
-                compiled.append(
-                    [
-                        function.__module__,
-                        function.__name__,
-                        types,
-                        took - inside,
-                        took,
-                        bool(self.open),
-                    ]
-                )
-
-    events.register("numba:compile", Listener())
-
-
-def child(
-    folder: Path, caches: Path, pipeline: str, kernels: bool = False, known: str = "zonda"
-) -> dict[str, Any]:
+def child(folder: Path, caches: Path, pipeline: str, known: str = "zonda") -> dict[str, Any]:
     """One run in a process of its own; ``known``: the folder of what is remembered beside compiled
     kernels.
     """
@@ -153,7 +108,6 @@ def child(
         str(folder),
         "--pipeline",
         pipeline,
-        *(["--listen"] if kernels else []),
     ]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
@@ -161,22 +115,6 @@ def child(
     wall, now = time.time() - begun, os.times()
     cpu = now.children_user + now.children_system - used.children_user - used.children_system
     return {**json.loads(result.read_text()), "wall": wall, "cpu": cpu}
-
-
-def write(rows: list[list[str]]) -> None:
-    """The lists of kernels, one in each package: ``rows`` (seconds, module, name, types) with their
-    numbers.
-    """
-    lists: dict[Path, list[str]] = {}
-    for number, row in enumerate(dict.fromkeys(" ".join(row) for row in rows), 1):
-        package = row.split()[1].split(".")[1:3]  # operators, sky
-        package = package if package[0] == "operators" else package[:1]
-        lists.setdefault(Path(__file__).parents[1].joinpath(*package, "kernels.py"), []).append(
-            f'    "{number} {row}",'
-        )
-    for path, lines in lists.items():
-        head = path.read_text().partition("KERNELS =")[0]
-        path.write_text(f"{head}KERNELS = (\n" + "\n".join(lines) + "\n)\n")
 
 
 def table(title: str, run: dict[str, Any]) -> str:
@@ -197,33 +135,15 @@ def main() -> None:
     )
     parser.add_argument("--pipeline", default=PIPELINE)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--kernels", action="store_true", help="write the packages' kernels.py")
     parser.add_argument("--child", help=argparse.SUPPRESS)
-    parser.add_argument("--listen", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
-        compiled: list[Any] | None = [] if options.listen else None
-        found = stages(options.child, options.pipeline, compiled)
-        Path(options.child, "result.json").write_text(json.dumps({**found, "compiled": compiled}))
+        found = stages(options.child, options.pipeline)
+        Path(options.child, "result.json").write_text(json.dumps(found))
         return
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place, "out")
         folder.mkdir()
-        if options.kernels:
-            os.sched_setaffinity(
-                0, {min(os.sched_getaffinity(0))}
-            )  # one processor: nothing is compiled elsewhere
-            made = child(folder, Path(place, "caches"), options.pipeline, kernels=True)["compiled"]
-            rows = [
-                [f"{all_in:.1f}", m, n, *t]
-                for m, n, t, _, all_in, inside in made
-                if not inside and None not in t
-            ]
-            write(rows)
-            for module, name, types, seconds, *_ in sorted(made, key=lambda row: -row[3]):
-                print(f"{seconds:6.2f} s  {module}.{name} {', '.join(map(str, types))}")
-            print(f"{sum(row[3] for row in made):6.2f} s of CPU time in all")
-            return
         first = child(folder, Path(place, "caches"), options.pipeline)
         runs = [
             child(folder, Path(place, "caches"), options.pipeline) for _ in range(options.repeats)

@@ -69,10 +69,9 @@ operators:
 
 def one(file: Path, memory: int | None) -> None:
     """Plan and run the file in this process; figures as JSON."""
-    from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
+    from zonda.core.machine import one_blas_thread
 
     one_blas_thread()
-    ensure_cache()
     warnings.simplefilter("ignore")
     import zonda
 

@@ -1,4 +1,4 @@
-"""Memory and threads of this machine, and the memory of this process."""
+"""Memory and threads of this machine and of this process."""
 
 from __future__ import annotations
 
@@ -28,3 +28,14 @@ def resident_memory() -> int:
     with suppress(OSError, ValueError):
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0
+
+
+def one_blas_thread() -> None:
+    """Let BLAS work on one thread, unless the user says otherwise; call it before numpy is
+    imported.
+
+    zonda's own threads fill the machine. BLAS threads beside them wait for each other, and sums may
+    depend on their number.
+    """
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .compilation.jit import nb
+from .kernels import kernel
 from .numerics.projection import rotation_matrices
 from .numerics.quaternions import detector_quaternions
 from .types import AnyFloats, Floats
@@ -114,7 +114,7 @@ def seen_from(quaternions: Floats, direction: Floats) -> Floats:
     return np.ascontiguousarray(np.einsum("nij,i->jn", rotation_matrices(quaternions), direction))
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def fill_row(poles, axis, plate, gamma, start, c, s):  # type: ignore[no-untyped-def]
     """`PolarizationAngles.fill` of one detector, with its ``axis`` (2, 3) and ``gamma`` (2,), into
     ``c``, ``s`` (n,).
@@ -136,7 +136,7 @@ def fill_row(poles, axis, plate, gamma, start, c, s):  # type: ignore[no-untyped
             c[t], s[t] = c[t] * u - s[t] * v, c[t] * v + s[t] * u
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _fill(  # type: ignore[no-untyped-def]
     poles, axes, plate, gamma, detectors, start, cosine, sine
 ):
@@ -145,7 +145,7 @@ def _fill(  # type: ignore[no-untyped-def]
         fill_row(poles, axes[d], plate, gamma[d], start, cosine[k], sine[k])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _add(  # type: ignore[no-untyped-def]
     poles, axes, plate, gamma, detectors, start, efficiency, q, u, rows, out
 ):

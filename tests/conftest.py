@@ -4,12 +4,17 @@ what a test registers goes with it; hypothesis draws the same examples each time
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from zonda.core.registry import registries
+from zonda.core.storage import user_cache
+
+# kernels are compiled once, not in every session
+os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache.folder()))
 
 # how quickly examples are made depends on what else the machine does
 settings.register_profile(

@@ -63,18 +63,6 @@ CALLS = {
 }
 ALLOWED = {
     ("core/cli/group.py", "import_module"): "names from the table in zonda/commands.py",
-    (
-        "core/compilation/compile_ahead.py",
-        "import_module",
-    ): "modules that packages list in their kernels.py",
-    (
-        "core/compilation/compile_ahead.py",
-        "subprocess.Popen",
-    ): "zonda itself, as a child; no shell; its own arguments",
-    (
-        "core/compilation/kernel_cache.py",
-        "pickle.loads",
-    ): "machine code that this user compiled; numba's own cache does the same",
     ("core/discovery.py", "import_module"): "names from the metadata of installed packages",
     (
         "core/storage/packed.py",

@@ -7,6 +7,7 @@ pluggy and the metadata.
 COMMANDS = {
     "accuracy": "zonda.core.accuracy.command:accuracy",
     "check": "zonda.core.cli.check:check",
+    "compile": "zonda.core.cli.compile:compile_kernels",
     "completion": "zonda.plugins.commands.completion:completion",
     "compare": "zonda.plugins.commands.compare:compare",
     "doctor": "zonda.plugins.commands.doctor:doctor",

@@ -116,10 +116,9 @@ def resume(
     tried again, and what is complete is combined. The maps are the same bits as those of an
     undisturbed campaign.
     """
-    from ..compilation.compiled import ensure_cache, one_blas_thread
+    from ..machine import one_blas_thread
 
     one_blas_thread()
-    ensure_cache()
     from ..storage.files import check_output_folder
     from ..storage.lock import lock
     from . import run as campaign

@@ -17,7 +17,7 @@ from typing import Any, cast
 
 from .. import children
 from ..errors import PipelineError
-from ..machine import available_memory, available_threads
+from ..machine import available_memory, available_threads, one_blas_thread
 from . import warned
 from .settings import Engine, Tls
 
@@ -198,13 +198,10 @@ def begin_worker(safe: str | None = None) -> None:
     """
     children.restore(safe)
     warned.keep()
-    from ..compilation.compiled import ensure_cache, one_blas_thread
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     one_blas_thread()
-    ensure_cache()
     from multiprocessing import connection, parent_process
 
     parent = parent_process()

@@ -13,7 +13,6 @@ from . import complete
 from .request import RunRequest
 
 if TYPE_CHECKING:
-    from ..compilation.compile_ahead import Helper
     from ..configuration.header import Accuracy
     from ..configuration.pipeline_file import PipelineFile
     from ..data import Data
@@ -108,30 +107,22 @@ def run(**given: Any) -> None:
     products are in the folder that the last line names.
     """
     from .. import early
-    from ..compilation.compile_ahead import Helper
-    from ..compilation.compiled import ensure_cache, one_blas_thread
-    from ..machine import available_threads
+    from ..machine import available_threads, one_blas_thread
 
     request = RunRequest(**given)
     one_blas_thread()
-    ensure_cache()
     context = click.get_current_context()
     context.call_on_close(gc.enable)
     gc.disable()  # modules make no garbage, and looking for it takes a tenth of their time
-    helper = Helper()
-    context.call_on_close(helper.close)
-    if not request.is_campaign:
-        if available_threads() > 1 and request.threads != 1:
-            context.call_on_close(early.end)
-            early.begin(request.pipelines[0])
-        helper.prepare()
+    if not request.is_campaign and available_threads() > 1 and request.threads != 1:
+        context.call_on_close(early.end)
+        early.begin(request.pipelines[0])
     file = load(request.pipelines[0], request.settings)
     if request.is_campaign or file.header.campaign is not None:
-        helper.close()
         early.end()
         _run_campaign(request)
     else:
-        _run_one(request, file, helper)
+        _run_one(request, file)
 
 
 def load(pipeline: str, settings: tuple[str, ...], only: tuple[str, ...] = ()) -> PipelineFile:
@@ -157,7 +148,7 @@ def _run_campaign(request: RunRequest) -> None:
     campaign.run(request)
 
 
-def _run_one(request: RunRequest, file: PipelineFile, helper: Helper) -> None:
+def _run_one(request: RunRequest, file: PipelineFile) -> None:
     from ..plan import remembered
     from ..storage.files import check_output_folder, write_text
     from ..storage.lock import lock
@@ -179,7 +170,6 @@ def _run_one(request: RunRequest, file: PipelineFile, helper: Helper) -> None:
         from ..campaign.folder import check_free, make_way
 
         check_free(folder)
-    helper.begin()
     made = remembered.summary(
         file,
         keep=request.keep,
@@ -205,7 +195,6 @@ def _run_one(request: RunRequest, file: PipelineFile, helper: Helper) -> None:
         ceiling=request.memory,
         provenance=provenance,
     )
-    helper.succeeded()
     write_text(folder / "resolved.yaml", resolved)
     _show(data, request.verbose)
     if request.verify:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ..compilation.jit import nb
+from ..kernels import kernel
 from ..types import Floats
 
 STEPS = 8192
@@ -22,7 +22,7 @@ def table(power: float) -> Floats:
     return np.asarray(np.exp(-power * DEEPEST / STEPS * np.arange(STEPS + 2)), np.float64)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def smooth_directly(  # type: ignore[no-untyped-def]
     values, d, areas, reach, whole, sigma, power, gaussian, first, stop
 ):

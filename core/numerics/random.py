@@ -33,7 +33,7 @@ import numpy as np
 from numba import float32, int32, int64, uint32, uint64
 from numpy.typing import NDArray
 
-from ..compilation.jit import nb
+from ..kernels import kernel
 
 TILE = 1024
 """Numbers made together."""
@@ -131,7 +131,7 @@ def _target(
 # kernels (callable from numba)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def fill_normals(key, stream, start, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (n,) float32 or float64 with normal deviates ``start`` .. of ``stream`` under
     ``key`` (2,) uint32.
@@ -148,7 +148,7 @@ def fill_normals(key, stream, start, out):  # type: ignore[no-untyped-def]
             target[k] = source[k]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def normal_scratch():  # type: ignore[no-untyped-def]
     """(words, bits, tile) for `normal_tile`."""
     return (
@@ -158,7 +158,7 @@ def normal_scratch():  # type: ignore[no-untyped-def]
     )
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def normal_tile(key, stream, number, words, bits, tile):  # type: ignore[no-untyped-def]
     """Fill ``tile`` (`TILE`,) float32 with normal deviates `TILE` number .. of ``stream`` under
     ``key``.
@@ -171,7 +171,7 @@ def normal_tile(key, stream, number, words, bits, tile):  # type: ignore[no-unty
     box_muller(words[2], words[3], bits, tile[512:768], tile[768:1024])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def fill_uniforms(key, stream, start, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (n,) with uniform deviates in (0, 1); arguments as in `fill_normals`."""
     words = np.empty((4, _BLOCKS), np.uint32)
@@ -194,7 +194,7 @@ def fill_uniforms(key, stream, start, out):  # type: ignore[no-untyped-def]
             out[k - first] = (np.float64(flat[k - origin]) + 0.5) * 2.0**-32
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def fill_lattice_normals(key, i0, j0, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (n_i, n_j) with the normal deviates of the lattice points from (i0, j0) under
     ``key`` (2,) uint32.
@@ -245,7 +245,7 @@ def fill_lattice_normals(key, i0, j0, out):  # type: ignore[no-untyped-def]
                     target[j] = source[j]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def philox(key, c0, c1, c2, c3, words):  # type: ignore[no-untyped-def]
     """Philox4x32-10 of the counters (c0 + b, c1, c2, c3), b = 0 .. n - 1 (no carry): words (4, n)
     uint32.
@@ -270,9 +270,7 @@ def philox(key, c0, c1, c2, c3, words):  # type: ignore[no-untyped-def]
         out0[b], out1[b], out2[b], out3[b] = uint32(x0), uint32(x1), uint32(x2), uint32(x3)
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def box_muller(a, b, bits, one, two):  # type: ignore[no-untyped-def]
     """Two arrays of normal deviates ``one, two`` (n,) float32 from two of random words ``a, b``
     (n,) uint32.

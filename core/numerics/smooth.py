@@ -18,12 +18,13 @@ from dataclasses import dataclass, field
 from functools import lru_cache, reduce
 from typing import Any, NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compilation.columns import fused
-from ..compilation.jit import nb
+from ..kernels import kernel
 from ..types import AnyFloats
+from .columns import fused
 
 PAD = 1
 """Coefficients before the first sample's interval, so that every sample has its four neighbours."""
@@ -288,7 +289,7 @@ class DetectorField:
         return out
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False)
+@kernel(error_model="python")
 def _prefilter(values, taps, out):  # type: ignore[no-untyped-def]
     half, n = taps.size - 1, nb.uint64(out.shape[1])
     total = np.empty(out.shape[1])
@@ -305,13 +306,13 @@ def _prefilter(values, taps, out):  # type: ignore[no-untyped-def]
             target[t] = total[t]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False)
+@kernel(error_model="python")
 def _evaluate_rows(coefficients, inside, start, out):  # type: ignore[no-untyped-def]
     for d in range(out.shape[0]):
         series_into(coefficients[d], 0, inside, start, out[d])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False)
+@kernel(error_model="python")
 def _lines(weights, coefficients, first, lines):  # type: ignore[no-untyped-def]
     """lines[d, k] = sum_n weights[d, n] coefficients[n, first + k], summed in float64."""
     total = np.empty(lines.shape[1])
@@ -325,13 +326,13 @@ def _lines(weights, coefficients, first, lines):  # type: ignore[no-untyped-def]
             lines[d, k] = total[k]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False)
+@kernel(error_model="python")
 def _evaluate(lines, first, inside, start, out):  # type: ignore[no-untyped-def]
     for d in range(out.shape[0]):
         series_into(lines[d], first, inside, start, out[d])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def series_into(line, first, inside, start, into):  # type: ignore[no-untyped-def]
     """One detector of a `Series` at the samples start .. start + into.size - 1 (absolute). For use
     in kernels.

@@ -59,10 +59,9 @@ def plan(
     formula. They are dropped or coarsened, the cheapest first, while the bounds add up to no more
     than the budget: a tenth of the noise, or the file's `budget:`.
     """
-    from ..compilation.compiled import ensure_cache, one_blas_thread
+    from ..machine import one_blas_thread
 
     one_blas_thread()
-    ensure_cache()
     from ..configuration.pipeline_file import load
     from .bands import PlanOfBands, as_dict
     from .bands import plan as make

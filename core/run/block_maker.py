@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..block import Block
-from ..compilation.jit import nb
 from ..errors import PipelineError
 from ..faults import PluginError, whose
+from ..kernels import kernel
 from ..mapmaker import MapMaker, filters, forms
 from ..numerics.tiles import TILE_SAMPLES
 from ..operator import Operator
@@ -410,13 +410,7 @@ def share_mask(block: Block, streams: Sequence[str]) -> None:
                 array[d, bad] = np.nan
 
 
-@nb.njit(
-    nogil=True,
-    cache=True,
-    boundscheck=False,
-    error_model="numpy",
-    fastmath={"contract", "nsz", "reassoc"},
-)
+@kernel(fastmath={"contract", "nsz", "reassoc"})
 def _finite(row):  # type: ignore[no-untyped-def]
     """Whether all samples of a row are finite."""
     total = zero = row.dtype.type(0)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 from typing import Any
 
-from ..compilation.compiled import one_blas_thread
+from ..machine import one_blas_thread
 
 SMALL = 1 << 20
 """Bytes up to which a data set is read whole; of larger ones the first value."""

@@ -18,9 +18,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 
+import numba as nb
 import numpy as np
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 from zonda.core.types import Floats
 
 from .layer_terms import LayerTerms
@@ -213,7 +214,7 @@ def _to_powers(n: int) -> Floats:
     return matrix
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _polynomials(  # type: ignore[no-untyped-def]
     y, s, coefficients, y0, y_scale, s0, s_scale, y_low, y_high, out
 ):

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from zonda.core.block import Block
-from zonda.core.compilation.jit import nb
 from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.focalplane import Focalplane
+from zonda.core.kernels import kernel
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.storage.ecsv import read_table
@@ -176,7 +176,7 @@ def read_shares(path: Path, plane: Focalplane) -> Shares:
     return Shares.of(len(plane), detector, source, share)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _add_shares(given, first, source, share, out):  # type: ignore[no-untyped-def]
     """Equation (1); the detectors' samples in turn, so that a sample has the same bits in every
     block.

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.block import Block
-from zonda.core.compilation.jit import nb
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Hertz, Kelvin, Seconds
 from zonda.core.data import Data
+from zonda.core.kernels import kernel
 from zonda.core.numerics.random import uniforms
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
@@ -134,7 +134,7 @@ class Arrivals:
     amplitude: Floats
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _add_pulses(times, amplitudes, decay, seconds, threshold, out):  # type: ignore[no-untyped-def]
     """Add equation (1) at ``seconds`` (n,) to ``out`` (n,); NaN where it is above the threshold.
     Returns how many are.

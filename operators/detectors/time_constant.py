@@ -28,9 +28,9 @@ from typing import ClassVar
 import numpy as np
 
 from zonda.core.block import Block
-from zonda.core.compilation.jit import nb
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction, Seconds
+from zonda.core.kernels import kernel
 from zonda.core.numerics.random import normals
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.observation import Observation
@@ -125,7 +125,7 @@ def _reach(tau: float, rate: float) -> int:
     return math.ceil(REACH * tau * rate) + 1 if tau > 0 else 0
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _low_pass(given, start, factors, tile, out):  # type: ignore[no-untyped-def]
     """Equation (2); ``given``, ``out`` (n_det, n) from sample ``start`` on, in tiles that are
     absolute.
@@ -155,7 +155,7 @@ def _low_pass(given, start, factors, tile, out):  # type: ignore[no-untyped-def]
             begin = end
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _around(row, low, high):  # type: ignore[no-untyped-def]
     """Samples low .. high - 1 of a row in float64: straight lines where they are not finite, held
     beyond the last that are.

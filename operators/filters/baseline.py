@@ -22,10 +22,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 from zonda.core.numerics.smooth import spline_basis
 from zonda.core.types import Floats
 
@@ -215,13 +216,7 @@ def _inverse(normal: Floats) -> Floats:
 # rows stand beside it.
 
 
-@nb.njit(
-    nogil=True,
-    cache=True,
-    boundscheck=False,
-    error_model="numpy",
-    fastmath={"contract", "nsz", "reassoc"},
-)
+@kernel(fastmath={"contract", "nsz", "reassoc"})
 def dot(a, b):  # type: ignore[no-untyped-def]
     """sum_t a_t b_t of two chunks."""
     total = 0.0
@@ -230,16 +225,14 @@ def dot(a, b):  # type: ignore[no-untyped-def]
     return total
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def lessen(x, c, f):  # type: ignore[no-untyped-def]
     """x -= c f, of two chunks."""
     for t in range(nb.uint64(x.size)):
         x[t] -= c * f[t]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _solve(inverse, sums, out):  # type: ignore[no-untyped-def]
     """All rows for each row of the matrix, which may exceed the cache."""
     for k in range(sums.shape[1]):
@@ -247,7 +240,7 @@ def _solve(inverse, sums, out):  # type: ignore[no-untyped-def]
             lessen(out[d], -sums[d, k], inverse[k])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _factor(normal, least, factor):  # type: ignore[no-untyped-def]
     """Cholesky's factor L of a matrix (K, K) with few diagonals: factor[i, j] = L[j + i, j], and 1
     / L[j, j] at i = 0.
@@ -270,7 +263,7 @@ def _factor(normal, least, factor):  # type: ignore[no-untyped-def]
     return True
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _substitute(factor, rows):  # type: ignore[no-untyped-def]
     """Solve L L^T c = row for each of the ``rows`` (n_row, K), in place."""
     taps, size = factor.shape
@@ -288,14 +281,14 @@ def _substitute(factor, rows):  # type: ignore[no-untyped-def]
             row[j] = value * factor[0, j]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def keep_used(x, use):  # type: ignore[no-untyped-def]
     """x = 0 where it is not used, unless it is not finite."""
     for t in range(nb.uint64(x.size)):
         x[t] *= use[t]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _normal(use, functions, stops, firsts, normal):  # type: ignore[no-untyped-def]
     """normal += B_g B_g^T."""
     taps, low, x = functions.shape[0], 0, np.empty(AT_ONCE)
@@ -313,7 +306,7 @@ def _normal(use, functions, stops, firsts, normal):  # type: ignore[no-untyped-d
             normal[j, i] = normal[i, j]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _sums(  # type: ignore[no-untyped-def]
     values, lines, cell, inside, start, begin, use, functions, stops, firsts, sums
 ):
@@ -330,7 +323,7 @@ def _sums(  # type: ignore[no-untyped-def]
         low = high
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _subtract(  # type: ignore[no-untyped-def]
     values, lines, cell, inside, start, begin, functions, stops, firsts, coefficients
 ):

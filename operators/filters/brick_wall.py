@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks, empty
 from zonda.core.numerics.smooth import product, spline_basis
 from zonda.core.numerics.tiles import TILE_DETECTORS
@@ -314,9 +314,7 @@ def bridge(row: AnyFloats, gaps: NDArray[np.intp]) -> None:
     row[gaps] = np.interp(gaps, known, row[known])
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _spread(rows, first, weights, s):  # type: ignore[no-untyped-def]
     """s[first + j, d] += sum_n weights[j, n] rows[d, n] of up to `ABREAST` rows (n_det, N): s
     (n_knot, ABREAST).
@@ -355,9 +353,7 @@ AT_ONCE = 64
 """Groups that all rows pass through together, while their weights are in the cache."""
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _subtract(rows, first, weights, c):  # type: ignore[no-untyped-def]
     """rows[d, n] -= sum_j weights[j, n] c[d, first + j]."""
     n_det, n, w = np.uintp(rows.shape[0]), np.uintp(rows.shape[1]), weights

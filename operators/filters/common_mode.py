@@ -31,9 +31,9 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from zonda.core.compilation.jit import nb
 from zonda.core.data import Block, Data, Stream
 from zonda.core.flags import DEAD
+from zonda.core.kernels import kernel
 
 from .mode_search import Modes, ModeSearch
 from .parameters import CommonModeParameters
@@ -114,9 +114,7 @@ class CommonModeFilter(CommonModeParameters):
         return Modes(detectors, times, None, tuple(parts))
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _remove(signal, u, v):  # type: ignore[no-untyped-def]
     """signal -= u v^T in float64, rounded once."""
     n_det, n = signal.shape

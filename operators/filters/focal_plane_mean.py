@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.stream import Stream
@@ -122,9 +122,7 @@ LANES = 32
 """
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def add_moments(row, lanes, out):  # type: ignore[no-untyped-def]
     """Add the sum and the sum of squares of ``row`` (n,) to ``out`` (2,). ``lanes`` (2, LANES):
     scratch.
@@ -148,9 +146,7 @@ def add_moments(row, lanes, out):  # type: ignore[no-untyped-def]
         out[1] += second[i]
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _look(part, start, stop, use, sums, range_of, moments):  # type: ignore[no-untyped-def]
     """Add samples start .. stop - 1 of ``part`` to ``sums`` (tiles, n), ``range_of`` (2, n) and
     ``moments`` (2, n_det).

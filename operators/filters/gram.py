@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
@@ -290,7 +290,7 @@ def directions(number: int, n_detectors: int) -> Floats:
     return normals(stream_key(0, "CommonModeFilter", number), 0, n_detectors).astype(np.float64)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-untyped-def]
     """v = A^T q of the samples start .. stop - 1, tile by tile: out (n_tile, 3, n_det) takes each
     tile's sums and squares, where wanted, and A v, of the detectors ``rows``."""
@@ -306,9 +306,7 @@ def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-
             _image(array, low, high, rows, series, None, out[k:])
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
     """v = A^T q at samples start .. stop - 1, eight detectors at a time."""
     n = stop - start
@@ -335,9 +333,7 @@ def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
             v[t] += q0 * np.float64(a[t])
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _image(array, begin, end, rows, series, moments, out):  # type: ignore[no-untyped-def]
     """out[:, 2] = A v of each tile of the samples begin .. end - 1, four detectors at a time;
     unless ``moments`` is None, out[:, 0] = A 1 and out[:, 1] = squares in the same reading."""

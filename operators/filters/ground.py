@@ -28,15 +28,16 @@ import warnings
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from zonda.core.compilation.jit import nb
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Block, Observation
 from zonda.core.flags import has_a_signal
+from zonda.core.kernels import kernel
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
@@ -178,13 +179,7 @@ class Template:
         return len(spoilt)
 
 
-@nb.njit(
-    nogil=True,
-    cache=True,
-    boundscheck=False,
-    error_model="numpy",
-    fastmath={"contract", "nsz", "reassoc"},
-)
+@kernel(fastmath={"contract", "nsz", "reassoc"})
 def _total(x):  # type: ignore[no-untyped-def]
     total = 0.0
     for t in range(nb.uint64(x.size)):
@@ -192,7 +187,7 @@ def _total(x):  # type: ignore[no-untyped-def]
     return total
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _sums(  # type: ignore[no-untyped-def]
     values, lines, cell, inside, start, begin, use, functions, stops, number, sums, totals
 ):
@@ -217,7 +212,7 @@ def _sums(  # type: ignore[no-untyped-def]
         first = last
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _subtract(  # type: ignore[no-untyped-def]
     values, lines, cell, inside, start, begin, which, functions, stops, number, trend, means
 ):

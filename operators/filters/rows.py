@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.block import Block
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.smooth import series_into
 from zonda.core.types import AnyFloats, Floats
@@ -117,7 +118,7 @@ def in_double(
     by_rows(label, block, on_a_copy, inside)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def read(values, lines, cell, inside, start, d, low, into):  # type: ignore[no-untyped-def]
     """Samples low .. low + into.size - 1 of row ``d`` in float64, with the mean; the other
     arguments are those of `Rows`.
@@ -132,7 +133,7 @@ def read(values, lines, cell, inside, start, d, low, into):  # type: ignore[no-u
             into[t] = row[t]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def write(values, d, low, x):  # type: ignore[no-untyped-def]
     """Round ``x`` to the samples from ``low`` on of row ``d``."""
     row = values[d, low : low + x.size]
@@ -140,7 +141,7 @@ def write(values, d, low, x):  # type: ignore[no-untyped-def]
         row[t] = x[t]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _read_all(values, lines, cell, inside, start, begin, out):  # type: ignore[no-untyped-def]
     for d in range(out.shape[0]):
         read(values, lines, cell, inside, start, d, begin, out[d])

@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.block import Block
-from zonda.core.compilation.jit import nb
 from zonda.core.errors import PipelineError
+from zonda.core.kernels import kernel
 from zonda.core.maps.planes import Plane
 from zonda.core.types import Floats
 
@@ -121,7 +121,7 @@ class Directions:
             )
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def add_directions(  # type: ignore[no-untyped-def]
     rays, motion, start, xi, eta, index, rows, finite, first, good, sums
 ):

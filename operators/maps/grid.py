@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.jit import nb
 from zonda.core.errors import InputError
+from zonda.core.kernels import kernel
 from zonda.core.maps.header import exact_header
 from zonda.core.numerics import projection
 from zonda.core.numerics.chunks import chunks
@@ -230,7 +230,7 @@ def _union(pieces: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
     return low + np.flatnonzero(found)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def tangent_pixels(h, first, stop, xi, eta, ny, nx, out):  # type: ignore[no-untyped-def]
     """Flat index y nx + x of the pixel that holds each sample, -1 outside the image or behind it.
     ``h`` (9, n_samp).

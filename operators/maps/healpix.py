@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 
 PAGE = 6
 """A page holds 2 ** PAGE pixels."""
@@ -66,7 +66,7 @@ def lookup(covered: NDArray[np.int64]) -> Lookup:
     return Lookup(covered, first, pages, places)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def healpix_pixels(  # type: ignore[no-untyped-def]
     h, first, stop, xi, eta, nside, nest, covered, page, pages, places, out
 ):
@@ -95,7 +95,7 @@ def healpix_pixels(  # type: ignore[no-untyped-def]
                 _by_search(pixel, covered, found)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def _angles(h, low, end, a, b, height, cap, quarter):  # type: ignore[no-untyped-def]
     """z, s / nside (equation 2) and t of the directions of one detector, without branches: in
     vectors.
@@ -135,7 +135,7 @@ def _angles(h, low, end, a, b, height, cap, quarter):  # type: ignore[no-untyped
         quarter[k] = t if t < 4.0 else 0.0
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def _ring(z, s, t, nside):  # type: ignore[no-untyped-def]
     """Pixel number in the RING ordering."""
     if abs(z) <= 2.0 / 3.0:
@@ -152,7 +152,7 @@ def _ring(z, s, t, nside):  # type: ignore[no-untyped-def]
     ) + column
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def _nested(z, s, t, nside):  # type: ignore[no-untyped-def]
     """Pixel number in the NESTED ordering."""
     if abs(z) <= 2.0 / 3.0:
@@ -170,7 +170,7 @@ def _nested(z, s, t, nside):  # type: ignore[no-untyped-def]
     return face * nside * nside + (_spread(x) | (_spread(y) << 1))
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def _spread(v):  # type: ignore[no-untyped-def]
     """The bits of ``v``, below 2 ** 29, at the even places."""
     v = (v | (v << 16)) & 0x0000FFFF0000FFFF
@@ -180,7 +180,7 @@ def _spread(v):  # type: ignore[no-untyped-def]
     return (v | (v << 1)) & 0x5555555555555555
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def _by_pages(pixel, page, pages, places, found):  # type: ignore[no-untyped-def]
     """Index of each pixel among the covered ones, -1 where it is none of them, from the pages of
     `Lookup`.
@@ -196,7 +196,7 @@ def _by_pages(pixel, page, pages, places, found):  # type: ignore[no-untyped-def
         )
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath=False)
+@kernel(fastmath=False)
 def _by_search(pixel, covered, found):  # type: ignore[no-untyped-def]
     """Index of each pixel among the covered ones, -1 where it is none of them, by bisection."""
     for k in range(found.size):

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, frame_rotation, ray_coefficients
 from zonda.core.types import Floats
@@ -225,7 +225,7 @@ def _joined(one: Box | None, other: Box, pixel: float) -> Box:
     return _whole((left, min(one[1], other[1]), right, max(one[3], other[3])), pixel)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def plate_carree_pixels(  # type: ignore[no-untyped-def]
     h, first, stop, xi, eta, rows, column, row, ny, nx, out
 ):

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from zonda.core.compilation.columns import (
+from zonda.core.kernels import kernel
+from zonda.core.numerics.columns import (
     add_change,
     bits_of,
     lanes_of,
@@ -20,7 +21,6 @@ from zonda.core.compilation.columns import (
     prefetch,
     running_terms,
 )
-from zonda.core.compilation.jit import nb
 from zonda.core.polarization import fill_row
 
 from .sums import FLAGGED, LARGEST, MAGIC, MAGIC_BITS, NOT_FINITE, OUTSIDE, TOO_LARGE, VALUE, WEIGHT
@@ -39,7 +39,7 @@ signal follow.
 """
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def add_stokes(  # type: ignore[no-untyped-def]
     signals, first, rows, at, cells, angles, which, start, good, window, own, bands
 ):
@@ -195,13 +195,13 @@ def add_stokes(  # type: ignore[no-untyped-def]
                             )
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _limit(weight):  # type: ignore[no-untyped-def]
     """The size of a sample that is too large."""
     return LARGEST / VALUE / max(weight, 1.0)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _scaled(row, factor, out):  # type: ignore[no-untyped-def]
     """Samples times ``factor``, and the bits of the largest, which are in the order of sizes:
     infinity and NaN are above all.
@@ -214,14 +214,14 @@ def _scaled(row, factor, out):  # type: ignore[no-untyped-def]
     return top
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _round(factor, values):  # type: ignore[no-untyped-def]
     """Cosines or sines times ``factor``, in steps of 2^-30."""
     for t in range(values.size):
         values[t] = ((factor * values[t] * WEIGHT + MAGIC) - MAGIC) / WEIGHT
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _least(pixels):  # type: ignore[no-untyped-def]
     least = np.int32(0)
     for t in range(pixels.size):
@@ -229,7 +229,7 @@ def _least(pixels):  # type: ignore[no-untyped-def]
     return least
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _scale(weight, noise, share, w, n):  # type: ignore[no-untyped-def]
     """The weight and the noise term of each sample, whose share the window leaves, in units of
     2^-30.
@@ -239,7 +239,7 @@ def _scale(weight, noise, share, w, n):  # type: ignore[no-untyped-def]
         w[t], n[t] = weight * one * WEIGHT, noise * one * one * WEIGHT
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _without(  # type: ignore[no-untyped-def]
     signals, where, pixels, fine, limit, size, c, s, share, values, kept, dropped
 ):
@@ -281,7 +281,7 @@ def _without(  # type: ignore[no-untyped-def]
     return number, bits_of(high)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _runs(pixels, run, begins, places):  # type: ignore[no-untyped-def]
     """Number of runs of samples in one pixel; where each begins, and its pixel. ``run``: of each
     sample, counted from 1.
@@ -299,7 +299,7 @@ def _runs(pixels, run, begins, places):  # type: ignore[no-untyped-def]
     return np.int64(found)
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _fetch(sums, places, n_runs):  # type: ignore[no-untyped-def]
     """Fetch the sums of some pixels, which are in memory, while their terms are made."""
     columns = np.uint64(sums.shape[1])
@@ -310,7 +310,7 @@ def _fetch(sums, places, n_runs):  # type: ignore[no-untyped-def]
         prefetch(sums, place + columns - np.uint64(1))
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _add(sums, terms, fields, of, places, begins, n_runs, every_w):  # type: ignore[no-untyped-def]
     """Add hits, A, and the data of the first signal of a band, which is number ``of`` of the
     ``fields``, to the pixels of runs.
@@ -333,7 +333,7 @@ def _add(sums, terms, fields, of, places, begins, n_runs, every_w):  # type: ign
         )
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _add_lanes(  # type: ignore[no-untyped-def]
     sums, column, terms, fields, lane, lanes, places, begins, n_runs
 ):

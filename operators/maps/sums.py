@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.columns import prefetch
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
+from zonda.core.numerics.columns import prefetch
 from zonda.core.types import Floats
 
 from .grid import Grid, TangentGrid
@@ -137,7 +137,7 @@ class Binning:
         return inside, deepest, dropped, largest
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def add_image(  # type: ignore[no-untyped-def]
     signals,
     h,
@@ -186,9 +186,7 @@ def add_image(  # type: ignore[no-untyped-def]
         )
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _cells(h, start, a, b, ny, nx, cells):  # type: ignore[no-untyped-def]
     """Place (y + 1) (nx + 2) + x + 1 of the pixel that holds each sample of a detector at (a, b);
     beyond the edge, the border's.
@@ -212,7 +210,7 @@ def _cells(h, start, a, b, ny, nx, cells):  # type: ignore[no-untyped-def]
         cells[t] = np.int32(np.int32(y) * row_length + np.int32(x))
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def add_list(  # type: ignore[no-untyped-def]
     signals,
     first,
@@ -250,7 +248,7 @@ def add_list(  # type: ignore[no-untyped-def]
     )
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _add(  # type: ignore[no-untyped-def]
     signals,
     first,
@@ -356,7 +354,7 @@ def _add(  # type: ignore[no-untyped-def]
             _scatter(flat, columns, cells, group, units[0])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _scales(weight, per_variance, scatter):  # type: ignore[no-untyped-def]
     """Of one detector: the largest |d| [K] that is accepted, units of w d per K, and units of the
     scatter per K^2.
@@ -367,9 +365,7 @@ def _scales(weight, per_variance, scatter):  # type: ignore[no-untyped-def]
     return limit, weight * VALUE, square
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _units(row, factor, shifted, units):  # type: ignore[no-untyped-def]
     """w d in fixed point, and all their bits together (of ~q where q < 0): an upper bound of |q|
     below the next power of two.
@@ -387,7 +383,7 @@ def _units(row, factor, shifted, units):  # type: ignore[no-untyped-def]
     return together
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _drop(  # type: ignore[no-untyped-def]
     signals, d, first, fine, limit, places, units, stride, n_rows, dropped
 ):
@@ -421,7 +417,7 @@ def _drop(  # type: ignore[no-untyped-def]
             dropped[OUTSIDE] -= 1
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _scatter(flat, columns, cells, rows, units):  # type: ignore[no-untyped-def]
     """Add fixed-point values (`TOGETHER`, n) and hits to the places of the detectors ``rows``, side
     by side.
@@ -449,7 +445,7 @@ def _scatter(flat, columns, cells, rows, units):  # type: ignore[no-untyped-def]
         flat[at + hit] += 1
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _scatter_two(flat, columns, base, cells, rows, units):  # type: ignore[no-untyped-def]
     """`_scatter` of two signals (2, `TOGETHER`, n); the second one's data are in the column
     ``base``.
@@ -486,7 +482,7 @@ def _scatter_two(flat, columns, base, cells, rows, units):  # type: ignore[no-un
         flat[at + base] += h[t]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _scatter_any(flat, columns, base, cells, rows, units):  # type: ignore[no-untyped-def]
     """`_scatter` of any number of signals (m, n_row, n) and detectors."""
     for k in range(rows.size):
@@ -499,7 +495,7 @@ def _scatter_any(flat, columns, base, cells, rows, units):  # type: ignore[no-un
                 flat[at + base + np.uintp(s - 1)] += units[s, k, t]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _fold(sums, ny, nx, weight, noise, out, others):  # type: ignore[no-untyped-def]
     """Move a thread's sums to ``out`` (n_pixels, 4), those of further signals to ``others``
     (n_pixels, m - 1): hits inside, on the border, and the most in a pixel. ``ny``: 0 for a list.

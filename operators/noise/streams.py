@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+import numba as nb
 import numpy as np
 from numba import uint64
 from numpy.typing import NDArray
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 from zonda.core.numerics.random import TILE, fill_normals, normal_scratch, normal_tile, normals
 from zonda.core.numerics.smooth import Series, SmoothField, series_into
 from zonda.core.numerics.tiles import TILE_DETECTORS
@@ -218,9 +219,7 @@ def _pieces(start: int, stop: int) -> list[tuple[int, int]]:
     return list(pairwise(cuts)) if stop > start else []
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _filter(  # type: ignore[no-untyped-def]
     key,
     tile,
@@ -280,9 +279,7 @@ def _filter(  # type: ignore[no-untyped-def]
                 row[t] += size[t] * mixed[t]
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _pair(x, s, pair):  # type: ignore[no-untyped-def]
     """Equation (3) in place on x (m, 16) and the pair's state s (2, 16), both flat."""
     a, b, to_real, to_imaginary = pair[0], pair[1], pair[2], pair[3]
@@ -295,9 +292,7 @@ def _pair(x, s, pair):  # type: ignore[no-untyped-def]
             x[now + d] = y + (to_real * r + to_imaginary * i)
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _four_sections(x, s, rate, tap):  # type: ignore[no-untyped-def]
     """Four sections in place on x (m, 16) and their states s (4, 16), both flat. The inner loop
     fills vector registers.

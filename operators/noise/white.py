@@ -9,9 +9,9 @@ import numpy as np
 from numba import uint64
 from pydantic import BeforeValidator, Field, SerializeAsAny, WithJsonSchema, model_validator
 
-from zonda.core.compilation.jit import nb
 from zonda.core.configuration.units import Fraction, KelvinRootSecond
 from zonda.core.errors import placed
+from zonda.core.kernels import kernel
 from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
 from zonda.core.numerics.smooth import series_into
 from zonda.core.operator import Operator
@@ -130,7 +130,7 @@ class _State(NamedTuple):
     key: NDArray[np.uint32]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _add_normals(key, first, start, lines, cell, inside, add, out):  # type: ignore[no-untyped-def]
     """out[d, t] = (or, to ``add``, +=) level n: level the `Series` (lines, cell, inside) of
     detector first + d at sample start + t, n normal deviate start + t of stream first + d."""

@@ -24,10 +24,10 @@ from pydantic import Field
 
 from zonda.core import flags
 from zonda.core.block import Block
-from zonda.core.compilation.jit import nb
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.errors import PipelineError
+from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.random import normals
@@ -212,9 +212,7 @@ def _sum(block: Block, name: str, others: Sequence[str]) -> AnyFloats:
     return total
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _calibrate_sky(sky, fluctuation, gain, out):  # type: ignore[no-untyped-def]
     """Equation (2) where there is nothing but the sky: the same bits in a third of the time."""
     one = out.dtype.type(1)
@@ -230,9 +228,7 @@ def _calibrate_sky(sky, fluctuation, gain, out):  # type: ignore[no-untyped-def]
     return 0
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _calibrate(  # type: ignore[no-untyped-def]
     sky,
     fluctuation,

@@ -15,14 +15,12 @@ from __future__ import annotations
 import numpy as np
 from numba import int32, uint64
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 
 from .sampling import CHUNK, count_covered, locate, misses, span_on_grid
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def add_lines(  # type: ignore[no-untyped-def]
     h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out
 ):
@@ -55,14 +53,7 @@ def add_lines(  # type: ignore[no-untyped-def]
     return beyond, behind
 
 
-@nb.njit(
-    nogil=True,
-    cache=True,
-    boundscheck=False,
-    error_model="numpy",
-    fastmath={"contract", "nsz"},
-    inline="always",
-)
+@kernel(fastmath={"contract", "nsz"}, inline="always")
 def _add_bilinear(f, place, u, v, first, stop, nx, constants, row):  # type: ignore[no-untyped-def]
     """The four grid points around each sample, one right and one up of its first spline
     coefficient; 0 off the grid.

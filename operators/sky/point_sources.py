@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.block import Block
-from zonda.core.compilation.jit import nb
 from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.units import Hertz
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band
+from zonda.core.kernels import kernel
 from zonda.core.numerics.projection import boresights, rotation_matrices
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.sphere import unit_vectors
@@ -268,7 +268,7 @@ class Sources:
         return len(np.unique(self.number))
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _add_sources(  # type: ignore[no-untyped-def]
     matrices, start, rays, width, per_area, towards, power, first, number, out
 ):

@@ -20,8 +20,8 @@ import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
-from zonda.core.compilation.columns import spline_of_four
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
+from zonda.core.numerics.columns import spline_of_four
 from zonda.core.types import AnyFloats
 
 CHUNK = 256
@@ -130,9 +130,7 @@ def pointing(
     return h, box, limits, ones
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def _point(  # type: ignore[no-untyped-def]
     quaternions, matrix, ny, nx, bounds, h, box, limits, ones
 ):
@@ -201,9 +199,7 @@ def _point(  # type: ignore[no-untyped-def]
             )  # far away no sample is on the grid and any number will do
 
 
-@nb.njit(
-    nogil=True, cache=True, boundscheck=False, error_model="numpy", fastmath={"contract", "nsz"}
-)
+@kernel(fastmath={"contract", "nsz"})
 def add_splines(  # type: ignore[no-untyped-def]
     h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out
 ):
@@ -245,14 +241,7 @@ def add_splines(  # type: ignore[no-untyped-def]
 # are compiled before, too.
 
 
-@nb.njit(
-    nogil=True,
-    cache=True,
-    boundscheck=False,
-    error_model="numpy",
-    fastmath={"contract", "nsz"},
-    inline="always",
-)
+@kernel(fastmath={"contract", "nsz"}, inline="always")
 def misses(box, a, b, limits):  # type: ignore[no-untyped-def]
     """Whether a detector at (a, b) = (xi, eta) is in front of the map and a pixel or more off it at
     every instant of a chunk.
@@ -277,14 +266,7 @@ def misses(box, a, b, limits):  # type: ignore[no-untyped-def]
     return False
 
 
-@nb.njit(
-    nogil=True,
-    cache=True,
-    boundscheck=False,
-    error_model="numpy",
-    fastmath={"contract", "nsz"},
-    inline="always",
-)
+@kernel(fastmath={"contract", "nsz"}, inline="always")
 def _between(box, k, a, b):  # type: ignore[no-untyped-def]
     """Bounds of h_k a + h_(k+1) b + h_(k+2)."""
     p, q = a * box[k, 0], a * box[k, 1]
@@ -292,14 +274,7 @@ def _between(box, k, a, b):  # type: ignore[no-untyped-def]
     return min(p, q) + min(r, s) + box[k + 2, 0], max(p, q) + max(r, s) + box[k + 2, 1]
 
 
-@nb.njit(
-    nogil=True,
-    cache=True,
-    boundscheck=False,
-    error_model="numpy",
-    fastmath={"contract", "nsz"},
-    inline="always",
-)
+@kernel(fastmath={"contract", "nsz"}, inline="always")
 def locate(  # type: ignore[no-untyped-def]
     h, a, b, count, limits, constants, ones, width, place, u, v
 ):
@@ -330,14 +305,7 @@ def locate(  # type: ignore[no-untyped-def]
     return inside, front
 
 
-@nb.njit(
-    nogil=True,
-    cache=True,
-    boundscheck=False,
-    error_model="numpy",
-    fastmath={"contract", "nsz"},
-    inline="always",
-)
+@kernel(fastmath={"contract", "nsz"}, inline="always")
 def count_covered(place, u, v, count, width, covered):  # type: ignore[no-untyped-def]
     """The number of samples whose nearest grid point is covered."""
     total = int32(0)
@@ -348,14 +316,7 @@ def count_covered(place, u, v, count, width, covered):  # type: ignore[no-untype
     return total
 
 
-@nb.njit(
-    nogil=True,
-    cache=True,
-    boundscheck=False,
-    error_model="numpy",
-    fastmath={"contract", "nsz"},
-    inline="always",
-)
+@kernel(fastmath={"contract", "nsz"}, inline="always")
 def span_on_grid(place, count):  # type: ignore[no-untyped-def]
     """The multiples of four between which all samples on the grid lie; what is filled up behind
     ``count`` is off the grid.
@@ -373,14 +334,7 @@ def span_on_grid(place, count):  # type: ignore[no-untyped-def]
     return first, stop
 
 
-@nb.njit(
-    nogil=True,
-    cache=True,
-    boundscheck=False,
-    error_model="numpy",
-    fastmath={"contract", "nsz"},
-    inline="always",
-)
+@kernel(fastmath={"contract", "nsz"}, inline="always")
 def _spline(place, u, v, first, stop, constants, at, weights):  # type: ignore[no-untyped-def]
     """The cubic B-spline weights (8, CHUNK), four along x, four along y; ``at``: ``place``, 0 for
     samples off the grid.

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 from zonda.core.numerics.projection import frame_rotation, pixel_matrix
 from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.types import Floats
@@ -241,7 +241,7 @@ def _of_healpix(sky: HealpixMap, axis: Floats | None) -> Under:
     return under
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _add(out, x, y, powers, x0, y0, step, sigma, share):  # type: ignore[no-untyped-def]
     planes, ny, nx = out.shape
     square, rest = sigma * sigma, 1.0 - share

@@ -6,13 +6,12 @@ import datetime
 import math
 import os
 import platform
-import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 
 from zonda.core.checks import Family, Measured
+from zonda.core.kernels import folder
 
 from .cases import MACHINE
 
@@ -54,7 +53,7 @@ def description() -> dict[str, str]:
     found["long double"] = f"{np.finfo(np.longdouble).nmant + 1} bits"
     found["threads"] = f"{available_threads()} of {os.cpu_count()}"
     found["free memory"] = f"{available_memory() / 1e9:.1f} GB"
-    found["compiled code"] = str(_cache_folder())
+    found["compiled code"] = str(folder() or "not kept")
     found["system"] = f"{platform.system()} {platform.release()}"
     return found
 
@@ -126,28 +125,13 @@ def elementary_functions() -> Measured:
     return worst, which
 
 
-@checks.add(MACHINE, reference="a file made and removed", limit=0, unit="folders")
+@checks.add(MACHINE, reference="a lock taken in the folder", limit=0, unit="folders")
 def writable_cache() -> Measured:
     """whether compiled code can be kept: without it every run compiles for half a minute"""
-    folder = _cache_folder()
-    trial = folder / f".zonda-doctor-{os.getpid()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        trial.write_bytes(b"")
-        trial.unlink()
-    except OSError as err:
-        return 1, f"{folder}: {err.strerror}; set NUMBA_CACHE_DIR to a folder that lasts"
-    return 0, str(folder)
-
-
-def _cache_folder() -> Path:
-    """Folder of numba's compiled code: beside the source, else in the user's cache."""
-    if named := os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(named)
-    beside = Path(sys.modules["zonda.core"].__path__[0]) / "__pycache__"
-    if os.access(beside if beside.exists() else beside.parent, os.W_OK):
-        return beside
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "numba"
+    place = folder()
+    if place is None:
+        return 1, "set NUMBA_CACHE_DIR to a folder of yours that lasts"
+    return 0, str(place)
 
 
 @checks.add(MACHINE, reference="1 GB, enough for the shipped pipelines", limit=0, unit="GB short")

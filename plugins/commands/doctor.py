@@ -23,10 +23,9 @@ def doctor(as_json: bool) -> None:
     status 1 if a figure exceeds its limit. The first run after installation also compiles, which
     takes a minute.
     """
-    from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
+    from zonda.core.machine import one_blas_thread
 
     one_blas_thread()
-    ensure_cache()
     from zonda.core.checks import measure, registered
     from zonda.core.tables import aligned
     from zonda.plugins.checks.cases import MACHINE

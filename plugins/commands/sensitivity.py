@@ -114,10 +114,9 @@ def sensitivity(
       zonda sensitivity --instrument mustang2 --site green_bank --pwv '7.7 mm' --area '8 arcmin'
       --reach '20 uK'
     """
-    from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
+    from zonda.core.machine import one_blas_thread
 
     one_blas_thread()
-    ensure_cache()
     from zonda.core.storage.files import check_output_folder
     from zonda.plugins.forecast import report
     from zonda.plugins.forecast.sensitivity import SensitivityOfBands

@@ -58,10 +58,9 @@ def validate(
         listing = [(c.id, c.paper, f"{c.claim} ({c.section})") for c in chosen]
         click.echo("\n".join(aligned(listing, align="<><")))
         return 0
-    from zonda.core.compilation.compiled import ensure_cache, one_blas_thread
+    from zonda.core.machine import one_blas_thread
 
     one_blas_thread()
-    ensure_cache()
     from zonda.core.storage.files import check_output_folder
     from zonda.core.storage.lock import lock
     from zonda.plugins.validation.engine import validate as measured

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
 from zonda.core.types import Floats
 
 from .survey import Survey, Track
@@ -97,7 +97,7 @@ def kernel_series(
     return out
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _sums(  # type: ignore[no-untyped-def]
     matrices, centre, offsets, origin, spacing, inside, variance, far, thin, total
 ):
@@ -127,7 +127,7 @@ def _sums(  # type: ignore[no-untyped-def]
                     total[i, j, 1] += g * g
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _series(  # type: ignore[no-untyped-def]
     matrices, offsets, origin, spacing, factors, variance, out
 ):

@@ -196,9 +196,9 @@ def resumed() -> Measured:
 
 
 KERNEL = """
-import numba as nb
+from zonda.core.kernels import kernel
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def total(values):
     found = values[0] * 0
     for value in values:
@@ -208,7 +208,6 @@ def total(values):
 COMPILING = """
 import importlib.util, sys
 import numpy as np
-import zonda.core.compilation.jit
 spec = importlib.util.spec_from_file_location("zonda.toy_at_once", sys.argv[1])
 module = sys.modules["zonda.toy_at_once"] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
@@ -227,7 +226,7 @@ def compiled_at_once() -> Measured:
         path.write_text(KERNEL)
         settings = {
             **os.environ,
-            "ZONDA_CACHE_DIR": f"{folder}/cache",
+            "NUMBA_CACHE_DIR": f"{folder}/cache",
             "PYTHONDONTWRITEBYTECODE": "1",
         }
 

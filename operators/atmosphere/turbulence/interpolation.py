@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import numba as nb
 import numpy as np
 
-from zonda.core.compilation.columns import four_columns_at
-from zonda.core.compilation.jit import nb
+from zonda.core.kernels import kernel
+from zonda.core.numerics.columns import four_columns_at
 
 CHUNK, RUN = 256, 16
 """Positions that are interpolated at once, and of which one box is made."""
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def boxes_of(x, y):  # type: ignore[no-untyped-def]
     """Middles and half widths of what `RUN` successive positions span: (n, runs, 4) x, y, half x,
     half y.
@@ -33,7 +34,7 @@ def boxes_of(x, y):  # type: ignore[no-untyped-def]
     return out
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _cells(a, b, box, first, last):  # type: ignore[no-untyped-def]
     """First and last cells, one of rounding included, at which the 4 coefficients of a x + b y +
     (first .. last) begin.
@@ -47,7 +48,7 @@ def _cells(a, b, box, first, last):  # type: ignore[no-untyped-def]
     return np.int64(np.floor(low)) - 1, np.int64(np.floor(high)) - 1
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def extent(matrix, boxes, i, j):  # type: ignore[no-untyped-def]
     """First and last cells: across low, high, along low, high. The drift (i, j) is steady, so its
     ends bound it.
@@ -68,7 +69,7 @@ def extent(matrix, boxes, i, j):  # type: ignore[no-untyped-def]
     return low_i, high_i, low_j, high_j
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def mark(  # type: ignore[no-untyped-def]
     matrix, boxes, i, j, side_i, side_j, first_i, first_j, wanted
 ):
@@ -83,7 +84,7 @@ def mark(  # type: ignore[no-untyped-def]
                     wanted[k - first_i, m - first_j] = 1
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def interpolate(  # type: ignore[no-untyped-def]
     matrix, x, y, i, j, side_i, side_j, low_i, low_j, width, addresses, constants, bands, out
 ):

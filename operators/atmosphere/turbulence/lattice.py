@@ -21,11 +21,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
 
+import numba as nb
 import numpy as np
 
-from zonda.core.compilation.columns import fused
-from zonda.core.compilation.jit import nb
 from zonda.core.errors import InputError
+from zonda.core.kernels import kernel
+from zonda.core.numerics.columns import fused
 from zonda.core.numerics.random import lattice_normals, stream_key
 
 from .beams import Aperture
@@ -204,7 +205,7 @@ def _same_taps(one: Field | None, other: Field | None) -> bool:
 # the end of a row. What is fused is fused by name.
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False)
+@kernel(error_model="python")
 def _add_symmetric(row, taps, out):  # type: ignore[no-untyped-def]
     """out[j] += taps[0] row[j + R] + sum_k taps[k] (row[j + R - k] + row[j + R + k]); R = taps.size
     - 1. Four taps at a time.
@@ -239,7 +240,7 @@ def _add_symmetric(row, taps, out):  # type: ignore[no-untyped-def]
         k += 1
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False)
+@kernel(error_model="python")
 def _add_two_symmetric(row, taps, others, out, other):  # type: ignore[no-untyped-def]
     """`_add_symmetric` with two sets of taps: to ``out`` and to ``other`` at once, each in the same
     order.
@@ -278,7 +279,7 @@ def _add_two_symmetric(row, taps, others, out, other):  # type: ignore[no-untype
         k += 1
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False)
+@kernel(error_model="python")
 def _convolve(noise, kernels, out):  # type: ignore[no-untyped-def]
     """out[b] += noise * kernels[b]; ``noise`` has R more cells on every side, the kernels are
     symmetric quadrants (R + 1, R + 1) whose taps are zero in the same places."""
@@ -306,7 +307,7 @@ def _convolve(noise, kernels, out):  # type: ignore[no-untyped-def]
                 _add_symmetric(row, kernels[number - 1, di, :size], out[number - 1, i])
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False)
+@kernel(error_model="python")
 def _upsample(coarse, ci, cj, weights, out, fi, fj):  # type: ignore[no-untyped-def]
     """out += x2 kriging interpolation; (ci, cj) and (fi, fj) are the absolute indices of the
     arrays' first points.
@@ -349,7 +350,7 @@ def _upsample(coarse, ci, cj, weights, out, fi, fj):  # type: ignore[no-untyped-
             target[first + 2 * j] += odd[start + j]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False)
+@kernel(error_model="python")
 def _prefilter(field, taps, out):  # type: ignore[no-untyped-def]
     """Separable symmetric filter; ``field`` has taps.size - 1 more cells on every side than
     ``out``.

@@ -20,11 +20,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numba as nb
 import numpy as np
 
-from zonda.core.compilation.jit import nb
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
+from zonda.core.kernels import kernel
 from zonda.core.types import Floats
 
 from .geometry import Cone, ScanPlane, axes_at, check_above_horizon, rim
@@ -211,7 +212,7 @@ def _polynomial(
     )
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _on_plane(linear, start, xi, eta, shift, x, y, sine):  # type: ignore[no-untyped-def]
     n = nb.uint64(x.shape[1])
     x0, x1, x2 = linear[0][start:], linear[1][start:], linear[2][start:]
@@ -228,7 +229,7 @@ def _on_plane(linear, start, xi, eta, shift, x, y, sine):  # type: ignore[no-unt
             up[t] = w * norm
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _on_cone(  # type: ignore[no-untyped-def]
     linear, turn, start, xi, eta, shift, q, c, s, scales, x, y, sine
 ):
@@ -260,7 +261,7 @@ def _on_cone(  # type: ignore[no-untyped-def]
             over[t] = p * imaginary[t] + i * real[t] - shift[1]
 
 
-@nb.njit(nogil=True, cache=True, boundscheck=False, error_model="numpy")
+@kernel
 def _horner(coefficients, z, out):  # type: ignore[no-untyped-def]
     n = nb.uint64(z.size)
     first = coefficients[0]

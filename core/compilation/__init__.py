@@ -1,1 +1,0 @@
-"""Compiled kernels: where they are kept from run to run, and who compiles them when."""
