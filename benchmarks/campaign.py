@@ -5,7 +5,7 @@ tasks done.
     processes python benchmarks/campaign.py --tasks 200 --engine serial --plot memory.png
 
 The observations are 19 detectors x 100 samples, so that nearly all of the time is the campaign's
-own: sending tasks, the job log, partial products. Resident memory of the main process and of the
+own: sending tasks, their state, partial products. Resident memory of the main process and of the
 largest worker is noted at every task.
 """
 

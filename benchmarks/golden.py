@@ -227,7 +227,7 @@ def killed(folder: Path) -> dict[str, str]:
     time.sleep(6)  # wherever it is by then: the products must be the same
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    order = "resume" if (folder / "killed").exists() else "run"
+    order = "resume" if (folder / "killed" / "campaign.json").exists() else "run"
     target = [folder / "killed"] if order == "resume" else [*command[4:]]
     subprocess.run(zonda(order, *target), check=True, capture_output=True)
     again = products(folder / "killed")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
@@ -56,10 +55,6 @@ class Work(ABC, Generic[T, R]):
     def ended(self, item: T, result: R | Lost) -> bool:
         """Whether to try it again."""
 
-    def together(self) -> contextlib.AbstractContextManager[None]:
-        """A context for all records that are made at one time."""
-        return contextlib.nullcontext()
-
 
 def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) -> None:
     """Make all calls; where this raises, workers of this machine have ended.
@@ -79,21 +74,17 @@ def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) ->
     try:
         while True:
             batch: list[T] = []
-            with work.together():
-                for future in ended:
-                    item, result = at_work.pop(future), _result(future, folder, shown)
-                    if work.ended(item, result):
-                        (suspects if isinstance(result, Lost) else waiting).append(item)
-                while (
-                    waiting
-                    and not work.stop
-                    and len(at_work) + len(batch) < pool.workers + pool.ahead
-                ):
-                    batch.append(waiting.popleft())
-                if suspects and not batch and not at_work and not work.stop:
-                    batch.append(suspects.popleft())
-                work.attempts.update(batch)
-                work.began(batch)
+            for future in ended:
+                item, result = at_work.pop(future), _result(future, folder, shown)
+                if work.ended(item, result):
+                    (suspects if isinstance(result, Lost) else waiting).append(item)
+            room = pool.workers + pool.ahead - len(at_work)
+            while waiting and not work.stop and len(batch) < room:
+                batch.append(waiting.popleft())
+            if suspects and not batch and not at_work and not work.stop:
+                batch.append(suspects.popleft())
+            work.attempts.update(batch)
+            work.began(batch)
             for item in batch:
                 at_work[_submit(pool, *work.call(item))] = item
             if not at_work:

@@ -16,8 +16,8 @@ from ..command_types import Bytes
 if TYPE_CHECKING:
     from ..cli.request import RunRequest
     from .job import Job, Task
-    from .log import TaskRow
     from .prepare import CampaignFile
+    from .record import TaskRow
     from .settings import Campaign
     from .work import CampaignResult
 
@@ -145,14 +145,11 @@ def resume(
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def status(folder: Path, listed: bool, as_json: bool) -> None:
     """Show how far the campaign in DIR is: its tasks by state, what failed and why."""
-    from .folder import shares
-    from .job import LOG, Job
-    from .log import WAITING, read
+    from .job import Job
+    from .record import Record
 
     job = Job.read(folder)
-    rows = [row for path in (*shares(folder), folder / LOG) if path.exists() for row in read(path)]
-    latest = {row.number: row for row in sorted(rows, key=lambda row: FARTHEST.index(row.state))}
-    table = [(task, latest.get(task.number, WAITING)) for task in job.tasks]
+    table = list(zip(job.tasks, Record(job, folder).rows(), strict=True))
     if as_json:
         import json
 
@@ -228,12 +225,8 @@ def _show(result: CampaignResult, verbose: bool) -> None:
             _say(f"{combination}{': ' if combination else ''}{who}: {what}: {value}")
 
 
-FARTHEST = ("waiting", "failed", "claimed", "done")
-"""Of the states that several logs give of a task, the last one counts."""
-
-
 def _counts(table: Table) -> dict[str, int]:
-    from .log import STATES
+    from .record import STATES
 
     found = [row.state for _, row in table]
     return {state: found.count(state) for state in STATES}

@@ -20,13 +20,12 @@ from pydantic import TypeAdapter
 from ..errors import InputError
 from ..storage.files import write_text
 
-FORMAT = 2
-"""Of a campaign's folder: this file, the job log and the partial products."""
+FORMAT = 3
+"""Of a campaign's folder: this file, the partial products and the records beside them."""
 
 FILE = "campaign.json"
-LOG = "jobs.sqlite"
 TASKS = "tasks"
-"""Folder of partial products and layouts."""
+"""Folder of partial products, layouts and the state of tasks."""
 
 INPUTS = "inputs"
 """Folder of arrays that were given in Python."""
@@ -87,7 +86,7 @@ class Task:
     @property
     def product(self) -> str:
         """Name of its partial product's file."""
-        return f"{self.number:06d}-{self.key[:16]}.npz"
+        return f"{self.number:06d}.npz"
 
     def path(self, folder: Path) -> Path:
         """Path of its partial product, in the campaign's folder."""
@@ -153,11 +152,6 @@ class Job:
     def sets(self) -> str:
         """``2 sets of products``."""
         return f"{plural(len(self.combinations), 'set')} of products"
-
-    @property
-    def layouts(self) -> dict[int, str]:
-        """Digests of the combinations' layouts, by number."""
-        return {number: combination.layout for number, combination in enumerate(self.combinations)}
 
     def incomplete(self, done: Collection[int]) -> set[int]:
         """Numbers of the combinations of which a task is not among those ``done``."""

@@ -22,12 +22,12 @@ EFFECT = "maps of the two may differ in the last bits, by about 1e-7 K"
 
 @cache
 def here() -> str:
-    """This process's machine and libraries, as the job log keeps it (JSON)."""
+    """This process's machine and libraries, as JSON."""
     return json.dumps(arithmetic(), sort_keys=True)
 
 
 def read(text: str) -> dict[str, str]:
-    """What a job log says of a machine; empty where it says nothing, or what is no such thing."""
+    """A machine from its JSON; empty where that is none."""
     try:
         found = json.loads(text)
     except ValueError:

@@ -106,20 +106,19 @@ class Partial:
         self.scans += other.scans
         return self
 
-    def write(self, path: Path, identity: str) -> str:
-        """Write it to a file; return the digest."""
+    def write(self, path: Path, identity: str, made: Mapping[str, Any]) -> None:
+        """Write it to a file; ``made``: how it was made (`parts.head`)."""
         products = {
             label: {"kind": type(p).__name__, "arrays": p.arrays()}
             for label, p in self.products.items()
         }
-        return parts.write(
-            path, identity, {"products": products, "scans": self.scans, "tally": _rows(self.tally)}
-        )
+        tree = {"products": products, "scans": self.scans, "tally": _rows(self.tally)}
+        parts.write(path, identity, tree, made)
 
     @classmethod
-    def read(cls, path: Path, identity: str, digest: str) -> Partial:
+    def read(cls, path: Path, identity: str) -> Partial:
         """Read it from a file. Raises `InputError` where that is missing or damaged."""
-        tree = parts.read(path, identity, digest)
+        tree = parts.read(path, identity)
         products = {
             label: registry.products.get(p["kind"]).of(p["arrays"])
             for label, p in tree["products"].items()

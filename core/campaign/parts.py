@@ -1,9 +1,9 @@
-"""Partial products and layouts as files: plain values and arrays in a zip archive that knows its
-own checksum. No pickles.
+"""Partial products, layouts and records as files: plain values and arrays in a zip archive, whose
+own checksums tell a damaged one. No pickles.
 
-A file holds ``values.json``, a tree of mappings, lists and plain values in which ``{"array": k}``
-stands for the k-th array, and ``0.npy``, ``1.npy`` ... The first line of the tree is a BLAKE2b
-digest of everything else: a file that was cut short, changed or taken for another one is refused.
+A file holds ``head.json`` (its identity, and how it was made), ``values.json``, a tree of mappings,
+lists and plain values in which ``{"array": k}`` stands for the k-th array, and ``0.npy``, ``1.npy``
+...
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import io
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,14 @@ import numpy as np
 from ..errors import InputError
 from ..storage.files import atomic_path
 
-VALUES = "values.json"
+HEAD, VALUES = "head.json", "values.json"
 
 
-def write(path: Path, identity: str, tree: Mapping[str, Any]) -> str:
-    """Write a tree atomically; its digest. ``identity``: of what it is the product, checked by
-    `read`.
+def write(
+    path: Path, identity: str, tree: Mapping[str, Any], made: Mapping[str, Any] | None = None
+) -> None:
+    """Write a tree atomically. ``identity``: of what it is the product, checked by `read`;
+    ``made``: how it was made, for `head`.
 
     Raises `OutputError` where it cannot be written, TypeError for a value that is neither plain nor
     an array.
@@ -35,46 +38,51 @@ def write(path: Path, identity: str, tree: Mapping[str, Any]) -> str:
     arrays: list[Any] = []
     text = json.dumps(_flatten(tree, arrays), allow_nan=True)
     content = [_npy(array) for array in arrays]
-    digest = _digest(identity, text, content)
     with (
         atomic_path(path) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive,
     ):
-        _put(archive, VALUES, json.dumps({"identity": identity, "digest": digest}) + "\n" + text)
+        _put(archive, HEAD, json.dumps({"identity": identity, "made": dict(made or {})}))
+        _put(archive, VALUES, text)
         for k, data in enumerate(content):
             _put(archive, f"{k}.npy", data)
-    return digest
 
 
-def read(path: Path, identity: str, digest: str | None = None) -> dict[str, Any]:
-    """The tree in a file that `write` made. Raises `InputError` where it is damaged, another's, or
-    not the one meant.
+def read(path: Path, identity: str) -> dict[str, Any]:
+    """The tree in a file that `write` made. Raises `InputError` where it is damaged or the product
+    of another identity.
     """
-    return _opened(path, identity, digest)[0]
+    with _opened(path, identity) as (archive, _):
+        content = [archive.read(f"{k}.npy") for k in range(len(archive.namelist()) - 2)]
+        arrays = [np.load(io.BytesIO(data), allow_pickle=False) for data in content]
+        tree: dict[str, Any] = _restore(json.loads(archive.read(VALUES)), arrays)
+        return tree
 
 
-def digest_of(path: Path, identity: str) -> str | None:
-    """The digest of a file that is whole and the product of ``identity``; None of any other."""
+def head(path: Path, identity: str) -> dict[str, Any]:
+    """What `write` was told of how the file was made. Raises as `read`."""
+    with _opened(path, identity) as (_, made):
+        return made
+
+
+def digest_of(path: Path) -> str:
+    """BLAKE2b of a file's bytes; empty where it cannot be read. The same tree gives the same."""
     try:
-        return _opened(path, identity, None)[1]
-    except InputError:
-        return None
+        with open(path, "rb") as content:
+            return hashlib.file_digest(content, "blake2b").hexdigest()[:32]
+    except OSError:
+        return ""
 
 
-def _opened(path: Path, identity: str, digest: str | None) -> tuple[dict[str, Any], str]:
+@contextmanager
+def _opened(path: Path, identity: str) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
+    """An archive and how it was made; what goes wrong in the body is an `InputError`."""
     try:
         with zipfile.ZipFile(path) as archive:
-            head, _, text = archive.read(VALUES).decode().partition("\n")
-            given = json.loads(head)
-            content = [archive.read(f"{k}.npy") for k in range(len(archive.namelist()) - 1)]
-        found = _digest(given["identity"], text, content)
-        if found != given["digest"]:
-            raise ValueError("its checksum is wrong")
-        if given["identity"] != identity or digest not in (None, found):
-            raise ValueError("it is the product of another task")
-        tree = _restore(
-            json.loads(text), [np.load(io.BytesIO(data), allow_pickle=False) for data in content]
-        )
+            found = json.loads(archive.read(HEAD))
+            if found["identity"] != identity:
+                raise ValueError("it is the product of another task")
+            yield archive, found["made"]
     except (
         OSError,
         ValueError,
@@ -90,8 +98,6 @@ def _opened(path: Path, identity: str, digest: str | None) -> tuple[dict[str, An
         raise InputError(
             f"cannot be used: {str(err) or type(err).__name__}", place=str(path), cure=cure
         ) from None
-    assert isinstance(tree, dict)
-    return tree, found
 
 
 def _put(archive: zipfile.ZipFile, name: str, data: str | bytes) -> None:
@@ -104,13 +110,6 @@ def _npy(array: Any) -> bytes:
     stream = io.BytesIO()
     np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
     return stream.getvalue()
-
-
-def _digest(identity: str, text: str, content: list[bytes]) -> str:
-    found = hashlib.blake2b(digest_size=16)
-    for part in (identity.encode(), text.encode(), *content):
-        found.update(len(part).to_bytes(8, "little") + part)
-    return found.hexdigest()
 
 
 def _flatten(value: Any, arrays: list[Any]) -> Any:

@@ -187,10 +187,11 @@ class _Draft:
             data = pipeline.point(look.scene(self._files), layouts, self._folder, laid_out=True)
             self.need = max(self.need, pipeline.least_memory(data.observations))
         name, subfolder = _names(source, members[0][1], self.combinations)
-        digest = parts.write(
-            layout_path(self._folder, len(self.combinations)), "layout", {"layouts": layouts}
+        path = layout_path(self._folder, len(self.combinations))
+        parts.write(path, "layout", {"layouts": layouts})
+        self.combinations.append(
+            Combination(name, subfolder, parts.digest_of(path), members[0][1].combination)
         )
-        self.combinations.append(Combination(name, subfolder, digest, members[0][1].combination))
         before = 0
         for (number, _), look, samples in zip(members, looks, scans, strict=True):
             every = tuple(range(len(samples)))
@@ -336,10 +337,8 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
     ]
     files = [parse(text, name="campaign", folder=folder) for text in job.pipelines]
     path = layout_path(folder, number)
-    if (
-        parts.write(path, "layout", {"layouts": common_layouts(looks, files, folder)[0]})
-        != job.combinations[number].layout
-    ):
+    parts.write(path, "layout", {"layouts": common_layouts(looks, files, folder)[0]})
+    if parts.digest_of(path) != job.combinations[number].layout:
         raise InputError(
             "differs from the layout that was planned",
             place=str(path),

@@ -8,7 +8,7 @@ anyway; means of spectra are floats and owe their bits to the tree.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,14 +37,12 @@ class Combined:
     error: ZondaError | None = None
 
 
-def combine(folder: Path, number: int, digests: Mapping[int, str]) -> Combined:
+def combine(folder: Path, number: int) -> Combined:
     """Add up one combination's parts, finish its products and write them. Errors are returned, not
     raised.
-
-    ``digests``: of the tasks' products, by the task's number.
     """
     try:
-        data = combined(Job.read(folder), folder, number, digests)
+        data = combined(Job.read(folder), folder, number)
     except ZondaError as err:
         return Combined(error=err)
     counts = {(who, what) for who, what, _ in data.tally.counts()}
@@ -54,7 +52,7 @@ def combine(folder: Path, number: int, digests: Mapping[int, str]) -> Combined:
 
 
 @faults_named()
-def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) -> Data:
+def combined(job: Job, folder: Path, number: int) -> Data:
     """As `combine`; the finished data. Raises `InputError` where a partial product is missing or
     damaged.
     """
@@ -77,7 +75,7 @@ def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) ->
     depth = 1
     while FAN**depth < len(tasks):
         depth += 1
-    whole = _sum(tasks, folder, digests, 0, depth)
+    whole = _sum(tasks, folder, 0, depth)
     data.partial, data.tally, data.observations = (
         whole.products,
         whole.tally,
@@ -89,15 +87,13 @@ def combined(job: Job, folder: Path, number: int, digests: Mapping[int, str]) ->
     return data
 
 
-def _sum(
-    tasks: Sequence[Task], folder: Path, digests: Mapping[int, str], first: int, level: int
-) -> Partial:
+def _sum(tasks: Sequence[Task], folder: Path, first: int, level: int) -> Partial:
     """Sum of ``FAN**level`` parts from the ``first`` on; one sum is held for each level."""
     if level == 0:
         task = tasks[first]
-        return Partial.read(task.path(folder), task.key, digests[task.number])
-    whole = _sum(tasks, folder, digests, first, level - 1)
+        return Partial.read(task.path(folder), task.key)
+    whole = _sum(tasks, folder, first, level - 1)
     width = FAN ** (level - 1)
     for branch in range(first + width, min(first + FAN * width, len(tasks)), width):
-        whole += _sum(tasks, folder, digests, branch, level - 1)
+        whole += _sum(tasks, folder, branch, level - 1)
     return whole

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from .. import hooks
@@ -17,21 +15,17 @@ from .folder import (
     check_free,
     clean,
     make_way,
-    open_log,
-    opened,
     publish,
-    readable,
-    shares,
     sources_of,
     verify,
     write_sources,
 )
-from .job import FILE, LOG, TASKS, Job, Say, Task, digest_of_text, layout_path, plural
-from .log import Log, TaskRow
+from .job import FILE, Job, Say, Task, digest_of_text, layout_path, plural
 from .machines import Watch
 from .memory import share_out
 from .prepare import CampaignFile, Pruning, changed, restore_layout
 from .prepare import job as prepare
+from .record import Record
 from .work import CampaignResult, Combinations, Tasks
 
 
@@ -68,16 +62,9 @@ def begin(
         raise
     _describe(made, folder, say)
     write_sources(made, folder)
-    with contextlib.closing(open_log(folder / LOG, made.tasks)) as log:
-        made.write(folder)
-        return _work(
-            made,
-            folder,
-            log,
-            pool,
-            _watch(made.same_machine, folder, [log.rows()], say),
-            made.tasks,
-        )
+    made.write(folder)
+    record = Record(made, folder)
+    return _work(record, pool, _watch(record, made.same_machine, say), made.tasks)
 
 
 def resume(
@@ -100,18 +87,14 @@ def resume(
     check_unchanged(job, folder, anyway)
     share_out(pool, job.need, job.name)
     clean(folder)
-    with contextlib.closing(opened(folder / LOG, job.tasks, job.layouts, say)) as log:
-        combined = log.combined(job.layouts)
-        for number, combination in enumerate(job.combinations):
-            if number not in combined:
-                try:
-                    parts.read(layout_path(folder, number), "layout", combination.layout)
-                except InputError:
-                    restore_layout(job, folder, number)
-        missing = verify(
-            [t for t in job.tasks if t.combination not in combined], folder, log, say, strict
-        )
-        return _work(job, folder, log, pool, _watch(strict, folder, [log.rows()], say), missing)
+    record = Record(job, folder)
+    for number, combination in enumerate(job.combinations):
+        layout = layout_path(folder, number)
+        if number not in record.combined and parts.digest_of(layout) != combination.layout:
+            restore_layout(job, folder, number)
+    waiting = [task for task in job.tasks if task.combination not in record.combined]
+    missing = verify(record, waiting, say, strict)
+    return _work(record, pool, _watch(record, strict, say), missing)
 
 
 def share(
@@ -126,8 +109,7 @@ def share(
     """Run every n-th task from the k-th on (counted from 1), where ``which`` is (k, n): a job of an
     array. Combines nothing.
 
-    The first job there works the campaign out; all write their own job log. The caller holds the
-    lock of its share.
+    The first job there works the campaign out. The caller holds the lock of its share.
     """
     from zonda import __version__
 
@@ -146,13 +128,9 @@ def share(
         )
     share_out(pool, job.need, job.name)
     mine = [task for task in job.tasks if task.number % which[1] == which[0] - 1]
-    path = folder / f"jobs.{which[0]}-of-{which[1]}.sqlite"
-    with contextlib.closing(opened(path, mine, {}, say)) as log:
-        missing = verify(mine, folder, log, say)
-        theirs = [readable(path) for path in shares(folder)]
-        result = Tasks(job, folder, log, pool, _watch(job.same_machine, folder, theirs, say)).run(
-            missing
-        )
+    record = Record(job, folder, f".{which[0]}-of-{which[1]}")
+    missing = verify(record, mine, say, same_machine=False)
+    result = Tasks(record, pool, _watch(record, job.same_machine, say)).run(missing)
     _tell(result, say)
     _fail(result, len(mine))
     return result
@@ -182,21 +160,20 @@ def check_unchanged(job: Job, folder: Path, anyway: bool) -> None:
         )
 
 
-def _watch(strict: bool, folder: Path, logs: Iterable[Iterable[TaskRow]], say: Say) -> Watch:
-    known = {row.number: row.machine for rows in logs for row in rows if row.machine}
-    return Watch(known, strict, folder, say)
+def _watch(record: Record, strict: bool, say: Say) -> Watch:
+    known = {row.number: row.machine for row in record.rows() if row.machine}
+    return Watch(known, strict, record.folder, say)
 
 
-def _work(
-    job: Job, folder: Path, log: Log, pool: Pool, watch: Watch, missing: Sequence[Task]
-) -> CampaignResult:
+def _work(record: Record, pool: Pool, watch: Watch, missing: Sequence[Task]) -> CampaignResult:
     """Run tasks, combine what is complete, remove partial products."""
-    result = Tasks(job, folder, log, pool, watch).run(missing)
+    job, folder = record.job, record.folder
+    result = Tasks(record, pool, watch).run(missing)
     if result.tasks:
         _tell(result, watch.say)
-    done = {row.number for row in log.rows() if row.state == "done"}
-    waiting = log.combined(job.layouts) | job.incomplete(done)
-    Combinations(job, folder, log, result).run(
+    done = record.complete
+    waiting = record.combined | job.incomplete(done)
+    Combinations(record, result).run(
         [n for n in range(len(job.combinations)) if n not in waiting], pool
     )
     clean(folder)  # of workers that were killed while they wrote
@@ -209,8 +186,7 @@ def _work(
         )
     if job.figures:
         table.write(job, folder)
-    if not job.keep_tasks:
-        shutil.rmtree(folder / TASKS, ignore_errors=True)
+    record.finish()
     return result
 
 

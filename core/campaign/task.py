@@ -56,8 +56,6 @@ class Outcome:
 
     Attributes
     ----------
-    digest
-        Of the product's content; empty where it failed.
     error
         What went wrong, as shown to the user; empty where nothing did.
     final
@@ -72,11 +70,10 @@ class Outcome:
 
     host: str
     seconds: float
-    digest: str = ""
+    machine: str = ""
     error: str = ""
     final: bool = False
     stop: bool = False
-    machine: str = ""
 
 
 def perform(order: Order) -> Outcome:
@@ -91,7 +88,7 @@ def perform(order: Order) -> Outcome:
                 place=host,
                 cure="install the same one",
             )
-        digest = _run(order)
+        return Outcome(host, *_run(order, host, begin))
     except ZondaError as err:
         final = isinstance(err, PipelineError | PointingError)
         stop = isinstance(err, OutputError | NotCombined)
@@ -102,11 +99,11 @@ def perform(order: Order) -> Outcome:
         text = "".join(traceback.format_exception(err)).rstrip()
         stop = isinstance(err, OSError)
         return Outcome(host, time.monotonic() - begin, error=text, stop=stop)
-    return Outcome(host, time.monotonic() - begin, digest, machine=machines.here())
 
 
 @faults_named()
-def _run(order: Order) -> str:
+def _run(order: Order, host: str, begin: float) -> tuple[float, str]:
+    """Write the product of a task; wall time since ``begin``, and the machine."""
     from ..configuration.time import Instant
     from ..pipeline import Part
     from .prepare import scene_of
@@ -125,7 +122,11 @@ def _run(order: Order) -> str:
         ceiling=order.memory,
         provenance={"resolved_yaml": order.pipeline},
     )
-    return Partial.of(data, task.before, part.prefix).write(task.path(folder), task.key)
+    partial = Partial.of(data, task.before, part.prefix)
+    seconds, machine = time.monotonic() - begin, machines.here()
+    made = {"host": host, "seconds": seconds, "machine": machine}
+    partial.write(task.path(folder), task.key, made)
+    return seconds, machine
 
 
 @lru_cache(4)
@@ -141,10 +142,11 @@ def pipeline_of(text: str, folder: Path) -> PipelineFile:
 @lru_cache(4)
 def layouts_in(path: Path, digest: str) -> Mapping[str, Any]:
     """The layouts in a file, by label. Raises InputError where it is not the one meant."""
-    try:
-        layouts: Mapping[str, Any] = parts.read(path, "layout", digest)["layouts"]
-    except InputError as err:
+    if parts.digest_of(path) != digest:
         raise InputError(
-            err.message, place=err.place, cure="can this worker see the campaign's folder?"
-        ) from None
+            "cannot be used: it is missing, damaged or another campaign's",
+            place=str(path),
+            cure="can this worker see the campaign's folder?",
+        )
+    layouts: Mapping[str, Any] = parts.read(path, "layout")["layouts"]
     return layouts

@@ -1,6 +1,4 @@
-"""Run a campaign's tasks, and combine what they made: each on workers, each noted in the job
-log.
-"""
+"""A campaign's tasks, and the combination of their products, on workers."""
 
 from __future__ import annotations
 
@@ -16,9 +14,9 @@ from ..storage.files import discard
 from .calls import Lost, Work, carry_out
 from .engines import Pool, engine_failed
 from .folder import clean
-from .job import Job, Task
-from .log import Log
+from .job import Task
 from .machines import Watch
+from .record import Record
 from .reduce import Combined, combine
 from .task import Order, Outcome, perform
 
@@ -53,11 +51,11 @@ class CampaignResult:
 class Tasks(Work[Task, Outcome]):
     """The tasks of a campaign. ``watch`` compares the machines that they run on."""
 
-    def __init__(self, job: Job, folder: Path, log: Log, pool: Pool, watch: Watch) -> None:
+    def __init__(self, record: Record, pool: Pool, watch: Watch) -> None:
         super().__init__()
-        self.job, self.folder, self.log, self.pool, self.watch = job, folder, log, pool, watch
-        self.result = CampaignResult(folder)
-        self._claimed: set[int] = set()
+        self.job, self.folder = record.job, record.folder
+        self.record, self.pool, self.watch = record, pool, watch
+        self.result = CampaignResult(record.folder)
         self._failures = 0
 
     def run(self, tasks: Sequence[Task]) -> CampaignResult:
@@ -70,7 +68,7 @@ class Tasks(Work[Task, Outcome]):
             carry_out(self, tasks, self.pool, self.folder)
         except BaseException:
             with contextlib.suppress(Exception):
-                self.log.put_off(self._claimed)
+                self.record.put_off()
             if self.pool.stop is not None:
                 clean(self.folder)
             raise
@@ -78,10 +76,6 @@ class Tasks(Work[Task, Outcome]):
             hooks.manager().hook.zonda_campaign_end()
         self.result.seconds = time.monotonic() - self._begin
         return self.result
-
-    def together(self) -> contextlib.AbstractContextManager[None]:
-        """See `Work.together`: the disk is waited for once."""
-        return self.log.together()
 
     def call(self, item: Task) -> tuple[Callable[[Order], Outcome], Order]:
         """See `Work.call`."""
@@ -98,14 +92,12 @@ class Tasks(Work[Task, Outcome]):
 
     def began(self, items: list[Task]) -> None:
         """See `Work.began`."""
-        self._claimed |= {task.number for task in items}
-        self.log.claim(task.number for task in items)
+        self.record.claim(task.number for task in items)
 
     def ended(self, item: Task, result: Outcome | Lost) -> bool:
         """Record the outcome of a task."""
         number = item.number
         outcome = Outcome(LOST, 0.0, error=str(result)) if isinstance(result, Lost) else result
-        self._claimed.discard(number)
         if not outcome.error and (
             error := self.watch.meet(outcome.machine, f"task {number} on {outcome.host}")
         ):
@@ -115,12 +107,12 @@ class Tasks(Work[Task, Outcome]):
             bool(outcome.error) and not outcome.final and self.attempts[item] <= self.job.retries
         )
         if not outcome.error:
-            self.log.done(number, outcome.host, outcome.seconds, outcome.digest, outcome.machine)
+            self.record.done(item, outcome.host, outcome.seconds, outcome.machine)
             self.result.tasks += 1
             self.result.samples += item.samples
         else:
             self._failures += 1
-            self.log.failed(number, outcome.host, outcome.seconds, outcome.error, again)
+            self.record.failed(item, outcome.host, outcome.seconds, outcome.error, again)
             if not again:
                 self.result.failed[number] = outcome.error
                 self.stop = self.stop or outcome.stop
@@ -136,10 +128,14 @@ class Combinations(Work[int, Combined]):
     and memory.
     """
 
-    def __init__(self, job: Job, folder: Path, log: Log, result: CampaignResult) -> None:
+    def __init__(self, record: Record, result: CampaignResult) -> None:
         super().__init__()
-        self.job, self.folder, self.log, self.result = job, folder, log, result
-        self._digests = {row.number: row.digest for row in log.rows()}
+        self.job, self.folder, self.record, self.result = (
+            record.job,
+            record.folder,
+            record,
+            result,
+        )
         self._error: ZondaError | None = None
 
     def run(self, numbers: Sequence[int], pool: Pool) -> None:
@@ -148,14 +144,9 @@ class Combinations(Work[int, Combined]):
         if self._error is not None:
             raise self._error
 
-    def call(self, item: int) -> tuple[Callable[..., Combined], Path, int, dict[int, str]]:
+    def call(self, item: int) -> tuple[Callable[..., Combined], Path, int]:
         """See `Work.call`."""
-        return (
-            combine,
-            self.folder.resolve(),
-            item,
-            {t.number: self._digests[t.number] for t in self.job.tasks_of(item)},
-        )
+        return combine, self.folder.resolve(), item
 
     def ended(self, item: int, result: Combined | Lost) -> bool:
         """Record that products are written, and remove their parts."""
@@ -174,10 +165,9 @@ class Combinations(Work[int, Combined]):
             self._error, self.stop = self._error or error, True
             return False
         assert isinstance(result, Combined)
-        combination = self.job.combinations[item]
-        self.log.combine(item, combination.layout)
-        self.result.tally += [(combination.name, *row) for row in result.tally]
+        self.record.combine(item)
+        name = self.job.combinations[item].name
+        self.result.tally += [(name, *row) for row in result.tally]
         if not self.job.keep_tasks:
-            for task in self.job.tasks_of(item):
-                discard(task.path(self.folder))
+            self.record.discard_parts(item)
         return False

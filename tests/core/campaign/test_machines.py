@@ -1,4 +1,4 @@
-"""The job log says on what each task ran; another kind of machine is told, or refused."""
+"""The machine of each task is on record; another kind of machine is reported, or refused."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import pytest
 
 from zonda.core import versions
-from zonda.core.campaign import log as joblog
 from zonda.core.campaign import machines
 from zonda.core.campaign.machines import Watch, differences, kind, kinds, read
 
@@ -101,7 +100,7 @@ def test_what_another_kind_has_done_is_done_again_on_request(bench, moving, caps
     assert bench.command("run", file, "--output", out, *SERIAL, "--task", "1/2") == 0
     moving(0)
     assert bench.command("run", file, "--output", out, *SERIAL, "--task", "2/2") == 0
-    assert "another kind of machine" in capsys.readouterr().err  # the first share's log says so
+    assert "another kind of machine" in capsys.readouterr().err  # the first share's products say so
     assert len(status(bench, out, capsys)[0]["machines"]) == 2
     moving(10**6)
     assert bench.command("resume", out, *SERIAL, "--same-machine") == 0
@@ -118,18 +117,6 @@ def test_the_campaign_s_word_can_be_taken_back(bench, moving, capsys):
     moving(0)
     assert bench.command("resume", out, *SERIAL, "--any-machine") == 0
     assert "another kind of machine" in capsys.readouterr().err
-
-
-def test_a_task_that_is_put_off_has_no_machine(tmp_path):
-    log = joblog.Log(tmp_path / "jobs.sqlite")
-    log.begin([0, 1])
-    for number in (0, 1):
-        log.done(number, "h", 1.0, "d", '{"cpu": "a"}')
-    log.put_off([1])
-    assert [row.machine for row in log.rows()] == ['{"cpu": "a"}', ""]
-    log.done(0, "h", 1.0, "d", '{"cpu": "b"}')
-    assert log.rows()[0].machine == '{"cpu": "b"}'
-    log.close()
 
 
 def test_what_counts_as_another_kind():

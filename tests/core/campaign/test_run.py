@@ -8,15 +8,15 @@ import random
 import signal
 import threading
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 
 import h5py
-import pytest
 
-from zonda.core.campaign import calls, run
+from zonda.core.campaign import calls
 from zonda.core.campaign import work as campaign
 from zonda.core.campaign.engines import Pool, SerialExecutor
 from zonda.core.campaign.job import Job
-from zonda.core.campaign.log import Log, read
+from zonda.core.campaign.record import Record
 from zonda.core.campaign.task import Outcome, perform
 
 SERIAL = ("--engine", "serial", "--threads", 1)
@@ -42,13 +42,17 @@ class Shuffled(Executor):
             future.set_result(fn(*args))
 
 
+def read(folder):
+    return list(Record(Job.read(folder), folder).rows())
+
+
 def states(folder):
-    return [row.state for row in read(folder / "jobs.sqlite")]
+    return [row.state for row in read(folder)]
 
 
 def test_products(undisturbed):
     names = {p.name for p in undisturbed.iterdir()}
-    assert names == {"campaign.json", "jobs.sqlite", "map.fits", "noise_map.fits", "resolved.yaml"}
+    assert names == {"campaign.json", "tasks.npz", "map.fits", "noise_map.fits", "resolved.yaml"}
     from astropy.io import fits
 
     with fits.open(undisturbed / "map.fits") as file:
@@ -194,7 +198,7 @@ def test_a_campaign_that_cannot_begin_leaves_nothing(bench, capsys):
 def test_a_failed_task_is_tried_again(undisturbed, bench, monkeypatch):
     monkeypatch.setattr(campaign, "perform", failing(2))
     out = bench.run(bench.CAMPAIGN, *SERIAL)
-    row = read(out / "jobs.sqlite")[3]
+    row = read(out)[3]
     assert (row.state, row.attempts, row.error) == ("done", 3, "it broke")
     assert bench.planes(out) == bench.planes(undisturbed)
 
@@ -204,7 +208,7 @@ def test_tries_are_bounded_and_resume_goes_on(undisturbed, bench, monkeypatch, c
     out = bench.run(bench.CAMPAIGN, *SERIAL, status=2)
     assert "1 of 12 tasks failed; the first is 3: it broke" in capsys.readouterr().err
     assert states(out) == ["done"] * 3 + ["failed"] + ["done"] * 8
-    assert read(out / "jobs.sqlite")[3].attempts == 3
+    assert read(out)[3].attempts == 3
     assert not (out / "map.fits").exists()
     assert bench.command("status", out) == 0
     shown = capsys.readouterr().out
@@ -212,11 +216,12 @@ def test_tries_are_bounded_and_resume_goes_on(undisturbed, bench, monkeypatch, c
     assert "it broke" in shown
     monkeypatch.setattr(campaign, "perform", perform)
     before = {p.name: p.stat().st_mtime_ns for p in (out / "tasks").iterdir()}
-    monkeypatch.setattr(run.shutil, "rmtree", lambda *a, **k: None)
-    monkeypatch.setattr(campaign, "discard", lambda *a: None)
+    monkeypatch.setattr(Record, "finish", lambda *a: None)
+    monkeypatch.setattr(Record, "discard_parts", lambda *a: None)
     assert bench.command("resume", out, *SERIAL) == 0
     after = {p.name: p.stat().st_mtime_ns for p in (out / "tasks").iterdir()}
-    assert {name: after[name] for name in before} == before  # what was done was not done again
+    for name in before.keys() & {f"{number:06d}.npz" for number in range(12)}:
+        assert after[name] == before[name]  # what was done was not done again
     assert bench.planes(out) == bench.planes(undisturbed)
     assert states(out) == ["done"] * 12
 
@@ -224,7 +229,7 @@ def test_tries_are_bounded_and_resume_goes_on(undisturbed, bench, monkeypatch, c
 def test_what_cannot_succeed_is_not_tried_again(bench, monkeypatch):
     monkeypatch.setattr(campaign, "perform", failing(-1, final=True))
     out = bench.run(bench.CAMPAIGN, *SERIAL, status=2)
-    assert read(out / "jobs.sqlite")[3].attempts == 1
+    assert read(out)[3].attempts == 1
 
 
 def test_an_exception_leaves_a_campaign_that_resumes(undisturbed, bench, monkeypatch):
@@ -264,7 +269,7 @@ def test_a_plain_run_leaves_an_unfinished_campaign_alone(undisturbed, bench, mon
     )  # a finished one's products are replaced, as another run's are
     assert bench.planes(out) != bench.planes(undisturbed)
     assert not (out / "campaign.json").exists()
-    assert not list(out.glob("jobs*"))
+    assert not (out / "tasks.npz").exists()
     capsys.readouterr()
     assert bench.command("status", out) == 2
     assert "holds no campaign" in capsys.readouterr().err
@@ -298,7 +303,7 @@ def test_a_killed_worker_does_not_lose_the_campaign(undisturbed, bench, monkeypa
     monkeypatch.setattr(calls, "_submit", and_kill)
     out = bench.run(bench.CAMPAIGN, "--engine", "processes", "--workers", 2)
     assert killed
-    rows = read(out / "jobs.sqlite")
+    rows = read(out)
     assert any(row.attempts == 2 and "killed" in row.error for row in rows)
     assert bench.planes(out) == bench.planes(undisturbed)
 
@@ -328,24 +333,7 @@ def test_damaged_products_are_made_again(undisturbed, bench, monkeypatch, capsys
     (out / "tasks" / ".left.part.npz").write_bytes(b"half")
     capsys.readouterr()
     assert bench.command("resume", out, *SERIAL) == 0
-    assert "3 partial products were missing or damaged" in capsys.readouterr().err
-    assert bench.planes(out) == bench.planes(undisturbed)
-
-
-@pytest.mark.parametrize("damage", [b"", b"not a data base" * 100, None, "short"])
-def test_a_damaged_log_is_made_anew(undisturbed, bench, monkeypatch, damage):
-    out = half(bench, monkeypatch)
-    path = out / "jobs.sqlite"
-    if damage is None:
-        path.unlink()
-    else:
-        path.write_bytes(path.read_bytes()[:5000] if damage == "short" else damage)
-    done = []
-    monkeypatch.setattr(
-        campaign, "perform", lambda order: done.append(order.task.number) or perform(order)
-    )
-    assert bench.command("resume", out, *SERIAL) == 0
-    assert sorted(done) == [5, 6, 7, 8, 9, 10, 11]
+    assert "2 partial products damaged: run again" in capsys.readouterr().err
     assert bench.planes(out) == bench.planes(undisturbed)
 
 
@@ -411,24 +399,34 @@ def test_an_operator_that_cannot_be_combined_is_named(bench, monkeypatch, capsys
     assert states(out).count("failed") == 1  # the others would fail alike: they are not tried
 
 
-def test_every_transition_is_in_the_log(tmp_path):
-    log = Log(tmp_path / "jobs.sqlite")
-    log.begin([0, 1])
-    log.claim([0, 1])
-    assert [(r.state, r.attempts) for r in log.rows()] == [("claimed", 1)] * 2
-    log.failed(0, "h", 1.0, "no", again=True)
-    log.claim([0])
-    log.done(0, "h", 2.0, "abc")
-    log.failed(1, "h", 1.0, "no", again=False)
-    assert [(r.state, r.attempts, r.error, r.digest) for r in log.rows()] == [
-        ("done", 2, "no", "abc"),
-        ("failed", 1, "no", ""),
-    ]
-    log.put_off([1], "because")
-    assert (log.rows()[1].state, log.rows()[1].attempts, log.rows()[1].error) == (
-        "waiting",
-        0,
-        "because",
-    )
-    log.close()
+def test_every_transition_is_in_the_files(bench, monkeypatch):
+    """Tasks 0 to 4 are done, the rest has failed."""
+    out = half(bench, monkeypatch)
+    job = Job.read(out)
+    record, other = Record(job, out), Record(job, out)
+    assert record.complete == set()  # nothing is combined
+    task = job.tasks[5]
+    record.reset([task])
+    assert next(r for r in other.rows() if r.number == 5).state == "waiting"
+    record.claim([5])
+    assert [(r.state, r.attempts) for r in other.rows()][5] == ("claimed", 1)
+    record.failed(task, "h", 1.0, "no", again=True)
+    record.put_off()
+    assert [(r.state, r.attempts, r.error) for r in other.rows()][5] == ("waiting", 1, "no")
+    record.claim([5])
+    record.failed(task, "h", 1.0, "never", again=False)
+    record.put_off()
+    assert [(r.state, r.attempts, r.error) for r in other.rows()][5] == ("failed", 2, "never")
+    record.claim([5])
+    record.done(task, "h", 2.0, "{}")
+    assert [(r.state, r.attempts, r.error) for r in record.rows()][5] == ("done", 3, "never")
     assert isinstance(SerialExecutor().submit(len, "ab").result(), int)
+
+
+def test_a_combination_is_finished_if_its_record_lists_its_tasks(bench, undisturbed):
+    """A record of other tasks, as of another campaign, counts as none."""
+    job = Job.read(undisturbed)
+    record = Record(job, undisturbed)
+    assert (record.combined, record.complete) == ({0}, set(range(12)))
+    shorter = replace(job, tasks=job.tasks[:-1])
+    assert Record(shorter, undisturbed).combined == set()
