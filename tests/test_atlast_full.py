@@ -56,7 +56,7 @@ def test_made_again_is_the_same_map():
 
 def test_singular_modes_of_a_stream_beyond_memory_and_disk_are_refused_with_a_way_out(monkeypatch):
     pipeline, scene = slice_of(method="svd")
-    monkeypatch.setattr("zonda.core.run.streams.free_disk", lambda: 1000)
+    monkeypatch.setattr("zonda.core.run.schedule.free_disk", lambda: 1000)
     with pytest.raises(
         PipelineError, match=r"(?s)neither in memory nor on the disk.*CommonModeFilter.*--memory"
     ):

@@ -97,7 +97,7 @@ class Execution:
         self.blocks = BlockMaker(
             self.schedule, self.states, self.measured, self.timer, self.ledger, stopped
         )
-        self.schedule.make(self._cost, ordered, halos)
+        self.schedule.make(ordered, halos)
 
     def collect(self, data: Data) -> None:
         """Let all steps hand over what they added up."""
@@ -179,13 +179,6 @@ class Execution:
             threads = max(1, threads * room // settings.least)
             room = max(room, settings.least * threads // settings.threads)
         return replace(settings, memory=room, threads=threads)
-
-    def _cost(self, planned: Planned) -> float:
-        """CPU seconds for a sample, from a small block made twice: the first may compile."""
-        self._probe(planned.stage)
-        start = time.thread_time()
-        block = self._probe(planned.stage)
-        return (time.thread_time() - start) / (block.shape[0] * block.shape[1])
 
     def _probe(self, stage: Stage) -> Block:
         """The smallest block, made before its time."""

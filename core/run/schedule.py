@@ -7,7 +7,8 @@ forecast of a run is the schedule that would be followed with its budget.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import tempfile
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from ..plan.planning import planning_of
 from ..signal import MAIN, Formed
 from .blocks import PIECE, Segment, block_share, blocks, cut, least_block, whole_span
 from .settings import Held, Settings
-from .streams import DISK_RATE, SAMPLE_COST, WORTH_MEASURING, Source, Stage, choose, disk_rate
+from .streams import Source, Stage, free_disk
 from .whole import knows_means, may_have_means, names_of
 
 SCRATCH_STREAMS = 2
@@ -211,16 +212,11 @@ class Schedule:
 
     # ---- made once
 
-    def make(
-        self,
-        cost: Callable[[Planned], float] | None,
-        ordered: Collection[str] = (),
-        halos: Mapping[str, int] | None = None,
-    ) -> None:
+    def make(self, ordered: Collection[str] = (), halos: Mapping[str, int] | None = None) -> None:
         """Walk through the segments.
 
-        ``cost`` as in `schedule`; ``ordered`` and ``halos``: of the other bands that are executed
-        together with this one, see `blocks.cut`.
+        ``ordered`` and ``halos``: of the other bands that are executed together with this one, see
+        `blocks.cut`.
         """
         steps = self.chain.steps
         every = {*ordered, *ordered_in(steps, self.observation)}
@@ -245,7 +241,7 @@ class Schedule:
             size, how, why = len(new) * self.stream_size, "kept", ""
             planned = Planned(stage)
             if later and new and not self._keeps(stage, size, held, later):
-                how, why = self._where(planned, sorted(new), size, held, later, cost)
+                how, why = self._where(stage, sorted(new), size, held, later)
                 elsewhere += [
                     f"{name} {'spilled to disk' if how == 'spilled' else 'made again'}"
                     for name in sorted(new)
@@ -303,38 +299,40 @@ class Schedule:
         return held + size <= min(self.settings.memory // 2, self.settings.memory - least)
 
     def _where(
-        self,
-        planned: Planned,
-        new: list[str],
-        size: int,
-        held: int,
-        later: list[Segment],
-        cost: Callable[[Planned], float] | None,
+        self, stage: Stage, new: list[str], size: int, held: int, later: list[Segment]
     ) -> tuple[Held, str]:
-        """What becomes of streams that do not fit in memory beside ``held`` bytes, and why."""
-        stage, following = planned.stage, later[0]
+        """Decide about streams that do not fit in memory beside ``held`` bytes, and say why.
+
+        Raises
+        ------
+        PipelineError
+            Where they can neither be made again nor fit on the disk.
+        """
+        following, disk = later[0], free_disk()
         head, span = following.operators[0], stage.span
         hindrance = ""
         if head.couples == "all" and not planning_of(head).sweeps(self.observation):
             hindrance = f"{head.label} reads it as a whole"
         elif {span, following.span} == {"time", "detectors"}:
             hindrance = f"{head.label} needs the other direction whole"
-        # what is made in order of time at little cost would cost much in any other
-        slow = stage.in_time_order and whole_span(following.span, span) == "time"
-        rate, sample_cost = DISK_RATE, SAMPLE_COST
-        if cost is not None and size >= WORTH_MEASURING and not hindrance:
-            rate, sample_cost = disk_rate(), cost(planned)
-        return choose(
-            f"the stream{'s' if len(new) > 1 else ''} {', '.join(new)}",
-            size,
-            spill_seconds=2 * size / rate,
-            again=(
-                self._readings(later),
-                self.shape[0] * self.shape[1] * sample_cost / self.settings.threads,
-            ),
-            hindrance=hindrance,
-            prefer="spilled" if slow else self.settings.prefer,
-            refusal=(self.observation.name, self._ceiling_for(2 * (held + size))),
+        if hindrance and size > disk:
+            plural = "s" if len(new) > 1 else ""
+            raise PipelineError(
+                f"the stream{plural} {', '.join(new)} takes {size / 1e9:.3g} GB, which fit neither"
+                f" in memory nor on the disk ({disk / 1e9:.3g} GB free in"
+                f" {tempfile.gettempdir()}), and cannot be made again when it is read: {hindrance}",
+                place=self.observation.name,
+                cure=(
+                    f"use --memory {self._ceiling_for(2 * (held + size))}, or point TMPDIR to a"
+                    " larger disk, or split into shorter scans"
+                ),
+            )
+        if not hindrance and stage.in_time_order and whole_span(following.span, span) == "time":
+            hindrance = "" if size > disk else f"made in order of time, {head.label} needs scans"
+        return (
+            ("spilled", f"{size / 1e9:.2f} GB: {hindrance}")
+            if hindrance
+            else ("again", f"{size / 1e9:.3g} GB; {head.label} reads it in blocks")
         )
 
     def _readings(self, later: Sequence[Segment]) -> int:
@@ -436,16 +434,8 @@ def ordered_in(steps: Sequence[Operator], observation: Observation) -> list[str]
     return [o.label for o in steps if planning_of(o).in_time_order(observation)]
 
 
-def schedule(
-    chain: Chain,
-    observation: Observation,
-    settings: Settings,
-    cost: Callable[[Planned], float] | None = None,
-) -> Schedule:
-    """The schedule of an observation.
-
-    ``cost``: measures what a sample of a segment costs (CPU s); None: nothing is tried, neither
-    operators nor the disk.
+def schedule(chain: Chain, observation: Observation, settings: Settings) -> Schedule:
+    """Make the schedule of an observation.
 
     Raises
     ------
@@ -453,7 +443,7 @@ def schedule(
         Where a stream fits neither in memory nor on the disk and cannot be made again.
     """
     made = Schedule(chain, observation, settings)
-    made.make(cost)
+    made.make()
     return made
 
 

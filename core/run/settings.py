@@ -36,9 +36,6 @@ class Settings:
         and blocks.
     least
         Bytes of the smallest blocks on all ``threads``.
-    prefer
-        What is done with streams that do not fit in memory where there is a choice; None: what is
-        quicker.
     progress
         Progress callback.
     spare
@@ -59,7 +56,6 @@ class Settings:
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
     spare: list[AnyFloats] = field(default_factory=list)
     ceiling: int | None = None
-    prefer: Held | None = None
     asked: int | None = None
     least: int = 0
     kept: int = 0

@@ -1,19 +1,14 @@
-"""Where the streams between two segments stay: in memory, in a temporary file, or nowhere, to be
-made again block by block.
+"""Streams between two segments: in memory, in a temporary file, or nowhere, to be made again block
+by block.
 
 Making again needs no room and no disk: operators depend on absolute detectors and samples only,
 random numbers are counted, so the segments before can run once more for any block that a later
-segment or an `Operator.measure` reads. It costs their time once more for each reading. What is done
-follows from sizes, free disk and that cost:
+segment or an `Operator.measure` reads. A rule decides, which knows sizes and couplings alone:
 
     kept      while all streams of an observation that are held at once take at most half of the
-    budget, and leave
-              room for blocks;
-    spilled   where the disk has room and 2 N b / D <= k N c / threads;   (1)
-    again     otherwise,
-
-N samples of b bytes, D [B/s] the disk's rate, k the number of readings beyond the first, c [CPU s]
-what a sample costs.
+              budget, and leave room for blocks;
+    again     otherwise, where the reader takes them in blocks or sweeps;
+    spilled   otherwise: the reader needs them as a whole, or in another order.
 """
 
 from __future__ import annotations
@@ -22,7 +17,6 @@ import os
 import shutil
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -36,18 +30,6 @@ from ..numerics.smooth import SmoothField
 from ..operator import Operator
 from ..types import AnyFloats
 from .blocks import Segment
-from .settings import Held
-
-DISK_RATE = 4e8
-"""Bytes per second to and from the temporary folder where it is not measured."""
-
-WORTH_MEASURING = 1 << 30
-"""Bytes from which the disk's rate and the cost of a sample are measured before anything is
-decided.
-"""
-
-SAMPLE_COST = 25e-9
-"""CPU seconds to make a sample, where it is not measured."""
 
 DISK_SHARE = 0.9
 """Of the free disk that streams may take."""
@@ -347,70 +329,3 @@ def _read_at(file: Any, into: memoryview, place: int) -> int:
 def free_disk() -> int:
     """Bytes that streams may take in the temporary folder."""
     return int(DISK_SHARE * shutil.disk_usage(tempfile.gettempdir()).free)
-
-
-def disk_rate(size: int = 64 << 20) -> float:
-    """Bytes per second that reach the disk of the temporary folder, from writing ``size`` bytes."""
-    data = os.urandom(1 << 20)
-    with tempfile.TemporaryFile() as file:
-        begin = time.perf_counter()
-        for _ in range(size >> 20):
-            file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-        return size / max(time.perf_counter() - begin, 1e-3)
-
-
-def choose(
-    what: str,
-    size: int,
-    *,
-    spill_seconds: float,
-    again: tuple[int, float],
-    hindrance: str,
-    prefer: Held | None,
-    refusal: tuple[str, str],
-) -> tuple[Held, str]:
-    """Spill or make again, equation (1), and why.
-
-    Parameters
-    ----------
-    what, size
-        Streams in words; their bytes.
-    spill_seconds
-        Left side of equation (1).
-    again
-        k, and the seconds that each reading takes: the right side is their product.
-    hindrance
-        Why they cannot be made again; empty: they can.
-    refusal
-        Place, and what ``--memory`` would have to be for all streams to be kept.
-
-    Raises
-    ------
-    PipelineError
-        Where neither is possible.
-    """
-    disk = free_disk()
-    if hindrance and size > disk:
-        place, ceiling = refusal
-        raise PipelineError(
-            f"{what} takes {size / 1e9:.3g} GB, which fit neither in memory nor on the disk"
-            f" ({disk / 1e9:.3g} GB free in {tempfile.gettempdir()}), and cannot be made again when"
-            f" it is read: {hindrance}",
-            place=place,
-            cure=(
-                f"use --memory {ceiling}, or point TMPDIR to a larger disk, or split into shorter"
-                " scans"
-            ),
-        )
-    if size > disk:
-        return "again", f"{size / 1e9:.3g} GB; the disk has room for {disk / 1e9:.3g} GB"
-    if hindrance:
-        return "spilled", f"{size / 1e9:.2f} GB: {hindrance}"
-    readings, each = again
-    costs = (
-        f"{size / 1e9:.3g} GB: about {spill_seconds:.2g} s by disk, {readings * each:.2g} s to make"
-        f" {readings} times more"
-    )
-    return (prefer or ("spilled" if spill_seconds <= readings * each else "again")), costs

@@ -20,7 +20,7 @@ from zonda.core.run.execution import Execution
 from zonda.core.run.scan import run as run_scan
 from zonda.core.run.schedule import Chain, Schedule
 from zonda.core.run.settings import Settings, Timer
-from zonda.core.run.streams import Store, choose
+from zonda.core.run.streams import Store
 
 
 def observation(n_det=101, n_samp=9 * TILE_SAMPLES + 123):
@@ -169,9 +169,9 @@ CHAIN = [
 ]
 
 
-def execute(operators, obs, room=None, **settings):
+def execute(operators, obs, room=None, how=None, **settings):
     """The execution, the signal it keeps, the products. ``room``: bytes that streams may take,
-    where not half of the memory.
+    where not half of the memory; ``how``: what is done with those that do not fit.
     """
     operators = [o.model_copy() for o in operators]
     for i, o in enumerate(operators):
@@ -185,6 +185,8 @@ def execute(operators, obs, room=None, **settings):
             stack.enter_context(
                 mock.patch.object(Store, "fits", lambda self, size: self._in_use + size <= room)
             )
+        if how is not None:
+            stack.enter_context(mock.patch.object(Schedule, "_where", return_value=(how, "")))
         run_scan([execution], [data])
     return execution, obs.detdata["signal"], data
 
@@ -214,9 +216,9 @@ def test_blocks_halos_threads_and_spilling_change_no_bit():
         (int(1.9 * size), 1),
         (int(1.9 * size), 3),
     ):
-        for prefer in ("spilled", "again"):
+        for how in ("spilled", None):
             obs = observation()
-            got, data = run(CHAIN, obs, memory=memory * threads, threads=threads, prefer=prefer)
+            got, data = run(CHAIN, obs, memory=memory * threads, threads=threads, how=how)
             assert np.array_equal(got, want)
             assert (data.products["seen"] == 1).all()
 
@@ -354,11 +356,11 @@ def test_streams_made_again_change_no_bit_and_are_counted_once(name, threads):
     chain = CHAINS_MADE_AGAIN[name]
     want, _ = run(chain, observation(), memory=1 << 30)
     size = 4 * want.size
-    for prefer, said in (("again", "made again"), ("spilled", "spilled")):
+    for how, said in (("again", "made again"), ("spilled", "spilled")):
         obs = observation()
         memory = threads * int(1.9 * size)
         execution, got, data = execute(
-            chain, obs, memory=memory, threads=threads, prefer=prefer, room=size // 2
+            chain, obs, memory=memory, threads=threads, how=how, room=size // 2
         )
         assert np.array_equal(got, want)
         assert any(said in what for _, what, _ in obs.tally)
@@ -371,35 +373,17 @@ def test_a_stream_wanted_whole_is_spilled_or_refused(monkeypatch):
     chain = [Source(), Demean(), Scale(), Sink()]
     obs = observation()
     size = 4 * obs.n_detectors * obs.n_samples
-    run(chain, obs, memory=int(1.9 * size), prefer="again")
+    run(chain, obs, memory=int(1.9 * size))
     assert any("spilled" in what for _, what, _ in obs.tally)
-    monkeypatch.setattr("zonda.core.run.streams.free_disk", lambda: 1000)
+    monkeypatch.setattr("zonda.core.run.schedule.free_disk", lambda: 1000)
     with pytest.raises(
         PipelineError,
         match=r"(?s)neither in memory nor on the disk.*Scale.2 reads it as a whole.*--memory 16MB",
     ):
         run(chain, observation(), memory=int(1.9 * size))
-    level = [Source(), Demean(), Level(), Sink()]
-    run(
-        level, observation(), memory=int(1.9 * size), prefer="spilled"
-    )  # the disk has no room: made again
-
-
-def test_the_quicker_way_is_taken(monkeypatch):
-    """Equation (1) of `core.run.streams`: 2 N b / D against k N c / threads."""
-    # by disk 2 s; to make it again twice, 1.8 or 2.2 s, on two threads 1.1 s
-    for again, how in ((0.9, "again"), (1.1, "spilled"), (0.55, "again")):
-        found, why = choose(
-            "s",
-            4000,
-            spill_seconds=2.0,
-            again=(2, again),
-            hindrance="",
-            prefer=None,
-            refusal=("", ""),
-        )
-        assert found == how
-        assert why == f"4e-06 GB: about 2 s by disk, {2 * again:.2g} s to make 2 times more"
+    level, obs = [Source(), Demean(), Level(), Sink()], observation()
+    run(level, obs, memory=int(1.9 * size))
+    assert any("made again" in what for _, what, _ in obs.tally)
 
 
 def test_the_ceiling_of_the_process_leaves_what_is_not_held_already():
@@ -430,7 +414,6 @@ def test_a_stream_made_again_has_no_array():
             [Source(), Greedy(), Sink()],
             obs,
             memory=int(1.9 * 4 * obs.n_detectors * obs.n_samples),
-            prefer="again",
         )
 
 

@@ -12,6 +12,7 @@ import pytest
 from tests.core.run.test_execution import (
     CHAIN,
     Demean,
+    FocalPlaneMean,
     Level,
     Scale,
     Sink,
@@ -60,18 +61,28 @@ def test_what_is_held_is_what_was_forecast(chain, threads, share):
     assert np.array_equal(got, want)
 
 
-def test_the_schedule_is_followed():
-    """What a run does with its streams is what its schedule says, with the same blocks."""
+@pytest.mark.parametrize(
+    ("last", "how", "said"),
+    [
+        ([Level()], "again", "made again"),
+        ([Scale()], "spilled", "spilled to disk"),
+        ([FocalPlaneMean()], "spilled", "spilled to disk"),
+    ],
+)
+def test_the_schedule_is_followed(last, how, said):
+    """A stream that does not fit in memory is made again where its reader sweeps it or takes it in
+    blocks, else it is put on the disk. A run does with its streams what its schedule says.
+    """
     obs = observation()
     execution, _, _ = execute(
-        [Source(), Demean(), Level(), Sink()],
+        [Source(), Demean(), *last, Sink()],
         obs,
+        room=0,
         memory=int(1.9 * 4 * obs.n_detectors * obs.n_samples),
     )
-    planned = execution.schedule.planned
-    assert [p.how for p in planned] == ["spilled", "kept"]
-    assert execution.schedule.elsewhere == ("signal spilled to disk",)
-    assert any("stream signal spilled" in what for _, what, _ in obs.tally)
+    assert execution.schedule.planned[0].how == how
+    assert execution.schedule.elsewhere[0] == f"signal {said}"
+    assert any(f"stream signal {said}" in what for _, what, _ in obs.tally)
 
 
 class Heavy(Operator):

@@ -845,7 +845,6 @@ def test_a_signal_that_is_made_again_alone_has_what_its_filters_read(monkeypatch
     operators = [Template(), *steps(Responds(), *FILTERS["mean"])]
     _, ample = observed(operators, BOTH, scans=1, threads=1)
     monkeypatch.setattr("zonda.core.run.schedule.Schedule._keeps", lambda *arguments: False)
-    monkeypatch.setattr("zonda.core.run.streams.free_disk", lambda: 0)
     _, tight = observed(operators, BOTH, scans=1, threads=1)
     assert any("made again" in what for _, what, _ in tight.tally)
     for name in ("map", "sky/map", "rest/map"):

@@ -236,14 +236,14 @@ def test_a_mean_beside_the_stream_is_as_good_as_one_in_it(chain):
 def test_blocks_and_threads_change_no_bit(chain):
     size = 37 * (5 * TILE_SAMPLES + 21) * 4
     want, n = None, 5 * TILE_SAMPLES + 21
-    for memory, threads, prefer in (
+    for memory, threads, how in (
         (1 << 30, 1, None),
         (1 << 30, 3, None),
         (24 * size, 3, "again"),
         (6 * size, 1, "spilled"),
     ):
         _, got, _ = execute(
-            [Gives(), *chain], observation(37, n), memory=memory, threads=threads, prefer=prefer
+            [Gives(), *chain], observation(37, n), memory=memory, threads=threads, how=how
         )
         want = got if want is None else want
         assert np.array_equal(got, want)
@@ -254,7 +254,7 @@ def test_streams_made_again_are_whole():
     obs = observation(37, 5 * TILE_SAMPLES + 21)
     chain = [Gives(), Gain(), Measures(readings=1), Gain()]
     _, want, _ = execute(chain, obs)
-    _, got, _ = execute(chain, obs, room=0, prefer="again")
+    _, got, _ = execute(chain, obs, room=0)
     assert ("Execution", "stream signal made again when it is read") in {
         (who, what) for who, what, _ in obs.tally
     }
