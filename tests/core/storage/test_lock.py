@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
+import errno
 import os
+import signal
 import subprocess
 import sys
 
 import pytest
 
 from zonda.core.errors import OutputError
-from zonda.core.storage.lock import NAME, _myself, lock
+from zonda.core.storage.lock import NAME, lock
 
 HOLD = """
 import sys
@@ -61,46 +62,41 @@ def test_a_killed_holder_leaves_a_lock_that_is_taken_over(tmp_path):
         pass
 
 
-@pytest.mark.parametrize(
-    ("change", "taken"),
-    [
-        (
-            {},
-            True,
-        ),  # this process itself, but the file is not locked: it was written by an earlier one
-        ({"host": "elsewhere"}, False),
-        ({"boot": "before"}, True),
-        ({"began": "1"}, True),  # the number of the process was given away again
-    ],
-)
-def test_who_is_gone(tmp_path, change, taken):
-    (tmp_path / NAME).write_text(json.dumps(_myself() | change))
-    if taken:
-        with lock(tmp_path):
-            pass
-    else:
-        with pytest.raises(OutputError, match="on elsewhere"), lock(tmp_path):
-            pass
-
-
-def test_without_locks_of_the_file_system_the_process_decides(tmp_path, monkeypatch):
-    monkeypatch.setattr("zonda.core.storage.lock._flock", lambda handle: None)
-    for change, taken in (
-        ({}, False),
-        ({"began": "1"}, True),
-        ({"boot": "before"}, True),
-        ({"pid": -5}, True),
-    ):
-        (tmp_path / NAME).write_text(json.dumps(_myself() | change))
-        if taken:
-            with lock(tmp_path):
-                pass
-        else:
-            with pytest.raises(OutputError), lock(tmp_path):
-                pass
-
-
-def test_a_lock_that_was_cut_short_names_nobody(tmp_path):
+def test_a_file_that_nobody_holds_is_taken_over(tmp_path):
     (tmp_path / NAME).write_text('{"host": "some')
     with lock(tmp_path):
         pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_processes_that_the_holder_starts_do_not_hold_it(tmp_path):
+    code = HOLD.replace(
+        'print("held", flush=True)',
+        "import subprocess; "
+        "subprocess.Popen(['sleep', '60'], stdin=-3, stdout=-3); print('held', flush=True)",
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)],
+        env=environment,
+        start_new_session=True,
+        **pipes,
+    ) as process:
+        assert process.stdout.readline() == "held\n"
+        process.kill()
+        process.wait()
+        with lock(tmp_path):  # the child lives on
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOTSUP])
+def test_a_file_system_without_locks_is_refused(tmp_path, monkeypatch, number):
+    def flock(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with pytest.raises(OutputError, match="without locks") as caught, lock(tmp_path):
+        pass
+    assert "local disk" in caught.value.cure
+    assert list(tmp_path.iterdir()) == []
