@@ -7,20 +7,14 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from typing import Any
 
-from .. import children
 from ..errors import InputError
 from .files import check_memory, reading
 
 COMPRESSION_MAX = 1100
 """Bytes in memory per byte of the file: deflate, the densest filter in use, reaches 1032."""
-
-PATIENCE = 60.0
-"""Seconds for the first look at a file."""
 
 
 @contextlib.contextmanager
@@ -41,7 +35,6 @@ def checked(path: str | os.PathLike[str], place: str, cure: str) -> Any:
     """
     import h5py
 
-    survey(path, place, cure)
     file = h5py.File(path, "r")
     try:
         _refuse_other_files(file, place)
@@ -49,39 +42,6 @@ def checked(path: str | os.PathLike[str], place: str, cure: str) -> Any:
         file.close()
         raise
     return file
-
-
-def survey(path: str | os.PathLike[str], place: str, cure: str) -> None:
-    """Let a process of its own look at the file first (`hdf5_survey`). `InputError` where that
-    hangs, crashes or fails.
-    """
-    with open(path, "rb"):  # not there, not readable: OSError says so
-        pass
-    command = children.command(
-        "zonda.core.storage.hdf5_survey", "main", os.path.abspath(os.fspath(path))
-    )
-    try:
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=PATIENCE
-        )
-    except subprocess.TimeoutExpired:
-        raise InputError(
-            "is corrupt: the HDF5 library does not come to an end with it", place=place, cure=cure
-        ) from None
-    if done.returncode < 0:
-        raise InputError(
-            f"is corrupt: the HDF5 library crashes on it (signal {-done.returncode})",
-            place=place,
-            cure=cure,
-        )
-    if done.returncode:
-        said = (done.stderr.decode(errors="replace").strip().splitlines() or ["nothing"])[-1]
-        raise InputError(
-            "cannot be checked: the process that opens it first ended with status"
-            f" {done.returncode} and said {said!r}",
-            place=place,
-            cure=f"does `{sys.executable} -c 'import h5py'` work? If so, {cure}",
-        )
 
 
 def check_size(dataset: Any, place: str, *, whole: bool = True) -> None:

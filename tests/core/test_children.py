@@ -143,18 +143,6 @@ def test_a_campaign(hostile: Path, engine: str) -> None:
     unsprung(hostile, zonda(hostile, "run", hostile.parent / "c.yaml", *options))
 
 
-def test_the_first_look_at_a_file(hostile: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import h5py
-
-    from zonda.core.storage import hdf5_files
-
-    with h5py.File(hostile.parent / "x.h5", "w") as file:
-        file["x"] = [1.0]
-    monkeypatch.chdir(hostile)
-    hdf5_files.survey(hostile.parent / "x.h5", "file x.h5", "copy it again")
-    assert not (hostile.parent / "sprung").exists()
-
-
 def test_modules_of_pythonpath_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also those of a folder that was put into the path later, and arguments arrive as they are."""
     (tmp_path / "za_child.py").write_text(

@@ -143,7 +143,4 @@ WORDS = (
 )
 
 if __name__ == "__main__":
-    from zonda.core.storage import hdf5_files
-
-    hdf5_files.survey = lambda *_: None  # one process each is too slow
     fuzz("hdf5", target, seeds, longest=60_000, words=WORDS)

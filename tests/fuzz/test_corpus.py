@@ -43,9 +43,7 @@ def whole(name: str) -> list[bytes]:
 @pytest.fixture(autouse=True)
 def _limits(monkeypatch: pytest.MonkeyPatch) -> None:
     from zonda.core import machine
-    from zonda.core.storage import hdf5_files
 
-    monkeypatch.setattr(hdf5_files, "PATIENCE", 4.0)
     monkeypatch.setattr(machine, "available_memory", lambda: 256 << 20)
 
 
@@ -103,37 +101,6 @@ HOW = ["cut", "lost", "zeros", "bytes", "digits"]
 def test_damage_at_random_places(name: str, seed: int, how: str) -> None:
     data = whole(name)[seed % len(whole(name))]
     read(name, damaged(data, seed, how))
-
-
-@many(8)
-@given(seed=st.integers(0, 2**32), how=st.sampled_from(HOW))
-def test_damage_at_random_places_of_hdf5(seed: int, how: str) -> None:
-    """Few, because a process of its own looks at each first."""
-    data = whole("hdf5")[seed % len(whole("hdf5"))]
-    read("hdf5", damaged(data, seed, how))
-
-
-def test_an_input_on_which_libhdf5_hangs(tmp_path: Path) -> None:
-    """The process that looks first is ended, and the file refused."""
-    import time
-
-    from zonda.core.errors import InputError
-    from zonda.core.storage import hdf5_files
-
-    (tmp_path / "x.h5").write_bytes(b"")
-    slow = tmp_path / "python"
-    slow.write_text("#!/bin/sh\nsleep 30\n")
-    dead = tmp_path / "dead"
-    dead.write_text("#!/bin/sh\nkill -SEGV $$\n")
-    for program, words in ((slow, "does not come to an end"), (dead, "crashes on it")):
-        program.chmod(0o755)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(hdf5_files, "PATIENCE", 0.5)
-            patch.setattr(sys, "executable", str(program))
-            begin = time.monotonic()
-            with pytest.raises(InputError, match=words):
-                hdf5_files.survey(tmp_path / "x.h5", "file x.h5", "copy it again")
-            assert time.monotonic() - begin < 25
 
 
 @pytest.mark.parametrize("name", FUZZERS)
