@@ -5,7 +5,6 @@ and provenance on top.
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,10 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy import table as astropy_table
+from astropy import units as u
+from astropy.table.meta import get_header_from_yaml
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .files import reading, write_text
+from .files import atomic_path, reading
 from .table_mistakes import Mistakes, TableError
 
 LARGEST = 1 << 28
@@ -36,29 +38,20 @@ class Column:
 
 
 def write_ecsv(path: str | Path, columns: Sequence[Column], meta: Mapping[str, Any]) -> Path:
-    """Write a table atomically; its path. ``meta``: texts and numbers. Raises `OutputError`."""
-    head = ["%ECSV 1.0", "---", "delimiter: ','", "datatype:"]
+    """Write a table atomically, numbers with nine digits; its path. Raises `OutputError`.
+
+    ``meta``: texts and numbers.
+    """
+    made = astropy_table.Table(meta=dict(meta))
     for c in columns:
-        unit = f"unit: {c.unit}, " if c.unit else ""
-        kind = "string" if any(isinstance(v, str) for v in c.values) else "float64"
-        head.append(
-            f"- {{name: {c.name}, {unit}datatype: {kind}, description:"
-            f" {json.dumps(c.description)}}}"
-        )
-    head.append("meta: !!omap")
-    head += [f"- {{{json.dumps(key)}: {json.dumps(value)}}}" for key, value in meta.items()]
-    head.append("schema: astropy-2.0")
-    rows = zip(*(c.values for c in columns), strict=True)
-    body = [",".join(c.name for c in columns)]
-    body += [",".join(map(_cell, row)) for row in rows]
-    return write_text(path, "\n".join([*(f"# {line}" for line in head), *body]) + "\n")
-
-
-def _cell(value: Any) -> str:
-    """Text in quotation marks, a number with nine digits."""
-    if isinstance(value, str):
-        return '"' + " ".join(value.split()).replace('"', '""') + '"'
-    return "nan" if math.isnan(value) else f"{float(value):.9g}"
+        if any(isinstance(v, str) for v in c.values):
+            values: list[Any] = [" ".join(str(v).split()) for v in c.values]
+        else:
+            values = [float(f"{float(v):.9g}") for v in c.values]
+        made[c.name] = astropy_table.Column(values, unit=c.unit or None, description=c.description)
+    with atomic_path(path) as temporary:
+        made.write(temporary, format="ascii.ecsv", delimiter=",")
+    return Path(path)
 
 
 @dataclass(frozen=True)
@@ -125,11 +118,9 @@ class Table:
                 f" {name} [{named[0]}]"
             )
             raise TableError(self.place, [(self.lines[-1], f"{name} has no unit", cure)])
-        from astropy import units
-
         try:
-            return float(units.Unit(written).to(units.Unit(unit)))
-        except (ValueError, units.UnitConversionError):
+            return float(u.Unit(written).to(u.Unit(unit)))
+        except (ValueError, u.UnitConversionError):
             cure = (
                 f"give it in {accepted}, or another unit of its kind"
                 if unit
@@ -230,33 +221,16 @@ def _cells(lines: Sequence[tuple[int, str]], comma: str) -> tuple[list[int], Cel
 
 
 def _ecsv(text: str, place: str) -> Written:
-    """ECSV."""
-    import yaml
-
     with reading(place, "ECSV", "write it with astropy: table.write(path, format='ascii.ecsv')"):
         lines = text.splitlines()
-        head = [line[2:] for line in lines if line.startswith("# ")]
-        document = yaml.safe_load(_without_meta(head[1:]))
-        described = {
-            str(column["name"]): str(column.get("unit", "")) for column in document["datatype"]
-        }
+        head = get_header_from_yaml(line[2:] for line in lines if line.startswith("# "))
+        described = {column["name"]: str(column.get("unit", "")) for column in head["datatype"]}
         body = [
             (number, line)
             for number, line in enumerate(lines, 1)
             if line.strip() and not line.startswith("#")
         ]
-        numbers, rows = _cells(body, str(document.get("delimiter", " ")))
+        numbers, rows = _cells(body, str(head.get("delimiter", " ")))
         names = rows[0]
         units = [described[name] for name in names]
     return names, units, rows[1:], [*numbers[1:], numbers[0]]
-
-
-def _without_meta(head: list[str]) -> str:
-    """The heading of an ECSV file without its provenance, which may have YAML tags of astropy."""
-    kept, skipping = [], False
-    for line in head:
-        if not line.startswith((" ", "-")):
-            skipping = line.startswith("meta:")
-        if not skipping:
-            kept.append(line)
-    return "\n".join(kept)
