@@ -1,6 +1,4 @@
-"""Products that draw themselves: what `Plots` and `Report` show without knowing the step that made
-it.
-"""
+"""Products that draw themselves: `Plots` and `Report` show them without knowing their step."""
 
 from __future__ import annotations
 
@@ -10,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 @dataclass(frozen=True)
 class Sketch:
-    """A picture that is drawn but not printed: ``name`` without suffix, a title, what it shows, one
+    """Picture that is drawn but not printed: ``name`` without suffix, a title, what it shows, one
     of its matplotlib Axes.
     """
 
@@ -22,7 +20,7 @@ class Sketch:
 
 @runtime_checkable
 class Drawable(Protocol):
-    """A product with pictures of its own. It crosses to another process, which calls `sketches`."""
+    """Product with pictures of its own."""
 
     def sketches(self, name: str) -> list[Sketch]:
         """Pictures whose names begin with ``name``, on matplotlib figures that belong to nobody

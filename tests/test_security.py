@@ -76,22 +76,6 @@ ALLOWED = {
         "operators/atmosphere/weather/era5.py",
         "import_module",
     ): "cdsapi, by its name, when the user asks to fetch",
-    (
-        "operators/diagnostics/drawing/artist.py",
-        "import_module",
-    ): "names from a table in the same file",
-    (
-        "operators/diagnostics/drawing/artist.py",
-        "pickle.load",
-    ): "between parent and child, through pipes that nobody else has",
-    (
-        "operators/diagnostics/drawing/artist.py",
-        "pickle.loads",
-    ): "the same: what came through such a pipe",
-    (
-        "operators/diagnostics/drawing/artist.py",
-        "subprocess.Popen",
-    ): "zonda itself, as a child; no shell; its own arguments",
     ("core/components.py", "import_module"): "names from the registries' own declarations",
     (
         "operators/pointing/schedule_files.py",

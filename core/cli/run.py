@@ -106,20 +106,15 @@ def run(**given: Any) -> None:
     errors stay within the budget (by default a tenth of the noise): `zonda plan` shows what. The
     products are in the folder that the last line names.
     """
-    from .. import early
-    from ..machine import available_threads, one_blas_thread
+    from ..machine import one_blas_thread
 
     request = RunRequest(**given)
     one_blas_thread()
     context = click.get_current_context()
     context.call_on_close(gc.enable)
     gc.disable()  # modules make no garbage, and looking for it takes a tenth of their time
-    if not request.is_campaign and available_threads() > 1 and request.threads != 1:
-        context.call_on_close(early.end)
-        early.begin(request.pipelines[0])
     file = load(request.pipelines[0], request.settings)
     if request.is_campaign or file.header.campaign is not None:
-        early.end()
         _run_campaign(request)
     else:
         _run_one(request, file)

@@ -108,22 +108,32 @@ def _range(known: AnyFloats, limit: float | None, around_zero: bool) -> tuple[fl
     return (low, top, False) if low < top else (low, low + (abs(low) or 1.0), False)
 
 
-def _beam(ax: Any, shown: Shown) -> None:
-    """The beam in the lower left corner: a circle on the sky there, in the picture's pixels an
-    ellipse.
+def circle_on_sky(grid: Any, place: Any, diameter: float, **style: Any) -> Any:
+    """Circle of ``diameter`` [rad] on the sky about a pixel (x, y) of a grid: a matplotlib Ellipse.
+
+    Pixels off the sky take the metric of the middle of the image.
     """
     from matplotlib.patches import Ellipse
 
+    xx, xy, yy = (float(g) for g in grid.metric(*place))
+    if not math.isfinite(xx * yy):
+        xx, xy, yy = grid.middle
+    turn = 0.5 * math.atan2(2 * xy, xx - yy)  # of the principal axis nearest to x
+    if abs(turn) > math.pi / 4:
+        turn -= math.copysign(math.pi / 2, turn)
+    c, s = math.cos(turn), math.sin(turn)
+    along = xx * c * c + 2 * xy * c * s + yy * s * s
+    across = xx * s * s - 2 * xy * c * s + yy * c * c
+    sizes = diameter / math.sqrt(along), diameter / math.sqrt(across)
+    return Ellipse((float(place[0]), float(place[1])), *sizes, angle=math.degrees(turn), **style)
+
+
+def _beam(ax: Any, shown: Shown) -> None:
+    """Draw the beam in the lower left corner: a circle on the sky, in the picture an ellipse."""
     grid = wcs_grid(shown.wcs, (shown.values.shape[0], shown.values.shape[1]))
-    corner, place = np.array([ax.get_xlim()[0], ax.get_ylim()[0]]), np.zeros(2)
+    corner = np.array([ax.get_xlim()[0], ax.get_ylim()[0]])
+    place, style = np.zeros(2), {"facecolor": "white", "edgecolor": "black"}
     for _ in range(2):  # its own size says where it lies
-        xx, xy, yy = (float(g) for g in grid.metric(*place))
-        if not math.isfinite(xx * yy):
-            xx, xy, yy = grid.middle
-        half = shown.fwhm / 2 * np.sqrt(np.array([yy, xx]) / (xx * yy - xy**2))
-        place = corner + 2.4 * half
-    sizes, axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
-    width, height = (float(v) for v in shown.fwhm / np.sqrt(sizes))
-    angle = math.degrees(math.atan2(float(axes[1, 0]), float(axes[0, 0])))
-    at = float(place[0]), float(place[1])
-    ax.add_patch(Ellipse(at, width, height, angle=angle, facecolor="white", edgecolor="black"))
+        box = circle_on_sky(grid, place, shown.fwhm).get_extents()
+        place = corner + 1.2 * np.array([box.width, box.height])
+    ax.add_patch(circle_on_sky(grid, place, shown.fwhm, **style))

@@ -64,7 +64,8 @@ class Report(Output):
         folder = output_folder(data, self.label)
         shown = data.products.get("pictures")
         if shown is None:
-            shown = pictures(data, replace(Plots().style(), central_diameter=self.central_diameter))
+            style = replace(Plots().style(), central_diameter=self.central_diameter)
+            shown = list(pictures(data, style))
         data.products["report"] = write_text(
             folder / "report.html", page(data, shown, self.central_diameter)
         )

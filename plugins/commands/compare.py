@@ -219,7 +219,7 @@ def _compare(
     from zonda.operators.diagnostics.comparison.planes import common_beam
     from zonda.operators.diagnostics.comparison.stokes import on_meridians_of
     from zonda.operators.diagnostics.drawing.comparison_plots import draw_comparison
-    from zonda.operators.diagnostics.drawing.pictures import Style, printed
+    from zonda.operators.diagnostics.drawing.pictures import Style
     from zonda.operators.diagnostics.series import plane_key
 
     read = [
@@ -259,7 +259,7 @@ def _compare(
         )
         name = plane_key("comparison", plane)
         written += write_comparison(found, folder / name, {})
-        for picture in printed(draw_comparison, style, name, found, levels):
+        for picture in map(style.printed, draw_comparison(name, found, levels)):
             for kind, content in picture.files.items():
                 path = folder / f"{picture.name}.{kind}"
                 with atomic_path(path) as temporary:

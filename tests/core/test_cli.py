@@ -266,7 +266,7 @@ def test_pipelines(
         locate, "shipped", lambda: {p.stem: p for p in sorted(tmp_path.glob("*.yaml"))}
     )
     assert cli.main(["pipelines"]) == 0
-    assert capsys.readouterr().out == "one  The first\ntwo  \n"
+    assert capsys.readouterr().out == "one  The first\ntwo\n"
 
 
 def test_shipped_pipelines_go_by_name(

@@ -1,8 +1,13 @@
-"""Matplotlib figures without pyplot: margins, colours and labels that all pictures share."""
+"""Matplotlib figures without pyplot: colours, labels and files that all pictures share.
+
+matplotlib is imported inside functions: no window system is needed and no global state is touched.
+Colours are told apart by colour-blind eyes (Okabe & Ito 2008), and brightness scales are
+perceptually ordered.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
 from typing import Any
 
 import numpy as np
@@ -18,58 +23,50 @@ COLOURS = {
 OTHER = "#56B4E9"
 SEQUENCE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 PALE = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
-"""The box behind text that lies on lines."""
+"""Box behind text that lies on lines."""
 
 DPI = 110
-TOP, BOTTOM = 0.34, 0.58
-"""Margins for a title, and for tick labels with an axis label, in."""
-CHARACTER, LINE = 0.078, 0.17
-"""Width of a character and height of a line of 9 pt text, in."""
+LEAST_DPI = 300.0
+"""Lowest resolution of images within PDF and SVG files, dots per inch."""
+SETTINGS = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "zonda"}
+"""Text stays text: PDF carries its TrueType fonts, SVG names them. Names inside an SVG file do not
+change from run to run.
+"""
+METADATA = {
+    "png": {"Software": "zonda"},
+    "pdf": {"Creator": "zonda", "Producer": "matplotlib", "CreationDate": None},
+    "svg": {"Creator": "zonda", "Date": None},
+}
 
 
-def new_axes(
-    ax: Any,
-    size: tuple[float, float] = (7.2, 5.0),
-    left: float = 0.85,
-    top: float = TOP,
-    right: float = 0.12,
-) -> Any:
-    """``ax``, or the Axes of a new figure that belongs to nobody else (not to pyplot). ``left``,
-    ``top``, ``right``: margins, in."""
+def new_axes(ax: Any = None, size: tuple[float, float] = (7.2, 5.0), **grid: Any) -> Any:
+    """``ax``, or the Axes of a new figure of ``size`` [in] that is not pyplot's.
+
+    ``grid`` is passed to `Figure.subplots`, which returns an array of Axes for several of them.
+    """
     if ax is not None:
         return ax
-    width, height = size
-    inside = (
-        left / width,
-        BOTTOM / height,
-        1 - (left + right) / width,
-        1 - (BOTTOM + top) / height,
-    )
-    return new_figure(size, [inside])[0]
-
-
-def new_figure(
-    size: tuple[float, float], places: Sequence[tuple[float, float, float, float]]
-) -> list[Any]:
-    """The axes of a new figure of ``size`` [in], at ``places`` (left, bottom, width, height),
-    shares of it.
-    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, dpi=DPI)
-    return [figure.add_axes(place) for place in places]
+    return Figure(figsize=size, dpi=DPI).subplots(**grid)
 
 
-def fit_left(ax: Any) -> None:
-    """Move the left edge of the one axes of a figure to where its tick labels and their name have
-    room.
-    """
-    labels = ax.yaxis.get_major_formatter().format_ticks(ax.yaxis.get_majorticklocs())
-    left = (
-        0.4 + 1.12 * CHARACTER * max((len(label) for label in labels), default=0)
-    ) / ax.figure.get_figwidth()
-    box = ax.get_position()
-    ax.set_position((left, box.y0, box.x1 - left, box.height))
+def file_of(figure: Any, kind: str, dpi: float = DPI) -> bytes:
+    """A figure as a ``png``, ``pdf`` or ``svg`` file; the same figure gives the same bytes."""
+    from matplotlib import rc_context
+
+    out = io.BytesIO()
+    fast = {"pil_kwargs": {"compress_level": 2}} if kind == "png" else {}
+    with rc_context(SETTINGS):  # type: ignore[arg-type]
+        figure.savefig(
+            out,
+            format=kind,
+            dpi=dpi if kind == "png" else max(dpi, LEAST_DPI),
+            metadata=METADATA[kind],
+            bbox_inches="tight",
+            **fast,
+        )
+    return out.getvalue()
 
 
 def unit_of(peak: float) -> tuple[float, str]:
@@ -90,22 +87,11 @@ def _power_of_ten(value: float) -> str:
 
 
 def log_labels(axis: Any, low: float, high: float) -> None:
-    """Label the powers of ten between ``low`` and ``high``, and 2 and 5 of each where there are few
-    of them.
-    """
+    """Label the powers of ten between two limits, and 2 and 5 of each where there are few."""
     few = 0 < low < high < 160 * low
     text = (lambda value: f"{value:.6g}") if low > 1e-3 and high < 1e5 else _power_of_ten
     axis.set_major_formatter(lambda value, _: text(value) if value > 0 else "")
-    axis.set_tick_params(
-        which="minor", pad=5
-    )  # their labels are as far away as those of the longer marks
+    axis.set_tick_params(which="minor", pad=5)  # as far away as labels of the longer marks
     axis.set_minor_formatter(
         lambda value, _: text(value) if few and value > 0 and f"{value:.0e}"[0] in "25" else ""
     )
-
-
-def write_title(ax: Any, title: str, pad: float | None = None, room: float | None = None) -> None:
-    """Above the axes, where it stands: looking for room takes as long as drawing. ``room``: its
-    width, in; where that is not enough for 12 pt, the letters are smaller."""
-    size = None if room is None else min(12.0, max(7.0, 12.0 * room / (0.1 * max(len(title), 1))))
-    ax.set_title(title, y=1.0, pad=pad, **({} if size is None else {"fontsize": size}))

@@ -1,4 +1,4 @@
-"""Pictures of two maps that are compared, and of radial spectra of maps."""
+"""Pictures of two maps or streams that are compared, and of radial spectra of maps."""
 
 from __future__ import annotations
 
@@ -12,15 +12,22 @@ from zonda.core.drawable import Sketch
 from zonda.core.numerics.angles import ARCSEC, angle_text
 from zonda.core.types import Floats
 
-from .canvas import SEQUENCE, log_labels, new_figure, unit_of, write_title
-from .map_layout import map_axes
-from .map_plots import contour_text, noise_text, plot_contours, plot_map, plot_plain
-from .sky_axes import SkyAxes
+from .canvas import OTHER, SEQUENCE, log_labels, new_axes, unit_of
+from .map_plots import (
+    contour_text,
+    map_axes,
+    noise_text,
+    plot_contours,
+    plot_map,
+    plot_plain,
+    wcs_of,
+)
 
 if TYPE_CHECKING:
     from ..comparison.radial import RadialSpectra
     from ..comparison.statistics import Comparison
     from ..map_spectra import MapSpectra
+    from ..stream_statistics import StreamComparison
 
 CONTOURS = (-8.0, -4.0, -2.0, 2.0, 4.0)
 """Default levels of the contours on SNR maps."""
@@ -38,8 +45,7 @@ def draw_comparison(file: str, found: Comparison, contours: Sequence[float] = ()
 
 
 def _maps(file: str, found: Comparison) -> Sketch:
-    planes, header = found.planes, found.header
-    where = SkyAxes.of(header) or header
+    planes, where = found.planes, wcs_of(found.header)
     shape = planes["map"].shape
     axes = map_axes(shape, where, 3)
     both = np.abs(
@@ -68,8 +74,7 @@ def _maps(file: str, found: Comparison) -> Sketch:
 
 
 def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
-    planes, header = found.planes, found.header
-    where = SkyAxes.of(header) or header
+    planes, where = found.planes, wcs_of(found.header)
     snr = planes.get("snr")
     axes = map_axes(planes["map"].shape, where, 1 if snr is None else 2)
     finite = planes["fidelity"][np.isfinite(planes["fidelity"])]  # infinite where maps are equal
@@ -95,8 +100,7 @@ def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
 
 
 def _curves(file: str, found: Comparison) -> Sketch:
-    size = (10.6, 4.6)
-    left, right = new_figure(size, [(0.085, 0.135, 0.395, 0.7), (0.585, 0.135, 0.395, 0.7)])
+    left, right = new_axes(None, (10.6, 4.6), ncols=2, gridspec_kw={"wspace": 0.25})
     plot_radial_spectra(left, found.spectra, found.unit, found.fwhm)
     p, names = (
         found.profiles,
@@ -130,8 +134,8 @@ def _curves(file: str, found: Comparison) -> Sketch:
     right.set_ylabel(f"mean brightness [{unit}]" if unit else "mean brightness")
     right.grid(which="major", color="0.9", linewidth=0.7)
     right.legend(frameon=False, fontsize=8)
-    write_title(left, "Radial power spectra", pad=42)
-    write_title(right, "Radial profiles")
+    left.set_title("Radial power spectra")
+    right.set_title("Radial profiles")
     caption = (
         "Power spectral densities in rings of angular scale under a cosine window, and means in"
         " rings about the map's centre."
@@ -222,9 +226,9 @@ def _inverse(arcsec: Any) -> Any:
 
 def draw_map_spectra(file: str, found: MapSpectra) -> list[Sketch]:
     """Radial spectra of maps, each with the white level that its noise promises."""
-    (ax,) = new_figure((7.2, 5.2), [(0.13, 0.12, 0.85, 0.74)])
+    ax = new_axes(None, (7.2, 5.2))
     plot_radial_spectra(ax, found.spectra, "K_RJ", found.fwhm, found.names)
-    write_title(ax, "Radial power spectra of the maps", pad=42)
+    ax.set_title("Radial power spectra of the maps")
     caption = (
         "Power spectral densities of the maps in rings of angular scale under a cosine window over"
         " the well covered field."
@@ -240,3 +244,64 @@ def _short(text: str, most: int = 46) -> str:
     """The text, its middle left out where it is long."""
     half = math.floor((most - 1) / 2)
     return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"
+
+
+def draw_stream_comparison(file: str, found: StreamComparison) -> list[Sketch]:
+    """Spectra, their ratio and the coherence."""
+    spectra, ratio, coherence = new_axes(
+        None, (7.2, 7.2), nrows=3, height_ratios=(0.43, 0.21, 0.20), gridspec_kw={"hspace": 0.06}
+    )
+    f, (x, y, d) = found.frequency, found.power
+    for row, label, colour in (
+        (x, found.stream, "black"),
+        (y, found.reference, SEQUENCE[0]),
+        (d, "difference", SEQUENCE[1]),
+    ):
+        if np.isfinite(row).all() and (row > 0).any():
+            spectra.loglog(
+                f, np.where(row > 0, row, np.nan), color=colour, linewidth=1.1, label=label
+            )
+    spectra.set_ylabel("power spectral density [unit²/Hz]")
+    spectra.legend(frameon=False, fontsize=9)
+    positive = y > 0
+    ratio.loglog(f[positive], x[positive] / y[positive], color="black", linewidth=0.9)
+    gain = found.over_detectors("gain")[0]
+    if np.isfinite(gain) and gain != 0:
+        ratio.axhline(gain**2, color=OTHER, linestyle="--", linewidth=1.0)
+    ratio.set_ylabel("ratio")
+    coherence.semilogx(f, found.coherence, color="black", linewidth=0.9)
+    coherence.axhline(1 / found.segments, color=OTHER, linestyle="--", linewidth=1.0)
+    coherence.set_ylabel("coherence")
+    coherence.set_ylim(0, 1.05)
+    coherence.set_xlabel("frequency [Hz]")
+    for ax in (spectra, ratio, coherence):
+        _finish(ax, f, last=ax is coherence)
+    spectra.set_title(f"{found.stream} and {found.reference}")
+    return [Sketch(file, "Streams compared", _caption_of_streams(found), spectra)]
+
+
+def _finish(ax: Any, f: Any, last: bool) -> None:
+    ax.set_xlim(f[0], f[-1])
+    ax.grid(which="major", color="0.9", linewidth=0.7)
+    log_labels(ax.xaxis, *ax.get_xlim())
+    if ax.get_yscale() == "log":
+        log_labels(ax.yaxis, *ax.get_ylim())
+    if not last:
+        ax.tick_params(labelbottom=False, which="both")
+
+
+def _caption_of_streams(found: StreamComparison) -> str:
+    (r, scatter, error), (gain, _, gain_error) = (
+        found.over_detectors(k) for k in ("correlation", "gain")
+    )
+    many = (
+        f"{len(found.names)} detectors and {found.observations}"
+        f" scan{'s' if found.observations > 1 else ''}"
+    )
+    return (
+        f"Streams {found.stream} and {found.reference} at step {found.label}, mean of {many}: power"
+        f" spectra on the calibrated sky, their ratio (dashed: gain², {gain:.4g} ±"
+        f" {gain_error:.2g}) and the coherence (dashed: 1/n of independent streams, n ="
+        f" {found.segments:.3g} segments). Correlation {r:.4f} ± {error:.2g} of one detector,"
+        f" scatter over detectors {scatter:.2g}."
+    )

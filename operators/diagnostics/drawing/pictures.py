@@ -1,48 +1,53 @@
-"""Pictures of a run from plain values: what is drawn in the second process. numpy and, when
-something is drawn, matplotlib.
-"""
+"""Pictures of the products of a run, each with its title and caption."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from zonda.core.drawable import Drawable, Sketch
+from zonda.core.drawable import Sketch
 from zonda.core.maps.central import central_diameter, in_beams
-from zonda.core.maps.planes import Plane
+from zonda.core.maps.noise_figures import Noise
+from zonda.core.maps.on_plane import on_plane
 from zonda.core.numerics.angles import angle_text, sides_text
 from zonda.core.types import AnyFloats
 
 from ..series import Modes, Spectrum, TimeStream, unit_of_stream
-from .canvas import DPI, unit_of
-from .flat_map import FlatMap
-from .map_layout import map_axes
+from .canvas import DPI, file_of, unit_of
 from .map_plots import (
     SHOWN,
     contour_text,
+    map_axes,
     noise_text,
     plot_circle,
     plot_contours,
     plot_coverage,
     plot_map,
     plot_plain,
-    plot_plane,
+    wcs_of,
 )
-from .plot_modes import plot_modes
-from .plots import ScanTrack, plot_scan, plot_spectra, plot_tod, plot_transfer
-from .png import png_of
-from .sky_axes import SkyAxes
-from .vector import vector_of
+from .plots import ScanTrack, plot_modes, plot_scan, plot_spectra, plot_tod, plot_transfer
+
+if TYPE_CHECKING:
+    from zonda.core.maps.image import Image
+    from zonda.core.maps.map_product import MapProduct
+
+    from ..transfer_function import Transfer
+
+Window = tuple[slice, slice]
+LARGEST = 1500
+"""Pixels of an image's longer side in a picture; larger images are thinned out."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture: ``name`` without suffix, a title, what it shows, its bytes as PNG and, by format,
-    as further files.
+    """Picture of a product: ``name`` without suffix, a title, what it shows, its bytes as PNG and,
+    by format, as further files.
     """
 
     name: str
@@ -65,40 +70,109 @@ class Style:
     formats: tuple[str, ...] = ("png",)
     dpi: float = DPI
 
+    def smoothing(self, product: MapProduct) -> float:
+        """Gaussian [rad] by which a map is smoothed for its picture; 0 for none."""
+        if product.projection == "HEALPix" or product.smoothed_by:
+            return 0.0
+        return product.fwhm if self.smooth is None else self.smooth
 
-def printed(draw: Callable[..., list[Sketch]], style: Style, *arguments: Any) -> list[Picture]:
-    """What ``draw(*arguments)`` sketches, in the formats of the style; PNG always, since reports
-    show it.
+    def smoothed(self, product: MapProduct) -> MapProduct:
+        """The map as its picture shows it."""
+        fwhm = self.smoothing(product)
+        return product.smoothed(fwhm) if fwhm > 0 else product
+
+    def printed(self, sketch: Sketch) -> Picture:
+        """A sketch in the formats of the style; PNG always, since reports show it."""
+        figure = sketch.ax.figure
+        png = file_of(figure, "png", self.dpi)
+        files = {k: png if k == "png" else file_of(figure, k, self.dpi) for k in self.formats}
+        return Picture(sketch.name, sketch.title, sketch.caption, png, files)
+
+
+@dataclass(frozen=True)
+class Flat:
+    """Planes (ny, nx) of a map as its picture shows them; ``covered``: pixels with enough samples.
+
+    HEALPix and CAR maps are on a plane about their centre.
     """
-    made = []
-    for sketch in draw(*arguments):
-        png = png_of(sketch.ax, style.dpi)
-        files = {
-            name: png if name == "png" else vector_of(sketch.ax, name, style.dpi)
-            for name in style.formats
-        }
-        made.append(Picture(sketch.name, sketch.title, sketch.caption, png, files))
-    return made
+
+    planes: dict[str, AnyFloats]
+    hits: AnyFloats
+    covered: NDArray[np.bool_]
+    wcs: Any
+
+    @classmethod
+    def of(cls, product: MapProduct, planes: Mapping[str, AnyFloats], least: float = 0.0) -> Flat:
+        """From planes on the grid of a map; ``least``: share of the 99th percentile of the samples.
+
+        Samples are smoothed as the map is: the edge of what is covered is not ragged then.
+        """
+        seen = product.known_hits.astype(np.float64)
+        if product.smoothed_by and product.projection != "HEALPix":
+            seen = product.grid.smoother(product.smoothed_by)(seen)
+        found: dict[str, Any] = {**planes, "hits": product.known_hits, "seen": seen}
+        if product.projection == "TAN":
+            wcs = wcs_of(product.header)
+        else:
+            found, wcs = on_plane(product, found)
+        hits, seen = found.pop("hits"), np.nan_to_num(found.pop("seen"))
+        used = seen[hits > 0]
+        return cls(
+            found, hits, seen >= least * np.percentile(used, 99) if used.size else seen > 0, wcs
+        )
+
+    def window(self) -> Window:
+        """Rows and columns where there are samples, with a margin of a hundredth of the longer
+        side; all, if they are most.
+        """
+        ny, nx = self.hits.shape
+        edges = []
+        for axis, size in enumerate((ny, nx)):
+            used = np.flatnonzero((self.hits > 0).any(axis=1 - axis))
+            edges.append((int(used[0]), int(used[-1]) + 1) if used.size else (0, size))
+        spare = math.ceil(0.01 * max(high - low for low, high in edges))
+        (y0, y1), (x0, x1) = (
+            (max(0, low - spare), min(size, high + spare))
+            for (low, high), size in zip(edges, (ny, nx), strict=True)
+        )
+        if (y1 - y0) * (x1 - x0) >= 0.9 * ny * nx:
+            return slice(0, ny), slice(0, nx)
+        return slice(y0, y1), slice(x0, x1)
+
+    def cropped(self, window: Window | None = None) -> Flat:
+        """The rows and columns of a window; `window` by default."""
+        part = window or self.window()
+        planes = {name: values[part] for name, values in self.planes.items()}
+        return Flat(planes, self.hits[part], self.covered[part], self.wcs[part])
+
+    def limit(self, plane: str, share: float) -> float | None:
+        """Brightness scale that covers ``share`` per cent of well covered pixels: the noisy rim
+        must not set it.
+        """
+        if not self.hits.any():
+            return None
+        well = self.hits > 0.25 * np.percentile(self.hits[self.hits > 0], 99)
+        good = np.abs(self.planes[plane][well & np.isfinite(self.planes[plane])])
+        return float(np.percentile(good, share)) if good.size else None
 
 
-def draw_input(
-    file: str, values: Any, axes: SkyAxes | None, header: dict[str, Any], signed: bool = False
-) -> list[Sketch]:
-    """The input map (ny, nx), K_RJ; ``signed``: Q or U, with zero in the middle of the colours."""
-    what, where = _named("Input", file, "input"), header if axes is None else axes
+def draw_input(file: str, image: Image, signed: bool = False) -> list[Sketch]:
+    """Input map (ny, nx), K_RJ; ``signed``: Q or U, with zero in the middle of the colours."""
+    step = -(-max(image.values.shape) // LARGEST)
+    values, wcs = image.values[::step, ::step], wcs_of(image.header)[::step, ::step]
+    what = _named("Input", file, "input")
     title = f"{what}: the sky before the beam"
     if signed:
         top = float(np.nanpercentile(np.abs(values), 99.7)) or 1.0
         factor, unit = unit_of(top)
+        limits = (-top * factor, top * factor)
         label = f"Rayleigh–Jeans brightness [{unit}]"
-        ax = plot_plain(
-            values * factor, where, (-top * factor, top * factor), "RdBu_r", label, title=title
-        )
+        ax = plot_plain(values * factor, wcs, limits, "RdBu_r", label, title=title)
     else:
-        ax = plot_map(values, where, title=title)
+        ax = plot_map(values, wcs, title=title)
     text = "The input map, before beam, opacity and filters."
-    if header.get("BMAJ"):
-        width = angle_text(math.radians(float(header["BMAJ"])))
+    if image.fwhm:
+        width = angle_text(image.fwhm)
         text += f" Its pixels are spread over a grid with Gaussians of {width} (FWHM)."
     return [Sketch(file, what, text, ax)]
 
@@ -107,15 +181,16 @@ def draw_map(
     file: str,
     signal: str,
     key: str,
-    product: FlatMap,
+    product: MapProduct,
     style: Style,
     snr: tuple[AnyFloats, str] | None = None,
 ) -> list[Sketch]:
-    """Plane ``signal`` of a map of a signal, called ``key``; ``snr``: (ny, nx), contours of it, and
-    what its noise is.
+    """Map of a signal, called ``key``; ``snr``: contours of it on the map's grid, and what its
+    noise is.
     """
-    window = product.window()
-    shown, how = _shown(product.cropped(window), style)
+    shown = style.smoothed(product)
+    planes = {"signal": shown.signal} | ({} if snr is None else {"snr": snr[0]})
+    flat = Flat.of(shown, planes, style.least_coverage).cropped()
     title = {"": "Map", "noiseless": "Noiseless map"}.get(signal, f"Map of signal {signal}")
     title = _named(title, key)
     meaning = {
@@ -125,70 +200,73 @@ def draw_map(
             " leaves of it."
         ),
     }.get(signal, "A part of the components, filtered and binned.")
-    limit = shown.limit("signal", shown.hits, SHOWN if signal == "noiseless" else 99.7)
+    how = _how(product, shown)
+    text = f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}"
     head = _titled(title, shown)
     if snr is not None:
         head += f"; contours: S/N, {noise_text(snr[1], short=True)}"
-    ax = _panels([(shown, head)], style, limit)
-    text = f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}"
-    if snr is not None:
-        plot_contours(
-            ax,
-            np.where(shown.covered(style.least_coverage), snr[0][window], np.nan),
-            style.contours,
-        )
         text += (
             f" Contours of the signal-to-noise ratio: {contour_text(style.contours)} (negative ones"
-            " dashed)."
+            f" dashed). Its noise: {noise_text(snr[1])}."
         )
-        text += f" Its noise: {noise_text(snr[1])}."
+    limit = flat.limit("signal", SHOWN if signal == "noiseless" else 99.7)
+    ax = _panels([(flat, flat.planes["signal"], head)], shown.resolution, limit)[0]
+    if snr is not None:
+        plot_contours(ax, np.where(flat.covered, flat.planes["snr"], np.nan), style.contours)
     return [Sketch(file, title, text, ax)]
 
 
-def draw_noise(file: str, sources: dict[str, FlatMap], style: Style) -> list[Sketch]:
-    """Maps of noise alone: ``half_difference`` (of the map, which comes first) and ``source_free``
-    (plane ``signal``).
+def draw_noise(
+    file: str, sources: Mapping[Noise, tuple[MapProduct, str]], style: Style
+) -> list[Sketch]:
+    """Maps of noise alone, with the plane that holds it: ``half_difference`` of the map, which
+    comes first, and ``source_free``.
     """
-    words = {"source_free": "all but the sky"}
-    panels, figures, limits, how = [], [], [], ""
-    first = next(iter(sources.values()))
-    window, diameter = (
-        first.window(),
-        central_diameter(first.fwhm, first.pixel, style.central_diameter),
-    )
-    for of, source in sources.items():
-        words.setdefault(of, source.difference)
-        shown, how = _shown(source.cropped(window), style)
-        plane = next(iter(shown.planes))
-        panels.append((shown, _titled(_named(f"Noise: {words[of]}", file, "noise"), shown)))
-        limits.append(shown.limit(plane, panels[0][0].hits, 99.7))
-        rms = shown.central_rms(plane, diameter / 2)
+    panels: list[tuple[Flat, AnyFloats, str]] = []
+    figures, limits, how, window = [], [], "", None
+    first = next(iter(sources.values()))[0]
+    diameter = central_diameter(first.fwhm, first.pixel, style.central_diameter)
+    for of, (product, plane) in sources.items():
+        half = product.difference.replace(" - ", " minus ")
+        words = half if of == "half_difference" else "all but the sky"
+        shown = style.smoothed(product)
+        how = _how(product, shown)
+        flat = Flat.of(shown, {plane: getattr(shown, plane)}, style.least_coverage)
+        window = flat.window() if window is None else window
+        flat = flat.cropped(window)
+        head = _titled(_named(f"Noise: {words}", file, "noise"), shown)
+        panels.append((flat, flat.planes[plane], head))
+        limits.append(flat.limit(plane, 99.7))
+        rms = shown.rms(diameter / 2, of=plane)
         if math.isfinite(rms):
-            figures.append(f"{words[of]} {rms * 1e6:.4g} µK_RJ")
-    limit = max((x for x in limits if x), default=None)
-    ax = _panels(panels, style, limit, diameter)
-    text = f"Noise maps on one scale, {how}.{_resolution(panels[0][0])}"
+            figures.append(f"{words} {rms * 1e6:.4g} µK_RJ")
+    axes = _panels(panels, shown.resolution, max((x for x in limits if x), default=None))
+    place = axes[0].wcs.wcs_world2pix([np.degrees(first.centre)], 0)[0]
+    for ax in axes:
+        plot_circle(ax, panels[0][1].shape, place, diameter)
+    text = f"Noise maps on one scale, {how}.{_resolution(shown)}"
     if figures:
         wide = f"{np.degrees(diameter) * 60:.3g}′{in_beams(diameter, first.fwhm)}"
         text += f" Weighted rms within the dotted circle of {wide}: {', '.join(figures)}."
-    return [Sketch(file, _named("Noise", file, "noise"), text, ax)]
+    return [Sketch(file, _named("Noise", file, "noise"), text, axes[0])]
 
 
-def draw_coverage(
-    file: str, product: FlatMap, samples: int, pixels: int, sides: tuple[float, float]
-) -> list[Sketch]:
-    """Samples per pixel and seconds per beam; ``samples`` in ``pixels`` in all, of these
-    `MapArrays.sides`.
-    """
-    product = product.cropped()
-    what = "Samples per pixel" if product.per_beam is None else "Integration time per beam"
-    ax = plot_coverage(
-        product.hits, product.sky, per_beam=product.per_beam, title=_named(what, file, "coverage")
-    )
-    text = f"{samples:,} samples in {pixels:,} pixels of {sides_text(*sides)}.".replace(
+def draw_coverage(file: str, product: MapProduct) -> list[Sketch]:
+    """Samples per pixel and seconds per beam."""
+    per_beam: Any = product.seconds_per_beam()
+    each = isinstance(per_beam, np.ndarray) and per_beam.ndim > 0
+    flat = Flat.of(product, {"per_beam": per_beam} if each else {}).cropped()
+    if each:
+        found = flat.planes["per_beam"]
+        per_beam = np.where(np.isfinite(found), found, np.nanmean(found))
+    what = "Samples per pixel" if per_beam is None else "Integration time per beam"
+    title = _named(what, file, "coverage")
+    ax = plot_coverage(flat.hits, flat.wcs, per_beam=per_beam, title=title)
+    samples, pixels = int(product.hits.sum()), int((product.hits > 0).sum())
+    text = f"{samples:,} samples in {pixels:,} pixels of {sides_text(*product.sides)}.".replace(
         ",", "\u202f"
     )
-    if product.per_beam is not None:
+    if per_beam is not None:
         beam = f"of {angle_text(product.fwhm)} FWHM (area π FWHM² / (4 ln 2))"
         text += (
             " Integration time: of all detectors together, in the area of the telescope's beam"
@@ -197,15 +275,24 @@ def draw_coverage(
     return [Sketch(file, "Coverage", text, ax)]
 
 
-def draw_plane(file: str, product: FlatMap, plane: Plane) -> list[Sketch]:
-    """A plane of numbers, which says itself how it is shown. ``plane``: without its values."""
-    product = product.cropped()
-    (values,) = product.planes.values()
-    return [Sketch(file, plane.title, plane.caption, plot_plane(values, product.sky, plane))]
+def draw_plane(file: str, product: MapProduct, name: str) -> list[Sketch]:
+    """Plane of numbers, whose colours, title and caption it states itself."""
+    plane = product.planes[name]
+    flat = Flat.of(product, {name: plane.values[0]}).cropped()
+    values = flat.planes[name]
+    assert plane.colours is not None
+    known = values[np.isfinite(values)]
+    low, high = plane.colours
+    limits = (
+        float(known.min(initial=0.0)) if low is None else low,
+        float(known.max(initial=0.0)) if high is None else high,
+    )
+    ax = plot_plain(values, flat.wcs, limits, "cividis_r", plane.unit, title=plane.title)
+    return [Sketch(file, plane.title, plane.caption, ax)]
 
 
 def draw_scan(tracks: Sequence[ScanTrack]) -> list[Sketch]:
-    """Where the boresight went."""
+    """Track of the boresight."""
     ax = plot_scan(tracks)
     return [
         Sketch("scan", "Boresight track", "The boresight about the target, one line per scan.", ax)
@@ -259,8 +346,8 @@ def draw_modes(file: str, modes: Modes, before: str) -> list[Sketch]:
     return [Sketch(file, "Modes", caption, ax)]
 
 
-def draw_transfer(file: str, transfer: Any) -> list[Sketch]:
-    """A `Transfer`."""
+def draw_transfer(file: str, transfer: Transfer) -> list[Sketch]:
+    """Transfer function of the filters."""
     whose = "the sky alone" if transfer.modes == "sky" else "the complete data"
     caption = (
         "The map of the sky alone through all filters against the same map without filters, by"
@@ -271,11 +358,6 @@ def draw_transfer(file: str, transfer: Any) -> list[Sketch]:
     of = "" if file == "transfer_function" else f" ({file.removeprefix('transfer_function_')})"
     ax = plot_transfer(transfer, title=f"Transfer function{of}, singular modes of {whose}")
     return [Sketch(file, f"Transfer function{of}", caption, ax)]
-
-
-def draw_own(file: str, product: Drawable) -> list[Sketch]:
-    """A product that draws itself."""
-    return product.sketches(file)
 
 
 def draw_streams(file: str, stream: TimeStream, before: str) -> list[Sketch]:
@@ -303,36 +385,24 @@ def draw_streams(file: str, stream: TimeStream, before: str) -> list[Sketch]:
     return made
 
 
-def _shown(product: FlatMap, style: Style) -> tuple[FlatMap, str]:
-    """The map as its picture shows it, and what was done to it."""
-    if not product.smooth or style.smooth == 0 or product.smoothed_by:
-        return (
-            product,
-            (
-                f"smoothed by {angle_text(product.smoothed_by)}"
-                if product.smoothed_by
-                else "not smoothed"
-            ),
-        )
-    fwhm = product.fwhm if style.smooth is None else style.smooth
-    return (
-        (product.smoothed(fwhm), f"smoothed by {angle_text(fwhm)} for this picture")
-        if fwhm > 0
-        else (product, "not smoothed")
-    )
+def _how(product: MapProduct, shown: MapProduct) -> str:
+    """What was done to a map for its picture."""
+    if not shown.smoothed_by:
+        return "not smoothed"
+    text = f"smoothed by {angle_text(shown.smoothed_by)}"
+    return text if product.smoothed_by else f"{text} for this picture"
 
 
-def _resolution(shown: FlatMap) -> str:
-    """What the circle in a map's corner is."""
+def _resolution(shown: MapProduct) -> str:
+    """Meaning of the circle in a map's corner."""
     if not shown.fwhm:
         return ""
     beam, smoothing = angle_text(shown.fwhm), angle_text(shown.smoothed_by)
     if not shown.smoothed_by:
         return f" Resolution {beam} FWHM, the beam's."
-    whole = angle_text(math.hypot(shown.fwhm, shown.smoothed_by))
     return (
-        f" Resolution {whole} FWHM: the beam's {beam} and the smoothing's {smoothing}, added in"
-        " quadrature."
+        f" Resolution {angle_text(shown.resolution)} FWHM: the beam's {beam} and the smoothing's"
+        f" {smoothing}, added in quadrature."
     )
 
 
@@ -344,28 +414,22 @@ def _named(title: str, key: str, shows: str = "") -> str:
     return f"{title} ({more})" if more else title
 
 
-def _titled(title: str, shown: FlatMap) -> str:
+def _titled(title: str, shown: MapProduct) -> str:
     """With the resolution, which the circle in the map's corner shows: beam and smoothing
     together.
     """
     if not shown.smoothed_by:
         return f"{title}, not smoothed"
-    return f"{title}, smoothed to {angle_text(math.hypot(shown.fwhm, shown.smoothed_by))}"
+    return f"{title}, smoothed to {angle_text(shown.resolution)}"
 
 
 def _panels(
-    panels: Sequence[tuple[FlatMap, str]], style: Style, limit: float | None, circle: float = 0.0
-) -> Any:
-    """The first plane of each map with its title, side by side, where the first map is well
-    covered; ``circle``: diameter.
-    """
-    whole = panels[0][0]
-    covered = whole.covered(style.least_coverage)
-    fwhm = math.hypot(whole.fwhm, whole.smoothed_by)
-    axes = map_axes(covered.shape, whole.sky, len(panels))
-    for ax, (shown, title) in zip(axes, panels, strict=True):
-        values = np.where(covered, next(iter(shown.planes.values())), np.float32(np.nan))
-        plot_map(values, whole.sky, ax=ax, title=title, fwhm=fwhm or None, limit=limit)
-        if circle:
-            plot_circle(ax, whole.sky, values.shape, circle)
-    return axes[0]
+    panels: Sequence[tuple[Flat, AnyFloats, str]], fwhm: float, limit: float | None
+) -> list[Any]:
+    """Axes of maps side by side with their titles, where the first map is well covered."""
+    first = panels[0][0]
+    axes = map_axes(first.covered.shape, first.wcs, len(panels))
+    for ax, (_, values, title) in zip(axes, panels, strict=True):
+        shown = np.where(first.covered, values, np.nan)
+        plot_map(shown, first.wcs, ax=ax, title=title, fwhm=fwhm or None, limit=limit)
+    return axes

@@ -1,10 +1,5 @@
-"""Pictures of spectra, time streams and scans, drawn into ``ax`` or a new figure; each returns its
-Axes.
-
-matplotlib is imported inside; no window system is needed and no global state is touched. Colours
-are told apart by colour-blind eyes (Okabe & Ito 2008) and brightness scales are perceptually
-ordered. Margins of a new figure are fixed, and labels are plain Unicode text: measuring the one and
-parsing the other take longer than drawing.
+"""Pictures of spectra, modes, time streams and scans, drawn into ``ax`` or a new figure; each
+returns its Axes.
 """
 
 from __future__ import annotations
@@ -21,40 +16,18 @@ from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import AnyFloats
 
 from ..series import unit_of_stream
-from .canvas import (
-    CHARACTER,
-    COLOURS,
-    OTHER,
-    PALE,
-    SEQUENCE,
-    fit_left,
-    log_labels,
-    new_axes,
-    unit_of,
-    write_title,
-)
-from .map_layout import map_axes
-from .map_plots import plot_coverage, plot_map
+from .canvas import COLOURS, OTHER, PALE, SEQUENCE, log_labels, new_axes, unit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from zonda.core.data import Observation
 
-    from ..series import Spectrum, TimeStream
+    from ..series import Modes, Spectrum, TimeStream
     from ..transfer_function import Transfer
 
-__all__ = [
-    "ScanTrack",
-    "map_axes",
-    "plot_coverage",
-    "plot_map",
-    "plot_scan",
-    "plot_spectra",
-    "plot_tod",
-    "plot_transfer",
-]
-
+MODES = 4
+"""Modes whose streams are drawn."""
 MANY = 2000
 """Points of a track that are drawn, however near to one another."""
 
@@ -101,7 +74,7 @@ def plot_spectra(
     of white noise; it scatters about the knee of the law. Shades and names above tell which of the
     three laws dominates.
     """
-    ax = new_axes(ax, left=0.95)
+    ax = new_axes(ax)
     names = {
         "signal": "signal (all)",
         "sky": "astronomical sky",
@@ -156,7 +129,7 @@ def plot_spectra(
     )
     _name(ax, "frequency [Hz]", f"power spectral density{what}")
     ax.legend(frameon=False, fontsize=9, loc="upper right")
-    write_title(ax, title)
+    ax.set_title(title)
     return ax  # type: ignore[no-any-return]
 
 
@@ -237,7 +210,7 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     read; the legend says where. Horizontal bars are the rings. The dotted line is the beam's FWHM;
     the upper axis counts wavelengths.
     """
-    ax = new_axes(ax, (7.2, 4.8), top=0.86)
+    ax = new_axes(ax, (7.2, 4.8))
     r = transfer.rings
     scale, edges = transfer.scale / ARCSEC, 1 / transfer.edges / ARCSEC
     width = [np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)]
@@ -269,7 +242,7 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     log_labels(upper.xaxis, _to_kilolambda(edges[0]), _to_kilolambda(edges[-1]))
     _name(ax, "angular scale [arcsec]", "transfer function")
     ax.legend(frameon=False, fontsize=9, loc="best")
-    write_title(ax, title, pad=42)
+    ax.set_title(title)
     return ax  # type: ignore[no-any-return]
 
 
@@ -297,7 +270,7 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
     """Stream ``name`` of a few detectors against time, K_RJ: samples pale, means over one second
     dark.
     """
-    own, ax = ax is None, new_axes(ax, (7.2, 3.6))
+    ax = new_axes(ax, (7.2, 3.6))
     values = stream.streams[name]
     finite = values[np.isfinite(values)]
     largest = float(np.abs(finite).max()) if finite.size else 1.0
@@ -340,9 +313,7 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
             ax.set_ylim(low, high + (high - low) * 0.08 * rows)
         frame = {"frameon": rows > 3, "framealpha": 0.85, "edgecolor": "none"}
         _legend(ax, **frame, ncols=min(6, len(stream.names)), loc="upper right")
-    if own:
-        fit_left(ax)
-    write_title(ax, title or f"Time streams of {stream.observation}, after step {stream.label}")
+    ax.set_title(title or f"Time streams of {stream.observation}, after step {stream.label}")
     return ax  # type: ignore[no-any-return]
 
 
@@ -359,8 +330,7 @@ def plot_scan(
     """
     tracks = [o if isinstance(o, ScanTrack) else ScanTrack.of(o) for o in observations]
     named, own = len(tracks) <= 8, ax is None
-    right = 0.55 + CHARACTER * max(len(track.name) for track in tracks) if named and own else 0.0
-    ax = new_axes(ax, (5.7 + right, 5.2), left=0.75, right=0.12 + right)
+    ax = new_axes(ax, (5.7, 5.2))
     offsets = [_offsets(track, tracks[0].centre) for track in tracks]
     known = np.concatenate(offsets)
     known = known[np.isfinite(known).all(axis=1)]
@@ -378,7 +348,7 @@ def plot_scan(
         beside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "frameon": False}
         within = {"loc": "upper right", "framealpha": 0.85, "edgecolor": "none"}
         _legend(ax, **(beside if own else within))
-    write_title(ax, title)
+    ax.set_title(title)
     return ax  # type: ignore[no-any-return]
 
 
@@ -400,3 +370,47 @@ def _apart(points: NDArray[np.float64], least: float) -> NDArray[np.float64]:
     keep = np.append(True, part[1:] != part[:-1]) | ~np.isfinite(points).all(axis=1)
     keep[-1] = True
     return points[keep]
+
+
+def plot_modes(modes: Modes, *, axes: Any = None, title: str = "Modes") -> Axes:
+    """Share of the variance in each mode, and the leading modes in time, below one another;
+    ``axes``: two Axes to draw into.
+    """
+    left, right = new_axes(
+        axes, (9.6, 4.2), ncols=2, width_ratios=(0.30, 0.515), gridspec_kw={"wspace": 0.3}
+    )
+    share = modes.shares[modes.shares > 0]
+    left.loglog(
+        np.arange(1, share.size + 1), share, "o-", color=SEQUENCE[0], markersize=3.5, linewidth=0.9
+    )
+    for k, value in enumerate(share[:2]):
+        place: dict[str, Any] = {"xytext": (5, 5), "textcoords": "offset points", "fontsize": 9}
+        left.annotate(f"{100 * value:.3g} %", (k + 1, value), **place)
+    left.set_xlabel("mode")
+    left.set_ylabel("share of the variance")
+    left.set_xlim(0.8, max(2.0, 1.2 * share.size))
+    left.grid(which="major", color="0.9", linewidth=0.7)
+    for axis, limits in ((left.xaxis, left.get_xlim()), (left.yaxis, left.get_ylim())):
+        log_labels(axis, *limits)
+    rows = modes.streams[:MODES] / np.sqrt(max(1, modes.vectors.shape[1]))
+    peak = float(np.nanmax(abs(rows), initial=0.0)) or 1.0
+    factor, unit = unit_of(peak) if modes.unit else (1.0, "")
+    step = max(1, rows.shape[1] // 4000)
+    for k, row in enumerate(rows):
+        right.plot(
+            modes.seconds[::step],
+            row[::step] * factor,
+            linewidth=0.7,
+            color=SEQUENCE[k],
+            label=f"{k + 1}",
+            zorder=4 - k,
+        )
+    right.set_xlabel(f"time since the start of {modes.observation} [s]")
+    right.set_ylabel(f"mode / √rows [{unit}]" if unit else "mode / √rows")
+    right.margins(x=0)
+    low, high = right.get_ylim()
+    right.set_ylim(low, high + 0.12 * (high - low))
+    right.grid(color="0.92", linewidth=0.7)
+    _legend(right, frameon=False, ncols=MODES, loc="upper right")
+    left.set_title(title, fontsize=10)
+    return left  # type: ignore[no-any-return]

@@ -16,7 +16,7 @@ from zonda.core import cli
 from zonda.core.maps.measured_noise import WHITE
 from zonda.core.maps.noise_figures import FREE, maps_of, noise_stated
 from zonda.operators.diagnostics.comparison.files import read_planes
-from zonda.operators.diagnostics.plot_operators import Plots, _drawings
+from zonda.operators.diagnostics.plot_operators import Plots, _of_maps, _snr
 
 SCANS, KNEE = 2, "1 Hz"
 
@@ -158,11 +158,10 @@ def test_titles_headers_and_the_report_state_the_factor(tmp_path):
     assert half[1] == "half the difference, even - odd scans"
     assert half[0] == pytest.approx(stated[0], rel=0.1)  # the noise of two scans, independent
     style = Plots(contours=[-2, 2]).style()
-    drawing = next(d for d in _drawings(data, style) if d.key == "map map")
-    [sketch] = drawing.function(*drawing.arguments())
+    sketch = next(s for s in _of_maps(data, style) if s.name == "map")
     assert sketch.ax.get_title().endswith("× white noise")
     assert f"as in {FREE}." in sketch.caption
-    assert sketch.caption in (tmp_path / "report.html").read_text().replace("&#x27;", "'")
+    assert sketch.caption in (tmp_path / "report.html").read_text().replace("&#39;", "'")
 
 
 def test_files_that_a_run_saved_are_compared_by_the_same_noise(tmp_path, capsys):
@@ -206,8 +205,7 @@ def test_healpix_files_state_their_noise(tmp_path):
 
 def test_noise_of_p_is_that_of_q_and_u(tmp_path):
     data = run(None, polarization="pairs", stokes="IQU")
-    style = Plots(contours=[-3, 3]).style()
-    drawing = next(d for d in _drawings(data, replace(style, smooth=0.0)) if d.key == "map map_P")
-    snr, words = drawing.arguments()[-1]
+    style = replace(Plots(contours=[-3, 3]).style(), smooth=0.0)
+    snr, words = _snr(data["map"].stokes("P"), style, maps_of(data.products), "map_P")
     assert f"as in {FREE}" in words
     assert np.nanmean(snr**2) == pytest.approx(2.0, rel=0.2)  # Rayleigh: Q and U of unit variance

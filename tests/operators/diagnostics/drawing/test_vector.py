@@ -5,16 +5,15 @@ SNR.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import numpy as np
 
 import zonda
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.noise_figures import noise_alone
 from zonda.core.numerics.angles import ARCSEC
-from zonda.operators.diagnostics.drawing.canvas import new_axes
+from zonda.operators.diagnostics.drawing.canvas import file_of, new_axes
 from zonda.operators.diagnostics.drawing.map_plots import plot_contours
-from zonda.operators.diagnostics.drawing.vector import vector_of
 from zonda.operators.diagnostics.plot_operators import Plots, _snr
 from zonda.plugins.checks import scenes
 
@@ -28,18 +27,18 @@ def drawn():
 
 
 def test_the_same_figure_gives_the_same_bytes():
-    for kind in ("pdf", "svg"):
-        assert vector_of(drawn(), kind, 110) == vector_of(drawn(), kind, 110)
+    for kind in ("png", "pdf", "svg"):
+        assert file_of(drawn().figure, kind) == file_of(drawn().figure, kind)
 
 
 def test_text_stays_text():
-    svg = vector_of(drawn(), "svg", 110).decode()
+    svg = file_of(drawn().figure, "svg").decode()
     texts = [
         element.text for element in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")
     ]
     assert "a line" in texts
     assert "<dc:date>" not in svg
-    pdf = vector_of(drawn(), "pdf", 110)
+    pdf = file_of(drawn().figure, "pdf")
     assert pdf.startswith(b"%PDF-1.")
     assert pdf.rstrip().endswith(b"%%EOF")
     assert b"FontFile2" in pdf  # TrueType
@@ -116,13 +115,14 @@ def test_contours_are_of_the_smoothed_map():
     patches: 8 %), the source about 3 (4 pi sigma^2 / A)^(1/2) 20^2 / (20^2 + 9^2) = 17."""
     style = Plots(contours=[4.0]).style()
     found = product()
-    snr, words = _snr(found, style, noise_alone({"map": found}, "map"))
+    snr, words = _snr(found, style, {"map": found}, "map")
     edge = np.ones((48, 48), bool)
     edge[8:40, 8:40] = False
     assert 0.75 < snr[edge].std() < 1.3
     assert 12 < snr.max() < 22
     assert words.endswith("x white noise, as in half the difference, even - odd scans")
-    assert _snr(found, style, None)[1] == "white noise only"
+    alone = replace(found, half_difference=None)
+    assert _snr(alone, style, {"map": alone}, "map")[1] == "white noise only"
 
 
 def test_no_contours_where_no_level_is_reached():
