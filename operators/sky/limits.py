@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.numerics.angles import ARCSEC
 from zonda.core.types import Floats
 
 LARGEST = 1e30
@@ -20,6 +21,10 @@ SMALLEST_PIXEL, LARGEST_PIXEL = 1e-6 / 3600, 360.0
 FARTHEST = 1e9
 """Pixel of the reference point."""
 EQUINOXES = (1500.0, 2500.0)
+OBLONG = 20.0
+"""Ratio of a pixel's sides beyond which an image's scale is doubted."""
+COARSE = 100.0
+"""Beams in a pixel beyond which an image's scale is doubted."""
 
 
 def check_values(values: Floats, place: str, most: float, unit: str, cure: str) -> None:
@@ -70,3 +75,22 @@ def check_geometry(matrix: Floats, crpix: Any, header: Any, place: str) -> None:
                 place=place,
                 cure=f"set {key}, e.g. to 2000.0",
             )
+
+
+def odd_pixels(matrix: Floats, shape: tuple[int, ...], beam: float) -> str:
+    """Warning about pixels that are far too large or too small for a beam, or empty.
+
+    ``matrix`` (2, 2): pixel scale [rad]; ``shape``: (ny, nx); ``beam``: FWHM [rad].
+    """
+    x, y = (float(side) / ARCSEC for side in np.linalg.norm(matrix, axis=0))
+    across, fwhm = max(x * shape[1], y * shape[0]), beam / ARCSEC
+    text = f"its pixels are {x:.4g} x {y:.4g} arcsec"
+    cure = "are CDELT1 and CDELT2 in degrees?"
+    if across < fwhm:
+        return (
+            f"{text} and all of it {across:.4g} arcsec, less than the beam of {fwhm:.4g} arcsec;"
+            f" {cure}"
+        )
+    if max(x, y) > OBLONG * min(x, y):
+        return f"{text}: is one of CDELT1 and CDELT2 wrong?"
+    return f"{text}, and the beam {fwhm:.4g} arcsec; {cure}" if min(x, y) > COARSE * fwhm else ""

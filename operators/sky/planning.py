@@ -17,7 +17,6 @@ from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
 from .brightness import conversion
-from .convolved import beam_widths, brightness_on, grid_of
 from .grid import Grid
 from .resample import extremes
 from .skymap import SkyMap
@@ -69,8 +68,8 @@ class SkyPlanning(Planning[SkyMap]):
         """The map, its Fourier transform while it is convolved, and the coefficients of each
         beam.
         """
-        widths, _ = beam_widths(self.operator, observation)
-        grid = grid_of(self.operator, observation)
+        widths, _ = self.operator.beam_widths(observation)
+        grid = self.operator.grid_of(observation)
         angles = 0 if grid.pole is None else 40 * observation.n_samples
         each = (
             2 if grid.spread is None or grid.is_flat else 3
@@ -85,7 +84,7 @@ class SkyPlanning(Planning[SkyMap]):
         """Largest brightness of the map before the beam."""
         sky, grid, band = (
             self.operator,
-            grid_of(self.operator, observation),
+            self.operator.grid_of(observation),
             observation.instrument.band,
         )
         if not grid.reached(observation, self._widest(observation)):
@@ -94,7 +93,7 @@ class SkyPlanning(Planning[SkyMap]):
             return Traits(
                 peak=float(
                     np.nanmax(
-                        np.abs(brightness_on(grid, sky, band).values - sky.outside), initial=0.0
+                        np.abs(sky.brightness_on(grid, band).values - sky.outside), initial=0.0
                     )
                 )
             )
@@ -108,12 +107,12 @@ class SkyPlanning(Planning[SkyMap]):
         )
 
     def _widest(self, observation: Observation) -> float:
-        return float(beam_widths(self.operator, observation)[0].max(initial=0.0))
+        return float(self.operator.beam_widths(observation)[0].max(initial=0.0))
 
     def estimate(self, context: Context) -> Estimate:
         """Each effect as a share of a point source's peak."""
         o, widest = context.first, self._widest(context.first)
-        grids = [grid_of(self.operator, observation) for observation in context.observations]
+        grids = [self.operator.grid_of(observation) for observation in context.observations]
         reached = any(
             g.reached(x, widest) for x, g in zip(context.observations, grids, strict=True)
         )

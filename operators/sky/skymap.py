@@ -14,9 +14,8 @@ from zonda.core.polarization import PolarizationAngles
 from zonda.core.product import Product
 from zonda.core.storage.fits_files import header_of
 
-from .convolved import beam_widths, brightness_on, grid_of, looked_at, warn_of_beams, with_beam
+from .convolved import ConvolvedSky
 from .inputs import HealpixMap
-from .parameters import SkyParameters
 from .state import SkyState
 
 POLARIZED = ("polarization", "axis")
@@ -48,7 +47,7 @@ class InputImage(Product):
         return cls(Image(arrays["values"], header_of(arrays["header"].items()), **polarized))
 
 
-class SkyMap(SkyParameters):
+class SkyMap(ConvolvedSky):
     """Signal of the sky above the atmosphere (K_RJ), from a FITS or HEALPix map: averaged over the
     band, convolved with the beam.
 
@@ -69,16 +68,14 @@ class SkyMap(SkyParameters):
     provides: ClassVar[frozenset[str]] = frozenset({"sky"})
 
     def check(self, data: Data) -> list[str]:
-        """As `SkyParameters.check`, and what reading the map tells or refuses
-        (`convolved.looked_at`).
-        """
-        return [*super().check(data), *looked_at(self, data)]
+        """As `SkyParameters.check`, and the lines about the map that reading it gives."""
+        return [*super().check(data), *self._looked_at(data)]
 
     def prepare(self, observation: Observation) -> SkyState:
-        grid, (widths, index) = grid_of(self, observation), beam_widths(self, observation)
-        if stated := warn_of_beams(self, grid.source, observation.focalplane.fwhm):
+        grid, (widths, index) = self.grid_of(observation), self.beam_widths(observation)
+        if stated := self.warn_of_beams(grid.source, observation.focalplane.fwhm):
             observation.tally.state(self.label, "resolution", stated)
-        sky = brightness_on(grid, self, observation.instrument.band)
+        sky = self.brightness_on(grid, observation.instrument.band)
         if not grid.reached(observation, float(widths.max(initial=0.0))):
             observation.tally.state(
                 self.label,
@@ -93,7 +90,7 @@ class SkyMap(SkyParameters):
         )
         band = observation.instrument.band
         state = SkyState(
-            grid, sky, [with_beam(grid, self, band, float(fwhm)) for fwhm in widths], index, angles
+            grid, sky, [self.with_beam(grid, band, float(fwhm)) for fwhm in widths], index, angles
         )
         state.tell(observation.tally, self.label)
         return state

@@ -348,9 +348,8 @@ def test_a_map_is_read_again_as_a_sky(tmp_path):
     o = observation()
     product = mapped(o, signal_of(o))
     path = MapFile.of("map", product).write(tmp_path / "map.fits", Provenance.of_a_map(product))
-    from zonda.operators.sky.convolved import read_of
 
-    found = read_of(zonda.SkyMap(file=path, missing="zero"), True)
+    found = zonda.SkyMap(file=path, missing="zero").read_input(True)
     np.testing.assert_array_equal(found.polarization, np.nan_to_num(planes(product)[1:]))
 
 

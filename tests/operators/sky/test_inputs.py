@@ -12,7 +12,6 @@ from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.radiation import to_kelvin_rj
-from zonda.operators.sky.convolved import read_of
 from zonda.operators.sky.read import read_map
 from zonda.operators.sky.skymap import SkyMap
 from zonda.operators.sky.stokes import STOKES
@@ -153,7 +152,7 @@ def test_a_plane_of_a_cube(made, save):
     refused(path, "no plane 4 of 3 along FREQ", "counted from 1", plane=(4,))
     refused(path, "no plane 0", plane=(0,))
     refused(path, "plane has 2 numbers", plane=(1, 1))
-    np.testing.assert_array_equal(read_of(SkyMap(file=path, plane=3)).values, found.values)
+    np.testing.assert_array_equal(SkyMap(file=path, plane=3).read_input().values, found.values)
 
 
 def test_planes_along_two_axes_and_stokes(made, save):
@@ -215,7 +214,7 @@ def test_extensions_by_number_and_name(made, tmp_path):
     refused(path, "extension CAT is neither", hdu="CAT")
     refused(path, "extension 0 is neither", "0 PRIMARY: empty", hdu=0)
     refused(path, "extension SPEC is neither", hdu="SPEC")
-    assert read_of(SkyMap(file=path, hdu="ERR")).values[0, 0] == 2
+    assert SkyMap(file=path, hdu="ERR").read_input().values[0, 0] == 2
 
 
 def test_a_spectrum_before_the_image_is_passed_over(made, tmp_path):

@@ -82,10 +82,9 @@ def test_the_bound_of_oblong_pixels_is_that_of_their_longer_side(made, save):
     from types import SimpleNamespace
 
     from zonda.core.plan.planning import planning_of
-    from zonda.operators.sky.convolved import grid_of
 
     operator = SkyMap(file=save(np.zeros((60, 60)), made.tan_header((60, 60), cdelt=(-1.0, 4.0))))
-    grid = grid_of(operator, made.observation([np.radians(75)], np.radians(20), fwhm=16.0))
+    grid = operator.grid_of(made.observation([np.radians(75)], np.radians(20), fwhm=16.0))
     context = SimpleNamespace(sky_error=lambda share: {"peak": share}, samples=1e9)
     effect = planning_of(operator)._order(context, grid, 16 * ARCSEC)
     assert effect.choices[-1].bound["peak"] == pytest.approx(LINEAR / 4**2)

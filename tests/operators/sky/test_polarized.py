@@ -13,7 +13,6 @@ from zonda.core.errors import InputError
 from zonda.core.numerics.projection import directions, frame_rotation
 from zonda.core.numerics.sphere import local_axes
 from zonda.core.polarization import PolarizationAngles, between_meridians, turned_by
-from zonda.operators.sky.convolved import read_of
 from zonda.operators.sky.skymap import SkyMap
 from zonda.operators.sky.stokes import STOKES
 
@@ -217,9 +216,9 @@ def test_iau_is_cosmo_with_the_other_sign_of_u(made, save):
     read = {}
     for convention in ("COSMO", "IAU"):
         path = save(values, stokes_header(made, (9, 9), POLCCONV=convention), f"{convention}.fits")
-        read[convention] = read_of(SkyMap(file=path), True).polarization
+        read[convention] = SkyMap(file=path).read_input(True).polarization
         given = {"COSMO": "iau", "IAU": "cosmo"}[convention]
-        other = read_of(SkyMap(file=path, polarization_convention=given), True)
+        other = SkyMap(file=path, polarization_convention=given).read_input(True)
         np.testing.assert_array_equal(other.polarization, read[convention] * [[[1]], [[-1]]])
         assert "overridden" in other.notes["polarization"]
     np.testing.assert_array_equal(read["IAU"], read["COSMO"] * [[[1]], [[-1]]])
@@ -231,18 +230,20 @@ def test_an_image_that_does_not_say_its_convention_is_refused(made, save):
     del header["POLCCONV"]
     path = save(uniform((9, 9)), header)
     with pytest.raises(InputError, match="no POLCCONV") as caught:
-        read_of(SkyMap(file=path), True)
+        SkyMap(file=path).read_input(True)
     assert "polarization_convention" in caught.value.cure
-    assert read_of(SkyMap(file=path, polarization_convention="cosmo"), True).polarization.shape == (
+    assert SkyMap(file=path, polarization_convention="cosmo").read_input(
+        True
+    ).polarization.shape == (
         2,
         9,
         9,
     )
     with pytest.warns(UserWarning, match="Q, U are not used"):  # by a camera that is not polarized
-        assert read_of(SkyMap(file=path)).polarization is None
+        assert SkyMap(file=path).read_input().polarization is None
     path = save(uniform((9, 9)), stokes_header(made, (9, 9), POLCCONV="EUROPEAN"))
     with pytest.raises(InputError, match="neither COSMO nor IAU"):
-        read_of(SkyMap(file=path), True)
+        SkyMap(file=path).read_input(True)
 
 
 @pytest.mark.parametrize("partial", [False, True])
@@ -257,7 +258,7 @@ def test_healpix_that_does_not_say_it_is_cosmo(tmp_path, partial):
         dtype=np.float64,
         partial=partial,
     )
-    found = read_of(SkyMap(file=tmp_path / "m.fits"), True)
+    found = SkyMap(file=tmp_path / "m.fits").read_input(True)
     np.testing.assert_array_equal(found.values, np.delete(values[0], 5))
     np.testing.assert_array_equal(found.polarization, np.delete(values[1:], 5, axis=1))
     assert "COSMO" in found.notes["polarization"]
@@ -271,7 +272,7 @@ def test_planes_in_extensions(made, tmp_path):
         fits.ImageHDU(plane, header, name=name) for plane, name in zip(values, "IQU", strict=True)
     ]
     fits.HDUList([fits.PrimaryHDU(), *images]).writeto(tmp_path / "iqu.fits")
-    found = read_of(SkyMap(file=tmp_path / "iqu.fits"), True)
+    found = SkyMap(file=tmp_path / "iqu.fits").read_input(True)
     np.testing.assert_array_equal(found.values, values[0])
     np.testing.assert_array_equal(found.polarization, values[1:])
 
@@ -281,7 +282,7 @@ def test_an_array_of_three_images(made):
     step = SkyMap(
         map=values, wcs=made.tan_header((9, 9)), unit="K_RJ", polarization_convention="iau"
     )
-    found = read_of(step, True)
+    found = step.read_input(True)
     np.testing.assert_array_equal(found.values, values[0])
     np.testing.assert_array_equal(found.polarization, values[1:] * [[[1]], [[-1]]])
 
@@ -291,8 +292,8 @@ def test_missing_pixels_of_u_are_zero_where_that_is_wanted(made, save):
     values[2, 3, 4] = np.nan
     path = save(values, stokes_header(made, (9, 9)))
     with pytest.raises(InputError, match="plane 2 of Q and U, row 4, column 5"):
-        read_of(SkyMap(file=path), True)
-    found = read_of(SkyMap(file=path, missing="zero"), True)
+        SkyMap(file=path).read_input(True)
+    found = SkyMap(file=path, missing="zero").read_input(True)
     assert found.polarization[1, 3, 4] == 0
     assert found.zeroed == 1
 

@@ -6,9 +6,7 @@ import pytest
 
 from zonda.core.errors import InputError
 from zonda.core.plan.planning import planning_of
-from zonda.operators.sky import convolved
 from zonda.operators.sky import region as regions
-from zonda.operators.sky.convolved import grid_of
 from zonda.operators.sky.region import TILE, Disc, region, tangent_wcs
 from zonda.operators.sky.resample import resample_healpix, resample_image
 from zonda.operators.sky.skymap import SkyMap
@@ -67,7 +65,7 @@ def test_a_small_map_under_a_wide_scan_asks_for_a_small_grid(made, save):
     values[127:129, 127:129] = 1.0
     scan = strip(made, 26.0, fwhm=9.0)
     operator = SkyMap(file=save(values, header))
-    assert max(grid_of(operator, scan).shape) < 1500
+    assert max(operator.grid_of(scan).shape) < 1500
     got = made.look(operator, scan)
     assert got.max() > 0.05
     assert scan.tally.get("SkyMap", "samples outside the input map") > 0.9 * scan.n_samples
@@ -99,10 +97,10 @@ def test_tiles_and_blocks_change_nothing(made, save, tmp_path, monkeypatch, kind
     monkeypatch.setattr(regions, "SPARSE", 1.0)
     some = SkyMap(file=path)
     parts = made.look(some, scan)
-    assert not grid_of(some, scan).tiles.all()
+    assert not some.grid_of(scan).tiles.all()
     monkeypatch.setattr(regions, "SPARSE", 0.0)
     every = SkyMap(file=path)
-    assert grid_of(every, scan).tiles is None
+    assert every.grid_of(scan).tiles is None
     # MARGIN points beyond the beam: 0.27^16 = 8e-10 of what is left out there; HEALPix: 1e-9 of the
     # polynomials' rounding
     np.testing.assert_allclose(parts, made.look(every, scan), atol=1e-8)
@@ -159,7 +157,7 @@ def test_planning_interpolates_nothing(made, tmp_path, monkeypatch):
     small, wide = strip(made, 5.0, fwhm=3600.0), strip(made, 60.0, fwhm=3600.0)
     assert planning_of(operator).traits(wide).peak == pytest.approx(2.0)
     assert planning_of(operator).memory(wide) > planning_of(operator).memory(small) > 0
-    assert grid_of(operator, wide).seconds > 2 * grid_of(operator, small).seconds > 0
+    assert operator.grid_of(wide).seconds > 2 * operator.grid_of(small).seconds > 0
 
 
 def test_the_progress_bar_hears_of_interpolation_and_its_end(made, tmp_path, monkeypatch):
@@ -172,7 +170,7 @@ def test_the_progress_bar_hears_of_interpolation_and_its_end(made, tmp_path, mon
     )
     told = []
     monkeypatch.setattr(
-        convolved,
+        SkyMap,
         "_progress",
         lambda step, what: lambda done, total: told.append((what, done, total)),
     )

@@ -6,7 +6,6 @@ import pytest
 from astropy.io import fits
 
 from zonda.core.errors import InputError
-from zonda.operators.sky.convolved import read_of
 from zonda.operators.sky.read import read_map
 from zonda.operators.sky.skymap import SkyMap
 from zonda.operators.sky.stokes import STOKES, is_polarized
@@ -192,4 +191,4 @@ def test_skymap_warns(tmp_path):
     with pytest.warns(
         UserWarning, match=r"SkyMap: .*iqu\.fits: column TEMPERATURE is read as I; .* are not used"
     ):
-        read_of(SkyMap(file=str(tmp_path / "iqu.fits")))
+        SkyMap(file=str(tmp_path / "iqu.fits")).read_input()
