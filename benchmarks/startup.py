@@ -56,13 +56,13 @@ def stages(folder: str, pipeline: str) -> dict[str, Any]:
 
     after(run, "load", "read the pipeline file")
     mark("Python and the command line")
-    import zonda.core.plan.remembered as remembered
     from zonda.core.output import Output
     from zonda.core.pipeline import Pipeline
+    from zonda.core.plan import bands
     from zonda.core.run import execute
 
     mark("import zonda, numpy, numba, pydantic")
-    after(remembered, "summary", "plan")
+    after(bands, "for_run", "plan")
     usual = execute.run
 
     def observe(*arguments: Any) -> None:

@@ -46,7 +46,7 @@ def run(request: RunRequest) -> None:
         if pool.executor is None:
             return
         check_output_folder(folder)
-        pruning = Pruning(request.keep, request.drop, not request.no_prune)
+        pruning = Pruning(request.keep, request.drop, request.prune)
         if request.share is not None:
             k, n = request.share
             with lock(folder, f"{k}-of-{n}"):

@@ -66,7 +66,7 @@ class Pruning:
 
     keep: Sequence[str] = ()
     drop: Sequence[str] = ()
-    prune_all: bool = True
+    prune_all: bool | None = None
 
 
 def job(
@@ -154,7 +154,7 @@ class _Draft:
 
     def _plan(self, source: CampaignFile, entry: Entry, share: float) -> int:
         """Plan an entry's pipeline; its number."""
-        from ..plan.bands import plan
+        from ..plan.bands import for_run
         from ..run.first_look import first_look
 
         with within(f"entry {about(entry) or source.file.header.name}"):
@@ -164,7 +164,7 @@ class _Draft:
                 first_look(file.pipeline(), scene)
             else:
                 file.look(scene=scene)
-            made = plan(
+            made = for_run(
                 file,
                 keep=self._pruning.keep,
                 drop=self._pruning.drop,
@@ -172,7 +172,7 @@ class _Draft:
             )
         self._files.append(made.apply(file))
         self.pipelines.append(self._files[-1].resolved_yaml(self._folder))
-        self.plans.append(tuple(tuple(map(str, row)) for row in made.summary.short))
+        self.plans.append(tuple(tuple(map(str, row)) for row in made.short))
         self.inputs |= _inputs(self._files[-1], self._folder)
         return len(self.pipelines) - 1
 

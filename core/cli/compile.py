@@ -23,8 +23,8 @@ def compile_kernels(names: tuple[str, ...]) -> None:
     from ..configuration.locate import shipped
     from ..errors import OutputError
     from ..kernels import folder
-    from ..plan import remembered
-    from ..plan.slices import sliced
+    from ..plan.bands import for_run
+    from ..plan.prediction import sliced
 
     place = folder()
     if place is None:
@@ -35,7 +35,7 @@ def compile_kernels(names: tuple[str, ...]) -> None:
         )
     for name in names or shipped():
         file = load(name, ())
-        part = sliced(remembered.summary(file).apply(file), seconds=2.0)
+        part = sliced(for_run(file).apply(file), seconds=2.0)
         part.pipeline().run(part.scene())
         click.echo(f"compiled: {name}", err=True)
     click.echo(place)

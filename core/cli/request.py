@@ -16,7 +16,7 @@ class RunRequest:
     keep: tuple[str, ...]
     drop: tuple[str, ...]
     only: tuple[str, ...]
-    no_prune: bool
+    prune: bool | None
     output: Path | None
     threads: int | None
     memory: int | None
@@ -46,6 +46,5 @@ class RunRequest:
             ("--only", self.only),
         ]
         parts = [part for option, texts in options for text in texts for part in (option, text)]
-        return shlex.join(
-            ["zonda", "run", *self.pipelines, *parts, *(["--no-prune"] if self.no_prune else [])]
-        )
+        pruning = {None: [], True: ["--prune"], False: ["--no-prune"]}[self.prune]
+        return shlex.join(["zonda", "run", *self.pipelines, *parts, *pruning])

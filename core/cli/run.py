@@ -48,7 +48,14 @@ if TYPE_CHECKING:
 @click.option(
     "--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone."
 )
-@click.option("--no-prune", is_flag=True, help="Simulate everything in full.")
+@click.option(
+    "--prune/--no-prune",
+    default=None,
+    help=(
+        "Plan: leave out and coarsen what the error budget allows; or simulate everything in full."
+        "  [default: plan from 2e8 samples on]"
+    ),
+)
 @click.option(
     "--output",
     type=click.Path(path_type=Path),
@@ -102,9 +109,9 @@ def run(**given: Any) -> None:
     """Run a pipeline file, or a shipped pipeline by its name; a campaign of observations where the
     file has `campaign:`, or where there are several files.
 
-    What its outputs do not depend on is left out, and effects are dropped or coarsened while the
-    errors stay within the budget (by default a tenth of the noise): `zonda plan` shows what. The
-    products are in the folder that the last line names.
+    What its outputs do not depend on is left out. From 2e8 samples on, or with --prune, effects are
+    dropped or coarsened while the errors stay within the budget (by default a tenth of the noise):
+    `zonda plan` shows what. The products are in the folder that the last line names.
     """
     from ..machine import one_blas_thread
 
@@ -127,7 +134,7 @@ def load(pipeline: str, settings: tuple[str, ...], only: tuple[str, ...] = ()) -
     file = load(pipeline, settings)
     if not only:
         return file
-    from ..plan.only import only as alone
+    from ..plan.structure import only as alone
 
     return alone(file, only)
 
@@ -144,7 +151,7 @@ def _run_campaign(request: RunRequest) -> None:
 
 
 def _run_one(request: RunRequest, file: PipelineFile) -> None:
-    from ..plan import remembered
+    from ..plan.bands import for_run
     from ..storage.files import check_output_folder, write_text
     from ..storage.lock import lock
 
@@ -165,11 +172,11 @@ def _run_one(request: RunRequest, file: PipelineFile) -> None:
         from ..campaign.folder import check_free, make_way
 
         check_free(folder)
-    made = remembered.summary(
+    made = for_run(
         file,
         keep=request.keep,
         drop=request.drop,
-        prune_all=not request.no_prune,
+        prune_all=request.prune,
         threads=request.threads,
         memory=request.memory,
     )

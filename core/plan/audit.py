@@ -34,15 +34,13 @@ from ..mapmaker import made_by
 from ..signal import Signal
 from .bands import PlanOfBands, files_of_bands
 from .context import Context
-from .coverage import DEEP
 from .decide import Decided
-from .estimate import Choice, add
-from .figures import figure
-from .planner import Wishes, plan_band
+from .estimate import Choice, add, figure
+from .planner import NAME, Wishes, plan_band
+from .pointing import DEEP
+from .prediction import SECONDS, sliced
 from .result import Plan
-from .slices import SECONDS, sliced
 from .structure import Structure
-from .whole import NAME
 
 PARTS = 8
 """Parts of the slice whose scatter gives the standard error."""
@@ -50,8 +48,9 @@ PARTS = 8
 SHORTEST = 8.0
 """Shortest slice before detectors are left out, s."""
 
-COST = 20.0
-"""CPU seconds [reference machine] that an audit may take, all its runs: the slice is chosen by it.
+SAMPLES = 1.5e8
+"""Detectors x samples of all runs of an audit, each beside one of the sky alone: some 20 CPU s. The
+slice is chosen by it.
 """
 
 HEADLINE, ROUGH = 0.15, 0.4
@@ -76,16 +75,10 @@ class Extent:
 
 
 def extent(made: Plan, runs: int) -> Extent:
-    """The longest slice for which that many runs, each beside one of the sky alone, take no more
-    than `COST`.
-
-    Set-up (reading, convolving, laying out) is counted once for each run; what remains buys
-    samples. A slice is not made shorter than `SHORTEST` for it: detectors are left out instead.
+    """The longest slice for which that many runs take no more than `SAMPLES`. It is not made
+    shorter than `SHORTEST` for it: detectors are left out instead.
     """
-    o, estimates = made.context.first, made.costs
-    fixed = sum(c.fixed + c.once for c in estimates.values())
-    rate = 2 * sum(c.per_sample for c in estimates.values())
-    samples = max(COST / max(runs, 1) - fixed, 0.25 * COST / max(runs, 1)) / max(rate, 1e-9)
+    o, samples = made.context.first, SAMPLES / max(runs, 1)
     seconds = min(max(samples / (o.n_detectors * o.sample_rate), SHORTEST), SECONDS, o.duration)
     every = max(1, math.ceil(seconds * o.sample_rate * o.n_detectors / samples))
     return Extent(seconds, min(every, max(o.n_detectors // 64, 1)))

@@ -1,5 +1,5 @@
-"""Plans of cameras with several bands: each band is planned like a camera that has no other, and
-one pipeline is run for all.
+"""`zonda.plan`: the plan of a pipeline file. Of a camera with several bands each band is planned
+like a camera that has no other, and one pipeline is run for all.
 
 What a band's map needs is simulated for all of them; what is coarser is so where every band's plan
 says so.
@@ -15,10 +15,15 @@ from typing import Any
 
 from ..configuration.pipeline_file import PipelineFile
 from ..run.budget import BASE
-from . import result
 from .planner import Wishes, plan_band
-from .result import Plan
-from .summary import PlanSummary, Prediction
+from .pointing import samples_of
+from .prediction import Memory, Timing, timed
+from .result import Plan, PlanSummary, as_dict_of, foreseen, unplanned
+from .structure import Structure, prune
+
+PLANNED_FROM = 200_000_000
+"""Detectors x samples x bands of a scene from which it is planned unasked: below, a run takes less
+time than planning could save."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +32,13 @@ class PlanOfBands:
 
     plans: Mapping[str, Plan]
 
+    timing: Timing | None = None
+    """CPU time of all bands, where it was measured."""
+
     @cached_property
     def summary(self) -> PlanSummary:
         """What a run takes from them."""
-        return combined({name: made.summary for name, made in self.plans.items()})
+        return combined({name: made.summary for name, made in self.plans.items()}, self.timing)
 
     def apply(self, file: PipelineFile) -> PipelineFile:
         """The pipeline that is run: an ordinary one, with parameters changed and operators
@@ -44,6 +52,13 @@ class PlanOfBands:
             + f"\n\nall bands: {self.summary}"
         )
 
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, for JSON."""
+        bands = {name: one.as_dict() for name, one in self.plans.items()}
+        if self.timing is None or self.summary.memory is None:
+            return {"bands": bands}
+        return {"bands": bands, "prediction": as_dict_of(self.summary.memory, self.timing)}
+
 
 def plan(
     file: PipelineFile,
@@ -55,8 +70,7 @@ def plan(
     memory: int | None = None,
     measure: bool = False,
 ) -> Plan | PlanOfBands:
-    """Plan a pipeline file: decide as on a reference machine (one thread, memory for all), predict
-    for this one.
+    """Plan a pipeline file.
 
     Parameters
     ----------
@@ -68,11 +82,10 @@ def plan(
     prune_all
         False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
     threads, memory
-        Of the run that is predicted [memory in bytes]; decisions do not depend on them. None: those
-        of this machine.
+        Threads and bytes of the run whose memory is predicted; decisions do not depend on them.
+        None: those of this machine.
     measure
-        Run a slice of a few seconds to find the cost of operators that do not state it; decisions
-        do not depend on it.
+        Run slices of a few seconds to predict the CPU time; decisions do not depend on it.
 
     Returns
     -------
@@ -84,18 +97,43 @@ def plan(
     ZondaError
         For a name that is not in the plan, or a budget that is not a number from 0 to 1.
     """
-    wishes = Wishes(keep, drop, prune_all, threads, memory, measure)
+    wishes = Wishes(keep, drop, prune_all, threads, memory)
     names = files_of_bands(file) if isinstance(file, PipelineFile) else {}
     if not names:
-        return plan_band(file, wishes)
-    return PlanOfBands({name: plan_band(file, wishes, name) for name in names})
+        one = plan_band(file, wishes)
+        if not measure:
+            return one
+        return dataclasses.replace(one, timing=timed(one.apply(file), one.context.observations))
+    bands = PlanOfBands({name: plan_band(file, wishes, name) for name in names})
+    if not measure:
+        return bands
+    every = [o for made in bands.plans.values() for o in made.context.observations]
+    return dataclasses.replace(bands, timing=timed(bands.apply(file), every))
 
 
-def as_dict(made: Plan | PlanOfBands) -> dict[str, Any]:
-    """Everything, as JSON takes it."""
-    if isinstance(made, Plan):
-        return result.as_dict(made)
-    return {"bands": {name: result.as_dict(one) for name, one in made.plans.items()}}
+def for_run(
+    file: PipelineFile,
+    *,
+    keep: Sequence[str] = (),
+    drop: Sequence[str] = (),
+    prune_all: bool | None = None,
+    threads: int | None = None,
+    memory: int | None = None,
+) -> PlanSummary:
+    """What a run simulates: a plan from `PLANNED_FROM` samples on, or where one is asked for by
+    ``prune_all`` (True), ``keep`` or ``drop``; else what the outputs depend on, in full; everything
+    if ``prune_all`` is False. Errors are those of `plan`.
+    """
+    pipeline = file.pipeline()
+    if not (keep or drop or prune_all):
+        if prune_all is False:
+            return unplanned(Structure.of_all(pipeline), "--no-prune: everything in full")
+        samples = samples_of(pipeline, file.scene())
+        if samples < PLANNED_FROM:
+            few = f"{samples:.2g} samples, less than {PLANNED_FROM:.0e}: nothing is coarsened"
+            return unplanned(prune(pipeline), few)
+    return plan(file, keep=keep, drop=drop, prune_all=prune_all is not False, threads=threads,
+                memory=memory).summary  # fmt: skip
 
 
 def files_of_bands(file: PipelineFile) -> dict[str, PipelineFile]:
@@ -109,7 +147,7 @@ def files_of_bands(file: PipelineFile) -> dict[str, PipelineFile]:
     }
 
 
-def combined(summaries: Mapping[str, PlanSummary]) -> PlanSummary:
+def combined(summaries: Mapping[str, PlanSummary], timing: Timing | None = None) -> PlanSummary:
     """One summary for all bands: all operators and signals that one of them needs, settings that
     all of them have.
     """
@@ -128,22 +166,13 @@ def combined(summaries: Mapping[str, PlanSummary]) -> PlanSummary:
         if common:
             settings[label] = common
     short = [(f"{name}: {row[0]}", *row[1:]) for name, s in summaries.items() for row in s.short]
-    whole = (_added([getattr(s, which) for s in every]) for which in ("prediction", "unpruned"))
-    return PlanSummary(tuple(dict.fromkeys(operators)), tuple(runs), settings, short, *whole)
+    memory = _added([s.memory for s in every if s.memory is not None])
+    return PlanSummary(tuple(dict.fromkeys(operators)), tuple(runs), settings, short, memory,
+                       foreseen(memory, timing))  # fmt: skip
 
 
-def _added(predictions: list[Prediction]) -> Prediction:
-    """Times add up, and of their memory what each holds while another acts."""
-    products = sum(p.products for p in predictions)
-    seconds: dict[str, float] = {}
-    for p in predictions:
-        for label, used in p.seconds.items():
-            seconds[label] = seconds.get(label, 0.0) + used
-    return dataclasses.replace(
-        predictions[0],
-        seconds=seconds,
-        bytes=max(max(p.bytes - p.products, BASE) for p in predictions) + products,
-        products=products,
-        unknown=tuple(dict.fromkeys(label for p in predictions for label in p.unknown)),
-        startup=max(p.startup for p in predictions),
-    )
+def _added(each: list[Memory]) -> Memory:
+    """Memory of all bands: what each holds while another acts adds up."""
+    products = sum(m.products for m in each)
+    largest = max(max(m.bytes - m.products, BASE) for m in each)
+    return Memory(largest + products, products)

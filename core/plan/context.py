@@ -1,4 +1,4 @@
-"""What bounds depend on: the scan, the noise of the products, and the filters on the way to
+"""Context of the bounds: the scan, the noise of the products, and the filters on the way to
 them.
 """
 
@@ -22,7 +22,7 @@ from ..signal import MAIN, Component, Formed
 from .estimate import Traits, add
 
 OTHER_MODES = "; + 2 x rms of all of the stream, where other modes are removed"
-"""What `Context.behind_modes` adds to a formula."""
+"""Text that `Context.behind_modes` adds to a formula."""
 
 INSTANTS = 64
 """Nodes of a smooth field that are looked at, at most."""
@@ -44,7 +44,7 @@ class Coverage:
     speed
         Median speed of the boresight on the sky, rad/s.
     exact
-        Whether every sample was counted, in pixels of this side.
+        Every sample was counted, in pixels of this side.
     """
 
     hits: float
@@ -72,7 +72,7 @@ class Depth:
 
 @dataclass(frozen=True)
 class Work:
-    """What is done with each observation.
+    """Steps and signals of each observation.
 
     Attributes
     ----------
@@ -82,15 +82,11 @@ class Work:
         The signals that are formed, the complete one first.
     components
         Names of all streams that become part of a signal.
-    times
-        How often each operator does its work, by label: once for components, and for each signal
-        that it forms, filters or maps.
     """
 
     steps: tuple[Operator, ...] = ()
     signals: tuple[Formed, ...] = (Formed(MAIN, frozenset()),)
     components: frozenset[Component] = frozenset()
-    times: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -215,20 +211,18 @@ class Context:
 
     @property
     def removes_common(self) -> bool:
-        """Whether what all detectors have in common is removed."""
+        """A filter removes the detectors' common part."""
         return any(t.removes_common for t in self.traits.values())
 
     @property
     def turns(self) -> bool:
-        """Whether a filter removes modes that it finds in the data, which turn where a part of the
-        data is left out; or one without a planning class may."""
+        """A filter removes modes that it finds in the data, which turn where a part of the data is
+        left out; or one without a planning class may."""
         return any(t.turns for t in self.traits.values())
 
     @cached_property
     def before_filters(self) -> bool:
-        """Whether a stream is saved, measured or drawn above a filter: what the filters remove is
-        then in it.
-        """
+        """A stream is saved, measured or drawn above a filter; it holds what filters remove."""
         filtering = {
             label for label, t in self.traits.items() if t.removes_common or t.response is not None
         }
@@ -284,7 +278,7 @@ class Context:
         return {"tod": tod, "map_rms": self.in_map(tod, correlated, common)}
 
     def other_modes(self, label: str = "") -> dict[str, float]:
-        """Bound on what changes beside a part E of the data, where that is left out and other modes
+        """Bound on the change beside a part E of the data, where that is left out and other modes
         are removed for it; of what all other steps but ``label`` make, B, and all of the sky.
 
         With P, P' the projectors on the modes of E + B and of B, Q on the detectors' mean, |.| the
@@ -295,12 +289,10 @@ class Context:
 
         because nothing of the modes' rank leaves less than they do.
         """
-        others = replace(
-            self,
-            traits={
-                k: t for k, t in self.traits.items() if k != label or t.removes_common or t.response
-            },
-        )
+        kept = {
+            k: t for k, t in self.traits.items() if k != label or t.removes_common or t.response
+        }
+        others = self if len(kept) == len(self.traits) else replace(self, traits=kept)
         return {
             **self.bound(2 * others.passed, self.first.duration, common=True),
             **self.sky_error(1.0),
@@ -313,12 +305,20 @@ class Context:
         return add(bound, self.other_modes()) if self.turns else dict(bound)
 
     def affords(self, bound: Mapping[str, float]) -> bool:
-        """Whether a bound alone is within the budget."""
+        """True if a bound alone is within the budget."""
         return all(v <= self.limits[m] for m, v in bound.items() if m in self.limits)
 
     def sky_error(self, share: float) -> dict[str, float]:
         """Bound on peak and transfer function from a relative error of the sky's signal."""
         return {"peak": share * self.peak, "transfer": share}
+
+
+def calibration(observation: Observation) -> float:
+    """Largest factor 1 / (zeta <e^-tau>) over the detectors, of the scan's mean transmission."""
+    passed = observation.focalplane.main_beam_efficiency
+    if (transmission := observation.smooth.get("transmission")) is not None:
+        passed = passed * np.maximum(transmission.time_mean(), LEAST_TRANSMISSION)
+    return float(1 / passed.min()) if passed.size else 1.0
 
 
 def _calibrated_mean(o: Observation) -> NDArray[np.float64]:

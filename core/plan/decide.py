@@ -1,5 +1,7 @@
-"""What is decided about each effect: the largest saving for the share of the budget that it takes,
-first.
+"""Decisions of a plan: the coarser forms that save most, while their bounds fit in the budget.
+
+Forms are tried in a fixed order, by the saving that was measured in a benchmark scene
+(`estimate.Saving`). No time of this machine enters: the same file gives the same plan everywhere.
 """
 
 from __future__ import annotations
@@ -11,10 +13,6 @@ from dataclasses import dataclass, replace
 from ..configuration.diagnostics import nearest
 from ..errors import ZondaError
 from .estimate import Choice, Effect
-from .summary import Prediction
-
-LEAST_SAVING = 0.005
-"""Share of the predicted time that a decision must save to be worth an error."""
 
 
 @dataclass(frozen=True)
@@ -33,39 +31,37 @@ class Decided:
 
     @property
     def name(self) -> str:
-        """As ``--keep`` and ``--drop`` take it."""
+        """Name for ``--keep`` and ``--drop``."""
         return f"{self.operator}.{self.effect.name}"
 
     @property
     def simulated(self) -> bool:
-        """False for what nature has and zonda leaves out: nothing can be decided about it."""
+        """False for an effect that zonda leaves out: nothing can be decided about it."""
         return self.effect.choices[0].decision != "not simulated"
 
     @property
     def adds_error(self) -> bool:
-        """Whether the bound of the choice is an error of the products."""
+        """The bound of the choice is an error of the products."""
         return self.chosen > 0 or not self.simulated
 
     @property
     def formula(self) -> str:
-        """Where the bound comes from."""
+        """Source of the bound."""
         return self.choice.formula or self.effect.formula
 
     def bound(self, k: int, metric: str) -> float:
-        """Error that choice ``k`` adds; one that is not a number allows nothing."""
+        """Error that choice ``k`` adds; NaN counts as infinite."""
         value = self.effect.choices[k].bound.get(metric, 0.0) if k else 0.0
         return math.inf if math.isnan(value) else value
 
-    def saving(self, k: int, predicted: Prediction) -> float:
-        """CPU seconds that choice ``k`` saves on the machine of the prediction, all signals."""
-        times = predicted.times.get(self.operator, 1)
-        return self.effect.choices[k].seconds * times * max(predicted.factors.values(), default=1.0)
+    def means(self, name: str) -> bool:
+        """True for its full name, the effect's, or the operator's."""
+        return name in (self.name, self.effect.name, self.operator)
 
 
 def decide(
     effects: Sequence[Decided],
     allowed: Mapping[str, float],
-    predicted: Prediction,
     *,
     kept: Collection[str] = (),
     forced: Collection[str] = (),
@@ -78,8 +74,6 @@ def decide(
     ----------
     allowed
         The budget by metric.
-    predicted
-        On the reference machine: decisions must not depend on this one.
     kept, forced
         Names of effects that stay as the pipeline asks for them, and of those that take their
         coarsest form.
@@ -93,83 +87,62 @@ def decide(
         m: allowed[m] - sum(d.bound(chosen[d.name], m) for d in effects if d.name in forced)
         for m in allowed
     }
-    worth = LEAST_SAVING * predicted.total
-    free = [
-        d
+
+    def share(rung: tuple[Decided, int]) -> float:
+        """Share of the budget that a form takes."""
+        used = {m: rung[0].bound(rung[1], m) for m in allowed}
+        return max((b / allowed[m] if allowed[m] else math.inf for m, b in used.items() if b > 0),
+                   default=0.0)  # fmt: skip
+
+    free = {*(d.name for d in effects)} - {*kept} - {*forced} if prune_all and not joined else set()
+    rungs = [
+        (d, k)
         for d in effects
-        if prune_all and not joined and d.name not in kept and d.name not in forced
+        for k, choice in enumerate(d.effect.choices)
+        if k and d.name in free and choice.pays
     ]
-    while True:
-        steps: list[tuple[float, Decided, int]] = []
-        for d in free:
-            now = chosen[d.name]
-            for k in range(now + 1, len(d.effect.choices)):
-                saved = d.saving(k, predicted) - d.saving(now, predicted)
-                more = {m: d.bound(k, m) - d.bound(now, m) for m in left}
-                if saved >= worth and all(extra <= left[m] for m, extra in more.items()):
-                    share = max(
-                        (extra / allowed[m] for m, extra in more.items() if extra > 0), default=0.0
-                    )
-                    steps.append((saved / max(share, 1e-9), d, k))
-        if not steps:
-            break
-        _, d, k = max(steps, key=lambda step: step[0])
-        left = {m: v - d.bound(k, m) + d.bound(chosen[d.name], m) for m, v in left.items()}
-        chosen[d.name] = k
+    for d, k in sorted(rungs, key=lambda rung: (*_order(rung), share(rung))):
+        used = {m: d.bound(k, m) for m in left}
+        if not chosen[d.name] and all(used[m] <= left[m] for m in left):
+            chosen[d.name] = k
+            left = {m: left[m] - used[m] for m in left}
     stated = dict.fromkeys(kept, "--keep") | dict.fromkeys(forced, "--drop")
-    coarser_forms = "" if prune_all else "--no-prune"
-    found = []
-    for d in effects:
-        reason = (
-            _within(d, left)
-            if not d.simulated
-            else stated.get(d.name) or ("within the budget" if chosen[d.name] else "")
-        )
-        if joined and len(d.effect.choices) > 1:
-            reason = reason or f"{joined} joins the bands"
-        reason = reason or coarser_forms or _why_in_full(d, predicted, worth)
-        found.append(replace(d, chosen=chosen[d.name], reason=reason))
-    return found
+
+    def reason(d: Decided) -> str:
+        if not d.simulated:
+            over = [m for m, v in d.choice.bound.items() if v > left.get(m, math.inf)]
+            words = f"may exceed what is left of the budget for {' and '.join(over)}"
+            return words if over else "within the budget"
+        if d.name in stated or chosen[d.name]:
+            return stated.get(d.name, "within the budget")
+        coarser = d.effect.choices[1:]
+        if joined and coarser:
+            return f"{joined} joins the bands"
+        if not prune_all or not coarser:
+            return "" if prune_all else "--no-prune"
+        if not any(choice.pays for choice in coarser):
+            return "a coarser form would save nothing"
+        return "a coarser form would exceed the budget"
+
+    return [replace(d, chosen=chosen[d.name], reason=reason(d)) for d in effects]
 
 
-def _within(d: Decided, left: Mapping[str, float]) -> str:
-    over = [m for m, v in d.choice.bound.items() if v > left.get(m, math.inf)]
-    return (
-        f"may exceed what is left of the budget for {' and '.join(over)}"
-        if over
-        else "within the budget"
-    )
-
-
-def _why_in_full(d: Decided, predicted: Prediction, worth: float) -> str:
-    coarser = range(1, len(d.effect.choices))
-    if not coarser:
-        return ""
-    if max(d.saving(k, predicted) for k in coarser) < worth:
-        return "leaving it out would save nothing"
-    return "a coarser form would exceed the budget"
+def _order(rung: tuple[Decided, int]) -> tuple[float, float]:
+    """Largest measured saving first, then those that a planning class states in seconds."""
+    choice = rung[0].effect.choices[rung[1]]
+    return -(choice.saves.share if choice.saves else 0.0), -choice.seconds
 
 
 def named(names: Sequence[str], effects: Sequence[Decided], labels: Sequence[str]) -> set[str]:
     """Full names of the effects that ``names`` mean. Raises ZondaError for one that means none."""
-    found: set[str] = set()
+    short = dict.fromkeys(d.effect.name for d in effects)
     for name in names:
-        mine = {d.name for d in effects if name in (d.name, d.effect.name, d.operator)}
-        if not mine and name not in labels:
-            options = [
-                *dict.fromkeys(
-                    [*(d.effect.name for d in effects), *(d.name for d in effects), *labels]
-                )
-            ]
-            cure = (
-                nearest(name, options)
-                or f"choose from: {', '.join(dict.fromkeys(d.effect.name for d in effects))}"
-            )
-            raise ZondaError(
-                f"the plan has no effect or operator {name!r}", place="zonda plan", cure=cure
-            )
-        found |= mine
-    return found
+        if name not in labels and not any(d.means(name) for d in effects):
+            options = list(dict.fromkeys([*short, *(d.name for d in effects), *labels]))
+            cure = nearest(name, options) or f"choose from: {', '.join(short)}"
+            text = f"the plan has no effect or operator {name!r}"
+            raise ZondaError(text, place="zonda plan", cure=cure)
+    return {d.name for d in effects for name in names if d.means(name)}
 
 
 def check_droppable(drop: Sequence[str], effects: Sequence[Decided], labels: Sequence[str]) -> None:

@@ -1,10 +1,10 @@
-"""Estimates of an operator for the planner: the size of its effects, the errors of coarser forms,
-their costs.
+"""Estimates of an operator for the planner: the size of its effects, and the errors of coarser
+forms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -27,6 +27,22 @@ Decision = Literal["full", "coarse", "dropped", "not simulated"]
 
 
 @dataclass(frozen=True)
+class Saving:
+    """CPU time that a coarser form saves, as measured in a benchmark scene.
+
+    Attributes
+    ----------
+    scene
+        A shipped pipeline or a scene of ``benchmarks/plan``.
+    share
+        Share of the CPU time of the run in full (`python benchmarks/plan.py --rungs`).
+    """
+
+    scene: str
+    share: float
+
+
+@dataclass(frozen=True)
 class Choice:
     """One way to carry out an effect.
 
@@ -43,8 +59,10 @@ class Choice:
     formula
         Where the bound comes from.
     seconds
-        CPU time that it saves against the effect as the pipeline asks for it [reference s, see
-        `cost`].
+        Seconds that it saves, stated by planning classes of before: above 0 it is tried after the
+        forms that state what they `saves`.
+    saves
+        Measured saving; None: it saves nothing in this scene, and is taken only if it is asked for.
     """
 
     decision: Decision
@@ -54,6 +72,12 @@ class Choice:
     bound: Bound = field(default_factory=dict)
     formula: str = ""
     seconds: float = 0.0
+    saves: Saving | None = None
+
+    @property
+    def pays(self) -> bool:
+        """Whether the form saves time in this scene."""
+        return self.saves is not None or self.seconds > 0
 
 
 @dataclass(frozen=True)
@@ -80,38 +104,28 @@ class Effect:
 
 @dataclass(frozen=True)
 class Cost:
-    """CPU seconds on the reference machine (`cost.REFERENCE`) of one run over one observation.
+    """CPU seconds stated by planning classes of before; accepted and not used: times are measured.
 
     Attributes
     ----------
     fixed, per_time, per_sample
-        seconds = fixed + per_time N_t + per_sample N_det N_t.
+        seconds = fixed + per_time N_t + per_sample N_det N_t of one observation.
     once
-        Seconds for the whole run, whatever the observations and signals (pictures, files).
-    kernel
-        Which calibration kernel scales it: ``random``, ``stream`` or ``python``.
-    shared
-        Share of it that is done once for all bands that are executed together
-        (`Planning.shares_blocks`).
+        Seconds for the whole run.
     """
 
     fixed: float = 0.0
     per_time: float = 0.0
     per_sample: float = 0.0
     once: float = 0.0
-    kernel: Literal["random", "stream", "python"] = "stream"
+    kernel: str = "stream"
     shared: float = 0.0
-
-    def seconds(self, n_times: int, n_detectors: int) -> float:
-        """CPU seconds of one observation in one run."""
-        return self.fixed + self.per_time * n_times + self.per_sample * n_times * n_detectors
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """An operator's effects and its cost; ``cost`` None: unknown, the planner says so. ``without``:
-    what leaving the whole operator out would cost, where that is not what its effects
-    contribute."""
+    """An operator's effects. ``without``: what leaving the whole operator out would cost, where
+    that is not what its effects contribute. ``cost`` is accepted and not used."""
 
     effects: tuple[Effect, ...] = ()
     cost: Cost | None = None
@@ -120,7 +134,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Traits:
-    """What other operators' bounds need to know of an operator.
+    """Properties of an operator that the bounds of others depend on.
 
     Attributes
     ----------
@@ -132,7 +146,7 @@ class Traits:
     rms
         Adds a fluctuation of at most this rms to the calibrated stream, K (the smooth mean apart).
     faster
-        The rms of what of it is faster than a frequency [Hz], K; None: that of all of it.
+        Rms above a frequency [Hz], K; None: that of all of it.
     peak
         Adds a sky of at most this brightness, K; None: it adds no sky, or does not know.
     pixel
@@ -182,3 +196,21 @@ def not_simulated(name: str, what: str, bound: Bound, formula: str) -> Effect:
     return Effect(
         name, (Choice("not simulated", what, bound=bound, formula=formula),), bound, formula
     )
+
+
+def describe(bound: Bound, metrics: Iterable[str]) -> str:
+    """A bound in the products' units, the metrics that matter only."""
+    return ", ".join(f"{m} {figure(m, bound[m])}" for m in METRICS if m in bound and m in metrics)
+
+
+def figure(metric: str, value: float) -> str:
+    """A bound in the unit of its metric, which may name a plane too: ``transfer Q``."""
+    return f"{value:.1e}" if metric.split()[0] in ("transfer", "psd") else kelvin(value)
+
+
+def kelvin(value: float) -> str:
+    """A temperature with three figures and a unit that reads well."""
+    for factor, unit in ((1.0, "K"), (1e3, "mK"), (1e6, "uK"), (1e9, "nK")):
+        if abs(value) * factor >= 1:
+            return f"{value * factor:.3g} {unit}"
+    return f"{value * 1e9:.1g} nK" if value else "0 K"

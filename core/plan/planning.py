@@ -1,9 +1,10 @@
-"""Planning classes, one for each operator: error bounds, coarser forms, CPU time and memory."""
+"""Planning classes, one for each operator: error bounds, coarser forms and memory."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
+from ..function_operator import FunctionOperator
 from ..knobs import Knob
 from ..mapmaker import filters
 from ..operator import Operator
@@ -21,7 +22,7 @@ class Planning(Generic[O]):
     """The planning of an operator. Its name in the registry (``zonda.planning``) is that of the
     operator's class.
 
-    An operator without one is never coarsened, and the planner says that its cost is not counted.
+    An operator without one is never coarsened.
 
     Attributes
     ----------
@@ -29,7 +30,7 @@ class Planning(Generic[O]):
         The class of the operator, or ``module:class`` where it need not be imported for the
         planning of others; classes derived from it inherit its planning.
     cost
-        What it costs, where that is the same for every scene.
+        Accepted from planning classes of before, and not used: times are measured.
     knobs
         The parameters that trade accuracy for time, each with its ladder of values (`core.knobs`).
     reads_streams
@@ -38,8 +39,8 @@ class Planning(Generic[O]):
     holds
         Its `memory`, where that is the same for every observation.
     smaller
-        What lessens its `memory`, in a few words (``choose a larger pixel``), for a run that does
-        not fit.
+        Advice that lessens its `memory`, in a few words (``choose a larger pixel``), for a run that
+        does not fit.
     """
 
     of: ClassVar[type[Operator] | str]
@@ -53,7 +54,7 @@ class Planning(Generic[O]):
         self.operator = operator
 
     def traits(self, observation: Observation) -> Traits:
-        """What other operators' bounds need to know of this one (noise, pixels, filters).
+        """Properties that other operators' bounds depend on (noise, pixels, filters).
 
         Called after `Operator.configure`, before anything is prepared; ``observation`` has its
         pointing. A filter of which nothing is stated, and that couples all samples or is not
@@ -63,8 +64,8 @@ class Planning(Generic[O]):
         return Traits(turns=filters(own) and (own.couples == "all" or not own.linear))
 
     def estimate(self, context: Context) -> Estimate:
-        """Upper bounds on what its effects contribute, coarser forms of them, and what it costs."""
-        return Estimate((), self.cost)
+        """Upper bounds on what its effects contribute, and coarser forms of them."""
+        return Estimate()
 
     def coarser(self, parameter: str) -> list[Any]:
         """The rungs of a knob that are coarser than the operator's own value, the finest of them
@@ -84,19 +85,19 @@ class Planning(Generic[O]):
         return self.holds
 
     def sweeps(self, observation: Observation) -> int:
-        """How often `Operator.measure` goes through its stream with `Stream.sweep`; 0: it wants
-        ``stream.array``.
+        """Number of times that `Operator.measure` goes through its stream with `Stream.sweep`; 0:
+        it wants ``stream.array``.
         """
         return 0
 
     def in_time_order(self, observation: Observation) -> bool:
-        """Whether `Operator.exec` is much cheaper when it sees all detectors at one time before it
+        """True if `Operator.exec` is much cheaper when it sees all detectors at one time before it
         goes on to the next.
         """
         return False
 
     def shares_blocks(self, observation: Observation) -> bool:
-        """Whether bands that look through the same pixels save time where each block is worked on
+        """True if bands that look through the same pixels save time when each block is worked on
         with one after the other.
         """
         return False
@@ -120,3 +121,18 @@ def planning_class(operator: type[Operator]) -> type[Planning[Any]]:
             if found.of in (cls, f"{cls.__module__}:{cls.__qualname__}"):
                 return found
     return Planning
+
+
+class FunctionPlanning(Planning[FunctionOperator]):
+    """Planning of a function, whose effect is not known."""
+
+    of = FunctionOperator
+    smaller = "make the scan shorter, or couple less: couples='all' holds a whole scan in float64"
+
+    def memory(self, observation: Observation) -> int:
+        """With ``couples="all"`` the scan in float64, what the function makes of it, and that of
+        each signal.
+        """
+        if self.operator.couples != "all":
+            return 0
+        return 8 * (2 + len(observation.signals)) * observation.n_detectors * observation.n_samples

@@ -1,28 +1,97 @@
-"""A plan: what is decided, as text, as JSON, and in short for headers."""
+"""A plan: its decisions as text, as JSON, in short for headers; and what a run takes from it."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shutil
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-from ..configuration.pipeline_file import PipelineFile
+from ..configuration.pipeline_file import PipelineFile, Step
+from ..label import labels
 from ..maps.beams import expected_fwhm
 from .context import Context
 from .decide import Decided
-from .estimate import Cost
-from .figures import describe, duration, figure, kelvin
+from .estimate import describe, figure, kelvin
+from .prediction import Memory, Timing
 from .structure import Structure
-from .summary import PlanSummary, Prediction
+
+Row = tuple[str, str, str, str]
+"""(effect, decision, bound, formula or reason), for headers and the report."""
+
+
+@dataclass(frozen=True)
+class PlanSummary:
+    """What a run takes from a plan, or from the structure of a scene that is not planned.
+
+    Attributes
+    ----------
+    operators, runs
+        Labels of the operators, and names of the signals beside the complete one, that act.
+    settings
+        Changed parameters by operator.
+    short
+        Rows for headers and the report.
+    memory
+        None: not planned.
+    words
+        The line that the run prints.
+    """
+
+    operators: tuple[str, ...]
+    runs: tuple[str, ...]
+    settings: Mapping[str, Mapping[str, Any]]
+    short: list[Row]
+    memory: Memory | None = None
+    words: str = ""
+
+    def omitted(self, file: PipelineFile) -> list[str]:
+        """The steps and signals of a pipeline file that do not act."""
+        steps = [o.label for o in file.pipeline().operators if o.label not in self.operators]
+        return steps + [f"signal {name}" for name in file.runs if name not in self.runs]
+
+    def apply(self, file: PipelineFile) -> PipelineFile:
+        """The pipeline that is run: an ordinary one, with parameters changed and operators
+        omitted. Each step keeps its label, which its random numbers depend on.
+        """
+        steps, kept = [], []
+        for o, step in zip(file.pipeline().operators, file.steps, strict=True):
+            if o.label in self.operators:
+                update = dict(self.settings.get(o.label, {}))
+                changed = step.operator.model_copy(update=update) if update else step.operator
+                steps.append(Step(step.key, changed))
+                kept.append(o.label)
+        new = labels(s.operator for s in steps)
+        named = [
+            step
+            if label == now
+            else Step(step.key, step.operator.model_copy(update={"name": label}))
+            for step, label, now in zip(steps, kept, new, strict=True)
+        ]
+        runs = {name: run for name, run in file.runs.items() if name in self.runs}
+        header = file.header.model_copy(
+            update={"runs": runs, "budget": 0.0, **self.settings.get("pipeline", {})}
+        )
+        return dataclasses.replace(file, header=header, steps=tuple(named))
+
+    def __str__(self) -> str:
+        return self.words
+
+
+def unplanned(structure: Structure, why: str) -> PlanSummary:
+    """A run that is not planned: its structure, and why nothing is coarsened."""
+    row = ("plan", "not made", "", why)
+    words = f"not planned ({why})"
+    return PlanSummary(structure.operators, structure.runs, {}, [row, *omissions(structure)],
+                       words=words)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is done about each effect; the errors it adds, what is allowed; the time and memory it
-    will take.
+    """Decisions on each effect; the errors they add, the limits; the memory of the run.
 
     Attributes
     ----------
@@ -35,10 +104,10 @@ class Plan:
     noise
         White noise that the run will have, under the load of the atmosphere: rms of one sample and
         of a map pixel (0: no map), K; samples per pixel in the deep part of the map.
-    prediction, unpruned
-        With the plan, and with everything on.
-    costs
-        Of the operators that state one, as the pipeline asks for them.
+    memory
+        With the plan.
+    timing
+        CPU time, where it was measured.
     """
 
     structure: Structure
@@ -46,10 +115,9 @@ class Plan:
     limits: Mapping[str, float]
     spent: Mapping[str, float]
     noise: tuple[float, float, float]
-    prediction: Prediction
-    unpruned: Prediction
+    memory: Memory
     context: Context
-    costs: Mapping[str, Cost] = field(default_factory=dict)
+    timing: Timing | None = None
 
     @property
     def operators(self) -> tuple[str, ...]:
@@ -60,14 +128,8 @@ class Plan:
     @property
     def summary(self) -> PlanSummary:
         """What a run takes from it."""
-        return PlanSummary(
-            self.operators,
-            self.structure.runs,
-            self.settings(),
-            short(self),
-            self.prediction,
-            self.unpruned,
-        )
+        return PlanSummary(self.operators, self.structure.runs, self.settings(), self.short(),
+                           self.memory, foreseen(self.memory, self.timing))  # fmt: skip
 
     def apply(self, file: PipelineFile) -> PipelineFile:
         """The pipeline that is run: an ordinary one, with parameters changed and operators
@@ -84,12 +146,45 @@ class Plan:
                 mine[key] = [*mine.get(key, []), *value] if isinstance(value, list) else value
         return found
 
-    def saved_seconds(self, d: Decided) -> float:
-        """CPU time that a decision saves, all signals [reference s]."""
-        return d.choice.seconds * self.prediction.times.get(d.operator, 1) if d.chosen else 0.0
+    def short(self) -> list[Row]:
+        """Rows for headers: steps that are omitted by structure first."""
+        found = omissions(self.structure)
+        for d in self.decided:
+            bound = describe(d.choice.bound, self.context.metrics) if d.adds_error else ""
+            found.append((d.name, f"{d.choice.decision}: {d.choice.what}", bound, d.formula))
+        return found
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, for JSON."""
+        sample, pixel, hits = self.noise
+        structure = self.structure
+        return {
+            "noise": {"sample": sample, "map_pixel": pixel, "samples_per_pixel": hits},
+            "budget": {m: {"limit": v, "spent": self.spent[m]} for m, v in self.limits.items()},
+            "left_out": [dataclasses.asdict(row) for row in structure.rows],
+            "derived": dict(structure.derived),
+            "joins_bands": self.context.joined,
+            "effects": [self._effect(d) for d in self.decided],
+            "prediction": as_dict_of(self.memory, self.timing),
+        }
+
+    def _effect(self, d: Decided) -> dict[str, Any]:
+        metrics, saves = self.context.metrics, d.choice.saves
+        return {
+            "operator": d.operator,
+            "effect": d.effect.name,
+            "decision": d.choice.decision,
+            "what": d.choice.what,
+            "settings": {k: _plain(v) for k, v in d.choice.settings.items()},
+            "bound": {k: float(v) for k, v in d.choice.bound.items() if k in metrics},
+            "formula": d.formula,
+            "size": {k: float(v) for k, v in d.effect.size.items() if k in metrics},
+            "saves": None if saves is None else dataclasses.asdict(saves),
+            "reason": d.reason,
+        }
 
     def __str__(self) -> str:
-        return text(self)
+        return self.text()
 
     def _repr_html_(self) -> str:
         from ..pages import html_table
@@ -98,153 +193,121 @@ class Plan:
             "Plan", [(d.name, f"{d.choice.decision}: {d.choice.what}") for d in self.decided]
         )
 
+    def text(self, width: int | None = None) -> str:
+        """The table for a terminal of ``width`` columns; of this one where absent."""
+        width = width or max(80, min(shutil.get_terminal_size((120, 50)).columns, 140))
+        lines = [self._noise()]
+        for metric, limit in self.limits.items():
+            spent = figure(metric, self.spent[metric])
+            lines.append(f"budget for {metric}: {spent} of {figure(metric, limit)} spent")
+        said = []
+        if joined := self.context.joined:
+            said.append(
+                f"{joined} joins the bands: the bounds are of this band alone and need not hold, so"
+                " that nothing is coarsened"
+            )
+        groups: dict[tuple[str, str], list[str]] = {}
+        for row in self.structure.rows:
+            groups.setdefault((row.run, row.reason), []).append(row.operator)
+        for (run, reason), operators in groups.items():
+            signal, steps = f"signal {run}" if run else "", ", ".join(filter(None, operators))
+            said.append(f"omitted: {': '.join(filter(None, (signal, steps)))} ({reason})")
+        for text in said:
+            lines += textwrap.wrap(text, width, subsequent_indent="    ")
+        derived = self.structure.derived
+        lines += [f"signal {run} is a remainder: {how}" for run, how in derived.items()]
+        return "\n".join([*lines, "", *self._table(width), "", str(self.summary)])
 
-def as_dict(plan: Plan) -> dict[str, Any]:
-    """Everything, as JSON takes it."""
-    p, u = plan.prediction, plan.unpruned
-    sample, pixel, hits = plan.noise
-    return {
-        "noise": {"sample": sample, "map_pixel": pixel, "samples_per_pixel": hits},
-        "budget": {m: {"limit": v, "spent": plan.spent[m]} for m, v in plan.limits.items()},
-        "left_out": [
-            {"run": r.run, "operator": r.operator, "reason": r.reason} for r in plan.structure.rows
-        ],
-        "derived": dict(plan.structure.derived),
-        "joins_bands": plan.context.joined,
-        "effects": [_effect_as_dict(plan, d) for d in plan.decided],
-        "prediction": {
-            "cpu_seconds": p.total,
-            "bytes": p.bytes,
-            "by_operator": dict(p.seconds),
-            "unknown": list(p.unknown),
-        },
-        "everything_on": {"cpu_seconds": u.total, "bytes": u.bytes},
-    }
+    def _noise(self) -> str:
+        sample, pixel, hits = self.noise
+        if not pixel:
+            return f"noise: {kelvin(sample)} per sample; no map" if sample else "noise: none"
+        words = (
+            f"noise: {kelvin(pixel)} per map pixel ({hits:.0f} samples in the deep part),"
+            f" {kelvin(sample)} per sample"
+        )
+        coverage, plane = self.context.coverage, self.context.first.focalplane
+        fwhm, side = expected_fwhm(plane.fwhm, plane.net), coverage.pixel if coverage else math.inf
+        # sqrt(pixel area / (4 pi sigma^2)), where pixels are small
+        smoothing = side / fwhm * math.sqrt(2 * math.log(2) / math.pi)
+        if smoothing < 0.5:
+            beam, both = (
+                f"{math.degrees(f) * 3600:.3g} arcsec" for f in (fwhm, math.sqrt(2) * fwhm)
+            )
+            words += (
+                f";\n  {kelvin(pixel * smoothing)} in the map smoothed with the beam ({beam};"
+                f" resolution {both}), the white noise alone"
+            )
+        return words
+
+    def _table(self, width: int) -> list[str]:
+        """Under each operator: each effect's form, the error of that or of leaving it out, and
+        why."""
+        lines: list[str] = []
+        column = max((len(d.effect.name) for d in self.decided), default=0) + 2
+        indent = " " * (column + 2)
+        operator = formula = ""
+        for d in self.decided:
+            if d.operator != operator:
+                operator, formula = d.operator, ""
+                used = self.timing.of(operator) if self.timing else 0.0
+                lines.append(operator + (f"  {duration(used)} of CPU time" if used else ""))
+            kind, what = d.choice.decision, d.choice.what
+            lines.append(
+                f"  {d.effect.name:<{column}}{what if kind == what else f'{kind}: {what}'}"
+            )
+            bound = d.choice.bound if d.adds_error else d.effect.size
+            bounds, saves = describe(bound, self.context.metrics), d.choice.saves
+            notes = [
+                f"{'error within' if d.adds_error else 'without it'} {bounds}" if bounds else "",
+                f"saved {100 * saves.share:.2g} % of {saves.scene}" if saves else "",
+                d.reason,
+                d.formula if d.formula != formula else "",
+            ]
+            formula = d.formula
+            lines += textwrap.wrap("; ".join(filter(None, notes)), width, initial_indent=indent,
+                                   subsequent_indent=indent)  # fmt: skip
+        return lines
 
 
-def _effect_as_dict(plan: Plan, d: Decided) -> dict[str, Any]:
-    metrics = plan.context.metrics
-    return {
-        "operator": d.operator,
-        "effect": d.effect.name,
-        "decision": d.choice.decision,
-        "what": d.choice.what,
-        "settings": {k: _plain(v) for k, v in d.choice.settings.items()},
-        "bound": {k: float(v) for k, v in d.choice.bound.items() if k in metrics},
-        "formula": d.formula,
-        "size": {k: float(v) for k, v in d.effect.size.items() if k in metrics},
-        "saved_seconds": round(plan.saved_seconds(d), 4),
-        "reason": d.reason,
-    }
+def omissions(structure: Structure) -> list[Row]:
+    """Rows of the steps and signals that are left out by structure, and of remainders."""
+    found = []
+    for row in structure.rows:
+        signal = f"signal {row.run}" if row.run else ""
+        found.append((": ".join(filter(None, (signal, row.operator))), "left out", "", row.reason))
+    derived = structure.derived.items()
+    return found + [(f"signal {run}", "remainder", "", how) for run, how in derived]
+
+
+def foreseen(memory: Memory, timing: Timing | None) -> str:
+    """Memory, and time where it was measured, as one line."""
+    size = f"about {memory.bytes / 1e9:.2g} GB"
+    if timing is None:
+        return size
+    setup, total = sum(timing.setup.values()), timing.total
+    return (
+        f"about {duration(total)} of CPU time ({duration(setup)} of it set-up) and"
+        f" {memory.bytes / 1e9:.2g} GB; measured on {timing.slice}"
+    )
+
+
+def as_dict_of(memory: Memory, timing: Timing | None) -> dict[str, Any]:
+    """Memory and time, for JSON."""
+    found: dict[str, Any] = {"bytes": memory.bytes}
+    if timing is not None:
+        found["cpu_seconds"] = timing.total
+        found["set_up"], found["with_samples"] = dict(timing.setup), dict(timing.growing)
+        found["slice"] = timing.slice
+    return found
+
+
+def duration(seconds: float) -> str:
+    """A duration as text, in s, min or h."""
+    if seconds < 120:
+        return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def _plain(value: Any) -> Any:
     return value if isinstance(value, (int, float, str, bool, list, type(None))) else str(value)
-
-
-def text(plan: Plan, width: int | None = None) -> str:
-    """The table for a terminal of ``width`` columns; of this one where absent."""
-    width = width or max(80, min(shutil.get_terminal_size((120, 50)).columns, 140))
-    lines = [_noise(plan)]
-    for metric, limit in plan.limits.items():
-        lines.append(
-            f"budget for {metric}: {figure(metric, plan.spent[metric])} of {figure(metric, limit)}"
-            " spent"
-        )
-    if joined := plan.context.joined:
-        said = (
-            f"{joined} joins the bands: the bounds are of this band alone and need not hold, so"
-            " that nothing is coarsened"
-        )
-        lines += textwrap.wrap(said, width, subsequent_indent="    ")
-    groups: dict[tuple[str, str], list[str]] = {}
-    for row in plan.structure.rows:
-        groups.setdefault((row.run, row.reason), []).append(row.operator)
-    for (run, reason), operators in groups.items():
-        what = ": ".join(
-            filter(None, (f"signal {run}" if run else "", ", ".join(filter(None, operators))))
-        )
-        lines += textwrap.wrap(f"omitted: {what} ({reason})", width, subsequent_indent="    ")
-    lines += [f"signal {run} is a remainder: {how}" for run, how in plan.structure.derived.items()]
-    return "\n".join([*lines, "", *_effects(plan, width), "", str(plan.summary)])
-
-
-def _noise(plan: Plan) -> str:
-    sample, pixel, hits = plan.noise
-    if not pixel:
-        return f"noise: {kelvin(sample)} per sample; no map" if sample else "noise: none"
-    words = (
-        f"noise: {kelvin(pixel)} per map pixel ({hits:.0f} samples in the deep part),"
-        f" {kelvin(sample)} per sample"
-    )
-    coverage, plane = plan.context.coverage, plan.context.first.focalplane
-    fwhm = expected_fwhm(plane.fwhm, plane.net)
-    smoothing = (
-        (coverage.pixel if coverage else math.inf) / fwhm * math.sqrt(2 * math.log(2) / math.pi)
-    )
-    if smoothing < 0.5:  # sqrt(pixel area / (4 pi sigma^2)), where pixels are small
-        beam, both = (f"{math.degrees(f) * 3600:.3g} arcsec" for f in (fwhm, math.sqrt(2) * fwhm))
-        words += (
-            f";\n  {kelvin(pixel * smoothing)} in the map smoothed with the beam ({beam};"
-            f" resolution {both}), "
-        )
-        words += "the white noise alone"
-    return words
-
-
-def _effects(plan: Plan, width: int) -> list[str]:
-    """Under each operator and its predicted time: what is done about an effect, what that or
-    leaving it out adds, and why.
-    """
-    lines: list[str] = []
-    column = max((len(d.effect.name) for d in plan.decided), default=0) + 2
-    operator = formula = ""
-    for d in plan.decided:
-        choice = d.choice
-        if d.operator != operator:
-            operator, formula = d.operator, ""
-            seconds = plan.prediction.seconds.get(operator)
-            lines.append(
-                operator + (f"  {duration(seconds)} of CPU time" if seconds is not None else "")
-            )
-        decision = (
-            choice.decision
-            if choice.decision == choice.what
-            else f"{choice.decision}: {choice.what}"
-        )
-        lines.append(f"  {d.effect.name:<{column}}{decision}")
-        bounds = describe(choice.bound if d.adds_error else d.effect.size, plan.context.metrics)
-        saves = plan.saved_seconds(d)
-        notes = [f"{'error within' if d.adds_error else 'without it'} {bounds}" if bounds else ""]
-        notes += [
-            f"saves {saves:.2g} s" if saves >= 0.01 else "",
-            d.reason,
-            d.formula if d.formula != formula else "",
-        ]
-        formula = d.formula
-        indent = " " * (column + 2)
-        lines += textwrap.wrap(
-            "; ".join(filter(None, notes)), width, initial_indent=indent, subsequent_indent=indent
-        )
-    return lines
-
-
-def short(plan: Plan) -> list[tuple[str, str, str, str]]:
-    """Rows for headers: (effect, decision, bound, formula), steps that are omitted by structure
-    first.
-    """
-    found = []
-    for row in plan.structure.rows:
-        name = (
-            f"signal {row.run}" + (f": {row.operator}" if row.operator else "")
-            if row.run
-            else row.operator
-        )
-        found.append((name, "left out", "", row.reason))
-    found += [
-        (f"signal {run}", "remainder", "", how) for run, how in plan.structure.derived.items()
-    ]
-    for d in plan.decided:
-        bound = describe(d.choice.bound, plan.context.metrics) if d.adds_error else ""
-        found.append((d.name, f"{d.choice.decision}: {d.choice.what}", bound, d.formula))
-    return found

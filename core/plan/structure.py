@@ -1,5 +1,5 @@
 """Structural pruning: from the requested outputs back to the operators and signals that they depend
-on.
+on; and the narrowing of the complete signal to some components.
 
 An operator takes part if it is an output itself, if it changes a stream or a field that a later
 operator reads, or if what it does cannot be known. One that makes nothing but products
@@ -11,21 +11,24 @@ the components can take its place, and no signal takes its singular modes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from ..configuration.diagnostics import nearest
+from ..configuration.loaded import PipelineFile
+from ..errors import ZondaError
 from ..mapmaker import MapMaker, filters, forms, made_by, makes_products
 from ..operator import Operator
 from ..output import Output, changes_observations, is_output
 from ..pipeline import Pipeline
-from ..run.signals import acting_steps, remainder
+from ..run.signals import Signals, acting_steps, remainder
 from ..signal import MAIN, TRANSMISSION, Component, is_stream, stream_of
 from .context import Work
 
 
 @dataclass(frozen=True)
 class Row:
-    """What is omitted, and why: an operator of a signal (empty: the complete one), or (``operator``
-    empty) a signal.
+    """An omission and its reason: an operator of a signal (empty: the complete one), or a signal
+    (``operator`` empty).
     """
 
     run: str
@@ -44,7 +47,7 @@ class Structure:
     runs
         Names of the signals that are of use, beside the complete one.
     rows
-        What is left out, and why.
+        Omissions and their reasons.
     instead
         The signal that takes the place of the complete one, its name no longer needed; empty: none.
     derived
@@ -68,8 +71,8 @@ class Structure:
 
 
 def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
-    """What the pipeline's outputs depend on. ``keep``: labels of operators that stay whatever
-    depends on them.
+    """Structure of what the pipeline's outputs depend on. ``keep``: labels of operators that stay
+    whatever depends on them.
     """
     rows: list[Row] = []
     in_memory = not any(map(is_output, pipeline.operators))
@@ -139,7 +142,7 @@ def _wanted(pipeline: Pipeline, name: str) -> set[str]:
 
 
 def _is_compared(pipeline: Pipeline, name: str) -> bool:
-    """Whether a step that acts on the complete signal reads the stream of another one, too."""
+    """True if a step that acts on the complete signal reads the stream of another one, too."""
     return bool(name) and any(stream_of(name) in o.optional for o in pipeline.operators)
 
 
@@ -167,7 +170,7 @@ def _in_place_of_complete(
 
 
 def _takes_modes(pipeline: Pipeline, name: str) -> bool:
-    """Whether a signal is treated as a part of the complete one, by a filter or by the atmosphere's
+    """True if a signal is treated as a part of the complete one, by a filter or by the atmosphere's
     transmission.
     """
     signal = pipeline.signals.all[name]
@@ -244,7 +247,7 @@ def _components_before(operator: Operator, steps: Sequence[Operator]) -> set[str
 
 
 def _products(operator: Operator) -> set[str]:
-    """What it provides besides streams and the pointing."""
+    """Names that it provides besides streams and the pointing."""
     return {name for name in operator.provides if name != "boresight" and not is_stream(name)}
 
 
@@ -282,31 +285,45 @@ def remainders(pipeline: Pipeline, names: Iterable[str]) -> dict[str, str]:
     }
 
 
-FORM, FILTER, MAP = 0.3, 0.7, 0.4
-"""What a further signal takes of the time of the first in steps that form, filter and map it.
-Measured with the MUSTANG-2 job: 0.30; 0.88 (high-pass) and 0.53 (common mode); 0.40."""
-
-
 def work(pipeline: Pipeline, structure: Structure) -> Work:
-    """What the operators that take part do with each observation."""
+    """Steps and signals of each observation."""
     signals = tuple(
         pipeline.signals.all[name]
         for name in ["", *structure.runs]
         if name not in structure.derived
     )
     acting = [o for o in pipeline.operators if o.label in structure.operators]
-    steps = tuple(acting_steps(acting))
-    others, filtered = len(signals) - 1, sum(s.filtered for s in signals) - 1
-    times = dict.fromkeys(structure.operators, 1.0)
-    for o in steps:
-        more = (
-            FORM * others
-            if forms(o)
-            else FILTER * filtered
-            if filters(o)
-            else MAP * others
-            if isinstance(o, MapMaker)
-            else 0
-        )
-        times[o.label] = 1.0 + more
-    return Work(steps, signals, pipeline.signals.components, times)
+    return Work(tuple(acting_steps(acting)), signals, pipeline.signals.components)
+
+
+def only(file: PipelineFile, components: Sequence[str]) -> PipelineFile:
+    """The file with its complete signal narrowed to some components (``--only sky``): the same
+    levels, flags and random numbers.
+
+    The bits are those of the signal with this ``only``. Other signals go on with what is left of
+    their components; one that has nothing left, or everything, is left out.
+
+    Raises
+    ------
+    ZondaError
+        Where no step provides a component, or a step asks for singular modes of the complete data.
+    """
+    pipeline = file.pipeline()
+    signals, operators = pipeline.signals, pipeline.operators
+    provided = sorted(signals.components)
+    for name in components:
+        if name not in provided:
+            cure = nearest(name, provided) or f"choose from: {', '.join(provided)}"
+            raise ZondaError(f"no step of this pipeline makes {name!r}", place="--only", cure=cure)
+    narrowed = Signals(operators, {}, components, file.header.name)
+    for o in operators if narrowed.makers("") < signals.makers("") else ():
+        if isinstance(o, Output) and any(signal.modes == "full" for signal in o.signals()):
+            left = " and ".join(components)
+            raise ZondaError(
+                f"{o.label} asks for singular modes of the complete data, of which {left} alone is"
+                " left",
+                place="--only",
+                cure=f"set modes to sky (--set {o.label}.modes=sky), or leave --only out",
+            )
+    header = file.header.model_copy(update={"only": list(components)})
+    return replace(file, header=header)

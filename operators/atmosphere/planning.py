@@ -1,4 +1,4 @@
-"""Bounds and costs of the atmosphere's effects, see `core.plan`.
+"""Bounds of the atmosphere's effects, see `core.plan`.
 
 Of a layer l with share a_l, variance s_l^2 behind the beam, the band's emission T(PWV), and its
 kappa_l for water at that height (`layer_terms`; 1 where layers respond as the column does), one
@@ -14,9 +14,8 @@ the mean leave of it (`nodes.differential_rms`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from zonda.core.instrument import Band
 from zonda.core.knobs import Knob
 from zonda.core.observation import Observation
 from zonda.core.plan.context import OTHER_MODES, Context
-from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, add, full
+from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, add, full
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
@@ -36,7 +35,6 @@ from .model import AtmosphereModel, absorption_of
 from .turbulence.geometry import ScanPlane, axes, crossing, rays
 from .turbulence.levels import FIDELITIES
 from .turbulence.nodes import Layer, differential_rms, spread_evenly
-from .turbulence.tiles import AROUND
 from .weather.bands import BandAtmosphere, BandTransfer
 from .weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
 
@@ -53,25 +51,18 @@ PASSAGES = 3.0
 passages.
 """
 
-POINT, TRANSFER, LATTICE = 1.2e-8, 1.2e-7, 2.7e-8
-"""Seconds per point (node x time) of one layer and of the radiative transfer and splines; per
-lattice point: a band alone takes a fifth more than this, one of two, whose tiles are made at once,
-a tenth less."""
+LAYER = Saving("wide_field", 0.07)
+"""Of one layer less, where `DENSE` points (nodes x times) are evaluated per sample, or more."""
+DENSE = 0.03
 
-SHARED = 0.4
-"""Share of it that bands executed together do once, where each detector is evaluated by itself:
-two cost 1.5 to 1.6 times one.
-"""
-
-CHOICE = 0.02, 2e-5
-"""Seconds that the choice of nodes and steps takes for each scan: a + b per detector."""
-
-PAYS = 0.3
-"""Seconds of evaluation from which coarser nodes are looked for."""
-
-
-InProportion = Callable[[float], dict[str, float]]
-"""The bound of an error that is a share of the fluctuation."""
+COARSER = {
+    0.03: Saving("polarized", 0.2),
+    0.1: Saving("survey_night", 0.43),
+    0.3: Saving("survey_night", 0.45),
+}
+"""Of the nodes for larger tolerances, where they are half as many or less, and no more than
+`MOST_NODES`, of at least `MANY_NODES`."""
+MOST_NODES, MANY_NODES = 256, 64
 
 
 class AtmospherePlanning(Planning[AtmosphereLayers]):
@@ -127,31 +118,17 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         return Traits(rms=a.rms, faster=faster)
 
     def estimate(self, context: Context) -> Estimate:
-        """As for the observation at the lowest elevation."""
-        a, first = (
-            calibrated(self.operator.model(context.lowest)),
-            self.operator.model(context.first),
+        """Bounds for the observation at the lowest elevation."""
+        first = self.operator.model(context.first)
+        bounds = AtmosphereBounds(context, calibrated(self.operator.model(context.lowest)), first)
+        effects = (
+            *bounds.layers(),
+            bounds.nodes(),
+            bounds.lattice(),
+            *bounds.spectral(),
+            *bounds.slopes(),
         )
-        p = a.model.parameters
-        if (key := str(context.coverage)) not in a.averages:
-            a.averages[key] = shares(context, a.layers, a.components, first.plane)
-        points = _points(context, first, p.tolerance)
-        left = [left_of_layer(context, a, k) for k in range(len(a.layers))]
-        in_proportion = partial(_in_proportion, context, a, left)
-        effects = _layer_effects(context, a, left, points)
-        effects += [
-            _nodes(context, a, first, self.coarser("tolerance")),
-            _lattice_error(a, in_proportion),
-        ]
-        effects += [*_spectral(context, a, in_proportion), *_slopes(context, a)]
-        points /= len(context.observations)
-        fixed = 0.02 + (POINT * (len(a.layers) - len(set(p.omit))) + TRANSFER) * points
-        once = 0.05 + (CHOICE[0] + CHOICE[1] * context.first.n_detectors) * len(
-            context.observations
-        )
-        shared = 0.0 if first.resolution().nodes.shape else SHARED
-        cost = Cost(fixed + LATTICE * _cells(first), per_sample=0.6e-9, once=once, shared=shared)
-        return Estimate(tuple(effects), cost, _without(context, a, left))
+        return Estimate(effects, without=bounds.without())
 
 
 @dataclass(eq=False)
@@ -256,253 +233,6 @@ def _velocities(o: Observation, plane: ScanPlane, layers: list[Layer]) -> list[F
     return [layer.height * velocity - (plane.drift @ layer.wind)[:, None] for layer in layers]
 
 
-def _without(context: Context, a: Calibrated, left: Sequence[float]) -> dict[str, float]:
-    """All layers; the mean emission, where no filter takes it out."""
-    found = add(*_layer_bounds(context, a, left))
-    if not any(t.response for t in context.traits.values()):
-        found = add(found, {"tod": context.mean_emission, "map_rms": context.mean_emission})
-    return found
-
-
-def left_of_layer(context: Context, a: Calibrated, k: int) -> float:
-    """rms of layer k in one calibrated sample after the common mode is gone, K.
-
-    That is what the detectors see differently, and what they see with unequal gains.
-    """
-    whole = a.of_layer(k)
-    if not context.removes_common:
-        return whole
-    xi, eta = spread_evenly(context.first.focalplane.xi, context.first.focalplane.eta)
-    return math.hypot(
-        a.kelvin * differential_rms(xi, eta, [a.layers[k]], a.model.plane.stretch),
-        _gain_scatter(context, a) * whole,
-    )
-
-
-def _gain_scatter(context: Context, a: Calibrated) -> float:
-    """Relative rms of the detectors' gains: known ones, and the calibration's errors."""
-    return math.hypot(a.uneven, *(t.gain_error for t in context.traits.values()))
-
-
-def _correlated(context: Context, layer: Layer) -> float:
-    """Integral of the correlation over time, s: the beam or what of the outer scale the filters
-    pass, over the wind's speed.
-    """
-    speed = max(float(np.hypot(*layer.wind)), 0.1)
-    slow = max(4 * layer.sigma, min(layer.outer_scale, 20 * layer.sigma)) / speed
-    return min(slow, 1 / context.cut) if context.cut > 0 else slow
-
-
-def _layer_effects(
-    context: Context, a: Calibrated, left: Sequence[float], points: float
-) -> list[Effect]:
-    text = "1.25 p PWV dT/dPWV epsilon / (zeta e^-tau) kappa_l a_l x " + (
-        "rms left of the layer after subtraction of the detectors' mean"
-        if context.removes_common
-        else "rms behind the beam"
-    )
-    bounds, p = _layer_bounds(context, a, left), a.model.parameters
-    text += OTHER_MODES if context.turns else ""
-    effects = []
-    for k, layer in enumerate(a.layers):
-        bound = context.behind_modes(bounds[k])
-        choices = [full(f"at {layer.height:.0f} m")]
-        if k in p.omit:
-            choices = [full(f"at {layer.height:.0f} m: left out by the pipeline")]
-        elif not p.outputs:
-            choices.append(
-                Choice(
-                    "dropped",
-                    "left out",
-                    {"omit": [k]},
-                    bound=bound,
-                    formula=text,
-                    seconds=POINT * points,
-                )
-            )
-        effects.append(Effect(f"layer {k}", tuple(choices), bound, text))
-    return effects
-
-
-def _layer_bounds(context: Context, a: Calibrated, left: Sequence[float]) -> list[dict[str, float]]:
-    """Bound on what each layer adds to the products."""
-    averages, spectra = a.averages[str(context.coverage)], _spectral_shares(context, a)
-    bounds = []
-    for k, layer in enumerate(a.layers):
-        rms = SAFETY * left[k]
-        bound = context.bound(rms, _correlated(context, layer), common=True)
-        bound["map_rms"] = min(bound["map_rms"], averages[k] * rms)
-        if context.before_filters:
-            bound["tod"] = SAFETY * a.of_layer(k)
-        share = abs(a.model.layers[k].amplitude * float(a.model.kappa["opacity"][k]))
-        opacity = _opacity_share(a) * a.model.fluctuation.scale * share * math.sqrt(a.variances[k])
-        bound |= context.sky_error(PASSAGES * opacity)
-        bound["psd"] = min(SAFETY**2 * spectra[k], 1.0)
-        bounds.append(bound)
-    return bounds
-
-
-def _spectral_shares(context: Context, a: Calibrated) -> list[float]:
-    """Largest share that each layer has of the stream's power in a range of frequency (20 from 1 /
-    duration to Nyquist), white noise included."""
-    o = context.first
-    grid = (
-        np.geomspace(1 / o.duration, o.sample_rate / 2, 21)
-        if o.duration * o.sample_rate > 4
-        else np.array([0.0, 1.0])
-    )
-    power = np.array([[a.faster(k, float(f)) ** 2 for f in grid] for k in range(len(a.layers))])
-    each = np.maximum(power[:, :-1] - power[:, 1:], 0.0)
-    total = each.sum(axis=0) + context.noise**2 * 2 * np.diff(grid) / o.sample_rate
-    return [float(v) for v in (each / np.maximum(total, 1e-300)).max(axis=1)]
-
-
-def _in_proportion(
-    context: Context, a: Calibrated, left: Sequence[float], share: float
-) -> dict[str, float]:
-    """Bound of an error that is ``share`` of the fluctuation, of which ``left`` is what each layer
-    leaves (`left_of_layer`).
-    """
-    mapped = ((x * y) ** 2 for x, y in zip(left, a.averages[str(context.coverage)], strict=True))
-    sample, pixel = math.sqrt(sum(x * x for x in left)), math.sqrt(sum(mapped))
-    bound = context.bound(SAFETY * share * sample, _longest(context, a), common=True)
-    bound["map_rms"] = min(bound["map_rms"], SAFETY * share * pixel)
-    return bound | {"psd": 2 * share + share**2}
-
-
-def _longest(context: Context, a: Calibrated) -> float:
-    """Longest correlation time of the layers, s."""
-    return max(_correlated(context, layer) for layer in a.layers)
-
-
-def _points(context: Context, first: AtmosphereModel, tolerance: float) -> float:
-    """Points (nodes x times) at which the turbulence is evaluated, all observations; as for the
-    first one.
-    """
-    chosen, n = first.resolution(tolerance), context.first.n_samples
-    share = sum(chosen.step / s for s in chosen.steps) / len(chosen.steps)
-    return len(chosen.nodes.xi) * n / chosen.step * share * context.times / n
-
-
-def _cells(model: AtmosphereModel) -> float:
-    """Lattice points that a scan sweeps over, about: its throw and the height of its field, and
-    what drifts by.
-    """
-    o, omitted = model.observation, model.parameters.omit
-    field, low, high = 2 * o.focalplane.reach, float(o.elevation.min()), float(o.elevation.max())
-    angles = np.array(
-        [float(np.ptp(np.unwrap(o.azimuth))) * math.cos(low) + field, high - low + field]
-    )
-    total = 0.0
-    for k, (layer, turbulence) in enumerate(zip(model.layers, model.turbulence, strict=True)):
-        sides = angles * layer.distance / turbulence.spacing + 2 * AROUND
-        drift = float(np.hypot(*layer.wind)) * o.duration / turbulence.spacing
-        total += float(sides.prod() + drift * sides.mean()) * (k not in omitted)
-    return total
-
-
-def _lattice(a: Calibrated) -> float:
-    return a.model.parameters.lattice or FIDELITIES[a.model.parameters.fidelity].lattice
-
-
-def _opacity_share(a: Calibrated) -> float:
-    """d ln <e^-tau> / d ln PWV."""
-    step = 1e-3
-    return (
-        abs(
-            float(
-                a.model.band.log_transmission_difference(
-                    a.model.pwv, a.model.pwv * step, a.elevations[0]
-                )
-            )
-        )
-        / step
-    )
-
-
-def _nodes(
-    context: Context, a: Calibrated, first: AtmosphereModel, coarser: Sequence[float]
-) -> Effect:
-    """Nodes and steps in time."""
-    p = a.model.parameters
-    xi, eta = spread_evenly(context.first.focalplane.xi, context.first.focalplane.eta)
-    left = a.kelvin * differential_rms(xi, eta, a.layers, a.model.plane.stretch)
-    left = math.hypot(left, _gain_scatter(context, a) * a.rms)
-    left = max(left, 0.01 * a.rms if len(xi) == 1 else 0.0)
-    correlated = _longest(context, a)
-    choices = [full(f"within {p.tolerance:g} of what the detectors' mean leaves")]
-    text = (
-        "(sqrt 2 + 0.1) tolerance x rms left after subtraction of the detectors' mean: nodes, steps"
-        " in time, mean emission"
-    )
-    now = _points(context, first, p.tolerance)
-    for tolerance in coarser:
-        rms = 1.52 * (tolerance + p.tolerance) * left
-        bound = context.bound(rms, correlated, common=True) | {
-            "psd": (rms / max(context.noise, a.rms, 1e-30)) ** 2
-        }
-        saved = 0.0
-        if now * POINT * len(a.layers) > PAYS and context.affords(bound):
-            saved = POINT * len(a.layers) * (now - _points(context, first, tolerance))
-        settings = {"tolerance": tolerance}
-        choices.append(
-            Choice(
-                "coarse",
-                f"within {tolerance:g}",
-                settings,
-                bound=bound,
-                formula=text,
-                seconds=saved,
-            )
-        )
-    return Effect(
-        "detector nodes and time steps", tuple(choices), context.bound(left, correlated, True), text
-    )
-
-
-def _lattice_error(a: Calibrated, in_proportion: InProportion) -> Effect:
-    fidelity = a.model.parameters.fidelity
-    text = "half the covariance's relative error x rms: how much the ensemble's rms is off"
-    wrong = in_proportion(0.5 * FIDELITIES[fidelity].structure_error)
-    return Effect(
-        "turbulence lattice", (full(f"{fidelity}, {_lattice(a):g} of the beam"),), wrong, text
-    )
-
-
-def _spectral(context: Context, a: Calibrated, in_proportion: InProportion) -> list[Effect]:
-    """The band's spectrum and ozone: the fluctuation's error by radiative transfer at one
-    frequency, and without O3.
-    """
-    band, pwv, elevation = context.first.instrument.band, a.model.pwv, a.elevations[0]
-    layers = replace(a.model.profile.layers, spectra=absorption_of(a.model.parameters))
-    middle = Band(
-        name="middle", low=f"{band.centre - 0.25e9!r} Hz", high=f"{band.centre + 0.25e9!r} Hz"
-    )
-    right = _slope(BandTransfer(band, layers), pwv, elevation)
-    effects = []
-    for name, what, without, other in (
-        (
-            "spectral resolution",
-            "the band, in cells of 0.5 GHz",
-            "at the band's centre alone",
-            BandTransfer(middle, layers),
-        ),
-        (
-            "ozone",
-            "the profile's",
-            "without ozone",
-            BandTransfer(band, replace(layers, o3=np.zeros_like(layers.o3))),
-        ),
-    ):
-        text = (
-            "|ratio of dT/dPWV / e^-tau - 1| x rms of the fluctuation, by radiative transfer"
-            f" {without}"
-        )
-        bound = in_proportion(abs(_slope(other, pwv, elevation) / right - 1))
-        effects.append(Effect(name, (full(what),), bound, text))
-    return effects
-
-
 def _slope(transfer: BandTransfer, pwv: float, elevation: float) -> float:
     """dT/dPWV over <e^-tau>."""
     (low, log_t, _), (high, _, _) = (
@@ -512,45 +242,230 @@ def _slope(transfer: BandTransfer, pwv: float, elevation: float) -> float:
     return (high - low) / (0.02 * pwv) / math.exp(log_t)
 
 
-def _slopes(context: Context, a: Calibrated) -> list[Effect]:
-    """Emission and opacity over the elevations of the scan. The high-pass filter takes the mean
-    emission out.
+@dataclass(frozen=True)
+class AtmosphereBounds:
+    """Bounds of the effects on the products.
+
+    ``calibrated``: of the observation at the lowest elevation. ``first``: the model of the first
+    observation.
     """
-    low, high = max(a.elevations[0], math.radians(4.5)), a.elevations[1]
-    for o in context.observations:
-        low, high = min(low, float(o.elevation.min())), max(high, float(o.elevation.max()))
-    band, pwv = a.model.band, a.model.pwv
-    emission = abs(float(band.emission(pwv, low) - band.emission(pwv, high)))
-    opacity = abs(float(band.log_transmission(pwv, low) - band.log_transmission(pwv, high)))
-    plane = context.first.focalplane
-    share = float((plane.illumination_efficiency / plane.main_beam_efficiency).max()) / float(
-        band.transmission(pwv, low)
-    )
-    size = context.bound(emission * share, context.first.duration, True)
-    gone = "removed by the high-pass filter" if context.cut > 0 else "in float64 beside the stream"
-    noise = context.bound(
-        opacity / 2 * math.sqrt(sum(t.loudest**2 for t in context.traits.values()))
-    ) | {"psd": opacity}
-    return [
-        Effect(
-            "mean emission with elevation",
-            (full(gone),),
-            size,
-            "difference of the band's emission over the elevations seen",
-        ),
-        Effect(
-            "opacity with elevation",
-            (full("calibrated at the current elevation"),),
-            noise | context.sky_error(opacity),
-            "difference of the opacity over the elevations seen, x half the noise, x the sky",
-        ),
-    ]
+
+    context: Context
+    calibrated: Calibrated
+    first: AtmosphereModel
+
+    @cached_property
+    def left(self) -> list[float]:
+        """Rms of each layer in one calibrated sample after the common mode is gone, K: what the
+        detectors see differently, and what they see with unequal gains.
+        """
+        a = self.calibrated
+        each = [a.of_layer(k) for k in range(len(a.layers))]
+        if not self.context.removes_common:
+            return each
+        return [self._differences([m], whole) for m, whole in zip(a.layers, each, strict=True)]
+
+    def _differences(self, layers: list[Layer], whole: float) -> float:
+        """Rms that is left of some layers, whose rms is ``whole``, without the common mode."""
+        a, plane = self.calibrated, self.context.first.focalplane
+        gains = math.hypot(a.uneven, *(t.gain_error for t in self.context.traits.values()))
+        left = differential_rms(*spread_evenly(plane.xi, plane.eta), layers, a.model.plane.stretch)
+        return math.hypot(a.kelvin * left, gains * whole)
+
+    @cached_property
+    def averages(self) -> list[float]:
+        """Rms of each layer in a pixel over that in a sample."""
+        context, a = self.context, self.calibrated
+        if (key := str(context.coverage)) not in a.averages:
+            a.averages[key] = shares(context, a.layers, a.components, self.first.plane)
+        return a.averages[key]
+
+    def _correlated(self, layer: Layer) -> float:
+        """Integral of the correlation over time, s: the beam or what of the outer scale the filters
+        pass, over the wind's speed.
+        """
+        speed = max(float(np.hypot(*layer.wind)), 0.1)
+        slow = max(4 * layer.sigma, min(layer.outer_scale, 20 * layer.sigma)) / speed
+        return min(slow, 1 / self.context.cut) if self.context.cut > 0 else slow
+
+    @cached_property
+    def _longest(self) -> float:
+        """Longest correlation time of the layers, s."""
+        return max(map(self._correlated, self.calibrated.layers))
+
+    def _points(self, tolerance: float) -> float:
+        """Points (nodes x times) at which a layer is evaluated, per sample; of the first scan."""
+        chosen = self.first.resolution(tolerance)
+        share = sum(1 / s for s in chosen.steps) / len(chosen.steps)
+        return len(chosen.nodes.xi) * share / self.context.first.n_detectors
+
+    def layers(self) -> list[Effect]:
+        """Layers that may be omitted one by one."""
+        context, a = self.context, self.calibrated
+        text = "1.25 p PWV dT/dPWV epsilon / (zeta e^-tau) kappa_l a_l x " + (
+            "rms left of the layer after subtraction of the detectors' mean"
+            if context.removes_common
+            else "rms behind the beam"
+        )
+        text += OTHER_MODES if context.turns else ""
+        p, effects = a.model.parameters, []
+        saves = LAYER if self._points(p.tolerance) > DENSE else None
+        for k, layer in enumerate(a.layers):
+            bound, what = context.behind_modes(self.of_layers[k]), f"at {layer.height:.0f} m"
+            choices = [full(what + (": left out by the pipeline" if k in p.omit else ""))]
+            if k not in p.omit and not p.outputs:
+                choices.append(Choice("dropped", "left out", {"omit": [k]}, bound=bound,
+                                      formula=text, saves=saves))  # fmt: skip
+            effects.append(Effect(f"layer {k}", tuple(choices), bound, text))
+        return effects
+
+    @cached_property
+    def of_layers(self) -> list[dict[str, float]]:
+        """Bound on each layer's part of the products."""
+        context, a, bounds = self.context, self.calibrated, []
+        for k, layer in enumerate(a.layers):
+            rms = SAFETY * self.left[k]
+            bound = context.bound(rms, self._correlated(layer), common=True)
+            bound["map_rms"] = min(bound["map_rms"], self.averages[k] * rms)
+            if context.before_filters:
+                bound["tod"] = SAFETY * a.of_layer(k)
+            share = abs(a.model.layers[k].amplitude * float(a.model.kappa["opacity"][k]))
+            share *= a.model.fluctuation.scale * math.sqrt(a.variances[k])
+            bound |= context.sky_error(PASSAGES * share * self._opacity_slope)
+            bound["psd"] = min(SAFETY**2 * self._spectral_shares[k], 1.0)
+            bounds.append(bound)
+        return bounds
+
+    @cached_property
+    def _opacity_slope(self) -> float:
+        """d ln <e^-tau> / d ln PWV."""
+        model, step = self.calibrated.model, 1e-3
+        low = self.calibrated.elevations[0]
+        change = model.band.log_transmission_difference(model.pwv, model.pwv * step, low)
+        return abs(float(change)) / step
+
+    @cached_property
+    def _spectral_shares(self) -> list[float]:
+        """Largest share that each layer has of the stream's power in a range of frequency (20 from
+        1 / duration to Nyquist), white noise included."""
+        o, a, grid = self.context.first, self.calibrated, np.array([0.0, 1.0])
+        if o.duration * o.sample_rate > 4:
+            grid = np.geomspace(1 / o.duration, o.sample_rate / 2, 21)
+        power = np.array([[a.faster(k, float(f)) ** 2 for f in grid] for k in range(len(a.layers))])
+        each = np.maximum(power[:, :-1] - power[:, 1:], 0.0)
+        total = each.sum(axis=0) + self.context.noise**2 * 2 * np.diff(grid) / o.sample_rate
+        return [float(v) for v in (each / np.maximum(total, 1e-300)).max(axis=1)]
+
+    def without(self) -> dict[str, float]:
+        """All layers; the mean emission, where no filter takes it out."""
+        found, mean = add(*self.of_layers), self.context.mean_emission
+        if not any(t.response for t in self.context.traits.values()):
+            found = add(found, {"tod": mean, "map_rms": mean})
+        return found
+
+    def _in_proportion(self, share: float) -> dict[str, float]:
+        """Bound of an error that is ``share`` of the fluctuation."""
+        sample = math.hypot(*self.left)
+        pixel = math.hypot(*(x * y for x, y in zip(self.left, self.averages, strict=True)))
+        bound = self.context.bound(SAFETY * share * sample, self._longest, common=True)
+        bound["map_rms"] = min(bound["map_rms"], SAFETY * share * pixel)
+        return bound | {"psd": 2 * share + share**2}
+
+    def nodes(self) -> Effect:
+        """Nodes of the field and steps in time."""
+        context, a = self.context, self.calibrated
+        p, one = a.model.parameters, context.first.n_detectors == 1
+        left = max(self._differences(a.layers, a.rms), 0.01 * a.rms if one else 0.0)
+        choices = [full(f"within {p.tolerance:g} of what the detectors' mean leaves")]
+        text = (
+            "(sqrt 2 + 0.1) tolerance x rms left after subtraction of the detectors' mean: nodes,"
+            " steps in time, mean emission"
+        )
+        number = len(self.first.resolution(p.tolerance).nodes.xi)
+        for tolerance in (t for t in COARSER if t > p.tolerance):
+            rms = 1.52 * (tolerance + p.tolerance) * left
+            bound = context.bound(rms, self._longest, common=True)
+            bound["psd"] = (rms / max(context.noise, a.rms, 1e-30)) ** 2
+            saves = None
+            if number >= MANY_NODES and context.affords(bound):
+                fewer = len(self.first.resolution(tolerance).nodes.xi)
+                saves = COARSER[tolerance] if fewer <= min(number / 2, MOST_NODES) else None
+            choices.append(Choice("coarse", f"within {tolerance:g}", {"tolerance": tolerance},
+                                  bound=bound, formula=text, saves=saves))  # fmt: skip
+        size = context.bound(left, self._longest, True)
+        return Effect("detector nodes and time steps", tuple(choices), size, text)
+
+    def lattice(self) -> Effect:
+        """Lattice of the turbulence."""
+        p = self.calibrated.model.parameters
+        level = FIDELITIES[p.fidelity]
+        text = "half the covariance's relative error x rms: how much the ensemble's rms is off"
+        what = full(f"{p.fidelity}, {p.lattice or level.lattice:g} of the beam")
+        wrong = self._in_proportion(0.5 * level.structure_error)
+        return Effect("turbulence lattice", (what,), wrong, text)
+
+    def spectral(self) -> list[Effect]:
+        """The band's spectrum and ozone: the fluctuation's error by radiative transfer at one
+        frequency, and without O3.
+        """
+        a, band = self.calibrated, self.context.first.instrument.band
+        layers = replace(a.model.profile.layers, spectra=absorption_of(a.model.parameters))
+        low, high = (f"{band.centre + side!r} Hz" for side in (-0.25e9, 0.25e9))
+        bare = replace(layers, o3=np.zeros_like(layers.o3))
+        middle = BandTransfer(Band(name="middle", low=low, high=high), layers)
+        right = _slope(BandTransfer(band, layers), a.model.pwv, a.elevations[0])
+        cells, centre = "the band, in cells of 0.5 GHz", "at the band's centre alone"
+        effects = []
+        for name, what, without, other in (
+            ("spectral resolution", cells, centre, middle),
+            ("ozone", "the profile's", "without ozone", BandTransfer(band, bare)),
+        ):
+            text = (
+                "|ratio of dT/dPWV / e^-tau - 1| x rms of the fluctuation, by radiative transfer"
+                f" {without}"
+            )
+            share = abs(_slope(other, a.model.pwv, a.elevations[0]) / right - 1)
+            effects.append(Effect(name, (full(what),), self._in_proportion(share), text))
+        return effects
+
+    def slopes(self) -> list[Effect]:
+        """Emission and opacity over the elevations of the scan. The high-pass filter takes the mean
+        emission out.
+        """
+        context, model = self.context, self.calibrated.model
+        low = max(self.calibrated.elevations[0], math.radians(4.5))
+        high = max(
+            self.calibrated.elevations[1], *(o.elevation.max() for o in context.observations)
+        )
+        low = min(low, *(float(o.elevation.min()) for o in context.observations))
+        band, pwv, plane = model.band, model.pwv, context.first.focalplane
+        emission = abs(float(band.emission(pwv, low) - band.emission(pwv, high)))
+        opacity = abs(float(band.log_transmission(pwv, low) - band.log_transmission(pwv, high)))
+        share = float((plane.illumination_efficiency / plane.main_beam_efficiency).max())
+        share /= float(band.transmission(pwv, low))
+        size = context.bound(emission * share, context.first.duration, True)
+        filtered = context.cut > 0
+        gone = "removed by the high-pass filter" if filtered else "in float64 beside the stream"
+        loudest = math.hypot(*(t.loudest for t in context.traits.values()))
+        noise = context.bound(opacity / 2 * loudest) | {"psd": opacity}
+        return [
+            Effect(
+                "mean emission with elevation",
+                (full(gone),),
+                size,
+                "difference of the band's emission over the elevations seen",
+            ),
+            Effect(
+                "opacity with elevation",
+                (full("calibrated at the current elevation"),),
+                noise | context.sky_error(opacity),
+                "difference of the opacity over the elevations seen, x half the noise, x the sky",
+            ),
+        ]
 
 
 class ScreensPlanning(Planning[Any]):
-    """A cost for the whole run."""
+    """The fields and the tiles of the turbulence about them."""
 
     of = "zonda.operators.atmosphere.screens:AtmosphereScreens"
-    cost = Cost(once=0.3, kernel="python")
     holds = 100_000_000
-    """The fields and the tiles of the turbulence about them."""

@@ -1,4 +1,4 @@
-"""Planning of the detectors' effects: bounds, costs and memory (`core.plan`)."""
+"""Planning of the detectors' effects: bounds and memory (`core.plan`)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ import math
 import numpy as np
 
 from zonda.core.observation import Observation
-from zonda.core.plan.calibration import calibration
-from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Cost, Effect, Estimate, Traits, full
+from zonda.core.plan.context import Context, calibration
+from zonda.core.plan.estimate import Effect, Estimate, Traits, full
 from zonda.core.plan.planning import Planning
 
 from .crosstalk import Crosstalk, Shares, neighbours, read_shares
 from .gain_drift import GainDrift, grid
 from .glitches import REACH, Glitches
-from .time_constant import REACH as REMEMBERED
 from .time_constant import TimeConstant
 
 
@@ -44,9 +42,7 @@ class GainPlanning(Planning[GainDrift]):
         text = (
             "rms of the gains x (rms of the stream + mean emission); of the sky, rms of the gains"
         )
-        return Estimate(
-            (Effect("gain drift", (full("exact"),), size, text),), Cost(fixed=0.01, per_sample=2e-9)
-        )
+        return Estimate((Effect("gain drift", (full("exact"),), size, text),))
 
 
 class TimeConstantPlanning(Planning[TimeConstant]):
@@ -62,16 +58,8 @@ class TimeConstantPlanning(Planning[TimeConstant]):
         frequency = min(0.71 * speed / float(o.focalplane.fwhm.min()), o.sample_rate / 2)
         loss = 1 - 1 / math.hypot(1, 2 * math.pi * frequency * tau)
         text = "1 - |1 / (1 + 2 pi i f tau)| at f = 0.71 v / FWHM"
-        effects = (
-            Effect(
-                "time constant",
-                (full("exact below 0.46 of the sample rate"),),
-                context.sky_error(loss),
-                text,
-            ),
-        )
-        remembered = REMEMBERED * tau * o.sample_rate
-        return Estimate(effects, Cost(fixed=0.001, per_sample=3e-8 * (1 + remembered / 2048)))
+        exact = full("exact below 0.46 of the sample rate")
+        return Estimate((Effect("time constant", (exact,), context.sky_error(loss), text),))
 
 
 class CrosstalkPlanning(Planning[Crosstalk]):
@@ -97,11 +85,8 @@ class CrosstalkPlanning(Planning[Crosstalk]):
             "largest sum of a detector's shares x (rms of the stream + mean emission); of the sky,"
             " that sum"
         )
-        effect = Effect("crosstalk", (full("exact"),), size | context.sky_error(largest), text)
-        return Estimate(
-            (effect,),
-            Cost(fixed=0.01, per_sample=1e-9 + 0.3e-9 * len(rows) / max(o.n_detectors, 1)),
-        )
+        size |= context.sky_error(largest)
+        return Estimate((Effect("crosstalk", (full("exact"),), size, text),))
 
     def _shares(self, observation: Observation) -> Shares:
         step, plane = self.operator, observation.focalplane
@@ -123,12 +108,10 @@ class GlitchPlanning(Planning[Glitches]):
         return int(64 * observation.n_detectors * (self.operator.rate * span + 8))
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size and cost."""
-        step, o = self.operator, context.first
-        size = context.bound(self._rms(o), step.decay)
+        """Its size."""
+        size = context.bound(self._rms(context.first), self.operator.decay)
         text = "sqrt(rate decay) amplitude (Campbell), at the detector, over zeta e^-tau"
-        cost = Cost(fixed=0.01 + 1e-5 * o.n_detectors, per_sample=1.5e-9)
-        return Estimate((Effect("glitches", (full("exact"),), size, text),), cost, size)
+        return Estimate((Effect("glitches", (full("exact"),), size, text),), without=size)
 
     def _rms(self, observation: Observation) -> float:
         step = self.operator

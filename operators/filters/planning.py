@@ -1,4 +1,4 @@
-"""Planning of the filters: bounds, coarser forms, costs and memory (`core.plan`)."""
+"""Planning of the filters: bounds, coarser forms and memory (`core.plan`)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from zonda.core.knobs import Knob
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.observation import Observation
 from zonda.core.plan.context import LEAKS, Context
-from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
+from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, full
 from zonda.core.plan.planning import Planning
 
 from .bessel import amplitude
@@ -20,15 +20,21 @@ from .gram import MOST_COPIED
 from .highpass import HighpassFilter
 from .rows import ROWS
 
-LANCZOS = 0.5e-9
-"""Seconds per sample of one Lanczos step, which reads the stream once."""
+COARSE_KNOTS, LEAST_KNOTS = 8, 0.02
+"""Knots per cycle of the cut of the coarser form; knots per sample that it must save."""
 
-FUNCTION = 0.55e-9
-"""Seconds per sample of one function of time that is fitted and removed."""
+KNOTS = Saving("atlast_reduced", 0.022)
+"""Of a third of the knots. Half of them save 1.5 %."""
+
+COARSE_RESIDUAL = 1e-2
+RESIDUAL = Saving("atlast_reduced", 0.042)
+"""Of `COARSE_RESIDUAL`. 1e-4 saves 1.7 %."""
 
 STANDS_OUT = 0.3
 """Ratio of the noise's singular values to the common mode's up to which the second is far from
 `gap`, were the scan's common mode half of the ensemble's."""
+
+RESIDUALS = "rms of the stream behind the high-pass filter x residual / (1 - gap^2)"
 
 START = 1e-3
 """Residual of the first vector, the detectors' mean."""
@@ -62,44 +68,26 @@ class HighpassPlanning(Planning[HighpassFilter]):
         return 120 * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost, and the saving and error of fewer knots; the Bessel filter has none."""
+        """The error of fewer knots; the Bessel filter has none."""
         if self.operator.response == "bessel":
-            return Estimate((), Cost(fixed=0.01, per_time=2e-7, per_sample=2e-8))
+            return Estimate()
         o, cut, full_q = context.first, self.operator.frequency, self.operator.oversampling
-        knots = full_q * cut * o.duration
-        cost = Cost(fixed=0.01, per_time=5e-8, per_sample=2e-9 + 2e-8 * knots / o.n_samples)
         choices = [full(f"{full_q:g} knots per cycle of the cut")]
-        low, text = low_part(context, cut), DECIMATION
-        for q in self.coarser("oversampling"):
-            error = sum(
-                LEAKS * math.hypot(low * images(x)[0], aliased(context, cut, x))
-                for x in (q, full_q)
+        if (q := COARSE_KNOTS) < full_q:
+            low, both = low_part(context, cut), (q, full_q)
+            error = LEAKS * sum(
+                math.hypot(low * images(x)[0], aliased(context, cut, x)) for x in both
             )
-            share = sum(images(x)[1] for x in (q, full_q))
+            share = sum(images(x)[1] for x in both)
             bound = context.bound(error, 1 / cut, common=True)
             bound |= context.sky_error(share) | {"psd": 2 * share + share**2}
-            saved = (
-                2e-8 * (knots - q * cut * o.duration) * o.n_detectors * len(context.observations)
-            )
-            settings = {"oversampling": q}
-            choices.append(
-                Choice(
-                    "coarse",
-                    f"{q:g} knots per cycle",
-                    settings,
-                    bound=bound,
-                    formula=text,
-                    seconds=saved,
-                )
-            )
+            saves = KNOTS if (full_q - q) * cut / o.sample_rate > LEAST_KNOTS else None
+            choices.append(Choice("coarse", f"{q:g} knots per cycle", {"oversampling": q},
+                                  bound=bound, formula=DECIMATION, saves=saves))  # fmt: skip
         size = context.bound(context.fluctuation, o.duration, common=True)
-        effect = Effect(
-            "high-pass decimation",
-            tuple(choices),
-            size,
-            "rms of the stream: its low part removed wrongly altogether",
-        )
-        return Estimate((effect,), cost, _left_in(context))
+        text = "rms of the stream: its low part removed wrongly altogether"
+        effect = Effect("high-pass decimation", tuple(choices), size, text)
+        return Estimate((effect,), without=_left_in(context))
 
 
 DECIMATION = (
@@ -117,7 +105,7 @@ def images(q: float) -> tuple[float, float]:
 
 
 def aliased(context: Context, cut: float, q: float) -> float:
-    """rms of what the coarse series takes for the low part, K: what lies at the places of the
+    """Rms that the coarse series takes for the low part, K: the stream at the places of the
     images, weighed as they are; the mean of (k / K)^8 over the cosines is 1 / 9."""
     top = 0.5 * context.first.sample_rate
     if (q - 1) * cut >= top:
@@ -154,48 +142,22 @@ class DetrendPlanning(Planning[Any]):
     of = "zonda.operators.filters.detrend:Detrend"
 
     def memory(self, observation: Observation) -> int:
-        """As of `polynomial_memory`."""
-        return polynomial_memory(self.operator, observation)
+        """Bytes: the polynomials, and a row in float64; with a mask, its pointing, and where some
+        rows are in it.
+        """
+        masked, order = 3 + 2.5 * ROWS if self.operator.mask else 0.0, self.operator.order
+        return math.ceil(8 * (float(order) + 5 + masked) * observation.n_samples)
 
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        return Estimate((), polynomial_cost(self.operator.order))
 
-
-class PolynomialPlanning(Planning[Any]):
+class PolynomialPlanning(DetrendPlanning):
     """Exact: it has no coarser form."""
 
     of = "zonda.operators.filters.polynomial:PolynomialFilter"
 
-    def memory(self, observation: Observation) -> int:
-        """As of `polynomial_memory`."""
-        return polynomial_memory(self.operator, observation)
-
     def estimate(self, context: Context) -> Estimate:
-        """Its cost; leaving it out leaves the mean and the slow part in."""
-        cost, left = polynomial_cost(self.operator.order), _left_in(context)
-        return Estimate(
-            (Effect("polynomials", (full(f"exact, order {self.operator.order}"),), left, LEFT_IN),),
-            cost,
-            left,
-        )
-
-
-def polynomial_cost(order: int) -> Cost:
-    """Of polynomials that are fitted to each detector and removed."""
-    functions = order + 1
-    return Cost(
-        fixed=0.01, per_time=2e-8 + 8e-9 * functions, per_sample=3.5e-9 + FUNCTION * functions
-    )
-
-
-def polynomial_memory(operator: Any, observation: Observation) -> int:
-    """Bytes: the polynomials, and a row in float64; with a mask, its pointing, and where some rows
-    are in it.
-    """
-    masked = 3 + 2.5 * ROWS if operator.mask else 0.0
-    order: int = operator.order
-    return math.ceil(8 * (order + 5 + masked) * observation.n_samples)
+        """Leaving it out leaves the mean and the slow part in."""
+        exact, left = full(f"exact, order {self.operator.order}"), _left_in(context)
+        return Estimate((Effect("polynomials", (exact,), left, LEFT_IN),), without=left)
 
 
 class GroundPlanning(Planning[Any]):
@@ -209,22 +171,17 @@ class GroundPlanning(Planning[Any]):
         return 8 * (2 * trend + 8) * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost; leaving it out leaves the mean and the template in."""
-        trend: int = self.operator.trend
-        cost = Cost(fixed=0.01, per_time=1e-7 + 2e-8 * trend, per_sample=3e-9 + FUNCTION * trend)
+        """Leaving it out leaves the mean and the template in."""
         left = _left_in(context)
-        return Estimate(
-            (Effect("template in azimuth", (full("exact"),), left, LEFT_IN),), cost, left
-        )
+        effect = Effect("template in azimuth", (full("exact"),), left, LEFT_IN)
+        return Estimate((effect,), without=left)
 
 
 LEFT_IN = "rms of the stream + mean emission, which no filter before it takes; all of the sky"
 
 
 def _left_in(context: Context) -> dict[str, float]:
-    """Bound on what is in the stream and the map where a filter that removes the mean is left
-    out.
-    """
+    """Bound on the stream and the map if a filter that removes the mean is left out."""
     size = context.bound(context.fluctuation, context.first.duration, common=True)
     return {m: size[m] + context.mean_emission for m in size} | context.sky_error(1.0)
 
@@ -233,7 +190,6 @@ class DesplinePlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
     of = "zonda.operators.filters.despline:Despline"
-    cost = Cost(fixed=0.01, per_time=1e-7, per_sample=3.5e-9 + 4 * FUNCTION)
 
     def memory(self, observation: Observation) -> int:
         """The splines at each sample, and what they are made from; a row in float64."""
@@ -244,7 +200,6 @@ class TaperPlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
     of = "zonda.operators.filters.taper:Taper"
-    cost = Cost(fixed=0.001, per_time=2e-8, per_sample=1e-9)
 
     def memory(self, observation: Observation) -> int:
         """The window."""
@@ -282,49 +237,28 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         return 1 if self.operator.method == "mean" else 0
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost, and the saving and error of larger residuals."""
-        modes, tightest, svd = (
-            self.operator.modes,
-            self.operator.residual,
-            self.operator.method == "svd",
-        )
-        count = steps(tightest, modes, context) if svd else 1.0
-        cost = Cost(fixed=0.01, per_sample=2e-9 + LANCZOS * count)
+        """The error of larger residuals."""
+        step, tightest = self.operator, self.operator.residual
         slow = 1 / context.cut if context.cut > 0 else context.first.duration
         size = context.bound(context.passed, slow, common=True)
         without = size | context.sky_error(1.0)
-        if not svd:
-            return Estimate((), cost, without)
-        choices = [full(f"residual {tightest:g}")]
-        text = "rms of the stream behind the high-pass filter x residual / (1 - gap^2)"
-        for residual in self.coarser("residual") if self._stands_out(context) else ():
-            share = (residual + tightest) / (1 - self.operator.gap**2)
-            bound = context.bound(share * context.passed, slow, common=True) | {
-                "psd": 2 * share + share**2
-            }
-            bound |= context.sky_error(share)
-            saved = LANCZOS * (count - steps(residual, modes, context)) * context.samples
-            settings = {"residual": residual}
-            choices.append(
-                Choice(
-                    "coarse",
-                    f"residual {residual:g}",
-                    settings,
-                    bound=bound,
-                    formula=text,
-                    seconds=saved,
-                )
-            )
-        effect = Effect(
-            "common-mode residual",
-            tuple(choices),
-            size,
-            "rms of the stream: no common mode removed at all",
-        )
-        return Estimate((effect,), cost, without)
+        if step.method != "svd":
+            return Estimate(without=without)
+        choices, text = [full(f"residual {tightest:g}")], RESIDUALS
+        if (residual := COARSE_RESIDUAL) > tightest and self._stands_out(context):
+            share = (residual + tightest) / (1 - step.gap**2)
+            bound = context.bound(share * context.passed, slow, common=True)
+            bound |= context.sky_error(share) | {"psd": 2 * share + share**2}
+            coarse, fine = (steps(r, step.modes, context) for r in (residual, tightest))
+            choices.append(Choice("coarse", f"residual {residual:g}", {"residual": residual},
+                                  bound=bound, formula=text,
+                                  saves=RESIDUAL if coarse < fine else None))  # fmt: skip
+        text = "rms of the stream: no common mode removed at all"
+        effect = Effect("common-mode residual", tuple(choices), size, text)
+        return Estimate((effect,), without=without)
 
     def _stands_out(self, context: Context) -> bool:
-        """Whether one mode alone is removed, which stands far above the noise, of the complete
+        """True if one mode alone is removed, which stands far above the noise, of the complete
         signal alone. Else the second singular value is near the first, which a large residual does
         not show: another number of modes is then removed."""
         own = any(
@@ -343,9 +277,7 @@ def steps(residual: float, modes: int, context: Context) -> int:
 
 
 def shrinkage(context: Context) -> float:
-    """Square of the ratio of the noise's singular values to that of what all detectors see
-    alike.
-    """
+    """Square of the ratio of the noise's singular values to that of the common mode."""
     n_det, noise = context.first.n_detectors, max(context.noise, 1e-12)
     common = (
         max((context.passed / LEAKS) ** 2 - noise**2, 0.0)

@@ -1,12 +1,11 @@
-"""Planning of the steps that read and write files: what they read and what they cost."""
+"""Planning of the steps that read and write files: their streams and memory."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from zonda.core.observation import Observation
-from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Cost, Estimate, Traits
+from zonda.core.plan.estimate import Traits
 from zonda.core.plan.planning import Planning
 
 from .load_tod import LoadTOD
@@ -16,34 +15,26 @@ from .save_tod import SaveTOD
 
 
 class SaveMapPlanning(Planning[SaveMap]):
-    """A cost for every map."""
+    """It holds a map while it is written."""
 
     of = SaveMap
     holds = 20_000_000
     """A map and its copy in the file's units."""
 
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        return Estimate((), Cost(once=0.02 * (1 + len(context.work.signals)), kernel="python"))
-
 
 class SaveTODPlanning(Planning[SaveTOD]):
-    """It reads the streams; its cost is that of writing them."""
+    """It reads the streams."""
 
     of = SaveTOD
     reads_streams = True
 
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        return Estimate((), Cost(0.1, 0.0, 6e-9 * len(self.operator.streams)))
-
 
 class LoadTODPlanning(Planning[LoadTOD]):
-    """What the recorded stream brings into the map: the noise that the file states, fluctuations as
-    they are in parts of it.
-    """
+    """A recorded stream: the noise that the file states, fluctuations measured in parts of it."""
 
     of = LoadTOD
+    holds = 40_000_000
+    """The library that reads the file, and the parts in which it is read."""
 
     def traits(self, observation: Observation) -> Traits:
         """The white noise of the file's NET; the rms of parts of the first scan's stream."""
@@ -61,11 +52,3 @@ class LoadTODPlanning(Planning[LoadTOD]):
             return Traits(rms=rms)
         each[~use] = each[use].min()  # they are in no map
         return Traits(noise=float(each.min()), each=each, rms=rms)
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost: the file is opened, and each sample read once."""
-        return Estimate((), Cost(0.3, 0.5e-6, 8e-9 if self.operator.signal is not None else 0.0))
-
-    def memory(self, observation: Observation) -> int:
-        """What the library that reads the file holds, and the parts in which it is read."""
-        return 40_000_000

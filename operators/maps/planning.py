@@ -1,12 +1,11 @@
-"""Planning of the map makers: what other steps need to know of the map, its cost and its memory."""
+"""Planning of the map makers: pixels, weights and memory."""
 
 from __future__ import annotations
 
 import math
 
 from zonda.core.data import Observation
-from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Cost, Estimate, Traits
+from zonda.core.plan.estimate import Traits
 from zonda.core.plan.planning import Planning
 
 from .bin_map import BinMap
@@ -14,7 +13,7 @@ from .grid import TangentGrid, in_frame
 
 
 class BinMapPlanning(Planning[BinMap]):
-    """The cost grows with the samples, the memory with the pixels."""
+    """The memory grows with the pixels."""
 
     of = BinMap
     smaller = "choose a larger pixel or a smaller width"
@@ -33,14 +32,6 @@ class BinMapPlanning(Planning[BinMap]):
         return Traits(
             pixel=side, weighs=step.weights == "inverse_variance" and step.contents == "all"
         )
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        n, more = self.operator.grid.n_pixels, 2e-8 if self.operator.crosslinking else 0.0
-        if self.operator.stokes == "IQU":
-            each, shared = (1.6e-8, 0.6) if self.operator.nside else (1.0e-8, 0.4)
-            return Estimate((), Cost(0.01 + 3e-6 * n, 3e-7, more + each, shared=shared))
-        return Estimate((), Cost(0.01 + 5e-8 * n, 1e-7, more + 3.2e-9))
 
     def shares_blocks(self, observation: Observation) -> bool:
         """The pixels, which `looking.Looking` finds once; those of an image of I are found where

@@ -1,19 +1,17 @@
-"""Planning of the detectors' noise: bounds, coarser forms, costs and memory (`core.plan`)."""
+"""Planning of the detectors' noise: bounds, coarser forms and memory (`core.plan`)."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from zonda.core.errors import ZondaError
 from zonda.core.knobs import Knob
 from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.observation import Observation, WhiteLevel
 from zonda.core.plan.context import LEAKS, OTHER_MODES, Context
-from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full
+from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, full
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
@@ -21,6 +19,9 @@ from .one_over_f import PowerLawFilter
 from .pink import PinkNoise, PinkSpectrum, level_of
 from .streams import CHECKPOINT
 from .white import WhiteNoise
+
+NONE = Saving("deep_field", 0.16)
+"""Of no pink noise. Fewer poles save 1.2 % at most."""
 
 
 class WhitePlanning(Planning[WhiteNoise]):
@@ -34,10 +35,6 @@ class WhitePlanning(Planning[WhiteNoise]):
         """
         each = calibrated(observation.noise_levels[self.operator.label], observation)
         return Traits(noise=float(each.min(initial=np.inf)) if each.size else 0.0, each=each)
-
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        return Estimate((), Cost(per_sample=2e-9, kernel="random"))
 
     def memory(self, observation: Observation) -> int:
         """Amplitudes at the nodes of the mean emission."""
@@ -59,31 +56,22 @@ class PinkPlanning(Planning[PinkNoise]):
 
     def memory(self, observation: Observation) -> int:
         """Filter states that are kept, and the common part."""
-        kept = -(-observation.n_detectors // TILE_DETECTORS) * (
-            observation.n_samples // CHECKPOINT + 3
-        )
-        common = 12 * observation.n_samples if self.operator.shared > 0 else 0
-        if spectrum := PinkSpectrum.of(self.operator, observation):
-            slopes = spectrum.of_detectors(self.operator, observation).slope
-            kept, common = (
-                math.ceil(kept * filters_in_a_tile(slopes)),
-                common * len(np.unique(slopes)),
-            )
-        return (
-            kept * (4 * TILE_DETECTORS * (self.operator.poles + 3) + 300)
-            + common
-            + 80 * observation.n_detectors
-        )
+        pink, n_det, n_samp = self.operator, observation.n_detectors, observation.n_samples
+        kept = -(-n_det // TILE_DETECTORS) * (n_samp // CHECKPOINT + 3)
+        common = 12 * n_samp if pink.shared > 0 else 0
+        if spectrum := PinkSpectrum.of(pink, observation):
+            slopes = spectrum.of_detectors(pink, observation).slope
+            kept = math.ceil(kept * filters_in_a_tile(slopes))
+            common *= len(np.unique(slopes))
+        return kept * (4 * TILE_DETECTORS * (pink.poles + 3) + 300) + common + 80 * n_det
 
     def traits(self, observation: Observation) -> Traits:
         """rms of one calibrated sample, and of its part that is faster than a frequency."""
         spectrum = PinkSpectrum.of(self.operator, observation)
         if spectrum is None:
             return Traits()
-        law, amplitude = (
-            spectrum.filter(self.operator.poles),
-            self._amplitude(spectrum, observation),
-        )
+        law = spectrum.filter(self.operator.poles)
+        amplitude = self._amplitude(spectrum, observation)
         rate, rms = observation.sample_rate, amplitude * math.sqrt(law.gain * law.variance)
         grid = np.geomspace(1e-9, 0.5, 600)
         power = np.abs(_response(law, grid)) ** 2
@@ -98,19 +86,17 @@ class PinkPlanning(Planning[PinkNoise]):
         return Traits(rms=rms, faster=faster)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size and cost; the saving and error of fewer poles (whose first states are drawn
-        anew), or of no pink noise.
-        """
+        """Its size, the error of no pink noise."""
         pink, o = self.operator, context.lowest
         spectrum = PinkSpectrum.of(pink, o)
         if spectrum is None:
-            return Estimate((), Cost(per_sample=0.3e-9))
+            return Estimate()
         law, traits = spectrum.filter(pink.poles), self.traits(o)
         level = self._amplitude(spectrum, o) ** 2 / max(context.noise, 1e-30) ** 2
         assert traits.faster is not None
         passed = LEAKS * traits.faster(context.cut) if context.cut > 0 else traits.rms
         common = pink.shared > 0 and not context.removes_common
-        size = context.bound(passed, correlated=_correlated(law, context), common=common)
+        size = context.bound(passed, _correlated(law, context), common)
         if context.before_filters:
             size["tod"] = traits.rms
         size["psd"] = level * float(law.response(np.array([0.1 / (o.duration * o.sample_rate)]))[0])
@@ -118,65 +104,14 @@ class PinkPlanning(Planning[PinkNoise]):
             "1.5 (2 NET^2 int (f_knee/f)^slope R^2 df)^(1/2), correlated for int |rho| dt; R:"
             " high-pass filter"
         )
-        cost = pole_cost(pink.poles, filters_in_a_tile(spectrum.of_detectors(pink, o).slope))
-        left_out = context.behind_modes(size)
         text += OTHER_MODES if context.turns else ""
-        choices = [full(f"{pink.poles} poles"), *self._coarser(context, spectrum, level)]
+        bound, choices = context.behind_modes(size), [full(f"{pink.poles} poles")]
         if pink.shared == 0 and not context.kept_streams & pink.provides:
             # a common part would be what a singular mode consists of: it is not dropped
-            saved = cost.seconds(context.times, o.n_detectors) + 0.5e-9 * context.samples
             choices.append(
-                Choice(
-                    "dropped", "none", leave_out=True, bound=left_out, formula=text, seconds=saved
-                )
+                Choice("dropped", "none", leave_out=True, bound=bound, formula=text, saves=NONE)
             )
-        return Estimate((Effect("poles", tuple(choices), left_out, text),), cost, size)
-
-    def _coarser(self, context: Context, spectrum: PinkSpectrum, level: float) -> list[Choice]:
-        """Filters of fewer poles; ``level``: of the white noise that they filter, over that of all
-        white noise.
-        """
-        pink, o, choices = self.operator, context.lowest, []
-        law, amplitude = spectrum.filter(pink.poles), self._amplitude(spectrum, o)
-        correlated, common = (
-            _correlated(law, context),
-            pink.shared > 0 and not context.removes_common,
-        )
-        text = (
-            "2 NET^2 (f_knee/f_min)^slope int |H - H_coarse|^2 R^2 df, same innovations; R:"
-            " high-pass filter"
-        )
-        text += OTHER_MODES if context.turns else ""
-        passes = filters_in_a_tile(spectrum.of_detectors(pink, o).slope)
-        seconds = pole_cost(pink.poles, passes).seconds(context.times, o.n_detectors)
-        for poles in self.coarser("poles"):
-            try:
-                coarse = spectrum.filter(poles)
-            except ZondaError:
-                break
-            power = difference(law, coarse, context, o.sample_rate, o.duration)
-            bound = context.bound(
-                amplitude * math.sqrt(power), correlated=correlated, common=common
-            )
-            if context.before_filters:
-                free = difference(
-                    law, coarse, replace(context, traits={}), o.sample_rate, o.duration
-                )
-                bound["tod"] = amplitude * math.sqrt(free)
-            bound["psd"] = psd_error(law, coarse, level)
-            bound = context.behind_modes(bound)
-            saved = seconds - pole_cost(poles, passes).seconds(context.times, o.n_detectors)
-            choices.append(
-                Choice(
-                    "coarse",
-                    f"{poles} poles",
-                    {"poles": poles},
-                    bound=bound,
-                    formula=text,
-                    seconds=saved,
-                )
-            )
-        return choices
+        return Estimate((Effect("poles", tuple(choices), bound, text),), without=size)
 
     def _amplitude(self, spectrum: PinkSpectrum, observation: Observation) -> float:
         """rms of the white noise that is filtered, in the calibrated stream; of the noisiest
@@ -195,18 +130,6 @@ def calibrated(level: WhiteLevel, observation: Observation) -> Floats:
     return np.asarray(level.sky_net(observation) * math.sqrt(observation.sample_rate), np.float64)
 
 
-def pole_cost(poles: int, passes: float = 1.0) -> Cost:
-    """The kernel takes poles four at a time; complex pairs are not counted.
-
-    ``passes``: filters in a tile of detectors (`filters_in_a_tile`).
-    """
-    return Cost(
-        fixed=0.01 * passes,
-        per_sample=(1.7e-9 + 0.75e-9 * math.ceil(poles / 4)) * passes,
-        kernel="random",
-    )
-
-
 def filters_in_a_tile(slopes: Floats) -> float:
     """Different slopes (n_det,) in a tile of detectors, on average: each is a filter that is run
     for the whole tile.
@@ -215,34 +138,6 @@ def filters_in_a_tile(slopes: Floats) -> float:
         slopes[first : first + TILE_DETECTORS] for first in range(0, len(slopes), TILE_DETECTORS)
     ]
     return float(np.mean([len(np.unique(tile)) for tile in tiles])) if tiles else 1.0
-
-
-def difference(
-    a: PowerLawFilter, b: PowerLawFilter, context: Context, rate: float, duration: float
-) -> float:
-    """Variance of the difference of two filters' outputs for the same white noise of unit variance,
-    after the filters R.
-
-    2 int_0^(1/2) |sqrt(g_a) H_a - sqrt(g_b) H_b|^2 R^2 df, in logarithmic steps. The stationary
-    first states are drawn independently: what they differ by dies out within 1 / (2 pi f) at a
-    frequency f, which adds 2 S(f) R^2 / (2 pi f T) to the integrand's spectrum S.
-    """
-    f = np.geomspace(1e-3 / (duration * rate), 0.5, 4000)
-    delta = np.abs(_response(a, f) - _response(b, f)) ** 2
-    start = (
-        2 * np.abs(_response(a, f)) ** 2 * np.minimum(1.0, 1 / (2 * np.pi * f * rate * duration))
-    )
-    passed = np.array([context.response(float(x * rate)) ** 2 for x in f])
-    return float(2 * np.trapezoid((delta + start) * passed, f))
-
-
-def psd_error(a: PowerLawFilter, b: PowerLawFilter, level: float) -> float:
-    """Largest relative error of the spectrum of pink plus white noise; ``level``: of unit responses
-    over white noise.
-    """
-    f = np.geomspace(1e-8, 0.5, 4000)
-    first, second = level * a.response(f), level * b.response(f)
-    return float((np.abs(second - first) / (1 + first)).max())
 
 
 def _response(law: PowerLawFilter, f: Any) -> Any:

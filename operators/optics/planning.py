@@ -1,4 +1,4 @@
-"""Planning of the optics: bounds, costs and memory (`core.plan`)."""
+"""Planning of the optics: bounds and memory (`core.plan`)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from zonda.core.observation import Observation
-from zonda.core.plan.calibration import calibration
-from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Cost, Effect, Estimate, Traits, full
+from zonda.core.plan.context import Context, calibration
+from zonda.core.plan.estimate import Effect, Estimate, Traits, full
 from zonda.core.plan.planning import Planning
 
 from .efficiency import Efficiency
@@ -30,10 +29,6 @@ class EfficiencyPlanning(Planning[Efficiency]):
         at_once = min(AT_ONCE, observation.n_detectors)
         return 700 * observation.n_detectors + 64 * at_once * (observation.n_samples // 512 + 3)
 
-    def estimate(self, context: Context) -> Estimate:
-        """Its cost."""
-        return Estimate((), Cost(0.005, 1e-8, 1.6e-9))
-
 
 class GroundPlanning(Planning[Any]):
     """It has no coarser form."""
@@ -49,16 +44,13 @@ class GroundPlanning(Planning[Any]):
         return 64 * observation.n_samples + 8 * observation.n_detectors
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size and cost. A filter that removes what the detectors have in common removes most
+        """Its size. A filter that removes what the detectors have in common removes most
         of it: that is not counted.
         """
-        step, o = self.operator, context.first
-        size = context.bound(
-            max(self._rms(x) for x in context.observations), o.duration, common=True
-        )
+        rms = max(self._rms(o) for o in context.observations)
+        size = context.bound(rms, context.first.duration, common=True)
         text = "rms (e / 45 deg)^power at the lowest elevation, at the detector, over zeta e^-tau"
-        cost = Cost(fixed=0.01, per_time=5e-9 * 50 / step.fwhm, per_sample=1e-9)
-        return Estimate((Effect("ground pickup", (full("exact"),), size, text),), cost, size)
+        return Estimate((Effect("ground pickup", (full("exact"),), size, text),), without=size)
 
     def _rms(self, observation: Observation) -> float:
         step = self.operator
@@ -93,10 +85,8 @@ class HalfWavePlatePlanning(Planning[Any]):
             else {"tod": 0.0, "map_rms": 0.0}
         )
         text = "2 p x the sky's brightness, which its polarized one cannot exceed"
-        return Estimate(
-            (Effect("half-wave plate", (full("exact: ideal, of one angle"),), size, text),),
-            Cost(0.001, 3e-8),
-        )
+        exact = full("exact: ideal, of one angle")
+        return Estimate((Effect("half-wave plate", (exact,), size, text),))
 
 
 class LeakagePlanning(Planning[Any]):
@@ -109,12 +99,12 @@ class LeakagePlanning(Planning[Any]):
         return 8 * observation.n_samples if observation.hwp_angle is not None else 0
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size; its cost: a product of whole streams, or with a plate one of their own."""
-        plate, o = context.first.hwp_angle is not None, context.first
+        """Its size."""
+        o = context.first
         share = self.operator.share * float(o.focalplane.polarization_efficiency.max(initial=0.0))
         size = context.bound(
             share * (context.fluctuation + context.mean_emission), o.duration, common=True
         )
         text = "p l x (rms of the stream + mean emission); of the sky, p l"
-        effect = Effect("leakage", (full("exact"),), size | context.sky_error(share), text)
-        return Estimate((effect,), Cost(0.001, 3e-8, 8e-9 if plate else 5e-9))
+        size |= context.sky_error(share)
+        return Estimate((Effect("leakage", (full("exact"),), size, text),))

@@ -15,7 +15,7 @@ from zonda.core.data import Observation
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Cost, Effect, Estimate, full, not_simulated
+from zonda.core.plan.estimate import Effect, Estimate, full, not_simulated
 from zonda.core.plan.planning import Planning
 
 from .base import Pointing
@@ -116,7 +116,7 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
                 "1.43 / FWHM x spacing of float64 at the scan's end x speed",
             ),
         )
-        return Estimate(effects, Cost(fixed=0.01, per_time=0.5e-6, kernel="python"))
+        return Estimate(effects)
 
 
 def _motion(context: Context) -> list[tuple[str, str]]:
@@ -160,10 +160,7 @@ class MispointingPlanning(Planning[Mispointing]):
         )
         size = context.sky_error(min(STEEPEST * delta / fwhm, 1.0))
         text = "1.43 / FWHM x (offset + 3 rms)"
-        return Estimate(
-            (Effect("mispointing", (full("exact"),), size, text),),
-            Cost(fixed=0.001, per_time=1.5e-7),
-        )
+        return Estimate((Effect("mispointing", (full("exact"),), size, text),))
 
 
 def _bend(context: Context) -> float:

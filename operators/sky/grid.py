@@ -44,14 +44,6 @@ from .spread import Spread
 if TYPE_CHECKING:
     from zonda.core.data import Observation
 
-PER_VALUE = 1e-7
-"""Seconds on the reference machine for a pixel of a file: read, checked, converted."""
-LARGE = 2**22
-"""Values of a file below which reading is no matter."""
-PER_POINT = {"image": 1.5e-6, "healpix": 2.5e-5}
-"""Seconds for a point of a grid that is interpolated."""
-PER_PIXEL = {"image": 1.7e-6, "healpix": 1.5e-6}
-"""Seconds for a pixel that is spread over a grid."""
 FLAT = 1e-3
 """Relative difference of solid angles up to which pixels of a TAN image count as equal (1.5 deg).
 """
@@ -173,24 +165,6 @@ class Grid:
             angle_between(rays / np.linalg.norm(rays, axis=1, keepdims=True), matrix[2]).max()
         )
         return bool(np.cos(furthest) ** 3 >= 1 - FLAT)
-
-    @property
-    def interpolation(self) -> float:
-        """Seconds on the reference machine to bring the map onto the grid."""
-        kind = "image" if isinstance(self.source, WcsMap) else "healpix"
-        if self.spread is not None:
-            pixels = min(
-                self.points * self.step**2 / nominal_sides(self.source).prod(),
-                float(self.source.values.size),
-            )
-            return self.points * 5e-7 + float(pixels) * PER_PIXEL[kind]
-        return self.points * PER_POINT[kind] if self.resampled else 0.0
-
-    @property
-    def seconds(self) -> float:
-        """Seconds on the reference machine to read the file and bring it onto the grid."""
-        size = self.source.values.size
-        return (PER_VALUE * size if size > LARGE else 0.0) + self.interpolation
 
 
 def own_pixels(

@@ -1,9 +1,8 @@
-"""Planning of the sky: bounds, coarser forms, costs and memory (`core.plan`)."""
+"""Planning of the sky: bounds, coarser forms and memory (`core.plan`)."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,16 @@ from zonda.core.data import Observation
 from zonda.core.instrument import Band
 from zonda.core.knobs import Knob
 from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Choice, Cost, Effect, Estimate, Traits, full, not_simulated
+from zonda.core.plan.estimate import (
+    Bound,
+    Choice,
+    Effect,
+    Estimate,
+    Saving,
+    Traits,
+    full,
+    not_simulated,
+)
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
@@ -32,17 +40,11 @@ LINEAR = 1.1 * 2 * 8 * math.log(2) / 12
 (|f_xx| + |f_yy|).
 """
 
-FASTER = 1.6e-9
-"""Seconds per sample that linear sampling saves."""
+PENCIL, STRAIGHT = Saving("deep_field", 0.035), Saving("atlast_reduced", 0.034)
+"""Of no beam; of linear sampling."""
 
-INTENSITY, POLARIZED = 8e-10, 3.5e-9
-"""Seconds times l_max^2 nside in which healpy makes a map of I, or maps of I, Q and U."""
-
-PYSM = 1.5e-8
-"""Seconds of processor time that PySM takes per pixel, frequency and component."""
-
-CONVOLUTION = 1.2e-6
-"""Seconds per point of the grid that the convolution takes."""
+FINEST = 16
+"""Points per FWHM of the finest grid that the operator makes."""
 
 
 def chromaticity(band: Band) -> float:
@@ -111,52 +113,27 @@ class SkyPlanning(Planning[SkyMap]):
 
     def estimate(self, context: Context) -> Estimate:
         """Each effect as a share of a point source's peak."""
-        o, widest = context.first, self._widest(context.first)
-        grids = [self.operator.grid_of(observation) for observation in context.observations]
-        reached = any(
-            g.reached(x, widest) for x, g in zip(context.observations, grids, strict=True)
-        )
-        grid, distinct = grids[0], {g.key: g for g in grids}
-        fwhm = (
-            float(self.operator.fwhm or o.focalplane.fwhm.max())
-            if self.operator.beam == "gaussian" and reached
-            else 0.0
-        )
-        size = float(np.prod(grid.shape))
-        points = 2.0 * size
-        convolution = CONVOLUTION * sum(float(np.prod(g.shape)) for g in distinct.values())
-        made = grid.seconds + sum(g.interpolation for k, g in distinct.items() if k != grid.key)
-        planes = 1 if grid.pole is None else 3
-        per_sample = (5e-9 if planes == 1 else 1.5e-8) if reached else 0.3e-9
-        cost = Cost(fixed=0.01 + 3e-8 * points, per_time=5e-8 * planes, per_sample=per_sample,
-                    once=made + (planes * convolution if reached else 0.0))  # fmt: skip
-        what = (
-            "Gaussian"
-            if fwhm
-            else "none"
-            if reached
-            else "not convolved: no detector reaches the map"
-        )
-        choices = [full(what), *self._without_beam(context, fwhm, convolution)]
+        o, step, widest = context.first, self.operator, self._widest(context.first)
+        reached = any(step.grid_of(x).reached(x, widest) for x in context.observations)
+        fwhm = float(step.fwhm or o.focalplane.fwhm.max())
+        if step.beam != "gaussian" or not reached:
+            fwhm = 0.0
+        what = "none" if reached else "not convolved: no detector reaches the map"
+        choices = [full("Gaussian" if fwhm else what), *self._without_beam(context, fwhm)]
         effects = (
             Effect("beam convolution", tuple(choices), context.sky_error(1.0), "the sky's peak"),
-            self._order(context, grid, fwhm),
+            self._order(context, step.grid_of(o), fwhm),
             Effect(
                 "coordinate precision",
                 (full("float32 offsets, float64 origins"),),
                 context.sky_error(1.43 * COORDINATES),
                 "1.43 x 5e-4 pixel of a quarter beam",
             ),
-            not_simulated(
-                "beam chromaticity",
-                "one beam for the band",
-                context.sky_error(chromaticity(o.instrument.band)),
-                "|<(nu / nu_0)^2> - 1| over the band: FWHM ~ 1 / nu, a point source's peak",
-            ),
+            one_beam(context),
         )
-        return Estimate(effects, cost)
+        return Estimate(effects)
 
-    def _without_beam(self, context: Context, fwhm: float, convolution: float) -> list[Choice]:
+    def _without_beam(self, context: Context, fwhm: float) -> list[Choice]:
         """A pencil beam changes waves on the map by 1 - exp(-2 pi^2 sigma^2 k^2), most at the
         pixels' Nyquist frequency.
         """
@@ -167,9 +144,8 @@ class SkyPlanning(Planning[SkyMap]):
         bound = context.sky_error(-math.expm1(-exponent))
         bound["transfer"] = math.expm1(min(exponent, 700.0))  # of the waves under the beam
         settings = {"beam": "none", "fwhm": None}
-        return [
-            Choice("dropped", "no beam", settings, bound=bound, formula=text, seconds=convolution)
-        ]
+        bound = context.behind_modes(bound)
+        return [Choice("dropped", "no beam", settings, bound=bound, formula=text, saves=PENCIL)]
 
     def _order(self, context: Context, grid: Grid, fwhm: float) -> Effect:
         """Linear sampling for cubic splines: on the grid there is, or on one twice as fine."""
@@ -177,40 +153,43 @@ class SkyPlanning(Planning[SkyMap]):
         if operator.interpolation == "linear" or not fwhm:
             what = "linear" if operator.interpolation == "linear" else "cubic B-spline"
             return Effect("sampling order", (full(what),), cubic, "0.3 % of a point source's peak")
-        points = fwhm / float(
-            np.radians(np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0)).max()
-        )
-        n = points * (
-            math.ceil(operator.pixels_per_fwhm / points - 1e-9)
-            if 2 <= points < operator.pixels_per_fwhm
-            else 1
-        )
-        saved = FASTER * context.samples
+        scale = np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0)
+        points = fwhm / float(np.radians(scale).max())
+        resampled = 2 <= points < operator.pixels_per_fwhm
+        n = points * (math.ceil(operator.pixels_per_fwhm / points - 1e-9) if resampled else 1)
         text = (
             "1.1 h^2 / 12 (|f_xx| + |f_yy|) of a point source on n points h apart per FWHM: 1.02 /"
             " n^2 of its peak"
         )
+
+        def linear(what: str, n: float, **more: Any) -> Choice:
+            return Choice("coarse", what, {"interpolation": "linear", **more}, formula=text,
+                          bound=context.sky_error(LINEAR / n**2), saves=STRAIGHT)  # fmt: skip
+
         choices = [full("cubic B-spline")]
         wanted = 2 * points * math.ceil(n / points - 1e-9)
-        if points >= 2 and wanted <= 16:  # the finest grid that the operator makes
-            extra = CONVOLUTION * float(np.prod(grid.shape)) * 3
-            settings = {"interpolation": "linear", "pixels_per_fwhm": min(wanted, 16.0)}
-            bound, what = context.sky_error(LINEAR / wanted**2), "linear, on twice as fine a grid"
+        if points >= 2 and wanted <= FINEST:
             choices.append(
-                Choice("coarse", what, settings, bound=bound, formula=text, seconds=saved - extra)
+                linear("linear, on twice as fine a grid", wanted, pixels_per_fwhm=wanted)
             )
-        bound = context.sky_error(LINEAR / n**2)
-        choices.append(
-            Choice(
-                "coarse",
-                "linear",
-                {"interpolation": "linear"},
-                bound=bound,
-                formula=text,
-                seconds=saved,
-            )
-        )
-        return Effect("sampling order", tuple(choices), bound, text)
+        choices.append(linear("linear", n))
+        return Effect("sampling order", tuple(choices), choices[-1].bound, text)
+
+
+def one_beam(context: Context) -> Effect:
+    """Effect of the beam's change over the band, which is not simulated."""
+    return not_simulated(
+        "beam chromaticity",
+        "one beam for the band",
+        context.sky_error(chromaticity(context.first.instrument.band)),
+        "|<(nu / nu_0)^2> - 1| over the band: FWHM ~ 1 / nu, a point source's peak",
+    )
+
+
+def brightness(traits: Traits) -> Bound:
+    """Bound on the error of a sky that is left out."""
+    peak = traits.peak or 0.0
+    return {"tod": peak, "map_rms": peak, "peak": peak, "transfer": 1.0}
 
 
 class SourcesPlanning(Planning[Any]):
@@ -230,26 +209,10 @@ class SourcesPlanning(Planning[Any]):
         return 8 * entries + 200 * observation.n_detectors + 100 * self._catalogue_size()
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost: sources in view, for every detector and sample."""
-        o = context.first
-        _, entries = self._seen(o)
-        in_view = entries / max(-(-o.n_samples // 256), 1)
-        cost = Cost(fixed=0.01, per_time=1e-7, per_sample=0.5e-9 + 2e-9 * in_view)
-        effect = not_simulated(
-            "beam chromaticity",
-            "one beam for the band",
-            context.sky_error(chromaticity(o.instrument.band)),
-            "|<(nu / nu_0)^2> - 1| over the band: FWHM ~ 1 / nu, a point source's peak",
-        )
-        peak = self.traits(o).peak or 0.0
-        size = {"tod": peak, "map_rms": peak, "peak": peak, "transfer": 1.0}
-        sources = Effect(
-            "point sources",
-            (full("exact: each through its beam"),),
-            size,
-            "the brightest source in the smallest beam",
-        )
-        return Estimate((sources, effect), cost)
+        """Its size: the brightest source."""
+        exact, size = full("exact: each through its beam"), brightness(self.traits(context.first))
+        text = "the brightest source in the smallest beam"
+        return Estimate((Effect("point sources", (exact,), size, text), one_beam(context)))
 
     def _catalogue_size(self) -> int:
         from .point_sources import Catalogue
@@ -288,24 +251,13 @@ class CMBPlanning(Planning[Any]):
         return int(12 * self.operator.nside**2 * (110 if self._polarized(observation) else 50))
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost: maps from multipoles, of each ring and each pair (l, m); and what `SkyMap` does
-        with them.
-        """
-        nside, polarized = self.operator.nside, self._polarized(context.first)
-        highest = min(self.operator.read().values.shape[1] - 1, 3 * nside - 1)
-        drawn = (POLARIZED if polarized else INTENSITY) * highest**2 * nside
-        once = drawn + (4.5e-7 if polarized else 3e-7) * 12 * nside**2 + 2.0
-        peak = self.traits(context.first).peak or 0.0
-        size = {"tod": peak, "map_rms": peak, "peak": peak, "transfer": 1.0}
+        """Its size."""
+        drawn, size = full(f"drawn at nside {self.operator.nside}"), self.traits(context.first)
         text = "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB"
-        effect = Effect("CMB", (full(f"drawn at nside {self.operator.nside}"),), size, text)
-        per_time, per_sample = (1.5e-7, 1.5e-8) if polarized else (5e-8, 5e-9)
-        return Estimate(
-            (effect,), Cost(fixed=0.05, per_time=per_time, per_sample=per_sample, once=once)
-        )
+        return Estimate((Effect("CMB", (drawn,), brightness(size), text),))
 
     def _polarized(self, observation: Observation) -> bool:
-        """Whether I, Q and U are drawn."""
+        """True if I, Q and U are drawn."""
         return observation.focalplane.polarized and bool(self.operator.read().values[1:].any())
 
 
@@ -326,21 +278,10 @@ class PySMPlanning(Planning[Any]):
         return own + self._sampled(observation).memory(observation)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its cost: PySM's, and that of `SkyMap`."""
-        from .pysm_emission import band_weights
-
-        peak = self.traits(context.first).peak or 0.0
-        size = {"tod": peak, "map_rms": peak, "peak": peak, "transfer": 1.0}
-        effect = Effect(
-            "sky of PySM",
-            (full(f"at nside {self.operator.nside}"),),
-            size,
-            "largest brightness where the scan looks",
-        )
-        frequencies = len(band_weights(context.first.instrument.band)[0])
-        once = PYSM * frequencies * self._number * 12 * self.operator.nside**2
-        cost = self._sampled(context.first).estimate(context).cost or Cost()
-        return Estimate((effect,), replace(cost, once=cost.once + once))
+        """Its size."""
+        at, size = full(f"at nside {self.operator.nside}"), self.traits(context.first)
+        text = "largest brightness where the scan looks"
+        return Estimate((Effect("sky of PySM", (at,), brightness(size), text),))
 
     @property
     def _number(self) -> int:

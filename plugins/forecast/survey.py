@@ -23,7 +23,7 @@ from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.projection import boresights, frame_rotation, homographies
 from zonda.core.observation import Observation
 from zonda.core.pipeline import Pipeline
-from zonda.core.plan.look import observed
+from zonda.core.plan.pointing import observed
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.run.signals import note_signals
 from zonda.core.types import AnyFloats, Floats

@@ -421,8 +421,8 @@ def test_the_forecast_knows_that_maps_of_all_bands_grow_beside_each_other(tmp_pa
     """`zonda plan`: the largest band without its maps, and the maps of all."""
     file = two_bands(tmp_path, "BinMap: {pixel: 2 arcsec}, SaveMap")
     made = zonda.plan(zonda.load(file))
-    each = [p.summary.prediction for p in made.plans.values()]
-    whole = made.summary.prediction
+    each = [p.memory for p in made.plans.values()]
+    whole = made.summary.memory
     maps = sum(p.products for p in each)
     assert maps > 10e6
     assert whole.bytes == max(p.bytes - p.products for p in each) + maps

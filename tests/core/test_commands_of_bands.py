@@ -16,7 +16,6 @@ import zonda
 from zonda.core import cli
 from zonda.core.accuracy.bands import OfBands, each_band, metric_of
 from zonda.core.accuracy.metrics import Metric, get
-from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import ZondaError
 
 PIPELINE = """
@@ -77,42 +76,6 @@ def test_a_band_is_planned_as_in_a_camera_that_has_no_other(path: Path) -> None:
         "PointingDaisy.samples per FWHM of 137 arcsec",
         "PointingDaisy.samples per FWHM of 84 arcsec",
     ]
-
-
-@pytest.mark.parametrize("pixels", ["shared", "separate"])
-def test_a_forecast_counts_once_what_bands_in_step_do_once(pixels: str) -> None:
-    """Of maps of I, Q and U 0.4, of a turbulence that each detector looks through by itself as
-    much; of the rest nothing.
-
-    This machine's speed is measured by each plan: the ratio to another step of the same kind of
-    kernel is compared.
-    """
-    text = PIPELINE.replace("PIXELS", pixels).replace(
-        "  detectors: 38", "  polarization: pairs\n  detectors: 380"
-    )
-    changes = (
-        ("30 arcmin", "6 deg"),
-        ("30 s", "20 min"),
-        ("pixel: 1 arcmin", "stokes: IQU, pixel: 2 arcmin"),
-        ("1.5 deg", "8 deg"),
-    )
-    for old, new in changes:
-        text = text.replace(old, new)
-    seconds = {}
-    for name in ("both", *NAMES):
-        file = parse(text, overrides=[] if name == "both" else [f"instrument.band={name}"])
-        forecast = zonda.plan(file, threads=1, prune_all=False).summary.prediction
-        stream = forecast.seconds["HighpassFilter"]
-        seconds[name] = {
-            label: forecast.seconds[label] / stream
-            for label in ("AtmosphereLayers", "BinMap", "CommonModeFilter")
-        }
-    for label, ratio in seconds["both"].items():
-        alone = sum(seconds[name][label] for name in NAMES) / 2
-        shared = pixels == "shared" and label != "CommonModeFilter"
-        assert ratio / alone == pytest.approx(0.8 if shared else 1.0, rel=0.05), (
-            label
-        )  # (2 - 0.4) / 2
 
 
 @pytest.mark.parametrize("path", ["separate"], indirect=True)

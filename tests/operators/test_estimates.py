@@ -15,8 +15,6 @@ from zonda.core.plan.planning import planning_of
 from zonda.operators.atmosphere.planning import Calibrated, _slope, calibrated
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere, BandTransfer
 from zonda.operators.filters.brick_wall import plan_highpass
-from zonda.operators.noise.one_over_f import power_law_filter
-from zonda.operators.noise.planning import difference, psd_error
 from zonda.operators.pointing.planning import STEEPEST
 from zonda.operators.sky.planning import CUBIC, chromaticity
 
@@ -135,47 +133,7 @@ def test_chromaticity(name):
     assert np.abs(mean - gaussian(x)).max() <= 1.05 * chromaticity(band) + 1e-6
 
 
-# ---- noise
-
-
-class Filters:
-    """A brick wall at 0.1 Hz."""
-
-    def response(self, frequency):
-        return float(frequency >= 0.1)
-
-
-@pytest.mark.parametrize("poles", [4, 6])
-def test_pink_noise_of_two_filters(poles):
-    """Both filters driven by the same white noise, sample by sample, with the first states at zero;
-    brick wall; variance.
-    """
-    from scipy.signal import lfilter
-
-    rate, n = 100.0, 1 << 18
-    one, other = power_law_filter(1e-5, 1.0, 8), power_law_filter(1e-5, 1.0, poles)
-    white = np.random.default_rng(3).standard_normal(n)
-
-    def made(law):
-        y = white
-        for zero, pole in zip(law.zeros, law.poles, strict=True):
-            y = lfilter([1, -(1 - zero)], [1, -(1 - pole)], y)
-        return math.sqrt(law.gain) * y
-
-    spectrum = np.fft.rfft(made(one) - made(other))
-    spectrum[np.fft.rfftfreq(n, 1 / rate) < 0.1] = 0
-    actual = np.fft.irfft(spectrum, n).var()
-    bound = difference(one, other, Filters(), rate, n / rate)
-    assert actual <= bound * (1 + 3 * math.sqrt(2 / 1000))
-    assert actual > 0.1 * bound
-
-
-def test_error_of_the_spectrum():
-    one, other = power_law_filter(1e-5, 1.0, 8), power_law_filter(1e-5, 1.0, 4)
-    level = (0.5 / 1e-3) ** 1.0
-    f = np.geomspace(1e-5, 0.5, 5000)
-    total, coarse = (1 + level * law.response(f) for law in (one, other))
-    assert np.abs(coarse / total - 1).max() <= 1.001 * psd_error(one, other, level)
+# ---- filters
 
 
 @pytest.mark.parametrize("knots", [8, 12, 16])

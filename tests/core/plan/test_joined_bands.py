@@ -14,7 +14,7 @@ from zonda.core.accuracy.measure import execute
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import PipelineError
 from zonda.core.plan.audit import Audit, audit_of_bands
-from zonda.core.plan.bands import PlanOfBands, as_dict
+from zonda.core.plan.bands import PlanOfBands
 
 TEXT = """
 name: joined
@@ -54,7 +54,7 @@ def coarse(made: PlanOfBands) -> set[str]:
 
 
 def test_a_plan_coarsens_nothing_where_bands_are_joined() -> None:
-    """With 919 detectors fewer poles changed the map of f090 by 1.5 times the bound of that band
+    """With 919 detectors a coarser form changed the map of f090 by 1.5 times the bound of that band
     alone.
     """
     by_band, joined = (
@@ -62,7 +62,7 @@ def test_a_plan_coarsens_nothing_where_bands_are_joined() -> None:
     )
     assert isinstance(by_band, PlanOfBands)
     assert isinstance(joined, PlanOfBands)
-    assert "PinkNoise.poles" in coarse(by_band)
+    assert "HighpassFilter.high-pass decimation" in coarse(by_band)
     assert coarse(joined) == set()
     assert joined.summary.settings == {}
     assert (
@@ -73,17 +73,17 @@ def test_a_plan_coarsens_nothing_where_bands_are_joined() -> None:
     )
     assert "joins" not in str(by_band)
     reasons = {d.name: d.reason for d in joined.plans["f090"].decided}
-    assert reasons["PinkNoise.poles"] == "CommonModeFilter joins the bands"
-    assert [one["joins_bands"] for one in as_dict(joined)["bands"].values()] == [
+    assert reasons["HighpassFilter.high-pass decimation"] == "CommonModeFilter joins the bands"
+    assert [one["joins_bands"] for one in joined.as_dict()["bands"].values()] == [
         "CommonModeFilter"
     ] * 2
 
 
 def test_what_is_dropped_all_the_same_is_audited_of_each_band_alone() -> None:
     file = parse(TEXT)
-    made = zonda.plan(file, drop=["poles"], threads=1)
+    made = zonda.plan(file, drop=["high-pass decimation"], threads=1)
     assert isinstance(made, PlanOfBands)
-    assert coarse(made) == {"PinkNoise.poles"}
+    assert coarse(made) == {"HighpassFilter.high-pass decimation"}
     found = audit_of_bands(file, made, threads=1)
     for one in found.bands.values():
         assert isinstance(one, Audit)

@@ -15,7 +15,7 @@ import zonda
 from zonda.core import cli
 from zonda.core.plan.audit import SHORTEST, Audit, Checked, _compare, _Result, audit, extent
 from zonda.core.plan.estimate import Choice
-from zonda.core.plan.slices import SECONDS, sliced
+from zonda.core.plan.prediction import SECONDS, sliced
 
 SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
 SET = [a for s in SHORT for a in ("--set", s)]
@@ -44,7 +44,7 @@ def test_every_bound_of_the_shipped_pipeline_holds(everything_coarse):
     checked = {row.effect for row in everything_coarse.rows}
     assert len([c for c in checked if ".layer" in c]) == 10
     assert {
-        "PinkNoise.poles",
+        "SkyMap.sampling order",
         "SkyMap.beam convolution",
         "HighpassFilter.high-pass decimation",
         "all together",
@@ -57,7 +57,7 @@ def test_the_errors_are_there(everything_coarse):
     """
     actual = {(r.effect, r.metric): r.actual for r in everything_coarse.rows}
     for name in (
-        "PinkNoise.poles",
+        "AtmosphereLayers.detector nodes and time steps",
         "AtmosphereLayers.layer 3",
         "HighpassFilter.high-pass decimation",
     ):
@@ -89,7 +89,7 @@ def test_the_shipped_plan_holds(file, made):
 
 def test_a_violated_bound_is_seen(file, made):
     """The same audit with a bound a thousand times too small."""
-    plain = zonda.plan(file, drop=["poles"], threads=1)
+    plain = zonda.plan(file, drop=["high-pass decimation"], threads=1)
     whole = audit(file, plain, threads=1, seconds=20.0)
     tight = Audit(tuple(dataclasses.replace(r, bound=r.bound / 1000) for r in whole.rows), "test")
     assert tight.violated
@@ -129,7 +129,15 @@ def test_the_table_has_units():
 
 def test_command_audit(capsys, monkeypatch):
     status, out, _ = _command(
-        capsys, "plan", "mustang2_cluster", *SET, "--drop", "poles", "--audit", "--threads", "1"
+        capsys,
+        "plan",
+        "mustang2_cluster",
+        *SET,
+        "--drop",
+        "high-pass decimation",
+        "--audit",
+        "--threads",
+        "1",
     )
     assert status == 0
     assert "0 violated" in out
@@ -172,16 +180,13 @@ operators:
     assert not found.violated
 
 
-def test_the_slice_is_chosen_by_cost(file, made):
-    """Cheap: the whole minute or the scan; a thousand times dearer: the shortest, and fewer
+def test_the_slice_is_chosen_by_its_samples(file, made):
+    """Few runs: the whole minute or the scan; three thousand times as many: the shortest, and fewer
     detectors.
     """
     assert extent(made, 4).seconds == pytest.approx(min(SECONDS, 40.0))
     assert extent(made, 4).every == 1
-    dear = {
-        k: dataclasses.replace(c, per_sample=3000 * c.per_sample) for k, c in made.costs.items()
-    }
-    found = extent(dataclasses.replace(made, costs=dear), 4)
+    found = extent(made, 12000)
     assert found.seconds == SHORTEST
     assert found.every == 223 // 64
     assert extent(made, 400).seconds < extent(made, 4).seconds

@@ -9,7 +9,6 @@ from zonda.core.mapmaker import MapMaker
 from zonda.core.operator import Operator
 from zonda.core.output import Output, StreamOutput
 from zonda.core.pipeline import Pipeline
-from zonda.core.plan import structure as shares
 from zonda.core.plan.planner import plan_band
 from zonda.core.plan.structure import Structure, prune, work
 from zonda.core.signal import Component, Signal
@@ -104,13 +103,6 @@ def test_each_further_signal_is_formed_filtered_and_mapped():
     )
     found = work(pipeline, prune(pipeline))
     assert [signal.name for signal in found.signals] == ["", "noiseless"]
-    once = dict.fromkeys(("Point", "Sky", "Air", "Noise", "Save"), 1.0)
-    assert found.times == {
-        **once,
-        "Sum": 1 + shares.FORM,
-        "Filter": 1 + shares.FILTER,
-        "Map": 1 + shares.MAP,
-    }
 
 
 def test_a_remainder_is_not_formed():

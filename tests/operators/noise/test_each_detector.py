@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.core.plan.look import look
 from zonda.core.plan.planning import planning_of
+from zonda.core.plan.pointing import context_of
 from zonda.core.plan.structure import Structure
 from zonda.operators.io.save_tod import load_tod, save_tod
 from zonda.operators.noise.estimate import fit, spectrum
@@ -104,9 +104,9 @@ def test_the_step_stands_above_the_focal_plane(tmp_path: Path) -> None:
     np.testing.assert_array_equal(one, other)
 
 
-def test_the_plan_counts_a_pass_for_each_slope_in_a_tile(tmp_path: Path) -> None:
-    """Two slopes in the first tile of 16 detectors (10 and 6), one in the rest: 1.5 on average."""
-    costs, sizes = [], []
+def test_the_plan_counts_the_states_of_each_slope_in_a_tile(tmp_path: Path) -> None:
+    """Two slopes in the first tile of 16 detectors (10 and 6), one in the rest."""
+    sizes = []
     for slopes in ([1.2] * len(SLOPES), SLOPES):
         instrument = camera(tmp_path, slopes=slopes)
         scene = zonda.Scene(
@@ -122,11 +122,8 @@ def test_the_plan_counts_a_pass_for_each_slope_in_a_tile(tmp_path: Path) -> None
             zonda.Efficiency(),
         ]
         pipeline = zonda.Pipeline([*steps, zonda.BinMap(pixel="1 arcmin")])
-        context = look(pipeline, scene, Structure.of_all(pipeline))
-        planning = planning_of(context.operators[1])
-        costs.append(planning.estimate(context).cost)
-        sizes.append(planning.memory(context.first))
-    assert costs[1].per_sample == pytest.approx(1.5 * costs[0].per_sample)
+        context = context_of(pipeline, scene, Structure.of_all(pipeline))
+        sizes.append(planning_of(context.operators[1]).memory(context.first))
     assert sizes[1] > sizes[0]
 
 
