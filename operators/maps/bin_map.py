@@ -25,7 +25,7 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.tiles import TILE_SAMPLES
 
-from .coverage import Coverage, Directions
+from .coverage import COUNTS, Coverage, Directions
 from .few_angles import warn_before
 from .finished import finish
 from .grid import Grid, TangentGrid
@@ -377,15 +377,14 @@ def add_scan(step: BinMap, data: Data, observation: Observation, state: Prepared
             if polarized
             else MapSums(n, signals, step.noise == "scatter", of_scans)
         )
-        made.coverage = Coverage.empty(n, step.crosslinking, step.scan_hits)
+        counts = [name for name in COUNTS if getattr(step, name)]
+        made.coverage = Coverage.empty(n, counts, step.scan_hits)
         data.add(step.label, made)
     sums: Any = data.partial[step.label]
-    before = sums.hits.sum(axis=0) if step.scan_hits else None
+    before = sums.hits.sum(axis=0) if sums.coverage.of_hits else None
     binned, dropped = sums.add(observation, halves(step, list(state.binnings)), step.label)
-    if state.directions is not None:
-        sums.coverage.add_directions(state.directions)
-    if before is not None:
-        sums.coverage.add_hits(sums.hits.sum(axis=0) - before, f"{step.label}, {observation.name}")
+    hits = None if before is None else sums.hits.sum(axis=0) - before
+    sums.coverage.add(hits, state.directions, f"{step.label}, {observation.name}")
     note_beams(step, observation, sums, binned)
     used = observation.focalplane.net[observation.good_detectors]
     sums.unknown_variance |= step.weights == "inverse_variance" and not (used > 0).all()

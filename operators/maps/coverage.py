@@ -21,9 +21,10 @@ pole. Cosine and sine are rounded to 2^-30: as int64 the sums are exact.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,24 +43,6 @@ SLOWEST = 1e-10
 """Radians per sample below which a detector does not move: far below sidereal motion, far above the
 rounding of directions.
 """
-CROSSLINKING = Plane(
-    None,
-    {"crosslinking": "0: scans cross evenly, 1: one direction"},
-    unit="0: directions cross evenly, 1: one direction",
-    colours=(0.0, 1.0),
-    title="Crosslinking",
-    caption=(
-        "The size of the mean of exp(2iψ), ψ the direction in which detectors move through a pixel."
-    ),
-)
-DIRECTIONS = Plane(
-    None,
-    {
-        "mean_cos_2psi": "mean of cos 2 psi, psi the scan direction",
-        "mean_sin_2psi": "mean of sin 2 psi, psi from east to north",
-    },
-    unit="mean of cos or sin 2 psi",
-)
 MOST_ENTRIES = 1 << 27
 """Pixels of all scans together whose hits are kept: 1 GB."""
 
@@ -155,48 +138,118 @@ def add_directions(  # type: ignore[no-untyped-def]
                 row[2] += np.int64(np.rint(2.0 * east * north / speed * WEIGHT))
 
 
+class PixelCount(ABC):
+    """Integers that a map adds up over its scans beside the samples' means, and their planes.
+
+    A further one is a subclass in `COUNTS` and a parameter of the same name in `MapParameters`.
+    """
+
+    columns: ClassVar[int] = 1
+    """Integers in each pixel."""
+    memory: ClassVar[int] = 24
+    """Bytes for each pixel: those of two tasks while they are added up, and of the planes."""
+    of_hits: ClassVar[bool] = True
+    """The hits of each scan are needed."""
+
+    @staticmethod
+    @abstractmethod
+    def of_scan(
+        hits: Sums | None, directions: Directions | None
+    ) -> Iterator[tuple[NDArray[np.int64], Sums]]:
+        """Pixels, and what a scan with ``hits`` (n_pixels,) adds there, (n, columns)."""
+
+    @staticmethod
+    @abstractmethod
+    def planes(sums: Sums) -> dict[str, Plane]:
+        """Planes of the map by name, each row (n_pixels,)."""
+
+
+class Crosslinking(PixelCount):
+    """n and both parts of the sum of equation (1), the latter in units of 2^-30."""
+
+    columns: ClassVar[int] = 3
+    memory: ClassVar[int] = 96
+    of_hits: ClassVar[bool] = False
+
+    @staticmethod
+    def of_scan(
+        hits: Sums | None, directions: Directions | None
+    ) -> Iterator[tuple[NDArray[np.int64], Sums]]:
+        assert directions is not None
+        for sums in directions.parts.values():
+            pixels = np.flatnonzero(sums[:, 0])
+            yield (
+                pixels,
+                sums.take(pixels, axis=0),
+            )  # of 2^33 samples in a pixel they would overflow
+        directions.parts.clear()
+
+    @staticmethod
+    def planes(sums: Sums) -> dict[str, Plane]:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            means = np.asarray(sums[:, 1:].T / (sums[:, 0] * WEIGHT))
+        crosslinking = Plane(
+            np.hypot(*means)[None],
+            {"crosslinking": "0: scans cross evenly, 1: one direction"},
+            unit="0: directions cross evenly, 1: one direction",
+            colours=(0.0, 1.0),
+            title="Crosslinking",
+            caption=(
+                "The size of the mean of exp(2iψ), ψ the direction in which detectors move through"
+                " a pixel."
+            ),
+        )
+        names = {
+            "mean_cos_2psi": "mean of cos 2 psi, psi the scan direction",
+            "mean_sin_2psi": "mean of sin 2 psi, psi from east to north",
+        }
+        directions = Plane(means, names, unit="mean of cos or sin 2 psi")
+        return {"crosslinking": crosslinking, "directions": directions}
+
+
+COUNTS: dict[str, type[PixelCount]] = {"crosslinking": Crosslinking}
+"""By the parameter of the map maker that asks for them."""
+
+
 @dataclass
 class Coverage:
-    """What a map tells beside its samples' mean; None: not asked for.
+    """What a map tells beside its samples' mean.
 
     Attributes
     ----------
-    directions
-        (n_pixels, 3) n and both parts of the sum of equation (1), the latter in units of 2^-30.
+    sums
+        (n_pixels, columns) of each of `COUNTS` that is asked for.
     pixels, hits
-        Of each observation, int32: which pixels it hit, and how often.
+        Of each observation, int32: which pixels it hit, and how often; None: not asked for.
     """
 
-    directions: Sums | None = None
+    sums: dict[str, Sums] = field(default_factory=dict)
     pixels: list[NDArray[np.int32]] | None = None
     hits: list[NDArray[np.int32]] = field(default_factory=list)
 
     @classmethod
-    def empty(cls, n_pixels: int, crosslinking: bool, scan_hits: bool) -> Coverage:
+    def empty(cls, n_pixels: int, counts: Iterable[str], scan_hits: bool) -> Coverage:
         """Of no observation."""
-        return cls(
-            np.zeros((n_pixels, 3), np.int64) if crosslinking else None, [] if scan_hits else None
-        )
+        sums = {name: np.zeros((n_pixels, COUNTS[name].columns), np.int64) for name in counts}
+        return cls(sums, [] if scan_hits else None)
 
-    def add_directions(self, found: Directions) -> None:
-        """Add an observation's directions."""
-        assert self.directions is not None
-        for sums in found.parts.values():
-            pixels = np.flatnonzero(sums[:, 0])
-            self.directions[pixels] += sums.take(
-                pixels, axis=0
-            )  # of 2^33 samples in a pixel they would overflow
-        found.parts.clear()
+    @property
+    def of_hits(self) -> bool:
+        """Whether the hits of each scan are needed."""
+        return self.pixels is not None or any(COUNTS[name].of_hits for name in self.sums)
 
-    def add_hits(self, hits: Sums, place: str) -> None:
-        """Keep an observation's hits (n_pixels,). Raises PipelineError where all observations' are
-        too many.
+    def add(self, hits: Sums | None, directions: Directions | None, place: str) -> None:
+        """Add an observation with ``hits`` (n_pixels,) (None: not needed). Raises PipelineError
+        where all observations' hits are too many to be kept.
         """
-        assert self.pixels is not None
-        pixels = np.flatnonzero(hits)
-        self.pixels.append(pixels.astype(np.int32))
-        self.hits.append(hits[pixels].astype(np.int32))
-        self.check(place)
+        for name, sums in self.sums.items():
+            for where, more in COUNTS[name].of_scan(hits, directions):
+                sums[where] += more
+        if self.pixels is not None and hits is not None:
+            pixels = np.flatnonzero(hits)
+            self.pixels.append(pixels.astype(np.int32))
+            self.hits.append(hits[pixels].astype(np.int32))
+            self.check(place)
 
     def check(self, place: str) -> None:
         """Raise PipelineError where hits of more pixels are kept than `MOST_ENTRIES`."""
@@ -210,9 +263,9 @@ class Coverage:
 
     def __iadd__(self, other: Coverage) -> Coverage:
         """Add what later observations made: exact."""
-        if self.directions is not None and other.directions is not None:
-            pixels = np.flatnonzero(other.directions[:, 0])
-            self.directions[pixels] += other.directions.take(pixels, axis=0)
+        for name, sums in self.sums.items():
+            pixels = np.flatnonzero(other.sums[name].any(axis=1))
+            sums[pixels] += other.sums[name].take(pixels, axis=0)
         if self.pixels is not None and other.pixels is not None:
             self.pixels += other.pixels
             self.hits += other.hits
@@ -220,10 +273,10 @@ class Coverage:
 
     def arrays(self) -> dict[str, Any]:
         """See `Product.arrays`."""
-        found: dict[str, Any] = {}
-        if self.directions is not None:
-            pixels = np.flatnonzero(self.directions[:, 0])
-            found |= {"pixels": pixels, "directions": self.directions.take(pixels, axis=0)}
+        found: dict[str, Any] = {"counts": list(self.sums)}
+        for name, sums in self.sums.items():
+            pixels = np.flatnonzero(sums.any(axis=1))
+            found |= {f"{name}_pixels": pixels, name: sums.take(pixels, axis=0)}
         if self.pixels is not None:
             found |= {"pixels_of_scans": list(self.pixels), "hits_of_scans": list(self.hits)}
         return found
@@ -231,22 +284,14 @@ class Coverage:
     @classmethod
     def of(cls, arrays: Mapping[str, Any], n_pixels: int) -> Coverage:
         """What `arrays` gave, put together again."""
-        made = cls.empty(n_pixels, "directions" in arrays, "hits_of_scans" in arrays)
-        if made.directions is not None:
-            made.directions[arrays["pixels"]] = arrays["directions"]
+        made = cls.empty(n_pixels, arrays["counts"], "hits_of_scans" in arrays)
+        for name, sums in made.sums.items():
+            sums[arrays[f"{name}_pixels"]] = arrays[name]
         if made.pixels is not None:
             made.pixels, made.hits = list(arrays["pixels_of_scans"]), list(arrays["hits_of_scans"])
         return made
 
     def planes(self) -> dict[str, Plane]:
-        """Planes (n, n_pixels) of the map: equation (1), and the means of cos 2 psi and sin 2 psi;
-        NaN where no sample has a direction.
-        """
-        if self.directions is None:
-            return {}
-        with np.errstate(invalid="ignore", divide="ignore"):
-            means = np.asarray(self.directions[:, 1:].T / (self.directions[:, 0] * WEIGHT))
-        return {
-            "crosslinking": replace(CROSSLINKING, values=np.hypot(*means)[None]),
-            "directions": replace(DIRECTIONS, values=means),
-        }
+        """Planes of the map, each row (n_pixels,)."""
+        found = (COUNTS[name].planes(sums) for name, sums in self.sums.items())
+        return {key: plane for planes in found for key, plane in planes.items()}

@@ -37,7 +37,7 @@ class PixelSums(Product):
     unknown_variance
         A scan's weights are uniform because every NET is zero.
     coverage
-        Directions of motion, and the hits of each observation.
+        Counts beside the means, and the hits of each observation.
     beams
         The detectors' beams, and what each weighs in the map.
     """

@@ -9,6 +9,7 @@ from zonda.core.plan.estimate import Traits
 from zonda.core.plan.planning import Planning
 
 from .bin_map import BinMap
+from .coverage import COUNTS
 from .grid import TangentGrid, in_frame
 
 
@@ -45,7 +46,8 @@ class BinMapPlanning(Planning[BinMap]):
         while it is laid out.
         """
         others = len(observation.signals) - 1
-        more = (96 if self.operator.crosslinking else 0) + (40 if self.operator.scan_hits else 0)
+        counts = (count.memory for name, count in COUNTS.items() if getattr(self.operator, name))
+        more = sum(counts) + (40 if self.operator.scan_hits else 0)
         samples = 144 * observation.n_samples if self.operator.crosslinking else 0
         return more * self.operator.grid.n_pixels + samples + self._sums(observation, others)
 
