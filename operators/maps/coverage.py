@@ -207,7 +207,31 @@ class Crosslinking(PixelCount):
         return {"crosslinking": crosslinking, "directions": directions}
 
 
-COUNTS: dict[str, type[PixelCount]] = {"crosslinking": Crosslinking}
+class Visits(PixelCount):
+    """Scans that have samples in a pixel."""
+
+    @staticmethod
+    def of_scan(
+        hits: Sums | None, directions: Directions | None
+    ) -> Iterator[tuple[NDArray[np.int64], Sums]]:
+        assert hits is not None
+        pixels = np.flatnonzero(hits)
+        yield pixels, np.ones((len(pixels), 1), np.int64)
+
+    @staticmethod
+    def planes(sums: Sums) -> dict[str, Plane]:
+        visits = Plane(
+            sums.T,
+            {"visits": "scans per pixel"},
+            unit="scans per pixel",
+            colours=(0.0, None),
+            title="Visits",
+            caption="The number of scans that have samples in a pixel.",
+        )
+        return {"visits": visits}
+
+
+COUNTS: dict[str, type[PixelCount]] = {"crosslinking": Crosslinking, "visits": Visits}
 """By the parameter of the map maker that asks for them."""
 
 

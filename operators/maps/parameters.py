@@ -60,6 +60,8 @@ class MapParameters(MapMaker):
     crosslinking: bool = False
     """Keep the directions in which detectors moved through each pixel: 0 where they crossed evenly,
     1 where all moved along one line."""
+    visits: bool = False
+    """Count the scans that have samples in each pixel."""
     scan_hits: bool = False
     """Keep the hits of each scan in each pixel."""
     smooth: Angle | Literal["beam"] | None = None

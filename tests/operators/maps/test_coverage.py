@@ -306,6 +306,43 @@ def test_hits_of_scans_are_those_of_each_alone(bench, grid):
         made(bench, many, **grid, scan_hits=False).hits_of(0)
 
 
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize("stokes", ["I", "hits"])
+def test_visits_are_the_scans_that_have_samples_in_a_pixel(bench, grid, stokes, tmp_path):
+    """Of scans along different lines, one of them for the most part flagged; files, pictures and
+    other units have the plane as it is.
+    """
+    many = [along(bench, 0.4 * k, k) for k in range(4)]
+    many[1].flags[:1900] = 1
+    how = {"contents": "hits"} if stokes == "hits" else {}
+    product = made(bench, many, **grid, **how, visits=True)
+    visits = product.plane("visits").values[0]
+    expected = sum((product.hits_of(k) > 0).astype(int) for k in range(4))
+    np.testing.assert_array_equal(visits, expected)
+    assert {1, 3} <= set(np.unique(visits))
+    np.testing.assert_array_equal(product.to("mK").plane("visits").values[0], expected)
+    assert product.plot(plane="visits").get_title() == "visits"
+    with fits.open(product.write(tmp_path / "map.fits")) as file:
+        one_table = product.pixels is not None
+        written = file["MAP"].data["VISITS"] if one_table else file["VISITS"].data
+        np.testing.assert_array_equal(written, expected)
+        assert written.dtype.kind == "i"
+
+
+def test_visits_of_tasks_add_up(bench):
+    """Of one scan and of two others, written and read between."""
+    many, kept = [along(bench, 0.4 * k, k) for k in range(3)], []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(BinMap, "finalize", lambda self, data: kept.append(data.take(self.label)))
+        for some in (many, many[:1], many[1:]):
+            step = BinMap(pixel="10 arcsec", width="4 arcmin", visits=True)
+            bench.run([step], some, {"signal": zeros})
+    whole, one, rest = (MapSums.of(sums.arrays()) for sums in kept)
+    one += rest
+    np.testing.assert_array_equal(one.coverage.sums["visits"], whole.coverage.sums["visits"])
+    assert whole.coverage.sums["visits"].max() == 3
+
+
 def test_too_many_hits_of_scans_are_refused(bench, monkeypatch):
     one, other = (
         coverage.Coverage({}, [np.arange(600, dtype=np.int32)], [np.ones(600, np.int32)])

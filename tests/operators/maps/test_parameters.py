@@ -36,6 +36,7 @@ STEPS = (
             "contents": ({}, {"contents": "hits"}),
             "half_difference": ({}, {"half_difference": False}),
             "crosslinking": ({}, {"crosslinking": True}),
+            "visits": ({}, {"visits": True}),
             "scan_hits": ({}, {"scan_hits": True}),
             "smooth": ({}, {"smooth": "beam"}),
             "product": ({}, {"product": "chart"}),
