@@ -276,9 +276,10 @@ def draw_coverage(file: str, product: MapProduct) -> list[Sketch]:
 
 
 def draw_plane(file: str, product: MapProduct, name: str) -> list[Sketch]:
-    """Plane of numbers, whose colours, title and caption it states itself."""
+    """Plane of numbers, whose colours, title and caption it states itself; grey without samples."""
     plane = product.planes[name]
-    flat = Flat.of(product, {name: plane.values[0]}).cropped()
+    seen = np.where(product.hits > 0, plane.values[0], np.nan)
+    flat = Flat.of(product, {name: seen}).cropped()
     values = flat.planes[name]
     assert plane.colours is not None
     known = values[np.isfinite(values)]
