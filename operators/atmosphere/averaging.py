@@ -1,4 +1,4 @@
-"""How far the atmosphere averages down in a pixel of the map.
+"""Variance of the atmosphere that is left in a pixel of the map.
 
 Of a layer's field g and a pixel that H samples see, at times t_h along rays x_h, the map holds
 

@@ -1,5 +1,5 @@
-"""How the PWV along a line of sight fluctuates about its mean: normally, or log-normally where it
-fluctuates strongly.
+"""Distribution of the PWV along a line of sight about its mean: normal, or log-normal for strong
+fluctuations.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Fluctuation:
 
     @property
     def log_normal(self) -> bool:
-        """Whether 1 + y is log-normal."""
+        """True if 1 + y is log-normal."""
         return self.rms >= LOG_NORMAL_FROM
 
     @property

@@ -101,7 +101,7 @@ def _layers_of(model: AtmosphereModel, label: str) -> DriftingLayers:
 
 
 def _of_bands(models: Sequence[AtmosphereModel], label: str) -> dict[str, DriftingLayers]:
-    """By name of the band's scan its layers."""
+    """Layers by name of the band's scan."""
     layers = [drifting_layers(model) for model in models]
     for model, others in zip(models, share_tiles(layers), strict=True):
         whole = len(model.turbulence) - len(set(model.parameters.omit))
@@ -151,7 +151,7 @@ def streams(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def in_time_order(model: AtmosphereModel) -> bool:
-    """Whether blocks should come in order of time: detectors are evaluated one by one, and share
+    """True if blocks should come in order of time: detectors are evaluated one by one, and share
     the turbulence of the moment.
     """
     o, chosen = model.observation, model.resolution()

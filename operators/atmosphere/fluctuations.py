@@ -174,7 +174,7 @@ class OfDetectors:
         return same and self._layers.looks_as(other._layers)
 
     def drawn(self) -> tuple[int, float, float]:
-        """As `AtNodes.drawn`, of the units made so far."""
+        """See `AtNodes.drawn`, for the units made so far."""
         parts = [self._sums[key] for key in sorted(self._sums)]
         return (
             sum(p[0] for p in parts),
@@ -183,7 +183,7 @@ class OfDetectors:
         )
 
     def into(self, detectors: slice, samples: slice, out: dict[str, AnyFloats]) -> None:
-        """As `AtNodes.into`."""
+        """See `AtNodes.into`."""
         for unit, of_detectors in _parts(detectors, UNIT_DETECTORS):
             for number, of_samples in _parts(samples, UNIT_SAMPLES):
                 coefficients = self._unit(unit, number)
@@ -318,14 +318,12 @@ class OfDetectors:
 
 
 def units_fit(n_detectors: int, n_samples: int, step: int, streams: int) -> bool:
-    """Whether all units of `OfDetectors` take little memory."""
+    """True if all units of `OfDetectors` take little memory."""
     return units_bytes(n_detectors, n_samples, step, streams) <= BYTES_KEPT
 
 
 def keeps_all(n_detectors: int, n_samples: int, step: int, streams: int) -> bool:
-    """Whether all units of `OfDetectors` are kept, so that the order in which blocks are worked on
-    does not matter.
-    """
+    """True if all units of `OfDetectors` are kept, so that blocks may be worked on in any order."""
     stream = 4 * n_detectors * n_samples
     return units_bytes(n_detectors, n_samples, step, streams) <= max(
         BYTES_KEPT, min(ALL_KEPT, SHARE_KEPT * stream)

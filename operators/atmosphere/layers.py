@@ -59,7 +59,7 @@ class AtmosphereLayers(LayerParameters):
         return frozenset({"atmosphere", "transmission", *self.outputs})
 
     def model(self, observation: Observation) -> AtmosphereModel:
-        """What an observation sees of the atmosphere, before any of it is drawn."""
+        """Model of the atmosphere of an observation, before any of it is drawn."""
         return self._models.of(self, observation)
 
     def check(self, data: Data) -> list[str]:

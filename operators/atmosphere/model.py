@@ -1,4 +1,4 @@
-"""What an observation sees of the atmosphere before any of it is drawn: built once, for the run and
+"""Model of the atmosphere of an observation before any of it is drawn: built once, for the run and
 for planning.
 """
 
@@ -155,8 +155,8 @@ class AtmosphereModel:
         )
 
     def strength(self, sine: Floats) -> Floats | None:
-        """By which the fluctuation at sines of the elevation exceeds that at the mean elevation;
-        None: nowhere.
+        """Factor by which the fluctuation at sines of the elevation exceeds that at the mean
+        elevation; None: 1.
 
         Where `pwv_rms` holds at the zenith, in scans whose elevation changes by so much that it
         varies by `ONE_VALUE`.
@@ -201,7 +201,7 @@ class AtmosphereModel:
 
     @cached_property
     def _variance_at_zenith(self) -> float:
-        """Of the sum of the layers behind the beam, for a telescope that looks up."""
+        """Variance of the sum of the layers behind the beam, for a telescope that looks up."""
         telescope, band, total = (
             self.observation.instrument.telescope,
             self.observation.instrument.band,
@@ -249,7 +249,7 @@ class AtmosphereModel:
         ]
 
     def terms(self, sines: tuple[float, float]) -> LayerTerms | None:
-        """What the layers that are simulated add to the column's response between two sines of the
+        """Contribution of the simulated layers to the column's response between two sines of the
         elevation.
         """
         if self.parameters.layer_response == "column":
@@ -315,7 +315,7 @@ class Models:
     _made: list[tuple[str, AtmosphereModel]] = field(default_factory=list, compare=False)
 
     def of_run(self, data: Data) -> Models:
-        """Those of a run, which begins at one time in one weather, and whose scans follow each
+        """Models of a run, which begins at one time in one weather, and whose scans follow each
         other through the same layers.
         """
         planes = dict(
@@ -372,8 +372,8 @@ class Models:
 
 @dataclass(frozen=True)
 class ExpectedLoad:
-    """What an `AtmosphereLayers` announces to other steps of an observation: `expected_load` as a
-    call, and its model.
+    """Announcement of an `AtmosphereLayers` to other steps: `expected_load` as a call, and its
+    model.
     """
 
     models: Models

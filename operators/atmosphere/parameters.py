@@ -1,4 +1,4 @@
-"""What a user says of the turbulent layers, and the checks that need nothing else."""
+"""Parameters of the turbulent layers, and the checks that need nothing else."""
 
 from __future__ import annotations
 

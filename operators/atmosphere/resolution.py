@@ -1,5 +1,5 @@
-"""Where one scan's atmosphere is evaluated: nodes and steps in time that keep every error below the
-tolerance.
+"""Nodes and steps in time at which one scan's atmosphere is evaluated, so that every error stays
+below the tolerance.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def _mean_nodes(
 
 
 class _Timing:
-    """What steps in time err by, of each layer."""
+    """Errors of steps in time, for each layer."""
 
     def __init__(
         self, path: _Path, observation: Observation, plane: ScanPlane, layers: Sequence[Layer]
@@ -314,7 +314,7 @@ class _Path:
         return np.asarray((ends[:, 1] - ends[:, 0]) * self._observation.sample_rate, np.float64)
 
     def errors(self, step: int) -> tuple[Floats, float]:
-        """Of `_errors_of`, each worked out once: bands share a path."""
+        """Errors of `_errors_of`, each worked out once: bands share a path."""
         if step not in self._errors:
             self._errors[step] = self._errors_of(step)
         return self._errors[step]

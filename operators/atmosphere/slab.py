@@ -1,5 +1,4 @@
-"""How strongly a turbulent slab fluctuates along a line of sight, by the elevation at which one
-looks through it.
+"""Strength of a turbulent slab's fluctuation along a line of sight, by elevation.
 
 The water along a path through three-dimensional turbulence of local strength proportional to the
 vapour density rho_v has the variance

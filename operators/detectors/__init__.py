@@ -1,1 +1,1 @@
-"""What detectors and their readout do to the signal."""
+"""Effects of detectors and their read-out on the signal."""

@@ -56,7 +56,7 @@ class Glitches(Operator):
     """Samples above this (K_RJ at the detector) are lost; where absent, none are."""
 
     def prepare(self, observation: Observation) -> Arrivals:
-        """All pulses of the scan."""
+        """Draw the pulses of the scan."""
         found = self.arrivals(observation)
         inside = int(np.count_nonzero(found.time >= 0))
         observation.tally.count(self.label, "glitches", inside)

@@ -1,1 +1,1 @@
-"""What the analysis removes."""
+"""Filters of the analysis."""

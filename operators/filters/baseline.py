@@ -74,8 +74,8 @@ class Basis:
         return _inverse(self.normal(use))
 
     def solver(self, use: Mask) -> Floats:
-        """What `solved` takes for the samples ``use`` (N,): `inverse`, or of `MANY` functions, all
-        of them determined and each overlapping with few, a factor (taps, K).
+        """Matrix that `solved` takes for the samples ``use`` (N,): `inverse`, or for `MANY`
+        functions, all of them determined and each overlapping with few, a factor (taps, K).
         """
         normal, factor = self.normal(use), np.zeros((len(self.functions), self.size))
         if self.size < max(MANY, len(factor) + 1) or not _factor(
@@ -158,7 +158,9 @@ class Fit:
         return spoilt
 
     def coefficients(self, rows: Rows, masked: Mask | None = None) -> tuple[Floats, int]:
-        """What `remove` subtracts, (n_det, K), and how many samples are not finite."""
+        """Coefficients that `remove` subtracts, (n_det, K), and the number of samples that are not
+        finite.
+        """
         sums, spoilt = self.basis.sums(rows, self.use), 0
         found = solved(self.inverse, sums)
         other = ~np.isfinite(sums).all(axis=1)
@@ -234,7 +236,7 @@ def lessen(x, c, f):  # type: ignore[no-untyped-def]
 
 @kernel
 def _solve(inverse, sums, out):  # type: ignore[no-untyped-def]
-    """All rows for each row of the matrix, which may exceed the cache."""
+    """Solve for all detectors row by row of the matrix, which may exceed the cache."""
     for k in range(sums.shape[1]):
         for d in range(sums.shape[0]):
             lessen(out[d], -sums[d, k], inverse[k])

@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass
 class Reading:
-    """What one reading of a stream gives.
+    """Sums of one reading of a stream.
 
     Attributes
     ----------

@@ -48,7 +48,7 @@ at a time.
 
 
 class Usable:
-    """Which detectors take part.
+    """Detectors that take part.
 
     Attributes
     ----------

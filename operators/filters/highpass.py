@@ -26,7 +26,7 @@ ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a li
 
 
 class State(NamedTuple):
-    """What `HighpassFilter.exec` needs: the filter, flagged samples, and the source mask."""
+    """Filter, flagged samples and source mask for `HighpassFilter.exec`."""
 
     plan: HighpassPlan | BesselPlan
     bad: NDArray[np.intp]
@@ -167,7 +167,7 @@ class HighpassFilter(HighpassParameters):
         return plan
 
     def _short(self) -> str:
-        """What happens to a short scan."""
+        """Statement about a scan that is shorter than one cycle of the cut."""
         if self.response == "bessel":
             return "all of it is within the filter's transient"
         return ONLY_A_LINE if self.degree else ONLY_THE_MEAN

@@ -119,7 +119,7 @@ def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz
 
 
 def _gaps_are_closed(values: Floats, residuals: Floats, wanted: int, gap: float | None) -> bool:
-    """Whether no wanted mode is determined, as far as residuals of a tenth show."""
+    """True if no wanted mode is determined, as far as residuals of a tenth show."""
     if gap is None or len(values) < wanted + 3 or not (residuals[: wanted + 1] <= 0.1).all():
         return False
     size = np.sqrt(np.maximum(values, 0.0))

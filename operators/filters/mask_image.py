@@ -31,14 +31,14 @@ class MaskImage:
     matrix: Floats
 
     def of(self, observation: Observation) -> InsideImage:
-        """Where the samples of a scan are inside."""
+        """Samples of a scan that are inside."""
         h = np.ascontiguousarray(ray_coefficients(observation.boresight_radec, self.matrix).T)
         return InsideImage(h, observation.focalplane.xi, observation.focalplane.eta, self.masked)
 
 
 @dataclass(frozen=True)
 class InsideImage:
-    """Which samples lie in masked pixels; beyond the image none does.
+    """Samples in masked pixels; none beyond the image.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class InsideImage:
 
     @property
     def n_detectors(self) -> int:
-        """Of the scan."""
+        """Number of the scan's detectors."""
         return len(self.xi)
 
     def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:

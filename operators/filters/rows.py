@@ -107,7 +107,9 @@ def in_double(
     remove: Callable[[Floats, Mask | None], int],
     inside: Inside | None = None,
 ) -> None:
-    """As `by_rows`, for what changes samples (n_det, n_samp) of whole rows in float64."""
+    """Act as `by_rows` with a function that changes samples (n_det, n_samp) of whole rows in
+    float64.
+    """
 
     def on_a_copy(rows: Rows, masked: Mask | None) -> int:
         copy = rows.double(slice(None), rows.values.shape[1])

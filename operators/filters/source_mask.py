@@ -70,9 +70,7 @@ class SourceMask(Parameters):
         return self
 
     def of(self, observation: Observation) -> Inside:
-        """Where the samples of a scan are inside. Raises InputError for a file that cannot be
-        used.
-        """
+        """Samples of a scan that are inside. Raises InputError for a file that cannot be used."""
         if self.file is not None:
             return read_mask(self.file).of(observation)
         ra, dec = self.centre.icrs() if self.centre else observation.centre
@@ -91,11 +89,11 @@ class SourceMask(Parameters):
 
 
 class Inside(Protocol):
-    """Which samples of a scan are in a mask."""
+    """Samples of a scan in a mask."""
 
     @property
     def n_detectors(self) -> int:
-        """Of the scan."""
+        """Number of the scan's detectors."""
 
     def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:
         """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
@@ -103,7 +101,7 @@ class Inside(Protocol):
 
 @dataclass(frozen=True)
 class InsideDisc:
-    """Which samples are in a disc.
+    """Samples in a disc.
 
     Attributes
     ----------
@@ -121,7 +119,7 @@ class InsideDisc:
 
     @property
     def n_detectors(self) -> int:
-        """Of the scan."""
+        """Number of the scan's detectors."""
         return int(self.rays.shape[1])
 
     def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:
@@ -185,7 +183,7 @@ ENOUGH = 256
 
 
 def check_masks(mask: SourceMask | None, data: Data, label: str) -> list[str]:
-    """What `Operator.check` finds of a mask: InputError for a file that cannot be used,
+    """Check a mask for `Operator.check`. Raises InputError for a file that cannot be used, and
     PipelineError as `check_mask`.
     """
     for observation in data.observations if mask is not None else ():

@@ -1,1 +1,1 @@
-"""What the detectors add."""
+"""Noise of the detectors."""

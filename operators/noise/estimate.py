@@ -234,8 +234,8 @@ class _Bins:
         return cls(first, number.astype(np.float64))
 
     def covariance(self) -> Floats:
-        """Of the bins' means, where the values are of variance 1 and correlated by `MEDIANS` with
-        those one and two on.
+        """Covariance of the bins' means, if the values have variance 1 and correlations `MEDIANS`
+        with the next two.
         """
         which = np.repeat(np.arange(len(self.number)), self.number.astype(int))
         found = np.diag(self.number)

@@ -48,7 +48,7 @@ class NoiseLevel:
 
     @property
     def follows_load(self) -> bool:
-        """Whether it depends on the mean emission or transmission of the atmosphere."""
+        """True if it depends on the mean emission or transmission of the atmosphere."""
         return self.model.reference != "sky" or not isinstance(self.model, FixedNet)
 
     def net(self, observation: Observation) -> Floats:

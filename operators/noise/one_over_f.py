@@ -207,7 +207,7 @@ def _log_power(root: Any, sine: Floats) -> Any:
 
 
 def _is_level(law: PowerLawFilter, f_min: float, slope: float) -> bool:
-    """Whether the variance is that of a response that is flat below f_min, within `LEVEL`."""
+    """True if the variance is that of a response that is flat below f_min, within `LEVEL`."""
     up = (
         -np.expm1((1 - slope) * np.log(0.5 / f_min)) / (slope - 1)
         if slope != 1

@@ -198,7 +198,7 @@ class PinkSpectrum:
 
     @classmethod
     def of(cls, pink: PinkNoise, observation: Observation) -> PinkSpectrum | None:
-        """As the step asks for it, else the instrument's; None: no pink noise."""
+        """Spectrum that the step asks for, else the instrument's; None: no pink noise."""
         instrument = observation.instrument
         knee = instrument.knee if pink.knee is None else pink.knee
         if pink.knee is None and not knee:  # the median; single detectors may have some
@@ -287,7 +287,7 @@ class Detectors:
         return np.array([(knee / self.minimum) ** (slope / 2) for knee, slope in pairs])
 
     def describe(self) -> str:
-        """How far detectors differ, in words; empty where they do not."""
+        """Differences between detectors in words; empty if there are none."""
         spans = [
             f"{what} {values.min():.4g} to {values.max():.4g}{unit}"
             for what, values, unit in (("knee", self.knee, " Hz"), ("slope", self.slope, ""))

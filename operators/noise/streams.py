@@ -68,7 +68,7 @@ class Streams:
 
     @property
     def variance(self) -> float:
-        """Of the filter's output."""
+        """Variance of the filter's output."""
         return float(self.law.variance)
 
     def add(
@@ -187,8 +187,8 @@ class StreamsOfSlopes:
         shared: float,
         over: bool,
     ) -> None:
-        """As `Streams.add`; ``common`` (number of slopes, n_samp): one for each filter, in the
-        order of ``made``.
+        """Add noise as `Streams.add`; ``common`` (number of slopes, n_samp): one for each filter,
+        in the order of ``made``.
         """
         n_det, n_samp = out.shape
         edges = [

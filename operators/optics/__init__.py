@@ -1,1 +1,1 @@
-"""What the optics take away."""
+"""Effects of telescope and optics: efficiencies, ground pickup, polarization."""

@@ -143,9 +143,7 @@ class Efficiency(Operator):
 
 @dataclass(frozen=True)
 class Calibration:
-    """What `Efficiency` knows of one observation: per-detector factors (n_det,), t and M of
-    equation (2).
-    """
+    """Factors of one observation per detector (n_det,), t and M of equation (2)."""
 
     zeta: Floats
     epsilon: Floats

@@ -63,8 +63,8 @@ def quotient(
 
 
 def _representatives(weights: NDArray[np.floating], use: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Of more than 512 detectors some hundreds: evenly, those at which a node weighs most and
-    least, and some in ``use``.
+    """Some hundreds of more than 512 detectors: evenly chosen, those at which a node weighs most
+    and least, and some in ``use``.
     """
     n = len(weights)
     if n <= 512:

@@ -61,7 +61,7 @@ Offsets = Annotated[
 
 
 class Aim(NamedTuple):
-    """What a scan is centred on."""
+    """Centre of a scan."""
 
     transform: CelestialTransform
     target: Target
@@ -191,7 +191,7 @@ class Pointing(Operator):
         return _on_tangent_plane(*aim.target.icrs(), x + aim.offset[0], y + aim.offset[1])
 
     def boresight(self, aim: Aim, seconds: Floats) -> Boresight:
-        """Where the boresight is at ``seconds`` (n,) since the start of the scan."""
+        """Boresight at ``seconds`` (n,) since the start of the scan."""
         if type(self).directions is Pointing.directions and aim.target.frame != "horizontal":
             return aim.transform.follow(lambda chunk: self._on_the_sky(aim, chunk), seconds)
         return aim.transform.boresight(self.directions(aim, seconds), seconds)
@@ -200,7 +200,7 @@ class Pointing(Operator):
 
     @property
     def number(self) -> int:
-        """How many scans there are, of all targets."""
+        """Number of scans of all targets."""
         return self.scans * len(self.targets or [None])
 
     def observe(self, data: Data) -> None:

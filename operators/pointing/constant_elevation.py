@@ -46,7 +46,7 @@ class Sweep:
 
     @property
     def beyond(self) -> float:
-        """How far a turnaround reaches beyond the limits, rad."""
+        """Reach of a turnaround beyond the limits, rad."""
         factor = 1 / 4 + 1 / np.pi**2 if self.smooth else 1 / 4
         return self.rate * self.turnaround * float(factor)
 

@@ -110,8 +110,8 @@ def _when(
 
 
 def _span(horizontal: Floats, transform: CelestialTransform, target: Target) -> tuple[float, float]:
-    """How far below and above its target the boresight (n, 3) goes in elevation, over at most 1000
-    samples.
+    """Distances below and above its target to which the boresight (n, 3) goes in elevation, over at
+    most 1000 samples.
     """
     n = len(horizontal)
     looked = np.unique(np.linspace(0, n - 1, min(n, 1000)).astype(int))
@@ -147,7 +147,7 @@ none too fast.
 def excess(
     found: dict[Quantity, LargestDerivative], limits: dict[Quantity, float]
 ) -> dict[Quantity, float]:
-    """By how much each limit is exceeded, a factor > 1, the worst first."""
+    """Factors > 1 by which limits are exceeded, the worst first."""
     ratio = {q: found[q].figure / limit for q, limit in limits.items() if q in found}
     over = {q: r for q, r in ratio.items() if r > 1 + ROUNDING}
     return dict(sorted(over.items(), key=lambda item: -(item[1] ** (1 / item[0][1]))))

@@ -120,9 +120,7 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
 
 
 def _motion(context: Context) -> list[tuple[str, str]]:
-    """What is known of the telescope's motion: (what, text). Samples per beam are those of the band
-    that is planned.
-    """
+    """The telescope's motion: (what, text). Samples per beam are those of the planned band."""
     topics = LargestMotion.TOPICS if context.band else MOTION
     found = [(what, text) for _, what, text in context.first.tally if what.startswith(topics)]
     sampled = SamplesPerBeam()
@@ -132,13 +130,13 @@ def _motion(context: Context) -> list[tuple[str, str]]:
 
 
 class RecordedPlanning(PointingPlanning):
-    """As of other pointing steps."""
+    """Planning of `PointingRecorded`, like that of other pointing steps."""
 
     of: ClassVar[type[Operator]] = PointingRecorded
 
 
 class SchedulePlanning(PointingPlanning):
-    """As of other pointing steps."""
+    """Planning of `PointingSchedule`, like that of other pointing steps."""
 
     of: ClassVar[type[Operator]] = PointingSchedule
 

@@ -46,8 +46,8 @@ RASTER = ": raster"
 
 
 class RasterParameters(Pointing):
-    """What `PointingRaster` takes. What is absent follows from the instrument, and stands in the
-    log of the run.
+    """Parameters of `PointingRaster`. One that is absent follows from the instrument, and stands in
+    the log of the run.
     """
 
     width: Angle | None = Field(None, gt=0, le=0.5)
@@ -197,9 +197,7 @@ class PointingRaster(RasterParameters):
 
 
 def _doubts(rows: Rows, duration: float, interval: float) -> list[str]:
-    """What to warn of in scans of ``duration`` [s], sampled at an ``interval`` [s], behind their
-    name.
-    """
+    """Warnings about scans of ``duration`` [s], sampled at an ``interval`` [s], by name."""
     found = []
     if rows.overshoot > rows.width:
         share = rows.turnaround / (rows.leg + rows.turnaround)

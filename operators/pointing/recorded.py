@@ -89,7 +89,7 @@ class PointingRecorded(Operator):
     """
 
     def check(self, data: Data) -> list[str]:
-        """What is in the file, and whether the telescope can look there."""
+        """Summary of the file. Raises PointingError if the telescope cannot look there."""
         recording, found = self._read()
         for scan in found.scans:
             data.observations.append(self._observation(data, _thinned(scan), recording))
@@ -172,7 +172,7 @@ def _on_the_sky(recording: Recording, celestial: str | None, place: str) -> Reco
 
 
 def _doubts(recording: Recording, found: Comb, time: Instant, file: Path) -> list[str]:
-    """What a run warns of: a record of another day than the scene's, rows out of order."""
+    """Warnings of a run: a record of another day than the scene's, rows out of order."""
     texts, start = [], recording.start or time
     if abs(time.seconds_since(start)) > ANOTHER_DAY:
         texts.append(

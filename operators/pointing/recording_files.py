@@ -76,7 +76,7 @@ Columns = Mapping[str, tuple[Any, str | None]]
 
 @dataclass
 class RecordedTable:
-    """What a file holds.
+    """Content of a file.
 
     Attributes
     ----------

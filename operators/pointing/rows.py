@@ -77,9 +77,7 @@ class Rows(NamedTuple):
 
     @property
     def overshoot(self) -> float:
-        """How far a turnaround reaches beyond the end of a row, rad: equations (1) and (2) at u =
-        1/2.
-        """
+        """Reach of a turnaround beyond the end of a row, rad: equations (1) and (2) at u = 1/2."""
         return self.speed * self.turnaround * (0.25 + 1 / math.pi**2 if self.smooth else 0.25)
 
     @property
@@ -112,7 +110,7 @@ class Rows(NamedTuple):
         return np.where(number % 2 == 0, x, -x), y
 
     def row(self, number: Floats) -> Floats:
-        """Which row, from 0, is crossed in the passage ``number``."""
+        """Number of the row, from 0, that is crossed in the passage ``number``."""
         within = np.mod(number, 2 * self.n)
         return np.asarray(np.minimum(within, 2 * self.n - 1 - within))
 

@@ -71,7 +71,7 @@ class PointingSchedule(ScheduleParameters):
         self._observe(data, self.sample_rate or data.scene.instrument.sample_rate)
 
     def check(self, data: Data) -> list[str]:
-        """How many scans there are, where they look, how fast, and how near to Sun and Moon."""
+        """Number of scans, their places and speeds, and distances from Sun and Moon."""
         first, rate = len(data.observations), self.sample_rate or data.scene.instrument.sample_rate
         rows = read_schedule(self.schedule, self.nod.duration)
         looked = _some(rows)

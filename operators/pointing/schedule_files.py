@@ -81,7 +81,7 @@ class Row:
 
 @dataclass(frozen=True)
 class SchedulesSite:
-    """Where a schedule was made for: its name, and position [rad]."""
+    """Site for which a schedule was made: its name, and position [rad]."""
 
     name: str
     latitude: float
@@ -140,7 +140,7 @@ def _head_of_ecsv(lines: list[str]) -> dict[str, Any]:
 
 
 def _degrees(value: Any) -> float:
-    """Of a quantity, a number or a text such as ``-22.96 deg``. Raises ValueError."""
+    """Degrees of a number, or a text such as ``-22.96 deg``. Raises ValueError."""
     from astropy.units import Quantity, UnitsError, deg, dimensionless_unscaled
 
     try:

@@ -39,7 +39,7 @@ Track = Callable[[Floats], Floats]
 
 
 class ScheduleParameters(Operator):
-    """What all scans of a schedule have in common."""
+    """Parameters that all scans of a schedule share."""
 
     schedule: InputPath
     """Version 5 (ECSV) or versions 4 to 1 (text) of TOAST's schedules."""

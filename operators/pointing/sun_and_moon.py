@@ -1,4 +1,4 @@
-"""How near scans come to the Sun and the Moon."""
+"""Distances of scans from the Sun and the Moon."""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ class ArrayMap:
 
     @property
     def name(self) -> str:
-        """How messages call it: ``array of 64 x 48``."""
+        """Name in messages: ``array of 64 x 48``."""
         if self.table is not None:
             return "HEALPix table in memory"
         return f"array of {' x '.join(str(n) for n in reversed(self.values.shape))}"
@@ -174,12 +174,12 @@ class ArrayMap:
 
     @property
     def text(self) -> str:
-        """What the log says of it: ``array of 64 x 48, float64, hash 0123456789abcdef``."""
+        """Entry of the log: ``array of 64 x 48, float64, hash 0123456789abcdef``."""
         kind = "" if self.table is not None else f", {self.values.dtype.name}"
         return f"{self.name}{kind}, hash {self.given or self.digest}"
 
     def record(self) -> dict[str, Any]:
-        """What products say of it: shape, type, unit, hash."""
+        """Shape, type, unit and hash, for products."""
         unit = {"unit": self.header["BUNIT"]} if "BUNIT" in self.header else {}
         shape = (
             {"healpix": int(self.header.get("NSIDE") or 0)}
@@ -189,7 +189,7 @@ class ArrayMap:
         return {**shape, "type": self.values.dtype.name, **unit, "hash": self.digest}
 
     def write(self, path: Path) -> None:
-        """As a FITS file that reads back to the same bits: header values are rounded as astropy
+        """Write a FITS file that reads back to the same bits: header values are rounded as astropy
         does, in memory too.
 
         The key `GIVEN` says what it was.

@@ -257,8 +257,8 @@ def resampled(
 
 
 def _lost(image: WcsMap) -> int:
-    """How many bright pixels in Jy/pixel lie beyond the projection, where there is no sky; of
-    `CHECKED` and more an estimate.
+    """Number of bright pixels in Jy/pixel beyond the projection, where there is no sky; an estimate
+    for `CHECKED` and more.
     """
     if image.unit != "Jy/pixel":
         return 0

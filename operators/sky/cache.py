@@ -1,4 +1,4 @@
-"""What an operator has computed, kept for its next observation."""
+"""Results of an operator that are kept for its next observation."""
 
 from __future__ import annotations
 

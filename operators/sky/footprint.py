@@ -1,6 +1,4 @@
-"""Where an input map lies on the sky, by its header alone: what `zonda check` and ``target: map``
-need.
-"""
+"""Place of an input map on the sky by its header alone, for `zonda check` and ``target: map``."""
 
 from __future__ import annotations
 
@@ -50,7 +48,7 @@ class Footprint:
     shape: tuple[int, int]
 
     def holds(self, direction: Floats) -> bool:
-        """Whether an ICRS direction (3,) is on the map; of another projection than TAN: within its
+        """True if an ICRS direction (3,) is on the map; in other projections than TAN, within its
         `radius`.
         """
         if self.matrix is None:

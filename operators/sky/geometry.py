@@ -1,5 +1,5 @@
-"""Where the pixels of an image lie, by its header (the WCS, or pixels of a known size), or where
-the user puts them.
+"""Directions of an image's pixels by its header (the WCS, or pixels of a known size), or as the
+user places them.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def rescaled(wcs: Any, matrix: Floats) -> Any:
 
 
 def is_celestial(ctype: str) -> bool:
-    """Whether an axis of this CTYPE is a longitude or a latitude on the sky."""
+    """True for the CTYPE of a longitude or a latitude on the sky."""
     return (
         re.match(r"(RA--|DEC-|[GESH]L(ON|AT)|HP(LN|LT)|[A-Z]{2}L[NT])", ctype.upper()) is not None
     )

@@ -66,7 +66,7 @@ LOOKED_AT = 256, 37
 
 @dataclass(frozen=True)
 class Grid:
-    """Where the map of ``source`` is convolved.
+    """Pixels on which the map of ``source`` is convolved.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Grid:
         return north
 
     def reached(self, observation: Observation, widest: float) -> bool:
-        """Whether any detector of an observation comes within a beam of FWHM ``widest`` [rad] of
+        """True if any detector of an observation comes within a beam of FWHM ``widest`` [rad] of
         the map.
         """
         ny, nx = self.shape
@@ -156,7 +156,7 @@ class Grid:
 
     @property
     def is_flat(self) -> bool:
-        """Whether solid angles are the same all over it, to `FLAT`."""
+        """True if solid angles are the same all over the grid, to `FLAT`."""
         ny, nx = self.shape
         corners = np.array([[x, y, 1.0] for x in (-0.5, nx - 0.5) for y in (-0.5, ny - 0.5)])
         matrix = pixel_matrix(self.wcs)
@@ -192,7 +192,7 @@ def own_pixels(
 
 
 def is_flat(source: WcsMap, wcs: Any, observation: Observation, reach: float) -> bool:
-    """Whether a TAN image is flat (`FLAT`) as far as an observation and its beam's ``reach`` [rad]
+    """True if a TAN image is flat (`FLAT`) as far as an observation and its beam's ``reach`` [rad]
     go from its tangent point.
     """
     ny, nx = source.values.shape
@@ -253,9 +253,7 @@ def tangent_grid(
 
 
 def is_resolved(source: WcsMap | HealpixMap, fwhm: float) -> bool:
-    """Whether a beam of ``fwhm`` [rad] is at least 2 pixels of the map wide, by the header's
-    scale.
-    """
+    """True if a beam of ``fwhm`` [rad] is at least 2 of the map's pixels wide, by the header."""
     return _resolves(float(nominal_sides(source).max()), fwhm)
 
 

@@ -31,7 +31,7 @@ _FRAMES: dict[str, Frame] = {
 
 
 def is_healpix(hdu: Any) -> bool:
-    """Whether an HDU is a table of HEALPix pixels."""
+    """True for an HDU with a table of HEALPix pixels."""
     header = hdu.header
     return header.get("XTENSION") == "BINTABLE" and (
         str(header.get("PIXTYPE", "")).upper() == "HEALPIX"
@@ -183,7 +183,7 @@ def _check_wanted(place: str, wanted: Wanted) -> None:
 
 
 def _ordering(place: str, header: Any) -> bool:
-    """Whether the pixels are numbered in the nested scheme."""
+    """True if the pixels are numbered in the nested scheme."""
     ordering = str(header.get("ORDERING", "")).strip().upper()
     if ordering == "NUNIQ":
         raise InputError(

@@ -18,8 +18,7 @@ Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the user says of a file: the parameters of `SkyMap` of these names, angles in rad, and
-    whether the map is centred.
+    """Parameters of `SkyMap` that say how a file is read, angles in rad.
 
     Attributes
     ----------

@@ -24,8 +24,8 @@ from .sampling import CHUNK, count_covered, locate, misses, span_on_grid
 def add_lines(  # type: ignore[no-untyped-def]
     h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, over, out
 ):
-    """As `sampling.add_splines`, from the grid's values. Samples within two points of its border
-    are left as they are.
+    """Add samples as `sampling.add_splines`, from the grid's values. Samples within two points of
+    its border are left as they are.
     """
     place = np.empty(CHUNK, np.int32)
     u, v = np.empty(CHUNK, out.dtype), np.empty(CHUNK, out.dtype)

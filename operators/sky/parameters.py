@@ -126,7 +126,7 @@ class SkyParameters(Operator):
 
     @property
     def place(self) -> str:
-        """How messages call the map."""
+        """Name of the map in messages."""
         return f"{self.label}, sky map {self.map.name if self.map else self.file}"
 
     @property
@@ -187,9 +187,7 @@ class SkyParameters(Operator):
         return None if found is None else footprint(*found, self.pixel_size, centre, self.place)
 
     def _copies(self, data: Data) -> str:
-        """What to say of a map that goes with the target, where there are several; empty where it
-        does not.
-        """
+        """Warning about a map that goes with the target, if there are several targets, or empty."""
         found, targets = self._header(), len({o.centre for o in data.observations})
         placeless = self.centre is None and found is not None and "CTYPE1" not in found[0]
         if targets < 2 or not (self.centre == "target" or placeless):
@@ -201,8 +199,8 @@ class SkyParameters(Operator):
         )
 
     def check(self, data: Data) -> list[str]:
-        """Whether the scans are about a point of the map, by its header; the share of their samples
-        that is outside.
+        """Check that scans are about a point of the map, by its header; states the share of samples
+        outside.
         """
         if text := self._copies(data):
             warnings.warn(text, stacklevel=2)

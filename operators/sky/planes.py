@@ -1,4 +1,4 @@
-"""Which image of a file and which plane of a cube is read: the one that the user names, or the only
+"""Choice of the image of a file and the plane of a cube: the one that the user names, or the only
 possible one.
 """
 
@@ -68,7 +68,7 @@ def chosen(hdus: Any, wanted: int | str | None, place: str) -> tuple[Any, dict[s
 
 
 def is_map(hdu: Any) -> bool:
-    """Whether it is a HEALPix table or an image of two axes or more."""
+    """True for a HEALPix table or an image of two axes or more."""
     return is_healpix(hdu) or bool(hdu.is_image and hdu.header.get("NAXIS", 0) > 1)
 
 

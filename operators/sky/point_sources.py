@@ -212,7 +212,7 @@ class Catalogue:
 
 @dataclass(frozen=True)
 class Sources:
-    """What `exec` needs for one scan.
+    """Sources and detectors of one scan.
 
     Attributes
     ----------
@@ -235,7 +235,7 @@ class Sources:
 
     @classmethod
     def of(cls, catalogue: Catalogue, power: Floats, observation: Observation) -> Sources:
-        """Those that come into the field, widened by the beam."""
+        """Sources that come into the field, widened by the beam."""
         plane, n = observation.focalplane, observation.n_samples
         rays = np.stack([-plane.eta, -plane.xi, np.ones(len(plane))], axis=1)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -264,7 +264,7 @@ class Sources:
 
     @property
     def in_view(self) -> int:
-        """How many sources come near the field at any time."""
+        """Number of sources that come near the field at any time."""
         return len(np.unique(self.number))
 
 

@@ -74,7 +74,7 @@ class PySMSky(FullSky):
             check_templates(config, self.nside, self.label)
 
     def check(self, data: Data) -> list[str]:
-        """What is modelled, and by which version of PySM; raises as `observe`."""
+        """Names the model and the version of PySM. Raises as `observe`."""
         self.observe(data)
         return [f"PySM {needed('pysm3', EXTRA).__version__}: {self._what}"]
 

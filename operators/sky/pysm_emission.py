@@ -161,7 +161,7 @@ def _seeded(config: Any, models: Any) -> Any:
 
 
 def is_file(item: Any) -> bool:
-    """Whether a value of a component is the name of a file."""
+    """True if a value of a component is the name of a file."""
     return isinstance(item, str) and item.endswith(FILES)
 
 

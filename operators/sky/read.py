@@ -68,7 +68,7 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
 
 
 def read_array(array: ArrayMap, place: str, **options: Any) -> WcsMap | HealpixMap:
-    """As `read_map`, of an array or HDU in memory."""
+    """Read an array or HDU in memory as `read_map` reads a file."""
     wanted = Wanted(**options)
     if array.table is not None:
         with reading(place, "FITS", "check the table"):

@@ -68,7 +68,7 @@ class Region:
 
     @property
     def points(self) -> int:
-        """How many points are worked on."""
+        """Number of points that are worked on."""
         ny, nx = self.shape
         return ny * nx if self.tiles is None else int(self.tiles.sum()) * TILE**2
 

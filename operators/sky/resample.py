@@ -165,7 +165,7 @@ class ImageOnSky:
 
     @property
     def joined(self) -> bool:
-        """Whether it goes round the sky, so that its last column stands beside its first."""
+        """True if the image goes round the sky, so that its last column stands beside its first."""
         return bool(self._period and abs(self.grid.shape[1] - self._period) < 0.5)
 
     def directions(self, x: Any, y: Any) -> Floats:
@@ -193,9 +193,7 @@ class ImageOnSky:
         return found
 
     def is_own(self, x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether pixels are those that hold their centres: of several that stand for the same sky,
-        one.
-        """
+        """True for pixels that hold their centres: one of several that stand for the same sky."""
         if self._period or self.grid.kind in ZENITHAL or self.grid.wcs.has_distortion:
             return np.ones(x.shape, bool)
         u, v = self.grid.coordinates(self.grid.at(x, y))
@@ -231,8 +229,8 @@ class ImageOnSky:
             return x, y, (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
 
     def for_splines(self, d: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """As `at`; where the image goes round the sky, x is continuous about where most of the
-        directions are.
+        """Positions as `at`; if the image goes round the sky, x is continuous about most of the
+        directions.
         """
         x, y, inside = self.at(d)
         if self.joined and inside.any():
@@ -381,7 +379,7 @@ def resample_healpix(
 def slots(
     sky: HealpixMap, numbers: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Where pixels of these numbers stand in ``sky.values``, and whether they are there."""
+    """Indices of pixels of these numbers in ``sky.values``, and whether they are there."""
     if sky.pixels is None:
         return numbers, np.ones(len(numbers), bool)
     found = np.minimum(np.searchsorted(sky.pixels, numbers), len(sky.pixels) - 1)

@@ -94,8 +94,8 @@ def pointing(
     bounds: NDArray[np.float64],
     kind: Any,
 ) -> Chunks:
-    """Where the boresight is on a working grid, in m chunks of `CHUNK` samples, each counted from
-    its own origin.
+    """Boresight on a working grid, in m chunks of `CHUNK` samples, each counted from its own
+    origin.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def add_splines(  # type: ignore[no-untyped-def]
 
 @kernel(fastmath={"contract", "nsz"}, inline="always")
 def misses(box, a, b, limits):  # type: ignore[no-untyped-def]
-    """Whether a detector at (a, b) = (xi, eta) is in front of the map and a pixel or more off it at
+    """True if a detector at (a, b) = (xi, eta) is in front of the map and a pixel or more off it at
     every instant of a chunk.
 
     By intervals: x = n / w with n and w between bounds, 0 < w, lies between the least and the
@@ -278,8 +278,8 @@ def _between(box, k, a, b):  # type: ignore[no-untyped-def]
 def locate(  # type: ignore[no-untyped-def]
     h, a, b, count, limits, constants, ones, width, place, u, v
 ):
-    """Where a detector at (a, b) = (xi, eta) looks: the index of its first coefficient (-1: none)
-    and the fractions u, v.
+    """Position of a detector at (a, b) = (xi, eta) on the grid: the index of its first coefficient
+    (-1: none) and the fractions u, v.
 
     Returns the numbers of samples inside the input map's edges and in front of the tangent plane.
     """

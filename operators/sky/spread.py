@@ -68,7 +68,7 @@ Under = Callable[[Block, Chosen], tuple[NDArray[np.bool_], Iterator[Part]]]
 
 @dataclass(frozen=True)
 class Spread:
-    """How pixels are spread: for a beam of ``fwhm`` [rad], by the ``share`` f of its variance."""
+    """Spread of pixels over a grid for a beam of ``fwhm`` [rad]: ``share`` f of its variance."""
 
     fwhm: float
     share: float

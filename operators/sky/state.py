@@ -1,6 +1,4 @@
-"""What `SkyMap` keeps for an observation: the convolved maps, where the boresight is on them, what
-was counted.
-"""
+"""State of `SkyMap` for an observation: convolved maps, the boresight on them, counts."""
 
 from __future__ import annotations
 
@@ -112,7 +110,7 @@ class _Held:
 
 @dataclass
 class SkyState:
-    """What `SkyMap.exec` needs.
+    """State for `SkyMap.exec`.
 
     Attributes
     ----------

@@ -1,5 +1,5 @@
-"""Where the lines of sight cross a layer: ray directions, the plane that turbulence is laid out in,
-and its drift.
+"""Lines of sight through a layer: ray directions, the plane that turbulence is laid out in, and its
+drift.
 
 A ray of direction u crosses a flat layer at height h at the horizontal point h X, X = (u_east,
 u_north) / u_up. Turbulence is a field on the plane transverse to the mean line of sight n of a
@@ -225,7 +225,7 @@ class ScanPlane:
 
     @property
     def stretch(self) -> float:
-        """What separations along the elevation are too large by."""
+        """Factor by which separations along the elevation are too large."""
         return 1 / math.sin(self.elevation) if self.kind == "horizontal" else 1.0
 
     def unroll(self, crossings: Floats) -> Floats:
@@ -363,7 +363,7 @@ def _mean_drift(cone: Cone, crossings: Floats) -> tuple[Floats, float]:
 
 
 def looking(observation: Observation) -> tuple[int, bytes, bytes]:
-    """What tells whether two bands look along the same lines of sight."""
+    """Key that tells whether two bands look along the same lines of sight."""
     plane = observation.focalplane
     return id(observation.boresight_azel), plane.xi.tobytes(), plane.eta.tobytes()
 

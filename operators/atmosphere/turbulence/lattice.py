@@ -125,7 +125,7 @@ class Turbulence:
         return float(beam_correlation(0.0, self.outer_scale, self.sigma)[0])
 
     def alike(self, other: Turbulence) -> bool:
-        """Whether another field is a convolution of the same random numbers with kernels of the
+        """True if another field is a convolution of the same random numbers with kernels of the
         same shapes.
         """
         if len(self.levels) != len(other.levels) or not np.array_equal(self._keys, other._keys):
@@ -193,7 +193,7 @@ def _regions(fields: Sequence[Turbulence], i0: int, i1: int, j0: int, j1: int) -
 
 
 def _same_taps(one: Field | None, other: Field | None) -> bool:
-    """Whether two kernels have the same taps, whatever they weigh: sums are then made in the same
+    """True if two kernels have the same taps, with any weights: sums are then made in the same
     order.
     """
     if one is None or other is None:

@@ -107,8 +107,8 @@ def gaussian_levels(
 def aperture_levels(
     outer_scale: float, aperture: Aperture, lattice: float, fidelity: str
 ) -> tuple[Level, ...]:
-    """As `gaussian_levels`: `Aperture.gaussians` see the mixture beyond s_0 = sigma^2, the finest
-    level all else.
+    """Levels as `gaussian_levels`: `Aperture.gaussians` see the mixture beyond s_0 = sigma^2, the
+    finest level all else.
     """
     f = FIDELITIES[fidelity]
     exponent = math.floor(math.log2(aperture.sigma * min(lattice, 0.5)))

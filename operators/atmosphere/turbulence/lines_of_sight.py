@@ -1,4 +1,4 @@
-"""Where many lines of sight cross the plane of the turbulence, compiled: `geometry` for every
+"""Crossings of many lines of sight with the plane of the turbulence, compiled: `geometry` for every
 detector and coarse time.
 
 A focal-plane point (xi, eta) looks at u = (z - eta x - xi y) / sqrt(1 + xi^2 + eta^2), with x, y, z
@@ -114,7 +114,7 @@ class LinesOfSight:
         return x, y, sine
 
     def same_as(self, other: LinesOfSight) -> bool:
-        """Whether another's positions have the same bits."""
+        """True if another's positions have the same bits."""
         own, theirs = ((one._linear, one._turn, one._shift, *one._series) for one in (self, other))
         times = (self.step, self.first, self.count) == (other.step, other.first, other.count)
         return times and len(own) == len(theirs) and all(map(np.array_equal, own, theirs))

@@ -1,5 +1,5 @@
-"""Where the smooth atmosphere is evaluated: nodes over the focal plane and steps in time, chosen
-from an error bound.
+"""Nodes over the focal plane and steps in time for the smooth atmosphere, chosen from an error
+bound.
 
 For a layer of covariance sum_k w_k exp(-r^2 / 4 e_k) (`covariance.mixture`) the expected squared
 error of a linear interpolation with weights W (summing to 1) is exact and separable on a grid:

@@ -129,8 +129,8 @@ class DriftingLayers:
     def with_others(
         self, others: Sequence[DriftingLayers], xi: Floats, eta: Floats, first: int, count: int
     ) -> tuple[Floats, Floats]:
-        """As a call, of this band and of ``others`` that look as it does: where they look is found
-        once.
+        """Sum of the layers of this band and of ``others`` that look as it does: lines of sight are
+        found once.
 
         The sum of the layers is (1 + len(others), len(xi), count).
         """
@@ -140,8 +140,8 @@ class DriftingLayers:
     def sums(
         self, others: Sequence[DriftingLayers], xi: Floats, eta: Floats, first: int, count: int
     ) -> tuple[Floats, list[Floats], Floats]:
-        """As `with_others`, and for each band its weighted sums, (k, len(xi), count) in the order
-        of its ``weights``.
+        """Sums as `with_others`, and for each band its weighted sums, (k, len(xi), count) in the
+        order of its ``weights``.
 
         The plain sums have the same bits with such weights and without.
         """
@@ -200,8 +200,8 @@ class DriftingLayers:
         return total, weighted, sine
 
     def looks_as(self, other: DriftingLayers) -> bool:
-        """Whether another band looks along the same lines at the same times, and at layers that
-        drift alike.
+        """True if another band looks along the same lines at the same times, at layers that drift
+        alike.
         """
         if self._step != other._step or len(self._drifting) != len(other._drifting):
             return False
@@ -221,7 +221,9 @@ class DriftingLayers:
         return self._constants[0].dtype == other._constants[0].dtype
 
     def _sweep(self, xi: Floats, eta: Floats) -> list[Swept]:
-        """What the lines of sight of the rim (xi, eta) of the points sweep over, for each layer."""
+        """Regions that the lines of sight of the rim (xi, eta) of the points sweep over, for each
+        layer.
+        """
         whole = [(1 << 62, -(1 << 62), 1 << 62, -(1 << 62))] * len(self._drifting)
         cells = [0.0] * len(self._drifting)
         for own, path in self.paths.items():

@@ -164,15 +164,15 @@ class Tiles:
 
 @dataclass(frozen=True)
 class Swept:
-    """What lines of sight sweep over of a lattice: first and last cells, and about how many lattice
-    points.
+    """Region of a lattice that lines of sight sweep over: first and last cells, and about how many
+    lattice points.
     """
 
     box: Box
     cells: float
 
     def joined(self, other: Swept) -> Swept | None:
-        """Both, where most of what either reaches is reached by the other too; or None."""
+        """Union of two regions if they mostly overlap, else None."""
         (a, b, c, d), (e, f, g, h) = self.box, other.box
         joined = min(a, e), max(b, f), min(c, g), max(d, h)
         common = max(min(b, f) - max(a, e) + 1.0, 0.0) * max(min(d, h) - max(c, g) + 1.0, 0.0)

@@ -117,7 +117,7 @@ class BandAtmosphere:
         return self._transfer.spectra(pwv, elevations)
 
     def of_water(self, pwv: float, elevations: Sequence[float]) -> WaterResponse:
-        """What water at each height changes, by radiative transfer. PWV in m, elevations in rad."""
+        """Response to water at each height, by radiative transfer. PWV in m, elevations in rad."""
         return self._transfer.of_water(pwv, elevations)
 
     def emission(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
@@ -253,7 +253,7 @@ class BandAtmosphere:
 
 @dataclass(frozen=True)
 class WaterResponse:
-    """What water that is added at a height changes, per metre of PWV, along lines of sight at k
+    """Response to water that is added at a height, per metre of PWV, along lines of sight at k
     elevations.
 
     Attributes
@@ -318,7 +318,7 @@ class BandTransfer:
         return LoadSpectra(self._frequency, self._width, self._square, brightness, transmission)
 
     def of_water(self, pwv: float, elevations: Sequence[float]) -> WaterResponse:
-        """What water at each height changes, where the column holds ``pwv`` [m]."""
+        """Response to water at each height, if the column holds ``pwv`` [m]."""
         layers = self._layers.scaled(pwv)
         vertical, per_water = (
             layers.opacity(self._cross_sections),

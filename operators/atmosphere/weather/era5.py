@@ -120,8 +120,8 @@ def read_era5(path: Path, site: Site, time: Instant) -> Column:
 
 
 def _remarks(water_below_none: int, o3: Floats | None) -> list[str]:
-    """What ERA5's packing and spectral transform leave: slightly negative water and ozone, which
-    are taken as none.
+    """Remarks on slightly negative water and ozone, which ERA5's packing and spectral transform
+    leave and which count as none.
     """
     ozone_below_none = 0 if o3 is None else int(np.count_nonzero(o3 < 0))
     found = ["ozone of the standard atmosphere"] if o3 is None else []
@@ -277,8 +277,8 @@ KEY = "https://cds.climate.copernicus.eu/how-to-api says how to get a free key a
 
 
 def request(site: Site, time: Instant, hours: int) -> dict[str, Any]:
-    """What to ask for: the cells around the site, and every hour from that before ``time`` to
-    ``hours`` later.
+    """Request for the cells around the site, and every hour from that before ``time`` to ``hours``
+    later.
 
     The store takes whole days times hours of the day, so a period over midnight gets more than
     that.

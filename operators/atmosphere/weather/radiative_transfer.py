@@ -207,7 +207,7 @@ class Layers:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """What a ray sees, per frequency (n,).
+    """Opacity and brightness along a ray, per frequency (n,).
 
     Attributes
     ----------

@@ -140,7 +140,7 @@ def profile_of(
 
 
 def on_the_ground(profile: Profile, time: Instant, wind: AnyFloats | None = None) -> GroundWeather:
-    """What instruments at the telescope read; ``wind`` (east, north) [m/s] where it is not the
+    """Readings of instruments at the telescope; ``wind`` (east, north) [m/s] if it is not the
     profile's.
     """
     ground, air = profile.at(0.0), profile.at(10.0)
@@ -162,7 +162,7 @@ def on_the_ground(profile: Profile, time: Instant, wind: AnyFloats | None = None
 
 
 def of_scene(scene: Scene) -> GroundWeather:
-    """What instruments at the telescope read at the start of a scene."""
+    """Readings of instruments at the telescope at the start of a scene."""
     return on_the_ground(profile_of(scene.weather, scene.site, scene.time, scene.seed), scene.time)
 
 

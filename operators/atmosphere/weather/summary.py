@@ -76,7 +76,7 @@ def pwv_steps(profile: Profile) -> list[float]:
 
 
 def place_lines(site: Site, time: Instant, profile: Profile) -> list[str]:
-    """Where and when, and where the profile comes from."""
+    """Lines about place, time and source of the profile."""
     where = (
         f"{math.degrees(site.latitude):.4f} deg, {math.degrees(site.longitude):.4f} deg,"
         f" {site.altitude:g} m"
