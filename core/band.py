@@ -181,7 +181,7 @@ class CameraBand(Band):
 
     @property
     def stated(self) -> dict[str, Any]:
-        """What it does not leave to the instrument, by name."""
+        """Values that it does not leave to the instrument, by name."""
         return {key: value for key in PER_BAND if (value := getattr(self, key)) is not None}
 
     @property

@@ -80,7 +80,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Result:
-    """What a `Check` reached, how long it took [s], and a remark."""
+    """Value of a `Check`, the time it took [s], and a remark."""
 
     check: Check
     figure: float

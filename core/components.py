@@ -95,7 +95,7 @@ class Registry:
 
     @property
     def _class(self) -> Any:
-        """What `base` names, imported now."""
+        """The class that `base` names, imported now."""
         module, _, attribute = self.base.partition(":")
         return getattr(import_module(module), attribute)
 
@@ -287,7 +287,7 @@ class Registry:
             ) from None
 
     def _same(self, names: list[str]) -> bool:
-        """Whether all ``names`` stand for equal things, as a site and its alias do."""
+        """True if all ``names`` stand for equal things, as a site and its alias do."""
         make = self.get if self.classes else self.create
         try:
             first, *others = (make(name) for name in names)

@@ -138,7 +138,7 @@ def plugin_of(module: str) -> str:
 
 
 def others_may_declare(group: str) -> bool:
-    """Whether a distribution beside zonda's own may have entry points in ``group``.
+    """True if a distribution beside zonda's own may have entry points in ``group``.
 
     A look into the folders on sys.path that spares importing `importlib.metadata`, a third of the
     time of ``zonda --help``.

@@ -30,7 +30,7 @@ def for_site(sites: Registry, instruments: Registry, name: str) -> tuple[str, st
 
 
 def for_instrument(sites: Registry, instruments: Registry, name: str) -> tuple[str, str]:
-    """As `for_site`, for an unknown instrument."""
+    """(label, cure) for an unknown instrument that is the name of another thing, as `for_site`."""
     made = list(_made(instruments))
     mounted = sorted(known for known, i in made if fold(i.telescope.name) == fold(name))
     if mounted:

@@ -181,8 +181,8 @@ class Instrument(Parameters):
     @model_validator(mode="before")
     @classmethod
     def _one_or_several_bands(cls, value: Any, info: ValidationInfo) -> Any:
-        """What all bands state need not be stated for the instrument; ``band`` beside ``bands``
-        chooses one of them.
+        """Take from `bands` a value that all of them state; ``band`` beside ``bands`` chooses one
+        of them.
         """
         if isinstance(value, dict) and value.get("focalplane") is not None:
             value = _completed(value, info)
@@ -390,8 +390,7 @@ class Instrument(Parameters):
 
     @property
     def cameras(self) -> dict[str, Instrument]:
-        """By name of the band, the camera that has this band alone; one entry where there is one
-        band.
+        """Cameras with one band each, by name of the band.
 
         Of bands with arrays side by side the field of view is that of one array.
         """
@@ -424,8 +423,8 @@ class Instrument(Parameters):
 
     @property
     def identity(self) -> tuple[str, ...]:
-        """What tells its detectors' random numbers from those of another instrument or band: names
-        and passband.
+        """Names and passband, which tell its detectors' random numbers from those of another
+        instrument or band.
         """
         return "instrument", self.name, "band", *self.band.identity
 
@@ -477,7 +476,7 @@ class Instrument(Parameters):
 
     @property
     def notes(self) -> dict[str, str]:
-        """What was chosen in reading the files that describe it, for the log and `zonda check`."""
+        """Choices in reading the files that describe it, for the log and `zonda check`."""
         told = read_array(self.focalplane_table).notes if self.focalplane_table is not None else ()
         return {"focal plane": "; ".join(told)} if told else {}
 
@@ -507,8 +506,8 @@ class Instrument(Parameters):
 
 
 def _completed(given: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-    """What is ``given`` for an instrument, with what its table of detectors states: number, field,
-    medians.
+    """Add to the keys ``given`` for an instrument those that its table of detectors states: number,
+    field, medians.
     """
     rest = {key: value for key, value in given.items() if value is not None}
     try:

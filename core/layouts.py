@@ -1,5 +1,5 @@
-"""Where the pixels of a camera lie: hexagonal lattices, rings, and wafers of them. Lengths are in
-units of the layout's own.
+"""Layouts of a camera's pixels: hexagonal lattices, rings, and wafers of them. Lengths are in units
+of the layout's own.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ centres.
 
 @dataclass(frozen=True)
 class Layout:
-    """Where ``n`` pixels lie: what a registered layout (entry points ``zonda.layouts``), called
-    with their number, returns.
+    """Places of ``n`` pixels, returned by a registered layout (entry points ``zonda.layouts``) that
+    is called with their number.
 
     The callable may have an attribute ``wafers``: a number that divides that of the pixels.
 

@@ -108,8 +108,8 @@ class Operator(Labelled):
         """
 
     def check(self, data: Data) -> list[str]:
-        """What `zonda check` finds out beyond the parameters, in well under a second: lines to
-        print, or a `ZondaError`.
+        """Lines for `zonda check`, found in well under a second. Raises a `ZondaError` for a
+        mistake beyond the parameters.
 
         Pointing operators append observations to ``data``, on which later steps may look: of a long
         scan fewer instants, with what the run will take in `Observation.seen_of`

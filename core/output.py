@@ -55,7 +55,7 @@ class Output(Operator):
         return self._shown
 
     def reads(self, signal: str) -> bool:
-        """Whether it reads products of the signal of that name (empty: the complete one)."""
+        """True if it reads products of the signal of that name (empty: the complete one)."""
         return signal in self.shown if self.signals() or signal.startswith("_") else True
 
     def watch(self, data: Data, done: Progress) -> None:
@@ -69,13 +69,14 @@ class StreamOutput(Operator):
 
 
 def is_output(operator: Operator) -> bool:
-    """Whether a step says that it is an output: what it reads is what a run is for."""
+    """True if a step says that it is an output: a run is there for what it reads."""
     return isinstance(operator, (Output, StreamOutput))
 
 
 def changes_observations(operator: Operator) -> bool:
-    """Whether all that a step does is to change observations (a plate's angles): it provides
-    nothing, and neither works on their data nor writes."""
+    """True if a step does nothing but change observations (a plate's angles): it provides nothing,
+    and neither works on their data nor writes.
+    """
     works = any(
         getattr(type(operator), step) is not getattr(Operator, step)
         for step in ("exec", "measure", "collect", "finalize")
@@ -84,7 +85,7 @@ def changes_observations(operator: Operator) -> bool:
 
 
 def may_write(operator: Operator) -> bool:
-    """Whether a step may leave a file: an output, or one that works on the data and provides
+    """True if a step may leave a file: an output, or one that works on the data and provides
     nothing of it.
     """
     return is_output(operator) or not (operator.provides or changes_observations(operator))

@@ -44,7 +44,7 @@ class Product(ABC):
     @classmethod
     @abstractmethod
     def of(cls, arrays: Mapping[str, Any]) -> Self:
-        """What `arrays` gave, put together again."""
+        """Restore a product from `arrays`."""
 
     def subtract(self, stream: str, parts: Sequence[str]) -> None:
         """Add what belongs to the signal ``stream``: that of ``signal`` minus those of ``parts``,

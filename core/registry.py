@@ -1,4 +1,4 @@
-"""What plugins provide: one registry per kind of component.
+"""Registries of the components that plugins provide, one per kind.
 
 >>> import zonda
 >>> @zonda.register                                         # doctest: +SKIP

@@ -1,4 +1,4 @@
-"""What exists: the site, the instrument, the time, the target and the seed."""
+"""The scene: site, instrument, time, target, weather and seed."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ HIGHER = 200.0
 
 
 class Scene(Parameters):
-    """What exists while the pipeline observes. `site` and `instrument` take a registered name or an
-    object.
+    """Site, instrument, time, target, weather and seed of the observations. `site` and `instrument`
+    take a registered name or an object.
     """
 
     site: Site
@@ -134,9 +134,7 @@ def distance(here: tuple[float, float], site: Site) -> float:
 
 
 def elsewhere(scene: Scene) -> str:
-    """What to say of a telescope that the scene puts on another site than its own; empty where it
-    does not.
-    """
+    """Warning about a telescope on another site than its own, or empty."""
     telescope = scene.instrument.telescope
     try:
         home = sites.create(telescope.site) if telescope.site else None

@@ -76,14 +76,14 @@ class Signal(Parameters):
         return self
 
     def keeps(self, provides: frozenset[str]) -> bool:
-        """Whether what a step provides is part of it."""
+        """True if a stream that a step provides is part of it."""
         if self.only is not None:
             return bool(provides & set(self.only))
         return not provides & set(self.without or ())
 
     @property
     def is_quiet(self) -> bool:
-        """Whether no noise of detectors is in it, for sure."""
+        """True if surely no noise of detectors is in it."""
         return self.only is not None and set(self.only) <= {"sky", "atmosphere", TRANSMISSION}
 
 
@@ -114,7 +114,7 @@ class Formed:
     own: frozenset[str] = frozenset()
 
     def takes_model(self, label: str) -> bool:
-        """Whether filters use for this signal what they measure in the complete one."""
+        """True if filters use for this signal what they measure in the complete one."""
         return self.model and self.stream != MAIN and label not in self.own
 
     @property
@@ -133,7 +133,7 @@ def needed_name(signal: Signal) -> str:
 
 
 def can_be_named(name: str) -> bool:
-    """Whether a pipeline's author may call a signal so; names that begin with an underscore are
+    """True if a pipeline's author may call a signal so; names that begin with an underscore are
     those of outputs.
     """
     return name.isidentifier() and not name.startswith("_")
@@ -145,13 +145,12 @@ def stream_of(name: str) -> str:
 
 
 def is_signal(stream: str) -> bool:
-    """Whether it is the name of a signal's stream."""
+    """True for the name of a signal's stream."""
     return stream == MAIN or stream.startswith(f"{MAIN}/")
 
 
 def is_stream(name: str) -> bool:
-    """Whether what an operator provides under this name is nothing but a stream of a block: a
-    component, or a signal.
+    """True if the name is that of a stream of a block alone: a component, or a signal.
 
     Its only use is to be read by a later step. Any other name may be a product as well.
     """

@@ -1,4 +1,4 @@
-"""Where a telescope stands."""
+"""Sites of telescopes."""
 
 from __future__ import annotations
 

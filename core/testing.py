@@ -86,7 +86,7 @@ def check_parameters_are_documented(operator: Operator) -> None:
 
 
 def check_parameters_survive_text(operator: Operator) -> None:
-    """What is written to a resolved YAML file reads back to the same operator."""
+    """Check that a resolved YAML file reads back to the same operator."""
     text = operator.model_dump(mode="json", exclude_unset=True)
     again = type(operator).model_validate(text)
     assert again.model_dump() == operator.model_dump(), f"{text} reads back as {again!r}"
@@ -222,8 +222,8 @@ def check_linear(operator: Operator) -> None:
 
 
 def check_means(operator: Operator) -> None:
-    """What comes out is the same whether the mean, tens of kelvin, stands beside the stream or in
-    it (`Operator.knows_means`).
+    """Check that the result is the same whether the mean, tens of kelvin, stands beside the stream
+    or in it (`Operator.knows_means`).
 
     Both in float64, where 30 K are rounded to 4e-15 K; what a run in float32 would round, 2^-24 of
     the largest value, is allowed.

@@ -24,7 +24,7 @@ LONGEST_NAME = 60
 
 
 def is_variant(value: Any) -> bool:
-    """Whether ``value`` is the mapping of a variant."""
+    """True for the mapping of a variant."""
     return isinstance(value, Mapping) and LIKE in value
 
 
@@ -100,7 +100,7 @@ def variant(given: Mapping[str, Any], context: Any = None) -> Any:
 
 
 def differences(base: Any, other: Any) -> dict[str, tuple[Any, Any]]:
-    """What differs between two instruments but for their names and descriptions: (of ``base``, of
+    """Differences between two instruments but for their names and descriptions: (of ``base``, of
     ``other``) by key.
     """
     one, two = (_flat(x.model_dump(mode="json")) for x in (base, other))
@@ -126,7 +126,7 @@ def written(given: Mapping[str, Any], made: Any) -> dict[str, Any]:
 
 
 def one_of(instrument: Any, band: Any) -> bool:
-    """Whether ``band`` is the name of one of the bands of an instrument that has several."""
+    """True if ``band`` is the name of one of the bands of an instrument that has several."""
     return isinstance(band, str) and any(
         own.name == band for own in getattr(instrument, "bands", ())
     )

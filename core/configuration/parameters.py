@@ -31,8 +31,8 @@ def quantity(default: str, **limits: Any) -> Any:
 
 
 def named(names: Any, value: Any) -> Any:
-    """What a registered name stands for (``names``: a `core.registry.Registry`); what is no text is
-    returned as it is.
+    """The component that a registered name stands for (``names``: a `core.registry.Registry`); a
+    value that is no text is returned as it is.
 
     Raises PydanticCustomError, which is shown at the value's place.
     """
@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 else:
 
     class _Shown(type(BaseModel)):
-        """How classes of parameters look to `help()` and to tab completion: their parameters,
-        without pydantic's own names.
+        """Metaclass that shows classes of parameters to `help()` and tab completion with their
+        parameters, without pydantic's own names.
 
         All is worked out when somebody asks.
         """
@@ -175,7 +175,7 @@ class Parameters(BaseModel, metaclass=_Shown):
         ]
 
     def _arguments(self) -> dict[str, str]:
-        """What was given, by name, as Python text."""
+        """Given arguments by name, as Python text."""
         dumped = self.model_dump(mode="json", include=self.model_fields_set)
         keys = {
             name: field.alias or name

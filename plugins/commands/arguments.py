@@ -45,7 +45,7 @@ def instant_of(text: str | None) -> Instant:
 
 
 def checked(what: str, make: Any) -> Any:
-    """What ``make`` returns; pydantic's refusals as a mistake of the command line."""
+    """Result of ``make``; pydantic's refusals become mistakes of the command line."""
     from pydantic import ValidationError
     from pydantic_core import PydanticCustomError
 

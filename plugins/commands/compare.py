@@ -186,7 +186,7 @@ def pairs(first: Path, second: Path) -> list[tuple[str, Path, Path]]:
 
 
 def _is_comparison(path: Path) -> bool:
-    """Whether a FITS file is what `write_comparison` wrote."""
+    """True for a FITS file that `write_comparison` wrote."""
     with open(path, "rb") as file:
         return b"REFERENC=" in file.read(10 * 2880)
 
@@ -286,8 +286,8 @@ def _without(
 def _choices(
     hdus: tuple[str, ...], planes: tuple[str, ...], systems: tuple[str, ...]
 ) -> tuple[Wanted, Wanted]:
-    """What to read of the reference and of the map. Raises BadParameter for what is given more than
-    twice, or is no plane.
+    """Planes of the reference and of the map to read. Raises BadParameter for more than two, or for
+    a name that is no plane.
     """
     from zonda.operators.diagnostics.comparison.files import Wanted
 
@@ -320,8 +320,9 @@ def _name(path: Path, paths: tuple[Path, Path]) -> str:
 def _in_one_unit(
     reference: Plane, other: Plane, unit: str | None, frequency: float | None, beam: float
 ) -> tuple[Plane, Plane]:
-    """Both in ``unit``, or in that of the reference: as brightness where that is per pixel, per
-    common ``beam`` [rad] where it is per beam."""
+    """Convert both maps to ``unit``, or to that of the reference: to brightness if that is per
+    pixel, per common ``beam`` [rad] if it is per beam.
+    """
     from zonda.core.errors import InputError
     from zonda.operators.diagnostics.comparison.files import in_unit
 

@@ -24,8 +24,8 @@ PLACES = 14
 
 
 def focal_plane_figure(instrument: Instrument, plane: Focalplane) -> Figure:
-    """All detectors on the left, the middle on the right: circles are the FWHM to scale, ticks the
-    polarization angles.
+    """Draw all detectors on the left, the middle on the right: circles are the FWHM to scale, ticks
+    the polarization angles.
     """
     from matplotlib.figure import Figure
 
@@ -54,8 +54,8 @@ def focal_plane_figure(instrument: Instrument, plane: Focalplane) -> Figure:
 
 
 def _middle(plane: Focalplane) -> tuple[tuple[float, float], float]:
-    """Where the pixel in the middle of the innermost array or wafer looks; how far around it this
-    one has `PLACES`.
+    """Place of the pixel in the middle of the innermost array or wafer, and the distance within
+    which this one has `PLACES`.
     """
     first = int(np.argmin(np.hypot(plane.xi, plane.eta)))
     own = np.flatnonzero((plane.band == plane.band[first]) & (plane.wafer == plane.wafer[first]))
@@ -75,7 +75,7 @@ def _draw(
     centre: tuple[float, float],
     ticks: bool = False,
 ) -> None:
-    """What lies within ``reach`` of ``centre``, both in tangents."""
+    """Draw the detectors within ``reach`` of ``centre``, both in tangents."""
     from matplotlib.collections import EllipseCollection
 
     unit, name = _unit(reach)

@@ -63,9 +63,7 @@ def lines(instrument: Instrument, plane: Focalplane) -> list[str]:
 
 
 def split_provenance(instrument: Instrument) -> tuple[list[str], list[str]]:
-    """Where the numbers of an instrument and its bands come from, and which of them are
-    stand-ins.
-    """
+    """Split sources of the numbers of an instrument and its bands from stand-ins."""
     bands = [
         (f"{name}: " if instrument.bands else "band: ", camera.band)
         for name, camera in instrument.cameras.items()

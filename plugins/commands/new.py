@@ -130,7 +130,7 @@ def _check_free(path: Path) -> None:
 
 
 def _write_folder(folder: Path, texts: dict[str, str]) -> None:
-    """All files, or none: they are written to a temporary folder, which is renamed."""
+    """Write all files to a temporary folder and rename it, so that none is there if one fails."""
     import os
     import shutil
 

@@ -29,8 +29,8 @@ MINUTE, HOUR, DAY = 60.0, 3600.0, 86400.0
 
 
 def spans_above(times: Floats, values: Floats) -> list[tuple[float | None, float | None]]:
-    """Where ``values`` (n,) at ``times`` (n,) are above 0, linear in between: (begin, end), None
-    where it goes on beyond.
+    """Intervals (begin, end) in which ``values`` (n,) at ``times`` (n,) are above 0, linear in
+    between; None for an end beyond the first or last time.
     """
     up = values > 0
     edges = np.flatnonzero(up[1:] != up[:-1])

@@ -55,7 +55,7 @@ class Seen:
 
     @property
     def known(self) -> bool:
-        """Whether the site has a climatology."""
+        """True if the site has a climatology."""
         return self.site.climatology is not None
 
     @property
@@ -149,7 +149,7 @@ def pwv_at(site: Site, when: Instant) -> Floats:
 
 
 def lines(seen: Seen, year: Sequence[Month]) -> list[str]:
-    """All lines of the text."""
+    """Lines of the text."""
     return [*_head(seen), "", *_table(seen), "", *_year(seen, year)]
 
 
