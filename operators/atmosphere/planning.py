@@ -95,7 +95,7 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         return size + bytes_of_units(self.operator.model(observation))
 
     def in_time_order(self, observation: Observation) -> bool:
-        """Where detectors are evaluated one by one and the scan is long, all of them share the
+        """True if detectors are evaluated one by one in a long scan: all of them share the
         turbulence of the moment.
         """
         return in_time_order(self.operator.model(observation))
@@ -357,7 +357,7 @@ class AtmosphereBounds:
         return [float(v) for v in (each / np.maximum(total, 1e-300)).max(axis=1)]
 
     def without(self) -> dict[str, float]:
-        """All layers; the mean emission, where no filter takes it out."""
+        """Effect of dropping all layers; and the mean emission, if no filter takes it out."""
         found, mean = add(*self.of_layers), self.context.mean_emission
         if not any(t.response for t in self.context.traits.values()):
             found = add(found, {"tod": mean, "map_rms": mean})
