@@ -115,7 +115,7 @@ def one(name, budget, threads):
     def listen(steps, longest, settings, *more):
         found = divided(steps, longest, settings, *more)
         blocks = schedule(steps, longest, found)
-        told["predicted"] = (settings.asked - found.memory + blocks.bytes) / 1e9
+        told["predicted"] = (settings.process - found.memory + blocks.bytes) / 1e9
         told["elsewhere"] = ", ".join(blocks.elsewhere)
         return found
 

@@ -23,6 +23,7 @@ from .output import Output, Progress
 from .pages import html_table
 from .run import arguments
 from .run.bands import (
+    Band,
     data_of_bands,
     distribute,
     gather,
@@ -31,8 +32,8 @@ from .run.bands import (
     points,
     use_recorded,
 )
-from .run.budget import held_of, least_memory, longest_of
-from .run.execute import Band, Budget, execute
+from .run.budget import Budget, held_of, least_memory, longest_of
+from .run.execute import execute
 from .run.order import check_order
 from .run.schedule import Chain
 from .run.settings import Settings, Timer
@@ -325,7 +326,7 @@ class Pipeline:
         """As `least_memory`, of one band; ``others``: bytes of the products of other bands."""
         observation = longest_of(observations)
         note_signals([observation], self.signals.components, self.signals.formed)
-        return least_memory(self.chain, observation, Settings(dtype=self._dtype, others=others))
+        return least_memory(self.chain, observation, Settings(dtype=self._dtype), others)
 
     @property
     def _dtype(self) -> type[np.floating[Any]]:
@@ -353,7 +354,7 @@ class Pipeline:
             progress=lambda done, total, what: hooks.zonda_progress(
                 done=done, total=total, what=what
             ),
-            asked=ceiling,
+            process=ceiling,
         )
         data.threads = settings.threads
         return data, settings

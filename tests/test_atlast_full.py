@@ -75,7 +75,7 @@ def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     data = Data(scene, output=tmp_path)
     for operator in pipeline.operators:
         operator.observe(data)
-    longest, settings = data.observations[0], Settings(threads=2, asked=8 * 10**9)
+    longest, settings = data.observations[0], Settings(threads=2, process=8 * 10**9)
     left = divided(pipeline.chain, longest, settings, "test")
     found = schedule(pipeline.chain, longest, left)
     assert found.bytes < left.memory
@@ -83,4 +83,4 @@ def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     with pytest.raises(
         PipelineError, match=r"(?s)the run would hold .*BinMap .* GB.*budget is 1 GB.*larger pixel"
     ):
-        divided(pipeline.chain, longest, Settings(threads=2, asked=10**9), "test")
+        divided(pipeline.chain, longest, Settings(threads=2, process=10**9), "test")

@@ -8,17 +8,41 @@ turbulence above the telescope. What belongs to detectors is keyed by instrument
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ..data import Data
 from ..errors import InputError, PipelineError
 from ..observation import Observation
 from ..operator import Operator
+from ..output import Progress
 from ..scene import WithScene
 from ..signal import MAIN, product_name, stream_of
 from ..tally import Tally
+from .schedule import Chain
+
+
+@dataclass(frozen=True)
+class Band:
+    """One band that observes, or a camera that has one: the steps, the data, and who is told when a
+    scan is done.
+    """
+
+    chain: Chain
+    data: Data
+    watch: Callable[[Data, Progress], None]
+
+    @property
+    def longest(self) -> Observation:
+        """The scan of most samples."""
+        return max(self.data.observations, key=lambda o: o.n_detectors * o.n_samples)
+
+
+def looks_alike(bands: Sequence[Band]) -> bool:
+    """Tell whether the detectors of all bands look through the same pixels."""
+    scans = zip(*(band.data.observations for band in bands), strict=True)
+    return all(one.looks_as(scan[0]) for scan in scans for one in scan)
 
 
 def data_of_bands(data: Data) -> dict[str, Data]:

@@ -1,17 +1,21 @@
-"""What a process may hold, divided among operators, streams and blocks, and scans prepared
+"""The memory of a process, divided among operators, streams and blocks, bands, and scans prepared
 ahead.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from ..errors import PipelineError
 from ..machine import available_memory, resident_memory
-from ..mapmaker import makes_products
+from ..mapmaker import joins, makes_products
 from ..observation import Observation
 from ..plan.planning import planning_of
+from .ahead import Ahead
+from .bands import Band, looks_alike
 from .schedule import Chain, schedule, spares
 from .settings import Settings
 
@@ -24,16 +28,125 @@ OTHERS = "maps of other bands"
 FEWER = "keep fewer streams, of fewer or shorter scans"
 
 
+@dataclass(frozen=True)
+class Budget:
+    """The memory that a run was given, to be divided.
+
+    Attributes
+    ----------
+    memory
+        Bytes for streams and blocks that were asked for; None: what the ceiling leaves.
+    fresh
+        False in a worker (`divided`).
+    place
+        The pipeline's name, for errors.
+    """
+
+    memory: int | None
+    fresh: bool
+    place: str
+
+
+class Division(NamedTuple):
+    """Settings of each band; whether all are executed ``together``, and ``blockwise``: there is
+    room for a block of each at a time.
+    """
+
+    settings: list[Settings]
+    together: bool = False
+    blockwise: bool = True
+
+
+def divide(
+    bands: Sequence[Band], settings: Settings, budget: Budget, ahead: Ahead, together: bool
+) -> Division:
+    """Divide the memory of a run among its bands.
+
+    Each band has what the products of the others leave. Bands that a step joins hold their
+    streams side by side, and once more together. Others that look through the same pixels share
+    equally, if each does the same with its streams as it would alone.
+
+    Parameters
+    ----------
+    ahead
+        Is turned off where there is no room for a scan that is prepared while another is executed.
+    together
+        False: bands follow each other, unless a step joins them.
+    """
+    n, joined = len(bands), len(bands) > 1 and any(map(joins, bands[0].chain.steps))
+    every = [o for band in bands for o in band.data.observations]
+    kept = 8 * len(bands[0].chain.keep) * sum(o.n_detectors * o.n_samples for o in every)
+    held = [held_of(band.chain, band.longest, joined) for band in bands]
+    alone = [
+        _alone(band, settings, budget, ahead, (kept, sum(held) - mine))
+        for band, mine in zip(bands, held, strict=True)
+    ]
+    if joined:
+        least = [
+            min(schedule(band.chain, band.longest, own).least, own.memory)
+            for band, own in zip(bands, alone, strict=True)
+        ]
+        shares = [max(own.memory // (2 * n), low) for own, low in zip(alone, least, strict=True)]
+    elif n > 1 and together and looks_alike(bands):
+        more = [
+            (2 if ahead.on else 1)
+            * (held_of(b.chain, b.longest, True) - held_of(b.chain, b.longest))
+            for b in bands
+        ]
+        found = [
+            share_in_step(band.chain, band.longest, own, n, sum(more) - mine)
+            for band, own, mine in zip(bands, alone, more, strict=True)
+        ]
+        shares = [one.memory for one in found if one is not None]
+    else:
+        shares = []
+    if len(shares) < n:
+        return Division(alone)
+    each = [replace(own, memory=share, spare=[]) for own, share in zip(alone, shares, strict=True)]
+    return Division(each, True, sum(shares) <= alone[0].memory)
+
+
+def _alone(
+    band: Band, settings: Settings, budget: Budget, ahead: Ahead, beside: tuple[int, int]
+) -> Settings:
+    """Divide the memory of one band; ``beside``: kept streams, and products of other bands."""
+    chain, data = band.chain, band.data
+    if budget.memory is not None and settings.process is None:
+        check_kept_memory(beside[0], available_memory(), budget.place)
+        return settings
+    most = settings.memory
+    settings = divided(chain, band.longest, settings, budget.place, budget.fresh, *beside)
+    if budget.memory is not None:
+        settings = replace(settings, memory=min(settings.memory, most))
+    if ahead.on:
+        less = with_scan_ahead(chain, band.longest, settings)
+        ahead.on, settings = less is not None, less or settings
+    if settings.threads < data.threads and budget.fresh:
+        text = (
+            f"{settings.threads} of {data.threads} threads work: more do not fit in the memory"
+            " budget"
+        )
+        warnings.warn(f"{budget.place}: {text}", stacklevel=5)
+    data.threads = settings.threads
+    return settings
+
+
 def longest_of(observations: Sequence[Observation]) -> Observation:
     """The observation of most samples."""
     return max(observations, key=lambda o: o.n_detectors * o.n_samples)
 
 
 def divided(
-    chain: Chain, observation: Observation, settings: Settings, place: str, fresh: bool = True
+    chain: Chain,
+    observation: Observation,
+    settings: Settings,
+    place: str,
+    fresh: bool = True,
+    kept: int = 0,
+    others: int = 0,
 ) -> Settings:
-    """The settings with the memory of streams and blocks, and with fewer threads where the blocks
-    of all do not fit.
+    """Divide the memory of a process: the settings with that of streams and blocks, and with fewer
+    threads where the blocks of all do not fit.
 
     Results depend on neither.
 
@@ -42,12 +155,15 @@ def divided(
     observation
         The longest.
     settings
-        ``asked``: bytes that the process may hold.
+        ``process``: bytes that the process may hold; None: what it holds and half of the free
+        memory.
     place
         The pipeline's name, for errors.
     fresh
         False in a worker, which still holds what tasks before this one have left: that is no part
         of the forecast.
+    kept, others
+        Bytes of streams that the user keeps, and of the products of other bands.
 
     Raises
     ------
@@ -55,9 +171,9 @@ def divided(
         Where the least that a run needs is more than its budget, or more than the machine has: what
         needs it, and what would make it fit.
     """
-    budget = settings.asked or resident_memory() + available_memory() // 2
+    budget = settings.process or resident_memory() + available_memory() // 2
     parts = {"zonda and its libraries": max(resident_memory(), BASE) if fresh else BASE}
-    parts |= {KEPT: settings.kept, OTHERS: settings.others}
+    parts |= {KEPT: kept, OTHERS: others}
     parts.update((o.label, planning_of(o).memory(observation)) for o in chain.steps)
     fixed = sum(parts.values())
     left = replace(settings, memory=max(budget - fixed, 1))
@@ -70,8 +186,7 @@ def divided(
         found = schedule(chain, observation, left)
     if fixed + found.least > budget:
         _refuse(chain, parts, found.least, budget, left.threads, place)
-    products = products_of(chain, observation) + settings.others
-    return replace(left, least=found.least, ceiling=budget - products, asked=budget)
+    return replace(left, process=budget)
 
 
 def products_of(chain: Chain, observation: Observation) -> int:
@@ -97,8 +212,7 @@ def with_scan_ahead(chain: Chain, observation: Observation, settings: Settings) 
     size = sum(planning_of(o).memory(observation) for o in chain.steps if not makes_products(o))
     if not spares(chain, observation, settings, size):
         return None
-    ceiling = None if settings.ceiling is None else settings.ceiling - size
-    return replace(settings, memory=settings.memory - size, ceiling=ceiling)
+    return replace(settings, memory=settings.memory - size)
 
 
 def share_in_step(
@@ -114,7 +228,7 @@ def share_in_step(
     memory = (settings.memory - beside) // bands
     if not spares(chain, observation, settings, settings.memory - memory):
         return None
-    return replace(settings, memory=memory, bands=bands, spare=[])
+    return replace(settings, memory=memory)
 
 
 def check_kept_memory(size: int, free: int, place: str) -> None:
@@ -129,11 +243,13 @@ def check_kept_memory(size: int, free: int, place: str) -> None:
         )
 
 
-def least_memory(chain: Chain, observation: Observation, settings: Settings) -> int:
+def least_memory(
+    chain: Chain, observation: Observation, settings: Settings, others: int = 0
+) -> int:
     """Bytes with which a process runs these steps over an observation on one thread, libraries
-    included.
+    included; ``others``: of the products of other bands.
     """
-    held = sum(planning_of(o).memory(observation) for o in chain.steps) + settings.others
+    held = sum(planning_of(o).memory(observation) for o in chain.steps) + others
     return _with_margin(
         BASE + held + schedule(chain, observation, replace(settings, threads=1)).least
     )

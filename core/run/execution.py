@@ -42,7 +42,8 @@ from ..types import AnyFloats
 from .ahead import Ahead
 from .block_maker import BlockMaker, Due, Measured
 from .blocks import least_block
-from .schedule import Chain, Planned, Schedule, ordered_in
+from .budget import products_of
+from .schedule import Chain, Planned, Schedule, ordered_in, schedule
 from .settings import Settings, Timer
 from .streams import Ledger, Source, Stage, Store, StreamMadeAgain
 from .whole import WholeStream, knows_means, means_of
@@ -84,11 +85,17 @@ class Execution:
         self._store = Store(settings.memory, settings.dtype, settings.spare, self.ledger)
         self._source, self._begun = Source(), list[Operator]()
 
-    def begin(self, ordered: Collection[str], halos: Mapping[str, int]) -> None:
-        """Make the schedule (arguments of `blocks.cut`), with the memory that there is now: what
-        operators hold is known.
+    def begin(self, bands: int, ordered: Collection[str], halos: Mapping[str, int]) -> None:
+        """Make the schedule, with the memory that there is now: what operators hold is known.
+
+        Parameters
+        ----------
+        bands
+            Number of those that hold streams and blocks at the same time.
+        ordered, halos
+            See `blocks.cut`.
         """
-        self.settings = self._within_ceiling()
+        self.settings = self._within_process(bands)
         self._store = Store(
             self.settings.memory, self.settings.dtype, self.settings.spare, self.ledger
         )
@@ -161,23 +168,23 @@ class Execution:
         """Labels of the steps that are much cheaper in order of time."""
         return ordered_in(self.chain.steps, self.observation)
 
-    def _within_ceiling(self) -> Settings:
+    def _within_process(self, bands: int) -> Settings:
+        """Lessen the memory of streams and blocks where operators took more than they said, and
+        the threads where the smallest blocks would not fit.
+        """
         settings = self.settings
-        if settings.ceiling is None:
+        if settings.process is None:
             return settings
-        room = max(
-            (settings.ceiling - (resident_memory() - sum(a.nbytes for a in settings.spare)))
-            // settings.bands,
-            1,
-        )
+        taken = resident_memory() - sum(array.nbytes for array in settings.spare)
+        to_come = products_of(self.chain, self.observation)
+        room = max((settings.process - taken) // bands - to_come, 1)
         threads = settings.threads
         if room >= settings.memory:
             return settings
-        if (
-            room < settings.least
-        ):  # the operators took a little more than they said: work on fewer blocks at once
-            threads = max(1, threads * room // settings.least)
-            room = max(room, settings.least * threads // settings.threads)
+        least = schedule(self.chain, self.observation, settings).least
+        if room < least:
+            threads = max(1, threads * room // least)
+            room = max(room, least * threads // settings.threads)
         return replace(settings, memory=room, threads=threads)
 
     def _probe(self, stage: Stage) -> Block:

@@ -66,7 +66,7 @@ def run(
                 halos[step.label] = max(own, halos.get(step.label, 0))
         ordered = {label for band in bands for label in band.ordered}
         for band in bands:
-            band.begin(ordered, halos)
+            band.begin(len(bands), ordered, halos)
         for execution in following if ahead is not None else ():
             ahead.start(execution)  # type: ignore[union-attr]
         for number, planned in enumerate(bands[0].schedule.planned):

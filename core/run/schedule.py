@@ -425,7 +425,7 @@ class Schedule:
     def _ceiling_for(self, need: int) -> str:
         """``--memory`` with which streams and blocks may take ``need`` bytes."""
         settings = self.settings
-        fixed = max(settings.asked - settings.memory, 0) if settings.asked else 0
+        fixed = max(settings.process - settings.memory, 0) if settings.process else 0
         return f"{-(-(need + fixed) * 21 // 20_000_000)}MB"
 
 

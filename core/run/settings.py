@@ -26,28 +26,16 @@ class Settings:
     threads
         Threads that work on blocks.
     memory
-        Bytes for streams and blocks.
-    ceiling
-        Bytes that the whole process may hold; None: only ``memory`` counts.
+        Bytes for streams and blocks of one band.
+    process
+        Bytes that the whole process may hold (``--memory``), of which ``memory`` is what is left
+        for streams and blocks; None: only ``memory`` counts.
     dtype
         Type of the streams.
-    asked
-        Bytes that were asked for (``--memory``), of which ``memory`` is what is left for streams
-        and blocks.
-    least
-        Bytes of the smallest blocks on all ``threads``.
     progress
         Progress callback.
     spare
         Memory to use again.
-    kept
-        Bytes of the streams of all scans that the user wants to have at the end.
-    others
-        Bytes of the products of the other bands of a camera, which grow scan by scan beside those
-        of this one.
-    bands
-        Bands that hold streams and blocks at a time (`core.run.scan`): ``memory`` is the part of
-        one of them.
     """
 
     threads: int = 1
@@ -55,12 +43,7 @@ class Settings:
     dtype: type[np.floating[Any]] = np.float32
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
     spare: list[AnyFloats] = field(default_factory=list)
-    ceiling: int | None = None
-    asked: int | None = None
-    least: int = 0
-    kept: int = 0
-    others: int = 0
-    bands: int = 1
+    process: int | None = None
 
 
 @dataclass

@@ -111,7 +111,7 @@ def test_kept_streams_count_in_the_budget(monkeypatch):
     for all but them.
     """
     from zonda.core.machine import resident_memory
-    from zonda.core.run import execute as module
+    from zonda.core.run import budget as module
 
     steps = [zonda.PointingDaisy(scan_duration="5 min", scans=2), *STEPS[2:]]
     where, room = scene(camera(200)), max(resident_memory(), 230_000_000) + 150_000_000

@@ -386,19 +386,19 @@ def test_a_stream_wanted_whole_is_spilled_or_refused(monkeypatch):
     assert any("made again" in what for _, what, _ in obs.tally)
 
 
-def test_the_ceiling_of_the_process_leaves_what_is_not_held_already():
+def test_the_memory_of_the_process_leaves_what_is_not_held_already():
     from zonda.core.machine import resident_memory
 
     obs = observation()
     size = 4 * obs.n_detectors * obs.n_samples
     chain = [Source(), Demean(), Level(), Sink()]
     execution, got, _ = execute(
-        chain, obs, memory=1 << 30, ceiling=resident_memory() + 3 * size // 2
+        chain, obs, memory=1 << 30, process=resident_memory() + 3 * size // 2
     )
     assert execution.settings.memory <= 2 * size
     assert np.array_equal(got, run(chain, observation())[0])
     with pytest.raises(PipelineError, match="raise --memory to"):
-        run(chain, observation(), memory=1 << 30, ceiling=1000)
+        run(chain, observation(), memory=1 << 30, process=1000)
 
 
 def test_a_stream_made_again_has_no_array():

@@ -113,7 +113,7 @@ def libraries(monkeypatch, free=10**10):
 
 def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
     chain = labelled([Source(), Heavy(size=3_000_000_000)])
-    obs, settings = observation(), Settings(threads=2, asked=2 * 10**9)
+    obs, settings = observation(), Settings(threads=2, process=2 * 10**9)
     libraries(monkeypatch)
     with pytest.raises(
         PipelineError,
@@ -126,8 +126,8 @@ def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
     with pytest.raises(PipelineError, match=r"more than this machine has \(1\.23 GB\)") as refused:
         divided(chain, obs, settings, "test")
     assert "--memory" not in refused.value.cure
-    found = divided(chain, obs, replace(settings, asked=4 * 10**9), "test")
-    assert found.ceiling == 10**9  # the product is still to come
+    found = divided(chain, obs, replace(settings, process=4 * 10**9), "test")
+    assert found.process == 4 * 10**9
     assert found.memory == 10**9 - BASE
 
 
@@ -139,7 +139,7 @@ def test_blocks_that_are_too_large_are_worked_on_by_fewer_threads(monkeypatch):
     chain = labelled([Source(), Demean(), Sink()])
     assert (
         divided(
-            chain, observation(16, 1_000_000), Settings(threads=4, asked=630 * 10**6), "test"
+            chain, observation(16, 1_000_000), Settings(threads=4, process=630 * 10**6), "test"
         ).threads
         == 2
     )
@@ -149,14 +149,14 @@ def test_the_figure_that_a_refusal_names_works(monkeypatch):
     obs, chain = observation(16, 1_000_000), labelled([Source(), Demean(), Sink()])
     libraries(monkeypatch)
     with pytest.raises(PipelineError, match=r"blocks on 1 thread 19\d MB") as refused:
-        divided(chain, obs, Settings(threads=4, asked=3 * 10**8), "test")
+        divided(chain, obs, Settings(threads=4, process=3 * 10**8), "test")
     found = re.search(
         r"use --memory (\d+)MB; or split the scan into shorter ones", refused.value.cure
     )
     assert found is not None
-    settings = divided(chain, obs, Settings(threads=4, asked=int(found[1]) * 10**6), "test")
+    settings = divided(chain, obs, Settings(threads=4, process=int(found[1]) * 10**6), "test")
     assert settings.threads == 1
-    assert settings.memory >= settings.least
+    assert settings.memory >= schedule(chain, obs, settings).least
     assert int(found[1]) * 10**6 >= least_memory(chain, obs, Settings(threads=4))
 
 
@@ -169,7 +169,7 @@ def test_no_cure_is_named_that_cannot_work(monkeypatch):
             divided(
                 labelled([Source(), Demean(), Sink()]),
                 obs,
-                Settings(threads=4, asked=BASE // 2),
+                Settings(threads=4, process=BASE // 2),
                 "test",
             )
         assert re.fullmatch(cure, refused.value.cure)
