@@ -17,7 +17,6 @@ import os
 import resource
 import statistics
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor
@@ -26,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import ZondaError
+from ..experiment.variant import Variant, run_file, steps_for
 from ..faults import faults_named
 
 if TYPE_CHECKING:
@@ -189,14 +189,14 @@ class _Worker:
 
     def measured(self, request: Request) -> Measured:
         """See `work`."""
-        from ..configuration.pipeline_file import load
         from .bands import metric_of
 
-        metric = metric_of(load(request.pipeline, request.overrides), request.metric)
+        variant = Variant(request.pipeline, request.overrides)
+        metric = metric_of(variant.file, request.metric)
         first, seed, self.runs, self.cpu = 0.0, request.seeds[0], 0, 0.0
         if request.repeats and not self.warm:
             start = time.process_time()
-            run(request.pipeline, request.overrides, metric, seed, request.threads, timed=True)
+            execute(variant.file, metric, request.threads, True, seed)
             first, self.warm = time.process_time() - start, True
         timings: list[dict[str, float]] = []
         yardstick: list[float] = []
@@ -216,9 +216,8 @@ class _Worker:
             del data
         for seed in request.seeds[len(found) :]:
             start = time.process_time()
-            data, _ = run(
-                request.pipeline, request.overrides, metric, seed, request.threads, timed=False
-            )
+            file = Variant(request.pipeline, request.overrides).file
+            data, _ = execute(file, metric, request.threads, False, seed)
             found.append(metric.measure(data))
             del data
             self._count(time.process_time() - start)
@@ -245,9 +244,8 @@ class _Worker:
             reset_peak_memory()
             start = time.process_time()
             with install_recorder("numba:compile") as compiled:
-                data, whole = run(
-                    request.pipeline, overrides, metric, seed, request.threads, timed=True
-                )
+                file = Variant(request.pipeline, overrides).file
+                data, whole = execute(file, metric, request.threads, True, seed)
             seconds = time.process_time() - start
             self._count(seconds)
             if not compiled.buffer:
@@ -294,37 +292,18 @@ def peak_memory() -> int:
     )
 
 
-def run(
-    pipeline: str,
-    overrides: tuple[str, ...],
+def execute(
+    file: PipelineFile,
     metric: Metric,
-    seed: int | None,
     threads: int | None,
     timed: bool,
-) -> tuple[Data, bool]:
-    """Run a pipeline file at a seed; see `execute`."""
-    from ..configuration.pipeline_file import load
-
-    more = [f"seed={seed}"] if seed is not None else []
-    return execute(load(pipeline, [*overrides, *more]), metric, threads, timed)
-
-
-def execute(
-    file: PipelineFile, metric: Metric, threads: int | None, timed: bool
+    seed: int | None = None,
 ) -> tuple[Data, bool]:
     """Run a pipeline file without what acts at its end; and whether the data hold what the metric
     needs. ``timed``: without the steps and signals that the metric adds, too.
     """
-    from ..output import Output
-    from ..pipeline import Pipeline
-
-    own = [o for o in file.operators if metric.needs_end or not isinstance(o, Output)]
-    more, signals = metric.steps(list(own)), metric.signals(file.runs)
-    steps, runs = (own, file.runs) if timed else (more, {**file.runs, **signals})
-    header = file.header
-    pipeline = Pipeline(
-        steps, runs=runs, only=header.only, name=header.name, precision=header.precision
-    )
-    with tempfile.TemporaryDirectory(prefix="zonda-accuracy-") as folder:
-        data = pipeline.run(file.scene(), output=folder, threads=threads)
-    return data, not timed or (len(more) == len(own) and not signals)
+    if not timed:
+        return run_file(file, [metric], seed=seed, threads=threads), True
+    own = steps_for(file, [metric])
+    data = run_file(file, operators=own, seed=seed, threads=threads)
+    return data, len(metric.steps(list(own))) == len(own) and not metric.signals(file.runs)

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
+from ..experiment.variant import Variant
 from .bands import metric_of
-from .measure import Request, measure, run
+from .measure import Request, execute, measure
 from .settings import knobs_of, overrides
 from .store import StoredFront, fingerprint
 from .sweep import tightest
@@ -91,8 +92,8 @@ def retest(
     base = (*overrides(front.shorter), f"seed={front.seed}")
 
     def found(setting: dict[str, str]) -> Any:
-        given = (*base, *overrides(setting))
-        return metric.measure(run(pipeline, given, metric, None, 1, timed=False)[0])
+        variant = Variant(pipeline, (*base, *overrides(setting)))
+        return metric.measure(execute(variant.file, metric, 1, timed=False)[0])
 
     reference = found(front.reference)
     chosen = sorted((p for p in front.points if p.error > 0), key=lambda p: -p.error)[:points]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -10,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.experiment import run_file
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
-from zonda.core.pipeline import Pipeline
 from zonda.core.signal import product_name, stream_of
 from zonda.operators.maps.bin_map import BinMap
 
@@ -176,11 +177,9 @@ def _maps(
         if len(parts) > 1
         else {}
     )
-    pipeline = Pipeline(
-        operators, runs=runs, name=file.header.name, precision=file.header.precision
-    )
-    scene = file.scene().model_copy(update={"seed": seed})
-    products = pipeline.run(scene, threads=threads).products
+    header = file.header.model_copy(update={"runs": runs, "only": []})
+    bare = dataclasses.replace(file, header=header)
+    products = run_file(bare, seed=seed, operators=operators, threads=threads).products
     name = next(o.product for o in operators if isinstance(o, BinMap))
     found = {}
     for band in bands:

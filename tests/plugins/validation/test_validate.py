@@ -7,8 +7,9 @@ from astropy.table import Table
 
 from tests.scenes import camera
 from zonda.core.cli import main
+from zonda.core.experiment import Variant
+from zonda.core.experiment import experiment as tasks
 from zonda.plugins.validation.claims import SHIPPED, read
-from zonda.plugins.validation.runs import Simulation
 
 PIPELINE = (
     camera(7)
@@ -65,13 +66,19 @@ def claims(tmp_path):
 @pytest.fixture
 def runs(monkeypatch):
     made = []
-    run = Simulation.run
+    run, draw = tasks.measured, Variant.run
 
-    def counted(self, number, choices, output=None):
-        made.append((self.settings, number))
-        return run(self, number, choices, output)
+    def counted(variant, number, choices):
+        made.append((variant.overrides, number))
+        return run(variant, number, choices)
 
-    monkeypatch.setattr(Simulation, "run", counted)
+    def drawn(self, metrics=(), **how):
+        if "output" in how:
+            made.append((self.overrides, 0))
+        return draw(self, metrics, **how)
+
+    monkeypatch.setattr(tasks, "measured", counted)
+    monkeypatch.setattr(Variant, "run", drawn)
     return made
 
 
