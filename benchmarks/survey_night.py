@@ -85,10 +85,12 @@ def one(file: Path, memory: int | None) -> None:
     steps: dict[str, float] = {}
     for label, _, seconds in data.provenance["timings"]:
         steps[label] = steps.get(label, 0.0) + seconds
-    forecast = made.summary.prediction
+    used = time.process_time()
+    forecast = zonda.plan(zonda.load(str(file)), prune_all=False, threads=1, measure=True).timing
+    labels = {*forecast.setup, *forecast.growing}
     found = {
-        "cpu": time.process_time(), "run": run, "steps": steps,
-        "forecast": forecast.total, "bytes": forecast.bytes, "expected": dict(forecast.seconds),
+        "cpu": used, "run": run, "steps": steps, "forecast": forecast.total,
+        "bytes": made.summary.memory.bytes, "expected": {k: forecast.of(k) for k in labels},
         "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }  # fmt: skip
     print(json.dumps(found))

@@ -191,6 +191,11 @@ def full(what: str, **more: Any) -> Choice:
     return Choice("full", what, **more)
 
 
+def exact(name: str, size: Bound, formula: str, what: str = "exact") -> Effect:
+    """An effect that has no coarser form."""
+    return Effect(name, (full(what),), size, formula)
+
+
 def not_simulated(name: str, what: str, bound: Bound, formula: str) -> Effect:
     """An effect that nature has and zonda leaves out, with a bound on what that costs."""
     return Effect(

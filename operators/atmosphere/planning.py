@@ -24,7 +24,7 @@ from zonda.core.instrument import Band
 from zonda.core.knobs import Knob
 from zonda.core.observation import Observation
 from zonda.core.plan.context import OTHER_MODES, Context
-from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, add, full
+from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, add, exact, full
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
@@ -400,9 +400,9 @@ class AtmosphereBounds:
         p = self.calibrated.model.parameters
         level = FIDELITIES[p.fidelity]
         text = "half the covariance's relative error x rms: how much the ensemble's rms is off"
-        what = full(f"{p.fidelity}, {p.lattice or level.lattice:g} of the beam")
+        what = f"{p.fidelity}, {p.lattice or level.lattice:g} of the beam"
         wrong = self._in_proportion(0.5 * level.structure_error)
-        return Effect("turbulence lattice", (what,), wrong, text)
+        return exact("turbulence lattice", wrong, text, what)
 
     def spectral(self) -> list[Effect]:
         """The band's spectrum and ozone: the fluctuation's error by radiative transfer at one
@@ -425,7 +425,7 @@ class AtmosphereBounds:
                 f" {without}"
             )
             share = abs(_slope(other, a.model.pwv, a.elevations[0]) / right - 1)
-            effects.append(Effect(name, (full(what),), self._in_proportion(share), text))
+            effects.append(exact(name, self._in_proportion(share), text, what))
         return effects
 
     def slopes(self) -> list[Effect]:
@@ -449,17 +449,17 @@ class AtmosphereBounds:
         loudest = math.hypot(*(t.loudest for t in context.traits.values()))
         noise = context.bound(opacity / 2 * loudest) | {"psd": opacity}
         return [
-            Effect(
+            exact(
                 "mean emission with elevation",
-                (full(gone),),
                 size,
                 "difference of the band's emission over the elevations seen",
+                gone,
             ),
-            Effect(
+            exact(
                 "opacity with elevation",
-                (full("calibrated at the current elevation"),),
                 noise | context.sky_error(opacity),
                 "difference of the opacity over the elevations seen, x half the noise, x the sky",
+                "calibrated at the current elevation",
             ),
         ]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from zonda.core.observation import Observation
 from zonda.core.plan.context import Context, calibration
-from zonda.core.plan.estimate import Effect, Estimate, Traits, full
+from zonda.core.plan.estimate import Estimate, Traits, exact
 from zonda.core.plan.planning import Planning
 
 from .crosstalk import Crosstalk, Shares, neighbours, read_shares
@@ -42,7 +42,7 @@ class GainPlanning(Planning[GainDrift]):
         text = (
             "rms of the gains x (rms of the stream + mean emission); of the sky, rms of the gains"
         )
-        return Estimate((Effect("gain drift", (full("exact"),), size, text),))
+        return Estimate((exact("gain drift", size, text),))
 
 
 class TimeConstantPlanning(Planning[TimeConstant]):
@@ -58,8 +58,8 @@ class TimeConstantPlanning(Planning[TimeConstant]):
         frequency = min(0.71 * speed / float(o.focalplane.fwhm.min()), o.sample_rate / 2)
         loss = 1 - 1 / math.hypot(1, 2 * math.pi * frequency * tau)
         text = "1 - |1 / (1 + 2 pi i f tau)| at f = 0.71 v / FWHM"
-        exact = full("exact below 0.46 of the sample rate")
-        return Estimate((Effect("time constant", (exact,), context.sky_error(loss), text),))
+        what = "exact below 0.46 of the sample rate"
+        return Estimate((exact("time constant", context.sky_error(loss), text, what),))
 
 
 class CrosstalkPlanning(Planning[Crosstalk]):
@@ -86,7 +86,7 @@ class CrosstalkPlanning(Planning[Crosstalk]):
             " that sum"
         )
         size |= context.sky_error(largest)
-        return Estimate((Effect("crosstalk", (full("exact"),), size, text),))
+        return Estimate((exact("crosstalk", size, text),))
 
     def _shares(self, observation: Observation) -> Shares:
         step, plane = self.operator, observation.focalplane
@@ -111,7 +111,7 @@ class GlitchPlanning(Planning[Glitches]):
         """Its size."""
         size = context.bound(self._rms(context.first), self.operator.decay)
         text = "sqrt(rate decay) amplitude (Campbell), at the detector, over zeta e^-tau"
-        return Estimate((Effect("glitches", (full("exact"),), size, text),), without=size)
+        return Estimate((exact("glitches", size, text),), without=size)
 
     def _rms(self, observation: Observation) -> float:
         step = self.operator

@@ -11,7 +11,7 @@ from zonda.core.knobs import Knob
 from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.observation import Observation
 from zonda.core.plan.context import LEAKS, Context
-from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, full
+from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, exact, full
 from zonda.core.plan.planning import Planning
 
 from .bessel import amplitude
@@ -156,8 +156,8 @@ class PolynomialPlanning(DetrendPlanning):
 
     def estimate(self, context: Context) -> Estimate:
         """Leaving it out leaves the mean and the slow part in."""
-        exact, left = full(f"exact, order {self.operator.order}"), _left_in(context)
-        return Estimate((Effect("polynomials", (exact,), left, LEFT_IN),), without=left)
+        left, what = _left_in(context), f"exact, order {self.operator.order}"
+        return Estimate((exact("polynomials", left, LEFT_IN, what),), without=left)
 
 
 class GroundPlanning(Planning[Any]):
@@ -173,8 +173,7 @@ class GroundPlanning(Planning[Any]):
     def estimate(self, context: Context) -> Estimate:
         """Leaving it out leaves the mean and the template in."""
         left = _left_in(context)
-        effect = Effect("template in azimuth", (full("exact"),), left, LEFT_IN)
-        return Estimate((effect,), without=left)
+        return Estimate((exact("template in azimuth", left, LEFT_IN),), without=left)
 
 
 LEFT_IN = "rms of the stream + mean emission, which no filter before it takes; all of the sky"

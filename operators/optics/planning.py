@@ -8,7 +8,7 @@ import numpy as np
 
 from zonda.core.observation import Observation
 from zonda.core.plan.context import Context, calibration
-from zonda.core.plan.estimate import Effect, Estimate, Traits, full
+from zonda.core.plan.estimate import Estimate, Traits, exact
 from zonda.core.plan.planning import Planning
 
 from .efficiency import Efficiency
@@ -50,7 +50,7 @@ class GroundPlanning(Planning[Any]):
         rms = max(self._rms(o) for o in context.observations)
         size = context.bound(rms, context.first.duration, common=True)
         text = "rms (e / 45 deg)^power at the lowest elevation, at the detector, over zeta e^-tau"
-        return Estimate((Effect("ground pickup", (full("exact"),), size, text),), without=size)
+        return Estimate((exact("ground pickup", size, text),), without=size)
 
     def _rms(self, observation: Observation) -> float:
         step = self.operator
@@ -85,8 +85,8 @@ class HalfWavePlatePlanning(Planning[Any]):
             else {"tod": 0.0, "map_rms": 0.0}
         )
         text = "2 p x the sky's brightness, which its polarized one cannot exceed"
-        exact = full("exact: ideal, of one angle")
-        return Estimate((Effect("half-wave plate", (exact,), size, text),))
+        what = "exact: ideal, of one angle"
+        return Estimate((exact("half-wave plate", size, text, what),))
 
 
 class LeakagePlanning(Planning[Any]):
@@ -107,4 +107,4 @@ class LeakagePlanning(Planning[Any]):
         )
         text = "p l x (rms of the stream + mean emission); of the sky, p l"
         size |= context.sky_error(share)
-        return Estimate((Effect("leakage", (full("exact"),), size, text),))
+        return Estimate((exact("leakage", size, text),))

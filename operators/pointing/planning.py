@@ -15,7 +15,7 @@ from zonda.core.data import Observation
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Effect, Estimate, full, not_simulated
+from zonda.core.plan.estimate import Estimate, exact, not_simulated
 from zonda.core.plan.planning import Planning
 
 from .base import Pointing
@@ -26,18 +26,18 @@ from .samples_per_beam import SamplesPerBeam
 from .schedule import PointingSchedule
 
 MOTION = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
-"""How entries of the tally begin that are about the telescope's motion."""
+"""Beginnings of the tally's entries about the telescope's motion."""
 
 STEEPEST = math.sqrt(8 * math.log(2)) * math.exp(-0.5)
 """Largest slope of a Gaussian beam, in peaks per FWHM."""
 
 REFRACTIVITY = 2.9e-4
-"""Of air at sea level, for radio waves in dry air: refraction is N cot(elevation) rad. Moist air
-adds up to a third.
+"""Refractivity N of dry air at sea level, for radio waves: refraction is N cot(elevation) rad.
+Moist air adds up to a third.
 """
 
 INSTANTS = 4096
-"""Of a scan that are looked at for its extremes."""
+"""Instants of a scan that are looked at for its extremes."""
 
 ABERRATION = 1.0e-4
 """v / c of the Earth's orbit and rotation."""
@@ -77,9 +77,8 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
                 "1.43 / FWHM x 1.33 N cosec^2(el) x throw in elevation: what a constant correction"
                 " leaves",
             ),
-            Effect(
+            exact(
                 "aberration",
-                (full("exact"),),
                 shift(ABERRATION * _extent(context)),
                 "1.43 / FWHM x v/c x reach of the scan; a shift common to all is in the target's"
                 " coordinates",
@@ -90,17 +89,16 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
                 shift(ABERRATION * radius),
                 "1.43 / FWHM x v/c x radius of the field",
             ),
-            Effect(
+            exact(
                 "sky rotation",
-                (full("exact"),),
                 shift(rotation),
                 "1.43 / FWHM x rotation during a scan x radius of the field",
             ),
-            Effect(
+            exact(
                 "pointing interpolation",
-                (full(f"within {error:g} of a beam"),),
                 shift(error * fwhm),
                 "1.43 x interpolation_error",
+                f"within {error:g} of a beam",
             ),
             not_simulated(
                 "sample integration",
@@ -108,12 +106,12 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
                 context.sky_error(smear),
                 "(v / f_s)^2 8 ln 2 / (24 FWHM^2): loss of a point source's peak along the scan",
             ),
-            *(Effect(what, (full("checked"),), {}, text) for what, text in _motion(context)),
-            Effect(
+            *(exact(what, {}, text, "checked") for what, text in _motion(context)),
+            exact(
                 "time stamps",
-                (full("float64 seconds since the start"),),
                 shift(resolution),
                 "1.43 / FWHM x spacing of float64 at the scan's end x speed",
+                "float64 seconds since the start",
             ),
         )
         return Estimate(effects)
@@ -158,7 +156,7 @@ class MispointingPlanning(Planning[Mispointing]):
         )
         size = context.sky_error(min(STEEPEST * delta / fwhm, 1.0))
         text = "1.43 / FWHM x (offset + 3 rms)"
-        return Estimate((Effect("mispointing", (full("exact"),), size, text),))
+        return Estimate((exact("mispointing", size, text),))
 
 
 def _bend(context: Context) -> float:

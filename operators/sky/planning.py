@@ -18,6 +18,7 @@ from zonda.core.plan.estimate import (
     Estimate,
     Saving,
     Traits,
+    exact,
     full,
     not_simulated,
 )
@@ -42,9 +43,6 @@ LINEAR = 1.1 * 2 * 8 * math.log(2) / 12
 
 PENCIL, STRAIGHT = Saving("deep_field", 0.035), Saving("atlast_reduced", 0.034)
 """Of no beam; of linear sampling."""
-
-FINEST = 16
-"""Points per FWHM of the finest grid that the operator makes."""
 
 
 def chromaticity(band: Band) -> float:
@@ -73,40 +71,23 @@ class SkyPlanning(Planning[SkyMap]):
         widths, _ = self.operator.beam_widths(observation)
         grid = self.operator.grid_of(observation)
         angles = 0 if grid.pole is None else 40 * observation.n_samples
-        each = (
-            2 if grid.spread is None or grid.is_flat else 3
-        )  # of a wide field pixels are spread for each beam
-        return (
-            (5 + each * len(widths)) * grid.nbytes
-            + (grid.source.nbytes if grid.resampled else 0)
-            + angles
-        )
+        each = 2 if grid.spread is None or grid.is_flat else 3  # pixels are spread for each beam
+        source = grid.source.nbytes if grid.resampled else 0
+        return (5 + each * len(widths)) * grid.nbytes + source + angles
 
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""
-        sky, grid, band = (
-            self.operator,
-            self.operator.grid_of(observation),
-            observation.instrument.band,
-        )
+        sky, band = self.operator, observation.instrument.band
+        grid = sky.grid_of(observation)
         if not grid.reached(observation, self._widest(observation)):
             return Traits(peak=abs(sky.outside))
         if not grid.resampled:
-            return Traits(
-                peak=float(
-                    np.nanmax(
-                        np.abs(sky.brightness_on(grid, band).values - sky.outside), initial=0.0
-                    )
-                )
-            )
+            values = sky.brightness_on(grid, band).values
+            return Traits(peak=float(np.nanmax(np.abs(values - sky.outside), initial=0.0)))
         found = conversion(grid, band, sky.spectral_index)
         factor = sky.scale * float(np.asarray(found.factor).max())
-        return Traits(
-            peak=max(
-                abs(v * factor - sky.outside)
-                for v in extremes(grid.source, grid.wcs, grid.tiles, found.per_area)
-            )
-        )
+        ends = extremes(grid.source, grid.wcs, grid.tiles, found.per_area)
+        return Traits(peak=max(abs(v * factor - sky.outside) for v in ends))
 
     def _widest(self, observation: Observation) -> float:
         return float(self.operator.beam_widths(observation)[0].max(initial=0.0))
@@ -123,11 +104,11 @@ class SkyPlanning(Planning[SkyMap]):
         effects = (
             Effect("beam convolution", tuple(choices), context.sky_error(1.0), "the sky's peak"),
             self._order(context, step.grid_of(o), fwhm),
-            Effect(
+            exact(
                 "coordinate precision",
-                (full("float32 offsets, float64 origins"),),
                 context.sky_error(1.43 * COORDINATES),
                 "1.43 x 5e-4 pixel of a quarter beam",
+                "float32 offsets, float64 origins",
             ),
             one_beam(context),
         )
@@ -148,32 +129,22 @@ class SkyPlanning(Planning[SkyMap]):
         return [Choice("dropped", "no beam", settings, bound=bound, formula=text, saves=PENCIL)]
 
     def _order(self, context: Context, grid: Grid, fwhm: float) -> Effect:
-        """Linear sampling for cubic splines: on the grid there is, or on one twice as fine."""
-        operator, cubic = self.operator, context.sky_error(CUBIC)
+        """Linear sampling for cubic splines, on the grid there is."""
+        operator, name = self.operator, "sampling order"
         if operator.interpolation == "linear" or not fwhm:
             what = "linear" if operator.interpolation == "linear" else "cubic B-spline"
-            return Effect("sampling order", (full(what),), cubic, "0.3 % of a point source's peak")
+            return exact(name, context.sky_error(CUBIC), "0.3 % of a point source's peak", what)
         scale = np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0)
         points = fwhm / float(np.radians(scale).max())
-        resampled = 2 <= points < operator.pixels_per_fwhm
-        n = points * (math.ceil(operator.pixels_per_fwhm / points - 1e-9) if resampled else 1)
+        finer = 2 <= points < operator.pixels_per_fwhm
+        n = points * (math.ceil(operator.pixels_per_fwhm / points - 1e-9) if finer else 1)
         text = (
             "1.1 h^2 / 12 (|f_xx| + |f_yy|) of a point source on n points h apart per FWHM: 1.02 /"
             " n^2 of its peak"
         )
-
-        def linear(what: str, n: float, **more: Any) -> Choice:
-            return Choice("coarse", what, {"interpolation": "linear", **more}, formula=text,
-                          bound=context.sky_error(LINEAR / n**2), saves=STRAIGHT)  # fmt: skip
-
-        choices = [full("cubic B-spline")]
-        wanted = 2 * points * math.ceil(n / points - 1e-9)
-        if points >= 2 and wanted <= FINEST:
-            choices.append(
-                linear("linear, on twice as fine a grid", wanted, pixels_per_fwhm=wanted)
-            )
-        choices.append(linear("linear", n))
-        return Effect("sampling order", tuple(choices), choices[-1].bound, text)
+        bound, settings = context.sky_error(LINEAR / n**2), {"interpolation": "linear"}
+        linear = Choice("coarse", "linear", settings, bound=bound, formula=text, saves=STRAIGHT)
+        return Effect(name, (full("cubic B-spline"), linear), bound, text)
 
 
 def one_beam(context: Context) -> Effect:
@@ -210,9 +181,9 @@ class SourcesPlanning(Planning[Any]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its size: the brightest source."""
-        exact, size = full("exact: each through its beam"), brightness(self.traits(context.first))
-        text = "the brightest source in the smallest beam"
-        return Estimate((Effect("point sources", (exact,), size, text), one_beam(context)))
+        size, text = brightness(self.traits(context.first)), "the brightest source in its beam"
+        what = "exact: each through its beam"
+        return Estimate((exact("point sources", size, text, what), one_beam(context)))
 
     def _catalogue_size(self) -> int:
         from .point_sources import Catalogue
@@ -252,9 +223,8 @@ class CMBPlanning(Planning[Any]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its size."""
-        drawn, size = full(f"drawn at nside {self.operator.nside}"), self.traits(context.first)
-        text = "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB"
-        return Estimate((Effect("CMB", (drawn,), brightness(size), text),))
+        size, what = brightness(self.traits(context.first)), f"drawn at nside {self.operator.nside}"
+        return Estimate((exact("CMB", size, "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB", what),))
 
     def _polarized(self, observation: Observation) -> bool:
         """True if I, Q and U are drawn."""
@@ -279,9 +249,8 @@ class PySMPlanning(Planning[Any]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its size."""
-        at, size = full(f"at nside {self.operator.nside}"), self.traits(context.first)
-        text = "largest brightness where the scan looks"
-        return Estimate((Effect("sky of PySM", (at,), brightness(size), text),))
+        size, what = brightness(self.traits(context.first)), f"at nside {self.operator.nside}"
+        return Estimate((exact("sky of PySM", size, "largest brightness in view", what),))
 
     @property
     def _number(self) -> int:
