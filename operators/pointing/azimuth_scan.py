@@ -19,7 +19,7 @@ from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
 
 from .base import Aim, Pointing
-from .sun import mark_sun
+from .sun_and_moon import mark_sun
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation

@@ -28,7 +28,7 @@ from .limits import LargestMotion, excess
 from .motion import POINTS, motion
 from .observed import Samples, observed
 from .schedule_files import Row
-from .sun import sunlit
+from .sun_and_moon import sunlit
 
 if TYPE_CHECKING:
     from zonda.core.data import Data, Observation
