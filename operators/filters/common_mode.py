@@ -35,8 +35,7 @@ from zonda.core.data import Block, Data, Stream
 from zonda.core.flags import DEAD
 from zonda.core.kernels import kernel
 
-from .mode_search import Modes, ModeSearch
-from .parameters import CommonModeParameters
+from .mode_search import CommonModeParameters, Modes, ModeSearch
 
 
 class CommonModeFilter(CommonModeParameters):

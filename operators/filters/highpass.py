@@ -9,18 +9,21 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Hertz, Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.flags import TRIMMED, has_a_signal
+from zonda.core.operator import Operator
 from zonda.core.types import AnyFloats, Floats
 
 from .baseline import Fit, polynomials
 from .bessel import BesselPlan, sections
 from .brick_wall import HighpassPlan, first_kept, plan_highpass
-from .parameters import HighpassParameters
 from .rows import SPOILT, in_double
-from .source_mask import Inside, check_mask, check_masks, filter_outside
+from .source_mask import Inside, SourceMask, check_mask, check_masks, filter_outside
 
 ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a line are removed"
 
@@ -31,6 +34,43 @@ class State(NamedTuple):
     plan: HighpassPlan | BesselPlan
     bad: NDArray[np.intp]
     inside: Inside | None
+
+
+class HighpassParameters(Operator):
+    """Parameters of `HighpassFilter`."""
+
+    frequency: Hertz = quantity("0.08 Hz", gt=0)
+    """Cutoff: lower frequencies are removed (`brick_wall`), or attenuated as the fourth power of
+    the frequency (`bessel`).
+    """
+    response: Literal["brick_wall", "bessel"] = "brick_wall"
+    """Brick wall without phase, or a causal Bessel filter with four poles."""
+    degree: int | None = Field(3, ge=0, le=3)
+    """Degree of the polynomial fitted to each detector's scan and removed first (1: a line; null:
+    none, for `bessel` alone).
+    """
+    trim: Seconds = quantity("0 s", ge=0)
+    """Time at either end of each scan that is flagged."""
+    oversampling: float = Field(24.0, ge=8, le=1000)
+    """Of the brick wall: coarse knots per cut cycle (M / (K / 2)); the low part's error at the cut
+    is about oversampling^-4.
+    """
+    mask: SourceMask | None = None
+    """Source whose samples are bridged to find the slow part, which is subtracted there too:
+    equation (1) of `source_mask`.
+    """
+
+    @model_validator(mode="after")
+    def _has_a_degree(self) -> HighpassParameters:
+        if self.degree is None and self.response == "brick_wall":
+            raise ValueError(
+                "a brick wall needs a degree of 0 or more; degree: null belongs to response: bessel"
+            )
+        if self.response == "bessel" and "oversampling" in self.model_fields_set:
+            raise ValueError(
+                "oversampling belongs to response: brick_wall; the Bessel filter is exact"
+            )
+        return self
 
 
 class HighpassFilter(HighpassParameters):

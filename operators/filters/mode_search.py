@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from zonda.core.data import Stream
 from zonda.core.errors import PipelineError
 from zonda.core.flags import DEAD
+from zonda.core.operator import Operator
 from zonda.core.signal import MAIN
 from zonda.core.types import Floats
 
 from . import focal_plane_mean
 from .gram import Gram, Usable
 from .lanczos import NOTHING, Ritz, lanczos
-from .parameters import CommonModeParameters
-from .source_mask import MASKED, Inside, counts
+from .source_mask import MASKED, Inside, SourceMask, counts
 
 ROUNDING = 2.0**-24 / np.sqrt(3.0)
 """rms of float32's relative rounding error."""
@@ -26,6 +28,54 @@ KEPT = "modes kept because the data do not determine them (rank)"
 UNDETERMINED = "degenerate modes (the next singular value is nearly as large)"
 """Counts of the log. Degenerate: the next singular value is more than `gap` times the mode's own.
 """
+
+
+class CommonModeParameters(Operator):
+    """Parameters of `CommonModeFilter`."""
+
+    modes: int = Field(1, ge=1, le=100)
+    """How many modes to remove."""
+    group: Literal["band", "wafer", "all"] = "band"
+    """Whose modes are found together: those of all detectors of a band, of each wafer of it, or of
+    all bands of the camera.
+    """
+    method: Literal["svd", "mean"] = "svd"
+    """Singular modes, or the mean of all detectors at each instant (one mode), which needs little
+    memory.
+    """
+    residual: float = Field(1e-6, gt=1e-12, lt=1e-1)
+    """Largest residual of a removed mode, equation (2)."""
+    gap: float = Field(0.9, gt=0, lt=1)
+    """A mode is determined by the data while the next singular value is at most this times its own.
+    """
+    scale: Literal["none", "rms"] = "none"
+    """`rms`: the modes are those of streams of unit rms, equation (4), as in the mapper of maria
+    1.0.0.
+    """
+    mask: SourceMask | None = None
+    """Source whose samples are not used to find the modes, which are subtracted there too. Where it
+    covers all detectors at an instant, nothing is subtracted: choose it smaller than the field of
+    view."""
+    on_undetermined: Literal["mean", "skip", "remove"] = "mean"
+    """What to do with a mode that is not determined: remove the detectors' mean (in place of the
+    first), skip or remove it.
+    """
+
+    @model_validator(mode="after")
+    def _one_mean(self) -> CommonModeParameters:
+        if self.method == "mean" and self.modes != 1:
+            raise ValueError(
+                "method: mean removes one mode; leave modes at 1 or choose method: svd"
+            )
+        of_svd = {"residual", "gap", "on_undetermined"} & self.model_fields_set
+        if self.method == "mean" and of_svd:
+            raise ValueError(
+                f"{sorted(of_svd)[0]} belongs to method: svd; the detectors' mean is exact and"
+                " always determined"
+            )
+        if self.method == "mean" and self.scale == "rms":
+            raise ValueError("scale: rms belongs to method: svd; the detectors' mean has no scale")
+        return self
 
 
 @dataclass
