@@ -22,6 +22,7 @@ from zonda.core.numerics.smooth import SmoothField
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.packages import needed
+from zonda.core.plan.planning import Planning
 from zonda.core.signal import MAIN
 from zonda.core.stream import Stream
 from zonda.core.types import AnyFloats
@@ -300,3 +301,20 @@ def _newly_flagged(label: str, stream: Stream, ob: Any, before: Any) -> Any:
             new.size,
         )
     return new & ~instants
+
+
+class ToastPlanning(Planning[ToastOperator]):
+    """Planning of an operator of TOAST, whose cost and effect are not known."""
+
+    of = ToastOperator
+    smaller = "make the scan shorter: TOAST holds all of it in float64"
+
+    def memory(self, observation: Observation) -> int:
+        """For TOAST the signal in float64, its flags and as much again to work with; what it made
+        of each signal.
+        """
+        return (
+            (8 + 2 + 1 + 8 + 8 * len(observation.signals))
+            * observation.n_detectors
+            * observation.n_samples
+        )
