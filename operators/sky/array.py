@@ -25,10 +25,9 @@ from pydantic_core import core_schema
 from zonda.core.configuration.values import mistake
 from zonda.core.errors import InputError
 from zonda.core.maps.header import exact_header
+from zonda.core.maps.map_reading import is_healpix
 from zonda.core.maps.units import parse_unit
 from zonda.core.storage.fits_files import joined
-
-from .healpix import is_healpix
 
 IN_A_FILE = (
     "an array is given in Python, as in SkyMap(map=array); in a pipeline file write file:"

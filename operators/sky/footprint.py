@@ -10,6 +10,7 @@ import numpy as np
 
 from zonda.core.configuration.target import Target
 from zonda.core.errors import InputError
+from zonda.core.maps.map_reading import chosen, is_healpix
 from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
 from zonda.core.numerics.sphere import angle_between, angles, unit_vectors
 from zonda.core.storage.files import reading
@@ -17,9 +18,7 @@ from zonda.core.storage.fits_files import opened
 from zonda.core.types import Floats
 
 from .geometry import geometry, is_plain_tan, placed, turned
-from .healpix import is_healpix
 from .inputs import WcsMap
-from .planes import chosen
 from .region import Disc
 
 LATTICE = 17

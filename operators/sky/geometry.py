@@ -5,7 +5,6 @@ user places them.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +13,7 @@ from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
 from zonda.core.maps.header import number, text, with_known_frame
+from zonda.core.maps.map_reading import is_celestial
 from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.numerics.sphere import angles, local_axes
 from zonda.core.storage.files import first_line
@@ -157,13 +157,6 @@ def rescaled(wcs: Any, matrix: Floats) -> Any:
     made.wcs.pc = matrix
     made.wcs.set()
     return made
-
-
-def is_celestial(ctype: str) -> bool:
-    """True for the CTYPE of a longitude or a latitude on the sky."""
-    return (
-        re.match(r"(RA--|DEC-|[GESH]L(ON|AT)|HP(LN|LT)|[A-Z]{2}L[NT])", ctype.upper()) is not None
-    )
 
 
 def _celestial(header: Any, axis: str) -> bool:

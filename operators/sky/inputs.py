@@ -10,10 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.maps.map_reading import Frame
 from zonda.core.types import Floats
-
-Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
-"""Names of frames as astropy has them."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,13 @@ import numpy as np
 
 from zonda.core.errors import InputError
 from zonda.core.maps.header import text
+from zonda.core.maps.map_reading import (
+    STOKES,
+    chosen,
+    is_healpix,
+    plane_of_cube,
+    planes_of_q_and_u,
+)
 from zonda.core.maps.stokes_names import columns_of_q_and_u
 from zonda.core.storage.files import reading
 from zonda.core.storage.fits_files import check_size, opened
@@ -21,9 +28,8 @@ from zonda.core.types import Floats
 from . import stokes
 from .array import GIVEN, ArrayMap
 from .geometry import geometry
-from .healpix import is_healpix, read_healpix
+from .healpix import read_healpix
 from .inputs import HealpixMap, Wanted, WcsMap
-from .planes import chosen, plane_of_cube
 from .resolution import made_with
 from .units import beam_solid_angle, check_beam, filled, unit_of
 
@@ -63,7 +69,7 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
             found = _image(place, _pixels(hdu, wanted), hdu.header, wanted, q_and_u)
         found.notes = notes | found.notes
         if found.polarization is not None:
-            found.notes.pop(stokes.STOKES, None)
+            found.notes.pop(STOKES, None)
         return _told(found, hdu.header.get(GIVEN))
 
 
@@ -148,7 +154,7 @@ def _image(
             )
             raise InputError(f"{name} is for HEALPix maps", place=place, cure=cure)
     plane, notes = plane_of_cube(header, values.shape, wanted.plane, place)
-    planes = stokes.planes_of_q_and_u(header, values.shape, plane) if wanted.polarized else None
+    planes = planes_of_q_and_u(header, values.shape, plane) if wanted.polarized else None
     unit, factor = unit_of(place, header, "BUNIT", wanted.unit, notes)
     beam = beam_solid_angle(place, header, unit, wanted.input_beam, notes)
     wcs, scale = geometry(place, header, wanted.pixel_size, wanted.centred, notes)
@@ -160,7 +166,7 @@ def _image(
     if planes is not None and not wanted.header_alone:
         q_and_u = np.stack([np.array(values[k], np.float64) for k in planes])
     if planes is not None or q_and_u is not None:
-        notes.pop(stokes.STOKES, None)
+        notes.pop(STOKES, None)
         sign = stokes.sign_of_u(header, wanted.convention, True, place, notes)
     if wanted.header_alone:
         return WcsMap(values[plane], unit, wcs, scale, beam, notes)

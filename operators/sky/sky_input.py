@@ -7,6 +7,7 @@ from collections.abc import Hashable
 from typing import cast
 
 from zonda.core.hooks import manager
+from zonda.core.maps.map_reading import STOKES
 from zonda.core.types import Floats
 
 from .inputs import HealpixMap, WcsMap
@@ -14,7 +15,6 @@ from .parameters import SkyParameters
 from .read import read_array, read_map
 from .resample import Progress, no_progress
 from .resolution import seen_twice
-from .stokes import STOKES
 from .units import DOUBT
 
 LARGE = 1 << 26

@@ -5,7 +5,7 @@ a FITS file and tables.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,20 @@ from zonda.core.maps.header import marked_bad, number, text, with_known_frame
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_file import ascii_text
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.map_reading import (
+    STOKES,
+    Cures,
+    HealpixTable,
+    axes_of_planes,
+    chosen,
+    is_healpix,
+    plane_of_cube,
+    planes_of_q_and_u,
+)
 from zonda.core.maps.measured_noise import ELSEWHERE
 from zonda.core.maps.noise_figures import FREE
 from zonda.core.maps.planes import IQU
-from zonda.core.maps.stokes_names import (
-    along_axis,
-    columns_of_q_and_u,
-    intensity_column,
-    pixel_column,
-)
+from zonda.core.maps.stokes_names import columns_of_q_and_u, intensity_column
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
@@ -41,12 +46,6 @@ from .statistics import Comparison
 
 SAME_BAND = 1e-3
 """Relative difference of frequencies of one band."""
-FRAMES = {
-    **dict.fromkeys(("C", "Q", "EQ", "ICRS", "CELESTIAL", "EQUATORIAL"), "icrs"),
-    **dict.fromkeys(("G", "GALACTIC"), "galactic"),
-    **dict.fromkeys(("E", "ECLIPTIC"), "barycentricmeanecliptic"),
-}
-"""Of COORDSYS."""
 NOISES = {
     "NOISE": "noise I",
     "COV_II": "noise I",
@@ -58,9 +57,12 @@ NOISES = {
 }
 """Of a file's extensions and columns: standard errors, or variances; and noise alone."""
 FLUXES = ("Jy/pixel", "Jy/beam", "MJy/sr")
-CURE = (
-    "give a FITS file with a two-dimensional image that has a celestial WCS, or with a HEALPix"
-    " table"
+CURES = Cures(
+    plane="choose its plane ({ranges}): --plane {list}, or plane: {example}",
+    coordsys=(
+        "give it: --coordsys C (ICRS), G (galactic) or E (ecliptic), or coordsys: C; or set the"
+        " header key COORDSYS"
+    ),
 )
 
 
@@ -193,9 +195,9 @@ def _on_one_grid(a: Plane, b: Plane) -> bool:
 def _read(path: Path, name: str, wanted: Wanted) -> ReadMap:
     place = str(path)
     with opened(path, place, "check the file, e.g. with fitsverify, or copy it again") as hdus:
-        hdu = _chosen(hdus, wanted.hdu, place)
+        hdu, _ = chosen(hdus, wanted.hdu, place)
         check_size(hdu, place)
-        if not _is_healpix(hdu):
+        if not is_healpix(hdu):
             if wanted.coordsys is not None and not wanted.shared:
                 raise InputError(
                     "coordsys is for HEALPix maps",
@@ -210,45 +212,6 @@ def _read(path: Path, name: str, wanted: Wanted) -> ReadMap:
                 "plane is for images, and this is a HEALPix table", place=place, cure="remove it"
             )
         return _told(name or path.name, hdu.header, False, _healpix(hdu, wanted, place), place)
-
-
-def _is_healpix(hdu: Any) -> bool:
-    return not hdu.is_image and "NSIDE" in hdu.header and "ORDERING" in hdu.header
-
-
-def _chosen(hdus: Any, wanted: int | str | None, place: str) -> Any:
-    """The extension that is ``wanted``, or the first that is a map."""
-    maps = [
-        hdu
-        for hdu in hdus
-        if _is_healpix(hdu) or (hdu.is_image and hdu.header.get("NAXIS", 0) >= 2)
-    ]
-    if wanted is None:
-        if not maps:
-            raise InputError(
-                "is not a map: it holds no image of two axes and no HEALPix table",
-                place=place,
-                cure=CURE,
-            )
-        return maps[0]
-    found = [
-        hdu
-        for k, hdu in enumerate(hdus)
-        if str(wanted).strip().upper() in (str(k), str(hdu.name).upper())
-    ]
-    if not found or not any(found[0] is one for one in maps):
-        there = ", ".join(
-            f"{k}{f' {hdu.name}' if hdu.name else ''}"
-            for k, hdu in enumerate(hdus)
-            if any(hdu is m for m in maps)
-        )
-        what = "is neither an image of two axes nor a HEALPix table" if found else "is not there"
-        raise InputError(
-            f"the extension {wanted} {what}",
-            place=place,
-            cure=f"set hdu to one of these: {there or 'none'}",
-        )
-    return found[0]
 
 
 @dataclass(frozen=True)
@@ -346,25 +309,21 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
         raise InputError(
             f"is not a map: it has no celestial coordinates (CTYPE: {kinds})",
             place=place,
-            cure=CURE,
+            cure="give a FITS file with a two-dimensional image that has a celestial WCS, or with a"
+            " HEALPix table",
         )
-    stokes, index, note = _plane_of(header, shape, wanted, place)
-    values = np.asarray(hdu.data[index], np.float64)
-    names = along_axis(header, stokes, shape[len(shape) - stokes]) if stokes else ["I"]
-    found = {
-        key: plane
-        for key, plane in zip(names, values.reshape(-1, *shape[-2:]), strict=True)
-        if key in ("I", "Q", "U")
-    }
-    if "I" not in found:
-        raise InputError(
-            f"its axis STOKES has {', '.join(names)} and no I",
-            place=place,
-            cure="give a map of I, Q and U",
-        )
+    for axis in range(3, len(shape) + 1):
+        if shape[len(shape) - axis] == 1:  # whatever it is of, there is no choice
+            header[f"CTYPE{axis}"] = ""
+    plane = wanted.plane if axes_of_planes(header, shape) or not wanted.shared else None
+    index, told = plane_of_cube(header, shape, plane, place, CURES)
+    polarized = planes_of_q_and_u(header, shape, index) or ()
+    planes = {"I": index, **dict(zip("QU", polarized, strict=False))}
+    found = {key: np.asarray(hdu.data[at], np.float64) for key, at in planes.items()}
     stated: dict[str, tuple[float, str]] = {}
     halves = "of two halves"
-    first = wanted.hdu is None and len(names) == 1  # the extensions beside it are of it
+    alone = STOKES not in told and len(planes) == 1
+    first = wanted.hdu is None and alone  # the extensions beside it are of it
     alike = [other for other in hdus if other.is_image and other.shape == shape] if first else []
     letters = columns_of_q_and_u([str(other.name) for other in alike])
     for key, k in zip(("Q", "U"), letters or (), strict=False):
@@ -377,64 +336,11 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
             halves = text(other.header, "JACKKNIF", place) or halves
     both = found.keys() >= {"Q", "U"}
     kept = {k: v for k, v in found.items() if both or k[-1] == "I"}
-    notes = [f"{what}: {said}" for what, said in (("plane", note), ("frame", frame)) if said]
+    notes = [
+        f"{what}: {said}" for what, said in (("plane", told.get("plane")), ("frame", frame)) if said
+    ]
     return Found(
         wcs.celestial.to_header(relax=True), kept, header.get("BUNIT"), stated, notes, halves
-    )
-
-
-def _plane_of(
-    header: Any, shape: Sequence[int], choice: Wanted, place: str
-) -> tuple[int, tuple[int | slice, ...], str]:
-    """(FITS number of the axis STOKES whose planes are all read, or 0; index of what is read; a
-    note of the plane of a cube).
-    """
-    axes = {len(shape) - k: n for k, n in enumerate(shape[:-2])}  # FITS counts from the fastest
-    kinds = {axis: str(header.get(f"CTYPE{axis}", "")).strip().upper() for axis in axes}
-    if any(kind[:4] in ("RA--", "DEC-", "GLON", "GLAT") for kind in kinds.values()):
-        cure = "transpose it, so that axes 1 and 2 are longitude and latitude"
-        raise InputError(
-            "the axes of the sky are not the first two of the cube", place=place, cure=cure
-        )
-    stokes = next((axis for axis, n in axes.items() if n > 1 and kinds[axis] == "STOKES"), 0)
-    asked = [axis for axis in sorted(axes) if axes[axis] > 1 and axis != stokes]
-    wanted = choice.plane if asked or not choice.shared else None
-    if wanted is not None and stokes and len(wanted) == len(asked) + 1:
-        asked, stokes = sorted([*asked, stokes]), 0
-    if asked and wanted is None:
-        ranges = ", ".join(
-            f"1 to {axes[axis]} along {kinds[axis] or f'axis {axis}'}" for axis in asked
-        )
-        sides = " x ".join(str(n) for n in reversed(shape))
-        example = ",".join("1" for _ in asked)
-        cure = (
-            f"choose its plane ({ranges}): --plane {example}, or plane:"
-            f" {example if len(asked) == 1 else f'[{example}]'}"
-        )
-        raise InputError(f"is a cube of {sides} pixels, not a map", place=place, cure=cure)
-    if len(wanted or ()) != len(asked):
-        cure = f"give {len(asked)} of them" if asked else "leave plane out: it is no cube"
-        raise InputError(
-            f"plane has {len(wanted or ())} numbers, and the image {len(asked)} axes of planes",
-            place=place,
-            cure=cure,
-        )
-    numbers = dict(zip(asked, wanted or (), strict=True))
-    for axis, chosen in numbers.items():
-        if not 1 <= chosen <= axes[axis]:
-            raise InputError(
-                f"there is no plane {chosen} of {axes[axis]}",
-                place=place,
-                cure="planes are counted from 1",
-            )
-    note = ", ".join(
-        f"{n} of {axes[axis]}{f' along {kinds[axis]}' if kinds[axis] else ''}"
-        for axis, n in numbers.items()
-    )
-    return (
-        stokes,
-        tuple(slice(None) if axis == stokes else numbers.get(axis, 1) - 1 for axis in axes),
-        note,
     )
 
 
@@ -459,31 +365,19 @@ def _stated(header: Any, of: str, place: str) -> dict[str, tuple[float, str]]:
 
 def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
     """Pixels of a HEALPix table with a value, with their noise and what holds noise alone."""
-    header, names = hdu.header, [str(n).upper() for n in hdu.columns.names]
+    table, header = HealpixTable(hdu, place), hdu.header
     stated_there = text(header, "COORDSYS", place)
-    written = (
-        (stated_there or wanted.coordsys if wanted.shared else wanted.coordsys or stated_there)
-        or ""
-    ).upper()
-    frame = FRAMES.get(written)
-    if frame is None:
-        what = f"unknown: COORDSYS = {written!r}" if written else "missing"
-        cure = (
-            "give it: --coordsys C (ICRS), G (galactic) or E (ecliptic), or coordsys: C; or set the"
-            " header key COORDSYS"
-        )
-        raise InputError(
-            f"the coordinate system of the HEALPix map is {what}", place=place, cure=cure
-        )
-    nest = str(header["ORDERING"]).upper().startswith("NEST")
-    place_of, first = pixel_column(names), intensity_column(names, None, place)
+    given = (stated_there or wanted.coordsys) if wanted.shared else wanted.coordsys
+    frame, _ = table.frame(given or None, CURES)
+    names = [name.upper() for name in table.names]
+    first = intensity_column(names, None, place)
     columns = {"I": first, **dict(zip(("Q", "U"), columns_of_q_and_u(names) or (), strict=False))}
     columns |= {
         key: names.index(name)
         for name, key in NOISES.items()
         if name in names and key[-1] in columns
     }
-    planes = {key: np.asarray(hdu.data.field(k), np.float64).ravel() for key, k in columns.items()}
+    planes = {key: table.numbers(k) for key, k in columns.items()}
     planes = {
         key: np.where(marked_bad(plane, header, place), np.nan, plane)
         for key, plane in planes.items()
@@ -492,34 +386,16 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
         key: _root(plane) if names[columns[key]].startswith("COV") else plane
         for key, plane in planes.items()
     }
-    pixels = (
-        np.arange(planes["I"].size)
-        if place_of is None
-        else np.asarray(hdu.data.field(place_of), np.int64).ravel()
-    )
+    nside, n = table.nside(planes["I"].size), planes["I"].size
+    pixels = table.pixels(nside, n)
+    pixels = np.arange(n) if pixels is None else pixels
     seen = np.isfinite(planes["I"])
     if not seen.any():
         raise InputError(
             "no pixel has a value", place=place, cure="give a map that is not NaN everywhere"
         )
-    nside = number(header, "NSIDE", place)
     order = np.flatnonzero(seen)[np.argsort(pixels[seen])]
-    bad = (
-        not nside
-        or nside != int(nside)
-        or pixels[order[0]] < 0
-        or pixels[order[-1]] >= 12 * nside**2
-    )
-    if (
-        bad
-        or (np.diff(pixels[order]) == 0).any()
-        or (place_of is None and pixels.size != 12 * (nside or 0) ** 2)
-    ):
-        cure = "check NSIDE and the column of the pixel numbers"
-        raise InputError(
-            "the pixel numbers are out of range or twice there", place=place, cure=cure
-        )
-    where = healpix_grid(int(nside or 0), nest, pixels[order], frame)
+    where = healpix_grid(nside, table.nest, pixels[order], frame)
     stated: dict[str, tuple[float, str]] = {}
     for of in ("I", *(("Q", "U") if "Q" in columns else ())):
         stated |= _stated(

@@ -11,10 +11,10 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
+from zonda.core.maps.map_reading import STOKES
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.operators.sky.read import read_map
 from zonda.operators.sky.skymap import SkyMap
-from zonda.operators.sky.stokes import STOKES
 
 ARCSEC = np.pi / 648000
 

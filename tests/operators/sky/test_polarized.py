@@ -10,11 +10,11 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
+from zonda.core.maps.map_reading import STOKES
 from zonda.core.numerics.projection import directions, frame_rotation
 from zonda.core.numerics.sphere import local_axes
 from zonda.core.polarization import PolarizationAngles, between_meridians, turned_by
 from zonda.operators.sky.skymap import SkyMap
-from zonda.operators.sky.stokes import STOKES
 
 STOKES_I, Q, U = 1.0, 0.3, -0.2
 N_DET = 6

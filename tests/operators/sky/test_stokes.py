@@ -6,9 +6,10 @@ import pytest
 from astropy.io import fits
 
 from zonda.core.errors import InputError
+from zonda.core.maps.map_reading import STOKES
+from zonda.core.maps.stokes_names import is_polarized
 from zonda.operators.sky.read import read_map
 from zonda.operators.sky.skymap import SkyMap
-from zonda.operators.sky.stokes import STOKES, is_polarized
 
 
 @pytest.mark.parametrize(

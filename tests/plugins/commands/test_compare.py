@@ -310,7 +310,9 @@ def test_an_extension_and_a_coordinate_system(tmp_path, values, capsys):
         compare(a, tmp_path / "two.fits", "--output", tmp_path / "o", "--hdu", "0", "--hdu", "5")
         == 2
     )
-    assert "set hdu to one of these: 0 PRIMARY, 1 OTHER" in capsys.readouterr().err
+    assert (
+        "set hdu to one of these: 0 PRIMARY: image of 48 x 48; 1 OTHER" in capsys.readouterr().err
+    )
     pixels = healpy.query_disc(
         16384, healpy.ang2vec(75.0, 20.0, lonlat=True), np.radians(40 / 3600)
     )
