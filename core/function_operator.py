@@ -140,7 +140,7 @@ class FunctionOperator(Operator):
 
 
 EMISSION = "atmosphere"
-"""The stream whose mean stands in ``observation.smooth`` (`core.run.whole`)."""
+"""The stream whose mean stands in ``observation.smooth`` (`core.run.means`)."""
 
 
 @overload

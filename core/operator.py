@@ -61,7 +61,7 @@ class Operator(Labelled):
         True where it handles the means that stand beside streams (`Block.means`,
         ``observation.smooth["atmosphere"]``). Without it `exec` sees whole streams: where one that
         it declares has a mean, a float64 block with the mean in it, and no entry in `Block.means`;
-        the same mean is subtracted from what it leaves there (`core.run.whole`). `measure`
+        the same mean is subtracted from what it leaves there (`core.run.means`). `measure`
         likewise. A class that overrides `exec` or `measure` must say so anew.
     all_bands
         True where it is given all bands of a camera at once, instead of one after the other: a

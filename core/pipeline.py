@@ -10,6 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from .assembly import arguments
+from .assembly.order import check_order
+from .assembly.signals import Signals, note_signals, remainder
 from .data import Data
 from .errors import PipelineError
 from .faults import faults_named
@@ -21,7 +24,6 @@ from .observation import Observation
 from .operator import Operator
 from .output import Output, Progress
 from .pages import html_table
-from .run import arguments
 from .run.bands import (
     Band,
     data_of_bands,
@@ -34,10 +36,8 @@ from .run.bands import (
 )
 from .run.budget import Budget, held_of, least_memory, longest_of
 from .run.execute import execute
-from .run.order import check_order
 from .run.schedule import Chain
 from .run.settings import Settings, Timer
-from .run.signals import Signals, note_signals, remainder
 from .scene import Scene
 from .signal import Signal, stream_of
 from .storage.files import check_output_folder

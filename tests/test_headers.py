@@ -13,8 +13,8 @@ import pytest
 from astropy.io import fits
 
 import zonda
+from zonda.core.assembly.checks import looks
 from zonda.core.errors import ZondaError
-from zonda.core.run.first_look import looks
 
 WORLD = {
     "CTYPE1": "RA---TAN",

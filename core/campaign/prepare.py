@@ -154,8 +154,8 @@ class _Draft:
 
     def _plan(self, source: CampaignFile, entry: Entry, share: float) -> int:
         """Plan an entry's pipeline; its number."""
+        from ..assembly.checks import first_look
         from ..plan.bands import for_run
-        from ..run.first_look import first_look
 
         with within(f"entry {about(entry) or source.file.header.name}"):
             file = _with_budget(source.load(entry.settings), share)

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from ..assembly import arguments
 from ..components import SESSION
 from ..configuration.files import InMemory
 from ..configuration.loaded import PipelineFile, Step
@@ -28,7 +29,6 @@ from ..operator import Operator
 from ..output import Output, may_write
 from ..pipeline import Pipeline
 from ..registry import instruments, operators, operators_that, sites
-from ..run import arguments
 from ..scene import Scene
 from ..storage.files import check_output_folder, product_path
 from ..storage.lock import lock

@@ -12,11 +12,11 @@ from pydantic import ValidationError
 
 from zonda import __version__
 
+from ..assembly.checks import first_look, looks, warn_of_nothing_saved
 from ..component_files import is_file
 from ..errors import ZondaError
 from ..operator import Operator
 from ..pipeline import Pipeline
-from ..run.first_look import first_look, looks, warn_of_nothing_saved
 from ..scene import Scene
 from ..signal import Signal
 from ..variants import is_variant, written

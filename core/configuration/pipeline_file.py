@@ -14,13 +14,13 @@ from typing import Any
 from zonda import __version__
 
 from .. import registry
+from ..assembly.checks import looks
+from ..assembly.order import check_order
 from ..errors import PipelineError, ZondaError
 from ..mapmaker import made_by
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
-from ..run.first_look import looks
-from ..run.order import check_order
 from ..scene import Scene, WithScene
 from ..signal import Signal, can_be_named
 from ..site import Site

@@ -6,9 +6,9 @@ import re
 from typing import Any
 
 from .. import registry
+from ..assembly.order import check_order
 from ..errors import ZondaError
 from ..operator import Operator
-from ..run.order import check_order
 from .explain import glued
 from .loaded import Step
 from .mistakes import Mistakes

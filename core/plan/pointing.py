@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..assembly.signals import note_signals
 from ..data import Data, Observation
 from ..mapmaker import made_by
 from ..numerics.projection import rotation_matrices
@@ -19,7 +20,6 @@ from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline
 from ..run.bands import data_of_bands, distribute, of_one_band, points
-from ..run.signals import note_signals
 from ..scene import Scene
 from ..signal import is_stream
 from ..types import Floats

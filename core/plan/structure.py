@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from ..assembly.signals import Signals, acting_steps, remainder
 from ..configuration.diagnostics import nearest
 from ..configuration.loaded import PipelineFile
 from ..errors import ZondaError
@@ -20,7 +21,6 @@ from ..mapmaker import MapMaker, filters, forms, made_by, makes_products
 from ..operator import Operator
 from ..output import Output, changes_observations, is_output
 from ..pipeline import Pipeline
-from ..run.signals import Signals, acting_steps, remainder
 from ..signal import MAIN, TRANSMISSION, Component, is_stream, stream_of
 from .context import Work
 
@@ -51,7 +51,7 @@ class Structure:
     instead
         The signal that takes the place of the complete one, its name no longer needed; empty: none.
     derived
-        Signals that are not formed, and how they follow from others (`core.run.signals`).
+        Signals that are not formed, and how they follow from others (`core.assembly.signals`).
     """
 
     operators: tuple[str, ...]

@@ -28,11 +28,11 @@ from ..signal import Formed, is_stream
 from ..stream import Stream
 from ..tally import Tally
 from ..types import AnyFloats
-from .blocks import pieces, trimmed, within
+from .means import exec_whole, knows_means, means_of, names_of
 from .schedule import Schedule
+from .segments import pieces, trimmed, within
 from .settings import Timer
 from .streams import Ledger, Stage
-from .whole import exec_whole, knows_means, means_of, names_of
 
 Measured = dict[tuple[str, str], Any]
 """By label and signal: what `Operator.measure` found."""
@@ -133,7 +133,7 @@ class BlockMaker:
         due
             Takes the map makers at the segment's end that act on all bands at once; they do not
             act here. None: all steps act. The block is then one piece, or the segment has a step
-            that needs more (`blocks.Segment.split`).
+            that needs more (`segments.Segment.split`).
         """
         segment, again = stage.segment, again or stage.swept
         if signals is None:

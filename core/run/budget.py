@@ -14,8 +14,8 @@ from ..machine import available_memory, resident_memory
 from ..mapmaker import joins, makes_products
 from ..observation import Observation
 from ..plan.planning import planning_of
-from .ahead import Ahead
 from .bands import Band, looks_alike
+from .prefetch import Ahead
 from .schedule import Chain, schedule, spares
 from .settings import Settings
 

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 from ..hooks import manager
 from ..mapmaker import joins
-from .ahead import Ahead
 from .bands import Band
 from .budget import Budget, divide
 from .execution import Execution
+from .prefetch import Ahead
 from .scan import run
 from .settings import Settings, Timer
 

@@ -39,14 +39,14 @@ from ..signal import MAIN, Formed, is_signal
 from ..stream import Stream, forget_pages, in_order
 from ..tally import Tally
 from ..types import AnyFloats
-from .ahead import Ahead
 from .block_maker import BlockMaker, Due, Measured
-from .blocks import least_block
 from .budget import products_of
+from .means import WholeStream, knows_means, means_of
+from .prefetch import Ahead
 from .schedule import Chain, Planned, Schedule, ordered_in, schedule
+from .segments import least_block
 from .settings import Settings, Timer
 from .streams import Ledger, Source, Stage, Store, StreamMadeAgain
-from .whole import WholeStream, knows_means, means_of
 
 
 class Execution:
@@ -93,7 +93,7 @@ class Execution:
         bands
             Number of those that hold streams and blocks at the same time.
         ordered, halos
-            See `blocks.cut`.
+            See `segments.cut`.
         """
         self.settings = self._within_process(bands)
         self._store = Store(
@@ -132,7 +132,7 @@ class Execution:
 
     def prepare(self) -> None:
         """Configure and prepare all steps; perhaps while another observation is executed
-        (`ahead`).
+        (`prefetch`).
         """
         for operator in self.chain.steps:
             operator.configure(self.observation)

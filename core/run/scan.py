@@ -27,10 +27,10 @@ from ..signal import MAIN
 from ..stream import Stream, forget_pages
 from ..tally import Tally
 from ..types import AnyFloats
-from .ahead import Ahead
 from .block_maker import Due
-from .blocks import pieces
 from .execution import Execution, Pass
+from .prefetch import Ahead
+from .segments import pieces
 from .streams import Ledger, Store
 
 ELSEWHERE = "samples flagged as those of another band are: nothing is measured there"

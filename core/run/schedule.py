@@ -20,10 +20,10 @@ from ..observation import Observation
 from ..operator import Operator
 from ..plan.planning import planning_of
 from ..signal import MAIN, Formed
-from .blocks import PIECE, Segment, block_share, blocks, cut, least_block, whole_span
+from .means import knows_means, may_have_means, names_of
+from .segments import PIECE, Segment, block_share, blocks, cut, least_block, whole_span
 from .settings import Held, Settings
 from .streams import Source, Stage, free_disk
-from .whole import knows_means, may_have_means, names_of
 
 SCRATCH_STREAMS = 2
 """Block-sized arrays assumed for operators' own scratch when the budget is divided."""
@@ -216,7 +216,7 @@ class Schedule:
         """Walk through the segments.
 
         ``ordered`` and ``halos``: of the other bands that are executed together with this one, see
-        `blocks.cut`.
+        `segments.cut`.
         """
         steps = self.chain.steps
         every = {*ordered, *ordered_in(steps, self.observation)}

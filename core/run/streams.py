@@ -29,7 +29,7 @@ from ..numerics.chunks import empty
 from ..numerics.smooth import SmoothField
 from ..operator import Operator
 from ..types import AnyFloats
-from .blocks import Segment
+from .segments import Segment
 
 DISK_SHARE = 0.9
 """Of the free disk that streams may take."""

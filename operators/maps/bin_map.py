@@ -30,10 +30,10 @@ from .few_angles import warn_before
 from .finished import finish
 from .grid import Grid, TangentGrid
 from .halves import halves_of
-from .looking import Cells, Looking
 from .map_layout import check_size, grid_of, layout_of, outside
 from .map_sums import MapSums
 from .parameters import MapParameters
+from .pixels import Cells, Looking
 from .stokes_map import check_polarized, stokes_binnings
 from .stokes_product import StokesSums
 from .stokes_sums import Part, StokesBinning, add_blocks

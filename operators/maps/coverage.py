@@ -36,7 +36,7 @@ from zonda.core.maps.planes import Plane
 from zonda.core.types import Floats
 
 from .image_grid import rays
-from .looking import Cells, Looking, tiles
+from .pixels import Cells, Looking, tiles
 from .sums import WEIGHT, Sums
 
 SLOWEST = 1e-10

@@ -35,7 +35,7 @@ class BinMapPlanning(Planning[BinMap]):
         )
 
     def shares_blocks(self, observation: Observation) -> bool:
-        """The pixels, which `looking.Looking` finds once; those of an image of I are found where
+        """The pixels, which `pixels.Looking` finds once; those of an image of I are found where
         they are used.
         """
         step = self.operator

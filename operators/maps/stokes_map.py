@@ -20,8 +20,8 @@ from zonda.core.types import Floats
 
 from .grid import Grid, HealpixGrid
 from .halves import DIFFERENCES, halves_of
-from .looking import Looking, fingerprint
 from .parameters import MapParameters
+from .pixels import Looking, fingerprint
 from .stokes_kernel import HIT
 from .stokes_product import StokesSums
 from .stokes_sums import PLACES, StokesBinning

@@ -33,7 +33,7 @@ from zonda.core.block import Block
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 
-from .looking import Cells, Looking, tiles
+from .pixels import Cells, Looking, tiles
 from .stokes_kernel import DATA, FIRST, HIT, add_stokes
 from .sums import FLAGGED, Sums
 

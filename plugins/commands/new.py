@@ -153,11 +153,11 @@ def pipeline_text(path: Path, instrument: str, site: str | None, target: str | N
     """
     import numpy as np
 
+    from zonda.core.assembly.checks import first_look
     from zonda.core.configuration.pipeline_file import parse
     from zonda.core.configuration.target import Target
     from zonda.core.errors import PointingError
     from zonda.core.registry import instruments, sites
-    from zonda.core.run.first_look import first_look
 
     if target is not None:
         checked("--target", lambda: Target.parse(target))

@@ -32,7 +32,7 @@ from zonda.core.numerics.transforms import convolved, gaussian_taps
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.maps.grid import TangentGrid
-from zonda.operators.maps.looking import Cells, Looking
+from zonda.operators.maps.pixels import Cells, Looking
 from zonda.operators.maps.stokes_sums import MATRIX, PLACES, Part, StokesBinning, add_blocks
 from zonda.operators.maps.sums import WEIGHT
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.fft import dct, idct
 
+from zonda.core.assembly.signals import note_signals
 from zonda.core.errors import PipelineError
 from zonda.core.focalplane import Focalplane
 from zonda.core.maps.beams import expected_fwhm
@@ -25,7 +26,6 @@ from zonda.core.observation import Observation
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan.pointing import observed
 from zonda.core.polarization import PolarizationAngles
-from zonda.core.run.signals import note_signals
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.filters.brick_wall import plan_highpass

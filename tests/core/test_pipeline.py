@@ -7,6 +7,7 @@ import pytest
 from pydantic import PrivateAttr
 
 import zonda
+from zonda.core.assembly.order import check_order, makers
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
 from zonda.core.mapmaker import MapMaker
@@ -16,7 +17,6 @@ from zonda.core.operator import Operator
 from zonda.core.output import Output
 from zonda.core.pipeline import Pipeline
 from zonda.core.registry import operators
-from zonda.core.run.order import check_order, makers
 from zonda.core.signal import Signal, product_name
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 import zonda
+from zonda.core.assembly.checks import looks
 from zonda.core.plausible import doubt, doubts
 from zonda.core.registry import instruments
-from zonda.core.run.first_look import looks
 
 
 @pytest.mark.parametrize("name", list(instruments))

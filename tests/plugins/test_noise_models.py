@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from zonda.core.assembly.checks import first_look
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.configuration.time import Instant
 from zonda.core.emission import LoadSpectra
@@ -13,7 +14,6 @@ from zonda.core.instrument import Band
 from zonda.core.numerics.radiation import BOLTZMANN, PLANCK, T_CMB, rayleigh_jeans
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.registry import sites
-from zonda.core.run.first_look import first_look
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere
 from zonda.operators.atmosphere.weather.climatology import profile
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum

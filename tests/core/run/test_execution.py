@@ -15,10 +15,10 @@ from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
 from zonda.core.registry import planning
-from zonda.core.run.blocks import PIECE, cut
 from zonda.core.run.execution import Execution
 from zonda.core.run.scan import run as run_scan
 from zonda.core.run.schedule import Chain, Schedule
+from zonda.core.run.segments import PIECE, cut
 from zonda.core.run.settings import Settings, Timer
 from zonda.core.run.streams import Store
 

@@ -19,7 +19,7 @@ from zonda.core.errors import ZondaError
 from zonda.core.focalplane import Focalplane
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.plan.planning import planning_of
-from zonda.core.run.blocks import cut
+from zonda.core.run.segments import cut
 from zonda.core.scene import Scene
 from zonda.core.site import Site
 from zonda.operators.atmosphere import fluctuations, resolution

@@ -9,9 +9,9 @@ from astropy.table import Table
 
 import zonda
 import zonda.testing
+from zonda.core.assembly.checks import first_look
 from zonda.core.drawable import Drawable
 from zonda.core.errors import PipelineError
-from zonda.core.run.first_look import first_look
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.model import ExpectedLoad
 from zonda.operators.atmosphere.screens import AtmosphereScreens, pwv_at, screens

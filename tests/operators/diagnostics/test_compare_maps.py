@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 
 import zonda
 import zonda.testing
+from zonda.core.assembly.checks import first_look
 from zonda.core.errors import PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCSEC
-from zonda.core.run.first_look import first_look
 from zonda.operators.diagnostics.compare_maps import CompareMaps
 from zonda.operators.diagnostics.comparison.files import plane_of, read_planes
 from zonda.operators.diagnostics.comparison.radial import radial_spectra

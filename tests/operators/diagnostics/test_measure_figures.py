@@ -7,10 +7,10 @@ from astropy.table import Table
 import zonda
 from tests.scenes import camera, write_sky
 from zonda.core.accuracy.metrics import OfFunction, get
+from zonda.core.assembly.checks import first_look
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.plan.structure import prune
 from zonda.core.registry import metrics
-from zonda.core.run.first_look import first_look
 from zonda.plugins.checks import scenes
 
 STEPS = """\

@@ -381,4 +381,4 @@ def test_what_a_step_leaves_is_looked_at(what, words, beside):
     operator._what = what
     with pytest.raises(PluginError, match=words) as caught:
         execute([Gives(beside=beside), operator, Sees()], observation(3, 100))
-    assert "Leaves.1 (tests.core.run.test_whole.Leaves)" in str(caught.value)
+    assert "Leaves.1 (tests.core.run.test_means.Leaves)" in str(caught.value)

@@ -16,7 +16,7 @@ import zonda
 from zonda.operators.maps import stokes_sums
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.grid import HealpixGrid
-from zonda.operators.maps.looking import Looking
+from zonda.operators.maps.pixels import Looking
 from zonda.plugins.checks.scenes import scan
 
 FOOTPRINT = np.arange(int(12 * 1024**2 * 0.32), int(12 * 1024**2 * 0.34))

@@ -870,7 +870,7 @@ def test_an_unfiltered_signal_whose_components_need_neighbours_is_held(monkeypat
     operators = [Smear(), *steps(*FILTERS["modes"])]
     _, ample = observed(operators, runs, memory=1 << 30)
     monkeypatch.setattr("zonda.core.run.schedule.AMPLE", np.inf)
-    monkeypatch.setattr("zonda.core.run.blocks.PIECE", 2048)
+    monkeypatch.setattr("zonda.core.run.segments.PIECE", 2048)
     _, tight = observed(operators, runs)
     assert same(tight.products["raw/map"], ample.products["raw/map"], "signal", "hits")
 
