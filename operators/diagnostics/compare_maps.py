@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class CompareMaps(Output):
-    """How a map differs from a reference: difference, fidelity, signal-to-noise ratio, radial
+    """Comparison of a map with a reference: difference, fidelity, signal-to-noise ratio, radial
     spectra and profiles.
 
     Both are brought to one beam (the wider one) and one grid (that of the map with the smaller
@@ -99,7 +99,7 @@ class CompareMaps(Output):
             check_map(data, name, self.label)
         if self.file is None:
             return []
-        read = _read(self)
+        read = self._read()
         if not np.isfinite(read.planes["I"].values).any():
             cure = "give a map that is not NaN everywhere"
             raise InputError("no pixel has a value", place=f"{self.label}, {self.file}", cure=cure)
@@ -114,7 +114,7 @@ class CompareMaps(Output):
         compared.
         """
         references, maps = (
-            _references(self, data),
+            self._references(data),
             products_of(_product(data, self.map, self.label), self.map),
         )
         both = [plane for plane in maps if plane in references]
@@ -125,80 +125,80 @@ class CompareMaps(Output):
             plane_of(maps["I"][1], self.map), {plane: references[plane] for plane in both}
         )
         for plane in both:
-            _compare(self, data, plane, references[plane], maps[plane])
+            self._compare(data, plane, references[plane], maps[plane])
 
+    def _compare(self, data: Data, which: str, reference: Plane, product: tuple[str, Any]) -> None:
+        """Compare one of I, Q and U with that of the reference. ``product``: the map's name, and
+        the map.
+        """
+        name, found = product
+        runs = data.provenance.get("runs", {})
+        plane = covered(
+            self._with_noise(data, which, plane_of(found, name)), found, self.least_coverage
+        )
+        plane = replace(plane, quiet=is_quiet(runs, self.map))
+        if self.file is None:
+            reference = replace(reference, quiet=is_quiet(runs, self.reference))
+        fwhm = self.beam or resolution(plane, reference, found)
+        made = compare(
+            reference, plane, Settings(fwhm or None, self.threshold, self.bins), self.label
+        )
+        of = "" if which == "I" else f"{which}: "
+        for note in made.notes:
+            what, text = note.split(": ", 1) if ": " in note else ("grid", note)
+            data.tally.state(self.label, of + what, text)
+        _tell(self.label, of, data, made)
+        key = plane_key(key_of(self, "comparison"), which)
+        data.products[key] = made
+        if data.output is not None:
+            write_comparison(made, product_path(data.output, data.named(key)), about(data))
 
-def _compare(
-    step: CompareMaps, data: Data, which: str, reference: Plane, product: tuple[str, Any]
-) -> None:
-    """Compare one of I, Q and U with that of the reference. ``product``: the map's name, and the
-    map.
-    """
-    name, found = product
-    runs = data.provenance.get("runs", {})
-    plane = covered(
-        _with_noise(step, data, which, plane_of(found, name)), found, step.least_coverage
-    )
-    plane = replace(plane, quiet=is_quiet(runs, step.map))
-    if step.file is None:
-        reference = replace(reference, quiet=is_quiet(runs, step.reference))
-    fwhm = step.beam or resolution(plane, reference, found)
-    made = compare(reference, plane, Settings(fwhm or None, step.threshold, step.bins), step.label)
-    of = "" if which == "I" else f"{which}: "
-    for note in made.notes:
-        what, text = note.split(": ", 1) if ": " in note else ("grid", note)
-        data.tally.state(step.label, of + what, text)
-    _tell(step.label, of, data, made)
-    key = plane_key(key_of(step, "comparison"), which)
-    data.products[key] = made
-    if data.output is not None:
-        write_comparison(made, product_path(data.output, data.named(key)), about(data))
+    def _with_noise(self, data: Data, which: str, plane: Plane) -> Plane:
+        """A plane with the noise of the complete map, also of a signal without noise, and with the
+        map of the noise alone.
+        """
+        complete = self.map.rpartition("/")[2]
+        whole = data.products.get(complete)
+        if self.noise == "map" or not isinstance(whole, MapProduct) or whole.contents != "all":
+            return plane
+        name = plane_key(complete, which) if whole.polarization is not None else complete
+        maps = maps_of(data.products)
+        alone = (
+            noise_alone(maps, name)
+            if self.noise == "measured"
+            else noise_alone(maps, name, ["half_difference"])
+        )
+        noisy = plane_of(maps[name], name, alone)
+        if noisy.values.shape != plane.values.shape:
+            return plane
+        return replace(
+            plane,
+            noise=noisy.noise,
+            blurred=noisy.blurred,
+            alone=noisy.alone,
+            alone_of=noisy.alone_of,
+        )
 
+    def _references(self, data: Data) -> dict[str, Plane]:
+        """The planes of the reference, K_RJ."""
+        if self.file is None:
+            return planes_of(_product(data, self.reference, self.label), self.reference)
+        read, band = self._read(), data.scene.instrument.band
+        for what, _, note in (note.partition(": ") for note in read.notes):
+            data.tally.state(self.label, what, note)
+        return {which: _in_kelvin(plane, band) for which, plane in read.planes.items()}
 
-def _with_noise(step: CompareMaps, data: Data, which: str, plane: Plane) -> Plane:
-    """With the noise of the complete map, also of a signal without noise, and what is known of the
-    noise alone.
-    """
-    complete = step.map.rpartition("/")[2]
-    whole = data.products.get(complete)
-    if step.noise == "map" or not isinstance(whole, MapProduct) or whole.contents != "all":
-        return plane
-    name = plane_key(complete, which) if whole.polarization is not None else complete
-    maps = maps_of(data.products)
-    alone = (
-        noise_alone(maps, name)
-        if step.noise == "measured"
-        else noise_alone(maps, name, ["half_difference"])
-    )
-    noisy = plane_of(maps[name], name, alone)
-    if noisy.values.shape != plane.values.shape:
-        return plane
-    return replace(
-        plane, noise=noisy.noise, blurred=noisy.blurred, alone=noisy.alone, alone_of=noisy.alone_of
-    )
-
-
-def _references(step: CompareMaps, data: Data) -> dict[str, Plane]:
-    """The planes of the reference, K_RJ."""
-    if step.file is None:
-        return planes_of(_product(data, step.reference, step.label), step.reference)
-    read, band = _read(step), data.scene.instrument.band
-    for what, _, note in (note.partition(": ") for note in read.notes):
-        data.tally.state(step.label, what, note)
-    return {which: _in_kelvin(plane, band) for which, plane in read.planes.items()}
-
-
-def _read(step: CompareMaps) -> ReadMap:
-    """The file. Raises InputError as `read_planes`."""
-    assert step.file is not None
-    plane = (
-        (step.plane,)
-        if isinstance(step.plane, int)
-        else None
-        if step.plane is None
-        else tuple(step.plane)
-    )
-    return read_planes(step.file, wanted=Wanted(step.hdu, plane, step.coordsys))
+    def _read(self) -> ReadMap:
+        """The file. Raises InputError as `read_planes`."""
+        assert self.file is not None
+        plane = (
+            (self.plane,)
+            if isinstance(self.plane, int)
+            else None
+            if self.plane is None
+            else tuple(self.plane)
+        )
+        return read_planes(self.file, wanted=Wanted(self.hdu, plane, self.coordsys))
 
 
 def _in_kelvin(plane: Plane, band: Band) -> Plane:

@@ -13,14 +13,13 @@ from pydantic import Field, model_validator
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
-from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.storage.ecsv import write_ecsv
 from zonda.core.storage.files import product_path
 from zonda.core.stream_names import AnyStream, check_signals, streams_asked, streams_needed
 
-from .power_spectrum import Welch, calibration, on_sky
-from .series import about, check_streams, key_of
+from .power_spectrum import Welch, calibration, on_sky, quick_length
+from .series import about, check_streams, count_flagged, key_of, no_stream, spread_evenly
 from .stream_statistics import Pair, StreamComparison, pair
 
 LEAST_SEGMENTS = 8
@@ -42,8 +41,8 @@ class Pairs:
 
 
 class CompareStreams(Operator):
-    """How a stream differs from another at this step: rms, correlation, gain, ratio of spectra and
-    coherence.
+    """Comparison of a stream with another at this step: rms, correlation, gain, ratio of spectra
+    and coherence.
 
     Both are referred to the calibrated sky as in `PowerSpectrum`, and freed of a straight line in
     each segment: what is slower than a segment is not compared. `signal` holds the mean emission of
@@ -94,115 +93,80 @@ class CompareStreams(Operator):
 
     @property
     def streams(self) -> tuple[str, str]:
-        """Both."""
+        """The stream and its reference."""
         return self.stream, self.reference
 
     def prepare(self, observation: Observation) -> Pairs:
         check_signals(self.streams, observation, self.label)
-        return begin(self, observation)
+        length = min(
+            observation.n_samples // LEAST_SEGMENTS, round(self.segment * observation.sample_rate)
+        )
+        count_flagged(observation, self.label, "the comparison includes")
+        chosen = spread_evenly(observation, self.detectors)
+        return Pairs(chosen, quick_length(length) if length >= 4 else 0)
 
     def exec(self, block: Block, state: Pairs) -> None:
         here = (state.detectors >= block.detectors.start) & (state.detectors < block.detectors.stop)
         for detector in state.detectors[here] if state.length else ():
-            add(self, block, state, int(detector))
+            self._add(block, state, int(detector))
 
     def collect(self, data: Data, observation: Observation, state: Pairs) -> None:
-        if (found := finished(self, observation, state)) is not None:
+        if (found := self._finished(observation, state)) is not None:
             data.add(self.label, found)
 
     def finalize(self, data: Data) -> None:
         found: StreamComparison | None = data.take(self.label)
-        if found is not None:
-            tell(self, data, found)
-
-
-def begin(step: CompareStreams, observation: Observation) -> Pairs:
-    """The detectors and the length of the segments."""
-    from scipy.fft import next_fast_len
-
-    usable = np.flatnonzero(observation.good_detectors)
-    count = min(usable.size, step.detectors)
-    chosen = np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
-    length = min(
-        observation.n_samples // LEAST_SEGMENTS, round(step.segment * observation.sample_rate)
-    )
-    if flagged := int(np.count_nonzero(~observation.good_samples)):
-        observation.tally.count(
-            step.label,
-            "flagged samples that the comparison includes",
-            flagged,
-            observation.n_samples,
-        )
-    if length < 4:
-        return Pairs(usable[chosen], 0)
-    return Pairs(
-        usable[chosen], next(n for n in range(length, 0, -1) if next_fast_len(n, real=True) == n)
-    )
-
-
-def add(step: CompareStreams, block: Block, state: Pairs, detector: int) -> None:
-    """The spectra of one detector, whose whole scan is in the block."""
-    for name in step.streams:
-        if name not in block.detdata:
-            have = ", ".join(sorted(block.detdata))
-            raise PipelineError(
-                f"there is no stream {name!r} at this step",
-                place=step.label,
-                cure=f"choose from: {have}",
+        if found is None:
+            return
+        other = "scans left out: other detectors or length"
+        data.tally.count(self.label, other, found.of_another_length)
+        for figure, text in found.lines():
+            data.tally.state(self.label, figure, text)
+        data.products[found.product] = found
+        if data.output is not None:
+            meta = about(
+                data,
+                STREAM=found.stream,
+                REFERENCE=found.reference,
+                SCANS=found.observations,
+                SEGMENTS=found.segments,
             )
-    factor = calibration(block, detector)
-    with np.errstate(invalid="ignore", over="ignore"):
-        x, y = (on_sky(block, detector, name, factor) for name in step.streams)
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
-        block.observation.tally.count(
-            step.label, "detectors left out for samples that are not finite", 1
-        )
-        return
-    found = pair(x, y, block.observation.sample_rate, state.length)
-    with state.lock:
-        state.found[detector] = found
+            tables = {"": found.columns(), "_detectors": found.detector_columns()}
+            for behind, columns in tables.items():
+                name = data.named(f"{found.product}{behind}")
+                write_ecsv(product_path(data.output, name, ".ecsv"), columns, meta)
 
+    def _add(self, block: Block, state: Pairs, detector: int) -> None:
+        """The spectra of one detector, whose whole scan is in the block."""
+        for name in self.streams:
+            if name not in block.detdata:
+                raise no_stream(name, block.detdata, self.label)
+        factor = calibration(block, detector)
+        with np.errstate(invalid="ignore", over="ignore"):
+            x, y = (on_sky(block, detector, name, factor) for name in self.streams)
+        if not (np.isfinite(x).all() and np.isfinite(y).all()):
+            block.observation.tally.count(
+                self.label, "detectors left out for samples that are not finite", 1
+            )
+            return
+        found = pair(x, y, block.observation.sample_rate, state.length)
+        with state.lock:
+            state.found[detector] = found
 
-def finished(
-    step: CompareStreams, observation: Observation, state: Pairs
-) -> StreamComparison | None:
-    """The comparison of one scan, in the order of the detectors; None where there is none, which is
-    counted.
-    """
-    if not state.found:
-        why = "without a detector to compare" if state.length else "too short to compare streams"
-        observation.tally.count(step.label, f"scans {why}", 1)
-        return None
-    every = sorted(state.found)
-    welch = Welch(observation.n_samples, observation.sample_rate, state.length)
-    names = [observation.focalplane.names[d] for d in every]
-    what = (*step.streams, step.label, key_of(step, "stream_comparison"))
-    return StreamComparison.of_pairs(
-        [state.found[d] for d in every], welch.frequency, welch.independent, names, what
-    )
-
-
-def tell(step: CompareStreams, data: Data, found: StreamComparison) -> None:
-    """State the figures in the log, keep the product and write its tables."""
-    data.tally.count(
-        step.label, "scans left out: other detectors or length", found.of_another_length
-    )
-    for figure, text in found.lines():
-        data.tally.state(step.label, figure, text)
-    data.products[found.product] = found
-    if data.output is not None:
-        made = about(
-            data,
-            STREAM=found.stream,
-            REFERENCE=found.reference,
-            SCANS=found.observations,
-            SEGMENTS=found.segments,
-        )
-        write_ecsv(
-            product_path(data.output, data.named(found.product), ".ecsv"), found.columns(), made
-        )
-        write_ecsv(
-            product_path(data.output, data.named(f"{found.product}_detectors"), ".ecsv"),
-            found.detector_columns(),
-            made,
+    def _finished(self, observation: Observation, state: Pairs) -> StreamComparison | None:
+        """Comparison of one scan, in the order of the detectors; None where there is none, which is
+        counted.
+        """
+        if not state.found:
+            why = (
+                "without a detector to compare" if state.length else "too short to compare streams"
+            )
+            observation.tally.count(self.label, f"scans {why}", 1)
+            return None
+        every = sorted(state.found)
+        welch = Welch(observation.n_samples, observation.sample_rate, state.length)
+        names = [observation.focalplane.names[d] for d in every]
+        what = (*self.streams, self.label, key_of(self, "stream_comparison"))
+        return StreamComparison.of_pairs(
+            [state.found[d] for d in every], welch.frequency, welch.independent, names, what
         )

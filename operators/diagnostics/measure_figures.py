@@ -47,26 +47,26 @@ class MeasureFigures(Output):
     @property
     def requires(self) -> frozenset[str]:
         """Products that the metrics read."""
-        return frozenset[str]().union(*(metric.reads for metric in _metrics(self)))
+        return frozenset[str]().union(*(metric.reads for metric in self._measured))
 
     def signals(self) -> tuple[Signal, ...]:
-        """Those that the metrics need."""
-        return tuple(signal for metric in _metrics(self) for signal in metric.needs())
+        """Signals that the metrics need."""
+        return tuple(signal for metric in self._measured for signal in metric.needs())
 
     def named_signals(self) -> tuple[str, ...]:
-        """Those that parameters of the metrics name."""
-        return tuple(name for metric in _metrics(self) for name in metric.named_signals())
+        """Signals that parameters of the metrics name."""
+        return tuple(name for metric in self._measured for name in metric.named_signals())
 
     def reads(self, signal: str) -> bool:
-        """Whether a metric reads products of that signal."""
-        plain = len(_metrics(self)) < len(self.metrics) and not signal.startswith("_")
+        """True if a metric reads products of that signal."""
+        plain = len(self._measured) < len(self.metrics) and not signal.startswith("_")
         return plain or signal in self.shown or signal in self.named_signals()
 
     def check(self, data: Data) -> list[str]:
         """Raises `ZondaError` where a metric cannot be measured on the kind of map that will be
         made.
         """
-        for metric in _metrics(self):
+        for metric in self._measured:
             metric.look(kinds_of_maps(data))
         return []
 
@@ -86,9 +86,14 @@ class MeasureFigures(Output):
         if data.output is not None:
             figures.write(product_path(data.output, data.named(key), ".ecsv"), about(data))
 
+    @property
+    def _measured(self) -> list[FigureMetric]:
+        chosen = getattr(self, "metrics", ())  # a mistaken step of a pipeline file has none
+        return [choice.metric for choice in chosen if isinstance(choice.metric, FigureMetric)]
+
 
 def _figure(choice: Choice, data: Data, names: list[str]) -> Figure:
-    """As `Choice.figure`; NaN, with the reason, for what cannot be measured on the sum of a
+    """`Choice.figure`; NaN, with the reason, for what cannot be measured on the sum of a
     campaign's scans.
     """
     try:
@@ -102,8 +107,3 @@ def _figure(choice: Choice, data: Data, names: list[str]) -> Figure:
             getattr(choice.metric, "unit", ""),
             description=f"not known: {err.message}",
         )
-
-
-def _metrics(step: MeasureFigures) -> list[FigureMetric]:
-    chosen = getattr(step, "metrics", ())  # a mistaken step of a pipeline file has none
-    return [choice.metric for choice in chosen if isinstance(choice.metric, FigureMetric)]

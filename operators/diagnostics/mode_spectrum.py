@@ -17,7 +17,7 @@ from zonda.core.storage.ecsv import write_ecsv
 from zonda.core.storage.files import product_path
 
 from .components import Lagged, components
-from .series import Modes, about, key_of
+from .series import Modes, about, key_of, spread_evenly
 
 MOST_ROWS = 4096
 """Detectors times delays: the covariance of more takes minutes and gigabytes."""
@@ -27,7 +27,7 @@ KEPT = 64
 
 @dataclass
 class Found:
-    """What `ModeSpectrum.measure` puts down for `ModeSpectrum.collect`."""
+    """Modes that `ModeSpectrum.measure` finds, for `ModeSpectrum.collect`."""
 
     modes: Modes | None = None
 
@@ -81,7 +81,7 @@ class ModeSpectrum(Operator):
 
     def measure(self, stream: Stream, model: Any = None) -> Any:
         """Read the stream twice: for the covariance, and for the streams of the modes."""
-        stream.state.modes = _find(self, stream)
+        stream.state.modes = self._find(stream)
         return stream.state
 
     def collect(self, data: Data, observation: Observation, state: Found) -> None:
@@ -94,54 +94,45 @@ class ModeSpectrum(Operator):
             return
         data.products[found.product] = found
         if data.output is not None:
-            made = about(data, SCAN=found.observation)
-            write_ecsv(
-                product_path(data.output, data.named(found.product), ".ecsv"),
-                found.columns(),
-                {**made, "SCANS": len(found.values)},
-            )
-            write_ecsv(
-                product_path(data.output, data.named(f"{found.product}_streams"), ".ecsv"),
-                found.stream_columns(),
-                made,
-            )
+            meta = about(data, SCAN=found.observation)
+            for behind, columns, more in (
+                ("", found.columns(), {"SCANS": len(found.values)}),
+                ("_streams", found.stream_columns(), {}),
+            ):
+                name = data.named(f"{found.product}{behind}")
+                write_ecsv(product_path(data.output, name, ".ecsv"), columns, meta | more)
 
-
-def _find(step: ModeSpectrum, stream: Stream) -> Modes | None:
-    """The modes of one scan; None where there are none, which is counted."""
-    observation = stream.observation
-    usable = np.flatnonzero(observation.good_detectors)
-    count = min(usable.size, step.detectors)
-    chosen = usable[
-        np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
-    ]
-    lag = max(1, round(step.delay * observation.sample_rate))
-    lagged = Lagged(stream, chosen, step.delays, lag)
-    if chosen.size < 2 or np.count_nonzero(lagged.good) < 2:
+    def _find(self, stream: Stream) -> Modes | None:
+        """The modes of one scan; None where there are none, which is counted."""
+        observation = stream.observation
+        chosen = spread_evenly(observation, self.detectors)
+        lag = max(1, round(self.delay * observation.sample_rate))
+        lagged = Lagged(stream, chosen, self.delays, lag)
+        if chosen.size < 2 or np.count_nonzero(lagged.good) < 2:
+            observation.tally.count(
+                self.label, "scans without two detectors and two samples: no modes", 1
+            )
+            return None
+        found = components(lagged, self.modes, center=self.center, normalize=self.normalize)
         observation.tally.count(
-            step.label, "scans without two detectors and two samples: no modes", 1
+            self.label, "detectors left out: signal not finite", int(np.count_nonzero(~found.used))
         )
-        return None
-    found = components(lagged, step.modes, center=step.center, normalize=step.normalize)
-    observation.tally.count(
-        step.label, "detectors left out: signal not finite", int(np.count_nonzero(~found.used))
-    )
-    if not found.energy > 0:
-        observation.tally.count(step.label, "scans whose signal is constant: no modes", 1)
-        return None
-    values, n = np.zeros((1, KEPT)), min(KEPT, found.values.size)
-    values[0, :n] = found.values[:n]
-    return Modes(
-        values,
-        np.array([found.energy]),
-        observation.seconds,
-        found.times,
-        found.vectors,
-        [observation.focalplane.names[d] for d in chosen],
-        step.delays,
-        lag / observation.sample_rate if step.delays else 0.0,
-        "" if step.normalize else "K_RJ",
-        observation.name,
-        step.label,
-        key_of(step, "modes"),
-    )
+        if not found.energy > 0:
+            observation.tally.count(self.label, "scans whose signal is constant: no modes", 1)
+            return None
+        values, n = np.zeros((1, KEPT)), min(KEPT, found.values.size)
+        values[0, :n] = found.values[:n]
+        return Modes(
+            values,
+            np.array([found.energy]),
+            observation.seconds,
+            found.times,
+            found.vectors,
+            [observation.focalplane.names[d] for d in chosen],
+            self.delays,
+            lag / observation.sample_rate if self.delays else 0.0,
+            "" if self.normalize else "K_RJ",
+            observation.name,
+            self.label,
+            key_of(self, "modes"),
+        )

@@ -21,7 +21,7 @@ from zonda.core.signal import BUILT_IN, MAIN, TRANSMISSION, Component
 from zonda.core.stream_names import StreamName, streams_asked, streams_needed
 from zonda.core.types import Floats
 
-from .series import Spectrum, check_streams, key_of
+from .series import Spectrum, check_streams, count_flagged, key_of, no_stream, spread_evenly
 
 ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")
 """Of spectra in pictures."""
@@ -102,23 +102,18 @@ class Welch:
         return self._memory.arrays  # type: ignore[no-any-return]
 
 
-def _quick(n: int) -> int:
+def quick_length(n: int) -> int:
     """Largest number up to ``n`` without a prime factor above 5: transforms of other lengths take
     up to ten times as long.
     """
-    best, five = 1, 1
-    while five <= n:
-        three = five
-        while three <= n:
-            best = max(best, three << (n // three).bit_length() - 1)
-            three *= 3
-        five *= 5
-    return best
+    from scipy.fft import next_fast_len
+
+    return next(k for k in range(n, 0, -1) if next_fast_len(k, real=True) == k)
 
 
 @dataclass
 class Periodograms:
-    """What is found of one scan: spectra by detector and stream.
+    """Spectra of one scan by detector and stream.
 
     ``welch``: None where the scan is too short. ``streams``: those asked for, None: the usual ones.
     ``place``: the step's label.
@@ -132,19 +127,14 @@ class Periodograms:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add(self, block: Block, detector: int) -> None:
-        """Those of one detector, whose whole scan is in the block."""
+        """Add the spectra of one detector, whose whole scan is in the block."""
         assert self.welch is not None
         found: dict[str, Floats] = {}
         gain = calibration(block, detector)
         usual = {MAIN, *BUILT_IN, *block.observation.components} - {TRANSMISSION}
         for name in self.streams or [s for s in in_order(block.detdata) if s in usual]:
             if name not in block.detdata:
-                have = ", ".join(sorted(block.detdata))
-                raise PipelineError(
-                    f"there is no stream {name!r} at this step",
-                    place=self.place,
-                    cure=f"choose from: {have}",
-                )
+                raise no_stream(name, block.detdata, self.place)
             with np.errstate(
                 invalid="ignore", over="ignore"
             ):  # of samples that are not finite: their spectrum is not
@@ -223,23 +213,14 @@ class PowerSpectrum(Operator):
         return []
 
     def prepare(self, observation: Observation) -> Periodograms:
-        usable = np.flatnonzero(observation.good_detectors)
-        count = min(usable.size, self.detectors)
-        chosen = np.unique(np.linspace(0, max(0, usable.size - 1), count).round().astype(np.int64))
-        length = _quick(
-            min(observation.n_samples, max(2, round(self.segment * observation.sample_rate)))
-        )
-        if flagged := int(np.count_nonzero(~observation.good_samples)):
-            observation.tally.count(
-                self.label,
-                "flagged samples that the power spectra include",
-                flagged,
-                observation.n_samples,
-            )
-        welch = (
-            Welch(observation.n_samples, observation.sample_rate, length) if length >= 4 else None
-        )
-        return Periodograms(usable[chosen], welch, self.streams, self.label)
+        asked = max(2, round(self.segment * observation.sample_rate))
+        length = quick_length(min(observation.n_samples, asked))
+        count_flagged(observation, self.label, "the power spectra include")
+        welch = None
+        if length >= 4:
+            welch = Welch(observation.n_samples, observation.sample_rate, length)
+        chosen = spread_evenly(observation, self.detectors)
+        return Periodograms(chosen, welch, self.streams, self.label)
 
     def exec(self, block: Block, state: Periodograms) -> None:
         if block.shape[1] != block.observation.n_samples:

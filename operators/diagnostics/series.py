@@ -1,6 +1,4 @@
-"""What steps keep of time streams: power spectra and the streams of a few detectors. numpy alone,
-for the process that draws.
-"""
+"""Products of time streams: power spectra, modes, and the streams of a few detectors."""
 
 from __future__ import annotations
 
@@ -11,15 +9,18 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zonda.core.errors import PipelineError
 from zonda.core.pages import html_table
 from zonda.core.product import Record
+from zonda.core.signal import is_stream
 from zonda.core.storage.ecsv import Column
+from zonda.core.stream_names import UNITS
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
-    from zonda.core.data import Data
+    from zonda.core.data import Data, Observation
     from zonda.core.operator import Operator
 
 
@@ -128,8 +129,6 @@ class Spectrum(Record):
 
 def unit_of_stream(name: str) -> str:
     """K_RJ; ``m`` or empty for streams of other kinds."""
-    from zonda.core.stream_names import UNITS
-
     return UNITS.get(name, "K_RJ")
 
 
@@ -168,9 +167,7 @@ class TimeStream(Record):
 
 
 def about(data: Data, **more: Any) -> dict[str, Any]:
-    """What tables of a run say of it: pipeline, seed, version, and ``more``; without what is
-    empty.
-    """
+    """Provenance of a table: pipeline, seed, version, and ``more``; without what is empty."""
     known = data.provenance
     meta = {
         "PIPELINE": known.get("name"),
@@ -181,9 +178,30 @@ def about(data: Data, **more: Any) -> dict[str, Any]:
     return {key: value for key, value in meta.items() if value not in ("", None)}
 
 
-def key_of(step: Operator, usual: str) -> str:
-    """Name of a step's product: ``usual``, or the step's own where it has one."""
-    return step.name or (usual if step.label == type(step).__name__ else step.label)
+def key_of(operator: Operator, usual: str) -> str:
+    """Name of an operator's product: ``usual``, or the operator's own where it has one."""
+    own = operator.label != type(operator).__name__
+    return operator.name or (operator.label if own else usual)
+
+
+def spread_evenly(observation: Observation, most: int) -> NDArray[np.int64]:
+    """At most ``most`` detectors, chosen evenly among those not flagged."""
+    usable = np.flatnonzero(observation.good_detectors)
+    ends = np.linspace(0, max(0, usable.size - 1), min(usable.size, most))
+    return usable[np.unique(ends.round().astype(np.int64))]
+
+
+def count_flagged(observation: Observation, place: str, what: str) -> None:
+    """Count the flagged samples of a scan that ``what`` includes."""
+    if flagged := int(np.count_nonzero(~observation.good_samples)):
+        told = f"flagged samples that {what}"
+        observation.tally.count(place, told, flagged, observation.n_samples)
+
+
+def no_stream(name: str, have: Iterable[str], place: str) -> PipelineError:
+    """Error of a stream that is not there."""
+    cure = f"choose from: {', '.join(sorted(have))}"
+    return PipelineError(f"there is no stream {name!r} at this step", place=place, cure=cure)
 
 
 def kinds_of_maps(data: Data) -> dict[str, str]:
@@ -214,17 +232,10 @@ def check_map(data: Data, name: str, place: str) -> None:
 
 def check_streams(data: Data, names: Iterable[str], place: str) -> None:
     """In `Operator.check`: PipelineError where no step makes a stream of this name."""
-    from zonda.core.signal import is_stream  # pictures are drawn without it
-
     known = {*data.made, "signal"}
     for name in names if data.made else ():
         if name.partition("/")[0] not in known:
-            have = ", ".join(sorted(n for n in known if is_stream(n)))
-            raise PipelineError(
-                f"there is no stream {name!r} at this step",
-                place=place,
-                cure=f"choose from: {have}",
-            )
+            raise no_stream(name, filter(is_stream, known), place)
 
 
 def plane_key(key: str, plane: str) -> str:
@@ -282,7 +293,7 @@ class Modes(Record):
 
     @property
     def detectors(self) -> int:
-        """How many detectors were used."""
+        """Number of detectors used."""
         return len(self.names)
 
     @property

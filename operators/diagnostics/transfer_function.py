@@ -118,7 +118,7 @@ class TransferFunction(Output):
         """
         after, before = (_map(data, name, self.map, self.label) for name in self.shown)
         window = window_of(before, self.radius, self.taper, self.least_coverage)
-        edges = _edges(self, before, window)
+        edges = self._edges(before, window)
         data.tally.state(self.label, "window", f"{np.count_nonzero(window)} pixels")
         if self.modes == "full":
             what = (
@@ -128,34 +128,52 @@ class TransferFunction(Output):
             )
             data.tally.state(self.label, "singular modes", what)
         for plane in ("I",) if before.polarization is None else IQU:
-            _add(self, data, plane, (before, after), (window, edges))
+            self._add(data, plane, (before, after), (window, edges))
 
+    def _add(
+        self,
+        data: Data,
+        plane: str,
+        maps: tuple[MapProduct, MapProduct],
+        where: tuple[Floats, Floats],
+    ) -> None:
+        """Make the product of one of I, Q and U. ``maps``: before and after the filters; ``where``:
+        window and edges of the rings.
+        """
+        (window, edges), (a, b) = (
+            where,
+            (m if m.polarization is None else m.stokes(plane) for m in maps),
+        )
+        rings = compare(a.signal, b.signal, window, a.pixel, edges)
+        empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
+        data.tally.count(
+            self.label,
+            f"{'' if plane == 'I' else f'{plane}: '}rings without modes or power: NaN",
+            empty,
+        )
+        key, of = (plane_key(name, plane) for name in (key_of(self, "transfer_function"), self.map))
+        found = data.products[key] = Transfer(
+            rings, edges, self.modes, maps[0].fwhm, self.label, of
+        )
+        if data.output is not None:
+            found.write(product_path(data.output, data.named(key), ".ecsv"), data.provenance)
 
-def _add(
-    step: TransferFunction,
-    data: Data,
-    plane: str,
-    maps: tuple[MapProduct, MapProduct],
-    where: tuple[Floats, Floats],
-) -> None:
-    """Make the product of one of I, Q and U. ``maps``: before and after the filters; ``where``:
-    window and edges of the rings.
-    """
-    (window, edges), (a, b) = (
-        where,
-        (m if m.polarization is None else m.stokes(plane) for m in maps),
-    )
-    rings = compare(a.signal, b.signal, window, a.pixel, edges)
-    empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
-    data.tally.count(
-        step.label,
-        f"{'' if plane == 'I' else f'{plane}: '}rings without modes or power: NaN",
-        empty,
-    )
-    key, of = (plane_key(name, plane) for name in (key_of(step, "transfer_function"), step.map))
-    found = data.products[key] = Transfer(rings, edges, step.modes, maps[0].fwhm, step.label, of)
-    if data.output is not None:
-        found.write(product_path(data.output, data.named(key), ".ecsv"), data.provenance)
+    def _edges(self, before: MapProduct, window: Floats) -> Floats:
+        """(bins + 1,) wavenumbers between the rings, rad^-1."""
+        if not window.any():
+            raise PipelineError(
+                "no pixel is left in the window", place=self.label, cure="choose a larger radius"
+            )
+        smallest = self.smallest or max(before.fwhm, 2 * before.pixel)
+        largest = self.largest or 2 * before.pixel * math.sqrt(np.count_nonzero(window) / math.pi)
+        if largest <= smallest:
+            scales = (
+                f"scales from {largest / ARCSEC:.3g} to {smallest / ARCSEC:.3g} arcsec are none"
+            )
+            raise PipelineError(
+                scales, place=self.label, cure="set largest and smallest, or map a larger field"
+            )
+        return np.geomspace(1 / largest, 1 / smallest, self.bins + 1)
 
 
 def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:
@@ -170,22 +188,6 @@ def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:
         cure = "set map to the product of the step that makes it, or that step's product to map"
         raise PipelineError(f"there is no map {name!r}", place=place, cure=cure)
     return product
-
-
-def _edges(step: TransferFunction, before: MapProduct, window: Floats) -> Floats:
-    """(bins + 1,) wavenumbers between the rings, rad^-1."""
-    if not window.any():
-        raise PipelineError(
-            "no pixel is left in the window", place=step.label, cure="choose a larger radius"
-        )
-    smallest = step.smallest or max(before.fwhm, 2 * before.pixel)
-    largest = step.largest or 2 * before.pixel * math.sqrt(np.count_nonzero(window) / math.pi)
-    if largest <= smallest:
-        scales = f"scales from {largest / ARCSEC:.3g} to {smallest / ARCSEC:.3g} arcsec are none"
-        raise PipelineError(
-            scales, place=step.label, cure="set largest and smallest, or map a larger field"
-        )
-    return np.geomspace(1 / largest, 1 / smallest, step.bins + 1)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from tests.scenes import in_blocks
 from zonda.core.data import Block
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.smooth import SmoothField
-from zonda.operators.diagnostics.power_spectrum import PowerSpectrum, Spectrum, Welch, _quick
+from zonda.operators.diagnostics.power_spectrum import PowerSpectrum, Spectrum, Welch, quick_length
 
 
 def welch(values, sample_rate, length):
@@ -197,7 +197,7 @@ def test_segments_have_lengths_that_transform_quickly(make_observation):
     lengths already.
     """
     for n in (5, 7, 101, 1999, 12800, 99991):
-        length = found = _quick(n)
+        length = found = quick_length(n)
         for factor in (2, 3, 5):
             while found % factor == 0:
                 found //= factor
