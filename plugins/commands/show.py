@@ -33,7 +33,8 @@ def show() -> None:
 def instrument(name: str, output: Path | None) -> None:
     """Print what an instrument is, and draw its focal plane (also as PDF or SVG).
 
-    NAME is a registered name (`zonda plugins`), or a pipeline file whose instrument is meant.
+    NAME is a registered name (`zonda plugins`), or a YAML file that describes an instrument or a
+    pipeline.
     """
     from zonda.core.storage.files import atomic_path, product_path
 
@@ -52,10 +53,11 @@ def instrument(name: str, output: Path | None) -> None:
 
 
 def _instrument(name: str) -> Instrument:
+    from zonda.core.component_files import is_file, names_in
     from zonda.core.configuration.pipeline_file import load
     from zonda.core.registry import instruments
 
-    if name.endswith((".yaml", ".yml")):
+    if is_file(name) and "operators" in names_in(Path(name)):
         return load(name).scene().instrument
     found: Instrument = instruments.create(name)
     return found

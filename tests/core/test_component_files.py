@@ -172,6 +172,15 @@ def test_a_file_of_ones_own(pipeline: Path, tmp_path: Path, monkeypatch: Any) ->
     assert (varied.detectors, np.float64(varied.net)) == (3, instrument.net)
 
 
+def test_it_is_shown(pipeline: Path, monkeypatch: Any, capsys: Any) -> None:
+    monkeypatch.chdir(pipeline.parent)
+    for name in ("camera.yaml", "pipeline.yaml"):
+        assert main(["show", "instrument", name, "--output", "camera.png"]) == 0
+        assert "7 detectors" in capsys.readouterr().out
+    assert (pipeline.parent / "camera.png").stat().st_size > 1000
+    assert main(["show", "instrument", "none.yaml"]) == 2
+
+
 def test_mistakes_in_it_are_told_with_carets(pipeline: Path, capsys: Any) -> None:
     camera = pipeline.parent / "camera.yaml"
     camera.write_text(camera.read_text().replace("50 Hz", "50 GHz s"))
