@@ -19,6 +19,14 @@ API_VERSION = 2
 refused.
 """
 
+REMOVED = {
+    "zonda.ground_weather": "weather comes from zonda.weather_sources",
+    "zonda.kernels": "kernels are compiled at their first use, or by `zonda compile`",
+    "zonda.products": "the class of a product is found in the module of the operator that makes it",
+    "zonda.sections": "keys of pipeline files are zonda's own",
+}
+"""Entry-point groups of earlier versions, and what replaces them."""
+
 RAISED = (Exception, SystemExit, GeneratorExit)
 """What a plugin may raise where it is imported or called; Ctrl-C is the user's."""
 
@@ -82,6 +90,7 @@ def _all() -> dict[str, list[Found]]:
     from importlib.metadata import distributions
 
     groups: dict[str, list[Found]] = {}
+    gone: dict[tuple[str, str], str] = {}
     seen: set[str] = set()
     for distribution in distributions():
         who = "?"
@@ -95,7 +104,9 @@ def _all() -> dict[str, list[Found]]:
             seen.add(normalized(who))
             version = distribution.metadata["Version"] or ""
             for point in distribution.entry_points:
-                if point.group.startswith("zonda."):
+                if point.group in REMOVED and normalized(who) != HOST:
+                    gone.setdefault((who, point.group), REMOVED[point.group])
+                elif point.group.startswith("zonda."):
                     found = Found(point.name, point.value, who, version)
                     if found not in groups.setdefault(point.group, []):
                         groups[point.group].append(found)
@@ -106,6 +117,9 @@ def _all() -> dict[str, list[Found]]:
                 f" {type(err).__name__}: {err}"
             )
             warnings.warn(message, PluginWarning, stacklevel=3)
+    for (who, group), instead in gone.items():
+        message = f"plugin {who} has entry points in {group}, a group that is gone: {instead}"
+        warnings.warn(message, PluginWarning, stacklevel=3)
     return groups
 
 

@@ -18,16 +18,27 @@ class Product(ABC):
 
     `Operator.collect` hands one observation's share to `Data.add`, `Operator.finalize` takes the
     sum with `Data.take`. A campaign adds up the shares of its tasks without knowing the operator:
-    what crosses from one process to another are `arrays`. Its class is then found by its name in
-    the registry (entry-point group ``zonda.products``).
+    what crosses from one process to another are `arrays`, and `identity`, by which the other
+    process finds the class: it has imported the modules of all steps.
     """
 
     zonda_api: ClassVar[int] = API_VERSION
+    kinds: ClassVar[dict[str, type[Product]]] = {}
+    """All classes of products that are imported, by `identity`."""
 
     signals: tuple[str, ...] = ()
     """Streams of the signals that it holds (`core.signal`), the complete one first; empty: it is of
     no signal in particular.
     """
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        cls.kinds[cls.identity()] = cls
+
+    @classmethod
+    def identity(cls) -> str:
+        """``module:class``."""
+        return f"{cls.__module__}:{cls.__qualname__}"
 
     @abstractmethod
     def __iadd__(self, other: Self) -> Self:

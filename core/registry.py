@@ -37,28 +37,12 @@ checks = Registry("checks", "zonda.checks", "zonda.core.checks:Family")
 metrics = Registry(
     "metric", "zonda.metrics", classes=True
 )  # classes, or functions of `Data`: core.accuracy.metrics
-ground_weather = Registry(
-    "weather on the ground", "zonda.ground_weather", classes=True
-)  # a function of the scene
 weather_sources = Registry(
     "weather source", "zonda.weather_sources", "zonda.core.weather:WeatherSource", classes=True
 )
 
-sections = Registry(
-    "section of pipeline files",
-    "zonda.sections",
-    "zonda.core.configuration.section:Section",
-    classes=True,
-    exact=True,
-)
-"""By the key in a pipeline file."""
-
 planning = Registry("planning", "zonda.planning", classes=True, exact=True)
 """By the name of the operator's class: its `core.plan.planning.Planning`."""
-
-products = Registry(
-    "product", "zonda.products", "zonda.core.product:Product", classes=True, exact=True
-)
 
 
 def _hint_for_site(name: str) -> tuple[str, str]:
@@ -133,13 +117,10 @@ registries = (
     bands,
     noise_models,
     weather_sources,
-    ground_weather,
     spectra,
     checks,
     metrics,
     planning,
-    products,
-    sections,
 )
 
 

@@ -15,9 +15,9 @@ from .configuration.time import Instant
 from .configuration.values import mistake
 from .errors import ZondaError
 from .instrument import Instrument
-from .registry import instruments, sites
+from .registry import instruments, sites, weather_sources
 from .site import Site
-from .weather import WeatherSource, weather_source
+from .weather import GroundWeather, WeatherSource, weather_source
 
 EARTH = 6371e3
 """Mean radius, m."""
@@ -67,6 +67,15 @@ class Scene(Parameters):
         return type(self)(
             **({name: getattr(self, name) for name in self.model_fields_set} | changes)
         )
+
+    def ground_weather(self) -> GroundWeather:
+        """Weather at the telescope at the start of the scene.
+
+        The class of the climatology, which is always installed, makes it from the column of any
+        source. Raises InputError where the source does not cover the place or the time.
+        """
+        found: GroundWeather = weather_sources.get("climatology").ground_weather(self)
+        return found
 
 
 @runtime_checkable

@@ -16,7 +16,6 @@ from zonda.core.data import Data, Observation
 from zonda.core.errors import InputError
 from zonda.core.flags import DETECTOR_MASK
 from zonda.core.kept import kept, one_scan
-from zonda.core.registry import ground_weather
 from zonda.operators.io.recorded_stream import RecordedStream
 from zonda.operators.io.save_tod import reader
 from zonda.operators.io.time_ordered_data import TimeOrderedData
@@ -81,7 +80,7 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
             scene is not None and tod.weather is None
         ):  # no step made an atmosphere of it; as SaveTOD writes it
             with contextlib.suppress(InputError):
-                tod.weather = ground_weather.get("scene")(scene)
+                tod.weather = scene.ground_weather()
     elif isinstance(source, TimeOrderedData):
         if stream not in source.streams:
             raise _absent(stream, source.streams, source.name)

@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from .. import registry
 from ..configuration.time import Instant
 from ..data import Data
-from ..errors import PipelineError
+from ..errors import InputError, PipelineError
 from ..focalplane import Focalplane
 from ..observation import Observation
 from ..product import Product
@@ -61,15 +60,12 @@ class Partial:
         kinds = {label: type(product) for label, product in data.partial.items()}
         place = str(data.provenance["name"])
         for label, kind in kinds.items():
-            if not _registered(kind):
+            if kind.__module__ == "__main__" or "<locals>" in kind.__qualname__:
                 raise NotCombined(
-                    f"{label} adds up a {kind.__name__}, a class that is not registered: other"
-                    " processes cannot find it",
+                    f"{label} adds up a {kind.__name__}, a class of this session: other processes"
+                    " cannot find it",
                     place=place,
-                    cure=(
-                        "register it in the entry-point group zonda.products under the name"
-                        f" {kind.__name__}"
-                    ),
+                    cure="move the class, and the step that makes it, to a module",
                 )
         for name in data.products:
             raise NotCombined(
@@ -109,7 +105,7 @@ class Partial:
     def write(self, path: Path, identity: str, made: Mapping[str, Any]) -> None:
         """Write it to a file; ``made``: how it was made (`parts.head`)."""
         products = {
-            label: {"kind": type(p).__name__, "arrays": p.arrays()}
+            label: {"kind": p.identity(), "arrays": p.arrays()}
             for label, p in self.products.items()
         }
         tree = {"products": products, "scans": self.scans, "tally": _rows(self.tally)}
@@ -119,10 +115,16 @@ class Partial:
     def read(cls, path: Path, identity: str) -> Partial:
         """Read it from a file. Raises `InputError` where that is missing or damaged."""
         tree = parts.read(path, identity)
-        products = {
-            label: registry.products.get(p["kind"]).of(p["arrays"])
-            for label, p in tree["products"].items()
-        }
+        products = {}
+        for label, product in tree["products"].items():
+            kind = Product.kinds.get(product["kind"])
+            if kind is None:
+                raise InputError(
+                    f"{label} adds up a {product['kind']}, which no step of the pipeline imports",
+                    place=str(path),
+                    cure="import the class in the module of the step that makes it",
+                )
+            products[label] = kind.of(product["arrays"])
         return cls(products, _tally(tree["tally"]), tree["scans"])
 
     def observations(self, scene: Scene) -> list[Observation]:
@@ -198,10 +200,6 @@ class Thinned(Observation):
             names=tuple(scan["origin"]),
             **own,
         )
-
-
-def _registered(kind: type[Product]) -> bool:
-    return kind.__name__ in registry.products and registry.products.get(kind.__name__) is kind
 
 
 def _rows(tally: Tally) -> dict[str, list[Any]]:

@@ -12,7 +12,6 @@ from ..configuration import overrides
 from ..configuration.diagnostics import Diagnostic
 from ..configuration.header import KEYS, Header
 from ..configuration.mistakes import Mistakes
-from ..configuration.section import Section
 from ..registry import declared, makers, operators, operators_that
 from .entries import setting
 from .settings import MOST_TASKS, Campaign, Sweep
@@ -34,130 +33,120 @@ class CampaignHeader(Header):
     """
 
 
-class CampaignSection(Section):
-    """What pipeline files ask about their key ``campaign``."""
-
-    header = CampaignHeader
-
-    @staticmethod
-    def rewrite(document: Document) -> list[Diagnostic]:
-        """See `Section.rewrite`. A schedule becomes a parameter of the pointing step that takes
-        one.
-        """
-        value, path = document.value["campaign"], ("campaign", "schedule")
-        if not isinstance(value, dict) or value.get("schedule") is None:
-            return []
-        given, at = document.sub(path), document.mark(path).start
-        del value["schedule"]
-        step = next(
-            (
-                name
-                for name in _names(document)
-                if name in operators and _takes_schedule(operators.get(name))
-            ),
-            None,
-        )
-        if step is None:
-            have = " or ".join(operators_that(_takes_schedule)) or "a step that does"
-            return [
-                Diagnostic(
-                    "no step takes the schedule",
-                    at,
-                    "",
-                    f"put {have} in the place of the pointing step",
-                )
-            ]
-        found = overrides.put(document, f"{step}.schedule", given, at, KEYS)
-        if value.get("nights") is not None:
-            text = (
-                "nights would repeat the same scans: the rows of a schedule have times of their own"
-            )
-            cure = (
-                "write every night into the schedule, or use realizations for other random numbers"
-            )
-            found.append(Diagnostic(text, document.mark(("campaign", "nights")).start, "", cure))
-        return found
-
-    @staticmethod
-    def too_large(value: Any) -> bool:
-        """Whether ``campaign:`` as it was written comes to more entries than allowed, whatever else
-        is wrong with it.
-        """
-        grid, given, nights = (value.get(key) for key in ("grid", "observations", "nights"))
-        sizes = (
-            [len(values) for values in grid.values() if isinstance(values, list)]
-            if isinstance(grid, dict)
-            else []
-        )
-        sizes.append(len(given) if isinstance(given, list) else 1)
-        counts = [
-            nights.get("count") if isinstance(nights, dict) else nights,
-            value.get("realizations"),
-        ]
-        return (
-            math.prod(max(1, n) for n in [*sizes, *(n for n in counts if isinstance(n, int))])
-            > MOST_TASKS
-        )
-
-    @staticmethod
-    def mistakes(
-        document: Document,
-        value: Campaign,
-        known: list[Diagnostic],
-        check: Callable[[Document], list[Diagnostic]],
-    ) -> list[Diagnostic]:
-        """See `Section.mistakes`. The axes are checked only in a file without other mistakes."""
-        found = [_at_axis(mistake, document, value) for mistake in known] or _mistakes(
-            document, value, check
-        )
-        if not found and value.figures and not _measures(document):
-            steps = " or ".join(f"- {name}: {{metrics: [...]}}" for name in makers("figures"))
-            at = document.mark(("campaign", "figures")).start
-            found = [
-                Diagnostic(
-                    "no step measures figures for the table",
-                    at,
-                    "",
-                    f"add {steps or 'a step that does'}",
-                )
-            ]
-        return found
-
-
-class SweepSection(Section):
-    """What pipeline files ask about their key ``sweep``: it is rewritten to a campaign that co-adds
-    nothing.
-    """
-
-    header = CampaignHeader
-
-    @staticmethod
-    def rewrite(document: Document) -> list[Diagnostic]:
-        """See `Section.rewrite`. Mistakes in the axes are the campaign's to find, at their places
-        in the sweep.
-        """
-        value = document.value.pop("sweep")
-        mistakes = Mistakes(document, None, [])
-        if "campaign" in document.value:
-            mistakes.wrong(
-                "a pipeline has either a sweep or a campaign",
-                document.mark(("sweep",)).start,
+def rewrite_campaign(document: Document) -> list[Diagnostic]:
+    """Move ``campaign.schedule`` to the pointing step that takes one; return the mistakes."""
+    value, path = document.value["campaign"], ("campaign", "schedule")
+    if not isinstance(value, dict) or value.get("schedule") is None:
+        return []
+    given, at = document.sub(path), document.mark(path).start
+    del value["schedule"]
+    step = next(
+        (
+            name
+            for name in _names(document)
+            if name in operators and _takes_schedule(operators.get(name))
+        ),
+        None,
+    )
+    if step is None:
+        have = " or ".join(operators_that(_takes_schedule)) or "a step that does"
+        return [
+            Diagnostic(
+                "no step takes the schedule",
+                at,
                 "",
-                "remove one of them",
+                f"put {have} in the place of the pointing step",
             )
-        elif mistakes.validate(Sweep, value, ("sweep",), "sweep") is not None:
-            called = {key: Sweep.CALLED.get(key, key) for key in value}
-            document.value["campaign"] = {called[key]: value[key] for key in value} | {
-                "combine": [],
-                "paired": True,
-                "figures": True,
-            }
-            for path, mark in list(document.marks.items()):
-                if path[0:1] == ("sweep",):
-                    document.marks[
-                        ("campaign", *(called.get(k, k) for k in path[1:2]), *path[2:])
-                    ] = mark
-        return mistakes.found
+        ]
+    found = overrides.put(document, f"{step}.schedule", given, at, KEYS)
+    if value.get("nights") is not None:
+        text = "nights would repeat the same scans: the rows of a schedule have times of their own"
+        cure = "write every night into the schedule, or use realizations for other random numbers"
+        found.append(Diagnostic(text, document.mark(("campaign", "nights")).start, "", cure))
+    return found
+
+
+def too_large(value: Any) -> bool:
+    """Whether ``campaign:`` as it was written comes to more entries than allowed, whatever else
+    is wrong with it.
+    """
+    grid, given, nights = (value.get(key) for key in ("grid", "observations", "nights"))
+    sizes = (
+        [len(values) for values in grid.values() if isinstance(values, list)]
+        if isinstance(grid, dict)
+        else []
+    )
+    sizes.append(len(given) if isinstance(given, list) else 1)
+    counts = [
+        nights.get("count") if isinstance(nights, dict) else nights,
+        value.get("realizations"),
+    ]
+    return (
+        math.prod(max(1, n) for n in [*sizes, *(n for n in counts if isinstance(n, int))])
+        > MOST_TASKS
+    )
+
+
+def mistakes(
+    document: Document,
+    value: Campaign,
+    known: list[Diagnostic],
+    check: Callable[[Document], list[Diagnostic]],
+) -> list[Diagnostic]:
+    """All mistakes of a document with a campaign. The axes are checked only in a file without other
+    mistakes.
+
+    Parameters
+    ----------
+    known
+        Mistakes that were found; those of an axis are placed there.
+    check
+        Lists the mistakes of a document without the campaign.
+    """
+    found = [_at_axis(mistake, document, value) for mistake in known] or _mistakes(
+        document, value, check
+    )
+    if not found and value.figures and not _measures(document):
+        steps = " or ".join(f"- {name}: {{metrics: [...]}}" for name in makers("figures"))
+        at = document.mark(("campaign", "figures")).start
+        found = [
+            Diagnostic(
+                "no step measures figures for the table",
+                at,
+                "",
+                f"add {steps or 'a step that does'}",
+            )
+        ]
+    return found
+
+
+def rewrite_sweep(document: Document) -> list[Diagnostic]:
+    """Replace the key ``sweep`` by a campaign that co-adds nothing; return the mistakes.
+
+    Mistakes in the axes are found by the campaign, at their places in the sweep.
+    """
+    value = document.value.pop("sweep")
+    mistakes = Mistakes(document, None, [])
+    if "campaign" in document.value:
+        mistakes.wrong(
+            "a pipeline has either a sweep or a campaign",
+            document.mark(("sweep",)).start,
+            "",
+            "remove one of them",
+        )
+    elif mistakes.validate(Sweep, value, ("sweep",), "sweep") is not None:
+        called = {key: Sweep.CALLED.get(key, key) for key in value}
+        document.value["campaign"] = {called[key]: value[key] for key in value} | {
+            "combine": [],
+            "paired": True,
+            "figures": True,
+        }
+        for path, mark in list(document.marks.items()):
+            if path[0:1] == ("sweep",):
+                document.marks[("campaign", *(called.get(k, k) for k in path[1:2]), *path[2:])] = (
+                    mark
+                )
+    return mistakes.found
 
 
 def _measures(document: Document) -> bool:

@@ -16,6 +16,7 @@ from zonda import __version__
 from .. import registry
 from ..assembly.checks import looks
 from ..assembly.order import check_order
+from ..campaign import section
 from ..errors import PipelineError, ZondaError
 from ..mapmaker import made_by
 from ..operator import Operator
@@ -114,14 +115,13 @@ class _Check(Mistakes):
         self.tree: dict[Any, Any] = document.value
 
     def run(self) -> PipelineFile:
-        for key in ("sweep", "campaign"):
+        for key, rewrite in (
+            ("sweep", section.rewrite_sweep),
+            ("campaign", section.rewrite_campaign),
+        ):
             if self.tree.get(key) is not None:
-                self.found += registry.sections.get(key).rewrite(self.document)
-        kind: type[Header] = (
-            Header
-            if self.tree.get("campaign") is None
-            else registry.sections.get("campaign").header
-        )
+                self.found += rewrite(self.document)
+        kind = Header if self.tree.get("campaign") is None else section.CampaignHeader
         head = {
             k: v
             for k, v in self.tree.items()
@@ -146,7 +146,6 @@ class _Check(Mistakes):
         if header is not None:
             self.runs(header, steps)
         if header is not None and header.campaign is not None:
-            section = registry.sections.get("campaign")
             self.found = section.mistakes(
                 self.document, header.campaign, self.found, self.without_campaign
             )
@@ -212,9 +211,7 @@ class _Check(Mistakes):
                 f"a pipeline of {len(items or [])} steps", at, "", f"write at most {MOST_STEPS}"
             )
         if isinstance(campaign, dict) and not many:
-            many = registry.sections.get("campaign").too_large(
-                campaign
-            )  # the header's own check has said so
+            many = section.too_large(campaign)  # the header's own check has said so
         if many:
             raise ConfigurationError(without_meant(self.found), self.name)
 

@@ -11,6 +11,7 @@ from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
 from .. import registry
 from ..band import PER_BAND
+from ..campaign.section import CampaignHeader
 from ..components import Registry
 from ..errors import ZondaError
 from ..operator import Operator
@@ -36,7 +37,7 @@ def json_schema() -> dict[str, Any]:
             continue
         classes[found.qualified if twice else found.name] = operator
     weather = _weather()
-    top: type[BaseModel] = registry.sections.get("campaign").header
+    top: type[BaseModel] = CampaignHeader
     wanted: list[type[BaseModel]] = [
         top,
         Scene,

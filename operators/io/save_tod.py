@@ -18,7 +18,6 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, OutputError
 from zonda.core.output import StreamOutput, output_folder
 from zonda.core.product import Record
-from zonda.core.registry import ground_weather
 from zonda.core.storage.files import atomic_path, discard, product_path, publish, temporary_sibling
 from zonda.core.stream_names import UNITS, StreamName, streams_asked, streams_needed
 
@@ -175,8 +174,7 @@ class SaveTOD(StreamOutput):
 def _weather(data: Data, observation: Observation, place: str) -> GroundWeather | None:
     """That of the scene, where no step made an atmosphere of it."""
     try:
-        found: GroundWeather = ground_weather.get("scene")(data.scene)
-        return found
+        return data.scene.ground_weather()
     except InputError as err:
         observation.tally.state(place, "weather is not written", str(err).splitlines()[0])
         return None

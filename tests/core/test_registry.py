@@ -191,6 +191,18 @@ def test_allow_list(plugin: Plugin, monkeypatch: pytest.MonkeyPatch) -> None:
         assert {"hill", "dale"} & set(registry.sites) == expected
 
 
+def test_a_group_that_is_gone_is_told_once_with_what_replaces_it(plugin: Plugin) -> None:
+    plugin(
+        "zonda-hills",
+        "1.2",
+        {"zonda.sites": {"hill": "zt_hills:hill"}, "zonda.products": {"Sum": "zt_hills:Sum"}},
+        zt_hills=SITE,
+    )
+    with pytest.warns(PluginWarning, match=r"zonda-hills .*zonda\.products.* is gone: .*class"):
+        assert "hill" in registry.sites
+    assert "green_bank" in registry.sites  # in silence: warnings of plugins are errors in tests
+
+
 def test_broken_metadata_hides_nothing_else(plugin: Plugin) -> None:
     folder = plugin("zonda-hills", "1.2", {"zonda.sites": {"hill": "zt_hills:hill"}}, zt_hills=SITE)
     info = folder / "zonda_torn-1.0.dist-info"

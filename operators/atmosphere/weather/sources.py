@@ -43,6 +43,12 @@ class Climatology(WeatherSource):
             return standard_column(site)
         return climatology_column(site, time)
 
+    @staticmethod
+    def ground_weather(scene: Scene) -> GroundWeather:
+        """Weather at the telescope at the start of a scene, whatever its source."""
+        profile = profile_of(scene.weather, scene.site, scene.time, scene.seed)
+        return on_the_ground(profile, scene.time)
+
 
 class Standard(WeatherSource):
     """The US Standard Atmosphere 1976 with a west wind, whatever the place and season: give its
@@ -159,11 +165,6 @@ def on_the_ground(profile: Profile, time: Instant, wind: AnyFloats | None = None
         wind_east=float(east),
         wind_north=float(north),
     )
-
-
-def of_scene(scene: Scene) -> GroundWeather:
-    """Readings of instruments at the telescope at the start of a scene."""
-    return on_the_ground(profile_of(scene.weather, scene.site, scene.time, scene.seed), scene.time)
 
 
 def _supersaturated(profile: Profile) -> tuple[tuple[str, str], ...]:
