@@ -54,6 +54,10 @@ class Data:
     """Threads that the run may use."""
     band: str = ""
     """Name of the band that these are the data of, where the camera has several."""
+    bands: dict[str, Data] = field(default_factory=dict, repr=False)
+    """By name, the data of each band of a camera with several: its scans, and its products under
+    the names that they have in a camera of one band.
+    """
 
     pointed: list[Observation] = field(default_factory=list)
     """The scans of several bands before each of these got its detectors; empty where there is one

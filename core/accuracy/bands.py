@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..data import Data
-from ..run.bands import data_of_bands
 from ..types import Floats
 from .metrics import Metric, get
 
@@ -22,23 +21,6 @@ def metric_of(file: PipelineFile, name: str) -> Metric:
     """
     found = get(name)
     return OfBands(found) if file.scene().instrument.bands else found
-
-
-def each_band(data: Data) -> dict[str, Data]:
-    """By name of the band, its scans and products of a finished run, under the names that they have
-    in a camera of one band.
-    """
-    found = data_of_bands(data)
-    longest_first = sorted(found, key=len, reverse=True)
-    for own in found.values():
-        own.observations = [
-            scan for scan in data.observations if scan.instrument == own.scene.instrument
-        ]
-    for key, product in data.products.items():
-        band = next((name for name in longest_first if key.endswith(f"_{name}")), None)
-        if band is not None:
-            found[band].products[key.removesuffix(f"_{band}")] = product
-    return found
 
 
 class OfBands(Metric):
@@ -59,7 +41,7 @@ class OfBands(Metric):
         return self.each.steps(operators)
 
     def measure(self, data: Data) -> dict[str, Any]:
-        return {band: self.each.measure(own) for band, own in each_band(data).items()}
+        return {band: self.each.measure(own) for band, own in data.bands.items()}
 
     def errors(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> dict[str, float]:
         return {band: self.each.error(one, reference[band]) for band, one in found.items()}

@@ -46,11 +46,9 @@ def looks_alike(bands: Sequence[Band]) -> bool:
 
 
 def data_of_bands(data: Data) -> dict[str, Data]:
-    """By name of the band, the data of a run with that band alone; empty where the camera has one
-    band.
-    """
+    """Give data a part for each band (`Data.bands`); none where the camera has one band."""
     instrument = data.scene.instrument
-    return {
+    data.bands = {
         name: Data(
             data.scene.model_copy(update={"instrument": camera}),
             provenance=dict(data.provenance),
@@ -61,6 +59,7 @@ def data_of_bands(data: Data) -> dict[str, Data]:
         )
         for name, camera in (instrument.cameras.items() if instrument.bands else ())
     }
+    return data.bands
 
 
 def points(operator: Operator) -> bool:

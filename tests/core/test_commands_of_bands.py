@@ -14,7 +14,7 @@ from astropy.table import Table
 
 import zonda
 from zonda.core import cli
-from zonda.core.accuracy.bands import OfBands, each_band, metric_of
+from zonda.core.accuracy.bands import OfBands, metric_of
 from zonda.core.accuracy.metrics import Metric, get
 from zonda.core.errors import ZondaError
 
@@ -212,10 +212,10 @@ class Peak(Metric):
 def test_metrics_of_bands(path: Path, tmp_path: Path) -> None:
     file = zonda.load(path, ["PointingDaisy.scan_duration=10 s"])
     data = file.pipeline().run(file.scene(), output=tmp_path, threads=1)
-    own = each_band(data)
-    for name in NAMES:
-        assert own[name]["map"] is data[f"map_{name}"]
-        assert {o.name for o in own[name].observations} == {f"scan-000-{name}", f"scan-001-{name}"}
+    for name, own in data.bands.items():
+        assert own["map"] is data[f"map_{name}"]
+        assert {o.name for o in own.observations} == {f"scan-000-{name}", f"scan-001-{name}"}
+    assert [*data.bands] == NAMES
     metric = OfBands(Peak())
     found = metric.measure(data)
     assert found == {name: float(np.nanmax(data[f"map_{name}"].signal)) for name in NAMES}
@@ -227,30 +227,6 @@ def test_metrics_of_bands(path: Path, tmp_path: Path) -> None:
     assert not isinstance(metric_of(zonda.load(path, ["instrument.band=low"]), "map_rms"), OfBands)
     rms = OfBands(get("map_rms"))
     assert rms.floor(rms.measure(data)) == 1.0
-
-
-def test_a_name_that_ends_like_another_bands() -> None:
-    """Products of the band ``b_a`` are not taken for those of ``a``."""
-    bands = [{"name": name, "low": "77 GHz", "high": "106 GHz"} for name in ("a", "b_a")]
-    camera = zonda.Instrument(
-        name="c",
-        telescope={"name": "d", "diameter": "6 m"},
-        bands=bands,
-        detectors=1,
-        field_of_view="1 arcmin",
-        main_beam_efficiency=0.8,
-        illumination_efficiency=0.9,
-        net="1 mK s(1/2)",
-        sample_rate="10 Hz",
-    )
-    scene = zonda.Scene(
-        site="llano_de_chajnantor", instrument=camera, time="2022-08-01T23:00", target="260d -10d"
-    )
-    own = each_band(
-        zonda.Data(scene, products={"map_a": 1, "map_b_a": 2, "sky/map_b_a": 3, "other": 4})
-    )
-    assert own["a"].products == {"map": 1}
-    assert own["b_a"].products == {"map": 2, "sky/map": 3}
 
 
 def test_accuracy_on_the_command_line(
