@@ -48,8 +48,8 @@ class JoinsBands(Protocol):
     all_bands: bool
 
     def of_rows(self, measured: Any, rows: slice) -> Any:
-        """Of what ``measure`` returned for the detectors of all bands, what ``exec`` needs for some
-        of them.
+        """Select, of what ``measure`` returned for the detectors of all bands, the part of some of
+        them.
         """
         ...
 
@@ -114,7 +114,7 @@ def place_of_signal(operators: Sequence[Operator]) -> int | None:
 
 
 def _calibrated(operators: Sequence[Operator]) -> frozenset[str]:
-    """What these steps provide, where all of it is sky or enters calibrated; else nothing."""
+    """Streams of these steps, where all of them are sky or enter calibrated; else none."""
     made = [
         name
         for o in operators
@@ -140,17 +140,17 @@ def with_calibrated_signal(operators: Sequence[Operator]) -> list[Operator]:
 
 
 def forms(operator: Operator) -> bool:
-    """Whether it makes signals of their components."""
+    """Tell whether a step makes signals of their components."""
     return MAIN in operator.provides and MAIN not in operator.requires
 
 
 def filters(operator: Operator) -> bool:
-    """Whether it changes signals."""
+    """Tell whether a step changes signals."""
     return MAIN in operator.provides and MAIN in operator.requires
 
 
 def changes_components(operator: Operator) -> bool:
-    """Whether it changes streams that other steps make, before a signal is formed of them, and
+    """Tell whether a step changes streams that others make, before a signal is formed of them, and
     makes none: it reads all that it provides, and is no part of any signal itself."""
     return (
         MAIN not in operator.provides
@@ -160,12 +160,12 @@ def changes_components(operator: Operator) -> bool:
 
 
 def made_by(operator: Operator) -> frozenset[str]:
-    """What it provides, without streams that it only changes."""
+    """Names that a step provides, without streams that it only changes."""
     return frozenset() if changes_components(operator) else operator.provides
 
 
 def makes_products(operator: Operator) -> bool:
-    """Whether all that it makes are products in memory: map makers, spectra. (What a step writes
+    """Tell whether a step makes products in memory alone: map makers, spectra. (What a step writes
     while it runs, it does not provide.)"""
     names = operator.provides
     return (
@@ -176,7 +176,7 @@ def makes_products(operator: Operator) -> bool:
 
 
 def acts(operator: Operator) -> bool:
-    """Whether it works on observations: neither an output nor a step that points the telescope and
+    """Tell whether a step works on observations: it is no output, and no step that points and
     has no ``exec``.
     """
     points = "boresight" in operator.provides and type(operator).exec is Operator.exec

@@ -323,7 +323,7 @@ class Pipeline:
         return self._least_memory(observations)
 
     def _least_memory(self, observations: Sequence[Observation], others: int = 0) -> int:
-        """As `least_memory`, of one band; ``others``: bytes of the products of other bands."""
+        """`least_memory` of one band; ``others``: bytes of the products of other bands."""
         observation = longest_of(observations)
         note_signals([observation], self.signals.components, self.signals.formed)
         return least_memory(self.chain, observation, Settings(dtype=self._dtype), others)
@@ -448,7 +448,7 @@ class Pipeline:
             )
 
     def provenance(self, scene: Scene) -> dict[str, Any]:
-        """What made the products: name, seed, versions, signals, operators with their
+        """Provenance of the products: name, seed, versions, signals, operators with their
         parameters.
         """
         return {

@@ -1,5 +1,5 @@
-"""What can be found out about a pipeline before any work: `zonda check` prints it, and every run
-begins with it.
+"""Checks of a pipeline before any work: `zonda check` prints what they find, and every run begins
+with them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def first_look(pipeline: Pipeline, scene: Scene, *, saved: bool = True) -> list[list[str]]:
-    """What each operator's `check` finds, in the order of the steps: lines to print.
+    """Lines to print that each operator's `check` returns, in the order of the steps.
 
     Warns where no step writes anything (unless not ``saved``: products are wanted in memory alone).
 
@@ -49,7 +49,7 @@ def warn_of_nothing_saved(pipeline: Pipeline) -> None:
 def looks(
     operators: Sequence[Operator | None], scene: Scene, say: Callable[[str], None] | None = None
 ) -> tuple[list[list[str]], list[tuple[int, ZondaError]]]:
-    """What each operator's `check` finds, and every error, with the number of its step.
+    """Lines that each operator's `check` returns, and every error, with the number of its step.
 
     None stands for a step that could not be made. ``say`` is told each step before it is looked at.
     """
@@ -71,8 +71,8 @@ def looks(
 
 
 def writes(operators: Iterable[Operator]) -> bool:
-    """Whether any step may leave a file: one that is neither pointing nor a stream, nor keeps its
-    products in memory.
+    """Tell whether any step may leave a file: one that is neither pointing nor a stream, nor keeps
+    its products in memory.
     """
     return any(
         may_write(o)

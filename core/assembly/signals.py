@@ -1,4 +1,4 @@
-"""Which signals a pipeline makes, of which components, and which of them follow from others.
+"""Signals that a pipeline makes, of which components, and which of them follow from others.
 
 With the complete data's modes and the same transmission of the atmosphere (``modes: full``) a
 pipeline of linear steps is a linear map L of the components. For a signal of the components C and
@@ -183,7 +183,7 @@ class Signals:
         )
 
     def _is_left(self, signal: Signal) -> bool:
-        """Whether a signal is another than the narrowed complete one, and not empty."""
+        """Tell whether a signal is another than the narrowed complete one, and not empty."""
         kept = [o for o in self._generators if self._keeps(signal, o)]
         every = [o for o in self._generators if self._keeps(None, o)]
         return bool(kept) and (len(kept) < len(every) or signal.filters == "none")
@@ -231,8 +231,8 @@ class Signals:
             operator._shown = tuple(names)
 
     def _kind(self, signal: Signal | None) -> tuple[frozenset[str], bool, bool]:
-        """What distinguishes signals: steps of components, filters, whether modes and transmission
-        are the complete data's.
+        """Features that distinguish signals: steps of components, filters, whether modes and
+        transmission are the complete data's.
         """
         kept = frozenset(o.label for o in self._generators if self._keeps(signal, o))
         changing = [o for o in self.operators if filters(o)]
@@ -273,7 +273,7 @@ class Signals:
         return found
 
     def _fits(self, name: str) -> bool:
-        """Whether a signal is a term of equation (1)."""
+        """Tell whether a signal is a term of equation (1)."""
         signal, kept = self.runs[name], self.makers(name)
         names_it = TRANSMISSION in [*(signal.only or ()), *(signal.without or ())]
         narrowed = self._only is not None
@@ -322,5 +322,5 @@ def _generators(operators: Sequence[Operator]) -> list[Operator]:
 
 
 def remainder(parts: Sequence[str]) -> str:
-    """How a remainder follows, e.g. ``the complete signal minus noiseless``."""
+    """Description of a remainder, e.g. ``the complete signal minus noiseless``."""
     return f"the complete signal minus {' and '.join(parts)}"

@@ -37,7 +37,7 @@ class PlanOfBands:
 
     @cached_property
     def summary(self) -> PlanSummary:
-        """What a run takes from them."""
+        """The parts of the plans that a run takes."""
         return combined({name: made.summary for name, made in self.plans.items()}, self.timing)
 
     def apply(self, file: PipelineFile) -> PipelineFile:

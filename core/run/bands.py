@@ -63,13 +63,13 @@ def data_of_bands(data: Data) -> dict[str, Data]:
 
 
 def points(operator: Operator) -> bool:
-    """Whether a step points the telescope, which is done once for all bands."""
+    """Tell whether a step points the telescope, which is done once for all bands."""
     return "boresight" in operator.provides
 
 
 def of_one_band(operator: Operator) -> bool:
-    """Whether a step acts on each band's data: all but those that only point, which is done once
-    for all bands.
+    """Tell whether a step acts on each band's data: all do but those that only point, which is
+    done once for all bands.
 
     A step that points and reads streams too observes the scans of all bands first, and then each
     band's data (`Data.band`); so does one that reads recorded pointing, whose flags differ from
@@ -121,7 +121,7 @@ def hand_over(data: Data, bands: Sequence[Data]) -> None:
 
 
 def _of(whole: Mapping[str, Any], band: str) -> dict[str, Any]:
-    """What belongs to a band of what `gather` put together by label."""
+    """Select by label, of the entries that `gather` put together, those of a band."""
     return {
         key.removesuffix(_key(band)): value
         for key, value in whole.items()

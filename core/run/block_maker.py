@@ -175,7 +175,7 @@ class BlockMaker:
     # ---- which steps act
 
     def _is_read(self, step: Operator) -> bool:
-        """Whether a step must act: one of its streams is read later, or it makes products."""
+        """Tell whether a step must act: one of its streams is read later, or it makes products."""
         provides = step.provides - {"boresight"}
         streams = [n for n in provides if is_stream(n)]
         return (
@@ -412,7 +412,7 @@ def share_mask(block: Block, streams: Sequence[str]) -> None:
 
 @kernel(fastmath={"contract", "nsz", "reassoc"})
 def _finite(row):  # type: ignore[no-untyped-def]
-    """Whether all samples of a row are finite."""
+    """Tell whether all samples of a row are finite."""
     total = zero = row.dtype.type(0)
     for t in range(row.size):
         total += row[t] * zero  # row[t] - row[t] would be cancelled where sums are reassociated

@@ -238,7 +238,7 @@ class Execution:
             self.observation.detdata[name] = self._whole(self._source.streams[name])
 
     def _whole(self, stream: Stream) -> AnyFloats:
-        """All of a stream with its mean, float64; a few detectors at a time, so that nothing of its
+        """A whole stream with its mean, float64; a few detectors at a time, so that nothing of its
         size is made besides.
         """
         whole = empty(self.schedule.shape, np.float64)

@@ -33,8 +33,8 @@ too.
 
 
 def knows_means(operator: Operator) -> bool:
-    """Whether it handles means itself. A class that overrides `exec` or `measure` of one that does
-    must say so anew.
+    """Tell whether a step handles means itself. A class that overrides `exec` or `measure` of one
+    that does must say so anew.
     """
     order = type(operator).__mro__
     says = next(n for n, c in enumerate(order) if "knows_means" in vars(c))

@@ -14,7 +14,7 @@ from typing import Protocol
 
 
 class Preparable(Protocol):
-    """What is prepared: an execution."""
+    """An execution, which can be prepared."""
 
     beforehand: Future[None] | None
 

@@ -141,7 +141,7 @@ class Planned:
 
 @dataclass
 class Schedule:
-    """What is done with one observation, and what that takes.
+    """Work on one observation, and the memory that it takes.
 
     Attributes
     ----------
@@ -291,8 +291,8 @@ class Schedule:
         return unfiltered if before and mapped and min(mapped) > before[0] and not bound else ()
 
     def _keeps(self, stage: Stage, size: int, held: int, later: list[Segment]) -> bool:
-        """Whether ``size`` bytes of streams beside those held stay in memory: in half of it, and
-        leave room for blocks.
+        """Tell whether ``size`` bytes of streams beside those held stay in memory: in half of it,
+        with room for blocks.
         """
         following = Stage(later[0], Source(names=stage.wanted), frozenset())
         least = max(self._least_blocks(stage), self._least_blocks(following))
@@ -336,8 +336,8 @@ class Schedule:
         )
 
     def _readings(self, later: Sequence[Segment]) -> int:
-        """How often, beyond once, the segments to come read what is passed on to the first of
-        them.
+        """Number of readings, beyond one, of the streams that are passed on to the first of the
+        segments to come.
         """
         heads = [s.operators[0] for s in later]
         swept = sum(planning_of(o).sweeps(self.observation) for o in heads if o.couples == "all")
@@ -448,7 +448,7 @@ def schedule(chain: Chain, observation: Observation, settings: Settings) -> Sche
 
 
 def spares(chain: Chain, observation: Observation, settings: Settings, size: int) -> bool:
-    """Whether streams and blocks do the same with ``size`` bytes less than ``settings.memory``."""
+    """Tell whether streams and blocks do the same with ``size`` bytes less memory."""
     if settings.memory <= size:
         return False
     less = replace(settings, memory=settings.memory - size)

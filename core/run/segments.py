@@ -85,8 +85,8 @@ def cut(
 
 
 def whole_span(span: str, before: str) -> str:
-    """What blocks hold whole where a segment of ``span`` reads streams that are made with the span
-    ``before``.
+    """Span that blocks hold whole where a segment of ``span`` reads streams that are made with the
+    span ``before``.
     """
     return before if span == "sample" else span
 
@@ -148,7 +148,7 @@ def pieces(detectors: slice, samples: slice) -> Iterator[tuple[slice, slice]]:
 
 
 def within(whole: slice, part: slice) -> slice:
-    """Where ``part`` lies in an array that begins where ``whole`` does."""
+    """Place of ``part`` in an array that begins where ``whole`` does."""
     return slice(part.start - whole.start, part.stop - whole.start)
 
 

@@ -1,4 +1,4 @@
-"""How observations are executed, and what that took."""
+"""Settings with which observations are executed, and the CPU time that it took."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ by block.
 
 @dataclass(frozen=True)
 class Settings:
-    """How to execute.
+    """Threads, memory and precision of an execution.
 
     Attributes
     ----------

@@ -83,12 +83,12 @@ class Stage:
 
     @property
     def place(self) -> int:
-        """Which buffers its blocks use: those that are worked on at the same time differ."""
+        """Number of the buffers of its blocks: those that are worked on at the same time differ."""
         return -1 if self.apart else self.depth
 
     @property
     def span(self) -> str:
-        """What its blocks must hold whole: ``time``, ``detectors``, or ``sample``, nothing."""
+        """Span that its blocks must hold whole: ``time``, ``detectors``, or ``sample``, none."""
         return self.source.span if self.segment.span == "sample" else self.segment.span
 
     @property
@@ -98,7 +98,7 @@ class Stage:
 
     @property
     def in_time_order(self) -> bool:
-        """Whether it is much cheaper in order of time."""
+        """True where it is much cheaper in order of time."""
         return self.segment.in_time_order or bool(
             self.source.stage and self.source.stage.in_time_order
         )
@@ -112,8 +112,8 @@ class Stage:
 
 @dataclass
 class Source:
-    """What a segment reads: streams that are held, or a stage that makes them; the mean emission
-    that belongs to them.
+    """Streams that a segment reads, or a stage that makes them; the mean emission that belongs to
+    them.
     """
 
     streams: dict[str, Stream] = field(default_factory=dict)
@@ -204,7 +204,7 @@ class Store:
         return sum(a.nbytes for a in self._live.values() if not isinstance(a, np.memmap))
 
     def fits(self, size: int) -> bool:
-        """Whether ``size`` more bytes stay within the streams' share of the budget."""
+        """Tell whether ``size`` more bytes stay within the streams' share of the budget."""
         return self._in_use + size <= self._room
 
     def allocate(

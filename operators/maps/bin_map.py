@@ -157,7 +157,7 @@ class Prepared:
 def prepared(
     step: BinMap, observation: Observation, reference: float, spare: list[Sums]
 ) -> Prepared:
-    """What `BinMap.prepare` makes. ``reference``: unit of the variance, K^2; ``spare``: see
+    """State of `BinMap.prepare`. ``reference``: unit of the variance, K^2; ``spare``: see
     `Binning`.
 
     Raises PipelineError where noise is wanted from the scatter of samples that a window has
@@ -193,7 +193,7 @@ def binnings(
     seen: NDArray[np.bool_],
     spare: list[Sums],
 ) -> list[Binning]:
-    """Of each half (`halves_of`), one binning for all signals or one for each; arguments as of
+    """Binnings of each half (`halves_of`), one for all signals or one for each; arguments as of
     `stokes_binnings`.
     """
     observation, (weight, noise, window) = looking.observation, levels
@@ -275,7 +275,7 @@ def add_bands(step: BinMap, blocks: Sequence[Block], states: Sequence[Prepared])
 
 
 def signals_of(step: BinMap, block: Block, state: Prepared) -> tuple[Any, ...]:
-    """All signals of a block, (n_det, n) each; zeros where only the hits are wanted."""
+    """Signals of a block, (n_det, n) each; zeros where only the hits are wanted."""
     if step.contents == "hits":
         nothing = block.buffer("nothing", block.shape)
         nothing.fill(0)
@@ -338,7 +338,7 @@ def add_together(step: BinMap, parts: Sequence[tuple[Any, Block, Prepared]]) -> 
 
 
 def _how(step: BinMap, block: Block, binning: Binning, reference: float) -> tuple[Any, ...]:
-    """Which samples of a block count with which weights, and this thread's sums."""
+    """Samples of a block that count, their weights, and this thread's sums."""
     rows, samples = block.detectors, block.samples
     return (
         block.observation.good_detectors[rows] & binning.use[rows],

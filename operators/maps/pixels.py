@@ -42,7 +42,7 @@ class Looking:
 
     @classmethod
     def of(cls, observation: Observation, grid: Grid) -> Looking:
-        """Where all detectors of an observation look."""
+        """The pointing of all detectors of an observation."""
         return cls(observation, grid, grid.pointing(observation))
 
     @cached_property
@@ -97,7 +97,7 @@ def fingerprint(*arrays: NDArray[Any]) -> bytes:
 
 
 def tiles(block: Block, used: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.int64], int, int]]:
-    """Of a block, in pieces that stay in the cache: rows of the detectors that are ``used``
+    """Pieces of a block that stay in the cache: rows of the detectors that are ``used``
     (n_det,), first and last sample.
 
     Which detectors are together does not depend on the others.
