@@ -67,7 +67,7 @@ def unpacked(path: str | os.PathLike[str], place: str, most: int) -> bytes:
 
 def _opened(path: str | os.PathLike[str], kind: str) -> IO[bytes]:
     if kind != "zip":
-        file: Any = import_module(kind).open(path, "rb") if kind else open(path, "rb")  # noqa: SIM115
+        file: Any = import_module(kind or "io").open(path, "rb")
         return file  # type: ignore[no-any-return]
     archive = zipfile.ZipFile(path)
     if len(members := archive.infolist()) != 1:
