@@ -51,7 +51,7 @@ SAME_NUMBER = 1e-6
 
 @dataclass(frozen=True)
 class _Band:
-    """What a scan has of a band: the file, the camera, the rows of its detectors."""
+    """A band of a scan: the file, the camera, the rows of its detectors."""
 
     part: RecordedScan
     camera: RecordedInstrument
@@ -83,8 +83,15 @@ class LoadTOD(RecordedFiles):
         return frozenset({"boresight"} if self.signal is None else {"boresight", RECORDED})
 
     def check(self, data: Data) -> list[str]:
-        """What is in the files."""
-        return _look(self, data)
+        """Describe the first scans in the files."""
+        first = len(data.observations)
+        with warnings.catch_warnings():  # observing says it again
+            warnings.simplefilter("ignore")
+            self.observe(data)
+        found = data.observations[first:]
+        lines = [_summary(o) for o in found[:MOST_TOLD]]
+        more = len(found) - MOST_TOLD
+        return lines + ([f"and {more} more scans"] if more > 0 else [])
 
     def observe(self, data: Data) -> None:
         """Append an observation for each scan; the scene's instrument and site become those of the
@@ -94,7 +101,7 @@ class LoadTOD(RecordedFiles):
         weather and half-wave plate of their own files.
         """
         if not data.band:
-            self._scans.update(_append(self, data))
+            self._scans.update(_Scans(self, data).append())
             return
         for observation in data.observations:
             if file := self.file_of(observation):
@@ -129,69 +136,204 @@ class LoadTOD(RecordedFiles):
             state.file.close()
 
 
-def _look(step: LoadTOD, data: Data) -> list[str]:
-    """What is in the first files, in words."""
-    first = len(data.observations)
-    with warnings.catch_warnings():  # observing says it again
-        warnings.simplefilter("ignore")
-        step.observe(data)
-    found = data.observations[first:]
-    lines = [_summary(o) for o in found[:MOST_TOLD]]
-    return lines + ([f"and {len(found) - MOST_TOLD} more scans"] if len(found) > MOST_TOLD else [])
+@dataclass(frozen=True)
+class _Scans:
+    """Observations that a step makes of its files."""
 
+    step: LoadTOD
+    data: Data
 
-def _append(step: LoadTOD, data: Data) -> dict[int, list[File]]:
-    """Append the observations; the files of each by its number."""
-    given, found = data.scene, dict[int, list[File]]()
-    if data.observations:
-        cure = (
-            "give all files to one LoadTOD, file: [FILE, ...], and leave out other steps that point"
-            " the telescope"
-        )
-        raise InputError("stands behind a step that has made scans", place=step.label, cure=cure)
-    own = step.own_scene(given.instrument)
-    if abs(given.time.seconds_since(own["time"])) > MOMENT:
-        raise InputError(
-            f"begins {own['time']}, the scene {given.time}: recorded data are of one night",
-            place=f"{step.label}, {step.files[0].name}",
-            cure="leave time out of the pipeline, and nights out of a campaign",
-        )
-    data.scene = given.model_copy(update={"site": own["site"], "instrument": own["instrument"]})
-    most, known = 0, dict[Any, RecordedScan]()
-    for scan in step.scans(given.instrument):
-        for part in scan:
-            _check_new(step, part, known)
-        number = sum(len(part.cameras) for part in scan)
-        most = most or number
-        observation = _observation(step, data, _of_bands(step, scan, own["instrument"], most))
-        found[observation.index] = [File.of(part, step.flag_mask) for part in scan]
-        if not own["instrument"].bands:
-            file = next(
-                file
-                for file in found[observation.index]
-                if observation.focalplane.names[0] in file.rows
+    def append(self) -> dict[int, list[File]]:
+        """Append the observations; the files of each by its number."""
+        step, given, found = self.step, self.data.scene, dict[int, list[File]]()
+        if self.data.observations:
+            cure = (
+                "give all files to one LoadTOD, file: [FILE, ...], and leave out other steps that"
+                " point the telescope"
             )
-            _tell(step.label, observation, file)
-        data.observations.append(observation)
-    return found
-
-
-def _check_new(step: LoadTOD, part: RecordedScan, known: dict[Any, RecordedScan]) -> None:
-    """Note the used detectors of a file: start, name and direction. Raises InputError where a file
-    before it has one of them.
-    """
-    tod, xi, eta = part.tod, part.tod.xi.tolist(), part.tod.eta.tolist()
-    rows = np.concatenate(part.rows)
-    for row in rows[(tod.detector_flags[rows] & np.uint8(step.detector_mask)) == 0].tolist():
-        key = str(tod.start), tod.names[row], xi[row], eta[row]
-        if (other := known.setdefault(key, part)) is not part:
-            what = f"the detector {tod.names[row]} at the times at which {other.path.name} has it"
-            cure = "give each file once"
             raise InputError(
-                f"has {what}: the same data would count twice",
-                place=f"{step.label}, {part.path}",
-                cure=cure,
+                "stands behind a step that has made scans", place=step.label, cure=cure
             )
+        own = step.own_scene(given.instrument)
+        if abs(given.time.seconds_since(own["time"])) > MOMENT:
+            raise InputError(
+                f"begins {own['time']}, the scene {given.time}: recorded data are of one night",
+                place=f"{step.label}, {step.files[0].name}",
+                cure="leave time out of the pipeline, and nights out of a campaign",
+            )
+        self.data.scene = given.model_copy(
+            update={"site": own["site"], "instrument": own["instrument"]}
+        )
+        most, known = 0, dict[Any, RecordedScan]()
+        for scan in step.scans(given.instrument):
+            for part in scan:
+                self._check_new(part, known)
+            number = sum(len(part.cameras) for part in scan)
+            most = most or number
+            observation = self._observation(self._of_bands(scan, own["instrument"], most))
+            found[observation.index] = [File.of(part, step.flag_mask) for part in scan]
+            if not own["instrument"].bands:
+                file = next(
+                    file
+                    for file in found[observation.index]
+                    if observation.focalplane.names[0] in file.rows
+                )
+                _tell(step.label, observation, file)
+            self.data.observations.append(observation)
+        return found
+
+    def _check_new(self, part: RecordedScan, known: dict[Any, RecordedScan]) -> None:
+        """Note the used detectors of a file: start, name and direction.
+
+        Raises InputError if a file before it has one of them.
+        """
+        tod, xi, eta = part.tod, part.tod.xi.tolist(), part.tod.eta.tolist()
+        rows = np.concatenate(part.rows)
+        for row in rows[
+            (tod.detector_flags[rows] & np.uint8(self.step.detector_mask)) == 0
+        ].tolist():
+            key = str(tod.start), tod.names[row], xi[row], eta[row]
+            if (other := known.setdefault(key, part)) is not part:
+                what = (
+                    f"the detector {tod.names[row]} at the times at which {other.path.name} has it"
+                )
+                cure = "give each file once"
+                raise InputError(
+                    f"has {what}: the same data would count twice",
+                    place=f"{self.step.label}, {part.path}",
+                    cure=cure,
+                )
+
+    def _of_bands(self, scan: Scan, instrument: Instrument, most: int) -> list[_Band]:
+        """The parts of a scan for each of the camera's bands; ``most``: bands of the first scan.
+
+        Raises InputError if it is of another camera, lacks a band, or has one more.
+        """
+        place = f"{self.step.label}, {scan[0].path.name}"
+        every = [
+            _Band(part, *each)
+            for part in scan
+            for each in zip(part.cameras, part.rows, strict=True)
+        ]
+        bands = {band.camera.band.name: band for band in every}
+        for name, camera in instrument.cameras.items():
+            of = bands.get(name)
+            if (
+                of is None
+                or of.camera.name != camera.name
+                or not np.isclose(of.camera.band.centre, camera.band.centre, rtol=1e-3)
+            ):
+                what = ", ".join(
+                    f"{b.camera.name} at {b.camera.band.centre / 1e9:.4g} GHz" for b in every
+                )
+                first = f"{camera.name} at {camera.band.centre / 1e9:.4g} GHz"
+                cure = "load the files of one instrument, all bands of each scan; or choose a band"
+                raise InputError(
+                    f"was recorded with {what}, the first scan with {first}", place=place, cure=cure
+                )
+        if len(every) > most:
+            text = (
+                f"has the bands {', '.join(bands)}, the first scan {', '.join(instrument.cameras)}"
+            )
+            raise InputError(
+                text, place=place, cure="begin with a scan of all bands; or choose a band"
+            )
+        for part in scan[1:]:
+            _check_same_scan(scan[0], part, f"{self.step.label}, {part.path.name}")
+        return [bands[name] for name in instrument.cameras]
+
+    def _observation(self, bands: list[_Band]) -> Observation:
+        """A scan; where the camera has several bands, their detectors follow each other."""
+        part, scene = bands[0].part, self.data.scene
+        tod, place = part.tod, f"{self.step.label}, {part.path}"
+        start, plane = (
+            Instant.parse(tod.start),
+            joined([b.camera for b in bands], place).focalplane(),
+        )
+        if (np.diff(tod.seconds) <= 0).any():
+            row = int(np.flatnonzero(np.diff(tod.seconds) <= 0)[0]) + 1
+            raise InputError(
+                f"the times do not increase at sample {row}",
+                place=place,
+                cure="leave out the samples that repeat",
+            )
+        fwhm = tod.columns.get(
+            "fwhm", plane.fwhm
+        )  # of all bands of the file, whichever are used; these alone have been checked
+        tolerance = self.step.interpolation_error * float(fwhm[fwhm > 0].min())
+        found = boresights(tod, start, scene.site, self.step.celestial, tolerance, place)
+        good = flags.good(
+            sample_flags := tod.sample_flags(self.step.flag_mask), flags.EXCLUDE_SAMPLE
+        )
+        flagged = np.concatenate([b.part.tod.detector_flags[b.rows] for b in bands])
+        dead = np.where(
+            flagged & np.uint8(self.step.detector_mask), np.uint8(flags.INVALID), np.uint8(0)
+        )
+        observation = Observation(
+            name=self._unique(tod.name, bands),
+            index=len(self.data.observations),
+            site=scene.site,
+            instrument=bands[0].camera if len(bands) == 1 else scene.instrument,
+            focalplane=plane,
+            start=start,
+            seconds=tod.seconds,
+            sample_rate=tod.sample_rate,
+            boresight_azel=found.azel,
+            boresight_radec=found.radec,
+            centre=self._centre(tod, found.radec, good),
+            seed=scene.seed,
+            flags=sample_flags,
+            detector_flags=dead,
+            intervals=tod.scan_intervals,
+            weather=tod.weather,
+            hwp_angle=tod.hwp_angle,
+        )
+        observation.recorded_azimuth = _recorded_azimuth(self.step.label, observation, tod)
+        state_celestial(self.step.label, observation, found, tod.sample_rate)
+        return observation
+
+    def _centre(self, tod: TimeOrderedData, radec: Any, good: Any) -> tuple[float, float]:
+        """ICRS (ra, dec) [rad] of the centre of the map."""
+        target = self.step.target or self.data.scene.target
+        if target is not None and target.frame != "horizontal":
+            found: tuple[float, float] = target.icrs()
+            return found
+        if {"centre_ra", "centre_dec"} <= set(tod.metadata):
+            return float(tod.metadata["centre_ra"]), float(tod.metadata["centre_dec"])
+        return middle(radec, good)
+
+    def _unique(self, name: str, bands: list[_Band]) -> str:
+        """The scan's name, of several bands without the first band's, with a number if another scan
+        has it.
+        """
+        if len(bands) > 1:
+            name = name.removesuffix(f"-{bands[0].camera.band.name}")
+        taken, number, found = {o.name for o in self.data.observations}, 2, name
+        while found in taken:
+            found, number = f"{name}.{number}", number + 1
+        return found
+
+
+def _check_same_scan(first: RecordedScan, part: RecordedScan, place: str) -> None:
+    """Raise InputError if a file has the times of another, and other directions, site or rate."""
+    for name in ("boresight_azel", "boresight_radec"):
+        one, other = getattr(first.tod, name), getattr(part.tod, name)
+        if one.shape != other.shape or not np.allclose(one, other, rtol=0, atol=SAME_DIRECTION):
+            text = f"looks elsewhere than {first.path.name}, which has the same times ({name})"
+            raise InputError(
+                text,
+                place=place,
+                cure="load them one after the other",
+            )
+    for what, stated in (("site", _place), ("sample rate", lambda tod: (tod.sample_rate,))):
+        wanted, own = stated(first.tod), stated(part.tod)
+        if not np.allclose(wanted, own, rtol=SAME_NUMBER, atol=SAME_DIRECTION):
+            both = ", not ".join(
+                " ".join(f"{number:.9g}" for number in numbers) for numbers in (own, wanted)
+            )
+            text = f"states another {what} than {first.path.name}, which has the same times: {both}"
+            cure = "correct the one that is wrong, or choose a band"
+            raise InputError(text, place=place, cure=cure)
 
 
 def _tell(label: str, observation: Observation, file: File) -> None:
@@ -206,108 +348,9 @@ def _tell(label: str, observation: Observation, file: File) -> None:
     )
 
 
-def _of_bands(step: LoadTOD, scan: Scan, instrument: Instrument, most: int) -> list[_Band]:
-    """What a scan has of each of the camera's bands; ``most``: bands of the first scan.
-
-    Raises InputError where it is of another camera, lacks a band, or has one more.
-    """
-    place = f"{step.label}, {scan[0].path.name}"
-    every = [
-        _Band(part, *each) for part in scan for each in zip(part.cameras, part.rows, strict=True)
-    ]
-    bands = {band.camera.band.name: band for band in every}
-    for name, camera in instrument.cameras.items():
-        of = bands.get(name)
-        if (
-            of is None
-            or of.camera.name != camera.name
-            or not np.isclose(of.camera.band.centre, camera.band.centre, rtol=1e-3)
-        ):
-            what = ", ".join(
-                f"{b.camera.name} at {b.camera.band.centre / 1e9:.4g} GHz" for b in every
-            )
-            first = f"{camera.name} at {camera.band.centre / 1e9:.4g} GHz"
-            cure = "load the files of one instrument, all bands of each scan; or choose a band"
-            raise InputError(
-                f"was recorded with {what}, the first scan with {first}", place=place, cure=cure
-            )
-    if len(every) > most:
-        text = f"has the bands {', '.join(bands)}, the first scan {', '.join(instrument.cameras)}"
-        raise InputError(text, place=place, cure="begin with a scan of all bands; or choose a band")
-    for part in scan[1:]:
-        for name in ("boresight_azel", "boresight_radec"):
-            one, other = getattr(scan[0].tod, name), getattr(part.tod, name)
-            if one.shape != other.shape or not np.allclose(one, other, rtol=0, atol=SAME_DIRECTION):
-                text = (
-                    f"looks elsewhere than {scan[0].path.name}, which has the same times ({name})"
-                )
-                raise InputError(
-                    text,
-                    place=f"{step.label}, {part.path.name}",
-                    cure="load them one after the other",
-                )
-        for what, stated in (("site", _place), ("sample rate", lambda tod: (tod.sample_rate,))):
-            wanted, own = stated(scan[0].tod), stated(part.tod)
-            if not np.allclose(wanted, own, rtol=SAME_NUMBER, atol=SAME_DIRECTION):
-                both = ", not ".join(
-                    " ".join(f"{number:.9g}" for number in numbers) for numbers in (own, wanted)
-                )
-                text = (
-                    f"states another {what} than {scan[0].path.name}, which has the same times:"
-                    f" {both}"
-                )
-                cure = "correct the one that is wrong, or choose a band"
-                raise InputError(text, place=f"{step.label}, {part.path.name}", cure=cure)
-    return [bands[name] for name in instrument.cameras]
-
-
 def _place(tod: TimeOrderedData) -> tuple[float, float, float]:
     """Latitude and longitude [deg], height [m]."""
     return float(np.degrees(tod.site[1])), float(np.degrees(tod.site[2])), tod.site[3]
-
-
-def _observation(step: LoadTOD, data: Data, bands: list[_Band]) -> Observation:
-    """A scan; where the camera has several bands, their detectors follow each other."""
-    part, scene = bands[0].part, data.scene
-    tod, place = part.tod, f"{step.label}, {part.path}"
-    start, plane = Instant.parse(tod.start), joined([b.camera for b in bands], place).focalplane()
-    if (np.diff(tod.seconds) <= 0).any():
-        row = int(np.flatnonzero(np.diff(tod.seconds) <= 0)[0]) + 1
-        raise InputError(
-            f"the times do not increase at sample {row}",
-            place=place,
-            cure="leave out the samples that repeat",
-        )
-    fwhm = tod.columns.get(
-        "fwhm", plane.fwhm
-    )  # of all bands of the file, whichever are used; these alone have been checked
-    tolerance = step.interpolation_error * float(fwhm[fwhm > 0].min())
-    found = boresights(tod, start, scene.site, step.celestial, tolerance, place)
-    good = flags.good(sample_flags := tod.sample_flags(step.flag_mask), flags.EXCLUDE_SAMPLE)
-    flagged = np.concatenate([b.part.tod.detector_flags[b.rows] for b in bands])
-    dead = np.where(flagged & np.uint8(step.detector_mask), np.uint8(flags.INVALID), np.uint8(0))
-    observation = Observation(
-        name=_unique(tod.name, bands, data),
-        index=len(data.observations),
-        site=scene.site,
-        instrument=bands[0].camera if len(bands) == 1 else scene.instrument,
-        focalplane=plane,
-        start=start,
-        seconds=tod.seconds,
-        sample_rate=tod.sample_rate,
-        boresight_azel=found.azel,
-        boresight_radec=found.radec,
-        centre=_centre(step, tod, scene, found.radec, good),
-        seed=scene.seed,
-        flags=sample_flags,
-        detector_flags=dead,
-        intervals=tod.scan_intervals,
-        weather=tod.weather,
-        hwp_angle=tod.hwp_angle,
-    )
-    observation.recorded_azimuth = _recorded_azimuth(step.label, observation, tod)
-    state_celestial(step.label, observation, found, tod.sample_rate)
-    return observation
 
 
 def _recorded_azimuth(label: str, observation: Observation, tod: TimeOrderedData) -> Floats | None:
@@ -323,29 +366,6 @@ def _recorded_azimuth(label: str, observation: Observation, tod: TimeOrderedData
         observation.tally.state(label, what, f"{np.degrees(away[known].max()):.3g} deg away")
         return None
     return np.where(known, tod.azimuth, own)
-
-
-def _centre(
-    step: LoadTOD, tod: TimeOrderedData, scene: Any, radec: Any, good: Any
-) -> tuple[float, float]:
-    """ICRS (ra, dec) [rad] of the centre of the map."""
-    target = step.target or scene.target
-    if target is not None and target.frame != "horizontal":
-        found: tuple[float, float] = target.icrs()
-        return found
-    if {"centre_ra", "centre_dec"} <= set(tod.metadata):
-        return float(tod.metadata["centre_ra"]), float(tod.metadata["centre_dec"])
-    return middle(radec, good)
-
-
-def _unique(name: str, bands: list[_Band], data: Data) -> str:
-    """The scan's name, of several bands without that of the first, and as no other scan has it."""
-    if len(bands) > 1:
-        name = name.removesuffix(f"-{bands[0].camera.band.name}")
-    taken, number, found = {o.name for o in data.observations}, 2, name
-    while found in taken:
-        found, number = f"{name}.{number}", number + 1
-    return found
 
 
 def _summary(o: Observation) -> str:
