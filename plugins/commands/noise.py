@@ -52,7 +52,7 @@ def noise(
     from zonda import __version__
     from zonda.core.configuration.units import Unit
     from zonda.core.errors import InputError
-    from zonda.operators.io.noise_of_file import noise_of, write_noise
+    from zonda.operators.io.noise_table import noise_of, write_noise
     from zonda.operators.noise.estimate import fit, segment_length, spectrum
 
     seconds = (
