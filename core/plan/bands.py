@@ -37,7 +37,7 @@ class PlanOfBands:
 
     @cached_property
     def summary(self) -> PlanSummary:
-        """The parts of the plans that a run takes."""
+        """Summary for a run of all bands."""
         return combined({name: made.summary for name, made in self.plans.items()}, self.timing)
 
     def apply(self, file: PipelineFile) -> PipelineFile:
@@ -120,7 +120,7 @@ def for_run(
     threads: int | None = None,
     memory: int | None = None,
 ) -> PlanSummary:
-    """What a run simulates: a plan from `PLANNED_FROM` samples on, or where one is asked for by
+    """Summary for a run: a plan from `PLANNED_FROM` samples on, or where one is asked for by
     ``prune_all`` (True), ``keep`` or ``drop``; else what the outputs depend on, in full; everything
     if ``prune_all`` is False. Errors are those of `plan`.
     """
@@ -137,8 +137,8 @@ def for_run(
 
 
 def files_of_bands(file: PipelineFile) -> dict[str, PipelineFile]:
-    """By name of the band, the file with a camera that has this band alone; empty where the camera
-    has one band.
+    """The file with a camera that has one band alone, by name of the band; empty if the camera has
+    one band.
     """
     scene = file.scene()
     return {

@@ -1,4 +1,4 @@
-"""How much error a user allows: a share of the noise, or limits in the products' units."""
+"""The error that a user allows: a share of the noise, or limits in the products' units."""
 
 from __future__ import annotations
 

@@ -33,12 +33,12 @@ LEAKS = 1.5
 
 @dataclass(frozen=True)
 class Coverage:
-    """How the scans cover the map.
+    """Coverage of the map by the scans.
 
     Attributes
     ----------
     hits
-        Samples per pixel in the deep part of the map (quantile `coverage.DEEP`).
+        Samples per pixel in the deep part of the map (quantile `pointing.DEEP`).
     pixel
         Side of a pixel, rad.
     speed

@@ -76,7 +76,7 @@ class Choice:
 
     @property
     def pays(self) -> bool:
-        """Whether the form saves time in this scene."""
+        """True if the form saves time in this scene."""
         return self.saves is not None or self.seconds > 0
 
 

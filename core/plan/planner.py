@@ -105,8 +105,8 @@ def _check_arguments(file: Any, wishes: Wishes) -> None:
 def _effects(
     file: PipelineFile, structure: Structure, context: Context, drop: Sequence[str]
 ) -> tuple[list[Decided], Context]:
-    """All effects, those of an operator that is dropped altogether as one; and the context without
-    such operators.
+    """Effects of all operators, those of one that is dropped altogether as one; and the context
+    without such operators.
     """
     estimates = {o.label: planning_of(o).estimate(context) for o in context.operators}
     pipeline = file.pipeline()
@@ -174,7 +174,7 @@ def _without(
 def _everything_of(
     label: str, estimates: Mapping[str, Estimate], context: Context, left: Context
 ) -> Effect:
-    """All effects of an operator as one, that is there or not: their sizes, and the part of other
+    """The effects of an operator as one, that is there or not: their sizes, and the part of other
     operators (noise whose level depends on the load) at another level without it. ``left``: without
     the operator."""
     bound = _contributes(label, estimates[label], context)

@@ -25,7 +25,7 @@ Row = tuple[str, str, str, str]
 
 @dataclass(frozen=True)
 class PlanSummary:
-    """What a run takes from a plan, or from the structure of a scene that is not planned.
+    """Summary of a plan, or of the structure of a scene that is not planned, for a run.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class Plan:
 
     @property
     def summary(self) -> PlanSummary:
-        """What a run takes from it."""
+        """Summary for a run."""
         return PlanSummary(self.operators, self.structure.runs, self.settings(), self.short(),
                            self.memory, foreseen(self.memory, self.timing))  # fmt: skip
 
