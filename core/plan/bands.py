@@ -8,12 +8,14 @@ says so.
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 from ..configuration.pipeline_file import PipelineFile
+from ..errors import ZondaError
 from ..run.budget import BASE
 from .planner import Wishes, plan_band
 from .pointing import samples_of
@@ -103,12 +105,22 @@ def plan(
         one = plan_band(file, wishes)
         if not measure:
             return one
-        return dataclasses.replace(one, timing=timed(one.apply(file), one.context.observations))
+        return dataclasses.replace(one, timing=_measured(one.apply(file), [one]))
     bands = PlanOfBands({name: plan_band(file, wishes, name) for name in names})
     if not measure:
         return bands
-    every = [o for made in bands.plans.values() for o in made.context.observations]
-    return dataclasses.replace(bands, timing=timed(bands.apply(file), every))
+    found = _measured(bands.apply(file), list(bands.plans.values()))
+    return dataclasses.replace(bands, timing=found)
+
+
+def _measured(file: PipelineFile, plans: Sequence[Plan]) -> Timing | None:
+    """CPU time of a planned pipeline; None, with a warning, if a slice of it cannot be run."""
+    try:
+        return timed(file, [o for made in plans for o in made.context.observations])
+    except ZondaError as err:
+        text = f"no time is predicted, since a slice of the pipeline does not run: {err.message}"
+        warnings.warn(text, stacklevel=3)
+        return None
 
 
 def for_run(

@@ -61,8 +61,8 @@ def samples_of(pipeline: Pipeline, scene: Scene) -> int:
 
 
 def observed(operators: Sequence[Operator], scene: Scene, band: str = "") -> Data:
-    """Observations of the operators; of a camera of several bands this ``band``, its detectors where
-    they are in the whole camera.
+    """Observations of the operators; of a camera of several bands those of this ``band``, its
+    detectors where they are in the whole camera.
     """
     data = Data(scene=scene)
     if band:
