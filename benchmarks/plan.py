@@ -81,7 +81,7 @@ def difference(one, other):
             deep = hits >= np.quantile(hits[hits > 0], 0.5)
             delta, noise = (a[0].data - b[0].data)[..., deep], a["NOISE"].data[..., deep]
             found.append(float(np.sqrt(np.nanmean(delta**2) / np.nanmean(noise**2))))
-    return f"{max(found):.1g}" if found else "no map"
+    return f"{max(found):.1g}" if found else "-"
 
 
 def row(scene, repeat):
@@ -98,7 +98,7 @@ def row(scene, repeat):
     left_out = made.summary.omitted(file)
     coarse, dropped = [], [f"`{name}` (structure)" for name in left_out]
     for d in plans[0].decided:
-        if d.chosen and all(applied.get(d.operator, {}).get(k) for k in d.choice.settings):
+        if d.chosen and d.choice.settings.keys() <= applied.get(d.operator, {}).keys():
             (dropped if d.choice.decision == "dropped" else coarse).append(
                 f"{d.effect.name}: {d.choice.what}"
             )
