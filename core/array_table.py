@@ -61,7 +61,7 @@ FARTHEST = math.tan(0.5)
 `Instrument`.
 """
 DEAD = {"true": 1, "yes": 1, "1": 1, "false": 0, "no": 0, "0": 0, "": 0}
-"""What stands in the column `dead`."""
+"""Values of the column `dead`."""
 ALIASES = {
     **dict.fromkeys(
         ("gamma", "pol_angle", "pol_ang", "polangle", "psi_pol", "polarization"),
@@ -74,7 +74,7 @@ ALIASES = {
     "beam_fwhm": "fwhm",
     **dict.fromkeys(("det", "detector", "det_id", "det_name", "detector_name"), "name"),
 }
-"""What sotodlib, so3g and TOAST call columns: their gamma runs from eta towards xi, as
+"""Names of columns in sotodlib, so3g and TOAST: their gamma runs from eta towards xi, as
 `Focalplane.polarization_angle` does.
 """
 LEAKAGE = "pol_leakage"
@@ -143,7 +143,7 @@ class ArrayTable:
         return float(np.hypot(self.columns["xi"], self.columns["eta"]).max())
 
     def rows(self, band: str) -> NDArray[np.intp]:
-        """Those of a band; all where the table has no column for it."""
+        """Rows of a band; all rows if the table has no column for it."""
         if not self.bands:
             return np.arange(len(self.names))
         return np.flatnonzero(np.array(self.bands) == band)
@@ -330,7 +330,7 @@ def _add_efficiency(table: Table, columns: dict[str, NDArray[Any]], mistakes: Mi
 
 
 def _check_columns(table: Table, mistakes: Mistakes) -> None:
-    """Those that a table must have are there, and none is misspelt."""
+    """Check that the required columns are there and none is misspelt."""
     known = (*TEXTS, *QUANTITIES, LEAKAGE)
     misspelt = {
         c: hint
@@ -348,7 +348,7 @@ def _check_columns(table: Table, mistakes: Mistakes) -> None:
 
 
 def _check_limits(table: Table, key: str, mistakes: Mistakes) -> None:
-    """Those of a pure number, and zero, hold in every unit."""
+    """Check the limits of a column: those of a pure number, and zero, hold in every unit."""
     values = table.values(key)
     low = -np.inf if key in SIGNED else 0.0
     limits = "more than 0" if key in POSITIVE else "0 or more"
@@ -387,8 +387,8 @@ def _dead(table: Table, mistakes: Mistakes) -> NDArray[np.int64]:
 
 
 def stated_by(table: ArrayTable, band: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """What a table says of the detectors of a band and ``stated`` lacks, as configuration: their
-    number, and medians of columns.
+    """Configuration of a band from the table, for keys that ``stated`` lacks: number of detectors,
+    and medians of columns.
 
     Of all detectors where the table has none of this band, which `ArrayTable.check` refuses.
     """

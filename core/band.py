@@ -35,7 +35,7 @@ class Band(Parameters):
     file: InputPath | None = None
     """Table of two columns, frequency in GHz and transmission (any scale); `#` begins a comment."""
     provenance: str = ""
-    """Where these numbers come from."""
+    """Source of these numbers."""
 
     _table: tuple[NDArray[np.float64], NDArray[np.float64]] = PrivateAttr()
 
@@ -206,4 +206,4 @@ PASSBAND = {"low", "high", "file"}
 """Keys of a passband."""
 
 PER_BAND = tuple(key for key in CameraBand.model_fields if key not in Band.model_fields)
-"""What bands of a camera may differ in, by the instrument's names."""
+"""Keys in which bands of a camera may differ, by the instrument's names."""

@@ -55,14 +55,14 @@ class Block:
     buffers: dict[str, AnyFloats] = field(default_factory=dict, repr=False)
     """Memory reused from block to block; `exec` must not keep a stream beyond the call."""
     places: dict[str, AnyFloats] = field(default_factory=dict, repr=False)
-    """Where the executor wants a stream to be made, so that it need not be copied there."""
+    """Array in which the executor wants a stream to be made, so that it need not be copied."""
     again: bool = False
     """These samples were worked on before, and are made again because the streams do not fit in
     memory: an operator makes the same bits and counts nothing (what it tells ``observation.tally``
     is thrown away)."""
 
     components: frozenset[Component] = frozenset()
-    """What ``signal`` is the sum of."""
+    """Components whose sum is ``signal``."""
     suffix: str = ""
     """Tells the buffers of one signal from those of the others."""
 

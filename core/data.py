@@ -1,4 +1,4 @@
-"""What flows: the scene, its observations, the blocks that operators work on, and the products."""
+"""Data of a run: the scene, its observations, the blocks of operators, and the products."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Data:
     band.
     """
     partial: dict[str, Product] = field(default_factory=dict)
-    """What steps have added up so far, by label."""
+    """Partial products that steps have added up so far, by label."""
     layouts: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     """By label: what all observations have in common (the grid of a map), as plain values and
     arrays; ``fixed: True`` says that further observations cannot change it. `Operator.observe`
@@ -138,7 +138,7 @@ class Data:
         return product_of(self.products, name)
 
     def __contains__(self, name: object) -> bool:
-        """Whether there is a product of this name."""
+        """True if there is a product of this name."""
         return name in self.products
 
     def __iter__(self) -> Iterator[str]:

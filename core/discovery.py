@@ -22,13 +22,14 @@ refused.
 REMOVED = {
     "zonda.ground_weather": "weather comes from zonda.weather_sources",
     "zonda.kernels": "kernels are compiled at their first use, or by `zonda compile`",
+    "zonda.processes": "pictures are drawn in the run's own process",
     "zonda.products": "the class of a product is found in the module of the operator that makes it",
     "zonda.sections": "keys of pipeline files are zonda's own",
 }
 """Entry-point groups of earlier versions, and what replaces them."""
 
 RAISED = (Exception, SystemExit, GeneratorExit)
-"""What a plugin may raise where it is imported or called; Ctrl-C is the user's."""
+"""Exceptions that a plugin may raise when it is imported or called; Ctrl-C is the user's."""
 
 
 class PluginWarning(UserWarning):

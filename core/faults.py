@@ -112,7 +112,7 @@ def _step(frame: FrameType) -> Operator | None:
 
 
 def _is_plugin(frame: FrameType) -> bool:
-    """Whether this is code of a plugin, or of a step that is not zonda's own."""
+    """True for code of a plugin, or of a step that is not zonda's own."""
     owner = _step(frame)
     foreign = owner is not None and type(owner).__module__.partition(".")[0] != HOST
     return foreign or bool(plugin_of(str(frame.f_globals.get("__name__", ""))))

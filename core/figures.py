@@ -100,7 +100,7 @@ class FigureMetric(Metric, Parameters):
         raise NotImplementedError
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
-        """What was measured, in a sentence."""
+        """Description of the measurement, in a sentence."""
         return (type(self).__doc__ or "").split("\n\n")[0].strip().rstrip(".")
 
     # ---- as a metric of `zonda accuracy`
@@ -120,7 +120,7 @@ class FigureMetric(Metric, Parameters):
             )
 
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
-        """Those of `needs` that the pipeline does not have."""
+        """Names in `needs` that the pipeline does not have."""
         return {
             f"for_figure_{k}": signal
             for k, signal in enumerate(self.needs())
@@ -294,7 +294,9 @@ class Figures:
         return len(self._known)
 
     def __getitem__(self, name: str) -> Figure:
-        """By name, however its parameters are ordered. Raises KeyError where there is none."""
+        """Find a figure by name, however its parameters are ordered. Raises KeyError if there is
+        none.
+        """
         with suppress(ValueError):  # what is no metric any more has the name that it was given
             name = name if name in self._known else Choice.parse(name).name
         if name not in self._known:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 Flags = NDArray[np.uint8]
 
 INVALID, PROCESSING = 1, 2
-"""Of samples and of detectors, as a file or TOAST has them."""
+"""Flag of samples and detectors that a file or TOAST has set."""
 TURNAROUND, IRREGULAR, SUN_UP, SUN_CLOSE = 4, 8, 16, 32
 """Of samples."""
 SOLAR_SYSTEM_OBJECT = 4
@@ -107,7 +107,7 @@ TRIMMED_INTERVALS = "zonda_trimmed"
 
 
 def good(flags: Flags, exclude: int) -> NDArray[np.bool_]:
-    """Where none of the bits ``exclude`` is set."""
+    """Mask of elements with none of the bits ``exclude``."""
     return np.asarray((flags & np.uint8(exclude)) == 0, np.bool_)
 
 

@@ -147,7 +147,7 @@ class Focalplane:
 
     @property
     def polarized(self) -> bool:
-        """Whether a detector is polarized."""
+        """Mask of polarized detectors."""
         return bool((self.polarization_efficiency > 0).any())
 
     @property

@@ -37,9 +37,7 @@ class FunctionOperator(Operator):
 
     _call: Any = PrivateAttr(None)
     _idle: bool | None = PrivateAttr(None)
-    """Whether it left all that it provides as it was, in every call so far; None: it was not
-    called.
-    """
+    """True if every call so far left all that it provides as it was; None before the first call."""
 
     def measure(self, stream: Stream, model: Any = None) -> Changed | None:
         """``couples = "all"``: call the function with a block that is the whole scan. Each signal

@@ -38,7 +38,7 @@ hookimpl = pluggy.HookimplMarker("zonda")
 
 
 class Steps(Protocol):
-    """What a hook is shown of the `zonda.Pipeline` that runs."""
+    """View of the running `zonda.Pipeline` for hooks."""
 
     name: str
     operators: list[Operator]

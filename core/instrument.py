@@ -60,7 +60,7 @@ STAND_INS: dict[str, Any] = {
     "main_beam_efficiency": 1.0,
     "illumination_efficiency": 1.0,
 }
-"""Of what an instrument must state, where bands or a table state it and are mistaken: only their
+"""Keys that bands or a table may state in the instrument's place: if these are mistaken, only their
 mistakes are told.
 """
 

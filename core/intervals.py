@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .types import AnyFloats
 
 Intervals = dict[str, list[tuple[float, float]]]
-"""By name: (start, stop) [s], in order and disjoint."""
+"""Intervals by name: (start, stop) [s], in order and disjoint."""
 
 
 def runs(inside: NDArray[np.bool_], seconds: AnyFloats) -> list[tuple[float, float]]:
@@ -46,8 +46,8 @@ def samples_in(spans: list[tuple[float, float]], seconds: AnyFloats) -> NDArray[
 
 
 def part(intervals: Mapping[str, list[tuple[float, float]]], begin: float, end: float) -> Intervals:
-    """What lies between ``begin`` and ``end`` [s], counted from ``begin``; names of which nothing
-    does are kept.
+    """Parts of intervals between ``begin`` and ``end`` [s], counted from ``begin``; names without
+    any part are kept.
     """
     return {
         name: [

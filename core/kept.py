@@ -1,4 +1,4 @@
-"""What a run left, found by name: products, scans and the streams that were kept."""
+"""Access to products and kept streams by name."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .types import Floats
 
 GAP = 0.03
-"""Of wafers: distance between their edges, beyond one pitch, in units of the distance between their
+"""Distance between the edges of wafers, beyond one pitch, in units of the distance between their
 centres.
 """
 

@@ -35,7 +35,7 @@ class WhiteLevel(Protocol):
 
     @property
     def follows_load(self) -> bool:
-        """Whether it depends on the mean emission or transmission of the atmosphere."""
+        """True if it depends on the mean emission or transmission of the atmosphere."""
 
     def sky_net(self, observation: Observation) -> NDArray[np.float64]:
         """(n_det,) K_RJ sqrt(s) on the sky, once every step is configured."""
@@ -291,16 +291,16 @@ class Observation:
         return stream_key(self.seed, "observation", self.index, *names)
 
     def detector_key(self, *names: str | int) -> NDArray[np.uint32]:
-        """As `key`, for what belongs to the detectors: noise, gains. Another instrument or another
-        band has numbers of its own.
+        """Key of random numbers that belong to the detectors, such as noise and gains. Another
+        instrument or another band has numbers of its own.
 
         The atmosphere is keyed without them: all bands of one seed look through the same.
         """
         return self.key(*self.instrument.identity, *names)
 
     def camera_key(self, *names: str | int) -> NDArray[np.uint32]:
-        """As `detector_key`, for what stays as it is from scan to scan: time constants,
-        sidelobes.
+        """Key of random numbers of detectors that stay from scan to scan, such as time constants
+        and sidelobes.
         """
         return stream_key(self.seed, "camera", *self.instrument.identity, *names)
 
@@ -346,8 +346,8 @@ class Observation:
 
     @property
     def mean_emission(self) -> dict[str, float]:
-        """Of the atmosphere, K_RJ: ``atmosphere`` as it is, ``scan`` calibrated (`core.emission`);
-        empty where there is none.
+        """Mean emission of the atmosphere, K_RJ: ``atmosphere`` as it is, ``scan`` calibrated
+        (`core.emission`); empty if there is none.
         """
         return mean_emission(self.smooth, self.focalplane, self.good_detectors, self.n_samples)
 

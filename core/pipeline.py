@@ -65,7 +65,7 @@ class Part:
 
 
 Bands = list[tuple["Pipeline", Data]]
-"""What observes with each band of the camera: the steps, and the band's data."""
+"""Steps and data that observe with each band of the camera."""
 
 
 class Pipeline:

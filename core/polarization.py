@@ -1,5 +1,5 @@
-"""How detectors see linear polarization: angles on the sky, and turning Q and U from one meridian
-to another.
+"""Linear polarization as detectors see it: angles on the sky, and rotation of Q and U from one
+meridian to another.
 
 Angles are COSMO's (from south to east, the same as from north to west): Q + i U = P exp(2 i psi). A
 detector of polarization efficiency p sees

@@ -24,7 +24,7 @@ class Product(ABC):
 
     zonda_api: ClassVar[int] = API_VERSION
     kinds: ClassVar[dict[str, type[Product]]] = {}
-    """All classes of products that are imported, by `identity`."""
+    """Imported classes of products, by `identity`."""
 
     signals: tuple[str, ...] = ()
     """Streams of the signals that it holds (`core.signal`), the complete one first; empty: it is of

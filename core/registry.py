@@ -42,7 +42,7 @@ weather_sources = Registry(
 )
 
 planning = Registry("planning", "zonda.planning", classes=True, exact=True)
-"""By the name of the operator's class: its `core.plan.planning.Planning`."""
+"""Planning classes (`core.plan.planning.Planning`) by the name of the operator's class."""
 
 
 def _hint_for_site(name: str) -> tuple[str, str]:

@@ -27,7 +27,7 @@ class Site(Parameters):
     one (docs/weather.md).
     """
     provenance: str = ""
-    """Where these numbers come from."""
+    """Source of these numbers."""
 
     def _as_argument(self) -> str:
         return named_or_written(self, sites)

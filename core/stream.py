@@ -43,13 +43,13 @@ class Stream:
     threads: int
     room: int = 0
     signal: str = MAIN
-    """Which signal it is, where it is one: ``signal/noiseless``. Its ``name`` is ``signal`` for the
-    step that measures it.
+    """Name of the signal that it is, if it is one: ``signal/noiseless``. Its ``name`` is ``signal``
+    for the step that measures it.
     """
     components: frozenset[Component] = frozenset()
-    """What the signal is the sum of."""
+    """Components whose sum is the signal."""
     state: Any = None
-    """What `Operator.prepare` of the step that measures it returned."""
+    """Result of `Operator.prepare` of the step that measures it."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -88,7 +88,7 @@ class Stream:
 
 
 SWEEP_DETECTORS, SWEEP_SAMPLES = 4 * TILE_DETECTORS, 32 * TILE_SAMPLES
-"""What is read at a time of a stream that is kept."""
+"""Detectors and samples that are read at a time of a kept stream."""
 
 
 def in_order(

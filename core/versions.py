@@ -1,5 +1,5 @@
-"""What results depend on besides the pipeline: this program, down to its files, libraries and
-instruction sets of the CPU.
+"""Versions on which results depend besides the pipeline: this program, down to its files, libraries
+and instruction sets of the CPU.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def versions() -> dict[str, str]:
 
 
 def arithmetic() -> dict[str, str]:
-    """What bits depend on besides the pipeline: libraries, the C library's functions, and the
-    instructions that each may use.
+    """Everything on which bits depend besides the pipeline: libraries, the C library's functions,
+    and the instructions that each may use.
 
     ``cpu`` and ``instructions`` are those that numba compiles for, ``numpy instructions`` those
     that numpy chooses among; ``processor`` is its name. Where all of it is the same, bits are.
@@ -101,7 +101,7 @@ def fingerprint() -> str:
 
 
 def folders() -> Iterator[str]:
-    """Where zonda's own modules are."""
+    """Folders of zonda's own modules."""
     for package in ("core", "operators", "plugins"):
         spec = find_spec(f"{HOST}.{package}")
         yield from spec.submodule_search_locations or () if spec else ()

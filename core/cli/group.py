@@ -43,7 +43,7 @@ class Commands(click.Group):
     _extended = False
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """All names."""
+        """Names of all commands."""
         self._extend()
         return sorted(self.commands)
 
@@ -58,8 +58,8 @@ class Commands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click's, but an unknown command names the nearest one, and a pipeline file the command
-        to use.
+        """Find a command as click does; an unknown command names the nearest one, and a pipeline
+        file the command to use.
         """
         name = args[0]
         if self.get_command(ctx, name) is None and not name.startswith("-"):

@@ -1,4 +1,4 @@
-"""What ``zonda run`` was asked for."""
+"""Arguments of ``zonda run``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class RunRequest:
 
     @property
     def is_campaign(self) -> bool:
-        """Whether this is a campaign, whatever the file says."""
+        """True if the arguments make a campaign, whatever the file says."""
         return bool(
             len(self.pipelines) > 1 or self.engine or self.workers or self.scheduler or self.share
         )

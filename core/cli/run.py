@@ -214,7 +214,7 @@ def _knobs(file: PipelineFile, wanted: Accuracy) -> tuple[str, ...]:
 
 
 def _show(data: Data, verbose: bool) -> None:
-    """What was lost, or with ``verbose`` all that was counted, chosen and approximated."""
+    """Print what was lost; with ``verbose`` all that was counted, chosen and approximated."""
     counts = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
     lost = {(who, what) for who, what in counts if what != "samples binned"}
     for who, what, value in data.tally.told():

@@ -1,4 +1,4 @@
-"""What a class of parameters takes, in words: for `help()`, signatures and docs/operators.md."""
+"""Descriptions of parameters in words, for `help()`, signatures and docs/operators.md."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def choices(field: FieldInfo) -> tuple[Any, ...]:
 
 
 def kind(field: FieldInfo) -> str:
-    """What a parameter takes: a kind of quantity with an example, its choices, or a type in
+    """Values that a parameter takes: a kind of quantity with an example, its choices, or a type in
     words.
     """
     kinds = members(field)

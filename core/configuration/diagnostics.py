@@ -1,4 +1,4 @@
-"""What is wrong, where, and what would mend it: printed with the source line and a caret."""
+"""Diagnostics: cause, place and cure of mistakes, printed with the source line and a caret."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WIDTH = 140
 """Longer source lines are cut around the caret."""
 
 _CONTROL = dict.fromkeys([*range(9), *range(10, 32), 127], "\N{REPLACEMENT CHARACTER}")
-"""What a terminal would obey is shown as a sign of its own."""
+"""Control characters, which a terminal would obey, and the signs that stand for them."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class ConfigurationError(ZondaError):
         return type(self), (self.diagnostics, self.place)
 
     def render(self, colour: bool = False) -> str:
-        """All diagnostics and their number."""
+        """Text of all diagnostics, with their number."""
         return "\n".join([*(d.render(colour) for d in self.diagnostics), self.message])
 
     def __str__(self) -> str:

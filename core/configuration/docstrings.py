@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 _places: dict[type, tuple[str, int, dict[str, Any]]] = {}
-"""Where the class statements stand: file, line, globals of the module."""
+"""Places of class statements: file, line, globals of the module."""
 _documented: dict[type, dict[str, str]] = {}
 
 
@@ -58,8 +58,8 @@ def described(model: type[BaseModel]) -> dict[str, FieldInfo]:
 
 
 def source_is_known(model: type) -> bool:
-    """Whether the source of the class and of its bases can be read; not that of what was typed at
-    the prompt of `python`.
+    """True if the source of the class and of its bases can be read, which is not so for what was
+    typed at the prompt of `python`.
     """
     places = [_places[cls] for cls in model.__mro__ if cls in _places]
     return all(linecache.getlines(file, module) for file, _, module in places)
@@ -76,7 +76,7 @@ def _docstrings(cls: type) -> dict[str, str]:
 
 
 def _of_class(lines: list[str], name: str) -> dict[str, str]:
-    """As `_docstrings`, from lines that begin with the class statement or its decorators."""
+    """Docstrings of fields, from lines that begin with the class statement or its decorators."""
     try:
         statement = ast.parse(textwrap.dedent("".join(inspect.getblock(lines)))).body[0]
     except (

@@ -33,7 +33,7 @@ _WANTED = {
     "model": "a mapping of keys",
     "path": "the path of a file or folder",
 }
-"""What pydantic's errors of type (or parsing) want, by the first word of their kind."""
+"""Expected values for pydantic's errors of type or parsing, by the first word of their kind."""
 SYNONYMS = {
     **dict.fromkeys(("steps", "pipeline", "ops"), "operators"),
     **dict.fromkeys(("camera", "telescope", "receiver"), "instrument"),
@@ -126,7 +126,7 @@ def _missing(diagnostic: Diagnostic) -> str:
 
 @dataclass(frozen=True)
 class _Validated:
-    """What was validated, and where it stands: the arguments of `explain`."""
+    """A validated value and its place: the arguments of `explain`."""
 
     model: type[BaseModel]
     document: Document
@@ -154,7 +154,7 @@ class _Validated:
         return self.value(e, path, loc)
 
     def name(self, loc: list[Any]) -> str:
-        """How messages call what is at ``loc``."""
+        """Name of the item at ``loc`` in messages."""
         return f"{self.who}, {'.'.join(map(str, loc))}" if loc else self.who
 
     def unknown(self, key: Any, loc: list[Any], span: Span) -> Diagnostic:
@@ -247,7 +247,7 @@ class _Validated:
 
 
 def glued(key: object, options: Iterable[str]) -> str:
-    """What to write where a key and its value are one text: {pixel:2 arcsec}."""
+    """Cure for a key and value that were written as one text: {pixel:2 arcsec}."""
     name, colon, value = str(key).partition(":")
     return f"write a space after the colon: {name}: {value}" if colon and name in options else ""
 

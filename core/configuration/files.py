@@ -26,7 +26,7 @@ def find(value: Any, info: ValidationInfo) -> Path:
 
 
 def find_in(folder: str | Path | None, value: Any) -> Path:
-    """As `find`, beside ``folder``."""
+    """Find a file beside ``folder``; see `find`."""
     if not isinstance(value, str | Path) or not str(value).strip():
         raise mistake(f"expected the path of a file, got {value!r:.60}")
     path = Path(value)

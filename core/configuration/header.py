@@ -15,7 +15,7 @@ from .units import Fraction
 
 
 class Accuracy(Parameters):
-    """What the knobs are chosen for."""
+    """Metric for which the knobs are chosen."""
 
     target: Fraction = Field(gt=0, le=1)
     """Largest error of the metric."""

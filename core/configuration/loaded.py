@@ -1,4 +1,4 @@
-"""What a pipeline file says, once it is checked."""
+"""A pipeline file after it was checked."""
 
 from __future__ import annotations
 
@@ -79,11 +79,11 @@ class PipelineFile:
         return self.header.outputs
 
     def scene(self) -> Scene:
-        """What exists: site, instrument, time, target, seed."""
+        """Scene of the file: site, instrument, time, target, seed."""
         return self._scene
 
     def pipeline(self) -> Pipeline:
-        """What is done: a new `Pipeline` of the operators."""
+        """New `Pipeline` of the operators."""
         header = self.header
         return Pipeline(
             self.operators,
@@ -101,8 +101,8 @@ class PipelineFile:
         scene: Scene | None = None,
         say: Callable[[str], None] | None = None,
     ) -> list[list[str]]:
-        """As `first_look`; raises `ConfigurationError` with all mistakes of the steps, each at its
-        place in the file.
+        """Let each step check itself, as `first_look` does. Raises `ConfigurationError` with all
+        mistakes of the steps, each at its place in the file.
 
         ``say`` is told each step before it is looked at.
         """
@@ -186,7 +186,7 @@ def _from_there(value: Any, folder: str) -> Any:
 
 
 def _filled(operator: Operator) -> dict[str, Any]:
-    """All parameters of an operator, but for those that do not apply beside the others.
+    """Parameters of an operator, without those that do not apply beside the others.
 
     Left out are parameters that are absent (None) by default and in fact, and defaults that the
     operator refuses when they are written down (e.g. the ordering of HEALPix pixels for a map that

@@ -1,4 +1,6 @@
-"""Where pipeline files are: a path, or the name of a shipped pipeline. Imports nothing heavy."""
+"""Paths of pipeline files, given by path or by the name of a shipped pipeline. Imports nothing
+heavy.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +99,7 @@ def read(path: Path) -> str:
 
 SHIPPED = "`zonda pipelines` lists those that have names"
 _DATA = (b"SIMPLE  =", b"\x89HDF", b"\x1f\x8b", b"\xff\xfe", b"\xfe\xff")
-"""How files of data, compressed files and UTF-16 text begin."""
+"""First bytes of data files, compressed files and UTF-16 text."""
 
 
 def _check_kind(path: Path, content: bytes) -> None:

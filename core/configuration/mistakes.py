@@ -41,8 +41,8 @@ class Mistakes:
     def validate(
         self, model: type[P], value: Any, at: Place, who: str, keys: Iterable[str] = ()
     ) -> P | None:
-        """What ``value`` at ``at`` describes; None where it is mistaken. ``who`` and ``keys`` as
-        `explain` takes them.
+        """Validated ``value`` at ``at``, or None if it is mistaken. ``who`` and ``keys`` are those
+        of `explain`.
         """
         try:
             return model.model_validate(value, context=self.context)

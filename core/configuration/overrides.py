@@ -37,7 +37,7 @@ def apply(document: Document, text: str, keys: list[str]) -> list[Diagnostic]:
 def put(
     document: Document, key: str, value: Document, place: Span, keys: list[str]
 ) -> list[Diagnostic]:
-    """As `apply`, with a value that was read already. ``place``: where the key stands."""
+    """Apply a value that was read already; see `apply`. ``place``: place of the key."""
     parts = key.split(".")
     try:
         path = (

@@ -53,7 +53,7 @@ OWN = frozenset({"site", "instrument"})
 """Keys of the scene that a step with recorded data brings (`scene.WithScene`)."""
 
 UNKNOWN = {"site": Site(name="", latitude="0 deg", longitude="0 deg"), "time": "2000-01-01"}
-"""What stands in the scene until recorded data say it."""
+"""Placeholders in the scene until recorded data replace them."""
 
 
 def load(path_or_name: str | Path, overrides: Iterable[str] = ()) -> PipelineFile:
@@ -84,7 +84,7 @@ def parse(
     folder: str | Path | None = None,
     overrides: Iterable[str] = (),
 ) -> PipelineFile:
-    """As `load`, from text; relative paths in it are looked for in ``folder`` first."""
+    """Load a pipeline from text; relative paths in it are looked for in ``folder`` first."""
     source = Source(name, text)
     document = yaml_places.load(source, longest={"operators": MOST_STEPS})
     mistakes = [Diagnostic(fault.message, fault.span, fault.label) for fault in document.faults]
@@ -168,7 +168,7 @@ class _Check(Mistakes):
         return PipelineFile(header, parameters, made, self.name, scene, self.document)
 
     def recorded_lost(self, steps: list[Step | None]) -> bool:
-        """Whether a step that brings its own site, instrument and time could not be made."""
+        """True if a step that brings its own site, instrument and time could not be made."""
         written = (
             [item for item, step in zip(self.tree["operators"], steps, strict=True) if step is None]
             if steps
@@ -217,7 +217,7 @@ class _Check(Mistakes):
 
     @property
     def target_of_map(self) -> bool:
-        """Whether the file says ``target: map``."""
+        """True if the file says ``target: map``."""
         return isinstance(text := self.tree.get("target"), str) and text.strip().lower() == "map"
 
     def targeted(self, scene: Scene, operators: Iterable[Operator]) -> Scene:
@@ -238,7 +238,7 @@ class _Check(Mistakes):
             return scene
 
     def without_campaign(self, document: Document) -> list[Diagnostic]:
-        """What is wrong with a document but for its campaign."""
+        """Mistakes of a document, without those of its campaign."""
         del document.value["campaign"]
         try:
             _Check(document, self.name, self.context["folder"], []).run()

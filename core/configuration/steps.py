@@ -125,7 +125,7 @@ def _step(mistakes: Mistakes, item: Any, at: Path) -> tuple[Step | None, Operato
 
 
 def noun(value: Any) -> str:
-    """What kind of YAML value this is, in words."""
+    """Kind of a YAML value, in words."""
     return (
         "a list" if isinstance(value, list) else "text" if isinstance(value, str) else "one value"
     )

@@ -1,5 +1,4 @@
-"""Where the telescope looks: a position in ICRS, Galactic or horizontal coordinates, written as
-text.
+"""Target of the telescope: a position in ICRS, Galactic or horizontal coordinates, written as text.
 
 >>> Target.parse("05h00m00s +20d00m00s").icrs()    # doctest: +ELLIPSIS
 (1.3089..., 0.3490...)

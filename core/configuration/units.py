@@ -72,7 +72,7 @@ KINDS = {
     ),
     "": Kind("a pure number", ("0.3", "30 %"), ("",)),
 }
-"""By SI unit."""
+"""Kinds of quantities by SI unit."""
 
 PURE, ANGLE, TIME, LENGTH, TEMPERATURE = (
     (0, 0, 0, 0),
@@ -204,7 +204,7 @@ class Unit:
 
     @property
     def example(self) -> str:
-        """How such a quantity is written."""
+        """Format in which such a quantity is written."""
         return self.kind.examples[0]
 
     def parse(self, value: Any) -> float:

@@ -44,7 +44,7 @@ def mistake(
     caret: tuple[int, int] | None = None,
     at: tuple[str | int, ...] = (),
 ) -> PydanticCustomError:
-    """What a validator raises: shown at the value's place.
+    """Error for a validator to raise; it is shown at the value's place.
 
     ``caret``: (offset, length) of what is wrong in a text. ``at``: keys and indices that lead to it
     within a mapping or list.
@@ -54,9 +54,7 @@ def mistake(
 
 
 def refusal(err: ZondaError, at: tuple[str | int, ...] = ()) -> PydanticCustomError:
-    """What a validator raises where ``err`` says what is wrong with its value, or with what is
-    ``at`` a place within it.
-    """
+    """Error for a validator to raise from ``err``, about its value or a place ``at`` within it."""
     if isinstance(err, ConfigurationError) and err.diagnostics:
         first = err.diagnostics[0]
         return mistake(first.message, first.label, first.help, at=at)

@@ -63,7 +63,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Mark:
-    """Where a value and its key stand."""
+    """Places of a value and of its key."""
 
     value: Span
     key: Span | None = None

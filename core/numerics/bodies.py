@@ -1,4 +1,4 @@
-"""Where targets, the Sun, the Moon and planets stand above the horizon of a site.
+"""Positions of targets, the Sun, the Moon and planets above the horizon of a site.
 
 Directions are ERFA's, without refraction: aberration, precession-nutation (IAU 2006/2000A), Earth
 rotation, polar motion. Planets are those of Simon et al. 1994 (plan94), the Moon that of Meeus 1998
@@ -41,7 +41,7 @@ DAY = 86400.0
 
 @dataclass(frozen=True)
 class Track:
-    """Where something stands at n instants.
+    """Horizontal position at n instants.
 
     Attributes
     ----------

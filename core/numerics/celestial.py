@@ -51,7 +51,7 @@ CONVERGED = 5e-11
 
 
 class _Nodes(NamedTuple):
-    """What varies slowly, at n instants."""
+    """Slowly varying quantities at n instants."""
 
     rotation: Floats
     """(n, 4) quaternion B of equation (2)."""
@@ -62,7 +62,7 @@ class _Nodes(NamedTuple):
 
 
 class Boresight(NamedTuple):
-    """Where the boresight looks at n instants."""
+    """Boresight directions at n instants."""
 
     horizontal: Floats
     """(n, 3) unit vectors north, west, up."""

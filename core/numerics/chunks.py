@@ -22,7 +22,7 @@ LARGE = 1 << 22
 
 
 def chunks(n: int, size: int = CHUNK) -> list[slice]:
-    """Of ``n`` instants, or of anything, ``size`` at a time."""
+    """Slices of ``n`` instants, or of anything, ``size`` at a time."""
     return [slice(k, min(k + size, n)) for k in range(0, n, size)]
 
 

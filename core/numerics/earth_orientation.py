@@ -29,7 +29,7 @@ class Orientation(NamedTuple):
     y: Floats
     """(n,) polar motion, rad."""
     source: str
-    """Which table, up to which day; or what was assumed."""
+    """Name and last day of the table, or the assumption that replaces it."""
     known: bool
     """False where the tables do not reach: then UT1 = UTC and the mean pole are assumed, as astropy
     does.
@@ -79,8 +79,8 @@ def _c04(first: int, last: int) -> Floats | None:
 
 
 def _finals(first: int, last: int) -> Floats | None:
-    """As `_c04`, from fixed columns: Bulletin B where it is given, else Bulletin A, which ends in a
-    year of predictions.
+    """Table of fixed columns, as from `_c04`: Bulletin B where it is given, else Bulletin A, which
+    ends in a year of predictions.
     """
     from astropy_iers_data import IERS_A_FILE
 

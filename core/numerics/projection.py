@@ -43,7 +43,7 @@ def rotation_matrices(quaternions: Floats) -> Floats:
 
 
 def _rotations(quaternions: Floats) -> Floats:
-    """As `rotation_matrices`, (3, 3, n): each element lies in one piece."""
+    """Rotation matrices (3, 3, n), see `rotation_matrices`: each element lies in one piece."""
     found = np.empty((3, 3, len(quaternions)))
     for s in chunks(len(quaternions)):
         x, y, z, w = _normalized(quaternions[s])

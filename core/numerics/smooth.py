@@ -123,7 +123,7 @@ class SmoothField:
     step: int
     n_samples: int
     _kept: dict[str, AnyFloats] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """All detectors' lines by type, where they are small."""
+    """Lines of all detectors by type, if they are small."""
 
     @classmethod
     def from_values(
@@ -209,8 +209,8 @@ class SmoothField:
         return out
 
     def series(self, detectors: slice, samples: slice, dtype: np.dtype[Any]) -> Series:
-        """What a kernel needs to evaluate f at the detectors and samples of a block, to the same
-        bits as `evaluate`.
+        """Arrays with which a kernel evaluates f at the detectors and samples of a block, to the
+        same bits as `evaluate`.
         """
         start, stop = samples.start, samples.stop
         if not 0 <= start <= stop <= self.n_samples:
@@ -278,7 +278,7 @@ class DetectorField:
     n_samples: int
 
     def evaluate(self, detectors: slice, samples: slice, out: AnyFloats | None = None) -> AnyFloats:
-        """As `SmoothField.evaluate`."""
+        """Values at detectors and samples; see `SmoothField.evaluate`."""
         start, stop = samples.start, samples.stop
         if not 0 <= start <= stop <= self.n_samples:
             raise ValueError(f"samples {start}:{stop} outside 0:{self.n_samples}")

@@ -83,8 +83,8 @@ def convolved(values: AnyFloats, taps: AnyFloats, along: AnyFloats | None = None
 
 
 def convolved_rows(values: Floats, taps: Floats, rows: list[Floats]) -> Floats:
-    """As `convolved`, with a kernel of its own along each row (``rows``); ``taps`` is for the
-    columns.
+    """Convolve as `convolved` does, with a kernel of its own along each row (``rows``); ``taps`` is
+    for the columns.
     """
     n = values.shape[1]
     along = np.empty_like(values)
