@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
+from zonda.core.canvas import DPI
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.drawable import Drawable, Sketch
@@ -22,7 +23,6 @@ from zonda.core.types import AnyFloats, Floats
 
 from .comparison.files import plane_of
 from .comparison.statistics import Comparison
-from .drawing.canvas import DPI
 from .drawing.comparison_plots import draw_comparison, draw_map_spectra, draw_stream_comparison
 from .drawing.pictures import (
     Picture,

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zonda.core.canvas import SEQUENCE
 from zonda.core.focalplane import Focalplane
 from zonda.core.instrument import Instrument
 from zonda.core.types import Floats
-from zonda.operators.diagnostics.drawing.canvas import SEQUENCE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

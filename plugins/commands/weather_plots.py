@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zonda.core.canvas import SEQUENCE
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
 from zonda.operators.atmosphere.weather.summary import (
     HOURS,
@@ -18,7 +19,6 @@ from zonda.operators.atmosphere.weather.summary import (
     PwvByMonth,
     pwv_steps,
 )
-from zonda.operators.diagnostics.drawing.canvas import SEQUENCE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

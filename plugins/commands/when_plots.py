@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zonda.core.canvas import SEQUENCE, log_labels
 from zonda.core.types import Floats
 from zonda.operators.atmosphere.weather.summary import MONTHS
-from zonda.operators.diagnostics.drawing.canvas import SEQUENCE, log_labels
 
 from .visibility import HORIZON, HOUR, Month, solar_offset
 from .when_text import Seen

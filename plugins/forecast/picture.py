@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zonda.core.canvas import COLOURS, DPI
 from zonda.core.numerics.angles import ARCMIN
-from zonda.operators.diagnostics.drawing.canvas import COLOURS, DPI
 
 from .depth import PARTS
 from .lines import prefixed

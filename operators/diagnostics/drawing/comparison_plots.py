@@ -8,12 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zonda.core.canvas import OTHER, SEQUENCE, log_labels, new_axes, unit_of
 from zonda.core.drawable import Sketch
-from zonda.core.numerics.angles import ARCSEC, angle_text
-from zonda.core.types import Floats
-
-from .canvas import OTHER, SEQUENCE, log_labels, new_axes, unit_of
-from .map_plots import (
+from zonda.core.maps.map_plots import (
     contour_text,
     map_axes,
     noise_text,
@@ -22,6 +19,8 @@ from .map_plots import (
     plot_plain,
     wcs_of,
 )
+from zonda.core.numerics.angles import ARCSEC, angle_text
+from zonda.core.types import Floats
 
 if TYPE_CHECKING:
     from ..comparison.radial import RadialSpectra

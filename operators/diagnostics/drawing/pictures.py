@@ -10,16 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.canvas import DPI, file_of, unit_of
 from zonda.core.drawable import Sketch
 from zonda.core.maps.central import central_diameter, in_beams
-from zonda.core.maps.noise_figures import Noise
-from zonda.core.maps.on_plane import on_plane
-from zonda.core.numerics.angles import angle_text, sides_text
-from zonda.core.types import AnyFloats
-
-from ..series import Modes, Spectrum, TimeStream, unit_of_stream
-from .canvas import DPI, file_of, unit_of
-from .map_plots import (
+from zonda.core.maps.map_plots import (
     SHOWN,
     contour_text,
     map_axes,
@@ -31,6 +25,12 @@ from .map_plots import (
     plot_plain,
     wcs_of,
 )
+from zonda.core.maps.noise_figures import Noise
+from zonda.core.maps.on_plane import on_plane
+from zonda.core.numerics.angles import angle_text, sides_text
+from zonda.core.types import AnyFloats
+
+from ..series import Modes, Spectrum, TimeStream, unit_of_stream
 from .plots import ScanTrack, plot_modes, plot_scan, plot_spectra, plot_tod, plot_transfer
 
 if TYPE_CHECKING:

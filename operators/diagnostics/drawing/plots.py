@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.canvas import COLOURS, OTHER, PALE, SEQUENCE, log_labels, new_axes, unit_of
 from zonda.core.numerics.angles import ARCMIN, ARCSEC
 from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import AnyFloats
 
 from ..series import unit_of_stream
-from .canvas import COLOURS, OTHER, PALE, SEQUENCE, log_labels, new_axes, unit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from zonda.core.canvas import file_of
 from zonda.core.maps.map_product import MapProduct
-from zonda.operators.diagnostics.drawing.canvas import file_of
 from zonda.operators.diagnostics.drawing.pictures import (
     Flat,
     Style,

@@ -14,17 +14,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from zonda.core.canvas import file_of
 from zonda.core.errors import OutputError
 from zonda.core.maps.image import Image
-from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.on_plane import on_plane
-from zonda.operators.diagnostics.drawing.canvas import file_of
-from zonda.operators.diagnostics.drawing.map_plots import (
+from zonda.core.maps.map_plots import (
     map_axes,
     plot_circle,
     plot_coverage,
     plot_map,
 )
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.on_plane import on_plane
 from zonda.operators.diagnostics.drawing.pictures import Flat
 from zonda.operators.diagnostics.drawing.plots import (
     plot_scan,
@@ -294,7 +294,7 @@ def test_a_track_starts_at_its_offset(make_observation):
 def test_no_window_system_and_no_global_state():
     code = (
         "import numpy as np, sys; from astropy.wcs import WCS; from"
-        " zonda.operators.diagnostics.drawing.map_plots import plot_map\nassert 'matplotlib' not in"
+        " zonda.core.maps.map_plots import plot_map\nassert 'matplotlib' not in"
         " sys.modules\nw = WCS(naxis=2); w.wcs.ctype = ['RA---TAN',"
         " 'DEC--TAN']\nplot_map(np.zeros((4, 4)), w).figure.savefig('/dev/null',"
         " format='png')\nassert 'matplotlib.pyplot' not in sys.modules"

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 import zonda
+from zonda.core.canvas import file_of, new_axes
+from zonda.core.maps.map_plots import plot_contours
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCSEC
-from zonda.operators.diagnostics.drawing.canvas import file_of, new_axes
-from zonda.operators.diagnostics.drawing.map_plots import plot_contours
 from zonda.operators.diagnostics.plot_operators import Plots, _snr
 from zonda.plugins.checks import scenes
 

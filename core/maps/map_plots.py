@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.maps.grid import wcs_grid
-from zonda.core.maps.picture import circle_on_sky
-from zonda.core.numerics.angles import angle_text
-from zonda.core.types import AnyFloats
-
-from .canvas import DPI, PALE, log_labels, unit_of
+from ..canvas import DPI, PALE, log_labels, unit_of
+from ..numerics.angles import angle_text
+from ..types import AnyFloats
+from .grid import wcs_grid
+from .picture import circle_on_sky
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
