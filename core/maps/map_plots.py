@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,6 @@ from ..canvas import DPI, PALE, log_labels, unit_of
 from ..numerics.angles import angle_text
 from ..types import AnyFloats
 from .grid import wcs_grid
-from .picture import circle_on_sky
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
@@ -112,7 +112,7 @@ def names_of(wcs: WCS) -> tuple[str, str, str]:
 def _label(ax: Any, upright: bool, whole: bool, latitudes: bool) -> None:
     """Name the axes, and draw meridians and parallels where these do not follow the edges."""
     first, second, frame = names_of(ax.wcs)
-    for axis, name, room in zip(ax.coords, (first, second), (0.8, 0.4), strict=True):
+    for axis, name, room in zip(ax.coords, (first, second), (0.8, 0.7), strict=True):
         axis.set_axislabel(f"{name} ({frame})", minpad=room if upright else 1.0)
         axis.set_ticklabel(size=9, exclude_overlapping=True, simplify=False)
         if axis.coord_type in ("longitude", "latitude"):
@@ -212,7 +212,7 @@ def plot_map(
     limits = (bottom * factor, top * factor)
     drawn = plot_plain(values * factor, wcs, limits, name, label, ax=ax, title=title)
     if fwhm:
-        _draw_beam(drawn, values.shape, fwhm)
+        draw_beam(drawn, wcs, values.shape, fwhm)
     return drawn
 
 
@@ -358,7 +358,7 @@ def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, 
     import matplotlib as mpl
 
     ax = map_axes(values.shape, wcs)[0] if ax is None else ax
-    if not hasattr(ax, "bar_axes"):
+    if hasattr(ax, "coords") and not hasattr(ax, "bar_axes"):
         _label(ax, upright=True, whole=False, latitudes=True)
     picture = ax.imshow(
         values,
@@ -389,12 +389,12 @@ def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, 
     return ax
 
 
-def _draw_beam(ax: Any, shape: tuple[int, ...], fwhm: float) -> None:
+def draw_beam(ax: Any, wcs: WCS, shape: tuple[int, ...], fwhm: float) -> None:
     """Draw the beam's half-power circle to scale in the lower left corner, with its width.
 
     A map that is hardly larger than the beam has the width alone.
     """
-    grid, (ny, nx) = wcs_grid(ax.wcs, (shape[0], shape[1])), shape
+    grid, (ny, nx) = wcs_grid(wcs, (shape[0], shape[1])), shape
     place, half = np.array([0.05 * nx, 0.05 * ny]), np.zeros(2)
     for _ in range(2):  # its own size says where it lies
         beam = circle_on_sky(grid, place + half, fwhm, facecolor="white", edgecolor="black")
@@ -414,3 +414,23 @@ def _draw_beam(ax: Any, shape: tuple[int, ...], fwhm: float) -> None:
         zorder=5,
         bbox=PALE,
     )
+
+
+def circle_on_sky(grid: Any, place: Any, diameter: float, **style: Any) -> Any:
+    """Circle of ``diameter`` [rad] on the sky about a pixel (x, y) of a grid: a matplotlib Ellipse.
+
+    Pixels off the sky take the metric of the middle of the image.
+    """
+    from matplotlib.patches import Ellipse
+
+    xx, xy, yy = (float(g) for g in grid.metric(*place))
+    if not math.isfinite(xx * yy):
+        xx, xy, yy = grid.middle
+    turn = 0.5 * math.atan2(2 * xy, xx - yy)  # of the principal axis nearest to x
+    if abs(turn) > math.pi / 4:
+        turn -= math.copysign(math.pi / 2, turn)
+    c, s = math.cos(turn), math.sin(turn)
+    along = xx * c * c + 2 * xy * c * s + yy * s * s
+    across = xx * s * s - 2 * xy * c * s + yy * c * c
+    sizes = diameter / math.sqrt(along), diameter / math.sqrt(across)
+    return Ellipse((float(place[0]), float(place[1])), *sizes, angle=math.degrees(turn), **style)

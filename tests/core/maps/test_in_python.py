@@ -152,7 +152,7 @@ def test_pictures_are_drawn_into_the_axes_that_are_given(brightness):
     assert own.images[0].get_clim() == (-5.0, 5.0)
     assert own.images[0].colorbar.ax.get_ylabel() == "uK_CMB"
     lon, lat = own.coords[0], own.coords[1]
-    assert (lon.get_axislabel(), lat.get_axislabel()) == ("right ascension", "declination")
+    assert (lon.get_axislabel(), lat.get_axislabel()) == ("RA (ICRS)", "Dec (ICRS)")
     with pytest.raises(InputError, match=r"no plane 'nois'(.|\n)*did you mean 'noise'"):
         brightness.plot(plane="nois")
     image = Image(np.eye(3), brightness.header, "K_RJ").plot()
