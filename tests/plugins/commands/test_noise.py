@@ -128,11 +128,11 @@ def test_rows_that_cannot_be(night, tmp_path, old, new, message):
     assert CliRunner().invoke(noise, [str(path), "--output", str(table)]).exit_code == 0
     text = table.read_text()
     if old is None:
-        row = next(line for line in text.splitlines() if line.startswith('"d03"'))
+        row = next(line for line in text.splitlines() if line.startswith("d03,"))
         cells = row.split(",")
         text = text.replace(row, ",".join([*cells[:3], new, *cells[4:]]))
     else:
-        text = text.replace(f'"{old}"', f'"{new}"')
+        text = text.replace(f"\n{old},", f"\n{new},")
     table.write_text(text)
     with pytest.raises(InputError, match=message):
         zonda.LoadTOD(file=path, noise=table).scene()
