@@ -38,9 +38,9 @@ def fault_of_class(cls: type[Any], base: type[Any]) -> Fault | None:
     return _parameters(cls) or _declarations(cls) or _methods(cls, base)
 
 
-def fault_of_step(step: Any, base: type[Any]) -> Fault | None:
+def fault_of_step(operator: Any, base: type[Any]) -> Fault | None:
     """Fault of an operator that can be seen before it runs."""
-    return _declarations(step) or _acts(step, base)
+    return _declarations(operator) or _acts(operator, base)
 
 
 def _parameters(cls: type[Any]) -> Fault | None:
@@ -97,18 +97,20 @@ def _methods(cls: type[Any], base: type[Any]) -> Fault | None:
     return None
 
 
-def _acts(step: Any, base: type[Any]) -> Fault | None:
-    cls = type(step)
+def _acts(operator: Any, base: type[Any]) -> Fault | None:
+    cls = type(operator)
     own = [stage for stage in STAGES if getattr(cls, stage) is not getattr(base, stage)]
     others = _further_methods(cls, base)
     if not own:
         return f"overrides none of {', '.join(STAGES)}: it would do nothing", _named(others, "exec")
-    if "exec" not in own and (streams := sorted(name for name in step.provides if is_stream(name))):
+    if "exec" not in own and (
+        streams := sorted(name for name in operator.provides if is_stream(name))
+    ):
         return (
             f"provides {' and '.join(streams)}, but overrides no exec: it would do nothing to it",
             _named(others, "exec"),
         )
-    if step.couples == "all" and "measure" not in own:
+    if operator.couples == "all" and "measure" not in own:
         return (
             "couples all samples, but overrides no measure, which reads the whole stream",
             _named(others, "measure"),

@@ -134,18 +134,18 @@ def operators_that(test: Callable[[Any], bool]) -> list[str]:
     return found
 
 
-def declared(step: Any, what: Literal["requires", "provides", "optional"]) -> frozenset[str]:
+def declared(kind: Any, what: Literal["requires", "provides", "optional"]) -> frozenset[str]:
     """Names that an operator's class states as ``what``, for tools that have no operator.
 
     A property is that of an operator with the default parameters, empty if that fails; ``provides``
     includes `Operator.on_request`.
     """
-    names = getattr(step, what)
+    names = getattr(kind, what)
     if isinstance(names, property):
         names = frozenset()
         with suppress(Exception):  # a parameter has no default, or a plugin is broken
-            names = getattr(step.model_construct(), what)
-    more = step.on_request if what == "provides" else frozenset()
+            names = getattr(kind.model_construct(), what)
+    more = kind.on_request if what == "provides" else frozenset()
     return frozenset(names) | more
 
 
