@@ -386,10 +386,10 @@ class AtmosphereBounds:
             rms = 1.52 * (tolerance + p.tolerance) * left
             bound = context.bound(rms, self._longest, common=True)
             bound["psd"] = (rms / max(context.noise, a.rms, 1e-30)) ** 2
-            saves = None
-            if number >= MANY_NODES and context.affords(bound):
+            saves = COARSER[tolerance] if number >= MANY_NODES else None
+            if saves and context.affords(bound):  # else it is not taken, whatever it saves
                 fewer = len(self.first.resolution(tolerance).nodes.xi)
-                saves = COARSER[tolerance] if fewer <= min(number / 2, MOST_NODES) else None
+                saves = saves if fewer <= min(number / 2, MOST_NODES) else None
             choices.append(Choice("coarse", f"within {tolerance:g}", {"tolerance": tolerance},
                                   bound=bound, formula=text, saves=saves))  # fmt: skip
         size = context.bound(left, self._longest, True)
