@@ -34,7 +34,7 @@ _COORDSYS = {"icrs": "C", "galactic": "G", "barycentricmeanecliptic": "E"}
 
 @dataclass(frozen=True)
 class Provenance:
-    """What all map files of a run say alike.
+    """Statements that all map files of a run have in common.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Provenance:
 
     @classmethod
     def of_a_map(cls, product: MapArrays) -> Provenance:
-        """What is known of a map apart from its run."""
+        """Provenance of a map apart from its run."""
         from zonda import __version__
 
         cards = header_of(
@@ -70,7 +70,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class MapFile:
-    """What a file shows of a product.
+    """The part of a product that a file shows.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class MapFile:
 
     @property
     def halves(self) -> Header:
-        """What `half_difference` is the difference of."""
+        """Card of the halves that were subtracted in `half_difference`."""
         return header_of(
             [("JACKKNIF", ascii_text(self.product.difference), "halves that were subtracted")]
         )
@@ -275,7 +275,7 @@ def _type(values: NDArray[Any]) -> np.dtype[Any]:
 
 
 def _origin(data: Data) -> Header:
-    """Where the data come from; the command and the resolved YAML as history."""
+    """Cards of the origin of the data; the command and the resolved YAML as history."""
     import zonda
 
     scene, provenance = data.scene, data.provenance

@@ -116,9 +116,7 @@ def reading(place: str, kind: str, cure: str) -> Iterator[None]:
 
 
 def _whereabouts(path: str | bytes | int | None) -> str:
-    """What to do about a path where nothing is: a name in its folder that is near, or the folder
-    that is missing.
-    """
+    """Cure for a path that does not exist: a similar name in its folder, or the missing folder."""
     otherwise = "check the path; if it was there before, it has been moved or removed"
     if not isinstance(path, (str, bytes)):
         return otherwise

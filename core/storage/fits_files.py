@@ -58,7 +58,7 @@ def header_of(cards: Iterable[tuple[Any, ...]] = (), history: Iterable[str] = ()
 
 
 def joined(*headers: fits.Header) -> fits.Header:
-    """All cards of some headers; the last of each key holds."""
+    """A header with the cards of some headers; the last card of each key holds."""
     made = fits.Header()
     for header in headers:
         for key in set(header.keys()) - COMMENTARY:

@@ -30,8 +30,9 @@ def opened(path: str | os.PathLike[str], place: str, kind: str, cure: str) -> It
 
 
 def checked(path: str | os.PathLike[str], place: str, cure: str) -> Any:
-    """As `opened`, for as long as the caller keeps the `h5py.File` open; errors are those of h5py,
-    but for files that harm.
+    """An `h5py.File` that the caller closes; it refuses what `opened` refuses.
+
+    Other errors are those of h5py.
     """
     import h5py
 
@@ -120,17 +121,17 @@ class Disk:
         return len(view)
 
     def read(self, size: int) -> bytes:
-        """As `readinto`, in bytes of its own."""
+        """Read ``size`` bytes; zeros beyond the end."""
         found = bytearray(size)
         self.readinto(found)
         return bytes(found)
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """As any file's."""
+        """Move to an offset, as `io.IOBase.seek`."""
         return self._file.seek(offset, whence)
 
     def tell(self) -> int:
-        """As any file's."""
+        """The present offset."""
         return self._file.tell()
 
     def truncate(self, size: int | None = None) -> int:

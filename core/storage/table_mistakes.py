@@ -12,7 +12,7 @@ MOST_TOLD = 12
 
 
 class TableError(InputError):
-    """What is wrong with a table.
+    """Error about the mistakes of a table.
 
     Parameters
     ----------

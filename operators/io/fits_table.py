@@ -338,7 +338,7 @@ def _native(values: Any) -> Any:
 
 
 def _read(file: Any) -> TimeOrderedData:
-    """All but the streams."""
+    """Read everything but the streams."""
     header = file[0].header
     samples, detectors, provenance = (
         file[name].data for name in ("SAMPLES", "DETECTORS", "PROVENANCE")

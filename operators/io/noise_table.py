@@ -115,8 +115,8 @@ there is no estimate.
 def noise_of(
     path: Path, signal: str, estimate: Estimate, *, subtract_mean: bool
 ) -> tuple[TimeOrderedData, dict[str, Any]]:
-    """All but the streams of a file, and the noise of each detector that is not flagged, by name;
-    None: no estimate.
+    """Everything but the streams of a file, and the noise of each unflagged detector by name; None:
+    no estimate.
 
     Parameters
     ----------

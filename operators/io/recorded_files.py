@@ -250,7 +250,7 @@ class RecordedFiles(Operator):
         return found
 
     def _part(self, path: Path, given: Instrument | None) -> RecordedScan:
-        """All but the stream of a file. Raises InputError where it cannot be used."""
+        """Everything but the stream of a file. Raises InputError for a file that cannot be used."""
         place = f"{self.label}, {path}"
         tod, streams = _head(path, _stamp(path))
         stated = "net" in tod.columns
@@ -306,7 +306,7 @@ def _told(path: Path, stamp: tuple[int, int]) -> tuple[tuple[str, bytes], frozen
 
 @lru_cache(maxsize=NEW_SCANS)
 def _head(path: Path, stamp: tuple[int, int]) -> tuple[TimeOrderedData, Mapping[str, str]]:
-    """All but the streams of a file, and the names of these with their units."""
+    """Everything but the streams of a file, and their names with their units."""
     opened = reader(path)
     opened.close()
     return opened.tod, opened.streams

@@ -1,5 +1,5 @@
-"""Where the boresight of a recorded scan is, on the sky and above the horizon: as recorded, or one
-from the other.
+"""Boresight of a recorded scan, on the sky and above the horizon: as recorded, or one from the
+other.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""What a file of time-ordered data says of its instrument and its site, as an `Instrument`, a
-`Site` and a focal plane.
+"""Instrument and site that a file of time-ordered data states, as an `Instrument`, a `Site` and a
+focal plane.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class RecordedInstrument(Instrument):
 
     @property
     def cameras(self) -> dict[str, Instrument]:
-        """By name of the band, the camera that has this band alone."""
+        """Cameras of one band each, by its name."""
         found = super().cameras
         for name, camera in found.items():
             assert isinstance(camera, RecordedInstrument)
@@ -62,7 +62,7 @@ class RecordedInstrument(Instrument):
         )
 
     def has_the_detectors_of(self, other: Instrument | None) -> bool:
-        """Whether the other is recorded too, and has the same detectors."""
+        """True if the other is recorded too, and has the same detectors."""
         return (
             isinstance(other, RecordedInstrument)
             and self.focalplane().names == other.focalplane().names
@@ -83,9 +83,7 @@ class RecordedInstrument(Instrument):
 
 
 def site_of(tod: TimeOrderedData) -> Site:
-    """Where the file's telescope stands, with the climatology of a registered site that is nearer
-    than `NEAR`.
-    """
+    """Site of the telescope, with the climatology of a registered site nearer than `NEAR`."""
     name, latitude, longitude, altitude = tod.site
     given: dict[str, Any] = {
         "name": name or "recorded",
@@ -134,7 +132,7 @@ def rows_of_bands(tod: TimeOrderedData, band: float | None, place: str) -> list[
 
 
 def is_near(centre: float, band: float) -> bool:
-    """Whether ``band`` [Hz] names a band of this centre [Hz]."""
+    """True if ``band`` [Hz] names a band of this centre [Hz]."""
     return abs(centre / band - 1) < NEAR_BAND
 
 

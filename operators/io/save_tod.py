@@ -37,7 +37,7 @@ class Files(Record):
     paths: list[str]
 
     def __iadd__(self, other: Files) -> Files:
-        """Those of later scans follow."""
+        """Append the files of later scans."""
         self.paths += other.paths
         return self
 
@@ -172,7 +172,7 @@ class SaveTOD(StreamOutput):
 
 
 def _weather(data: Data, observation: Observation, place: str) -> GroundWeather | None:
-    """That of the scene, where no step made an atmosphere of it."""
+    """Weather of the scene, for a run without an atmosphere."""
     try:
         return data.scene.ground_weather()
     except InputError as err:
@@ -235,6 +235,6 @@ def reader(path: str | os.PathLike[str]) -> fits_table.Reader | toast_reading.Re
 
 
 def is_fits(path: str | os.PathLike[str]) -> bool:
-    """Whether the path names a FITS file."""
+    """True if the path names a FITS file."""
     name = Path(path).name.lower()
     return name.endswith((".fits", ".fit", ".fits.gz", ".fit.gz"))

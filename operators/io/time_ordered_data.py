@@ -28,7 +28,7 @@ from zonda.core.weather import GroundWeather
 
 @dataclass
 class TimeOrderedData:
-    """What a time-ordered data file holds.
+    """The content of a file of time-ordered data.
 
     Attributes
     ----------

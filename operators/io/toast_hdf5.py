@@ -223,9 +223,7 @@ WEATHER = {  # ours: (TOAST's name, unit)
 
 
 def _write_weather(group: Any, weather: GroundWeather) -> None:
-    """As `toast.weather.Weather` reads it; its west wind blows towards east, and there are no
-    clouds.
-    """
+    """Write what `toast.weather.Weather` reads: west wind blows towards east, clouds are absent."""
     group.attrs["weather_class"] = "toast.weather.Weather"
     group.attrs["weather_time"] = weather.time
     for name in ("ice_water", "liquid_water"):

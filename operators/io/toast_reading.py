@@ -226,7 +226,7 @@ def read(path: str | os.PathLike[str]) -> TimeOrderedData:
 
 
 def _read(file: Any, place: str) -> TimeOrderedData:
-    """All but the streams."""
+    """Read everything but the streams."""
     import astropy.units as u
 
     instrument, shared = file["instrument"], file["shared"]
@@ -433,8 +433,9 @@ def columns_of_model(
 
 
 def _spectra(group: Any, place: str) -> dict[str, tuple[Floats, Floats]]:
-    """By key: frequencies [Hz], without zero, and power spectral densities [K^2 s]. One data set
-    for each set of frequencies.
+    """Frequencies [Hz], without zero, and power spectral densities [K^2 s] by key.
+
+    There is one data set for each set of frequencies.
     """
     import astropy.units as u
 

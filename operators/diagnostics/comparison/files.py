@@ -68,7 +68,7 @@ CURES = Cures(
 
 @dataclass(frozen=True)
 class ReadMap:
-    """What a FITS file holds.
+    """The planes of a FITS file, and what its header states of them.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class ReadMap:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which map of a file.
+    """Choice of a map of a file.
 
     Attributes
     ----------

@@ -102,7 +102,7 @@ class Plane:
 
     @property
     def noise_in_words(self) -> str:
-        """What stands behind its noise; empty where none is known."""
+        """Source of its noise in words; empty if none is known."""
         if self.noise is None:
             return ""
         if self.quiet and self.factor is None:
@@ -115,7 +115,7 @@ class Plane:
 
     @property
     def grid(self) -> MapGrid:
-        """Where its pixels are."""
+        """The positions of its pixels."""
         return image_grid(self.header, self.values.shape) if self.pixels is None else self.pixels
 
     @property
@@ -184,9 +184,11 @@ class Plane:
         return replace(self, values=values, noise=noise, **there)
 
     def independent(self, where: NDArray[np.bool_]) -> float:
-        """How many independent values the noise of the pixels ``where`` has: their solid angle / (2
-        pi blurred^2), or over that of its own pixels, at most their number. 2 pi sigma^2 is the
-        integral of the square of the correlation."""
+        """Number of independent values of the noise in the pixels ``where``, at most their number.
+
+        It is their solid angle over 2 pi blurred^2, the integral of the square of the correlation,
+        or over that of its own pixels if that is larger.
+        """
         count = float(np.count_nonzero(where))
         each = max(2 * math.pi * self.blurred**2, self.spread)
         return min(count, max(self.grid.solid_angle(where) / each, 1.0)) if each else count
@@ -266,7 +268,7 @@ def _sampled(values: Floats, x: Floats, y: Floats, order: int) -> Floats:
 
 
 def _off(x: Floats, y: Floats, inside: NDArray[np.bool_]) -> float:
-    """How far pixels ``inside`` are from whole ones, at most."""
+    """Largest distance of the pixels ``inside`` from whole ones."""
     return max(
         float(np.abs(np.where(inside, at - np.rint(at), 0)).max(initial=0.0)) for at in (x, y)
     )
@@ -353,7 +355,7 @@ def _of_neighbours(plane: Plane, target: MapGrid) -> tuple[Floats, Floats | None
 def common(
     reference: Plane, other: Plane, fwhm: float | None = None
 ) -> tuple[Plane, Plane, list[str]]:
-    """Both maps with one beam and on one grid, and what was done to them.
+    """The two maps with one beam and on one grid, and notes of the changes.
 
     Parameters
     ----------
@@ -464,8 +466,10 @@ def common_beam(reference: Plane, other: Plane) -> float:
 
 
 def _is_the_grid(second: Plane, first: Plane) -> bool:
-    """Whether two maps are compared on the pixels of the second: those of HEALPix, of two such maps
-    the larger ones; else the smaller ones."""
+    """True if two maps are compared on the pixels of the second.
+
+    HEALPix pixels come first, of two such maps the larger ones; of two images the smaller ones.
+    """
     if first.pixels is not None and second.pixels is not None:
         return second.pixels.nside < first.pixels.nside
     if first.pixels is not None or second.pixels is not None:

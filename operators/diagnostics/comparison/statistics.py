@@ -1,4 +1,4 @@
-"""How a map differs from a reference: figures, difference, fidelity and SNR.
+"""Differences of a map from a reference: figures, difference, fidelity and SNR.
 
     B = g A + o,
     g and o by least squares, A without error                                                  (1)
@@ -89,7 +89,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Settings:
-    """How maps are compared: common resolution [rad] (None: the wider of the two), t of equation
+    """Settings of a comparison: common resolution [rad] (None: the wider of the two), t of equation
     (2), number of rings.
     """
 
@@ -222,8 +222,8 @@ def _unevenness(grid: ImagePixels, known: NDArray[np.bool_]) -> float:
 
 
 def _places(plane: Plane, centre: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Where pixels are, up and across: numbers of rows and columns; of HEALPix offsets in latitude
-    and longitude.
+    """Places of the pixels, up and across: numbers of rows and columns; of HEALPix offsets in
+    latitude and longitude.
     """
     if plane.pixels is None:
         row, column = np.indices(plane.values.shape, np.float64)
