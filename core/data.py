@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from .block import STREAMS, Block
 from .errors import PipelineError
-from .kept import kept, one_scan, product_of
 from .observation import Observation
 from .pages import html_table
 from .product import Product
+from .results import kept, one_scan, product_of
 from .stream import Stream, in_order
 from .tally import Tally, percent
 

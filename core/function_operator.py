@@ -18,11 +18,11 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from .block import Block
-from .changed import Changed, whole
 from .data import Data
 from .errors import PipelineError, ZondaError
 from .operator import Operator
 from .stream import Stream
+from .whole_stream import Changed, whole
 
 Function = Callable[[Block], Any]
 

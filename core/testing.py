@@ -23,15 +23,6 @@ from pydantic import ValidationError
 
 from .configuration.docstrings import described, source_is_known
 from .data import STREAMS, Block, Data, Observation, Stream
-from .made_up import (
-    N_DETECTORS,
-    N_SAMPLES,
-    Given,
-    Points,
-    given_signal,
-    made_up_scan,
-    made_up_scene,
-)
 from .mapmaker import MapMaker, filters
 from .numerics.tiles import TILE_SAMPLES
 from .operator import Operator
@@ -40,6 +31,15 @@ from .pipeline import Part, Pipeline
 from .plan.planning import planning_of
 from .product import Product
 from .signal import is_stream
+from .testing_scan import (
+    N_DETECTORS,
+    N_SAMPLES,
+    Given,
+    Points,
+    given_signal,
+    made_up_scan,
+    made_up_scene,
+)
 
 
 def check_operator(

@@ -12,7 +12,6 @@ import numpy as np
 from pydantic import Field, JsonValue, model_validator
 
 from zonda.core.block import Block
-from zonda.core.changed import Changed
 from zonda.core.configuration.diagnostics import nearest
 from zonda.core.configuration.values import refusal
 from zonda.core.data import Data
@@ -26,6 +25,7 @@ from zonda.core.plan.planning import Planning
 from zonda.core.signal import MAIN
 from zonda.core.stream import Stream
 from zonda.core.types import AnyFloats
+from zonda.core.whole_stream import Changed
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 
 EXTRA = "toast"
