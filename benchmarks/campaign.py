@@ -48,7 +48,7 @@ def main(arguments):
     given = parser.parse_args(arguments)
 
     from zonda.core.campaign import calls
-    from zonda.core.campaign.task import Outcome
+    from zonda.core.campaign.tasks import Outcome
     from zonda.core.cli import main as zonda
 
     rows = []

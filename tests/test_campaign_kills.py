@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 
 from zonda.core.campaign import parts
-from zonda.core.campaign.job import FILE, TASKS, Job
+from zonda.core.campaign.campaign_file import FILE, TASKS, Job
 from zonda.core.configuration.pipeline_file import load
 
 from .scenes import camera, write_sky

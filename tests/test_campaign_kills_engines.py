@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from zonda.core.campaign.job import FILE, LOG
+from zonda.core.campaign.campaign_file import FILE
 
 from .test_campaign_kills import (
     ROUNDS,
@@ -64,7 +64,7 @@ def cluster(place: Path) -> Iterator[Any]:
         "host": "127.0.0.1",
     }
     with distributed.LocalCluster(**options) as made, distributed.Client(made) as client:
-        client.run(lambda: __import__("zonda.core.campaign.reduce") and None)
+        client.run(lambda: __import__("zonda.core.campaign.tasks") and None)
         yield made
 
 
@@ -277,4 +277,4 @@ def test_a_job_of_an_array_killed(place: Path, nursery: Nursery, whole_run: Any)
     assert forward(place, name)[0] == "resume"
     finish(place, nursery, name)
     assert same(products(place / name), whole_run[0])
-    assert (place / name / LOG).exists()
+    assert (place / name / "tasks.npz").exists()

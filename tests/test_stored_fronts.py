@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 import zonda
-from zonda.core.accuracy import store
+from zonda.core.accuracy import fronts as store
+from zonda.core.accuracy.fronts import retest
 from zonda.core.accuracy.settings import knobs_of
-from zonda.core.accuracy.verify import retest
 
 ROOT = Path(__file__).parents[1]
 FRONTS = sorted((ROOT / "pipelines" / "fronts").glob("*.json"))

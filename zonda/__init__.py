@@ -29,7 +29,7 @@ _WHERE = {
     "ZondaError": "zonda.core.errors",
     "load": "zonda.core.configuration.pipeline_file",
     "plan": "zonda.core.plan.bands",
-    "campaign": "zonda.core.campaign.python",
+    "campaign": "zonda.core.campaign.function",
     "measure": "zonda.core.figures",
     "sensitivity": "zonda.plugins.forecast.sensitivity",
     "hookimpl": "zonda.core.hooks",
@@ -75,7 +75,7 @@ __all__ = ["__version__", *_WHERE]
 
 if TYPE_CHECKING:
     from zonda.core.block import Block as Block
-    from zonda.core.campaign.python import campaign as campaign
+    from zonda.core.campaign.function import campaign as campaign
     from zonda.core.configuration.parameters import quantity as quantity
     from zonda.core.configuration.pipeline_file import load as load
     from zonda.core.configuration.units import Angle as Angle

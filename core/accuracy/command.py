@@ -125,7 +125,7 @@ def accuracy(
     work-precision diagram and writes the setting that meets the target at least cost. Ctrl-C ends
     it with the Pareto front found so far.
     """
-    from ..campaign.job import plural
+    from ..campaign.campaign_file import plural
     from ..configuration.pipeline_file import load
     from .measure import measuring
     from .metrics import get
@@ -168,9 +168,8 @@ def accuracy(
         if found.interrupted and pool.stop is not None:
             pool.stop()
 
-    from . import store as stored
-    from .figure import save
-    from .table import fragment, lines, not_met, percent
+    from . import fronts as stored
+    from .report import fragment, lines, not_met, percent, save
 
     text = "\n".join(lines(found))
     if found.interrupted:
@@ -200,10 +199,9 @@ def accuracy(
 
 
 def _retest(file: PipelineFile, pipeline: str, metric: str) -> int:
+    from .fronts import path_for, read, retest
+    from .report import percent
     from .settings import overrides
-    from .store import path_for, read
-    from .table import percent
-    from .verify import retest
 
     results = retest(read(path_for(file, metric)), file, pipeline)
     for result in results:

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ..errors import PipelineError
-from .engines import Pool
-from .warned import Registry, Warned, call, here, show
+from .engines import Pool, Registry, Warned, call, here, show
 
 T = TypeVar("T")
 R = TypeVar("R")

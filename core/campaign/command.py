@@ -15,11 +15,11 @@ from ..command_types import Bytes
 
 if TYPE_CHECKING:
     from ..cli.request import RunRequest
-    from .job import Job, Task
+    from .campaign_file import Job, Task
+    from .folder import TaskRow
     from .prepare import CampaignFile
-    from .record import TaskRow
     from .settings import Campaign
-    from .work import CampaignResult
+    from .tasks import CampaignResult
 
     Table = Sequence[tuple[Task, TaskRow]]
 
@@ -122,8 +122,8 @@ def resume(
     from ..storage.files import check_output_folder
     from ..storage.lock import lock
     from . import run as campaign
+    from .campaign_file import Job
     from .engines import engine as opened
-    from .job import Job
 
     job = Job.read(folder)
     options = _engine(_campaign_of(job), engine, workers, scheduler)
@@ -145,8 +145,8 @@ def resume(
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def status(folder: Path, listed: bool, as_json: bool) -> None:
     """Show how far the campaign in DIR is: its tasks by state, what failed and why."""
-    from .job import Job
-    from .record import Record
+    from .campaign_file import Job
+    from .folder import Record
 
     job = Job.read(folder)
     table = list(zip(job.tasks, Record(job, folder).rows(), strict=True))
@@ -165,7 +165,7 @@ def source(pipeline: str, settings: tuple[str, ...], several: bool) -> CampaignF
 
     file = load(pipeline, settings)
     if (target := file.header.accuracy) is not None:
-        from ..accuracy.store import settings_for
+        from ..accuracy.fronts import settings_for
 
         choice = settings_for(file, target.target, target.metric)
         _say(f"accuracy: {choice.reason}")
@@ -203,7 +203,7 @@ def _campaign_of(job: Job) -> Campaign:
 @contextlib.contextmanager
 def _resumable(folder: Path) -> Iterator[None]:
     """Show the command that resumes a campaign when that is interrupted."""
-    from .job import FILE
+    from .campaign_file import FILE
 
     try:
         yield
@@ -226,14 +226,14 @@ def _show(result: CampaignResult, verbose: bool) -> None:
 
 
 def _counts(table: Table) -> dict[str, int]:
-    from .record import STATES
+    from .folder import STATES
 
     found = [row.state for _, row in table]
     return {state: found.count(state) for state in STATES}
 
 
 def _lines(job: Job, table: Table, listed: bool) -> list[str]:
-    from .job import plural
+    from .campaign_file import plural
 
     counts = _counts(table)
     done = [(task, row) for task, row in table if row.state == "done"]
@@ -272,7 +272,7 @@ def _lines(job: Job, table: Table, listed: bool) -> list[str]:
 
 def _machines(done: Table) -> list[str]:
     """The machines that the tasks ran on."""
-    from .job import plural
+    from .campaign_file import plural
     from .machines import EFFECT, differences, kinds, short
 
     found = kinds(row.machine for _, row in done)

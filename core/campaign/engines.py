@@ -1,4 +1,10 @@
-"""Engines that run tasks: anything with the interface of `concurrent.futures.Executor`."""
+"""Engines that run tasks: anything with the interface of `concurrent.futures.Executor`.
+
+Warnings of worker processes are kept there, sent with the results, and shown by the main process as
+its own. The budget of ``--memory`` is divided among workers before the campaign starts; with MPI
+and Dask, whose processes are started by others, and for a job of an array (``--task``) it is that
+of one process or job.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +12,20 @@ import contextlib
 import json
 import logging
 import os
+import platform
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from .. import children
 from ..errors import PipelineError
-from ..machine import available_memory, available_threads, one_blas_thread
-from . import warned
+from ..machine import available_memory, available_threads, one_blas_thread, resident_memory
 from .settings import Engine, Tls
 
 SCHEDULER_FILE_WAIT = 20.0
@@ -197,7 +204,7 @@ def begin_worker(safe: str | None = None) -> None:
     ``safe``: ``PYTHONSAFEPATH`` of the main process.
     """
     children.restore(safe)
-    warned.keep()
+    keep()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -373,3 +380,164 @@ def _missing(package: str, extra: str, err: ImportError) -> PipelineError:
         place=f"engine {extra}",
         cure=f"pip install 'zonda[{extra}]'",
     )
+
+
+R = TypeVar("R")
+
+Warned = tuple[str, type[Warning], str, int]
+"""Text, category, file and line of a warning."""
+
+Registry = dict[str | tuple[str, type[Warning], int], int]
+"""What was shown, as `warnings` notes it."""
+
+_kept: list[Warned] = []
+_lock = threading.Lock()
+_at_work: list[Any] = []
+"""How this process showed warnings before it kept them, once for each call at work in it."""
+
+
+def here() -> str:
+    """Name of this process."""
+    return f"{platform.node()} {os.getpid()}"
+
+
+def keep() -> None:
+    """In a new worker process: keep warnings for the main process instead of writing them to
+    stderr.
+    """
+    warnings.showwarning = _keep
+
+
+def call(main: str, function: Callable[..., R], *arguments: Any) -> tuple[R, list[Warned]]:
+    """The result of a call, and the warnings that this process has kept; none in ``main`` (`here`),
+    which shows them itself.
+    """
+    if here() == main:
+        return function(*arguments), []
+    with _kept_during():
+        result = function(*arguments)
+    with _lock:
+        found = _kept.copy()
+        _kept.clear()
+    return result, found
+
+
+@contextlib.contextmanager
+def _kept_during() -> Iterator[None]:
+    """Keep the warnings of all threads; as before when the last call in this process is done
+    (Dask's may have several).
+    """
+    with _lock:
+        _at_work.append(warnings.showwarning)
+        keep()
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _at_work.pop()
+            if not _at_work:
+                warnings.showwarning = before
+
+
+def show(found: Sequence[Warned], shown: Registry) -> None:
+    """Warn here. ``shown``: a registry of what was shown; a text in it is not shown again, unless
+    the user's filters say so.
+    """
+    for text, category, file, line in found:
+        warnings.warn_explicit(text, category, file, line, registry=shown)
+
+
+def _keep(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    *more: Any,
+    **others: Any,
+) -> None:
+    known = (
+        category if category.__module__ == "builtins" else UserWarning
+    )  # others may not be importable there
+    _kept.append((str(message), known, filename, lineno))
+
+
+MAIN = 320_000_000
+"""Bytes of the main process, which plans, and of the small helper that Python starts beside the
+workers.
+"""
+GROWTH = 20_000_000
+"""Bytes more than it holds now that it may come to hold."""
+
+
+def share_out(pool: Pool, need: int, place: str) -> None:
+    """Set what each worker may hold (``pool.memory``), and where fewer workers fit, their number.
+
+    Parameters
+    ----------
+    need
+        Least bytes with which any task runs (`core.run.forecast.need`); 0: not known.
+    place
+        The campaign's name, for errors.
+
+    Raises
+    ------
+    PipelineError
+        Where a worker that can do the tasks does not fit: before any of them starts.
+    """
+    if not need:
+        return
+    if pool.resize is None:
+        _each(pool, need, place)
+        return
+    main, free = max(resident_memory() + GROWTH, MAIN), available_memory()
+    budget = pool.asked - main if pool.asked else max(free // 2, min(need, free))
+    fitting = max(budget // need, 0)
+    if fitting < (pool.workers if pool.fixed else 1):
+        if pool.asked or pool.workers * need > free:
+            _refuse(pool, need, main, place)
+        budget, fitting = pool.workers * need, pool.workers
+    if fitting < pool.workers:
+        pool.resize(fitting)
+    pool.memory = budget // pool.workers
+
+
+def _each(pool: Pool, need: int, place: str) -> None:
+    """Budgets where every process has one of its own."""
+    if pool.memory is not None and pool.memory < need and pool.asked is None:
+        pool.memory = None  # half of a share: the task may have more, if that is free where it runs
+    if pool.memory is not None and pool.memory < need:
+        raise PipelineError(
+            f"a task needs {_megabytes(need)}; the memory budget of each process is"
+            f" {_megabytes(pool.memory)}",
+            place=place,
+            cure=f"use --memory {_megabytes(need, '')}, or shorter scans",
+        )
+
+
+def _refuse(pool: Pool, need: int, main: int, place: str) -> None:
+    workers = pool.workers if pool.fixed else 1
+    has = (
+        f"the memory budget is {_megabytes(pool.asked)}"
+        if pool.asked
+        else f"{_megabytes(available_memory())} are free"
+    )
+    each = f"each of {workers} workers needs" if workers > 1 else "a worker needs"
+    cures = (
+        [f"use --memory {_megabytes(workers * need + main * 23 // 20, '')}"] if pool.asked else []
+    )
+    if workers > 1:
+        cures.append(
+            f"--workers 1 with --memory {_megabytes(need + main * 23 // 20, '')}"
+            if pool.asked
+            else "use --workers 1"
+        )
+    raise PipelineError(
+        f"{each} {_megabytes(need)} for its tasks, and the main process holds {_megabytes(main)};"
+        f" {has}",
+        place=place,
+        cure="; or ".join([*cures, "make the scans shorter"]),
+    )
+
+
+def _megabytes(size: int | None, space: str = " ") -> str:
+    return f"{-(-(size or 0) // 1_000_000)}{space}MB"

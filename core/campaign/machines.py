@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 
 from ..versions import arithmetic
-from .job import Say
+from .campaign_file import Say
 
 WITHOUT_INFLUENCE = frozenset({"processor", "python"})
 """What is recorded, and changes no bit: the model's name (its instructions count), and Python,

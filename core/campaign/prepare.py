@@ -15,8 +15,17 @@ from ..errors import InputError, within
 from ..scene import WithScene
 from ..storage.files import product_path
 from . import parts
+from .campaign_file import (
+    INPUTS,
+    Combination,
+    Job,
+    Task,
+    digest_of_text,
+    key_of,
+    layout_path,
+    plural,
+)
 from .entries import Entry, entries
-from .job import INPUTS, Combination, Job, Task, digest_of_text, key_of, layout_path, plural
 from .settings import MOST_TASKS, Campaign
 
 if TYPE_CHECKING:

@@ -9,9 +9,11 @@ from .. import hooks
 from ..errors import InputError, OutputError, PipelineError, ZondaError
 from ..storage.files import check_output_folder
 from . import parts, table
-from .engines import Pool
+from .campaign_file import FILE, Job, Say, Task, digest_of_text, layout_path, plural
+from .engines import Pool, share_out
 from .folder import (
     RESOLVED,
+    Record,
     check_free,
     clean,
     make_way,
@@ -20,13 +22,10 @@ from .folder import (
     verify,
     write_sources,
 )
-from .job import FILE, Job, Say, Task, digest_of_text, layout_path, plural
 from .machines import Watch
-from .memory import share_out
 from .prepare import CampaignFile, Pruning, changed, restore_layout
 from .prepare import job as prepare
-from .record import Record
-from .work import CampaignResult, Combinations, Tasks
+from .tasks import CampaignResult, Combinations, Tasks
 
 
 def begin(

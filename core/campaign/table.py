@@ -27,7 +27,7 @@ from ..tables import Table
 
 if TYPE_CHECKING:
     from ..data import Data
-    from .job import Job
+    from .campaign_file import Job
 
 FOLDER = "figures"
 """Folder with the figures of each combination, in files named by its number."""

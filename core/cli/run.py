@@ -206,7 +206,7 @@ def _run_one(request: RunRequest, file: PipelineFile) -> None:
 
 def _knobs(file: PipelineFile, wanted: Accuracy) -> tuple[str, ...]:
     """Settings of the knobs that meet an accuracy."""
-    from ..accuracy.store import settings_for
+    from ..accuracy.fronts import settings_for
 
     choice = settings_for(file, wanted.target, wanted.metric)
     click.echo(f"accuracy: {choice.reason}", err=True)
@@ -226,8 +226,8 @@ def _verify(
     file: PipelineFile, request: RunRequest, settings: tuple[str, ...], data: Data | None
 ) -> None:
     """Measure the error of a run; ``data``: what it made, if that is the whole pipeline."""
-    from ..accuracy.table import by_band
-    from ..accuracy.verify import achieved
+    from ..accuracy.fronts import achieved
+    from ..accuracy.report import by_band
 
     target = file.header.accuracy
     metric = target.metric if target else "map_rms"

@@ -13,11 +13,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 from engine import ROOT, fuzz, guided_by, scratch, told
 
 with guided_by(
-    "zonda.operators.atmosphere.weather.table", "zonda.core.instrument", "zonda.core.accuracy.store"
+    "zonda.operators.atmosphere.weather.table",
+    "zonda.core.instrument",
+    "zonda.core.accuracy.fronts",
 ):
     import numpy as np
 
-    from zonda.core.accuracy.store import read
+    from zonda.core.accuracy.fronts import read
     from zonda.core.errors import ZondaError
     from zonda.core.instrument import Band
     from zonda.core.site import Site

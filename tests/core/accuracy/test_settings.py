@@ -5,8 +5,8 @@ import re
 import pytest
 
 import zonda
+from zonda.core.accuracy.report import arguments, fragment
 from zonda.core.accuracy.settings import knobs_of, overrides, shortened
-from zonda.core.accuracy.table import arguments, fragment
 from zonda.core.configuration import yaml_places
 from zonda.core.errors import InputError
 

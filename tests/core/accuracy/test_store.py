@@ -6,11 +6,11 @@ import json
 import pytest
 
 import zonda
-from zonda.core.accuracy import store
+from zonda.core.accuracy import fronts as store
+from zonda.core.accuracy.fronts import Retest
+from zonda.core.accuracy.report import lines
 from zonda.core.accuracy.settings import knobs_of
 from zonda.core.accuracy.study import Setup, study
-from zonda.core.accuracy.table import lines
-from zonda.core.accuracy.verify import Retest
 from zonda.core.errors import InputError
 
 TEXT = """

@@ -6,9 +6,9 @@ import pytest
 
 from zonda.core.accuracy.measure import Measured
 from zonda.core.accuracy.pareto import Point, cheapest
+from zonda.core.accuracy.report import lines
 from zonda.core.accuracy.study import Setup, Study
 from zonda.core.accuracy.sweep import Alone, Bench, Rung, Sweep, sweep, tightest
-from zonda.core.accuracy.table import lines
 
 
 def study_of(found, points, target=0.01, shorter=None, **more):

@@ -8,8 +8,8 @@ import h5py
 import pytest
 from astropy.io import fits
 
-from zonda.core.campaign.job import Job
-from zonda.core.campaign.reduce import combined
+from zonda.core.campaign.campaign_file import Job
+from zonda.core.campaign.tasks import combined
 from zonda.core.configuration.pipeline_file import load
 
 from ...scenes import write_sky

@@ -10,8 +10,8 @@ import shutil
 
 import pytest
 
-from zonda.core.campaign import work as campaign
-from zonda.core.campaign.task import Outcome, perform
+from zonda.core.campaign import tasks as campaign
+from zonda.core.campaign.tasks import Outcome, perform
 
 SERIAL = ("--engine", "serial", "--threads", 1)
 SETS = (

@@ -2,8 +2,8 @@
 
 import pytest
 
+from zonda.core.campaign.campaign_file import FILE, digest_of_text
 from zonda.core.campaign.folder import clean
-from zonda.core.campaign.job import FILE, digest_of_text
 from zonda.core.storage import files
 from zonda.core.storage.files import temporary_sibling
 
@@ -25,7 +25,7 @@ def test_half_written_files_go_wherever_they_are(tmp_path):
 
 
 def test_a_campaign_that_ends_well_leaves_none(bench, monkeypatch):
-    from zonda.core.campaign.work import Tasks
+    from zonda.core.campaign.tasks import Tasks
 
     def leaves(folder):
         (folder / "entries/000000").mkdir(parents=True, exist_ok=True)

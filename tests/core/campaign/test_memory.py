@@ -6,9 +6,8 @@ import re
 
 import pytest
 
-from zonda.core.campaign import memory
-from zonda.core.campaign.engines import engine
-from zonda.core.campaign.memory import share_out
+from zonda.core.campaign import engines
+from zonda.core.campaign.engines import engine, share_out
 from zonda.core.errors import PipelineError
 
 MB = 1_000_000
@@ -18,10 +17,10 @@ NEED = 500 * MB
 @pytest.fixture(autouse=True)
 def machine(monkeypatch):
     """8 CPUs, 16 GB free, and a main process of 300 MB."""
-    for module in ("engines", "memory"):
+    for module in ("engines",):
         monkeypatch.setattr(f"zonda.core.campaign.{module}.available_memory", lambda: 16_000 * MB)
     monkeypatch.setattr("zonda.core.campaign.engines.available_threads", lambda: 8)
-    monkeypatch.setattr(memory, "resident_memory", lambda: 300 * MB)
+    monkeypatch.setattr(engines, "resident_memory", lambda: 300 * MB)
 
 
 def shared(size, workers=None, name="processes", need=NEED):

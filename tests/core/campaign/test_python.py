@@ -14,7 +14,7 @@ from astropy.time import Time
 from astropy.wcs import WCS
 
 import zonda
-from zonda.core.campaign.python import _plain
+from zonda.core.campaign.function import _plain
 from zonda.core.errors import OutputError, PipelineError, ZondaError
 from zonda.plugins.checks.scenes import TARGET, camera, scene
 
@@ -276,7 +276,7 @@ def test_an_unfinished_campaign_keeps_its_arrays(tmp_path, monkeypatch):
     pipeline = zonda.Pipeline(steps(sky()))
     with monkeypatch.context() as patch:
         patch.setattr(
-            "zonda.core.campaign.work.perform",
+            "zonda.core.campaign.tasks.perform",
             lambda order: (_ for _ in ()).throw(KeyboardInterrupt),
         )
         with pytest.raises(KeyboardInterrupt):

@@ -13,11 +13,11 @@ from dataclasses import replace
 import h5py
 
 from zonda.core.campaign import calls
-from zonda.core.campaign import work as campaign
+from zonda.core.campaign import tasks as campaign
+from zonda.core.campaign.campaign_file import Job
 from zonda.core.campaign.engines import Pool, SerialExecutor
-from zonda.core.campaign.job import Job
-from zonda.core.campaign.record import Record
-from zonda.core.campaign.task import Outcome, perform
+from zonda.core.campaign.folder import Record
+from zonda.core.campaign.tasks import Outcome, perform
 
 SERIAL = ("--engine", "serial", "--threads", 1)
 
@@ -87,7 +87,7 @@ def test_tasks_of_whole_entries_give_the_same_bits(undisturbed, bench):
 
 
 def test_a_tree_of_several_levels_gives_the_same_maps(undisturbed, bench, monkeypatch):
-    monkeypatch.setattr("zonda.core.campaign.reduce.FAN", 2)
+    monkeypatch.setattr("zonda.core.campaign.tasks.FAN", 2)
     assert bench.planes(bench.run(bench.CAMPAIGN, *SERIAL)) == bench.planes(undisturbed)
 
 

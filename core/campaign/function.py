@@ -33,9 +33,9 @@ from ..scene import Scene
 from ..storage.files import check_output_folder, product_path
 from ..storage.lock import lock
 from . import run
+from .campaign_file import FILE, INPUTS, Job
 from .engines import engine
 from .folder import check_free
-from .job import FILE, INPUTS, Job
 from .prepare import CampaignFile, Pruning
 from .section import CampaignHeader
 from .settings import Campaign

@@ -1,5 +1,5 @@
-"""Pareto fronts as files: what `accuracy: 1 %` in a pipeline chooses from, and a regression test of
-the errors.
+"""Pareto fronts as files, which `accuracy: 1 %` in a pipeline chooses from; the errors of a stored
+front, or of a run, measured again.
 
 The front of ``pipelines/my.yaml`` for the metric ``peak`` is ``pipelines/fronts/my.peak.json``. It
 holds for the pipeline it was made of: a fingerprint of scene and steps, without seed, knobs and the
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,9 +18,12 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ..errors import InputError
+from ..experiment.variant import Variant
 from ..output import Output
 from ..plan.planning import planning_of
 from ..storage.files import write_text
+from .bands import metric_of
+from .measure import Request, execute, measure
 from .metrics import get
 from .pareto import Point, cheapest
 from .settings import LENGTH, Setting, knobs_of, overrides
@@ -27,8 +31,10 @@ from .sweep import tightest
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
+    from ..data import Data
     from ..operator import Operator
     from .study import Study
+
 
 FORMAT = 2
 """1: ``reference_error`` without the knobs that stay as in the file."""
@@ -237,3 +243,83 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, dict):
         return {k: _rounded(v) for k, v in value.items()}
     return [_rounded(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+SLACK = 0.2
+"""By how much an error may exceed the stored one, relative: bits differ between CPUs, and the small
+errors with them.
+"""
+SMALLEST = 1e-5
+"""Errors below this are not told apart."""
+
+
+@dataclass(frozen=True)
+class Retest:
+    """A point of a stored Pareto front and its error now."""
+
+    setting: dict[str, str]
+    stored: float
+    now: float
+
+    @property
+    def good(self) -> bool:
+        return self.now <= self.stored * (1 + SLACK) + SMALLEST
+
+
+def achieved(
+    file: PipelineFile,
+    pipeline: str,
+    settings: Sequence[str],
+    metric: str,
+    threads: int | None = None,
+    data: Data | None = None,
+) -> tuple[float, dict[str, float]]:
+    """Error of this pipeline's own setting against its knobs at their tightest, same scans and
+    seed; and that of each band by its name, of which it is the largest (empty where the camera has
+    one band).
+
+    ``data``: of a run of it, which saves one of the two runs where the metric needs no step and no
+    signal of its own.
+    """
+    measures = metric_of(file, metric)
+    measures.check(file.operators, file.runs)
+    reference = overrides(tightest(knobs_of(file)))
+
+    def found(given: Sequence[str]) -> Any:
+        return measure(
+            Request(pipeline, tuple(given), metric, repeats=0, threads=threads or 1)
+        ).found[0]
+
+    enough = len(measures.steps(list(file.operators))) == len(
+        file.operators
+    ) and not measures.signals(file.runs)
+    own = measures.measure(data) if data is not None and enough else found(settings)
+    tightened = found((*settings, *reference))
+    return measures.error(own, tightened), dict(measures.errors(own, tightened))
+
+
+def retest(
+    front: StoredFront, file: PipelineFile, pipeline: str, points: int | None = None
+) -> list[Retest]:
+    """Measure the errors of a stored Pareto front again (of the ``points`` with the largest
+    errors): errors only, never times, and therefore in this process.
+
+    Raises InputError where the front is of another pipeline.
+    """
+    if front.fingerprint != fingerprint(file):
+        cure = "make it anew: zonda accuracy PIPELINE --store"
+        raise InputError(
+            "the stored Pareto front is of other steps or another scene",
+            place=file.place,
+            cure=cure,
+        )
+    metric = metric_of(file, front.metric)
+    base = (*overrides(front.shorter), f"seed={front.seed}")
+
+    def found(setting: dict[str, str]) -> Any:
+        variant = Variant(pipeline, (*base, *overrides(setting)))
+        return metric.measure(execute(variant.file, metric, 1, timed=False)[0])
+
+    reference = found(front.reference)
+    chosen = sorted((p for p in front.points if p.error > 0), key=lambda p: -p.error)[:points]
+    return [Retest(p.setting, p.error, metric.error(found(p.setting), reference)) for p in chosen]

@@ -1,0 +1,397 @@
+"""Tasks of a campaign, on workers: one runs scans of an entry and writes their partial product; one
+adds up the partial products of a set.
+
+The bits of a task do not depend on where and when it runs. The parts of a set are numbered in the
+order of their scans and added up in a fixed tree: runs of `FAN` parts from left to right, the sums
+likewise, until one is left. So the bits are the same for any engine, any number of workers, any
+order of completion. Sums of maps are integers and exact anyway; means of spectra are floats and owe
+their bits to the tree.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .. import hooks
+from ..configuration.time import Instant
+from ..data import Data
+from ..errors import InputError, OutputError, PipelineError, PointingError, ZondaError
+from ..faults import faults_named
+from ..storage.files import check_output_folder, discard
+from . import machines, parts, table
+from .calls import Lost, Work, carry_out
+from .campaign_file import Job, Task, layout_path, plural
+from .engines import Pool, engine_failed
+from .folder import Record, clean
+from .machines import Watch
+from .partial import NotCombined, Partial
+from .prepare import scene_of
+
+if TYPE_CHECKING:
+    from ..configuration.pipeline_file import PipelineFile
+
+
+@dataclass(frozen=True)
+class Order:
+    """A task as it is sent to a worker: everything it needs but the files.
+
+    Attributes
+    ----------
+    task, pipeline
+        What to do: the task and its planned pipeline as YAML.
+    layout
+        Digest of the layouts' file.
+    folder
+        The campaign's output folder, as the worker sees it.
+    threads, memory
+        For this task; None: all of the machine's. The memory is that of the worker's whole process.
+    version
+        Of the zonda that sends it.
+    """
+
+    task: Task
+    pipeline: str
+    layout: str
+    folder: Path
+    threads: int | None
+    memory: int | None
+    version: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a task.
+
+    Attributes
+    ----------
+    error
+        What went wrong, as shown to the user; empty where nothing did.
+    final
+        Whether trying again cannot help.
+    stop
+        Whether the other tasks would fail alike.
+    seconds
+        Wall time.
+    machine
+        On what it ran (`machines.here`).
+    """
+
+    host: str
+    seconds: float
+    machine: str = ""
+    error: str = ""
+    final: bool = False
+    stop: bool = False
+
+
+def perform(order: Order) -> Outcome:
+    """Run a task. Never raises an `Exception`: the outcome states what failed."""
+    begin, host = time.monotonic(), f"{socket.gethostname()}:{os.getpid()}"
+    try:
+        from zonda import __version__
+
+        if __version__ != order.version:
+            raise PipelineError(
+                f"this worker has zonda {__version__}, the campaign {order.version}",
+                place=host,
+                cure="install the same one",
+            )
+        return Outcome(host, *_run(order, host, begin))
+    except ZondaError as err:
+        final = isinstance(err, PipelineError | PointingError)
+        stop = isinstance(err, OutputError | NotCombined)
+        return Outcome(host, time.monotonic() - begin, error=str(err), final=final, stop=stop)
+    except Exception as err:
+        import traceback
+
+        text = "".join(traceback.format_exception(err)).rstrip()
+        stop = isinstance(err, OSError)
+        return Outcome(host, time.monotonic() - begin, error=text, stop=stop)
+
+
+@faults_named()
+def _run(order: Order, host: str, begin: float) -> tuple[float, str]:
+    """Write the product of a task; wall time since ``begin``, and the machine."""
+    from ..configuration.time import Instant
+    from ..pipeline import Part
+    from .prepare import scene_of
+
+    task, folder, file = order.task, order.folder, pipeline_of(order.pipeline, order.folder)
+    part = Part(
+        task.scans,
+        layouts_in(layout_path(folder, task.combination), order.layout),
+        f"{task.entry:06d}-",
+    )
+    data = file.pipeline().run_part(
+        scene_of(file, task.seed, Instant(task.time)),
+        part,
+        output=folder / "entries" / f"{task.entry:06d}",  # the time streams of one entry together
+        threads=order.threads,
+        ceiling=order.memory,
+        provenance={"resolved_yaml": order.pipeline},
+    )
+    partial = Partial.of(data, task.before, part.prefix)
+    seconds, machine = time.monotonic() - begin, machines.here()
+    made = {"host": host, "seconds": seconds, "machine": machine}
+    partial.write(task.path(folder), task.key, made)
+    return seconds, machine
+
+
+@lru_cache(4)
+def pipeline_of(text: str, folder: Path) -> PipelineFile:
+    """A pipeline of the campaign in ``folder``, kept by the worker with what its operators remember
+    (maps read and convolved).
+    """
+    from ..configuration.pipeline_file import parse
+
+    return parse(text, name="campaign", folder=folder)
+
+
+@lru_cache(4)
+def layouts_in(path: Path, digest: str) -> Mapping[str, Any]:
+    """The layouts in a file, by label. Raises InputError where it is not the one meant."""
+    if parts.digest_of(path) != digest:
+        raise InputError(
+            "cannot be used: it is missing, damaged or another campaign's",
+            place=str(path),
+            cure="can this worker see the campaign's folder?",
+        )
+    layouts: Mapping[str, Any] = parts.read(path, "layout")["layouts"]
+    return layouts
+
+
+FAN = 32
+"""Parts that are added up at once."""
+
+
+@dataclass(frozen=True)
+class Combined:
+    """What became of a combination: its tally (who, what, value, whether it is a count), or what
+    went wrong.
+    """
+
+    tally: tuple[tuple[str, str, str, bool], ...] = ()
+    error: ZondaError | None = None
+
+
+def combine(folder: Path, number: int) -> Combined:
+    """Add up one combination's parts, finish its products and write them. Errors are returned, not
+    raised.
+    """
+    try:
+        data = combined(Job.read(folder), folder, number)
+    except ZondaError as err:
+        return Combined(error=err)
+    counts = {(who, what) for who, what, _ in data.tally.counts()}
+    return Combined(
+        tuple((who, what, value, (who, what) in counts) for who, what, value in data.tally.told())
+    )
+
+
+@faults_named()
+def combined(job: Job, folder: Path, number: int) -> Data:
+    """As `combine`; the finished data. Raises `InputError` where a partial product is missing or
+    damaged.
+    """
+    combination, tasks = job.combinations[number], job.tasks_of(number)
+    first = tasks[0]
+    file = pipeline_of(job.pipelines[first.pipeline], folder)
+    pipeline, scene = file.pipeline(), scene_of(file, first.seed, Instant(first.time))
+    data = Data(scene, output=check_output_folder(folder / combination.folder))
+    data.provenance = {
+        **pipeline.provenance(scene),
+        "resolved_yaml": job.source[0] if len(job.source) == 1 else job.pipelines[first.pipeline],
+        "command": job.command,
+        "plan": job.plans[first.pipeline],
+        "campaign": f"{combination.name or job.name}: {plural(len(tasks), 'task')}",
+    }
+    data.layouts, data.laid_out = (
+        dict(layouts_in(layout_path(folder, number), combination.layout)),
+        True,
+    )
+    depth = 1
+    while FAN**depth < len(tasks):
+        depth += 1
+    whole = _sum(tasks, folder, 0, depth)
+    data.partial, data.tally, data.observations = (
+        whole.products,
+        whole.tally,
+        whole.observations(scene),
+    )
+    pipeline.finish(data)
+    if job.figures:
+        table.keep(folder, number, data)
+    return data
+
+
+def _sum(tasks: Sequence[Task], folder: Path, first: int, level: int) -> Partial:
+    """Sum of ``FAN**level`` parts from the ``first`` on; one sum is held for each level."""
+    if level == 0:
+        task = tasks[first]
+        return Partial.read(task.path(folder), task.key)
+    whole = _sum(tasks, folder, first, level - 1)
+    width = FAN ** (level - 1)
+    for branch in range(first + width, min(first + FAN * width, len(tasks)), width):
+        whole += _sum(tasks, folder, branch, level - 1)
+    return whole
+
+
+LOST = "(lost)"
+"""Host of an attempt whose worker was killed."""
+
+
+@dataclass
+class CampaignResult:
+    """The result of a campaign.
+
+    Attributes
+    ----------
+    tally
+        Of all combinations: rows (combination, who, what, value, whether it is a count).
+    tasks
+        Number of tasks that were run now.
+    seconds
+        Wall time of the tasks; ``samples`` in them.
+    failed
+        Errors of tasks that are given up, by number.
+    """
+
+    folder: Path
+    tally: list[tuple[str, str, str, str, bool]] = field(default_factory=list)
+    tasks: int = 0
+    samples: int = 0
+    seconds: float = 0.0
+    failed: dict[int, str] = field(default_factory=dict)
+
+
+class Tasks(Work[Task, Outcome]):
+    """The tasks of a campaign. ``watch`` compares the machines that they run on."""
+
+    def __init__(self, record: Record, pool: Pool, watch: Watch) -> None:
+        super().__init__()
+        self.job, self.folder = record.job, record.folder
+        self.record, self.pool, self.watch = record, pool, watch
+        self.result = CampaignResult(record.folder)
+        self._failures = 0
+
+    def run(self, tasks: Sequence[Task]) -> CampaignResult:
+        """Run these tasks; on an interrupt, those at work wait again."""
+        self._all, self._begin = (
+            {"total": len(tasks), "all_samples": sum(task.samples for task in tasks)},
+            time.monotonic(),
+        )
+        try:
+            carry_out(self, tasks, self.pool, self.folder)
+        except BaseException:
+            with contextlib.suppress(Exception):
+                self.record.put_off()
+            if self.pool.stop is not None:
+                clean(self.folder)
+            raise
+        finally:
+            hooks.manager().hook.zonda_campaign_end()
+        self.result.seconds = time.monotonic() - self._begin
+        return self.result
+
+    def call(self, item: Task) -> tuple[Callable[[Order], Outcome], Order]:
+        """See `Work.call`."""
+        from zonda import __version__
+
+        layout, pipeline = (
+            self.job.combinations[item.combination].layout,
+            self.job.pipelines[item.pipeline],
+        )
+        folder, pool = self.folder.resolve(), self.pool
+        return perform, Order(
+            item, pipeline, layout, folder, pool.threads, pool.memory, __version__
+        )
+
+    def began(self, items: list[Task]) -> None:
+        """See `Work.began`."""
+        self.record.claim(task.number for task in items)
+
+    def ended(self, item: Task, result: Outcome | Lost) -> bool:
+        """Record the outcome of a task."""
+        number = item.number
+        outcome = Outcome(LOST, 0.0, error=str(result)) if isinstance(result, Lost) else result
+        if not outcome.error and (
+            error := self.watch.meet(outcome.machine, f"task {number} on {outcome.host}")
+        ):
+            discard(item.path(self.folder))
+            outcome = replace(outcome, error=error, final=True, stop=True)
+        again = (
+            bool(outcome.error) and not outcome.final and self.attempts[item] <= self.job.retries
+        )
+        if not outcome.error:
+            self.record.done(item, outcome.host, outcome.seconds, outcome.machine)
+            self.result.tasks += 1
+            self.result.samples += item.samples
+        else:
+            self._failures += 1
+            self.record.failed(item, outcome.host, outcome.seconds, outcome.error, again)
+            if not again:
+                self.result.failed[number] = outcome.error
+                self.stop = self.stop or outcome.stop
+        hooks.manager().hook.zonda_campaign_progress(
+            done=self.result.tasks, failed=self._failures, samples=self.result.samples,
+            seconds=time.monotonic() - self._begin, **self._all,
+        )  # fmt: skip
+        return again
+
+
+class Combinations(Work[int, Combined]):
+    """The sets of products, by number. They are combined on workers: pictures and reports take time
+    and memory.
+    """
+
+    def __init__(self, record: Record, result: CampaignResult) -> None:
+        super().__init__()
+        self.job, self.folder, self.record, self.result = (
+            record.job,
+            record.folder,
+            record,
+            result,
+        )
+        self._error: ZondaError | None = None
+
+    def run(self, numbers: Sequence[int], pool: Pool) -> None:
+        """Combine these. Raises the first error, when what was at work has ended."""
+        carry_out(self, numbers, pool, self.folder)
+        if self._error is not None:
+            raise self._error
+
+    def call(self, item: int) -> tuple[Callable[..., Combined], Path, int]:
+        """See `Work.call`."""
+        return combine, self.folder.resolve(), item
+
+    def ended(self, item: int, result: Combined | Lost) -> bool:
+        """Record that products are written, and remove their parts."""
+        if isinstance(result, Lost):
+            if not engine_failed(result.error):
+                raise result.error
+            if self.attempts[item] <= self.job.retries:
+                return True
+            message = f"the engine failed when it combined the maps: {result}"
+            error: ZondaError | None = PipelineError(
+                message, place=str(self.folder), cure=f"zonda resume {self.folder}"
+            )
+        else:
+            error = result.error
+        if error is not None:
+            self._error, self.stop = self._error or error, True
+            return False
+        assert isinstance(result, Combined)
+        self.record.combine(item)
+        name = self.job.combinations[item].name
+        self.result.tally += [(name, *row) for row in result.tally]
+        if not self.job.keep_tasks:
+            self.record.discard_parts(item)
+        return False
