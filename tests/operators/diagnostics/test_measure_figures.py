@@ -177,7 +177,7 @@ def test_figures_of_one_signal_alone_keep_what_it_is_without(tmp_path):
     file = loaded(
         tmp_path, "  - MeasureFigures: {metrics: [{central_rms: {signal: free}}]}\n", runs
     )
-    planned = zonda.plan(file, threads=1).apply(file)
+    planned = zonda.plan(file, threads=1, keep=["HighpassFilter"]).apply(file)
     data = planned.pipeline().run(planned.scene(), output=tmp_path / "planned", threads=1)
     whole = file.pipeline().run(file.scene(), output=tmp_path / "whole", threads=1)
     (name,) = [figure.name for figure in whole["figures"]]
