@@ -26,7 +26,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.numerics.tiles import TILE_SAMPLES
 
 from .coverage import COUNTS, Coverage, Directions
-from .few_angles import warn_before
+from .few_angles import check_polarized, warn_before
 from .finished import finish
 from .grid import Grid, TangentGrid
 from .halves import halves_of
@@ -34,9 +34,7 @@ from .map_layout import check_size, grid_of, layout_of, outside
 from .map_sums import MapSums
 from .parameters import MapParameters
 from .pixels import Cells, Looking
-from .stokes_map import check_polarized, stokes_binnings
-from .stokes_product import StokesSums
-from .stokes_sums import Part, StokesBinning, add_blocks
+from .stokes_sums import Part, StokesBinning, add_blocks, stokes_binnings
 from .sums import (
     FLAGGED,
     NOT_FINITE,
@@ -134,7 +132,7 @@ class BinMap(MapParameters):
     def finalize(self, data: Data) -> None:
         """Turn the sums into one `MapProduct` for each signal, under the name `product`."""
         self._spare.clear()
-        sums: MapSums | StokesSums | None = data.take(self.label)
+        sums: MapSums | None = data.take(self.label)
         if sums is not None:
             finish(self, data, self.grid, self._layout, sums)
 
@@ -179,6 +177,7 @@ def prepared(
         observation.tally.count(step.label, LIGHT, int((~heavy).sum()), heavy.size)
     if "white" not in observation.components and step.noise == "net" and step.contents == "all":
         observation.tally.state(step.label, "noise of a pixel", NO_WHITE)
+    check_polarized(step, observation)
     looking = Looking.of(observation, step.grid)
     how = step, looking, (weight, noise, window), seen, spare
     made: list[Any] = stokes_binnings(*how) if step.stokes == "IQU" else binnings(*how)
@@ -293,8 +292,6 @@ def signals_of(step: BinMap, block: Block, state: Prepared) -> tuple[Any, ...]:
 
 def halves(step: BinMap, state: list[Any]) -> list[Any]:
     """The binnings of either half; of scans, which are a half each, all together."""
-    if step.stokes == "IQU":
-        return state
     middle = len(state) // 2
     return [state] if step.split == "scans" else [state[:middle], state[middle:]]
 
@@ -352,9 +349,7 @@ def _how(step: BinMap, block: Block, binning: Binning, reference: float) -> tupl
     )
 
 
-def note_beams(
-    step: BinMap, observation: Observation, sums: MapSums | StokesSums, binned: int
-) -> None:
+def note_beams(step: BinMap, observation: Observation, sums: MapSums, binned: int) -> None:
     """Note the beams of an observation's detectors, with what they weigh in the map: ``binned``
     samples, as many of each.
     """
@@ -370,15 +365,10 @@ def add_scan(step: BinMap, data: Data, observation: Observation, state: Prepared
     """
     if step.label not in data.partial:
         signals = () if step.contents == "hits" else observation.signals
-        n, of_scans = step.grid.n_pixels, step.split == "scans"
-        polarized = step.stokes == "IQU"
-        made = (
-            StokesSums(n, signals, of_scans)
-            if polarized
-            else MapSums(n, signals, step.noise == "scatter", of_scans)
-        )
+        how = step.stokes == "IQU", step.noise == "scatter", step.split == "scans"
+        made = MapSums(step.grid.n_pixels, signals, *how)
         counts = [name for name in COUNTS if getattr(step, name)]
-        made.coverage = Coverage.empty(n, counts, step.scan_hits)
+        made.coverage = Coverage.empty(step.grid.n_pixels, counts, step.scan_hits)
         data.add(step.label, made)
     sums: Any = data.partial[step.label]
     before = sums.hits.sum(axis=0) if sums.coverage.of_hits else None

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
+from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.projection import frame_rotation
 from zonda.core.polarization import PolarizationAngles
@@ -27,6 +28,21 @@ CURE = (
     "add detectors at other angles (two pairs at 45 deg whose paths cross), scans at other"
     " parallactic angles, or a HalfWavePlate"
 )
+
+
+def check_polarized(step: MapParameters, observation: Observation) -> None:
+    """Raise PipelineError where I, Q and U are wanted and no detector is polarized."""
+    if step.stokes != "IQU" or observation.focalplane.polarized:
+        return
+    camera = observation.instrument
+    by = camera.polarized_by
+    if (table := camera.focalplane_table) is not None:
+        by = (
+            f"add the column polarization_angle to {table} (polarization_efficiency, if it is"
+            " there, must be above 0)"
+        )
+    message = f"stokes: IQU needs polarized detectors, and none of {camera.name} is"
+    raise PipelineError(message, place=step.label, cure=f"{by}, or set stokes: I")
 
 
 def warn_before(step: MapParameters, observations: Sequence[Observation]) -> None:

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
@@ -20,19 +19,19 @@ from zonda.core.numerics.angles import angle_text
 from zonda.core.numerics.chunks import empty
 from zonda.core.signal import MAIN, product_name
 from zonda.core.tally import Tally
-from zonda.core.types import Floats
 
 from .few_angles import warn_after
 from .grid import Grid, HealpixGrid
 from .halves import DIFFERENCES
 from .map_sums import MapSums
 from .parameters import MapParameters
-from .stokes_map import UNSOLVED, stokes_map_of
-from .stokes_product import StokesSums
-from .sums import DATA, HITS, NOISE, VALUE, WEIGHT, WEIGHTS, Sums
+from .solve import Solver
+from .sums import VALUE
 
-AT_ONCE = 1 << 15
+AT_ONCE = 1 << 14
 """Pixels whose maps are made at a time: what is only used for a moment stays in the cache."""
+UNSOLVED = "pixels whose samples do not determine I, Q and U: NaN"
+"""A count of the log."""
 
 
 def finish(
@@ -40,7 +39,7 @@ def finish(
     data: Data,
     grid: Grid,
     layout: Mapping[str, Any],
-    sums: MapSums | StokesSums,
+    sums: MapSums,
 ) -> None:
     """Add the map of each signal to the products. Raises PipelineError where another step has made
     one of this name.
@@ -52,9 +51,7 @@ def finish(
             raise PipelineError(
                 text, place=step.label, cure="give one of them another product name"
             )
-        polarized = isinstance(sums, StokesSums)
-        make = stokes_map_of if polarized else map_of
-        product = make(step, grid, layout, sums, stream)  # type: ignore[arg-type]
+        product = map_of(step, grid, layout, sums, stream)
         product.band = data.scene.instrument.band
         if stream == MAIN:
             _with_coverage(product, grid, sums)
@@ -72,74 +69,62 @@ def map_of(
     step: MapParameters, grid: Grid, layout: Mapping[str, Any], sums: MapSums, stream: str
 ) -> MapProduct:
     """The map of the signal ``stream``."""
-    n, variance = grid.n_pixels, layout["variance"]
-    unit = variance if step.weights == "inverse_variance" else 1.0
-    hits, signal, weight, noise = (
-        empty((n, 1), kind).reshape(n) for kind in (np.int64, float, float, float)
+    variance = layout["variance"]
+    solver = Solver(
+        sums,
+        variance,
+        variance if step.weights == "inverse_variance" else 1.0,
+        step.noise == "scatter",
+        step.condition_limit,
+        bool(step.half_difference) and sums.halved and step.contents == "all",
     )
-    halves = (
-        bool(step.half_difference)
-        and (len(sums.scans) >= 2 or not sums.of_scans)
-        and step.contents == "all"
-    )
-    half = empty((n, 1), float).reshape(n) if halves else None
-    for start in range(0, n, AT_ONCE):
+    planes: dict[str, Any] = {}
+    for start in range(0, max(grid.n_pixels, 1), AT_ONCE):
         part = slice(start, start + AT_ONCE)
-        total = sums.total(stream, part)
-        hits[part] = total[:, HITS]
-        if step.contents == "hits":
-            signal[part], noise[part], weight[part] = np.nan, np.nan, hits[part] / unit
-            continue
-        signal[part], w = _mean(total)
-        weight[part], noise[part] = (
-            w / unit,
-            _noise(total, signal[part], w, variance, step.noise == "scatter"),
-        )
-        if half is not None:
-            (even, w_even), (odd, w_odd) = (_mean(sums.half(stream, k, part)) for k in (0, 1))
-            with np.errstate(invalid="ignore", divide="ignore"):
-                half[part] = (even - odd) * np.sqrt(w_even * w_odd) / (w_even + w_odd)
-    keep = hits > 0 if isinstance(grid, HealpixGrid) else slice(None)
-    planes: list[NDArray[Any]] = [signal, hits, weight, noise] + (
-        [half] if half is not None else []
-    )
-    planes = [
-        plane[keep].reshape(-1 if isinstance(grid, HealpixGrid) else grid.shape) for plane in planes
-    ]
-    common: dict[str, Any] = {
-        "frame": step.frame,
-        "weighting": step.weights,
-        "noise_from": step.noise,
-        "fwhm": sums.beams.fwhm or layout["fwhm"],
-        "beams": sums.beams.extremes,
-        "scans": list(sums.scans),
-        "centre": tuple(layout["middle"]),
-        "half_difference": planes[4] if half is not None else None,
-        "difference": DIFFERENCES[step.split],
-        "contents": step.contents,
-        "sample_rate": min(sums.rates) if len(sums.rates) == 1 else 0.0,
-    }
-    if not isinstance(grid, HealpixGrid):
-        header = grid.header
-        return MapProduct(
-            planes[0], planes[1], planes[2], planes[3], header=header, pixel=grid.pixel, **common
-        )
-    size = math.sqrt(4 * math.pi / (12 * grid.nside**2))
+        for name, values in solver.planes(stream, part).items():
+            if name not in planes:
+                planes[name] = empty((len(values), grid.n_pixels), values.dtype)
+            planes[name][:, part] = values
+    if step.contents == "hits":
+        planes["signal"][:] = planes["noise"][:] = np.nan
+    keep: Any = slice(None)
+    shape: tuple[int, ...] = (-1,)
+    if isinstance(grid, HealpixGrid):
+        keep = np.flatnonzero(planes["hits"][0])
+    else:
+        shape = grid.shape
+    planes = {name: rows[:, keep].reshape(len(rows), *shape) for name, rows in planes.items()}
+    planes["hits"] = planes["hits"][0]
     return MapProduct(
-        planes[0],
-        planes[1],
-        planes[2],
-        planes[3],
-        header=None,
-        pixel=size,
-        nside=grid.nside,
-        nest=grid.nest,
-        pixels=grid.pixels_covered[keep],
-        **common,
+        **planes,
+        frame=step.frame,
+        weighting=step.weights,
+        noise_from=step.noise,
+        fwhm=sums.beams.fwhm or layout["fwhm"],
+        beams=sums.beams.extremes,
+        scans=list(sums.scans),
+        centre=tuple(layout["middle"]),
+        difference=DIFFERENCES[step.split],
+        contents=step.contents,
+        sample_rate=min(sums.rates) if len(sums.rates) == 1 else 0.0,
+        **pixels_of(grid, keep),
     )
 
 
-def _with_coverage(product: MapProduct, grid: Grid, sums: MapSums | StokesSums) -> None:
+def pixels_of(grid: Grid, keep: Any) -> dict[str, Any]:
+    """Where the pixels of a map are: those of a list that it has are numbered ``keep``."""
+    if not isinstance(grid, HealpixGrid):
+        return {"header": grid.header, "pixel": grid.pixel}
+    return {
+        "header": None,
+        "pixel": math.sqrt(4 * math.pi / (12 * grid.nside**2)),
+        "nside": grid.nside,
+        "nest": grid.nest,
+        "pixels": grid.pixels_covered[keep],
+    }
+
+
+def _with_coverage(product: MapProduct, grid: Grid, sums: MapSums) -> None:
     """Give a map how its scans cross, and their hits, where these were asked for."""
     coverage = sums.coverage
     planes, pixels = coverage.planes(), coverage.pixels
@@ -180,9 +165,7 @@ def tell_beams(step: MapParameters, product: MapProduct, data: Data) -> None:
             )
 
 
-def state_choices(
-    step: MapParameters, product: MapProduct, sums: MapSums | StokesSums, tally: Tally
-) -> None:
+def state_choices(step: MapParameters, product: MapProduct, sums: MapSums, tally: Tally) -> None:
     """Tell how the map was made, and what is approximate about it."""
     if product.polarization is not None:
         hit = int(np.count_nonzero(product.hits))
@@ -207,25 +190,5 @@ def state_choices(
     tally.state(step.label, "fixed-point step of the sums", f"{1 / VALUE:.1e} K per sample")
     if not sums.of_scans:
         tally.state(step.label, "half-difference of", DIFFERENCES[step.split])
-    if step.half_difference and sums.of_scans and len(sums.scans) < 2:
+    if step.half_difference and not sums.halved:
         tally.state(step.label, "half-difference", "not made: it needs two scans")
-
-
-def _mean(sums: Sums) -> tuple[Floats, Floats]:
-    """(signal, weight) of fixed-point sums (n_pixel, 4); NaN where there are no hits."""
-    weight = sums[:, WEIGHTS] / WEIGHT
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(sums[:, HITS] > 0, sums[:, DATA] / VALUE / weight, np.nan), weight
-
-
-def _noise(total: Sums, signal: Floats, weight: Floats, variance: float, scatter: bool) -> Floats:
-    """Standard deviation of each pixel's mean: from the NET, or from the scatter of the samples."""
-    term = total[:, NOISE] / WEIGHT * variance
-    hits = total[:, HITS]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        if not scatter:
-            return np.where(hits > 0, np.sqrt(term) / weight, np.nan)
-        # equal samples leave the rounding of their squares, of either sign: a scatter below it is
-        # counted, and 0
-        found = np.maximum(term / weight - signal**2, 0.0)
-        return np.where(hits > 1, np.sqrt(found / (hits - 1)), np.nan)

@@ -24,16 +24,19 @@ from __future__ import annotations
 import threading
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.block import Block
+from zonda.core.numerics.projection import frame_rotation
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 
-from .pixels import Cells, Looking, tiles
+from .halves import halves_of
+from .parameters import MapParameters
+from .pixels import Cells, Looking, fingerprint, tiles
 from .stokes_kernel import DATA, FIRST, HIT, add_stokes
 from .sums import FLAGGED, Sums
 
@@ -107,6 +110,44 @@ class StokesBinning:
             self.spare.append(sums)
             yield pixels, found, dropped, largest
         self.parts.clear()
+
+
+def stokes_binnings(
+    step: MapParameters,
+    looking: Looking,
+    levels: tuple[Floats, Floats, Floats],
+    good: Any,
+    spare: list[Sums],
+) -> list[StokesBinning]:
+    """Empty sums for one observation, one for each half of its samples.
+
+    ``levels``: weights and noise of the detectors (`bin_map.weights_of`), and the window (n_samp,)
+    or (0,); ``good`` (n_samp,): which samples count.
+    """
+    observation, (weight, noise, window) = looking.observation, levels
+    own = bool(window.size) or not np.allclose(weight, noise, rtol=1e-6, atol=0)
+    angles = PolarizationAngles.of(
+        observation, observation.boresight_radec, frame_rotation(step.frame)[2]
+    )
+    signals, key = len(observation.signals), None
+    halves = [
+        (use, (good & samples).astype(np.uint8))
+        for use, samples in halves_of(step.split, observation)
+    ]
+    if looking.key is not None:
+        seen = (
+            angles.poles,
+            angles.axes,
+            angles.plate,
+            angles.gamma,
+            observation.focalplane.polarization_efficiency,
+            window,
+        )
+        key = looking.key, own, fingerprint(*seen, *(mask for half in halves for mask in half))
+    return [
+        StokesBinning(looking, angles, *half, window, weight, noise, signals, own, spare, key)
+        for half in halves
+    ]
 
 
 class Part(NamedTuple):

@@ -17,10 +17,10 @@ from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.map_file import MapFile, Provenance
 from zonda.core.numerics.projection import frame_rotation
 from zonda.core.polarization import PolarizationAngles
-from zonda.operators.diagnostics.plot_operators import _flat
+from zonda.operators.diagnostics.drawing.pictures import Flat
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.grid import TangentGrid
-from zonda.operators.maps.stokes_product import StokesSums
+from zonda.operators.maps.map_sums import MapSums
 from zonda.plugins.checks import scenes
 from zonda.plugins.checks.scenes import run, scan
 from zonda.plugins.metrics.common import covered
@@ -173,13 +173,15 @@ def test_sums_that_are_merged_have_the_bits_of_one_run():
     o = observation()
     rng = np.random.default_rng(8)
     noisy = signal_of(o) + rng.normal(size=(o.n_detectors, o.n_samples))
-    parts = [StokesSums.of(dict(sums_of(o, signal).arrays())) for signal in (noisy, -2 * noisy)]
+    parts = [MapSums.of(dict(sums_of(o, signal).arrays())) for signal in (noisy, -2 * noisy)]
     whole = parts[0]
     whole += parts[1]
     np.testing.assert_array_equal(
-        whole.matrix[0], whole.matrix[1]
+        whole.table[0], whole.table[1]
     )  # even and odd scans: the same pointing
-    np.testing.assert_array_equal(whole.data["signal"][1], sums_of(o, -2 * noisy).data["signal"][0])
+    np.testing.assert_array_equal(
+        whole.right["signal"][1], sums_of(o, -2 * noisy).right["signal"][0]
+    )
     assert len(whole.scans) == 2
 
 
@@ -303,7 +305,7 @@ def test_a_lower_limit_of_the_condition_number_leaves_pixels_out():
     )  # what is not known neither contributes nor is filled
     np.testing.assert_array_equal(np.isfinite(planes(smooth)).all(axis=0), fewer.known)
     assert np.array_equal(np.isfinite(smooth.noise), fewer.known)
-    assert not (_flat(fewer, "signal").hits[~fewer.known]).any()
+    assert not (Flat.of(fewer, {"signal": fewer.signal}).hits[~fewer.known]).any()
     assert np.array_equal(covered(fewer) & ~fewer.known, np.zeros(fewer.hits.shape, bool))
 
 
