@@ -145,7 +145,7 @@ def _label_lines(ax: Any) -> None:
 
 
 def _upright(wcs: WCS, shape: tuple[int, ...]) -> bool:
-    """Whether meridians run up and parallels run across, within 30 deg, all along the edges."""
+    """True if meridians run up and parallels across, within 30 deg, all along the edges."""
     ny, nx = shape
     along, h = np.linspace(0.001, 0.999, 33), 1e-3 * min(nx, ny)
     low, high = np.full(33, 0.001), np.full(33, 0.999)
@@ -164,7 +164,7 @@ def _upright(wcs: WCS, shape: tuple[int, ...]) -> bool:
 
 
 def _all_sky(wcs: WCS, shape: tuple[int, ...]) -> bool:
-    """Whether the corners of an image are off the sky, as of all-sky projections."""
+    """True if the corners of an image are off the sky, as of all-sky projections."""
     ny, nx = shape
     x, y = np.array([0, nx - 1, 0, nx - 1]), np.array([0, 0, ny - 1, ny - 1])
     return not np.isfinite(wcs.wcs_pix2world(x, y, 0)).any()

@@ -32,6 +32,7 @@ from ..configuration.pipeline_file import PipelineFile
 from ..errors import PipelineError
 from ..mapmaker import made_by
 from ..signal import Signal
+from ..tables import aligned
 from .bands import PlanOfBands, files_of_bands
 from .context import Context
 from .decide import Decided
@@ -126,7 +127,7 @@ class Audit:
 
     @property
     def violated(self) -> bool:
-        """Whether any bound was."""
+        """True if any bound was violated."""
         return any(r.violated for r in self.rows)
 
     def __str__(self) -> str:
@@ -134,12 +135,7 @@ class Audit:
         for r in self.rows:
             bound, actual, error = (figure(r.metric, v) for v in (r.bound, r.actual, r.error))
             table.append((r.effect, r.what, r.metric, bound, actual, error, r.verdict))
-        widths = [max(len(row[k]) for row in table) for k in range(6)]
-        lines = [f"audit of {self.slice}"]
-        lines += [
-            "  ".join([*(c.ljust(w) for c, w in zip(r, widths, strict=False)), r[6]]).rstrip()
-            for r in table
-        ]
+        lines = [f"audit of {self.slice}", *aligned(table)]
         count = sum(r.violated for r in self.rows)
         if not self.rows:
             return f"{lines[0]}: nothing was coarsened, and no output depends on what was dropped"

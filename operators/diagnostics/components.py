@@ -32,7 +32,7 @@ from zonda.core.types import Floats
 
 @dataclass
 class Components:
-    """What is found of one scan.
+    """Principal components of one scan.
 
     Attributes
     ----------

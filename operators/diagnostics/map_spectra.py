@@ -145,7 +145,7 @@ class MapSpectrum(Output):
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is asked for: names of maps (empty: the map and what holds noise alone), rings, least
+    """Requested spectra: names of maps (empty: the map and what holds noise alone), rings, least
     coverage, taper [rad].
     """
 

@@ -102,8 +102,8 @@ def _unsolved(name: str, product: MapProduct) -> list[Card]:
 
 
 def _noise(figure: NoiseFigure, product: MapProduct) -> list[Card]:
-    """How noisy the centre of a map is, smoothed with the beam where that can be done, and as it
-    is.
+    """Cards of the noise at the centre of a map, smoothed with the beam if that can be done, and as
+    it is.
     """
     of = {
         "half_difference": product.difference.replace(" - ", " − "),
@@ -128,13 +128,13 @@ def _central(diameter: float, product: MapProduct) -> str:
 
 
 def has_white_noise(data: Data) -> bool:
-    """Whether a step of the pipeline makes white noise."""
+    """True if a step of the pipeline makes white noise."""
     classes = (class_of(kind) for _, kind, _ in data.provenance.get("operators", []))
     return any(cls is not None and "white" in declared(cls, "provides") for cls in classes)
 
 
 def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
-    """What the NET and the samples promise for the centre of a map: a card, or none where nothing
+    """Card of the white noise at the centre of a map that NET and samples promise; none if nothing
     is known.
 
     Smoothing with a beam of width sigma divides the variance of pixels of area A by 4 pi sigma^2 /
@@ -159,8 +159,8 @@ def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
 
 
 def _smoothed(kelvin: float, product: MapProduct) -> str:
-    """What smoothing with its beam made of a map: its resolution, and the flux density of
-    ``kelvin`` in it.
+    """Resolution of a map smoothed with its beam, and the flux density of ``kelvin`` in it, in
+    words.
     """
     resolution = math.sqrt(2) * product.fwhm
     how = f"{angle_text(product.fwhm)} beam and as much smoothing, added in quadrature"
@@ -173,8 +173,8 @@ def _smoothed(kelvin: float, product: MapProduct) -> str:
 
 
 def _depth(name: str, product: MapProduct, diameter: float) -> list[Card]:
-    """How long the centre of a map was observed: a card, or none where that is not known. The
-    median over its pixels.
+    """Card of the time for which the centre of a map was observed, the median over its pixels; none
+    if it is not known.
     """
     factor, near = product.seconds_per_beam(), product.distance() <= diameter / 2
     if factor is None or not near.any():

@@ -136,7 +136,7 @@ def figures(found: Pair, step: float, segments: float) -> tuple[list[float], lis
 
 @dataclass
 class StreamComparison(Record):
-    """How a stream of a run differs from another (`stream_statistics`).
+    """Comparison of a stream of a run with another (`stream_statistics`).
 
     Attributes
     ----------
@@ -182,8 +182,8 @@ class StreamComparison(Record):
         names: list[str],
         what: tuple[str, str, str, str],
     ) -> StreamComparison:
-        """Of one scan, from the spectra of each detector; ``what``: stream, reference, label,
-        product.
+        """Comparison of one scan, from the spectra of each detector; ``what``: stream, reference,
+        label, product.
         """
         found = [figures(p, float(frequency[0]), segments) for p in pairs]
         values, errors = (np.array(rows, np.float64) for rows in zip(*found, strict=True))

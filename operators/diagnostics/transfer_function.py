@@ -1,4 +1,4 @@
-"""What the filters leave of each angular scale of the sky.
+"""Share of each angular scale of the sky that the filters leave.
 
 a is the map of the sky alone, binned without any filter; b the map of the sky alone through all
 filters; both of the same samples and pixels, so that beam, pixels and coverage are in both and only

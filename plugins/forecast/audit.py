@@ -15,6 +15,7 @@ from zonda.core.experiment import run_file
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.signal import product_name, stream_of
+from zonda.core.tables import aligned
 from zonda.operators.maps.bin_map import BinMap
 
 from .covered import steps_of
@@ -77,24 +78,13 @@ class Audited:
 
     def __str__(self) -> str:
         factor, unit = prefixed(max(r.mean for r in self.rows), "K_RJ")
-        table: list[tuple[str, ...]] = [
-            ("", f"forecast [{unit}]", "simulated", "standard error", "difference", "z")
-        ]
+        head = ("", f"forecast [{unit}]", "simulated", "standard error", "difference", "z")
+        table = []
         for r in self.rows:
             figures = (f"{v * factor:.4g}" for v in (r.forecast, r.mean, r.error))
             table.append((r.part, *figures, f"{100 * r.difference:+.1f} %", f"{r.z:+.1f}"))
-        widths = [max(len(row[k]) for row in table) for k in range(len(table[0]))]
-        lines = [f"audit: {self.rows[0].seeds} simulations of the whole pipeline"]
-        for first, *others in table:
-            lines.append(
-                "  ".join(
-                    [
-                        first.ljust(widths[0]),
-                        *(c.rjust(w) for c, w in zip(others, widths[1:], strict=True)),
-                    ]
-                )
-            )
-        return "\n".join(lines)
+        title = f"audit: {self.rows[0].seeds} simulations of the whole pipeline"
+        return "\n".join([title, *aligned(table, head, "<>")])
 
 
 @dataclass(frozen=True)

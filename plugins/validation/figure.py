@@ -90,7 +90,7 @@ def _draw_lines(
 
 
 def _axis(counter: CounterResult) -> str:
-    """What its values are, and their unit."""
+    """Name of its values, with their unit."""
     unit, what = counter.unit.unit, counter.experiment.statistic or "value"
     return f"{what} [{unit}]" if unit else what
 

@@ -56,7 +56,7 @@ def write(file: ClaimsFile, rows: Sequence[Row], folder: Path) -> None:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """How many claims have which verdict: ``12 agree, 1 differs``."""
+    """Numbers of claims by verdict: ``12 agree, 1 differs``."""
     return ", ".join(
         f"{verdict}: {number}"
         for verdict, number in Count(row.verdict.value for row in rows).most_common()

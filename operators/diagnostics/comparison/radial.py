@@ -57,7 +57,7 @@ def cell(steps: float | Floats) -> Floats:
 
 
 def lengths(steps: float | Floats) -> tuple[float, float]:
-    """Of a pixel along y and x, rad."""
+    """Lengths of a pixel along y and x, rad."""
     x, y = np.hypot(*cell(steps))
     return float(y), float(x)
 

@@ -387,7 +387,7 @@ def draw_streams(file: str, stream: TimeStream, before: str) -> list[Sketch]:
 
 
 def _how(product: MapProduct, shown: MapProduct) -> str:
-    """What was done to a map for its picture."""
+    """Smoothing of a map for its picture, in words."""
     if not shown.smoothed_by:
         return "not smoothed"
     text = f"smoothed by {angle_text(shown.smoothed_by)}"

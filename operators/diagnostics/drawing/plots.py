@@ -134,8 +134,8 @@ def plot_spectra(
 
 
 def _mark_regimes(ax: Any, regimes: Sequence[tuple[str, float, float]]) -> None:
-    """Where which law dominates: a pale shade, and its name below the upper edge where there is
-    room.
+    """Shade the frequencies where each law dominates, and write its name at the lower edge if there
+    is room.
     """
     words = {"atmosphere": "atmosphere", "pink": "1/f noise", "white": "white noise"}
     low, high = np.log10(ax.get_xlim())
