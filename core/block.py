@@ -129,8 +129,8 @@ class Block:
         return self.detectors.stop - self.detectors.start, self.samples.stop - self.samples.start
 
     def new(self, name: str, *, zero: bool = True) -> AnyFloats:
-        """Stream ``name``, made of zeros when it is not there yet; or of anything (not ``zero``),
-        to be overwritten.
+        """The stream ``name`` of this block; made, full of zeros, where there is none yet. Not
+        ``zero``: with any values, for a caller that overwrites all of them.
         """
         if name not in self.detdata:
             self.detdata[name] = (

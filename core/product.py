@@ -37,7 +37,7 @@ class Product(ABC):
 
     @classmethod
     def identity(cls) -> str:
-        """``module:class``."""
+        """Where another process finds this class: ``module:class``."""
         return f"{cls.__module__}:{cls.__qualname__}"
 
     @abstractmethod

@@ -237,8 +237,8 @@ def _flags(core: Any, aman: Any, scan: Scan) -> Any:
 
 
 def _scans(tod: TimeOrderedData) -> dict[str, NDArray[np.bool_]]:
-    """(n_samp,) turnarounds and, where the scan has throws, the direction of each sample: that of
-    the throw it is in.
+    """Masks (n_samp,) of samples in turnarounds and, of a scan that goes back and forth, of those
+    in throws of either direction, by sotodlib's names.
     """
     found = {"turnarounds": np.asarray((tod.flags & np.uint8(TURNAROUND)) != 0, np.bool_)}
     if any(tod.intervals.get(f"throw_{end}") for end in SCANS.values()):

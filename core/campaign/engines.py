@@ -134,7 +134,7 @@ def _processes(workers: int | None, threads: int | None, memory: int | None) -> 
     from multiprocessing import get_context
 
     class Workers(ProcessPoolExecutor):
-        """Its processes, which `submit` starts, never see Ctrl-C: not while they import either."""
+        """Pool of processes that never see Ctrl-C, not while they import either."""
 
         def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
             """See `Executor.submit`."""

@@ -122,14 +122,14 @@ def clean(folder: Path) -> None:
 
 
 def sources_of(job: Job, folder: Path) -> list[Path]:
-    """Where the campaign's own YAML is kept."""
+    """Files that keep the campaign's pipeline files, resolved, one for each."""
     if len(job.source) == 1:
         return [folder / RESOLVED]
     return [folder / f"resolved-{k}.yaml" for k in range(1, len(job.source) + 1)]
 
 
 def write_sources(job: Job, folder: Path) -> None:
-    """Write the campaign's own YAML."""
+    """Write the campaign's pipeline files, resolved, into its output folder."""
     for path, text in zip(sources_of(job, folder), job.source, strict=True):
         write_text(path, text)
 

@@ -81,8 +81,8 @@ class Image:
         return WCS(self.header, naxis=2)
 
     def plot(self, ax: Any = None, *, title: str = "", limit: float | None = None) -> Any:
-        """Draw it; the matplotlib Axes. ``limit``: where the colours end; default: what 99.5 % of
-        the pixels stay below.
+        """Draw the image, and return the matplotlib Axes. ``limit``: where the colours end;
+        default: what 99.5 % of the pixels stay below.
         """
         from .picture import Shown, draw
 

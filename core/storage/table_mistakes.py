@@ -51,7 +51,7 @@ class Mistakes:
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """A `TableError` of the body is noted, and what follows the body goes on."""
+        """Context that notes a `TableError` of its body, and goes on behind it."""
         try:
             yield
         except TableError as err:

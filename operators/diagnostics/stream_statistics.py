@@ -60,7 +60,7 @@ SHARED = 35 / 18
 
 @dataclass(frozen=True)
 class Pair:
-    """Equation (1) of one detector's streams: (n,) each, per Hz."""
+    """Spectra and cross-spectrum of one detector's two streams, equation (1): (n,) each, per Hz."""
 
     power: Floats
     reference: Floats
@@ -79,8 +79,8 @@ class Pair:
 
 
 def pair(x: Floats, y: Floats, sample_rate: float, length: int) -> Pair:
-    """Equation (1) of two series (n_samp,) in segments of ``length`` samples at ``sample_rate``
-    [Hz].
+    """Spectra and cross-spectrum of two series (n_samp,), equation (1), in segments of ``length``
+    samples at ``sample_rate`` [Hz].
     """
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
     line = np.arange(length) - (length - 1) / 2

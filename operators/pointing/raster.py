@@ -197,7 +197,9 @@ class PointingRaster(RasterParameters):
 
 
 def _doubts(rows: Rows, duration: float, interval: float) -> list[str]:
-    """Warnings about scans of ``duration`` [s], sampled at an ``interval`` [s], by name."""
+    """Warnings about a raster's scans of ``duration`` [s], sampled at an ``interval`` [s]; each
+    follows the scan's name.
+    """
     found = []
     if rows.overshoot > rows.width:
         share = rows.turnaround / (rows.leg + rows.turnaround)

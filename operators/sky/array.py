@@ -85,7 +85,7 @@ class ArrayMap:
 
     @classmethod
     def parse(cls, value: Any) -> ArrayMap:
-        """From an array, a Quantity or an HDU. Raises what `mistake` makes for anything else."""
+        """The map in an array, a Quantity or an HDU. Raises ValueError for anything else."""
         if isinstance(value, cls):
             return value
         if isinstance(value, str | Path):

@@ -128,7 +128,7 @@ class Daisy:
 
 
 def make(asked: Asked, settings: Sequence[str] = ()) -> PipelineFile:
-    """The pipeline, with changes as `zonda run --set` takes them.
+    """The pipeline for an observer's request, with changes as `zonda run --set` takes them.
 
     Raises ZondaError for names that are not registered, contradictions, and targets that are not
     up.

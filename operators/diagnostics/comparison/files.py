@@ -415,8 +415,8 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
 def plane_of(
     product: MapProduct | Image, name: str, alone: tuple[Floats, str] | None = None
 ) -> Plane:
-    """A product of a run, with its noise. The input image has no beam, but where its pixels were
-    spread (BMAJ).
+    """A map of a run as the plane to be compared, with its noise. The input image has no beam, but
+    where its pixels were spread (BMAJ).
 
     ``alone``: a map of the noise alone, and what it is in words.
     Where the noise is not known and there is a map of it, it has the shape of 1 / sqrt(samples).
