@@ -30,7 +30,7 @@ from .few_angles import check_polarized, warn_before
 from .finished import finish
 from .grid import Grid, TangentGrid
 from .halves import halves_of
-from .map_layout import check_size, grid_of, layout_of, outside
+from .map_layout import MapLayout
 from .map_sums import MapSums
 from .parameters import MapParameters
 from .pixels import Cells, Looking
@@ -92,17 +92,17 @@ class BinMap(MapParameters):
         check_polarized(self, data.observations[0])
         warn_before(self, data.observations)
         if self.nside is None:
-            check_size(self, data.observations)
-        return [] if self.width is None else [outside(self, data.observations)]
+            MapLayout(self).check_size(data.observations)
+        return [] if self.width is None else [MapLayout(self).outside(data.observations)]
 
     def observe(self, data: Data) -> None:
         """Lay out one grid for all observations."""
         layout = data.layouts.get(self.label)
         if not data.laid_out:
-            layout = layout_of(self, data.observations, layout)
+            layout = MapLayout(self).common(data.observations, layout)
         if layout is not None:
             data.layouts[self.label] = self._layout = layout
-            self._grid = grid_of(self, layout)
+            self._grid = MapLayout(self).grid(layout)
 
     @property
     def grid(self) -> Grid:

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
     from zonda.core.data import Observation
 
-    from .parameters import MapParameters
-
 Box = tuple[int, int, int, int]
 """First column, first row, last column, last row of full-sky pixels, columns possibly beyond 0 to 2
 N - 1.
@@ -112,30 +110,31 @@ def centre_of(box: Sequence[int], pixel: float) -> tuple[float, float]:
     ) / 2
 
 
-def box_about(step: MapParameters, centre: tuple[float, float]) -> Box:
-    """The pixels of a map of given width and height on the sky about ``centre`` (longitude,
+def box_about(centre: tuple[float, float], width: float, height: float, pixel: float) -> Box:
+    """The pixels of a map of ``width`` and ``height`` [rad] on the sky about ``centre`` (longitude,
     latitude) [rad].
     """
-    assert step.width is not None
-    height = step.height if step.height is not None else step.width
-    half = min(step.width / 2 / max(math.cos(centre[1]), 1e-9), math.pi)
-    return _box(centre[0], half, centre[1] - height / 2, centre[1] + height / 2, step.pixel)
+    half = min(width / 2 / max(math.cos(centre[1]), 1e-9), math.pi)
+    return _box(centre[0], half, centre[1] - height / 2, centre[1] + height / 2, pixel)
 
 
 def box_of(
-    step: MapParameters, observations: Sequence[Observation], before: Sequence[int] | None
+    observations: Sequence[Observation],
+    pixel: float,
+    frame: str,
+    before: Sequence[int] | None = None,
 ) -> Box:
     """The pixels that hold every sample of the observations, and those of a box ``before``."""
-    turn = frame_rotation(step.frame)
-    found = None if before is None else _whole(before, step.pixel)
+    turn = frame_rotation(frame)
+    found = None if before is None else _whole(before, pixel)
     for observation in observations:
         reach = math.atan(observation.focalplane.radius)
         for some in chunks(observation.n_samples):
             x, y, z = turn @ boresights(observation.boresight_radec[some])
             found = _joined(
                 found,
-                _around(np.arctan2(y, x), np.arcsin(np.clip(z, -1.0, 1.0)), reach, step.pixel),
-                step.pixel,
+                _around(np.arctan2(y, x), np.arcsin(np.clip(z, -1.0, 1.0)), reach, pixel),
+                pixel,
             )
     assert found is not None
     return found
@@ -160,7 +159,7 @@ def share_outside(grid: PlateCarreeGrid, observations: Sequence[Observation]) ->
 
 
 def middle_of(fields: Sequence[Sequence[float]], pixel: float) -> tuple[float, float]:
-    """(longitude, latitude) [rad] of the only one of some fields (`map_layout.fields_of`), else the
+    """(longitude, latitude) [rad] of the only one of some fields (`MapLayout.fields`), else the
     middle of all of them.
     """
     if len(fields) == 1:

@@ -26,8 +26,8 @@ def product(
     with the solid angle.
     """
     if kind == "CAR":
-        step = type("Step", (), {"width": math.radians(side), "height": None, "pixel": pixel})
-        box = box_about(step, (1.0, math.radians(dec)))
+        width = math.radians(side)
+        box = box_about((1.0, math.radians(dec)), width, width, pixel)
         grid = grid_of_box(box, pixel, "icrs")
         header, shape, centre = grid.wcs.to_header(), grid.shape, centre_of(box, pixel)
     else:

@@ -19,7 +19,7 @@ from zonda.core.numerics.angles import ARCMIN, ARCSEC
 from zonda.core.numerics.projection import directions
 from zonda.core.numerics.sphere import separation
 from zonda.operators.maps.bin_map import BinMap
-from zonda.operators.maps.map_layout import checked, grid_of, layout_of
+from zonda.operators.maps.map_layout import MapLayout, checked
 from zonda.operators.maps.plate_carree import Box, _box, _joined, centre_of, grid_of_box, rows_of
 from zonda.plugins.checks import scenes
 
@@ -148,14 +148,14 @@ def test_a_map_of_given_size_lies_about_the_middle_of_several_targets(
     scans = [scenes.scan(3, 50), scenes.scan(3, 50)]
     for scan, longitude in zip(scans, longitudes, strict=True):
         scan.centre = (math.radians(longitude), math.radians(20))
-    step = BinMap(projection="CAR", pixel="1 arcmin", width="4 deg")
-    layout = layout_of(step, scans, None)
+    mapping = MapLayout(BinMap(projection="CAR", pixel="1 arcmin", width="4 deg"))
+    layout = mapping.common(scans, None)
     assert layout is not None
     middle = (
         (longitudes[0] + longitudes[1] + (360 if longitudes[1] < longitudes[0] else 0)) / 2 % 360
     )
     np.testing.assert_allclose(np.degrees(layout["middle"]), (middle, 20), atol=1 / 60)
-    grid = grid_of(step, layout)
+    grid = mapping.grid(layout)
     ny, nx = grid.shape
     lon, lat = grid.wcs.wcs_pix2world((nx - 1) / 2, (ny - 1) / 2, 0)
     np.testing.assert_allclose(((lon - middle + 180) % 360 - 180, lat - 20), 0, atol=1 / 60)
@@ -217,7 +217,7 @@ def test_a_pixel_that_does_not_divide_the_sky_is_refused() -> None:
         BinMap(projection="CAR", pixel="7 arcsec")
     grid = grid_of_box((0, 0, 100_000, 100_000), math.radians(1 / 3600), "icrs")
     with pytest.raises(InputError, match="too large"):
-        checked(BinMap(), grid)
+        checked(grid, "BinMap")
 
 
 def test_blocks_threads_and_scans_give_the_same_bits() -> None:
