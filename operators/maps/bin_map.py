@@ -25,11 +25,11 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.tiles import TILE_SAMPLES
 
+from .angle_checks import check_polarized, warn_before
 from .coverage import COUNTS, Coverage, Directions
-from .few_angles import check_polarized, warn_before
-from .finished import finish
 from .grid import Grid, TangentGrid
 from .halves import halves_of
+from .map_from_sums import finish
 from .map_layout import MapLayout
 from .map_sums import MapSums
 from .parameters import MapParameters

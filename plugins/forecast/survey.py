@@ -29,7 +29,7 @@ from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.filters.brick_wall import plan_highpass
-from zonda.operators.maps.few_angles import check_polarized
+from zonda.operators.maps.angle_checks import check_polarized
 from zonda.operators.maps.grid import TangentGrid, tangent_wcs
 from zonda.operators.noise.pink import PinkNoise, PinkSpectrum, level_of
 from zonda.operators.noise.planning import calibrated as calibrated_level

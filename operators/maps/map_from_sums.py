@@ -20,7 +20,7 @@ from zonda.core.numerics.chunks import empty
 from zonda.core.signal import MAIN, product_name
 from zonda.core.tally import Tally
 
-from .few_angles import warn_after
+from .angle_checks import warn_after
 from .grid import Grid, HealpixGrid
 from .halves import DIFFERENCES
 from .map_sums import MapSums
