@@ -1,6 +1,4 @@
-"""Warnings where I, Q and U are wanted and samples see too few angles of polarization to determine
-them.
-"""
+"""Checks that detectors and samples see enough angles of polarization to determine I, Q and U."""
 
 from __future__ import annotations
 
@@ -19,20 +17,18 @@ from zonda.core.numerics.projection import frame_rotation
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import Floats
 
-from .parameters import MapParameters
-
 SCANS, SAMPLES, DETECTORS = 32, 256, 2000
-"""How many scans, samples of all of them and detectors are looked at beforehand, at most; scans and
-detectors drawn at random, as angles may repeat from one to the next."""
+"""Most scans, samples of all of them and detectors that are checked beforehand; scans and detectors
+are drawn at random, as angles may repeat from one to the next."""
 CURE = (
     "add detectors at other angles (two pairs at 45 deg whose paths cross), scans at other"
     " parallactic angles, or a HalfWavePlate"
 )
 
 
-def check_polarized(step: MapParameters, observation: Observation) -> None:
-    """Raise PipelineError where I, Q and U are wanted and no detector is polarized."""
-    if step.stokes != "IQU" or observation.focalplane.polarized:
+def check_polarized(observation: Observation, place: str) -> None:
+    """Raise PipelineError for maps of I, Q and U where no detector is polarized."""
+    if observation.focalplane.polarized:
         return
     camera = observation.instrument
     by = camera.polarized_by
@@ -42,32 +38,34 @@ def check_polarized(step: MapParameters, observation: Observation) -> None:
             " there, must be above 0)"
         )
     message = f"stokes: IQU needs polarized detectors, and none of {camera.name} is"
-    raise PipelineError(message, place=step.label, cure=f"{by}, or set stokes: I")
+    raise PipelineError(message, place=place, cure=f"{by}, or set stokes: I")
 
 
-def warn_before(step: MapParameters, observations: Sequence[Observation]) -> None:
-    """Warn where the samples of all scans, taken together, do not determine I, Q and U within
-    `condition_limit`.
+def warn_before(
+    observations: Sequence[Observation], frame: str, condition_limit: float, place: str
+) -> None:
+    """Warn where the samples of all scans, taken together, do not determine I, Q and U of ``frame``
+    within ``condition_limit``.
     """
-    if step.stokes != "IQU":
-        return
     bands = np.unique(observations[0].focalplane.band)
     for band in bands:
         some = [observations[k] for k in _some(len(observations), SCANS)]
         number = SAMPLES // len(some)
-        found = [_weights(step, o, np.flatnonzero(o.focalplane.band == band), number) for o in some]
+        found = [
+            _weights(frame, o, np.flatnonzero(o.focalplane.band == band), number) for o in some
+        ]
         condition = _condition(np.sum(found, axis=0))
-        if condition > step.condition_limit:
+        if condition > condition_limit:
             of = f", {list(observations[0].instrument.cameras)[band]}" if len(bands) > 1 else ""
             text = (
                 "all samples together see too few angles of polarization, hardly a pixel will have"
                 " I, Q and U"
             )
-            limit = f"(condition number {condition:.2g}, condition_limit {step.condition_limit:g})"
-            warnings.warn(f"{step.label}{of}: {text} {limit}; {CURE}", stacklevel=4)
+            limit = f"(condition number {condition:.2g}, condition_limit {condition_limit:g})"
+            warnings.warn(f"{place}{of}: {text} {limit}; {CURE}", stacklevel=4)
 
 
-def warn_after(step: MapParameters, product: MapProduct, band: str) -> None:
+def warn_after(product: MapProduct, place: str) -> None:
     """Warn where I, Q and U of most pixels with samples are NaN."""
     if product.polarization is None:
         return
@@ -80,7 +78,7 @@ def warn_after(step: MapParameters, product: MapProduct, band: str) -> None:
         )
         text = f"{number}: the samples in a pixel see too few angles of polarization"
         warnings.warn(
-            f"{step.label}{f', {band}' if band else ''}: {text}; {CURE}, or larger pixels",
+            f"{place}: {text}; {CURE}, or larger pixels",
             stacklevel=5,
         )
 
@@ -90,9 +88,7 @@ def _some(n: int, most: int) -> NDArray[np.intp]:
     return np.random.default_rng(0).permutation(n)[:most]
 
 
-def _weights(
-    step: MapParameters, observation: Observation, rows: NDArray[np.intp], number: int
-) -> Floats:
+def _weights(frame: str, observation: Observation, rows: NDArray[np.intp], number: int) -> Floats:
     """(3, 3) sum of (1, c, s) (1, c, s)^T over a ``number`` of samples of some detectors: equation
     (1) of `core.polarization`.
     """
@@ -102,7 +98,7 @@ def _weights(
         np.intp
     )  # in step with no plate
     plate = None if observation.hwp_angle is None else observation.hwp_angle[at]
-    pole = frame_rotation(step.frame)[2]
+    pole = frame_rotation(frame)[2]
     angles = PolarizationAngles.of(
         replace(observation, hwp_angle=plate), observation.boresight_radec[at], pole
     )

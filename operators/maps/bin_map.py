@@ -89,8 +89,9 @@ class BinMap(MapParameters):
         data.layouts[self.label] = {"product": self.product, "kind": self.kind}
         if not data.observations:
             return []
-        check_polarized(self, data.observations[0])
-        warn_before(self, data.observations)
+        if self.stokes == "IQU":
+            check_polarized(data.observations[0], self.label)
+            warn_before(data.observations, self.frame, self.condition_limit, self.label)
         if self.nside is None:
             MapLayout(self).check_size(data.observations)
         return [] if self.width is None else [MapLayout(self).outside(data.observations)]
@@ -177,7 +178,8 @@ def prepared(
         observation.tally.count(step.label, LIGHT, int((~heavy).sum()), heavy.size)
     if "white" not in observation.components and step.noise == "net" and step.contents == "all":
         observation.tally.state(step.label, "noise of a pixel", NO_WHITE)
-    check_polarized(step, observation)
+    if step.stokes == "IQU":
+        check_polarized(observation, step.label)
     looking = Looking.of(observation, step.grid)
     how = step, looking, (weight, noise, window), seen, spare
     made: list[Any] = stokes_binnings(*how) if step.stokes == "IQU" else binnings(*how)

@@ -56,7 +56,8 @@ def finish(
         if stream == MAIN:
             _with_coverage(product, grid, sums)
             state_choices(step, product, sums, data.tally)
-            warn_after(step, product, data.band)
+            band = f", {data.band}" if data.band else ""
+            warn_after(product, step.label + band)
             tell_beams(step, product, data)
         if step.smooth is not None:
             product = product.smoothed(

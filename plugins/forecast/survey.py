@@ -318,8 +318,8 @@ def survey_of(file: PipelineFile, band: str = "") -> Survey:
     steps = Steps.among(pipeline.operators)  # copies, which know the scans
     data = observed(pipeline.operators, file.scene(), band)
     observations = data.observations
-    if observations:
-        check_polarized(steps.binning, observations[0])
+    if observations and steps.binning.stokes == "IQU":
+        check_polarized(observations[0], steps.binning.label)
     note_signals(observations, pipeline.signals.components, pipeline.signals.formed)
     chosen_scans = sorted(
         {
