@@ -29,7 +29,7 @@ from .angle_checks import check_polarized, warn_before
 from .coverage import COUNTS, Coverage, Directions
 from .grid import Grid, TangentGrid
 from .halves import halves_of
-from .map_from_sums import finish
+from .map_from_sums import MapFromSums
 from .map_layout import MapLayout
 from .map_sums import MapSums
 from .parameters import MapParameters
@@ -135,7 +135,7 @@ class BinMap(MapParameters):
         self._spare.clear()
         sums: MapSums | None = data.take(self.label)
         if sums is not None:
-            finish(self, data, self.grid, self._layout, sums)
+            MapFromSums(self, self.grid, self._layout, sums).finish(data)
 
 
 @dataclass
