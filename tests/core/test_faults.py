@@ -210,7 +210,8 @@ def test_whatever_method_ends_the_program(breaks: Any, capsys: Any, where: str) 
 
 @pytest.mark.parametrize("where", ["in_time_order", "memory", "traits", "estimate"])
 def test_planning_too(breaks: Any, capsys: Any, where: str) -> None:
-    status, _ = breaks("sys.exit(0)", f"Breaks: {{where: {where}}}")
+    command = ("run", "--prune", "--threads", "2", "--output", "out")
+    status, _ = breaks("sys.exit(0)", f"Breaks: {{where: {where}}}", *command)
     told(
         status,
         capsys.readouterr().err,

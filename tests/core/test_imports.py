@@ -14,13 +14,11 @@ HEAVY = {
     "h5py",
     "healpy",
     "matplotlib",
-    "scipy.fft",
     "scipy.interpolate",
     "scipy.ndimage",
     "scipy.optimize",
     "scipy.sparse",
     "scipy.spatial",
-    "scipy.special",
     "scipy.stats",
 }
 

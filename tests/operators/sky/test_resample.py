@@ -390,5 +390,5 @@ def test_an_image_without_data_is_no_map(tmp_path):
             fits.BinTableHDU.from_columns([fits.Column("a", "E", array=np.zeros(3))]),
         ]
     ).writeto(tmp_path / "t.fits")
-    with pytest.raises(InputError, match="no image and no HEALPix table"):
+    with pytest.raises(InputError, match="no image of two axes and no HEALPix table"):
         read_map(tmp_path / "t.fits")
