@@ -111,7 +111,7 @@ def test_the_run_tells_of_losses_alone(tmp_path, capsys):
     assert said.out == f"{tmp_path / 'out'}/\n"
     assert "samples binned" not in said.err
     first, *rest = said.err.splitlines()
-    assert first.startswith("not planned (")
+    assert first.startswith("simulated in full (")
     assert all(line.startswith("SkyMap: samples outside the input map: ") for line in rest)
 
 

@@ -142,7 +142,7 @@ def for_run(
             return unplanned(Structure.of_all(pipeline), "--no-prune: everything in full")
         samples = samples_of(pipeline, file.scene())
         if samples < PLANNED_FROM:
-            few = f"{samples:.2g} samples, less than {PLANNED_FROM:.0e}: nothing is coarsened"
+            few = f"{samples:.2g} samples, less than {PLANNED_FROM:.0e}: no plan is made"
             return unplanned(prune(pipeline), few)
     return plan(file, keep=keep, drop=drop, prune_all=prune_all is not False, threads=threads,
                 memory=memory).summary  # fmt: skip

@@ -84,7 +84,7 @@ class PlanSummary:
 def unplanned(structure: Structure, why: str) -> PlanSummary:
     """A run that is not planned: its structure, and why nothing is coarsened."""
     row = ("plan", "not made", "", why)
-    words = f"not planned ({why})"
+    words = f"simulated in full ({why})"
     return PlanSummary(structure.operators, structure.runs, {}, [row, *omissions(structure)],
                        words=words)  # fmt: skip
 

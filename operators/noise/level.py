@@ -56,9 +56,15 @@ class NoiseLevel:
         holds.
         """
         if self._net is None:
-            self._net = self.model.net(observation) * scatter_factors(
-                self.scatter, observation, self.label
-            )
+            stated = np.asarray(self.model.net(observation), np.float64)
+            if stated.shape not in ((), (observation.n_detectors,)):
+                raise PipelineError(
+                    f"the noise model gives NETs of shape {stated.shape}, for"
+                    f" {observation.n_detectors} detectors",
+                    place=f"{self.label or type(self.model).__name__}, {observation.name}",
+                    cure=f"return an array (n_det,) from {type(self.model).__name__}.net",
+                )
+            self._net = stated * scatter_factors(self.scatter, observation, self.label)
         return self._net
 
     def sky_net(self, observation: Observation) -> Floats:

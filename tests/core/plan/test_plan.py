@@ -409,7 +409,7 @@ def test_products_carry_the_plan(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("options", "what"), [([], "nothing is coarsened"), (["--no-prune"], "everything in full")]
+    ("options", "what"), [([], "no plan is made"), (["--no-prune"], "everything in full")]
 )
 def test_products_say_that_there_was_no_plan(tmp_path, capsys, options, what):
     from astropy.io import fits
@@ -418,7 +418,7 @@ def test_products_say_that_there_was_no_plan(tmp_path, capsys, options, what):
         capsys, "run", "mustang2_cluster", *SET, *options, "--output", tmp_path
     )
     assert status == 0
-    assert "not planned" in err
+    assert "simulated in full" in err
     with fits.open(tmp_path / "map.fits") as hdus:
         row = hdus["PLAN"].data[0]
     assert (row["EFFECT"], row["DECISION"]) == ("plan", "not made")
@@ -534,7 +534,7 @@ def test_scenes_are_planned_by_their_size(seconds, planned):
     assert (found.memory is not None) == planned
     assert bool(found.settings) == planned
     assert (found.short[0][:2] == ("plan", "not made")) == (not planned)
-    assert str(found).startswith("about" if planned else "not planned (2e+08 samples")
+    assert str(found).startswith("about" if planned else "simulated in full (2e+08 samples")
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from zonda.core.errors import PipelineError
 from zonda.core.registry import noise_models
 from zonda.operators.noise.models import FixedNet, NoiseModel, noise_model
 from zonda.operators.noise.white import WhiteNoise
@@ -40,3 +41,14 @@ def test_by_name():
     )
     assert again.model == operator.model
     WhiteNoise.model_json_schema()
+
+
+def test_a_model_that_gives_another_number_of_detectors_is_named(bench):
+    class Short(NoiseModel):
+        def net(self, observation):
+            return observation.focalplane.net[:3]
+
+    noise_models.register(Short, name="short_for_test")
+    with pytest.raises(PipelineError, match=r"shape \(3,\), for 7 detectors") as caught:
+        bench.run([WhiteNoise(model="short_for_test")], bench.observation(), keep=())
+    assert "Short.net" in caught.value.cure
