@@ -113,8 +113,7 @@ class Data:
 
     @property
     def scans(self) -> list[Observation]:
-        """What was pointed: the observations, of several bands each with the detectors of all of
-        them.
+        """Scans as they were pointed; with several bands, each has the detectors of every band.
 
         Of a campaign of several bands those of the first, which is all that its folder tells.
         """

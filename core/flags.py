@@ -120,8 +120,8 @@ def in_file(flags: Flags, table: tuple[Flag, ...]) -> Flags:
 
 
 def has_a_signal(flags: Flags) -> NDArray[np.bool_]:
-    """Where filters take the signal as it is: samples that maps use, turnarounds, and what a filter
-    of this run trims.
+    """Samples in which filters take the signal as it is: those that maps use, turnarounds, and
+    those that a filter of this run trims.
     """
     return good(flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
 

@@ -37,7 +37,7 @@ class Product(ABC):
 
     @classmethod
     def identity(cls) -> str:
-        """Where another process finds this class: ``module:class``."""
+        """Place of this class for another process: ``module:class``."""
         return f"{cls.__module__}:{cls.__qualname__}"
 
     @abstractmethod

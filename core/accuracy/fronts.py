@@ -68,9 +68,9 @@ class Choice:
 
 
 def fingerprint(file: PipelineFile) -> str:
-    """Of what a Pareto front belongs to: the scene without its seed, the steps without their knobs,
-    the length of the scans and the outputs. Files count by name and size, parameters at their
-    defaults not at all.
+    """Fingerprint of the subject of a Pareto front: the scene without its seed, the steps without
+    their knobs, the length of the scans and the outputs. Files count by name and size, parameters
+    at their defaults not at all.
     """
     scene = file.scene()
     described: list[Any] = [
@@ -129,7 +129,7 @@ def as_json(study: Study, file: PipelineFile) -> dict[str, Any]:
 
 
 def path_for(file: PipelineFile, metric: str) -> Path:
-    """Where the front of this pipeline file is, or would be."""
+    """Path of the front of this pipeline file, stored or not."""
     place = Path(file.place)
     return place.parent / "fronts" / f"{place.stem}.{metric}.json"
 
@@ -210,7 +210,7 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
 
 
 def _plain(value: Any) -> str:
-    """All fields in SI, but for those that are no part of a resolved file: they change no
+    """Text of the fields in SI, without those that are no part of a resolved file: they change no
     result.
     """
     if not isinstance(value, BaseModel):

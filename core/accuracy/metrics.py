@@ -1,5 +1,4 @@
-"""What may be wrong: a metric turns the products of a run into numbers, and two runs into one
-relative error.
+"""Metrics: a metric turns the products of a run into numbers, and two runs into one relative error.
 
 A metric is a subclass of `Metric` in the entry-point group ``zonda.metrics``, or just a function
 there that takes a `Data` and returns a number or an array: its error is then |m - m0| / |m0|
@@ -64,7 +63,7 @@ class Metric:
         return operators
 
     def measure(self, data: Data) -> Any:
-        """What this run is judged by; anything that can be pickled."""
+        """Measure a run: anything that can be pickled."""
         raise NotImplementedError
 
     def error(self, found: Any, reference: Any) -> float:

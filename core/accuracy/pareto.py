@@ -154,7 +154,7 @@ def _tighter(alone: Alone, here: Setting) -> list[_Step]:
 
 
 def _steps(turning: Sequence[Alone], here: Setting) -> list[_Step]:
-    """All relaxations from here that save more than the noise of the measurement."""
+    """Relaxations from here that save more than the noise of the measurement."""
     steps = []
     for alone in turning:
         at = alone.rung(here[alone.knob.key])
@@ -172,7 +172,7 @@ def _steps(turning: Sequence[Alone], here: Setting) -> list[_Step]:
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
-    """Those that no other beats, by error."""
+    """Points that no other beats, by error."""
     unique = list({frozenset(p.setting.items()): p for p in points}.values())
     kept = [p for p in unique if not any(_beats(q, p) for q in unique)]
     return sorted(kept, key=lambda p: (p.error, p.seconds))

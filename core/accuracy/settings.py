@@ -168,8 +168,8 @@ def _on_ladder(knob: Knob, operator: Operator) -> str:
 
 
 def _names(file: PipelineFile) -> list[str]:
-    """What ``--set`` calls each step: its own name or its operator's, numbered where several answer
-    to it.
+    """Names of the steps for ``--set``: the step's own name or its operator's, numbered if several
+    answer to it.
     """
     answers = [
         {s.key, s.key.rpartition(":")[2], *([s.operator.name] if s.operator.name else [])}

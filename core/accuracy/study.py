@@ -29,7 +29,7 @@ JOINT = 40
 
 @dataclass(frozen=True)
 class Setup:
-    """What is studied, and how it is measured.
+    """Subject of a study, and how it is measured.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Study:
-    """What was found.
+    """Results of a study.
 
     Attributes
     ----------

@@ -95,7 +95,7 @@ class Bench:
         return self._done[key]
 
     def may(self, runs: float) -> bool:
-        """Whether so many runs more are within the budget, each as dear as the dearest so far."""
+        """True if so many runs more are within the budget, each as dear as the dearest so far."""
         first = self._done.get(frozenset(self.yardstick.items()))
         unit = first.cpu / first.runs if first else 0.0
         seconds = self.cpu + runs * self._dearest
@@ -108,7 +108,7 @@ class Bench:
         return max((len(self.seeds) if all_seeds else 1) - self._seeds(setting), 0)
 
     def has(self, setting: Setting) -> bool:
-        """Whether the setting is measured."""
+        """True if the setting is measured."""
         return self._seeds(setting) > 0
 
     def refusal(self, setting: Setting) -> ZondaError | None:
@@ -150,7 +150,7 @@ class Bench:
         return scale * middle, scale * spread
 
     def error(self, setting: Setting, reference: Setting) -> float:
-        """Of a setting against a reference with the same random numbers."""
+        """Error of a setting against a reference with the same random numbers."""
         return self.metric.error(self.measure(setting).found[0], self.measure(reference).found[0])
 
     def errors(self, setting: Setting, reference: Setting) -> dict[str, float]:
@@ -225,14 +225,14 @@ class Alone:
 
     @property
     def inert(self) -> bool:
-        """Whether the coarsest rung gives the same bits as the tightest: the knob changes nothing
+        """True if the coarsest rung gives the same bits as the tightest: the knob changes nothing
         in this pipeline.
         """
         return len(self.rungs) == 2 and self.rungs[0].error == 0 and not self.knob.redraws
 
     @property
     def unmeasured(self) -> bool:
-        """Whether too few rungs are measured to tell what the tightest is wrong by."""
+        """True if too few rungs are measured to tell the error of the tightest."""
         return self.how == UNKNOWN
 
     def rung(self, value: str) -> Rung:
@@ -240,10 +240,11 @@ class Alone:
 
     @property
     def stays(self) -> float:
-        """Of a knob that redraws, which stays as in the file: what the file's value is wrong by.
-        Its error against the tightest rung, or twice the standard error of that where it is not
-        resolved, and what the tightest is itself wrong by. A value that is not on the ladder counts
-        as the worst rung."""
+        """Error of the file's value of a knob that redraws, which stays as in the file. It is the
+        error against the tightest rung, or twice the standard error of that if it is not resolved,
+        plus the error of the tightest itself. A value that is not on the ladder counts as the worst
+        rung.
+        """
         measured = [r for r in self.rungs if r.error is not None]
         mine = [r for r in measured if r.value == self.knob.present] or measured
         errors = (max(r.error or 0.0, 2 * r.resolution) for r in mine)
@@ -252,7 +253,7 @@ class Alone:
 
 @dataclass
 class Sweep:
-    """All knobs alone."""
+    """Errors and costs of each knob alone."""
 
     reference: Setting
     alone: list[Alone] = field(default_factory=list)
@@ -282,8 +283,8 @@ class Sweep:
 
     @property
     def left(self) -> float:
-        """What the reference is itself wrong by, the sum over the knobs: at their tightest, or as
-        in the file (`Alone.stays`).
+        """Error of the reference itself, the sum over the knobs: at their tightest, or as in the
+        file (`Alone.stays`).
         """
         return self.left_of_turned + sum(a.stays for a in self.alone if a.knob.redraws)
 
@@ -299,7 +300,9 @@ class Sweep:
 
 
 def tightest(knobs: Sequence[PipelineKnob]) -> Setting:
-    """All knobs at their tightest, but for those that redraw, which stay as in the file."""
+    """Setting with every knob at its tightest, but for those that redraw, which stay as in the
+    file.
+    """
     return {knob.key: knob.tightest for knob in knobs if not knob.redraws}
 
 
@@ -344,7 +347,7 @@ def _in_order(
 
 
 def _alone(bench: Bench, knob: PipelineKnob, found: Sweep) -> Alone:
-    """What is measured of a knob so far."""
+    """Measurements of a knob so far."""
     reference = found.turned(knob, knob.tightest)
     compare: Callable[[Setting, Setting], tuple[float, float]] = (
         bench.mean_error if knob.redraws else lambda a, b: (bench.error(a, b), 0.0)
@@ -376,8 +379,8 @@ def _alone(bench: Bench, knob: PipelineKnob, found: Sweep) -> Alone:
 
 
 def convergence(steps: Sequence[float], resolutions: Sequence[float] = ()) -> tuple[float, str]:
-    """What the last rung is wrong by, from the errors between neighbours, coarse to fine; and what
-    that rests on.
+    """Error of the last rung, from the errors between neighbours, coarse to fine; and the grounds
+    of that figure.
 
     With d the last step that changes anything, d' the last larger one before it and r = max(d / d',
     0.1), what is left is the rest of a geometric series (Richardson's estimate on a ladder of equal
@@ -417,5 +420,5 @@ def convergence(steps: Sequence[float], resolutions: Sequence[float] = ()) -> tu
 
 
 def differences(setting: Mapping[str, str], reference: Mapping[str, str]) -> Setting:
-    """What a setting has other than the reference."""
+    """Values of a setting that differ from the reference."""
     return {k: v for k, v in setting.items() if reference.get(k) != v}

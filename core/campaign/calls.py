@@ -52,7 +52,7 @@ class Work(ABC, Generic[T, R]):
 
     @abstractmethod
     def ended(self, item: T, result: R | Lost) -> bool:
-        """Whether to try it again."""
+        """End a call; True if it is tried again."""
 
 
 def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) -> None:

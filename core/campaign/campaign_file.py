@@ -224,7 +224,7 @@ def key_of(
 
 
 def _inside(folder: str) -> bool:
-    """Whether a relative path, read as text, stays inside its folder."""
+    """True if a relative path, read as text, stays inside its folder."""
     return not Path(folder).is_absolute() and ".." not in Path(folder).parts and "\0" not in folder
 
 

@@ -219,7 +219,7 @@ def _say(text: str) -> None:
 
 
 def _show(result: CampaignResult, verbose: bool) -> None:
-    """What was lost, or with ``verbose`` all of the tally."""
+    """Print losses, or with ``verbose`` the whole tally."""
     for combination, who, what, value, counted in result.tally:
         if verbose or (counted and value != "0" and "/" not in who and what != "samples binned"):
             _say(f"{combination}{': ' if combination else ''}{who}: {what}: {value}")

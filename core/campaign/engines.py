@@ -86,7 +86,7 @@ class SerialExecutor(Executor):
 
 
 def engine_failed(err: BaseException) -> bool:
-    """Whether a call did not run to its end for a reason of the engine: a worker that is gone, a
+    """True if a call did not run to its end for a reason of the engine: a worker that is gone, a
     scheduler that is not there.
     """
     return isinstance(err, BrokenExecutor | CancelledError) or type(err).__module__.partition(".")[
@@ -331,8 +331,8 @@ def _dask(
 
 
 def _address(scheduler: str) -> str:
-    """What is named, or the address in the scheduler file of that name: one that is starting may
-    not have written it yet.
+    """Address of the scheduler: the name itself, or the address in the scheduler file of that name.
+    A scheduler that is starting may not have written it yet.
     """
     if "://" in scheduler or not (scheduler.endswith(".json") or Path(scheduler).is_file()):
         return scheduler

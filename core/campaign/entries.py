@@ -47,7 +47,7 @@ class Entry:
 def entries(
     campaign: Campaign, seed: int, time_of: Callable[[tuple[str, ...]], Instant]
 ) -> list[Entry]:
-    """All entries, the first axis slowest.
+    """Entries of the campaign, the first axis slowest.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ def make_way(folder: Path) -> None:
 
 
 def finished(folder: Path) -> bool:
-    """Whether all products of the campaign in a folder are written. Raises `OtherFormat`."""
+    """True if all products of the campaign in a folder are written. Raises `OtherFormat`."""
     try:
         job = Job.read(folder)
         return len(Record(job, folder).combined) == len(job.combinations)
@@ -319,7 +319,7 @@ def _write_rows(path: Path, identity: str, rows: Mapping[int, TaskRow]) -> None:
 
 
 def _read_rows(path: Path, identity: str) -> dict[int, TaskRow]:
-    """By number, the tasks that a file lists; none where it is missing or damaged."""
+    """Tasks that a file lists, by number; none if it is missing or damaged."""
     try:
         tree = parts.read(path, identity)
         table = [dict(zip(COLUMNS, row, strict=True)) for row in tree["tasks"]]
@@ -330,7 +330,7 @@ def _read_rows(path: Path, identity: str) -> dict[int, TaskRow]:
 
 
 def _identity(job: Job) -> str:
-    """That of a whole campaign: of all its tasks."""
+    """Identity of a whole campaign: of all its tasks."""
     return digest_of_text("".join(task.key for task in job.tasks))
 
 

@@ -45,7 +45,7 @@ PLACE = "zonda.campaign"
 
 @dataclass(frozen=True)
 class Products:
-    """What a campaign has written.
+    """Products that a campaign has written.
 
     Attributes
     ----------

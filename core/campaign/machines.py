@@ -36,13 +36,13 @@ def read(text: str) -> dict[str, str]:
 
 
 def kind(text: str) -> frozenset[tuple[str, str]]:
-    """All that bits depend on; empty: unknown."""
+    """Properties that bits depend on; empty: unknown."""
     return frozenset((k, v) for k, v in read(text).items() if k not in WITHOUT_INFLUENCE)
 
 
 def differences(one: str, other: str) -> str:
-    """How two machines differ: ``numpy 2.3.1 (2.4.6 there), ...``; of instructions, those that one
-    of the two lacks.
+    """Differences of two machines in words: ``numpy 2.3.1 (2.4.6 there), ...``; of instructions,
+    those that one of the two lacks.
     """
     a, b = read(one), read(other)
     found = []

@@ -52,8 +52,8 @@ class Partial:
 
     @classmethod
     def of(cls, data: Data, before: int, prefix: str) -> Partial:
-        """That of the scans of a task. ``before``: number of scans before them; ``prefix``: of
-        their names.
+        """Partial product of the scans of a task. ``before``: number of scans before them;
+        ``prefix``: of their names.
 
         Raises `NotCombined` for a product that no campaign can add up.
         """
@@ -128,8 +128,8 @@ class Partial:
         return cls(products, _tally(tree["tally"]), tree["scans"])
 
     def observations(self, scene: Scene) -> list[Observation]:
-        """All scans, thinned, each of its bands in turn; the focal plane is as the steps left it in
-        the very first one.
+        """Thinned scans, each of its bands in turn; the focal plane is as the steps left it in the
+        very first one.
         """
         whole, cameras = scene.instrument.focalplane(), list(scene.instrument.cameras.values())
         planes = [whole.of_band(k) if len(cameras) > 1 else whole for k in range(len(cameras))]
@@ -217,8 +217,8 @@ def _tally(rows: Mapping[str, Any]) -> Tally:
 
 
 def _thinned(observation: Observation, number: int) -> dict[str, Any]:
-    """What a report shows of a scan, with a subset of its boresight directions. ``number``: its
-    place among all.
+    """A scan as a report shows it, with a subset of its boresight directions. ``number``: its place
+    in the campaign.
     """
     n, elevation = observation.n_samples, observation.elevation
     kept = np.linspace(0, n - 1, min(n, POINTS if number < SCANS else 16)).round().astype(int)

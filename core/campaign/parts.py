@@ -60,7 +60,7 @@ def read(path: Path, identity: str) -> dict[str, Any]:
 
 
 def head(path: Path, identity: str) -> dict[str, Any]:
-    """What `write` was told of how the file was made. Raises as `read`."""
+    """Statement on how the file was made, as given to `write`. Raises as `read`."""
     with _opened(path, identity) as (_, made):
         return made
 

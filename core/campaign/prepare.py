@@ -57,7 +57,7 @@ class CampaignFile:
 
 @dataclass(frozen=True)
 class Look:
-    """Where one entry points: number of its pipeline, seed, start; how messages call it."""
+    """Pointing of one entry: number of its pipeline, seed, start; its name in messages."""
 
     pipeline: int
     seed: int

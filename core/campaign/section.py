@@ -67,8 +67,8 @@ def rewrite_campaign(document: Document) -> list[Diagnostic]:
 
 
 def too_large(value: Any) -> bool:
-    """Whether ``campaign:`` as it was written comes to more entries than allowed, whatever else
-    is wrong with it.
+    """True if ``campaign:`` as written comes to more entries than allowed, whatever else is wrong
+    with it.
     """
     grid, given, nights = (value.get(key) for key in ("grid", "observations", "nights"))
     sizes = (
@@ -93,7 +93,7 @@ def mistakes(
     known: list[Diagnostic],
     check: Callable[[Document], list[Diagnostic]],
 ) -> list[Diagnostic]:
-    """All mistakes of a document with a campaign. The axes are checked only in a file without other
+    """Mistakes of a document with a campaign. The axes are checked only in a file without other
     mistakes.
 
     Parameters
@@ -150,7 +150,7 @@ def rewrite_sweep(document: Document) -> list[Diagnostic]:
 
 
 def _measures(document: Document) -> bool:
-    """Whether a step of a document without mistakes makes figures."""
+    """True if a step of a document without mistakes makes figures."""
     return any("figures" in declared(operators.get(name), "provides") for name in _names(document))
 
 
@@ -173,8 +173,8 @@ def _takes_schedule(step: type[Operator]) -> bool:
 def _mistakes(
     document: Document, campaign: Campaign, check: Callable[[Document], list[Diagnostic]]
 ) -> list[Diagnostic]:
-    """What is wrong with the keys and values of ``grid`` and ``observations``, each at its place in
-    the file.
+    """Mistakes in the keys and values of ``grid`` and ``observations``, each at its place in the
+    file.
 
     ``check`` lists the mistakes of a document; each value is put where it would go and checked
     there.

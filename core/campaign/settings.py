@@ -150,7 +150,7 @@ class Campaign(Parameters):
 
     @property
     def axes(self) -> list[str]:
-        """What `combine` may name, the slowest first."""
+        """Axes that `combine` may name, the slowest first."""
         keys = list(dict.fromkeys(key for entry in self.observations for key in entry))
         first = ["observation", *keys] if self.observations else []
         return [

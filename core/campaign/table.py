@@ -115,7 +115,7 @@ def write(job: Job, folder: Path) -> None:
 
 
 def collected(job: Job, folder: Path) -> list[Point]:
-    """All figures at all points, figure by figure."""
+    """Figures at every point, figure by figure."""
     found: dict[tuple[str, str], tuple[tuple[tuple[str, Any], ...], list[Figure]]] = {}
     for number, combination in enumerate(job.combinations):
         axes = tuple(

@@ -174,9 +174,7 @@ FAN = 32
 
 @dataclass(frozen=True)
 class Combined:
-    """What became of a combination: its tally (who, what, value, whether it is a count), or what
-    went wrong.
-    """
+    """Result of a combination: its tally (who, what, value, is a count), or its error."""
 
     tally: tuple[tuple[str, str, str, bool], ...] = ()
     error: ZondaError | None = None
@@ -198,9 +196,7 @@ def combine(folder: Path, number: int) -> Combined:
 
 @faults_named()
 def combined(job: Job, folder: Path, number: int) -> Data:
-    """As `combine`; the finished data. Raises `InputError` where a partial product is missing or
-    damaged.
-    """
+    """Finished data of `combine`. Raises `InputError` if a part is missing or damaged."""
     combination, tasks = job.combinations[number], job.tasks_of(number)
     first = tasks[0]
     file = pipeline_of(job.pipelines[first.pipeline], folder)

@@ -1,4 +1,4 @@
-"""How wide the circle in the middle of a map is in which its noise and its depth are stated."""
+"""Width of the circle in the middle of a map in which its noise and its depth are stated."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ class MapFile:
         )
 
     def noise_cards(self, plane: str = "") -> Header:
-        """What stands behind the noise, for the header of a ``plane`` of it; of a table, for all
+        """Cards on the origin of the noise, for the header of a ``plane`` of it; of a table, for
         its columns together.
         """
         cards: dict[str, tuple[Any, ...]] = {}

@@ -80,7 +80,7 @@ class MapProduct(MapArrays):
 
     @property
     def central_radius(self) -> float:
-        """Of the circle in which `rms` is taken, rad: `central.central_diameter`."""
+        """Radius of the circle in which `rms` is taken, rad: `central.central_diameter`."""
         return central_diameter(self.fwhm, self.pixel) / 2
 
     def rms(self, radius: float | None = None, of: str = "signal") -> float:

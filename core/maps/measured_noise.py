@@ -1,4 +1,4 @@
-"""How much more noise a map has than white noise, and how that is said."""
+"""Noise of a map in units of its white noise, and the words for it."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def maps_of(products: Mapping[str, Any], *, split: bool = True) -> dict[str, Map
 
 @dataclass(frozen=True)
 class NoiseFigure:
-    """How noisy a map is near its centre.
+    """Noise of a map near its centre.
 
     ``of``: ``half_difference`` or ``source_free``; ``rms``: in K, NaN where there is no pixel;
     ``smoothed``: the same after smoothing with the beam (NaN where the map cannot be or is already
@@ -99,8 +99,7 @@ def noise_alone(
 def noise_stated(
     maps: Mapping[str, MapProduct], name: str, runs: Mapping[str, Any] | None = None
 ) -> dict[str, tuple[float | None, str]]:
-    """What is known of the noise of I, and of Q and U where they are there, of a map among ``maps``
-    (`maps_of`).
+    """Known noise of I, and of Q and U if they are there, of a map among ``maps`` (`maps_of`).
 
     The factor on its white noise, and what it was measured in; None and `WHITE` where there is no
     map of the noise alone, and `ELSEWHERE` of a map without noise. Nothing where no noise is known.
@@ -117,7 +116,7 @@ def noise_stated(
 
 
 def is_quiet(runs: Mapping[str, Any], name: str) -> bool:
-    """Whether the map ``name`` is of a signal without noise. ``runs``: the signals of a run, as its
+    """True if the map ``name`` is of a signal without noise. ``runs``: the signals of a run, as its
     provenance has them.
     """
     signal, _, rest = name.partition("/")

@@ -13,8 +13,7 @@ from ..errors import InputError
 
 @dataclass
 class ScanHits:
-    """Of each scan the pixels that it hit, and how often: a plane of hits for each, kept without
-    its zeros.
+    """Pixels that each scan hit, and how often: a plane of hits for each, kept without its zeros.
 
     Attributes
     ----------

@@ -1,5 +1,5 @@
-"""How files name Stokes parameters: columns, extensions, and planes along an axis STOKES; and what
-else columns hold.
+"""Names of Stokes parameters in files: columns, extensions, and planes along an axis STOKES; and of
+the other contents of columns.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ _OTHER = re.compile(
 
 
 def is_polarized(name: str) -> bool:
-    """Whether a column or an extension of this name holds Q, U or V."""
+    """True if a column or an extension of this name holds Q, U or V."""
     return _POLARIZED.fullmatch(name.strip()) is not None and _OTHER.fullmatch(name.strip()) is None
 
 
 def pixel_column(names: Sequence[str]) -> int | None:
-    """Which column of a HEALPix table numbers its pixels; None where none does, so that row k is
+    """Column of a HEALPix table that numbers its pixels; None if there is none, so that row k is
     pixel k.
     """
     return next((k for k, name in enumerate(names) if _PIXEL.fullmatch(name.strip())), None)
 
 
 def intensity_column(names: Sequence[str], wanted: int | str | None, place: str) -> int:
-    """Which column of a HEALPix table is read as I: the one that is ``wanted``, that of a known
+    """Column of a HEALPix table that is read as I: the one that is ``wanted``, that of a known
     name, or the only possible one.
 
     Parameters
@@ -106,15 +106,14 @@ def intensity_column(names: Sequence[str], wanted: int | str | None, place: str)
 
 
 def columns_of_q_and_u(names: Sequence[str]) -> list[int] | None:
-    """Which of the columns or extensions of these names hold Q and U; None where they are not both
-    there.
-    """
+    """Columns or extensions of these names that hold Q and U; None if they are not both there."""
     letters = [_letter(name) for name in names]
     return [letters.index("Q"), letters.index("U")] if {"Q", "U"} <= set(letters) else None
 
 
 def along_axis(header: Any, axis: int, length: int, place: str = "") -> list[str]:
-    """What each plane along the FITS axis STOKES is: I, Q and U where no card says anything.
+    """Stokes parameter of each plane along the FITS axis STOKES: I, Q and U if no card says
+    anything.
 
     Raises
     ------

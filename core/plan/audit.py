@@ -112,7 +112,7 @@ class Checked:
 
     @property
     def violated(self) -> bool:
-        """Whether the bound, or the prediction, does not hold."""
+        """True if the bound, or the prediction, does not hold."""
         if self.within is not None:
             return not abs(self.actual - self.bound) - 2 * self.error <= self.within * self.bound
         return not self.actual - 2 * self.error <= self.bound
@@ -120,7 +120,7 @@ class Checked:
 
 @dataclass(frozen=True)
 class Audit:
-    """All comparisons."""
+    """Comparisons of an audit."""
 
     rows: tuple[Checked, ...]
     slice: str
@@ -166,7 +166,7 @@ class AuditOfBands:
 
     @property
     def violated(self) -> bool:
-        """Whether any bound was, of any band."""
+        """True if a bound of any band is violated."""
         return any(found.violated for found in self.bands.values())
 
     def __str__(self) -> str:
@@ -428,9 +428,7 @@ def _compare(
 
 
 def _planes(full: Any, other: Any) -> list[tuple[str, Any, Any, Any]]:
-    """Of each plane of two maps its name (of I none), s^(1/2) of equation (1), and the maps of
-    it.
-    """
+    """Name (empty for I), s^(1/2) of equation (1), and the two maps, of each plane."""
     if getattr(full, "polarization", None) is None:
         return [("", 1.0, full, other)]
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -31,7 +31,7 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=60)]
 
 
 class Experiment(Parameters):
-    """How a value is found: measured on runs of a pipeline, or calculated."""
+    """Measurement of a value on runs of a pipeline, or its calculation."""
 
     pipeline: str | None = Field(None, min_length=1)
     """File in pipelines/validation (without suffix), shipped pipeline, or path beside the claims
@@ -63,7 +63,7 @@ class Experiment(Parameters):
         return self
 
     def differs_from(self, other: Experiment) -> bool:
-        """Whether it finds another value than ``other`` apart from random numbers: not where seeds
+        """True if it finds another value than ``other`` apart from random numbers: not if seeds
         alone differ.
         """
         if self.calculate is not None or other.calculate is not None:
@@ -76,8 +76,8 @@ class Experiment(Parameters):
 
 
 class Expected(Parameters):
-    """What the result of a counter-experiment must satisfy: limits hold by two standard errors of
-    the mean.
+    """Condition on the result of a counter-experiment: limits hold by two standard errors of the
+    mean.
     """
 
     agrees: bool = False
@@ -187,7 +187,7 @@ class Claim(Experiment):
 
     @property
     def is_quick(self) -> bool:
-        """Whether `--quick` includes it."""
+        """True if `--quick` includes it."""
         return self.quick or (
             self.pipeline is None and all(c.pipeline is None for c in self.counter)
         )

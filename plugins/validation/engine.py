@@ -72,9 +72,9 @@ def row(claim: Claim, runs: Runs) -> Row:
 def counter_result(
     claim: Claim, counter: Counter, experiment: Experiment, found: Values
 ) -> CounterResult:
-    """What a counter-experiment found. It is of the claim's quantity where it agrees with the
-    claim's value, or has its unit and is as the claim's a value, a ratio, a difference or a
-    significance."""
+    """Result of a counter-experiment. It is of the claim's quantity if it agrees with the claim's
+    value, or has its unit and is as the claim's a value, a ratio, a difference or a significance.
+    """
     expect = counter.expect
     unit = expect.above or expect.below or claim.paper
     comparable = expect.agrees or (
@@ -85,7 +85,7 @@ def counter_result(
 
 
 def kind(experiment: Experiment) -> str:
-    """What its values are: of the metric itself (empty), ratios, differences, or significances."""
+    """Kind of its values: of the metric itself (empty), ratios, differences, or significances."""
     return (
         "significance"
         if str(experiment.statistic).startswith("paired")
@@ -94,7 +94,7 @@ def kind(experiment: Experiment) -> str:
 
 
 def satisfied(expect: Expected, stated: Stated, found: Values) -> bool:
-    """Whether a counter-experiment's result is what is expected of it."""
+    """True if a counter-experiment's result is the expected one."""
     if expect.agrees:
         return compare(stated, found).holds
     above, below = (

@@ -26,7 +26,7 @@ Say = Callable[[str], None]
 
 
 class Runs:
-    """All runs that a list of experiments needs.
+    """Runs that a list of experiments needs.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Runs:
         self.experiment.run()
 
     def values(self, experiment: Experiment) -> Values:
-        """What an experiment found. Its runs have been executed."""
+        """Values of an experiment, whose runs have been executed."""
         if experiment.calculate is not None:
             return Values((experiment.calculate.value,))
         choice, seeds = self._choice(experiment), experiment.seeds or 1
@@ -149,7 +149,7 @@ def _pictures(folder: Path) -> list[Path]:
 
 
 def _text_of(path: Path) -> str:
-    """What a file holds; empty where there is none."""
+    """Content of a file; empty if there is none."""
     with suppress(OSError, ValueError):
         return path.read_text(encoding="utf-8")
     return ""

@@ -29,7 +29,7 @@ Of = Literal["realization", "mean"]
 
 
 class Verdict(StrEnum):
-    """What is found of a claim. `DIFFERS` is the only one that is not decided."""
+    """Verdict on a claim. `DIFFERS` is the only one that is not decided."""
 
     AGREES = "agrees"
     EXPLAINED = "differs, explained"
@@ -39,7 +39,7 @@ class Verdict(StrEnum):
 
     @property
     def decided(self) -> bool:
-        """Whether nothing is left to explain."""
+        """True if nothing is left to explain."""
         return self is not Verdict.DIFFERS
 
 
@@ -76,8 +76,9 @@ class Values:
 
 @dataclass(frozen=True)
 class Stated:
-    """What the paper states: value, standard error, half width of rounding, all SI; how it is
-    meant; of one realization or of the mean."""
+    """Statement of the paper: value, standard error, half width of rounding, all SI; its meaning;
+    of one realization or of the mean.
+    """
 
     value: float
     error: float = 0.0
@@ -124,7 +125,7 @@ def compare(stated: Stated, found: Values) -> Comparison:
 
 
 def clears(found: Values, above: float | None, below: float | None) -> bool:
-    """Whether the mean is above and below limits by `LIMIT` standard errors of the mean."""
+    """True if the mean is above and below limits by `LIMIT` standard errors of the mean."""
     margin = LIMIT * found.standard_error
     if math.isnan(found.mean):
         return False
@@ -134,7 +135,7 @@ def clears(found: Values, above: float | None, below: float | None) -> bool:
 
 
 def contradicted(stated: Stated, other: float, relation: Relation) -> bool:
-    """Whether what the paper states cannot stand beside ``other``, which follows from other numbers
+    """True if the paper's statement cannot stand beside ``other``, which follows from other numbers
     of the paper.
     """
     beside = Stated(other, 0.0, stated.rounding, relation)
