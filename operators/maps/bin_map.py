@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from zonda.core.numerics.tiles import TILE_SAMPLES
 from .angle_checks import check_polarized, warn_before
 from .coverage import COUNTS, Coverage, Directions
 from .grid import Grid, TangentGrid
-from .halves import halves_of
+from .halves import Split, halves_of
 from .map_from_sums import MapFromSums
 from .map_layout import MapLayout
 from .map_sums import MapSums
@@ -115,20 +115,80 @@ class BinMap(MapParameters):
         return self._grid
 
     def prepare(self, observation: Observation) -> Prepared:
-        """Pointing, weights and empty sums for one observation."""
-        return prepared(self, observation, self._layout["variance"], self._spare)
+        """Pointing, weights and empty sums for one observation.
+
+        Raises PipelineError where noise is wanted from the scatter of samples that a window has
+        changed.
+        """
+        levels, seen = self._levels(observation)
+        if self.stokes == "IQU":
+            check_polarized(observation, self.label)
+        looking = Looking.of(observation, self.grid)
+        hits, scatter = self.contents == "hits", self.noise == "scatter"
+        signals = 1 if hits else len(observation.signals)
+        how = self.split, looking, levels, seen, self._spare
+        made: list[Any] = (
+            stokes_binnings(*how)
+            if self.stokes == "IQU"
+            else binnings(*how, signals=signals, scatter=scatter)
+        )
+        directions = Directions.of(looking, seen) if self.crosslinking else None
+        reference = self._layout["variance"]
+        return Prepared(looking, made, directions, reference, self.split != "scans", hits, scatter)
 
     def exec(self, block: Block, state: Prepared) -> None:
         """Add one block to this thread's sums."""
-        add_bands(self, [block], [state])
+        self.exec_bands([block], [state])
 
     def exec_bands(self, blocks: Sequence[Block], states: Sequence[Prepared]) -> None:
         """Add the blocks of several bands, each to its own sums; what is the same is found once."""
-        add_bands(self, blocks, states)
+        parts = [Blocks(s.signals(b), b, s) for b, s in zip(blocks, states, strict=True)]
+        cells = Cells()
+        for signals, block, state in parts:
+            if state.directions is not None:
+                state.directions.add(signals, block, cells)
+        if self.stokes == "IQU":
+            add_blocks(
+                [Part(cast(Any, s.binnings), signals, block) for signals, block, s in parts], cells
+            )
+            return
+        for together in alike(parts):
+            add_together(together)
 
     def collect(self, data: Data, observation: Observation, state: Prepared) -> None:
-        """Add this observation to the even or the odd scans' sums."""
-        add_scan(self, data, observation, state)
+        """Add this observation to the even or the odd scans' sums; what is dropped is counted.
+
+        Raises PipelineError for samples that are too large.
+        """
+        if self.label not in data.partial:
+            signals = () if self.contents == "hits" else observation.signals
+            how = self.stokes == "IQU", self.noise == "scatter", self.split == "scans"
+            made = MapSums(self.grid.n_pixels, signals, *how)
+            counts = [name for name in COUNTS if getattr(self, name)]
+            made.coverage = Coverage.empty(self.grid.n_pixels, counts, self.scan_hits)
+            data.add(self.label, made)
+        sums: Any = data.partial[self.label]
+        before = sums.hits.sum(axis=0) if sums.coverage.of_hits else None
+        binned, dropped = sums.add(observation, state.halves, self.label)
+        hits = None if before is None else sums.hits.sum(axis=0) - before
+        sums.coverage.add(hits, state.directions, f"{self.label}, {observation.name}")
+        self._note_beams(observation, sums, binned)
+        used = observation.focalplane.net[observation.good_detectors]
+        sums.unknown_variance |= self.weights == "inverse_variance" and not (used > 0).all()
+        every, tally = observation.n_detectors * observation.n_samples, observation.tally
+        tally.count(self.label, "samples binned", binned, every)
+        for what, number in (
+            ("outside the map", OUTSIDE),
+            ("flagged", FLAGGED),
+            ("not finite", NOT_FINITE),
+        ):
+            tally.count(self.label, f"samples dropped: {what}", int(dropped[number]), every)
+        if dropped[TOO_LARGE]:
+            raise PipelineError(
+                f"{int(dropped[TOO_LARGE])} samples are too large for the map's fixed-point sums",
+                place=f"{self.label}, {observation.name}",
+                cure="look for the operator that makes them; a signal is below 1e4 K",
+            )
 
     def finalize(self, data: Data) -> None:
         """Turn the sums into one `MapProduct` for each signal, under the name `product`."""
@@ -137,180 +197,129 @@ class BinMap(MapParameters):
         if sums is not None:
             MapFromSums(self, self.grid, self._layout, sums).finish(data)
 
+    def _levels(self, observation: Observation) -> tuple[tuple[Any, Any, Any], NDArray[np.bool_]]:
+        """((weight, noise of each detector, window), samples that count (n_samp,))."""
+        weight, noise = self._weights(observation)
+        window = observation.window if self.contents == "all" else None
+        if window is not None and self.noise == "scatter":
+            text = (
+                "noise: scatter needs samples that no window has changed;"
+                f" {' and '.join(observation.windows)} did"
+            )
+            raise PipelineError(
+                text, place=self.label, cure="leave out noise: scatter, or the window"
+            )
+        seen = observation.good_samples
+        if window is None:
+            window = np.zeros(0)
+        else:
+            seen &= (heavy := window >= LIGHTEST)
+            observation.tally.count(self.label, LIGHT, int((~heavy).sum()), heavy.size)
+        if "white" not in observation.components and self.noise == "net" and self.contents == "all":
+            observation.tally.state(self.label, "noise of a pixel", NO_WHITE)
+        return (weight, noise, window), seen
+
+    def _weights(self, observation: Observation) -> tuple[Any, Any]:
+        """Weight and noise of each detector (`detector_weights`)."""
+        inverse = self.weights == "inverse_variance" and self.contents == "all"
+        return detector_weights(observation, self._layout["variance"], inverse, self.label)
+
+    def _note_beams(self, observation: Observation, sums: MapSums, binned: int) -> None:
+        """Note the beams of an observation's detectors, with what they weigh in the map: ``binned``
+        samples, as many of each.
+        """
+        good = observation.good_detectors
+        if count := int(np.count_nonzero(good)):
+            weight, _ = self._weights(observation)
+            sums.beams.add(observation.focalplane.fwhm[good], weight[good], -(-binned // count))
+
 
 @dataclass
 class Prepared:
     """An observation's pointing, weights and sums.
 
-    ``looking``: in which pixels its detectors look. ``binnings``: of each half (`halves_of`), one
-    for all signals or one for each with noise of its own. ``directions``: where the map tells how
-    scans cross. ``reference``: unit of the variance, K^2.
+    ``looking``: the detectors' pixels. ``binnings``: of each half (`halves_of`), one for all
+    signals or one for each with noise of its own. ``directions``: those of the scans, where the map
+    tells how they cross. ``reference``: unit of the variance, K^2. ``apart``: the halves are of
+    samples, not of scans; ``hits``: only hits are wanted; ``scatter``: noise is that of the
+    samples' scatter.
     """
 
     looking: Looking
     binnings: list[Binning] | list[StokesBinning]
     directions: Directions | None
     reference: float
+    apart: bool
+    hits: bool
+    scatter: bool
 
+    def signals(self, block: Block) -> tuple[Any, ...]:
+        """Signals of a block, (n_det, n) each; zeros where only the hits are wanted."""
+        if self.hits:
+            nothing = block.buffer("nothing", block.shape)
+            nothing.fill(0)
+            return (nothing,)
+        window, unfiltered = self.binnings[0].window[block.samples], block.observation.unfiltered
+        whole = any(name in block.means for name in block.signals) or (window.size and unfiltered)
+        signals = [block.total(name) if whole else block.detdata[name] for name in block.signals]
+        if window.size:  # no filter, no window, acted on these
+            signals = [
+                signal * window if name in unfiltered else signal
+                for name, signal in zip(block.signals, signals, strict=True)
+            ]
+        return tuple(signals)
 
-def prepared(
-    step: BinMap, observation: Observation, reference: float, spare: list[Sums]
-) -> Prepared:
-    """State of `BinMap.prepare`. ``reference``: unit of the variance, K^2; ``spare``: see
-    `Binning`.
+    @property
+    def halves(self) -> list[list[Any]]:
+        """The binnings of either half; of scans, which are a half each, all together."""
+        middle = len(self.binnings) // 2
+        every: list[Any] = list(self.binnings)
+        return [every[:middle], every[middle:]] if self.apart else [every]
 
-    Raises PipelineError where noise is wanted from the scatter of samples that a window has
-    changed.
-    """
-    weight, noise = weights_of(step, observation, reference)
-    window = observation.window if step.contents == "all" else None
-    if window is not None and step.noise == "scatter":
-        text = (
-            "noise: scatter needs samples that no window has changed;"
-            f" {' and '.join(observation.windows)} did"
+    def counted(self, block: Block, binning: Binning) -> tuple[Any, ...]:
+        """Samples of a block that count, their weights, and this thread's sums."""
+        rows, samples = block.detectors, block.samples
+        return (
+            block.observation.good_detectors[rows] & binning.use[rows],
+            binning.good[samples],
+            binning.window[samples],
+            binning.weight[rows],
+            binning.noise[rows],
+            self.scatter,
+            1 / self.reference,
+            *binning.of_thread(),
         )
-        raise PipelineError(text, place=step.label, cure="leave out noise: scatter, or the window")
-    seen = observation.good_samples
-    if window is None:
-        window = np.zeros(0)
-    else:
-        seen &= (heavy := window >= LIGHTEST)
-        observation.tally.count(step.label, LIGHT, int((~heavy).sum()), heavy.size)
-    if "white" not in observation.components and step.noise == "net" and step.contents == "all":
-        observation.tally.state(step.label, "noise of a pixel", NO_WHITE)
-    if step.stokes == "IQU":
-        check_polarized(observation, step.label)
-    looking = Looking.of(observation, step.grid)
-    how = step, looking, (weight, noise, window), seen, spare
-    made: list[Any] = stokes_binnings(*how) if step.stokes == "IQU" else binnings(*how)
-    directions = Directions.of(looking, seen) if step.crosslinking else None
-    return Prepared(looking, made, directions, reference)
 
 
-def binnings(
-    step: BinMap,
-    looking: Looking,
-    levels: tuple[Any, Any, Any],
-    seen: NDArray[np.bool_],
-    spare: list[Sums],
-) -> list[Binning]:
-    """Binnings of each half (`halves_of`), one for all signals or one for each; arguments as of
-    `stokes_binnings`.
-    """
-    observation, (weight, noise, window) = looking.observation, levels
-    alike = (
-        step.noise == "net"
-        and not window.size
-        and bool((weight == weight[0]).all() and (noise == noise[0]).all())
-    )
-    signals = 1 if step.contents == "hits" else len(observation.signals)
-    others, count = (0, signals) if step.noise == "scatter" else (signals - 1, 1)
-    return [
-        Binning(
-            step.grid,
-            looking.pointing,
-            use,
-            (seen & samples).astype(np.uint8),
-            window,
-            weight,
-            noise,
-            alike,
-            others,
-            spare,
-        )
-        for use, samples in halves_of(step.split, observation)
-        for _ in range(count)
-    ]
+class Blocks(NamedTuple):
+    """A block of one band: its signals (n_det, n), and the state of its observation."""
+
+    signals: tuple[Any, ...]
+    block: Block
+    state: Prepared
 
 
-def weights_of(step: BinMap, observation: Observation, reference: float) -> tuple[Any, Any]:
-    """(w, w^2 times the variance of one sample) of each detector, in units of the variance
-    ``reference`` [K^2].
-
-    Raises PipelineError where they differ by too much, or are not known.
-    """
-    usable, net = observation.good_detectors, observation.focalplane.net.copy()
-    if not usable.any():
-        return np.ones(len(net)), np.ones(len(net))
-    net[~usable] = net[usable][0]  # they weigh nothing, whatever their noise
-    variance = net**2 * observation.sample_rate / reference
-    weight = np.ones(len(net))
-    if step.weights == "inverse_variance" and step.contents == "all":
-        if (net > 0).all():
-            weight = 1 / variance
-        elif (net != net[0]).any():
-            bad = observation.focalplane.names[int(np.flatnonzero(net <= 0)[0])]
-            raise PipelineError(
-                f"detector {bad} has NET 0, which has no inverse variance",
-                place=step.label,
-                cure="set weights: uniform",
-            )
-    weight = np.rint(weight * WEIGHT) / WEIGHT  # so that the sums of w d and of w use the same w
-    if weight.max(initial=0.0) > 2.0**20 or weight.min(initial=1.0) < 2.0**-20:
-        spread = net.max() > 1000 * net.min()
-        much = "the detectors' NETs differ by more than a factor of 1000"
-        far = "the NET is more than 1000 times larger or smaller than that of the first scan"
-        raise PipelineError(much if spread else far, place=step.label, cure="set weights: uniform")
-    return weight, weight**2 * variance
-
-
-def add_bands(step: BinMap, blocks: Sequence[Block], states: Sequence[Prepared]) -> None:
-    """See `BinMap.exec_bands`."""
-    every = [signals_of(step, *one) for one in zip(blocks, states, strict=True)]
-    parts, cells = list(zip(every, blocks, states, strict=True)), Cells()
-    for signals, block, state in parts:
-        if state.directions is not None:
-            state.directions.add(signals, block, cells)
-    if step.stokes == "IQU":
-        add_blocks(
-            [Part(cast(Any, s.binnings), signals, block) for signals, block, s in parts], cells
-        )
-        return
-    alike: dict[Hashable, list[tuple[Any, Block, Prepared]]] = {}
+def alike(parts: Sequence[Blocks]) -> list[list[Blocks]]:
+    """The blocks of bands that look in the same pixels, together."""
+    found: dict[Hashable, list[Blocks]] = {}
     for number, part in enumerate(parts):
-        looking = part[2].looking
+        looking = part.state.looking
         image = looking.key is None or isinstance(looking.grid, TangentGrid)
-        alike.setdefault(number if image else looking.key, []).append(part)
-    for together in alike.values():
-        add_together(step, together)
+        found.setdefault(number if image else looking.key, []).append(part)
+    return list(found.values())
 
 
-def signals_of(step: BinMap, block: Block, state: Prepared) -> tuple[Any, ...]:
-    """Signals of a block, (n_det, n) each; zeros where only the hits are wanted."""
-    if step.contents == "hits":
-        nothing = block.buffer("nothing", block.shape)
-        nothing.fill(0)
-        return (nothing,)
-    window, unfiltered = state.binnings[0].window[block.samples], block.observation.unfiltered
-    whole = any(name in block.means for name in block.signals) or (window.size and unfiltered)
-    signals = [block.total(name) if whole else block.detdata[name] for name in block.signals]
-    if window.size:  # no filter, no window, acted on these
-        signals = [
-            signal * window if name in unfiltered else signal
-            for name, signal in zip(block.signals, signals, strict=True)
-        ]
-    return tuple(signals)
-
-
-def halves(step: BinMap, state: list[Any]) -> list[Any]:
-    """The binnings of either half; of scans, which are a half each, all together."""
-    middle = len(state) // 2
-    return [state] if step.split == "scans" else [state[:middle], state[middle:]]
-
-
-def add_together(step: BinMap, parts: Sequence[tuple[Any, Block, Prepared]]) -> None:
+def add_together(parts: Sequence[Blocks]) -> None:
     """Add the signals of blocks, of bands that look in the same pixels, to this thread's sums."""
     todo = []
     for signals, block, state in parts:
-        for half in halves(step, list(state.binnings)):
+        for half in state.halves:
             left = signals
             for binning in half:
                 count = 1 + binning.n_others
-                todo.append(
-                    (tuple(left[:count]), binning, *_how(step, block, binning, state.reference))
-                )
+                todo.append((tuple(left[:count]), binning, *state.counted(block, binning)))
                 left = left[count:]
-    block, looking = parts[0][1], parts[0][2].looking
+    block, looking = parts[0].block, parts[0].state.looking
     begin, end, rows = block.samples.start, block.samples.stop, block.detectors
     if isinstance(looking.grid, TangentGrid):
         plane = block.observation.focalplane
@@ -336,61 +345,72 @@ def add_together(step: BinMap, parts: Sequence[tuple[Any, Block, Prepared]]) -> 
                 how[-2][FLAGGED] += (stop - start) * which.size
 
 
-def _how(step: BinMap, block: Block, binning: Binning, reference: float) -> tuple[Any, ...]:
-    """Samples of a block that count, their weights, and this thread's sums."""
-    rows, samples = block.detectors, block.samples
-    return (
-        block.observation.good_detectors[rows] & binning.use[rows],
-        binning.good[samples],
-        binning.window[samples],
-        binning.weight[rows],
-        binning.noise[rows],
-        step.noise == "scatter",
-        1 / reference,
-        *binning.of_thread(),
+def detector_weights(
+    observation: Observation, reference: float, inverse: bool, place: str
+) -> tuple[Any, Any]:
+    """(w, w^2 times the variance of one sample) of each detector, in units of the variance
+    ``reference`` [K^2]; ``inverse``: w is the inverse variance, else 1.
+
+    Raises PipelineError where they differ by too much, or are not known.
+    """
+    usable, net = observation.good_detectors, observation.focalplane.net.copy()
+    if not usable.any():
+        return np.ones(len(net)), np.ones(len(net))
+    net[~usable] = net[usable][0]  # they weigh nothing, whatever their noise
+    variance = net**2 * observation.sample_rate / reference
+    weight = np.ones(len(net))
+    if inverse:
+        if (net > 0).all():
+            weight = 1 / variance
+        elif (net != net[0]).any():
+            bad = observation.focalplane.names[int(np.flatnonzero(net <= 0)[0])]
+            raise PipelineError(
+                f"detector {bad} has NET 0, which has no inverse variance",
+                place=place,
+                cure="set weights: uniform",
+            )
+    weight = np.rint(weight * WEIGHT) / WEIGHT  # so that the sums of w d and of w use the same w
+    if weight.max(initial=0.0) > 2.0**20 or weight.min(initial=1.0) < 2.0**-20:
+        spread = net.max() > 1000 * net.min()
+        much = "the detectors' NETs differ by more than a factor of 1000"
+        far = "the NET is more than 1000 times larger or smaller than that of the first scan"
+        raise PipelineError(much if spread else far, place=place, cure="set weights: uniform")
+    return weight, weight**2 * variance
+
+
+def binnings(
+    split: Split,
+    looking: Looking,
+    levels: tuple[Any, Any, Any],
+    good: NDArray[np.bool_],
+    spare: list[Sums],
+    *,
+    signals: int,
+    scatter: bool,
+) -> list[Binning]:
+    """Empty sums for one observation, for each half of its samples: one for all ``signals``, or one
+    for each if their noise is that of their ``scatter``. Arguments as of `stokes_binnings`.
+    """
+    observation, (weight, noise, window) = looking.observation, levels
+    alike = (
+        not scatter
+        and not window.size
+        and bool((weight == weight[0]).all() and (noise == noise[0]).all())
     )
-
-
-def note_beams(step: BinMap, observation: Observation, sums: MapSums, binned: int) -> None:
-    """Note the beams of an observation's detectors, with what they weigh in the map: ``binned``
-    samples, as many of each.
-    """
-    good = observation.good_detectors
-    if count := int(np.count_nonzero(good)):
-        weight, _ = weights_of(step, observation, step._layout["variance"])
-        sums.beams.add(observation.focalplane.fwhm[good], weight[good], -(-binned // count))
-
-
-def add_scan(step: BinMap, data: Data, observation: Observation, state: Prepared) -> None:
-    """Add a scan to the map's sums; what is dropped is counted. Raises PipelineError for samples
-    that are too large.
-    """
-    if step.label not in data.partial:
-        signals = () if step.contents == "hits" else observation.signals
-        how = step.stokes == "IQU", step.noise == "scatter", step.split == "scans"
-        made = MapSums(step.grid.n_pixels, signals, *how)
-        counts = [name for name in COUNTS if getattr(step, name)]
-        made.coverage = Coverage.empty(step.grid.n_pixels, counts, step.scan_hits)
-        data.add(step.label, made)
-    sums: Any = data.partial[step.label]
-    before = sums.hits.sum(axis=0) if sums.coverage.of_hits else None
-    binned, dropped = sums.add(observation, halves(step, list(state.binnings)), step.label)
-    hits = None if before is None else sums.hits.sum(axis=0) - before
-    sums.coverage.add(hits, state.directions, f"{step.label}, {observation.name}")
-    note_beams(step, observation, sums, binned)
-    used = observation.focalplane.net[observation.good_detectors]
-    sums.unknown_variance |= step.weights == "inverse_variance" and not (used > 0).all()
-    every, tally = observation.n_detectors * observation.n_samples, observation.tally
-    tally.count(step.label, "samples binned", binned, every)
-    for what, number in (
-        ("outside the map", OUTSIDE),
-        ("flagged", FLAGGED),
-        ("not finite", NOT_FINITE),
-    ):
-        tally.count(step.label, f"samples dropped: {what}", int(dropped[number]), every)
-    if dropped[TOO_LARGE]:
-        raise PipelineError(
-            f"{int(dropped[TOO_LARGE])} samples are too large for the map's fixed-point sums",
-            place=f"{step.label}, {observation.name}",
-            cure="look for the operator that makes them; a signal is below 1e4 K",
+    others, count = (0, signals) if scatter else (signals - 1, 1)
+    return [
+        Binning(
+            looking.grid,
+            looking.pointing,
+            use,
+            (good & samples).astype(np.uint8),
+            window,
+            weight,
+            noise,
+            alike,
+            others,
+            spare,
         )
+        for use, samples in halves_of(split, observation)
+        for _ in range(count)
+    ]

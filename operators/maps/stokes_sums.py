@@ -34,8 +34,7 @@ from zonda.core.numerics.projection import frame_rotation
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 
-from .halves import halves_of
-from .parameters import MapParameters
+from .halves import Split, halves_of
 from .pixels import Cells, Looking, fingerprint, tiles
 from .stokes_kernel import DATA, FIRST, HIT, add_stokes
 from .sums import FLAGGED, Sums
@@ -113,7 +112,7 @@ class StokesBinning:
 
 
 def stokes_binnings(
-    step: MapParameters,
+    split: Split,
     looking: Looking,
     levels: tuple[Floats, Floats, Floats],
     good: Any,
@@ -121,18 +120,17 @@ def stokes_binnings(
 ) -> list[StokesBinning]:
     """Empty sums for one observation, one for each half of its samples.
 
-    ``levels``: weights and noise of the detectors (`bin_map.weights_of`), and the window (n_samp,)
-    or (0,); ``good`` (n_samp,): which samples count.
+    ``levels``: weights and noise of the detectors (`bin_map.detector_weights`), and the window
+    (n_samp,) or (0,); ``good`` (n_samp,): which samples count.
     """
     observation, (weight, noise, window) = looking.observation, levels
     own = bool(window.size) or not np.allclose(weight, noise, rtol=1e-6, atol=0)
     angles = PolarizationAngles.of(
-        observation, observation.boresight_radec, frame_rotation(step.frame)[2]
+        observation, observation.boresight_radec, frame_rotation(looking.grid.frame)[2]
     )
     signals, key = len(observation.signals), None
     halves = [
-        (use, (good & samples).astype(np.uint8))
-        for use, samples in halves_of(step.split, observation)
+        (use, (good & samples).astype(np.uint8)) for use, samples in halves_of(split, observation)
     ]
     if looking.key is not None:
         seen = (
