@@ -14,8 +14,8 @@ from ..numerics.angles import FWHM_PER_SIGMA, angle_text, sides_text
 from ..pages import html_table
 from ..types import Floats
 from .central import central_diameter
-from .grid import CUT
 from .map_arrays import MapArrays
+from .smoothing import CUT, smoother
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -148,7 +148,7 @@ class MapProduct(MapArrays):
             )
         if self.polarization is not None:
             return self._with_parts([one.smoothed(fwhm) for one in self.by_stokes().values()])
-        convolve = self.grid.smoother(fwhm)
+        convolve = smoother(self.grid, fwhm)
         known = self.known
         weights = np.where(known, self.weights, 0.0)
         total = convolve(weights, 1.0)

@@ -16,6 +16,7 @@ from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import is_quiet, maps_of, noise_alone
+from zonda.core.maps.smoothing import smoother
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.output import Output
 from zonda.core.storage.files import product_path
@@ -232,7 +233,7 @@ def covered(plane: Plane, product: Any, least: float) -> Plane:
     areas, seen = np.broadcast_to(plane.grid.areas, product.hits.shape), product.known
     depth = product.known_hits / areas  # samples per solid angle, under the beam
     if product.fwhm > 0:
-        depth = plane.grid.smoother(product.fwhm)(np.nan_to_num(depth))
+        depth = smoother(plane.grid, product.fwhm)(np.nan_to_num(depth))
     enough = depth >= least * np.percentile(depth[seen], 99) if seen.any() else seen
     return replace(plane, values=np.where(enough, plane.values, np.nan))
 

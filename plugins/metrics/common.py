@@ -13,6 +13,7 @@ from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.grid import ImagePixels, wcs_grid
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.smoothing import smoothed, smoother
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.signal import Signal, product_name, stream_of
 from zonda.core.types import Floats
@@ -77,8 +78,8 @@ def as_seen(image: Image, product: MapProduct, fwhm: float | None = None) -> Flo
 
     own = wcs_grid(image.wcs, (image.values.shape[0], image.values.shape[1]))
     width = product.fwhm if fwhm is None else fwhm
-    smooth, _ = own.smoothed(
-        np.nan_to_num(image.values), math.sqrt(max(width**2 - image.fwhm**2, 0.0))
+    smooth, _ = smoothed(
+        own, np.nan_to_num(image.values), math.sqrt(max(width**2 - image.fwhm**2, 0.0))
     )
     grid = product.grid
     x, y = own.coordinates(grid.directions() @ grid.turn @ own.turn.T)  # either may be galactic
@@ -118,10 +119,10 @@ def relative_error_of_rms(product: MapProduct, where: NDArray[np.bool_]) -> floa
     rows, columns = (np.flatnonzero(w.any(axis=axis)) for axis in (1, 0))
     window = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
     w, grid = w[window], grid.window(*window)
-    smoothed = cell > float(np.nanmin(grid.areas))
+    wide = cell > float(np.nanmin(grid.areas))
     pairs = (
-        float((w * grid.smoother(product.smoothed_by)(w) * cell / grid.areas).sum())
-        if smoothed
+        float((w * smoother(grid, product.smoothed_by)(w) * cell / grid.areas).sum())
+        if wide
         else float((w * w).sum())
     )
     return 1 / math.sqrt(2 * float(w.sum()) ** 2 / pairs)

@@ -1,8 +1,8 @@
 """Maps that are compared, and how they are brought to one beam and one grid.
 
 One beam: each map is convolved, on its own pixels, with a Gaussian of FWHM sqrt(target^2 - own^2)
-on the sky (`core.maps.grid`). Pixels count with their solid angles W; those without a value count
-neither in the sum nor in its weight, and stay without one:
+on the sky (`core.maps.smoothing`). Pixels count with their solid angles W; those without a value
+count neither in the sum nor in its weight, and stay without one:
 
     m'_p = sum_q K_pq W_q m_q / sum_q K_pq W_q,
     q with a value                                            (1)
@@ -34,6 +34,7 @@ from zonda.core.maps.grid import HealpixPixels, ImagePixels, MapGrid, image_grid
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.measured_noise import ELSEWHERE, WHITE, noise_factor
 from zonda.core.maps.on_plane import on_plane
+from zonda.core.maps.smoothing import smoothed
 from zonda.core.numerics.angles import FWHM_PER_SIGMA, angle_text
 from zonda.core.numerics.projection import pixel_matrix
 from zonda.core.numerics.sphere import angles, local_axes
@@ -147,10 +148,10 @@ class Plane:
         noise = (
             None if self.noise is None else np.where(np.isfinite(self.values), self.noise, np.nan)
         )
-        values, noise = self.grid.smoothed(self.values, more, noise=noise)
+        values, noise = smoothed(self.grid, self.values, more, noise=noise)
         if noise is not None and self.blurred:  # pixels were not independent before
             noise = noise * _left(self.blurred, more / FWHM_PER_SIGMA, self.pixel)
-        alone = None if self.alone is None else self.grid.smoothed(self.alone, more)[0]
+        alone = None if self.alone is None else smoothed(self.grid, self.alone, more)[0]
         blurred = math.hypot(self.blurred, more / FWHM_PER_SIGMA)
         return replace(self, values=values, noise=noise, fwhm=fwhm, blurred=blurred, alone=alone)
 

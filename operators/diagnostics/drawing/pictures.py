@@ -27,6 +27,7 @@ from zonda.core.maps.map_plots import (
 )
 from zonda.core.maps.noise_figures import Noise
 from zonda.core.maps.on_plane import on_plane
+from zonda.core.maps.smoothing import smoother
 from zonda.core.numerics.angles import angle_text, sides_text
 from zonda.core.types import AnyFloats
 
@@ -109,7 +110,7 @@ class Flat:
         """
         seen = product.known_hits.astype(np.float64)
         if product.smoothed_by and product.projection != "HEALPix":
-            seen = product.grid.smoother(product.smoothed_by)(seen)
+            seen = smoother(product.grid, product.smoothed_by)(seen)
         found: dict[str, Any] = {**planes, "hits": product.known_hits, "seen": seen}
         if product.projection == "TAN":
             wcs = wcs_of(product.header)

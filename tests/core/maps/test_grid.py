@@ -9,6 +9,7 @@ import pytest
 
 from zonda.core.errors import InputError
 from zonda.core.maps.grid import healpix_grid, image_grid, wcs_grid
+from zonda.core.maps.smoothing import smoothed, smoother
 from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
 from zonda.core.numerics.sphere import separation, unit_vectors
 
@@ -126,7 +127,7 @@ def test_a_delta_pixel_becomes_a_gaussian_of_its_own_solid_angle(kind, dec, cdel
     sigma, at = fwhm / FWHM_PER_SIGMA, (28, shape[1] // 2 + 4)
     values = np.zeros(shape)
     values[at] = 1.0
-    found, noise = grid.smoothed(values, fwhm, noise=np.ones(shape))
+    found, noise = smoothed(grid, values, fwhm, noise=np.ones(shape))
     directions = grid.directions()
     apart = 2 * np.arcsin(np.clip(np.linalg.norm(directions - directions[at], axis=-1) / 2, 0, 1))
     areas = np.broadcast_to(grid.areas, shape)
@@ -152,7 +153,7 @@ def test_the_pole_of_a_whole_plate_carree_sky():
     fwhm = math.radians(2.0)
     values, sigma = np.zeros(shape), fwhm / FWHM_PER_SIGMA
     values[18, 100] = 1.0
-    found, _ = grid.smoothed(values, fwhm)
+    found, _ = smoothed(grid, values, fwhm)
     directions = grid.directions()
     apart = 2 * np.arcsin(np.linalg.norm(directions - directions[18, 100], axis=-1) / 2)
     expected = (
@@ -181,10 +182,10 @@ def test_a_large_plate_carree_sky_is_smoothed_as_a_small_one(width, monkeypatch)
     values = np.zeros(shape)
     for row in rows:
         values[row, (37 * row) % 180] = 1.0
-    monkeypatch.setattr("zonda.core.maps.grid.DIRECT", 1e99)
-    expected, noise = grid.smoothed(values, fwhm, noise=np.ones(shape))
-    monkeypatch.setattr("zonda.core.maps.grid.DIRECT", 0.0)
-    found, other = grid.smoothed(values, fwhm, noise=np.ones(shape))
+    monkeypatch.setattr("zonda.core.maps.smoothing.DIRECT", 1e99)
+    expected, noise = smoothed(grid, values, fwhm, noise=np.ones(shape))
+    monkeypatch.setattr("zonda.core.maps.smoothing.DIRECT", 0.0)
+    found, other = smoothed(grid, values, fwhm, noise=np.ones(shape))
     for row in rows:
         near = slice(max(row - 3, 0), row + 4)
         assert abs(found - expected)[near].max() < 0.005 * expected[near].max()
@@ -194,10 +195,10 @@ def test_a_large_plate_carree_sky_is_smoothed_as_a_small_one(width, monkeypatch)
 def test_a_pole_that_would_take_hours_is_refused(monkeypatch):
     shape = (90, 180)
     grid = image_grid(header("CAR", 0, shape, (-2.0, 2.0)), shape)
-    monkeypatch.setattr("zonda.core.maps.grid.DIRECT", 0.0)
-    monkeypatch.setattr("zonda.core.maps.grid.MOST_DIRECT", 1.0)
+    monkeypatch.setattr("zonda.core.maps.smoothing.DIRECT", 0.0)
+    monkeypatch.setattr("zonda.core.maps.smoothing.MOST_DIRECT", 1.0)
     with pytest.raises(InputError, match="that holds a pole"):
-        grid.smoother(math.radians(6.0))
+        smoother(grid, math.radians(6.0))
 
 
 def test_rows_that_go_round_the_sky_have_no_ends():
@@ -206,7 +207,7 @@ def test_rows_that_go_round_the_sky_have_no_ends():
     grid = image_grid(header("CAR", 0, shape, (-1.0, 1.0)), shape)
     values = np.zeros(shape)
     values[20, 1] = 1.0
-    found, _ = grid.smoothed(values, math.radians(5.0))
+    found, _ = smoothed(grid, values, math.radians(5.0))
     assert found[20, 359] == pytest.approx(found[20, 3], rel=1e-9)
     np.testing.assert_array_equal(found[:, 0], found[:, 360])
     assert np.count_nonzero(~grid.once) == 41
@@ -236,7 +237,7 @@ def test_pixels_beyond_the_sky_have_no_area_and_no_value():
     assert grid.once[20, 20]
     assert math.isnan(grid.areas[0, 0])
     assert grid.pixels_at(unit_vectors(math.radians(220.0), math.radians(-20.0))) == -1
-    found, _ = grid.smoothed(np.where(grid.once, 2.0, np.nan), math.radians(10.0))
+    found, _ = smoothed(grid, np.where(grid.once, 2.0, np.nan), math.radians(10.0))
     assert found[grid.once] == pytest.approx(2.0)
     assert np.isnan(found[~grid.once]).all()
 
@@ -268,7 +269,7 @@ def test_healpix(nest):
     at = int(grid.distance(middle).argmin())
     values, sigma = np.zeros(len(pixels)), fwhm / FWHM_PER_SIGMA
     values[at] = 1.0
-    found, noise = grid.smoothed(values, fwhm, noise=np.ones(len(pixels)))
+    found, noise = smoothed(grid, values, fwhm, noise=np.ones(len(pixels)))
     where = grid.directions()[at]
     lon, lat = math.atan2(where[1], where[0]), math.asin(where[2])
     expected = (

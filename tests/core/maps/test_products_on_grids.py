@@ -10,6 +10,7 @@ import pytest
 from zonda.core.instrument import Band
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.picture import Shown, draw
+from zonda.core.maps.smoothing import smoothed
 from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
 from zonda.operators.diagnostics.report_results import expected
 from zonda.operators.maps.grid import tangent_wcs
@@ -145,9 +146,9 @@ def test_large_images_are_smoothed_by_tiles(monkeypatch):
     values = np.zeros(one.signal.shape)
     for at in ((135, 135 + 114), (135 + 78, 135 - 78), (64, 128)):
         values[at] = 1.0
-    found, noise = one.grid.smoothed(values, fwhm, noise=np.ones(values.shape))
-    monkeypatch.setattr("zonda.core.maps.grid.DIRECT", 0.0)
-    tiled, other = one.grid.smoothed(values, fwhm, noise=np.ones(values.shape))
+    found, noise = smoothed(one.grid, values, fwhm, noise=np.ones(values.shape))
+    monkeypatch.setattr("zonda.core.maps.smoothing.DIRECT", 0.0)
+    tiled, other = smoothed(one.grid, values, fwhm, noise=np.ones(values.shape))
     peak = one.areas().max() / (2 * math.pi * sigma**2)
     assert abs(tiled - found).max() < 0.005 * peak
     np.testing.assert_allclose(other[20:-20, 20:-20], noise[20:-20, 20:-20], rtol=0.005)
