@@ -276,8 +276,8 @@ class MapArrays:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Where the map has a value: where there are samples and, of a polarized map, enough of
-        their angles.
+        """Pixels in which the map has a value: those with samples and, of a polarized map, enough
+        of their angles.
         """
         hit = self.hits > 0
         return hit if self.contents == "hits" else hit & np.isfinite(self.signal)
@@ -301,14 +301,14 @@ class MapArrays:
 
     @property
     def projection(self) -> Literal["TAN", "CAR", "HEALPix"]:
-        """Of its pixels."""
+        """Projection of the pixels."""
         if self.header is None:
             return "HEALPix"
         return "CAR" if str(self.header["CTYPE1"]).endswith("-CAR") else "TAN"
 
     @property
     def grid(self) -> ImagePixels | HealpixPixels:
-        """Where its pixels are on the sky, and how large: `core.maps.grid`."""
+        """Positions and sizes of the pixels on the sky."""
         if self.header is not None:
             return image_grid(self.header, (self.signal.shape[0], self.signal.shape[1]), self.pixel)
         assert self.pixels is not None  # of HEALPix
@@ -345,8 +345,8 @@ class MapArrays:
         return self.grid.distance(self.centre)
 
     def seconds_per_beam(self) -> Floats | float | None:
-        """What one sample in a pixel adds to the integration time of all detectors per beam [s]:
-        times ``hits``, that time.
+        """Integration time of all detectors per beam [s] for each sample in a pixel: times
+        ``hits``, that time.
 
             1 / sample rate x beam area / pixel area,   beam area = pi FWHM^2 / (4 ln 2)
 

@@ -1,4 +1,4 @@
-"""How scans cross in the pixels of a map, and which scan hit which.
+"""Directions in which scans cross the pixels of a map, and the hits of each scan.
 
 At each sample a detector moves on the sky in a direction, at the angle psi from the parallel of the
 map's frame (from east to north). In each pixel
@@ -237,7 +237,7 @@ COUNTS: dict[str, type[PixelCount]] = {"crosslinking": Crosslinking, "visits": V
 
 @dataclass
 class Coverage:
-    """What a map tells beside its samples' mean.
+    """Counts of a map beside its samples' mean, and the hits of each scan.
 
     Attributes
     ----------
@@ -253,13 +253,13 @@ class Coverage:
 
     @classmethod
     def empty(cls, n_pixels: int, counts: Iterable[str], scan_hits: bool) -> Coverage:
-        """Of no observation."""
+        """The coverage of no observation: zeros."""
         sums = {name: np.zeros((n_pixels, COUNTS[name].columns), np.int64) for name in counts}
         return cls(sums, [] if scan_hits else None)
 
     @property
     def of_hits(self) -> bool:
-        """Whether the hits of each scan are needed."""
+        """True if the hits of each scan are needed."""
         return self.pixels is not None or any(COUNTS[name].of_hits for name in self.sums)
 
     def add(self, hits: Sums | None, directions: Directions | None, place: str) -> None:
@@ -307,7 +307,7 @@ class Coverage:
 
     @classmethod
     def of(cls, arrays: Mapping[str, Any], n_pixels: int) -> Coverage:
-        """What `arrays` gave, put together again."""
+        """The coverage that `arrays` took apart."""
         made = cls.empty(n_pixels, arrays["counts"], "hits_of_scans" in arrays)
         for name, sums in made.sums.items():
             sums[arrays[f"{name}_pixels"]] = arrays[name]

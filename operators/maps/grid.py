@@ -92,7 +92,7 @@ class HealpixGrid:
 
     @cached_property
     def lookup(self) -> Lookup:
-        """Where each covered pixel lies among them."""
+        """Places of the covered pixels among them."""
         return lookup(self.pixels_covered)
 
     def pointing(self, observation: Observation) -> Floats:
@@ -220,7 +220,7 @@ def covered_healpix(
 
 
 def _union(pieces: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """All numbers of the pieces, sorted."""
+    """Sorted union of the pieces."""
     every = np.concatenate(pieces)
     low, high = int(every.min()), int(every.max())
     if high - low > 64 * every.size:

@@ -32,7 +32,7 @@ MOST_PAGES = 1 << 22
 
 
 class Lookup(NamedTuple):
-    """Where a pixel lies among the sorted ``covered`` ones: by pages of 64 pixels from page
+    """Places of pixels among the sorted ``covered`` ones: by pages of 64 pixels from page
     ``first`` on, or by search.
     """
 

@@ -1,4 +1,4 @@
-"""What all pixel grids have in common."""
+"""Base class of images, and the rays of detectors."""
 
 from __future__ import annotations
 

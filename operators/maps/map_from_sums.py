@@ -195,7 +195,7 @@ class MapFromSums:
 
 
 def pixels_of(grid: Grid, keep: Any) -> dict[str, Any]:
-    """Where the pixels of a map are: those of a list that it has are numbered ``keep``."""
+    """Header or pixel numbers of a map; ``keep``: places of the HEALPix pixels that it has."""
     if not isinstance(grid, HealpixGrid):
         return {"header": grid.header, "pixel": grid.pixel}
     return {

@@ -136,7 +136,7 @@ class MapSums(Product):
 
     @property
     def halved(self) -> bool:
-        """Both halves have samples."""
+        """True if both halves have samples."""
         return len(self.scans) > 1 or not self.of_scans
 
     @property
@@ -146,7 +146,7 @@ class MapSums(Product):
 
     @property
     def _tables(self) -> dict[str, Sums]:
-        """All sums by names for files, (2, n_pixels, columns) each."""
+        """Sums by their names in files, (2, n_pixels, columns) each."""
         found = {"table": self.table}
         for k, name in enumerate(self.signals or (MAIN,)):
             found |= {

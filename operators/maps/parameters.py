@@ -19,7 +19,7 @@ WIDEST_SMOOTH = 0.1
 
 
 class MapParameters(MapMaker):
-    """Which map is made of the samples."""
+    """Pixels, weights, noise and planes of a map."""
 
     pixel: Angle = quantity("2 arcsec", gt=0)
     """Side of a pixel."""
@@ -77,7 +77,7 @@ class MapParameters(MapMaker):
 
     @property
     def split(self) -> Split:
-        """Which halves are kept apart."""
+        """The halves that are kept apart."""
         return (
             "scans"
             if isinstance(self.half_difference, bool) or self.contents == "hits"

@@ -52,7 +52,7 @@ class BinMapPlanning(Planning[BinMap]):
         return more * self.operator.grid.n_pixels + samples + self._sums(observation, others)
 
     def _sums(self, observation: Observation, others: int) -> int:
-        """Of ``others`` signals beside the first."""
+        """Bytes of the sums with ``others`` signals beside the first."""
         if (
             self.operator.stokes == "IQU"
         ):  # hits, six sums and three for each signal, in two threads and two halves

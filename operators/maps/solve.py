@@ -24,7 +24,7 @@ ELEMENTS = [place - 1 for place in PLACES]
 
 @dataclass(frozen=True)
 class Solver:
-    """How planes (n, pixels) of a signal are made of its sums.
+    """Makes planes (n, pixels) of a signal from its sums.
 
     Attributes
     ----------
@@ -152,5 +152,5 @@ class _Solved:
 
 
 def _rest(a: Floats, values: Floats, data: Floats) -> Floats:
-    """What a solution leaves of b: one step of refinement."""
+    """Residual b - A m, for one step of refinement."""
     return np.asarray(data - np.einsum("nij,nj->ni", a, values))

@@ -47,7 +47,7 @@ PLACES = (1, 2, 3, 2, 4, 5, 3, 5, 6)
 
 @dataclass
 class StokesBinning:
-    """Which samples of one observation count with which weights, and the sums of each thread.
+    """Samples of one observation that count, their weights, and the sums of each thread.
 
     Attributes
     ----------
