@@ -17,11 +17,10 @@ from .data import Data
 from .errors import PipelineError
 from .faults import faults_named
 from .hooks import manager
-from .label import labels
 from .machine import available_memory, available_threads
 from .mapmaker import joins
 from .observation import Observation
-from .operator import Operator
+from .operator import Operator, labels
 from .output import Output, Progress
 from .pages import html_table
 from .run.bands import (

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from .numerics.chunks import TILE_DETECTORS, TILE_SAMPLES
 from .numerics.smooth import SmoothField
-from .numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from .observation import Observation
 from .signal import MAIN, Component
 from .types import AnyFloats

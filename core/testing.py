@@ -24,7 +24,7 @@ from pydantic import ValidationError
 from .configuration.docstrings import described, source_is_known
 from .data import STREAMS, Block, Data, Observation, Stream
 from .mapmaker import MapMaker, filters
-from .numerics.tiles import TILE_SAMPLES
+from .numerics.chunks import TILE_SAMPLES
 from .operator import Operator
 from .output import Output
 from .pipeline import Part, Pipeline

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from .configuration.time import Instant
 from .data import STREAMS, Block, Data, Observation
 from .instrument import Band, Instrument, Telescope
+from .numerics.chunks import TILE_SAMPLES
 from .numerics.quaternions import from_angles
 from .numerics.random import normals
 from .numerics.smooth import SmoothField
-from .numerics.tiles import TILE_SAMPLES
 from .operator import Operator
 from .scene import Scene
 from .site import Site

@@ -14,6 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+TILE_DETECTORS = 16
+"""Blocks begin at multiples of this many detectors."""
+
+TILE_SAMPLES = 2048
+"""Blocks begin at multiples of this many samples."""
+
+
 CHUNK = 1 << 14
 """Instants that are worked on at a time."""
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..configuration.pipeline_file import PipelineFile, Step
-from ..label import labels
 from ..maps.beams import expected_fwhm
+from ..operator import labels
 from .context import Context
 from .decide import Decided
 from .estimate import describe, figure, kelvin

@@ -22,7 +22,7 @@ from ..errors import PipelineError
 from ..faults import PluginError, whose
 from ..kernels import kernel
 from ..mapmaker import MapMaker, filters, forms
-from ..numerics.tiles import TILE_SAMPLES
+from ..numerics.chunks import TILE_SAMPLES
 from ..operator import Operator
 from ..signal import Formed, is_stream
 from ..stream import Stream

@@ -30,9 +30,8 @@ from ..discovery import RAISED
 from ..errors import PipelineError
 from ..machine import resident_memory
 from ..mapmaker import filters
-from ..numerics.chunks import empty
+from ..numerics.chunks import TILE_DETECTORS, empty
 from ..numerics.smooth import SmoothField
-from ..numerics.tiles import TILE_DETECTORS
 from ..observation import Observation
 from ..operator import Operator
 from ..signal import MAIN, Formed, is_signal

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import PipelineError
 from ..mapmaker import MapMaker, filters, forms, makes_products
-from ..numerics.tiles import TILE_DETECTORS
+from ..numerics.chunks import TILE_DETECTORS
 from ..observation import Observation
 from ..operator import Operator
 from ..plan.planning import planning_of

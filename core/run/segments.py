@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..data import Block, Observation
-from ..numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
+from ..numerics.chunks import TILE_DETECTORS, TILE_SAMPLES
 from ..operator import Operator
 
 PIECE = 4 * TILE_SAMPLES

@@ -31,8 +31,8 @@ from zonda.core.block import Block
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction, Seconds
 from zonda.core.kernels import kernel
+from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.numerics.random import normals
-from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.types import Floats

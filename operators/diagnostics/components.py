@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.numerics.tiles import TILE_SAMPLES
+from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.stream import Stream, forget_pages
 from zonda.core.types import Floats
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from zonda.core.data import Observation
-from zonda.core.numerics.tiles import TILE_SAMPLES
+from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.plan.planning import Planning
 
 from .map_spectra import MapSpectrum

@@ -28,9 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.kernels import kernel
-from zonda.core.numerics.chunks import chunks, empty
+from zonda.core.numerics.chunks import TILE_DETECTORS, chunks, empty
 from zonda.core.numerics.smooth import product, spline_basis
-from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.numerics.transforms import cosine_transform, fast_length
 from zonda.core.types import AnyFloats
 

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.kernels import kernel
-from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
+from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
 from zonda.core.stream import Stream
 from zonda.core.types import Floats
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from zonda.core.knobs import Knob
-from zonda.core.numerics.tiles import TILE_SAMPLES
+from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.observation import Observation
 from zonda.core.plan.context import LEAKS, Context
 from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, exact, full

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from zonda.core import flags
 from zonda.core.errors import InputError
-from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.tiles import TILE_DETECTORS
+from zonda.core.numerics.chunks import TILE_DETECTORS, chunks
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import reading
 from zonda.core.types import Floats

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from zonda.core.configuration.units import read_unit
 from zonda.core.errors import InputError
-from zonda.core.numerics.chunks import chunks
+from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
 from zonda.core.numerics.smooth import SmoothField
-from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.types import AnyFloats, Floats
 
 AT_ONCE = 4 * TILE_SAMPLES

@@ -23,7 +23,7 @@ from pydantic import PrivateAttr
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.numerics.tiles import TILE_SAMPLES
+from zonda.core.numerics.chunks import TILE_SAMPLES
 
 from .angle_checks import check_polarized, warn_before
 from .coverage import COUNTS, Coverage, Directions

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.block import Block
-from zonda.core.numerics.tiles import TILE_DETECTORS, TILE_SAMPLES
+from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES
 from zonda.core.observation import Observation
 from zonda.core.types import Floats
 

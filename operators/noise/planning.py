@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from zonda.core.knobs import Knob
-from zonda.core.numerics.tiles import TILE_DETECTORS
+from zonda.core.numerics.chunks import TILE_DETECTORS
 from zonda.core.observation import Observation, WhiteLevel
 from zonda.core.plan.context import LEAKS, OTHER_MODES, Context
 from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, full

@@ -13,9 +13,9 @@ from numba import uint64
 from numpy.typing import NDArray
 
 from zonda.core.kernels import kernel
+from zonda.core.numerics.chunks import TILE_DETECTORS
 from zonda.core.numerics.random import TILE, fill_normals, normal_scratch, normal_tile, normals
 from zonda.core.numerics.smooth import Series, SmoothField, series_into
-from zonda.core.numerics.tiles import TILE_DETECTORS
 from zonda.core.types import AnyFloats
 
 from .one_over_f import PowerLawFilter

@@ -15,8 +15,7 @@ from zonda.core.types import Floats
 
 from . import stokes
 from .inputs import HealpixMap, Wanted
-from .resolution import made_with
-from .units import beam_solid_angle, check_beam, filled, unit_of
+from .units import beam_solid_angle, check_beam, filled, made_with, unit_of
 
 
 def read_healpix(hdu: Any, place: str, wanted: Wanted) -> HealpixMap:

@@ -20,8 +20,8 @@ from zonda.core.storage.files import atomic_path
 
 from .array import ArrayMap, WorldCoordinates, check_shape, checked_unit
 from .beam import PIXELS_PER_FWHM
-from .cache import Cache
 from .footprint import Footprint, footprint, header_of, off_the_map, position
+from .state import Cache
 
 
 class SkyParameters(Operator):

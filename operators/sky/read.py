@@ -30,8 +30,7 @@ from .array import GIVEN, ArrayMap
 from .geometry import geometry
 from .healpix import read_healpix
 from .inputs import HealpixMap, Wanted, WcsMap
-from .resolution import made_with
-from .units import beam_solid_angle, check_beam, filled, unit_of
+from .units import beam_solid_angle, check_beam, filled, made_with, unit_of
 
 T = TypeVar("T", WcsMap, HealpixMap, WcsMap | HealpixMap)
 

@@ -14,8 +14,7 @@ from .inputs import HealpixMap, WcsMap
 from .parameters import SkyParameters
 from .read import read_array, read_map
 from .resample import Progress, no_progress
-from .resolution import seen_twice
-from .units import DOUBT
+from .units import DOUBT, seen_twice
 
 LARGE = 1 << 26
 """Bytes of a file above which the progress bar shows that it is read."""

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from zonda.core import experiment as core
 from zonda.core.campaign.entries import setting
@@ -15,9 +16,38 @@ from zonda.core.errors import InputError, ZondaError
 from zonda.core.figures import Choice
 from zonda.core.registry import operators
 from zonda.core.storage.files import write_text
+from zonda.operators.atmosphere.weather.sources import profile_of
+from zonda.plugins.commands.weather_plots import plot_spectrum
 
 from .claims import FOLDER, Claim, Experiment
 from .verdict import Values
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from zonda.core.scene import Scene
+
+
+def atmosphere_figure(scene: Scene) -> Figure:
+    """A figure of the climatology's profile at the zenith of the scene's site and time, with the
+    instrument's band.
+    """
+    from matplotlib.figure import Figure
+
+    air = profile_of(None, scene.site, scene.time, 0)
+    figure = Figure(figsize=(9, 8.5), dpi=110, layout="constrained")
+    axes = figure.subplots(2)
+    for ax, which in zip(axes, ("brightness", "transmission"), strict=True):
+        plot_spectrum(ax, air, math.pi / 2, [scene.instrument.band], which)
+    figure.legend(
+        *axes[1].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=6,
+        fontsize=8,
+        frameon=False,
+    )
+    return figure
+
 
 DRAWN = "drawn.txt"
 """File in a folder with pictures that holds the key of their simulation."""
@@ -99,8 +129,6 @@ class Runs:
     def draw_atmosphere(self, experiment: Experiment, folder: Path) -> None:
         """The atmosphere above the site of an experiment's pipeline: ``atmosphere.png``."""
         from zonda.core.storage.files import atomic_path
-
-        from .atmosphere_figure import atmosphere_figure
 
         folder.mkdir(parents=True, exist_ok=True)
         figure = atmosphere_figure(self._variants(experiment)[0].file.scene())

@@ -10,8 +10,8 @@ import pytest
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.instrument import Band, Instrument, Telescope
+from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.numerics.smooth import SmoothField
-from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
 from zonda.core.registry import planning

@@ -9,8 +9,8 @@ from pydantic import PrivateAttr
 from tests.core.run.test_execution import execute, observation
 from zonda.core.data import Block
 from zonda.core.faults import PluginError
+from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.numerics.smooth import SmoothField
-from zonda.core.numerics.tiles import TILE_SAMPLES
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
 from zonda.core.registry import planning

@@ -265,7 +265,7 @@ def test_a_counter_of_another_quantity_has_axes_of_its_own(claims, tmp_path):
 
 def test_the_atmosphere_of_a_site_is_drawn(tmp_path):
     from zonda.core.configuration.pipeline_file import load
-    from zonda.plugins.validation.atmosphere_figure import atmosphere_figure
+    from zonda.plugins.validation.runs import atmosphere_figure
 
     emission, transmission = atmosphere_figure(
         load(SHIPPED.parent / "mustang2.yaml", ()).scene()
