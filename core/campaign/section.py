@@ -165,9 +165,9 @@ def _names(document: Document) -> list[str]:
     return [str(name) for name in each]
 
 
-def _takes_schedule(step: type[Operator]) -> bool:
+def _takes_schedule(kind: type[Operator]) -> bool:
     """True if an operator's class makes scans of a schedule."""
-    return "schedule" in step.model_fields and "boresight" in declared(step, "provides")
+    return "schedule" in kind.model_fields and "boresight" in declared(kind, "provides")
 
 
 def _mistakes(

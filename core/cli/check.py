@@ -49,6 +49,6 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
         click.echo(outline(source(pipeline, settings, False))[0])
 
 
-def _say(step: str) -> None:
+def _say(label: str) -> None:
     """Name the step that is looked at, on one line of the terminal."""
-    click.echo(f"\r\033[K{f'checking {step}' if step else ''}", nl=False, err=True)
+    click.echo(f"\r\033[K{f'checking {label}' if label else ''}", nl=False, err=True)
