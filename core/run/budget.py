@@ -271,8 +271,9 @@ def _refuse(
     largest = ", ".join(f"{who} {_size(size)}" for who, size in rows[:4] if size > 0.01 * need)
     cures = [f"use --memory {_with_margin(need) // 1_000_000}MB"] if need * 1.05 <= free else []
     smaller = {KEPT: FEWER} | {o.label: planning_of(o).smaller for o in chain.steps}
+    own = need - parts["zonda and its libraries"]  # the process may hold more of other work
     cures += [
-        f"{label}: {how}" for label, how in smaller.items() if how and parts[label] > 0.1 * need
+        f"{label}: {how}" for label, how in smaller.items() if how and parts[label] > 0.1 * own
     ]
     if blocks > 0.1 * need and parts["zonda and its libraries"] < budget:
         cures.append("split the scan into shorter ones")
