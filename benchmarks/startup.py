@@ -86,14 +86,12 @@ def stages(folder: str, pipeline: str) -> dict[str, Any]:
     return {"stages": rows}
 
 
-def child(folder: Path, caches: Path, pipeline: str, known: str = "zonda") -> dict[str, Any]:
-    """One run in a process of its own; ``known``: the folder of what is remembered beside compiled
-    kernels.
-    """
+def child(folder: Path, caches: Path, pipeline: str) -> dict[str, Any]:
+    """One run in a process of its own."""
     environment = {
         **os.environ,
         "NUMBA_CACHE_DIR": str(caches / "numba"),
-        "ZONDA_CACHE_DIR": str(caches / known),
+        "ZONDA_CACHE_DIR": str(caches / "zonda"),
     }
     result = folder / "result.json"
     begun, used = time.time(), os.times()
@@ -148,20 +146,10 @@ def main() -> None:
         runs = [
             child(folder, Path(place, "caches"), options.pipeline) for _ in range(options.repeats)
         ]
-        planned = [
-            child(folder, Path(place, "caches"), options.pipeline, known=f"again-{k}")
-            for k in range(options.repeats)
-        ]
-        second, compiled = (min(some, key=lambda run: run["wall"]) for some in (runs, planned))
+        second = min(runs, key=lambda run: run["wall"])
         print(table("First run, nothing compiled", first), table("Second run", second), sep="\n\n")
-        compiling, planning = first["wall"] - compiled["wall"], compiled["wall"] - second["wall"]
-        print(
-            f"\nCompilation took {compiling:.1f} s of the first run. With compiled kernels but"
-            " nothing else known, a run also"
-        )
-        print(
-            f"plans and measures the processor's speed: {planning:.1f} s more than the second run."
-        )
+        compiling = first["wall"] - second["wall"]
+        print(f"\nCompilation took {compiling:.1f} s of the first run.")
 
 
 if __name__ == "__main__":

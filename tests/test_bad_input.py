@@ -415,7 +415,7 @@ def test_a_long_scan_is_looked_at_first_from_python_too(here, monkeypatch):
     assert looked == [0]
 
 
-def test_a_warning_of_the_first_look_is_not_repeated(here, capsys, warned):
+def test_a_warning_of_the_checks_is_not_repeated(here, capsys, warned):
     """A scan too fast for the beam: `run` warns once, before it runs, in the words of `check`."""
     (here / "my.yaml").write_text(PIPELINE.replace("2 s}", "4 s, scans: 2, sample_rate: 8 Hz}"))
     assert cli.main(["check", "my.yaml"]) == 0

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..scene import Scene
 
 
-def first_look(pipeline: Pipeline, scene: Scene, *, saved: bool = True) -> list[list[str]]:
+def run_checks(pipeline: Pipeline, scene: Scene, *, saved: bool = True) -> list[list[str]]:
     """Lines to print that each operator's `check` returns, in the order of the steps.
 
     Warns where no step writes anything (unless not ``saved``: products are wanted in memory alone).

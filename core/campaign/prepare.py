@@ -163,14 +163,14 @@ class _Draft:
 
     def _plan(self, source: CampaignFile, entry: Entry, share: float) -> int:
         """Plan an entry's pipeline; its number."""
-        from ..assembly.checks import first_look
+        from ..assembly.checks import run_checks
         from ..plan.bands import for_run
 
         with within(f"entry {about(entry) or source.file.header.name}"):
             file = _with_budget(source.load(entry.settings), share)
             scene = scene_of(file, entry.seed, entry.time)
             if entry.settings:  # the error names the entry, not a line of the file
-                first_look(file.pipeline(), scene)
+                run_checks(file.pipeline(), scene)
             else:
                 file.look(scene=scene)
             made = for_run(

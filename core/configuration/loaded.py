@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from zonda import __version__
 
-from ..assembly.checks import first_look, looks, warn_of_nothing_saved
+from ..assembly.checks import looks, run_checks, warn_of_nothing_saved
 from ..component_files import is_file
 from ..errors import ZondaError
 from ..operator import Operator
@@ -101,14 +101,14 @@ class PipelineFile:
         scene: Scene | None = None,
         say: Callable[[str], None] | None = None,
     ) -> list[list[str]]:
-        """Let each step check itself, as `first_look` does. Raises `ConfigurationError` with all
+        """Let each step check itself, as `run_checks` does. Raises `ConfigurationError` with all
         mistakes of the steps, each at its place in the file.
 
         ``say`` is told each step before it is looked at.
         """
         pipeline, scene = self.pipeline(), scene or self.scene()
         if self.document is None:
-            return first_look(pipeline, scene, saved=saved)
+            return run_checks(pipeline, scene, saved=saved)
         found, refused = looks(pipeline.operators, scene, say)
         if refused:
             mistakes = [refusal(self.document, self.steps[number], err) for number, err in refused]

@@ -153,7 +153,7 @@ def pipeline_text(path: Path, instrument: str, site: str | None, target: str | N
     """
     import numpy as np
 
-    from zonda.core.assembly.checks import first_look
+    from zonda.core.assembly.checks import run_checks
     from zonda.core.configuration.pipeline_file import parse
     from zonda.core.configuration.target import Target
     from zonda.core.errors import PointingError
@@ -183,7 +183,7 @@ def pipeline_text(path: Path, instrument: str, site: str | None, target: str | N
         text = template.substitute(values, time=_start(drafted, where.longitude, hours))
         file = parse(text, name=path.name)
         try:
-            first_look(file.pipeline(), file.scene(), saved=False)
+            run_checks(file.pipeline(), file.scene(), saved=False)
         except PointingError as err:
             failed = failed or err
             continue

@@ -42,10 +42,8 @@ def test_a_run_imports_nothing_heavy_before_its_first_block(tmp_path: Path) -> N
     own = {
         **os.environ,
         "ZONDA_CACHE_DIR": str(tmp_path / "cache"),
-    }  # whatever other runs of this user remember meanwhile
-    for _ in range(
-        2
-    ):  # the first compiles, makes the plan and measures the processor, where nothing is remembered
+    }
+    for _ in range(2):  # the first compiles
         done = subprocess.run(
             [sys.executable, "-c", RUN, str(tmp_path / "out")],
             capture_output=True,

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from zonda.core.assembly.checks import first_look
+from zonda.core.assembly.checks import run_checks
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.configuration.time import Instant
 from zonda.core.emission import LoadSpectra
@@ -174,7 +174,7 @@ def test_pairs_at_150_ghz():
 def test_two_polarizations_of_a_polarized_detector_are_refused():
     file = pairs(model="{name: background_limited, polarizations: 2}")
     for refused in (
-        lambda: first_look(file.pipeline(), file.scene(), saved=False),
+        lambda: run_checks(file.pipeline(), file.scene(), saved=False),
         lambda: net_of(file),
     ):
         with pytest.raises(

@@ -9,7 +9,7 @@ from astropy.table import Table
 
 import zonda
 import zonda.testing
-from zonda.core.assembly.checks import first_look
+from zonda.core.assembly.checks import run_checks
 from zonda.core.drawable import Drawable
 from zonda.core.errors import PipelineError
 from zonda.operators.atmosphere.layers import AtmosphereLayers
@@ -139,12 +139,12 @@ def test_a_scan_that_is_not_there_is_told_before_any_is_simulated(tmp_path):
         ]
         return zonda.Pipeline([daisy, zonda.AtmosphereLayers(), *more])
 
-    first_look(pipeline(19), scenes.scene(), saved=False)  # looks at some of the scans alone
+    run_checks(pipeline(19), scenes.scene(), saved=False)  # looks at some of the scans alone
     text = (
         "AtmosphereScreens: there is no observation 20: the pipeline makes 20(.|\n)*choose 0 to 19"
     )
     with pytest.raises(PipelineError, match=text):
-        first_look(pipeline(20), scenes.scene(), saved=False)
+        run_checks(pipeline(20), scenes.scene(), saved=False)
     with pytest.raises(PipelineError, match=text):
         pipeline(20).run(scenes.scene(), output=tmp_path, threads=1)
     assert not simulated

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import zonda
 import zonda.testing
-from zonda.core.assembly.checks import first_look
+from zonda.core.assembly.checks import run_checks
 from zonda.core.errors import PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
@@ -258,10 +258,10 @@ def test_maps_that_do_not_suit_are_refused_before_the_run(maps, step, message):
         [*steps, step], runs={"source_free": {"without": ["sky"], "modes": "full"}}
     )
     if not message:
-        first_look(pipeline, scenes.scene(), saved=False)
+        run_checks(pipeline, scenes.scene(), saved=False)
         return
     with pytest.raises(PipelineError, match=message):
-        first_look(pipeline, scenes.scene(), saved=False)
+        run_checks(pipeline, scenes.scene(), saved=False)
 
 
 @pytest.mark.parametrize(

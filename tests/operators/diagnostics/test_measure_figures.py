@@ -7,7 +7,7 @@ from astropy.table import Table
 import zonda
 from tests.scenes import camera, write_sky
 from zonda.core.accuracy.metrics import OfFunction, get
-from zonda.core.assembly.checks import first_look
+from zonda.core.assembly.checks import run_checks
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.plan.structure import prune
 from zonda.core.registry import metrics
@@ -163,10 +163,10 @@ def test_maps_of_which_there_is_no_figure_are_refused_before_the_run(
     )
     file = zonda.load(tmp_path / "p.yaml")
     if not message:
-        first_look(file.pipeline(), file.scene(), saved=False)
+        run_checks(file.pipeline(), file.scene(), saved=False)
         return
     with pytest.raises(ZondaError, match=message):
-        first_look(file.pipeline(), file.scene(), saved=False)
+        run_checks(file.pipeline(), file.scene(), saved=False)
 
 
 def test_figures_of_one_signal_alone_keep_what_it_is_without(tmp_path):
