@@ -33,7 +33,7 @@ from .errors import OutputError
 from .storage import user_cache
 
 PATIENCE = 600
-"""Time for which another process's compilation is waited for, s."""
+"""Longest wait for the compilation of another process, s."""
 INTRINSICS = "zonda.core.numerics.columns"
 """Module with parts of kernels that has no kernels of its own."""
 
@@ -111,7 +111,7 @@ class CacheLock(event.Listener):  # type: ignore[misc]
         self._depth = 0
 
     def try_out(self) -> None:
-        """Raises OSError where the file system has no such locks."""
+        """Take and release the lock once. Raises OSError if the file system has no such locks."""
         with contextlib.suppress(filelock.Timeout), self._file.acquire(timeout=0):
             pass
 

@@ -63,7 +63,7 @@ class Table:
         return list(zip(*(column.values for column in self.columns), strict=True))
 
     def shown(self) -> list[list[str]]:
-        """Cells of each row as people read them; what is not known is empty."""
+        """Cells of each row as text; unknown values are empty."""
         return [[cell_text(value) for value in row] for row in self.rows]
 
     def lines(self, align: str = "<") -> list[str]:
@@ -75,7 +75,7 @@ class Table:
         return [dict(zip(self.head, map(_plain, row), strict=True)) for row in self.rows]
 
     def write(self, path: str | Path) -> Path:
-        """Write an ECSV file; its path. Raises `OutputError`."""
+        """Write an ECSV file, and return its path. Raises `OutputError`."""
         return write_ecsv(path, self.columns, self.meta)
 
 

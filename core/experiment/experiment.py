@@ -76,7 +76,7 @@ class Experiment:
             self._keep(*waiting.popleft())
 
     def values(self, variant: Variant, metric: str, seeds: int) -> list[tuple[float, float]]:
-        """Values and errors over realizations, which have been run."""
+        """Means over realizations that have been run, and their errors."""
         kept = self._of(variant).values
         return [kept[str(number)][metric] for number in range(seeds)]
 
@@ -127,7 +127,7 @@ class KeptValues:
         return [m for m, seeds in metrics.items() if number < seeds and m not in known]
 
     def add(self, number: int, values: Pairs) -> None:
-        """Keep values, on disk at once."""
+        """Write values to the file at once."""
         self.values[str(number)] = {**self.values.get(str(number), {}), **values}
         write_text(self.path, json.dumps({**self.about, "values": self.values}, indent=1) + "\n")
 

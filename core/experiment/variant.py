@@ -38,7 +38,7 @@ class Variant:
     overrides: tuple[str, ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Sent to other processes without the file that it read."""
+        """Leave the file that was read out of the pickle."""
         return Variant, (self.pipeline, self.overrides)
 
     def __str__(self) -> str:
@@ -69,7 +69,7 @@ class Variant:
         return found.hexdigest()
 
     def run(self, metrics: Sequence[Metric] = (), **how: Any) -> Data:
-        """Run it; ``how``: as of `run_file`."""
+        """Run the variant; ``how`` are the arguments of `run_file`."""
         return run_file(self.file, metrics, **how)
 
 

@@ -1,4 +1,4 @@
-"""Planes of a map: what its pixels hold, in which unit, and how it changes with the map."""
+"""Planes of a map: the quantities in its pixels, their units, and their scaling with the map."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ class Plane:
         return replace(self, values=self.values[k : k + 1])
 
     def scaled(self, factor: float | Floats) -> Plane:
-        """In a unit of which one of the old has ``factor``: a number, or one for each pixel."""
+        """The plane in another unit, ``factor`` of which make one old unit (one or per pixel)."""
         if not self.scale:
             return self
         power = factor ** abs(self.scale)
         return replace(self, values=self.values * power if self.scale > 0 else self.values / power)
 
     def fits_unit(self, unit: str) -> str:
-        """FITS unit of the plane of a map in ``unit``; none of numbers."""
+        """FITS unit of the plane in a map in ``unit``; empty for plain numbers."""
         if self.scale == 1:
             return unit
         return f"{unit if unit.isalpha() else f'({unit})'}{self.scale}" if self.scale else ""

@@ -153,7 +153,7 @@ def timed(file: PipelineFile, observations: Sequence[Observation]) -> Timing:
 class _Run:
     samples: int
     seconds: Mapping[str, tuple[float, float]]
-    """By step: once, and for each scan."""
+    """CPU seconds of each step: once per run, and once per scan."""
 
 
 def _least(runs: Sequence[_Run]) -> _Run:
@@ -187,11 +187,11 @@ class Slice(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     observations: int = Field(1, ge=1)
-    """How many are kept."""
+    """Number of observations that are kept."""
     seconds: float = Field(SECONDS, gt=0)
-    """How long they last, s."""
+    """Length of each observation, s."""
     every: int = Field(1, ge=1)
-    """Every so many detectors are kept, the outermost four too."""
+    """One detector of so many is kept, and the outermost four."""
 
     def observe(self, data: Data) -> None:
         """Cut every scan to the slice."""

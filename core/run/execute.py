@@ -49,7 +49,7 @@ def execute(bands: Sequence[Band], settings: Settings, timer: Timer, budget: Bud
 
 
 def _done(execution: Execution, band: Band, last: bool) -> None:
-    """Tell that a band has observed a scan; release what its views share after the last."""
+    """Report that a band has observed a scan; after the last band, free what its views share."""
     observation = execution.observation
     band.data.tally.update(observation.tally)
     if observation.common is not None and last:
