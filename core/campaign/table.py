@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..configuration.units import read_unit
+from ..configuration.units import factor_to
 from ..errors import InputError
 from ..figures import Figure, Figures
 from ..pages import render
@@ -215,20 +215,15 @@ def _positions(values: Sequence[Any]) -> tuple[list[float], str, list[str]]:
     names.
     """
     matches = [_QUANTITY.match(_text(value)) for value in values]
-    units = [read_unit(match[2]) if match and match[2] else None for match in matches]
-    if (
-        matches
-        and all(matches)
-        and (all(units) or not any(match and match[2] for match in matches))
-    ):
-        numbers = [float(match[1]) for match in matches if match]
-        first = matches[0]
-        factors = [unit.factor / units[0].factor if unit and units[0] else 1.0 for unit in units]
-        return (
-            [n * factor for n, factor in zip(numbers, factors, strict=True)],
-            first[2] if first else "",
-            [],
-        )
+    units = [match[2] if match else None for match in matches]
+    factors = [None if unit is None else factor_to(units[0] or "", unit) for unit in units]
+    if matches and None not in factors:
+        numbers = [
+            float(match[1]) * factor
+            for match, factor in zip(matches, factors, strict=True)
+            if match and factor
+        ]
+        return numbers, units[0] or "", []
     names = list(dict.fromkeys(map(_text, values)))
     return [float(names.index(_text(value))) for value in values], "", names
 

@@ -6,19 +6,18 @@
 0.00058...
 
 Texts, astropy quantities and, for pure numbers, plain numbers are accepted; a number without a unit
-is an error. The common units are read here; what they do not cover is left to astropy, which takes
-half a second to import.
+is an error. Units are those of astropy, written as it reads them: ``mK s(1/2)``, ``deg / s2``.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
 from functools import lru_cache
 from numbers import Real
 from typing import Annotated, Any, NamedTuple
 
+import astropy.units as u
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
@@ -74,116 +73,36 @@ KINDS = {
 }
 """Kinds of quantities by SI unit."""
 
-PURE, ANGLE, TIME, LENGTH, TEMPERATURE = (
-    (0, 0, 0, 0),
-    (1, 0, 0, 0),
-    (0, 1, 0, 0),
-    (0, 0, 1, 0),
-    (0, 0, 0, 1),
-)
-FREQUENCY = (0, -1, 0, 0)
-DIMENSIONS: dict[tuple[float, ...], str] = {
-    PURE: "a pure number",
-    ANGLE: "angle",
-    TIME: "time",
-    FREQUENCY: "frequency",
-    LENGTH: "length",
-    TEMPERATURE: "temperature",
-    (1, -1, 0, 0): "angular speed",
-    (1, -2, 0, 0): "angular acceleration",
-    (1, -3, 0, 0): "angular jerk",
-    (0, -1, 1, 0): "speed",
-    (0, -2, 1, 0): "acceleration",
-    (0, 0.5, 0, 1): "noise level",
-}
-"""Names of dimensions, which are the powers of (rad, s, m, K)."""
-
-PREFIXES = {
-    "": 1.0, "k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12,
-    "c": 1e-2, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9,
-}  # fmt: skip
-_NAMED: list[tuple[str, float, tuple[int, ...]]] = [
-    ("deg degree °", math.pi / 180, ANGLE),
-    ("arcmin arcminute", math.pi / 10800, ANGLE),
-    ("arcsec arcsecond", math.pi / 648000, ANGLE),
-    ("mas", math.pi / 648000000, ANGLE),
-    ("second", 1.0, TIME),
-    ("min minute", 60.0, TIME),
-    ("h hr hour", 3600.0, TIME),
-    ("d day", 86400.0, TIME),
-    ("hertz", 1.0, FREQUENCY),
-    ("meter", 1.0, LENGTH),
-    ("Kelvin", 1.0, TEMPERATURE),
-    ("% percent", 0.01, PURE),
-]
-_PREFIXED = {"rad": ANGLE, "s": TIME, "Hz": FREQUENCY, "m": LENGTH, "K": TEMPERATURE}
-UNITS = {name: (factor, powers) for names, factor, powers in _NAMED for name in names.split()} | {
-    prefix + base: (factor, powers)
-    for base, powers in _PREFIXED.items()
-    for prefix, factor in PREFIXES.items()
-}
-"""Factor to SI and powers of (rad, s, m, K) of the units known without astropy."""
-
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$", re.DOTALL)
-_FACTOR = re.compile(
-    r"(?:sqrt\((?P<root>[^\W\d_]+)\)|(?P<name>[^\W\d_]+|%|°)"
-    r"(?:(?:\^|\*\*)?(?:(?P<power>-?\d(?:\.\d{1,9})?)(?!\d)"
-    r"|\((?P<top>-?\d)(?:/(?P<bottom>[1-9]))?\)))?)(?:\s*[*. ]\s*|$)"
-)
-# powers of one digit: no unit here overflows by them
+_LARGE_POWER = re.compile(r"\d{3}")
+"""Powers of three digits are refused: astropy would compute 10**9999999."""
 
 
-class Measure(NamedTuple):
-    """A unit: its factor to SI and its powers of (rad, s, m, K)."""
-
-    factor: float
-    powers: tuple[float, ...]
+_DECIMAL_POWER = re.compile(r"\^(-?\d*\.\d+)")
+"""s^0.5, which astropy reads as s**(0.5)."""
 
 
 @lru_cache(maxsize=512)
-def read_unit(text: str) -> Measure | None:
-    """A product of powers of the units above with at most one ``/ factor`` behind it, e.g. ``mK
-    s(1/2)``, ``deg / s2``.
-
-    None where the text is anything else: astropy may know it.
-    """
-    upper, slash, lower = (
-        text.strip().partition("/")
-        if not re.search(r"\(-?\d+/\d+\)", text)
-        else (text.strip(), "", "")
-    )
-    factor, powers = 1.0, [0.0] * 4
-    for part, sign in ((upper.strip(), 1), (lower.strip(), -1)):
-        factors = list(_factors(part))
-        if (factors and factors[-1] is None) or (slash and sign < 0 and len(factors) != 1):
-            return None
-        for known in factors:
-            assert known is not None
-            (size, dimension), power = known
-            # division, not a negative power: 36 km/h is then 10 m/s to the last bit
-            factor = factor * size**power if sign > 0 else factor / size**power
-            powers = [p + sign * power * d for p, d in zip(powers, dimension, strict=True)]
-    return Measure(factor, tuple(powers))
+def read_unit(text: str) -> u.UnitBase:
+    """The unit that a text names, e.g. ``mK s(1/2)``. Raises ValueError where there is none."""
+    if _LARGE_POWER.search(text):
+        raise ValueError("a number of three digits")
+    try:
+        unit = u.Unit(_DECIMAL_POWER.sub(r"**(\1)", text))
+        if isinstance(unit, u.StructuredUnit):  # "m, s"
+            raise ValueError("several units")
+        unit.decompose()
+    except (TypeError, OverflowError) as err:  # powers beyond all numbers, "m(1/0)"
+        raise ValueError(str(err)) from None
+    return unit
 
 
-def _factors(text: str) -> Iterator[tuple[tuple[float, tuple[int, ...]], float] | None]:
-    """((factor, powers of the base units), exponent) of each factor of a product; None where one is
-    not known.
-    """
-    at = 0
-    while at < len(text):
-        match = _FACTOR.match(text, at)
-        name = match and (match["root"] or match["name"])
-        if not match or name not in UNITS:
-            yield None
-            return
-        exponent = (
-            0.5
-            if match["root"]
-            else float(match["power"] or match["top"] or 1) / int(match["bottom"] or 1)
-        )
-        yield UNITS[name], exponent
-        at = match.end()
+def factor_to(si: str, text: str) -> float | None:
+    """Factor from the unit that ``text`` names to ``si``; None where it is no unit of that kind."""
+    try:
+        return float(read_unit(text).to(read_unit(si)))
+    except (ValueError, ZeroDivisionError):
+        return None
 
 
 class Unit:
@@ -235,10 +154,7 @@ class Unit:
 
     def write(self, value: float) -> str:
         """The shortest text that reads back to the same bits, in a unit people use."""
-        texts = [
-            _shortest(value, name, Measure(1.0, ()) if name == "" else read_unit(name))
-            for name in self.kind.display
-        ]
+        texts = [_shortest(value, name, factor_to(self.unit, name)) for name in self.kind.display]
         return min(
             (t for t in texts if t),
             key=lambda t: len(t.split(" ")[0]),
@@ -248,10 +164,8 @@ class Unit:
     def write_in_unit_of(self, value: float, like: str) -> str:
         """``value`` (SI) in the unit that the text ``like`` uses, for messages about limits."""
         match = _NUMBER.match(like)
-        measure = read_unit(match[2]) if match and match[2] else None
-        return (
-            f"{value / measure.factor:.6g} {match[2]}" if match and measure else self.write(value)
-        )
+        factor = factor_to(self.unit, match[2]) if match and match[2] else None
+        return f"{value / factor:.6g} {match[2]}" if match and factor else self.write(value)
 
     def _split(self, text: str) -> tuple[float, str, tuple[int, int]]:
         match = _NUMBER.match(text)
@@ -272,69 +186,41 @@ class Unit:
                 " s(1/2)"
             )
             raise mistake(message, "divide a NET per root hertz by sqrt(2)", caret=caret)
-        measure, own = read_unit(unit), read_unit(self.unit)
-        if measure is None or own is None:
-            return self._factor_by_astropy(text, unit, caret)
-        if measure.powers != own.powers:
-            raise self._wrong_kind(unit, DIMENSIONS.get(measure.powers, "another kind"), caret)
-        return measure.factor / own.factor
-
-    def _factor_by_astropy(self, text: str, unit: str, caret: tuple[int, int]) -> float:
-        import astropy.units as u
-
         try:
-            parsed = u.Unit(unit)
-            if isinstance(parsed, u.StructuredUnit):  # "m, s"
-                raise ValueError("several units")
-            parsed.decompose()
-        except (
-            ValueError,
-            TypeError,
-            OverflowError,
-        ) as err:  # the last: km400, by an astropy before 7
+            known = read_unit(unit)
+        except ValueError as err:
             hint = re.search(r"Did you mean ([^?]*)\?", str(err))
             otherwise = (
                 f"did you mean {hint[1]}?"
                 if hint
                 else f"expected {self.kind.noun}, e.g. '{self.example}'"
             )
-            own = read_unit(self.unit)
-            label = nearest(
-                unit,
-                (name for name, (_, powers) in UNITS.items() if own and powers == own.powers),
-                otherwise,
-            )
+            label = nearest(unit, self.kind.display, otherwise)
             raise mistake(f"unknown unit '{unit}' in {text!r:.60}", label, caret=caret) from None
-        try:
-            return float(parsed.to(u.Unit(self.unit)))
-        except u.UnitConversionError:
-            raise self._wrong_kind(unit, str(parsed.physical_type).split("/")[0], caret) from None
+        return self._converted(1.0 * known, unit, caret)
 
     def _from_astropy(self, value: Any) -> float:
-        import astropy.units as u
-
         if getattr(value, "shape", ()) != ():
             raise mistake(f"expected one value, got an array of shape {value.shape}")
         if self.unit == "K s(1/2)" and "Hz" in str(value.unit):
             return self._factor(str(value), str(value.unit), (0, 0))  # raises
+        return self._converted(value, str(value.unit), None)
+
+    def _converted(self, value: Any, unit: str, caret: tuple[int, int] | None) -> float:
         try:
-            return float(value.to_value(u.Unit(self.unit)))
+            return float(value.to_value(read_unit(self.unit)))
         except u.UnitConversionError:
-            raise self._wrong_kind(
-                str(value.unit), str(value.unit.physical_type).split("/")[0], None
-            ) from None
+            kinds = (kind.noun for si, kind in KINDS.items() if value.unit.is_equivalent(si))
+            got = next(kinds, f"a {value.unit.physical_type}").split("/")[0].split(" ", 1)[1]
+            message = (
+                f"expected {self.kind.noun} such as '{self.example}', but '{unit}' is a unit of"
+                f" {got}"
+            )
+            raise mistake(message, f"not {self.kind.noun}", caret=caret) from None
 
     def _without_unit(self, number: str) -> PydanticCustomError:
         message = f"{number} has no unit; write {self.kind.noun} such as '{self.example}'"
         return mistake(message, f"add a unit, e.g. {number} {self.example.split(' ', 1)[1]}")
-
-    def _wrong_kind(
-        self, unit: str, got: str, caret: tuple[int, int] | None
-    ) -> PydanticCustomError:
-        message = (
-            f"expected {self.kind.noun} such as '{self.example}', but '{unit}' is a unit of {got}"
-        )
-        return mistake(message, f"not {self.kind.noun}", caret=caret)
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
@@ -358,12 +244,12 @@ class Unit:
         return {"anyOf": options, "examples": list(self.kind.examples), "x-unit": self.unit}
 
 
-def _shortest(value: float, name: str, measure: Measure | None) -> str | None:
+def _shortest(value: float, name: str, factor: float | None) -> str | None:
     """``value`` (SI) in unit ``name``, where 15 digits or fewer read back to the same bits."""
-    if measure is None:
+    if factor is None:
         return None
-    digits = f"{value / measure.factor:.15g}"
-    return f"{digits} {name}".strip() if float(digits) * measure.factor == value else None
+    digits = f"{value / factor:.15g}"
+    return f"{digits} {name}".strip() if float(digits) * factor == value else None
 
 
 Angle = Annotated[float, Unit("rad")]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.configuration.units import read_unit
+from zonda.core.configuration.units import factor_to
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
 from zonda.core.numerics.smooth import SmoothField
@@ -171,13 +171,7 @@ def levels(stream: RecordedStream, n_detectors: int, n_samples: int) -> tuple[Fl
 
 def kelvin_per(unit: str) -> float | None:
     """Kelvin per unit of a temperature; None: of another quantity."""
-    kelvin = read_unit("K")
-    measure = read_unit(unit.replace("K_RJ", "K")) if unit.strip() else None
-    return (
-        None
-        if measure is None or kelvin is None or measure.powers != kelvin.powers
-        else float(measure.factor)
-    )
+    return factor_to("K", unit.replace("K_RJ", "K")) if unit.strip() else None
 
 
 def _kelvin(unit: str, name: str, place: str) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from zonda.core import flags
 from zonda.core.configuration.time import SECOND, Instant
-from zonda.core.configuration.units import read_unit
+from zonda.core.configuration.units import factor_to
 from zonda.core.errors import InputError
 from zonda.core.intervals import Intervals
 from zonda.core.storage import fits_files, hdf5_files
@@ -495,11 +495,11 @@ def _in_si(values: Any, unit: str | None, si: str, name: str, place: str) -> Flo
             place=place,
             cure=f"write one, e.g. {name} [deg] in the first line of a CSV",
         )
-    measure, own = read_unit(unit), read_unit(si)
-    if measure is None or own is None or measure.powers != own.powers:
+    factor = factor_to(si, unit)
+    if factor is None:
         raise InputError(
             f"{unit!r} is no unit of {name}",
             place=place,
             cure=f"use {'deg or rad' if si == 'rad' else 's'}",
         )
-    return np.asarray(values, np.float64) * measure.factor
+    return np.asarray(values, np.float64) * factor

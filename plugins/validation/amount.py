@@ -10,8 +10,8 @@ from typing import Any
 from zonda.core.configuration.units import read_unit
 from zonda.core.configuration.values import TextValue, mistake
 
-FURTHER = {"": 1.0, "Jy": 1e-26, "mJy": 1e-29, "uJy": 1e-32, "sigma": 1.0, "samples": 1.0}
-"""Factors to SI of units that pipeline files do not know."""
+FURTHER = ("", "sigma", "samples")
+"""Units of counts, which astropy does not know."""
 
 _TEXT = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$", re.DOTALL)
 
@@ -41,12 +41,13 @@ class Amount(TextValue):
         if not match:
             raise mistake(f"expected a number and its unit such as '148 uK', got {value!r:.60}")
         unit = match[2]
-        factor = FURTHER.get(unit) or getattr(read_unit(unit), "factor", None)
-        if factor is None:
+        try:
+            factor = 1.0 if unit in FURTHER else float(read_unit(unit).si.scale)
+        except ValueError:
             known = ", ".join(filter(None, FURTHER))
             raise mistake(
-                f"unknown unit '{unit}'", help=f"a unit of pipeline files, or one of: {known}"
-            )
+                f"unknown unit '{unit}'", help=f"a unit that astropy reads, or one of: {known}"
+            ) from None
         return cls(float(match[1]) * factor, unit, factor)
 
     def write(self, value: float, digits: int = 4) -> str:

@@ -92,7 +92,7 @@ def seeds() -> Iterator[bytes]:
 def words() -> list[str]:
     """Keys, operators, units and notation."""
     from zonda.core.configuration.schema import json_schema
-    from zonda.core.configuration.units import UNITS
+    from zonda.core.configuration.units import KINDS
 
     found: set[str] = set()
 
@@ -124,7 +124,11 @@ def words() -> list[str]:
         "  - ",
     ]
     return sorted(
-        word for word in found | set(notation) | {f"1 {unit}" for unit in UNITS} if len(word) < 60
+        word
+        for word in found
+        | set(notation)
+        | {f"1 {unit}" for kind in KINDS.values() for unit in kind.display}
+        if len(word) < 60
     )
 
 

@@ -53,7 +53,7 @@ def test_the_shipped_claims_are_right_and_of_the_paper():
     ("change", "message"),
     [
         ({"claims": 1}, "claims"),
-        ({"paper": "148 parsec"}, "unknown unit 'parsec'"),
+        ({"paper": "148 fortnights"}, "unknown unit 'fortnights'"),
         ({"paper": "much"}, "expected a number and its unit"),
         ({"relation": "near"}, "relation"),
         ({"calculate": "{rayleigh: {aperture: 1 m}}"}, "there is no calculation 'rayleigh'"),
