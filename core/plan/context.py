@@ -116,8 +116,6 @@ class Context:
     traits: dict[str, Traits] = field(default_factory=dict)
     coverage: Coverage | None = None
     metrics: frozenset[str] = frozenset()
-    limits: dict[str, float] = field(default_factory=dict)
-    """The budget by metric: a coarser form whose bound alone exceeds it need not be looked into."""
     depth: Depth = Depth(0.0, 0.0)
     """The white noise that the run will have."""
     bands_alike: int = 1
@@ -303,10 +301,6 @@ class Context:
         """The bound on an error of a part of the data, behind all filters: where one finds its
         modes in the data, with `other_modes`."""
         return add(bound, self.other_modes()) if self.turns else dict(bound)
-
-    def affords(self, bound: Mapping[str, float]) -> bool:
-        """True if a bound alone is within the budget."""
-        return all(v <= self.limits[m] for m, v in bound.items() if m in self.limits)
 
     def sky_error(self, share: float) -> dict[str, float]:
         """Bound on peak and transfer function from a relative error of the sky's signal."""

@@ -11,21 +11,15 @@ from typing import Any
 from ..configuration.pipeline_file import PipelineFile
 from ..errors import ZondaError
 from ..machine import available_memory, available_threads
-from ..mapmaker import made_by
 from .budget import limits
 from .context import OTHER_MODES, Context
 from .decide import Decided, check_droppable, decide, named
-from .estimate import Bound, Choice, Effect, Estimate, Saving, add, full
+from .estimate import Bound, Choice, Effect, Estimate, add, exact, full
 from .planning import planning_of
 from .pointing import context_of
 from .prediction import memory_of
 from .result import Plan
 from .structure import Structure, prune
-
-LARGEST_RATIO = 1e5
-"""Of a stream's rms to its noise up to which float32 is thought of where the pipeline asks for
-float64.
-"""
 
 NAME = "everything"
 """Name of the effect of an operator that is dropped altogether."""
@@ -58,7 +52,7 @@ def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") 
                                      for k in wishes.keep])  # fmt: skip
     context = context_of(pipeline, scene, structure, band)
     budget = limits(file.header.budget, context.map_noise, context.depth.sample)
-    context.limits = allowed = {m: v for m, v in budget.items() if m in context.metrics}
+    allowed = {m: v for m, v in budget.items() if m in context.metrics}
     effects, left = _effects(file, structure, context, wishes.drop)
     decided = decide(
         effects,
@@ -72,8 +66,7 @@ def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") 
         prune_all=wishes.prune_all,
         joined=context.joined,
     )
-    single = any(d.operator == "pipeline" and d.chosen for d in decided)
-    item = 8 if pipeline.precision == "float64" and not single else 4
+    item = 8 if pipeline.precision == "float64" else 4
     threads = wishes.threads or available_threads()
     return Plan(
         structure,
@@ -132,19 +125,7 @@ def _precision(precision: str, context: Context) -> Effect:
     bound = context.bound(rms)
     if context.noise > 0:
         bound["psd"] = (rms / context.noise) ** 2  # both are white
-    choices = [full(precision)]
-    carries_mean = context.cut == 0 and any("atmosphere" in made_by(o) for o in context.operators)
-    # with a mean or a large ratio the filters refuse float32
-    refused = carries_mean or context.fluctuation > LARGEST_RATIO * context.noise
-    if precision == "float64" and not refused:
-        settings = {"precision": "float32"}
-        choices.append(Choice("coarse", "float32", settings, bound=bound, formula=formula,
-                              saves=SINGLE))  # fmt: skip
-    return Effect("precision", tuple(choices), bound, formula)
-
-
-SINGLE = Saving("mustang2_cluster", 0.26)
-"""Streams in float32 where float64 is asked for."""
+    return exact("precision", bound, formula, precision)
 
 
 def _without(

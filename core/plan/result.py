@@ -72,9 +72,7 @@ class PlanSummary:
             for step, label, now in zip(steps, kept, new, strict=True)
         ]
         runs = {name: run for name, run in file.runs.items() if name in self.runs}
-        header = file.header.model_copy(
-            update={"runs": runs, "budget": 0.0, **self.settings.get("pipeline", {})}
-        )
+        header = file.header.model_copy(update={"runs": runs, "budget": 0.0})
         return dataclasses.replace(file, header=header, steps=tuple(named))
 
     def __str__(self) -> str:

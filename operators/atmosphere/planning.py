@@ -55,15 +55,6 @@ LAYER = Saving("wide_field", 0.07)
 """Of one layer less, where `DENSE` points (nodes x times) are evaluated per sample, or more."""
 DENSE = 0.03
 
-COARSER = {
-    0.03: Saving("polarized", 0.2),
-    0.1: Saving("survey_night", 0.43),
-    0.3: Saving("survey_night", 0.45),
-}
-"""Of the nodes for larger tolerances, where they are half as many or less, and no more than
-`MOST_NODES`, of at least `MANY_NODES`."""
-MOST_NODES, MANY_NODES = 256, 64
-
 
 class AtmospherePlanning(Planning[AtmosphereLayers]):
     """Layers, their resolution, spectral approximations, slopes with elevation."""
@@ -376,24 +367,12 @@ class AtmosphereBounds:
         context, a = self.context, self.calibrated
         p, one = a.model.parameters, context.first.n_detectors == 1
         left = max(self._differences(a.layers, a.rms), 0.01 * a.rms if one else 0.0)
-        choices = [full(f"within {p.tolerance:g} of what the detectors' mean leaves")]
-        text = (
-            "(sqrt 2 + 0.1) tolerance x rms left after subtraction of the detectors' mean: nodes,"
-            " steps in time, mean emission"
+        return exact(
+            "detector nodes and time steps",
+            context.bound(left, self._longest, True),
+            "rms left after subtraction of the detectors' mean",
+            f"within {p.tolerance:g} of what the detectors' mean leaves",
         )
-        number = len(self.first.resolution(p.tolerance).nodes.xi)
-        for tolerance in (t for t in COARSER if t > p.tolerance):
-            rms = 1.52 * (tolerance + p.tolerance) * left
-            bound = context.bound(rms, self._longest, common=True)
-            bound["psd"] = (rms / max(context.noise, a.rms, 1e-30)) ** 2
-            saves = COARSER[tolerance] if number >= MANY_NODES else None
-            if saves and context.affords(bound):  # else it is not taken, whatever it saves
-                fewer = len(self.first.resolution(tolerance).nodes.xi)
-                saves = saves if fewer <= min(number / 2, MOST_NODES) else None
-            choices.append(Choice("coarse", f"within {tolerance:g}", {"tolerance": tolerance},
-                                  bound=bound, formula=text, saves=saves))  # fmt: skip
-        size = context.bound(left, self._longest, True)
-        return Effect("detector nodes and time steps", tuple(choices), size, text)
 
     def lattice(self) -> Effect:
         """Lattice of the turbulence."""

@@ -26,19 +26,6 @@ COARSE_KNOTS, LEAST_KNOTS = 8, 0.02
 KNOTS = Saving("atlast_reduced", 0.022)
 """Of a third of the knots. Half of them save 1.5 %."""
 
-COARSE_RESIDUAL = 1e-2
-RESIDUAL = Saving("atlast_reduced", 0.042)
-"""Of `COARSE_RESIDUAL`. 1e-4 saves 1.7 %."""
-
-STANDS_OUT = 0.3
-"""Ratio of the noise's singular values to the common mode's up to which the second is far from
-`gap`, were the scan's common mode half of the ensemble's."""
-
-RESIDUALS = "rms of the stream behind the high-pass filter x residual / (1 - gap^2)"
-
-START = 1e-3
-"""Residual of the first vector, the detectors' mean."""
-
 
 class HighpassPlanning(Planning[HighpassFilter]):
     """Knots of the coarse series: the low part errs by (f / f_cut)^4 q^-4 below the cut, q knots
@@ -206,12 +193,7 @@ class TaperPlanning(Planning[Any]):
 
 
 class CommonModePlanning(Planning[CommonModeFilter]):
-    """Residual of the modes.
-
-    A residual r turns the mode by at most r sigma_1^2 / (sigma_1^2 - sigma_2^2) <= r / (1 - gap^2),
-    a mode that is determined having sigma_2 <= gap sigma_1: equation (2) of `common_mode`, Davis &
-    Kahan (1970).
-    """
+    """Planning of the common mode, which has no coarser form."""
 
     of = CommonModeFilter
     knobs = (Knob("residual", (1e-2, 1e-4, 1e-6, 1e-8), "singular modes iterated to a residual"),)
@@ -236,51 +218,13 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         return 1 if self.operator.method == "mean" else 0
 
     def estimate(self, context: Context) -> Estimate:
-        """The error of larger residuals."""
-        step, tightest = self.operator, self.operator.residual
+        """Its size: what it removes."""
+        step = self.operator
         slow = 1 / context.cut if context.cut > 0 else context.first.duration
         size = context.bound(context.passed, slow, common=True)
         without = size | context.sky_error(1.0)
         if step.method != "svd":
             return Estimate(without=without)
-        choices, text = [full(f"residual {tightest:g}")], RESIDUALS
-        if (residual := COARSE_RESIDUAL) > tightest and self._stands_out(context):
-            share = (residual + tightest) / (1 - step.gap**2)
-            bound = context.bound(share * context.passed, slow, common=True)
-            bound |= context.sky_error(share) | {"psd": 2 * share + share**2}
-            coarse, fine = (steps(r, step.modes, context) for r in (residual, tightest))
-            choices.append(Choice("coarse", f"residual {residual:g}", {"residual": residual},
-                                  bound=bound, formula=text,
-                                  saves=RESIDUAL if coarse < fine else None))  # fmt: skip
         text = "rms of the stream: no common mode removed at all"
-        effect = Effect("common-mode residual", tuple(choices), size, text)
+        effect = exact("common-mode residual", size, text, f"residual {step.residual:g}")
         return Estimate((effect,), without=without)
-
-    def _stands_out(self, context: Context) -> bool:
-        """True if one mode alone is removed, which stands far above the noise, of the complete
-        signal alone. Else the second singular value is near the first, which a large residual does
-        not show: another number of modes is then removed."""
-        own = any(
-            s.filtered and not s.takes_model(self.operator.label) for s in context.work.signals[1:]
-        )
-        return self.operator.modes == 1 and not own and shrinkage(context) <= STANDS_OUT**2
-
-
-def steps(residual: float, modes: int, context: Context) -> int:
-    """Steps that a residual takes: each lessens it by the square of the ratio of the noise's
-    singular values to the mode's.
-    """
-    return modes + max(
-        1, math.ceil(math.log(residual / START) / math.log(min(shrinkage(context), 0.5)))
-    )
-
-
-def shrinkage(context: Context) -> float:
-    """Square of the ratio of the noise's singular values to that of the common mode."""
-    n_det, noise = context.first.n_detectors, max(context.noise, 1e-12)
-    common = (
-        max((context.passed / LEAKS) ** 2 - noise**2, 0.0)
-        if context.cut > 0
-        else context.fluctuation**2
-    )
-    return noise**2 * (1 / n_det + 1e-4) / max(common, 1e-30)

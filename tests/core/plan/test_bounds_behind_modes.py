@@ -152,13 +152,3 @@ def test_decimation_of_a_scan_of_few_cycles(load, cut):
     assert (
         rows(file, "high-pass decimation")["HighpassFilter.high-pass decimation", "tod"].actual > 0
     )
-
-
-@pytest.mark.parametrize(("more", "offered"), [("{modes: 3}", False), ("{}", True)])
-def test_a_coarser_residual_needs_a_mode_that_stands_out(load, more, offered):
-    """Of several modes the last need not: what is removed then depends on a second singular value
-    that has not converged.
-    """
-    plan = zonda.plan(load(more, rms="10 %"), threads=1)
-    (effect,) = [d.effect for d in plan.decided if d.effect.name == "common-mode residual"]
-    assert (len(effect.choices) > 1) is offered

@@ -16,7 +16,6 @@ from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.plan import decide as deciding
-from zonda.core.plan.audit import audit
 from zonda.core.plan.bands import for_run
 from zonda.core.plan.budget import Limits, limits
 from zonda.core.plan.context import Context, Coverage
@@ -452,47 +451,6 @@ operators:
         hits = hdus[0].data
     whole = file.pipeline().run(file.scene(), output=tmp_path / "all", threads=1)
     np.testing.assert_array_equal(hits, whole.products["map"].hits)
-
-
-@pytest.mark.parametrize(
-    ("steps", "coarse"),
-    [
-        (
-            "[{AtmosphereLayers: {pwv: 5 mm}}, WhiteNoise, Efficiency, CommonModeFilter, BinMap]",
-            False,
-        ),
-        (
-            (
-                "[{AtmosphereLayers: {pwv: 5 mm}}, WhiteNoise, Efficiency, HighpassFilter,"
-                " CommonModeFilter, BinMap]"
-            ),
-            True,
-        ),
-    ],
-)
-def test_float64_is_not_taken_away_where_the_mean_emission_needs_it(steps, coarse):
-    """Tens of kelvin in the stream of a common-mode filter: float32 would be refused there."""
-    from zonda.core.configuration.pipeline_file import parse
-
-    head = (
-        "site: green_bank\ninstrument: mustang2\ntime: 2024-11-25T07:00\ntarget: 05h"
-        " +20d\nprecision: float64\n"
-    )
-    file = parse(
-        head + "operators: " + steps.replace("[", "[{PointingDaisy: {scan_duration: 20 s}}, ", 1)
-    )
-    made = zonda.plan(file, threads=1)
-    row = next(d for d in made.decided if d.effect.name == "precision")
-    assert len(row.effect.choices) == 1 + coarse
-    planned = made.apply(file)
-    assert planned.header.precision == ("float32" if row.chosen else "float64")
-    planned.pipeline().run(file.scene(), threads=1)
-    if coarse:
-        found = audit(
-            file, zonda.plan(file, threads=1, drop=["precision"]), threads=1, seconds=20.0
-        )
-        assert not found.violated, str(found)
-        assert any(r.effect == "pipeline.precision" and r.actual > 0 for r in found.rows)
 
 
 def test_decisions_do_not_depend_on_the_machine():

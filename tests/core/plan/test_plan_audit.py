@@ -57,7 +57,6 @@ def test_the_errors_are_there(everything_coarse):
     """
     actual = {(r.effect, r.metric): r.actual for r in everything_coarse.rows}
     for name in (
-        "AtmosphereLayers.detector nodes and time steps",
         "AtmosphereLayers.layer 3",
         "HighpassFilter.high-pass decimation",
     ):
