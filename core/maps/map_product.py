@@ -15,7 +15,7 @@ from ..pages import html_table
 from ..types import Floats
 from .central import central_diameter
 from .map_arrays import MapArrays
-from .smoothing import CUT, smoother
+from .smoothing import CUT, error_of_mean, smoother, weighted_mean
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -149,33 +149,19 @@ class MapProduct(MapArrays):
         if self.polarization is not None:
             return self._with_parts([one.smoothed(fwhm) for one in self.by_stokes().values()])
         convolve = smoother(self.grid, fwhm)
-        known = self.known
+        known, planes = self.known, dict(self.planes)
+        total: Any = None
         weights = np.where(known, self.weights, 0.0)
-        total = convolve(weights, 1.0)
-
-        def mean(values: Floats, use: NDArray[np.bool_]) -> Floats:
-            w = np.where(use, weights, 0.0)
-            below = total if use is known else convolve(w, 1.0)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                return np.where(use, convolve(w * np.where(use, values, 0.0), 1.0) / below, np.nan)
-
-        def error(noise: Floats) -> Floats:
-            quiet = known & np.isfinite(noise)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                square = convolve((weights * np.where(quiet, noise, 0.0)) ** 2, 2.0) / total**2
-                # the noise is not known where the transform's rounding is all there is
-                return np.where(quiet & (square >= 0), np.sqrt(square), np.nan)
-
-        planes = dict(self.planes)
-        for name, plane in planes.items():
+        for name, plane in planes.items():  # the signal is the first
             values = plane.values[0]
             if plane.smoothing == "mean":
-                found = mean(values, known if name == "signal" else np.isfinite(values))
+                values, own = weighted_mean(convolve, values, weights)
+                total = own if total is None else total
             elif plane.smoothing == "error":
-                found = error(values)
+                values = error_of_mean(convolve, values, weights, known, total)
             else:
                 continue
-            planes[name] = replace(plane, values=found[None])
+            planes[name] = replace(plane, values=values[None])
         return replace(self, planes=planes, smoothed_by=math.hypot(self.smoothed_by, fwhm))
 
     def _with_parts(self, parts: list[MapProduct]) -> MapProduct:

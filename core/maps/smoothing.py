@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..kernels import kernel
@@ -36,21 +36,14 @@ varies by half of it within.
 """
 CUT = 5.0
 """Standard deviations at which kernels end."""
-STEEP = 0.15
-"""sigma tan(latitude) up to which the mean of two kernels for each row serves CAR images, to some
-0.5 %.
-"""
 MOST_PAIRS = 3e6
 """Pairs of HEALPix pixels under a kernel up to which each is looked at: harmonics of a whole sphere
 take as long.
 """
 LARGEST_NSIDE = 2048
 """Of HEALPix maps that are smoothed by harmonics: beyond, a whole sphere takes gigabytes."""
-DIRECT = 1e9
-"""Pairs of pixels under a kernel up to which each is looked at: some 3 s."""
 MOST_DIRECT = 3e11
-"""Pairs beyond which that is not done."""
-TILE = 64
+"""Pairs of pixels under a kernel beyond which an image is refused: some 15 minutes."""
 SKEW = 1e-2
 """Skewness of pixels below which the kernel is that of pixels at right angles: right to half of it,
 of the kernel's peak.
@@ -64,327 +57,179 @@ DEEPEST = 12.5
 
 
 def smoother(grid: MapGrid, fwhm: float) -> Smoother:
-    """The convolution with a Gaussian of ``fwhm`` [rad], equation (2)."""
-    if isinstance(grid, ImagePixels):
-        return ImageSmoothing(grid).smoother(fwhm)
-    assert isinstance(grid, HealpixPixels)
-    return HealpixSmoothing(grid).smoother(fwhm)
+    """The convolution with a Gaussian of ``fwhm`` [rad], equation (2), by the fastest kernel that
+    is right for the grid. Raises InputError where it would take hours.
+    """
+    sigma = fwhm / FWHM_PER_SIGMA
+    if isinstance(grid, HealpixPixels):
+        return _of_healpix(grid, sigma)
+    assert isinstance(grid, ImagePixels)
+    car = grid.kind == "CAR" and grid.cylinder
+    if car and sigma * np.tan(abs(grid.latitudes)).max(initial=0.0) < GENTLE:
+        return _by_rows(grid, sigma)
+    if (steps := _even_steps(grid)) is None:
+        return _directly(grid, sigma)
+    along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
+    return lambda values, power=1.0: np.asarray(convolved(values, along_y**power, along_x**power))
 
 
-def smoothed(
-    grid: MapGrid,
-    values: Floats,
-    fwhm: float,
-    weights: Floats | None = None,
-    noise: Floats | None = None,
-) -> tuple[Floats, Floats | None]:
-    """(values, noise) of the mean under a Gaussian; NaN where ``values`` are, which count in no
-    other pixel.
+def weighted_mean(convolve: Smoother, values: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Equation (3): the mean of ``values`` under a Gaussian, NaN where these are, which count in no
+    other pixel; and the convolved weights.
 
         m'_p = sum_q K_pq w_q m_q / sum_q K_pq w_q,
         n'_p = [sum_q (K_pq w_q n_q)^2]^(1/2) / sum_q K_pq w_q          (3)
+    """
+    known = np.isfinite(values)
+    weights = np.where(known, weights, 0.0)
+    total = convolve(weights)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(
+            known, convolve(weights * np.where(known, values, 0.0)) / total, np.nan
+        ), total
 
-    ``weights``: default the solid angles, so that values are points of a brightness; noise is
-    of pixels that are independent.
+
+def error_of_mean(
+    convolve: Smoother, noise: Floats, weights: Floats, known: NDArray[np.bool_], total: Floats
+) -> Floats:
+    """Equation (3): standard error of the mean of pixels with independent ``noise``, ``weights``
+    whose convolution is ``total``; NaN where the mean is not ``known``, or the noise.
+    """
+    quiet = known & np.isfinite(noise)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        square = convolve((weights * np.where(quiet, noise, 0.0)) ** 2, 2.0) / total**2
+        # the noise is not known where the transform's rounding is all there is
+        return np.where(quiet & (square >= 0), np.sqrt(square), np.nan)
+
+
+def smoothed(
+    grid: MapGrid, values: Floats, fwhm: float, noise: Floats | None = None
+) -> tuple[Floats, Floats | None]:
+    """(values, noise) of `weighted_mean`. The weights are the solid angles, so that values are
+    points of a brightness.
     """
     convolve = smoother(grid, fwhm)
     own = np.broadcast_to(np.nan_to_num(np.where(grid.once, grid.areas, 0.0)), grid.shape)
-    own = own / own.max(initial=0.0) if weights is None else weights
     known = np.isfinite(values)
-    weight = np.where(known, own, 0.0)
-    total = convolve(weight)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        found = np.where(known, convolve(weight * np.where(known, values, 0.0)) / total, np.nan)
-        if noise is None:
-            return found, None
-        quiet = known & np.isfinite(noise)
-        variance = convolve((weight * np.where(quiet, noise, 0.0)) ** 2, 2.0)
-        return found, np.where(
-            quiet & (variance >= 0), np.sqrt(np.maximum(variance, 0.0)) / total, np.nan
-        )
+    weights = np.where(known, own / own.max(initial=0.0), 0.0)
+    found, total = weighted_mean(convolve, values, weights)
+    return found, None if noise is None else error_of_mean(convolve, noise, weights, known, total)
 
 
-@dataclass(frozen=True)
-class ImageSmoothing:
-    """Smoothing of an image, by the fastest kernel that is right for its projection."""
-
-    grid: ImagePixels
-
-    def smoother(self, fwhm: float) -> Smoother:
-        sigma = fwhm / FWHM_PER_SIGMA
-        if (
-            self.grid.kind == "CAR"
-            and self.grid.cylinder
-            and sigma * np.tan(abs(self.grid.latitudes)).max(initial=0.0) < GENTLE
-        ):
-            return self._by_rows(sigma)
-        steps = self._even()
-        if steps is None:
-            reach = self.grid.reach(CUT * sigma)
-            by_latitudes = (
-                self.grid.kind == "CAR" and self.grid.cylinder
-            )  # right to 0.2 %, and much faster
-            if 4.0 * math.prod(self.grid.shape) * math.prod(reach) < (
-                DIRECT / 100 if by_latitudes else DIRECT
-            ):
-                return self._directly(sigma)
-            if by_latitudes:
-                return self._by_latitudes(sigma)
-            return (
-                self._directly(sigma)
-                if 0 < self.grid.around <= self.grid.shape[1]
-                else self._by_tiles(sigma, reach)
-            )
-        along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
-        return lambda values, power=1.0: np.asarray(
-            convolved(values, along_y**power, along_x**power)
-        )
-
-    def _by_tiles(self, sigma: float, reach: tuple[int, int]) -> Smoother:
-        """Smoother of a large image: tile by tile, each so small that one kernel serves it where
-        that can be.
-        """
-        ny, nx = self.grid.shape
-        more = tuple(math.ceil(1.2 * n) + 2 for n in reach)
-        tiles = self._tiles(slice(0, ny), slice(0, nx))
-
-        def found(values: AnyFloats, power: float = 1.0) -> Floats:
-            out = np.empty((ny, nx))
-            for y, x in tiles:
-                low = max(y.start - more[0], 0), max(x.start - more[1], 0)
-                around = (
-                    slice(low[0], min(y.stop + more[0], ny)),
-                    slice(low[1], min(x.stop + more[1], nx)),
-                )
-                steps, part = (
-                    ImageSmoothing(self.grid.window(y, x))._even(),
-                    np.asarray(values[around], np.float64),
-                )
-                if steps is None:
-                    own = [slice(s.start - n, s.stop - n) for s, n in zip((y, x), low, strict=True)]
-                    whole = ImageSmoothing(self.grid.window(*around))._directly(
-                        sigma, (own[0], own[1])
-                    )(part, power)
-                else:
-                    along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
-                    whole = np.asarray(convolved(part, along_y**power, along_x**power), np.float64)
-                out[y, x] = whole[
-                    y.start - low[0] : y.stop - low[0], x.start - low[1] : x.stop - low[1]
-                ]
-            return out
-
-        return found
-
-    def _tiles(self, y: slice, x: slice) -> list[tuple[slice, slice]]:
-        """Halves of halves of the image, until each is even or of no more than `TILE` pixels a
-        side.
-        """
-        rows, columns = y.stop - y.start, x.stop - x.start
-        if max(rows, columns) <= TILE or ImageSmoothing(self.grid.window(y, x)).even:
-            return [(y, x)]
-        if rows >= columns:
-            middle = y.start + rows // 2
-            return self._tiles(slice(y.start, middle), x) + self._tiles(slice(middle, y.stop), x)
-        middle = x.start + columns // 2
-        return self._tiles(y, slice(x.start, middle)) + self._tiles(y, slice(middle, x.stop))
-
-    def _by_rows(self, sigma: float, both: bool = False) -> Smoother:
-        """Smoother of a CAR image: along each row with its own width, then along the columns; right
-        to sigma tan(latitude) / 2.
-
-        ``both``: the mean of that, of the height that equation (2) has, and of columns first, rows
-        then. The widths go with cos(latitude) of the pixel that is seen, and of the one that sees
-        it; so has r^2 the mean of both: right to the square.
-        """
-        side, taps = (
-            abs(float(self.grid.matrix[0, 0])),
-            gaussian_taps(sigma / abs(float(self.grid.matrix[1, 1]))),
-        )
-        cosines = np.cos(self.grid.latitudes)
-        if both:  # rows nearer to a pole are left to `_directly`
-            cosines = np.maximum(cosines, sigma / 2 / STEEP)
-        rows = [gaussian_taps(sigma / side / cosine) for cosine in cosines]
-        around, nx = self.grid.around, self.grid.shape[1]
-
-        def convolve(values: Floats, power: float) -> Floats:
-            along, one = [row**power for row in rows], np.ones(1)
-            if not both:
-                return convolved_rows(values, taps**power, along)
-            height = cosines[:, None] ** power
-            seen = height * convolved_rows(values / height, taps**power, along)
-            return (
-                seen
-                + convolved_rows(convolved_rows(values, taps**power, [one] * len(rows)), one, along)
-            ) / 2
-
-        if not 0 < around <= nx:
-            return lambda values, power=1.0: convolve(np.asarray(values, np.float64), power)
+def _by_rows(grid: ImagePixels, sigma: float) -> Smoother:
+    """Smoother of a CAR image: along each row with its own width, then along the columns; right to
+    sigma tan(latitude) / 2.
+    """
+    side, taps = (
+        abs(float(grid.matrix[0, 0])),
+        gaussian_taps(sigma / abs(float(grid.matrix[1, 1]))),
+    )
+    rows = [gaussian_taps(sigma / side / cosine) for cosine in np.cos(grid.latitudes)]
+    around, nx = grid.around, grid.shape[1]
+    columns, own = np.arange(nx), np.arange(nx)
+    if 0 < around <= nx:
         reach = min(max((len(row) for row in rows), default=0), (around - 1) // 2)
-        columns = np.arange(-reach, around + reach) % around
+        columns, own = np.arange(-reach, around + reach) % around, reach + own % around
 
-        def found(values: AnyFloats, power: float = 1.0) -> Floats:
-            return convolve(np.asarray(values, np.float64)[:, columns], power)[
-                :, reach + np.arange(nx) % around
-            ]
+    def found(values: AnyFloats, power: float = 1.0) -> Floats:
+        whole = np.asarray(values, np.float64)[:, columns]
+        return convolved_rows(whole, taps**power, [row**power for row in rows])[:, own]
 
-        return found
+    return found
 
-    def _by_latitudes(self, sigma: float) -> Smoother:
-        """Smoother of a large CAR image: by rows, but near the poles pixel by pixel. InputError
-        where that would take hours.
-        """
-        ny, nx = self.grid.shape
-        with np.errstate(divide="ignore", invalid="ignore"):
-            steep = ~(sigma * np.tan(abs(self.grid.latitudes)) < STEEP)
-        rows, halo = (
-            self._by_rows(sigma, both=True),
-            math.ceil(1.1 * CUT * sigma / abs(float(self.grid.matrix[1, 1]))) + 2,
-        )
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], steep.view(np.int8), [0]]))).reshape(
-            -1, 2
-        )
-        if (pairs := float(steep.sum()) * nx * nx * 2 * halo) > MOST_DIRECT:
-            text = (
-                f"a CAR map of {nx} x {ny} pixels that holds a pole, smoothed by"
-                f" {angle_text(sigma * FWHM_PER_SIGMA)}"
-            )
-            cure = "smooth it less, cut the pole off, or make a HEALPix map (nside)"
-            raise InputError(
-                f"{text}, would take {pairs / 1e12:.2g} hours", place="smoothing", cure=cure
-            )
 
-        def found(values: AnyFloats, power: float = 1.0) -> Floats:
-            out = rows(values, power)
-            for first, stop in edges:
-                low, high = max(int(first) - halo, 0), min(int(stop) + halo, ny)
-                own, whole = slice(int(first) - low, int(stop) - low), slice(0, nx)
-                part = ImageSmoothing(self.grid.window(slice(low, high), whole))._directly(
-                    sigma, (own, whole)
-                )
-                out[first:stop] = part(np.asarray(values)[low:high], power)[own]
-            return out
-
-        return found
-
-    @property
-    def even(self) -> bool:
-        """True if all pixels have the same steps along its axes, to `EVEN`: one kernel serves
-        all.
-        """
-        return self._even() is not None
-
-    def _even(self) -> tuple[float, float] | None:
-        """Steps (y, x) that hold for all pixels to `EVEN`, whose axes are at right angles; None:
-        they differ.
-        """
-        if 0 < self.grid.around <= self.grid.shape[1]:
-            return None
-        xx, xy, yy = self.grid.scattered_metric
-        reference = tuple(float(v) for v in np.sqrt((self.grid.matrix**2).sum(axis=0))[::-1])
-        for dy, dx in (reference, self.grid.sides):
-            with np.errstate(invalid="ignore"):
-                same = (
-                    (abs(np.sqrt(xx) / dx - 1) < EVEN)
-                    & (abs(np.sqrt(yy) / dy - 1) < EVEN)
-                    & (abs(xy) < SKEW / 2 * dx * dy)
-                )
-            if same.all():
-                return dy, dy if abs(dx / dy - 1) < 1e-9 else dx
+def _even_steps(grid: ImagePixels) -> tuple[float, float] | None:
+    """Steps (y, x) that hold for all pixels to `EVEN`, whose axes are at right angles; None: they
+    differ.
+    """
+    if 0 < grid.around <= grid.shape[1]:
         return None
+    xx, xy, yy = grid.scattered_metric
+    reference = tuple(float(v) for v in np.sqrt((grid.matrix**2).sum(axis=0))[::-1])
+    for dy, dx in (reference, grid.sides):
+        with np.errstate(invalid="ignore"):
+            same = (
+                (abs(np.sqrt(xx) / dx - 1) < EVEN)
+                & (abs(np.sqrt(yy) / dy - 1) < EVEN)
+                & (abs(xy) < SKEW / 2 * dx * dy)
+            )
+        if same.all():
+            return dy, dy if abs(dx / dy - 1) < 1e-9 else dx
+    return None
 
-    def _directly(self, sigma: float, within: tuple[slice, slice] | None = None) -> Smoother:
-        """Equation (2) as it stands: each pixel with its own kernel. ``within``: only for these
-        rows and columns.
-        """
-        ny, nx = self.grid.shape
-        whole = 0 < self.grid.around <= nx
-        columns = self.grid.around if whole else nx
-        directions = np.ascontiguousarray(self.grid.directions()[:, :columns])
-        areas = np.ascontiguousarray(
-            np.nan_to_num(np.broadcast_to(self.grid.areas, self.grid.shape)[:, :columns])
+
+def _directly(grid: ImagePixels, sigma: float) -> Smoother:
+    """Equation (2) as it stands: each pixel with its own kernel. InputError where that would take
+    hours.
+    """
+    ny, nx = grid.shape
+    whole = 0 < grid.around <= nx
+    columns = grid.around if whole else nx
+    directions = np.ascontiguousarray(grid.directions()[:, :columns])
+    areas = np.nan_to_num(np.broadcast_to(grid.areas, grid.shape)[:, :columns])
+    reach = np.zeros((2, ny, columns), np.int32)
+    for first in range(0, ny, ROWS):
+        rows = np.arange(first, min(first + ROWS, ny), dtype=np.float64)
+        xx, xy, yy = grid.metric(np.arange(columns, dtype=np.float64), rows[:, None])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            wide = 1.1 * CUT * sigma * np.sqrt(np.stack([yy, xx]) / (xx * yy - xy**2)) + 1
+            if grid.cylinder:  # meridians meet: a circle about the pole has all columns
+                side = abs(float(grid.matrix[0, 0]))
+                share = math.sin(min(CUT * sigma, math.pi / 2)) / (np.sqrt(xx) / side)
+                wide[0] = np.where(share < 1, np.arcsin(np.minimum(share, 1.0)) / side + 1, np.inf)
+        most = np.array([columns // 2 if whole else columns, ny])[:, None, None]
+        reach[:, first : first + ROWS] = np.minimum(np.where(np.isnan(wide), 0.0, wide), most)
+    if (pairs := 4 * float(reach.prod(axis=0, dtype=np.float64).sum())) > MOST_DIRECT:
+        raise InputError(
+            f"a map of {nx} x {ny} pixels, smoothed by {angle_text(sigma * FWHM_PER_SIGMA)}, would"
+            f" take {pairs / 1e12:.2g} hours",
+            place="smoothing",
+            cure="smooth it less, cut off the poles of a CAR map, or make a HEALPix map (nside)",
         )
-        farthest = columns // 2 if whole else columns
-        down, across = within or (slice(0, ny), slice(0, columns))
-        begin, end = (down.start, across.start), (down.stop, min(across.stop, columns))
-        reach = np.zeros((2, ny, columns), np.int32)
-        for first in range(0, ny, ROWS):
-            rows = np.arange(first, min(first + ROWS, ny), dtype=np.float64)
-            xx, xy, yy = self.grid.metric(np.arange(columns, dtype=np.float64), rows[:, None])
-            with np.errstate(invalid="ignore", divide="ignore"):
-                wide = 1.1 * CUT * sigma * np.sqrt(np.stack([yy, xx]) / (xx * yy - xy**2)) + 1
-                if self.grid.cylinder:  # meridians meet: a circle about the pole has all columns
-                    side = abs(float(self.grid.matrix[0, 0]))
-                    share = math.sin(min(CUT * sigma, math.pi / 2)) / (np.sqrt(xx) / side)
-                    wide[0] = np.where(
-                        share < 1, np.arcsin(np.minimum(share, 1.0)) / side + 1, np.inf
-                    )
-            wide = np.where(np.isnan(wide), 0.0, wide)
-            reach[:, first : first + ROWS] = np.minimum(
-                wide, np.array([farthest, ny])[:, None, None]
-            )
 
-        def found(values: AnyFloats, power: float = 1.0) -> Floats:
-            own = np.ascontiguousarray(values[:, :columns], np.float64)
-            out = smooth_directly(
-                own, directions, areas, reach, whole, sigma, power, table(power), begin, end
-            )
-            return np.asarray(out[:, np.arange(nx) % columns] if nx > columns else out, np.float64)
+    def found(values: AnyFloats, power: float = 1.0) -> Floats:
+        own = np.ascontiguousarray(values[:, :columns], np.float64)
+        out = smooth_directly(own, directions, areas, reach, whole, sigma, power, table(power))
+        return np.asarray(out[:, np.arange(nx) % columns], np.float64)
 
-        return found
+    return found
 
 
-@dataclass(frozen=True)
-class HealpixSmoothing:
-    """Smoothing of HEALPix maps: pair by pair, or by harmonics of the whole sphere."""
+def _of_healpix(grid: HealpixPixels, sigma: float) -> Smoother:
+    """Smoother of a HEALPix map: pair by pair of few pixels, or of a part of a sphere that is too
+    fine for harmonics; else by harmonics of the whole sphere.
+    """
+    import healpy
+    from scipy.spatial import cKDTree
 
-    grid: HealpixPixels
+    size = sigma / grid.sides[0]
+    scale = 1 / (2 * math.pi * size**2)
+    under = math.pi * (CUT * size) ** 2
 
-    def smoother(self, fwhm: float) -> Smoother:
-        sigma = fwhm / FWHM_PER_SIGMA / self.grid.sides[0]
-        if (
-            len(self.grid.pixels) * math.pi * (CUT * sigma) ** 2 < MOST_PAIRS
-            or self.grid.nside > LARGEST_NSIDE
-        ):
-            return self._directly(fwhm / FWHM_PER_SIGMA)
+    def by_harmonics(values: AnyFloats, power: float = 1.0) -> Floats:
+        whole = np.zeros(healpy.nside2npix(grid.nside))
+        ring = healpy.nest2ring(grid.nside, grid.pixels) if grid.nest else grid.pixels
+        whole[ring] = values
+        whole = healpy.smoothing(whole, sigma=sigma / math.sqrt(power), iter=3)
+        return np.asarray(whole[ring] * scale ** (power - 1) / power, np.float64)
 
-        def found(values: AnyFloats, power: float = 1.0) -> Floats:
-            import healpy
+    if len(grid.pixels) * under >= MOST_PAIRS and grid.nside <= LARGEST_NSIDE:
+        return by_harmonics
+    directions = grid.directions()
+    tree = cKDTree(directions)
 
-            whole = np.zeros(healpy.nside2npix(self.grid.nside))
-            whole[self.grid.pixels] = values
-            if self.grid.nest:
-                whole = healpy.reorder(whole, n2r=True)
-            whole = healpy.smoothing(whole, fwhm=fwhm / math.sqrt(power), iter=3)
-            if self.grid.nest:
-                whole = healpy.reorder(whole, r2n=True)
-            kept: Floats = whole[self.grid.pixels] * (4 * math.pi * sigma**2) ** (1 - power)
-            return kept
+    def by_pairs(values: AnyFloats, power: float = 1.0) -> Floats:
+        out = np.zeros(len(directions))
+        rows = max(1, round(1e6 / max(1.0, under)))
+        for first in range(0, len(directions), rows):
+            part = cKDTree(directions[first : first + rows])
+            near = part.sparse_distance_matrix(tree, CUT * sigma, output_type="ndarray")
+            chord = near["v"] ** 2
+            kernel = np.exp(-power * chord * (1 + chord / 12) / (2 * sigma**2))
+            out[first : first + rows] = np.bincount(near["i"], kernel * values[near["j"]], part.n)
+        return np.asarray(out * scale**power, np.float64)
 
-        return found
-
-    def _directly(self, sigma: float) -> Smoother:
-        """Equation (2) as it stands: of few pixels, or of a part of a sphere that is too fine for
-        harmonics of the whole.
-        """
-        from scipy.spatial import cKDTree
-
-        directions = self.grid.directions()
-        tree, scale = cKDTree(directions), float(self.grid.areas[0]) / (2 * math.pi * sigma**2)
-
-        def found(values: AnyFloats, power: float = 1.0) -> Floats:
-            out = np.zeros(len(directions))
-            rows = max(1, round(1e6 / max(1.0, math.pi * (CUT * sigma / self.grid.sides[0]) ** 2)))
-            for first in range(0, len(directions), rows):
-                part = cKDTree(directions[first : first + rows])
-                near = part.sparse_distance_matrix(tree, CUT * sigma, output_type="ndarray")
-                chord = near["v"] ** 2
-                kernel = np.exp(-power * chord * (1 + chord / 12) / (2 * sigma**2))
-                out[first : first + rows] = np.bincount(
-                    near["i"], kernel * values[near["j"]], part.n
-                )
-            return np.asarray(out * scale**power, np.float64)
-
-        return found
+    return by_pairs
 
 
 def table(power: float) -> Floats:
@@ -394,18 +239,17 @@ def table(power: float) -> Floats:
 
 @kernel
 def smooth_directly(  # type: ignore[no-untyped-def]
-    values, d, areas, reach, whole, sigma, power, gaussian, first, stop
+    values, d, areas, reach, whole, sigma, power, gaussian
 ):
-    """sum_q K_pq^power values_q (ny, nx) for pixels from (row, column) ``first`` to before
-    ``stop``; others are 0.
+    """sum_q K_pq^power values_q (ny, nx).
 
     ``d`` (ny, nx, 3) directions, NaN off the sky; ``areas`` (ny, nx) [sr]; ``reach`` (2, ny, nx)
     columns and rows to look at on either side; ``whole``: the last column is beside the first one.
     """
     ny, nx = values.shape
     out = np.zeros((ny, nx))
-    for y in range(first[0], stop[0]):
-        for x in range(first[1], stop[1]):
+    for y in range(ny):
+        for x in range(nx):
             scale = areas[y, x] / (2 * math.pi * sigma * sigma)
             if not scale > 0.0:
                 continue
