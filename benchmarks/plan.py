@@ -8,7 +8,7 @@ CPU seconds are those of whole processes, `zonda run --no-prune` and `zonda run 
 planning included, the best of `--repeat`; a first run, not counted, compiles. The difference of the
 maps is relative to their noise. `--forms` runs the steps in one process, in turn with the run in
 full, and compares the least times of the step that a form changes: savings as they stand beside the
-forms in planning classes (`zonda.core.plan.estimate.Saving`).
+forms in planning classes (`zonda.core.plan.bounds.Saving`).
 """
 
 from __future__ import annotations

@@ -7,11 +7,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from ..plan.budget import Limits
 from ..scene import Scene
 from ..signal import Signal
 from .parameters import Parameters, quantity
-from .units import Fraction
+from .units import Fraction, Kelvin
 
 
 class Accuracy(Parameters):
@@ -26,6 +25,31 @@ class Accuracy(Parameters):
     @classmethod
     def _target_alone(cls, value: Any) -> Any:
         return value if isinstance(value, dict | Accuracy) else {"target": value}
+
+
+class Limits(Parameters):
+    """Largest errors that the plan may add, in the products' own units."""
+
+    map_rms: Kelvin | None = Field(None, ge=0)
+    """rms per map pixel, e.g. 3 uK; where absent, a tenth of the noise."""
+    peak: Kelvin | None = Field(None, ge=0)
+    """Of the sky's brightness in the map; where absent, as `map_rms`."""
+    transfer: Fraction | None = Field(None, ge=0, le=1)
+    """Of the transfer function; where absent, 1 %."""
+    tod: Kelvin | None = Field(None, ge=0)
+    """rms of one sample of the calibrated time stream; where absent, a tenth of its white noise."""
+
+    psd: Fraction | None = Field(None, ge=0, le=1)
+    """Of the time stream's power spectrum, relative; where absent, 10 %."""
+
+    @model_validator(mode="after")
+    def _something(self) -> Limits:
+        if not self.model_fields_set:
+            raise ValueError(
+                "state at least one of map_rms, peak, transfer, tod, psd; or a share of the noise,"
+                " e.g. 10 %"
+            )
+        return self
 
 
 class Header(Parameters):

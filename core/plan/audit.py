@@ -34,9 +34,8 @@ from ..mapmaker import made_by
 from ..signal import Signal
 from ..tables import aligned
 from .bands import PlanOfBands, files_of_bands
-from .context import Context
+from .bounds import Choice, Context, add, figure
 from .decide import Decided
-from .estimate import Choice, add, figure
 from .planner import NAME, Wishes, plan_band
 from .pointing import DEEP
 from .prediction import SECONDS, sliced

@@ -1,7 +1,7 @@
 """Decisions of a plan: the coarser forms that save most, while their bounds fit in the budget.
 
 Forms are tried in a fixed order, by the saving that was measured in a benchmark scene
-(`estimate.Saving`). No time of this machine enters: the same file gives the same plan everywhere.
+(`bounds.Saving`). No time of this machine enters: the same file gives the same plan everywhere.
 """
 
 from __future__ import annotations
@@ -9,10 +9,47 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from ..configuration.diagnostics import nearest
+from ..configuration.header import Limits
 from ..errors import ZondaError
-from .estimate import Choice, Effect
+from .bounds import Choice, Effect
+
+TRANSFER = 0.01
+"""Error of the transfer function that is allowed where the user states none."""
+
+SHARE = 0.1
+"""Share of the noise that is allowed where the user states none."""
+
+
+def limits(budget: Any, map_noise: float, sample_noise: float) -> dict[str, float]:
+    """Largest bound by metric. ``budget``: a share of the noise (a number), or `Limits`.
+
+    Raises
+    ------
+    ZondaError
+        For a share that is not a number from 0 to 1.
+    """
+    given = (
+        {metric: v for metric, v in budget if v is not None} if isinstance(budget, Limits) else {}
+    )
+    share = SHARE if isinstance(budget, Limits) else float(budget)
+    if not 0 <= share <= 1:
+        raise ZondaError(
+            f"the budget is a share of the noise from 0 to 1, got {share:g}",
+            place="budget",
+            cure="write e.g. 10 %",
+        )
+    in_map, transfer = given.get("map_rms", share * map_noise), TRANSFER * min(1.0, share / SHARE)
+    return {
+        "map_rms": in_map,
+        "peak": in_map,
+        "transfer": transfer,
+        "tod": share * sample_noise,
+        "psd": share,
+        **given,
+    }
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,8 @@ from typing import Any
 from ..configuration.pipeline_file import PipelineFile
 from ..errors import ZondaError
 from ..machine import available_memory, available_threads
-from .budget import limits
-from .context import OTHER_MODES, Context
-from .decide import Decided, check_droppable, decide, named
-from .estimate import Bound, Choice, Effect, Estimate, add, exact, full
+from .bounds import OTHER_MODES, Bound, Choice, Context, Effect, Estimate, add, exact, full
+from .decide import Decided, check_droppable, decide, limits, named
 from .planning import planning_of
 from .pointing import context_of
 from .prediction import memory_of

@@ -9,11 +9,11 @@ from ..knobs import Knob
 from ..mapmaker import filters
 from ..operator import Operator
 from ..registry import RegistryError, planning
-from .estimate import Cost, Estimate, Traits
+from .bounds import Cost, Estimate, Traits
 
 if TYPE_CHECKING:
     from ..data import Observation
-    from .context import Context
+    from .bounds import Context
 
 O = TypeVar("O", bound=Operator)  # noqa: E741
 

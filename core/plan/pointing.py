@@ -23,7 +23,7 @@ from ..run.bands import data_of_bands, distribute, of_one_band, points
 from ..scene import Scene
 from ..signal import is_stream
 from ..types import Floats
-from .context import Context, Coverage, Depth
+from .bounds import Context, Coverage, Depth
 from .planning import planning_of
 from .structure import Structure, work
 

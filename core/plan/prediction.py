@@ -26,7 +26,7 @@ from ..run.budget import BASE, share_in_step
 from ..run.schedule import Chain, schedule
 from ..run.settings import Settings
 from ..signal import Signal
-from .context import Context
+from .bounds import Context
 from .planning import planning_of
 
 POINTED = 200

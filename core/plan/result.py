@@ -13,9 +13,8 @@ from typing import Any
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..maps.beams import expected_fwhm
 from ..operator import labels
-from .context import Context
+from .bounds import Context, describe, figure, kelvin
 from .decide import Decided
-from .estimate import describe, figure, kelvin
 from .prediction import Memory, Timing
 from .structure import Structure
 

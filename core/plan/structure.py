@@ -22,7 +22,7 @@ from ..operator import Operator
 from ..output import Output, changes_observations, is_output
 from ..pipeline import Pipeline
 from ..signal import MAIN, TRANSMISSION, Component, is_stream, stream_of
-from .context import Work
+from .bounds import Work
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.observation import Observation
-from zonda.core.plan.context import Context
+from zonda.core.plan.bounds import Context
 from zonda.core.types import Floats
 
 from .turbulence.geometry import ScanPlane, axes, crossing, rays

@@ -23,8 +23,18 @@ import numpy as np
 from zonda.core.instrument import Band
 from zonda.core.knobs import Knob
 from zonda.core.observation import Observation
-from zonda.core.plan.context import OTHER_MODES, Context
-from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, add, exact, full
+from zonda.core.plan.bounds import (
+    OTHER_MODES,
+    Choice,
+    Context,
+    Effect,
+    Estimate,
+    Saving,
+    Traits,
+    add,
+    exact,
+    full,
+)
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 

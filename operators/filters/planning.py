@@ -10,8 +10,17 @@ import numpy as np
 from zonda.core.knobs import Knob
 from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.observation import Observation
-from zonda.core.plan.context import LEAKS, Context
-from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, exact, full
+from zonda.core.plan.bounds import (
+    LEAKS,
+    Choice,
+    Context,
+    Effect,
+    Estimate,
+    Saving,
+    Traits,
+    exact,
+    full,
+)
 from zonda.core.plan.planning import Planning
 
 from .bessel import amplitude

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from zonda.core.observation import Observation
-from zonda.core.plan.estimate import Traits
+from zonda.core.plan.bounds import Traits
 from zonda.core.plan.planning import Planning
 
 from .load_tod import LoadTOD

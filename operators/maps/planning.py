@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from zonda.core.data import Observation
-from zonda.core.plan.estimate import Traits
+from zonda.core.plan.bounds import Traits
 from zonda.core.plan.planning import Planning
 
 from .bin_map import BinMap

@@ -10,8 +10,17 @@ import numpy as np
 from zonda.core.knobs import Knob
 from zonda.core.numerics.chunks import TILE_DETECTORS
 from zonda.core.observation import Observation, WhiteLevel
-from zonda.core.plan.context import LEAKS, OTHER_MODES, Context
-from zonda.core.plan.estimate import Choice, Effect, Estimate, Saving, Traits, full
+from zonda.core.plan.bounds import (
+    LEAKS,
+    OTHER_MODES,
+    Choice,
+    Context,
+    Effect,
+    Estimate,
+    Saving,
+    Traits,
+    full,
+)
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 

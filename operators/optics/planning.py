@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from zonda.core.observation import Observation
-from zonda.core.plan.context import Context, calibration
-from zonda.core.plan.estimate import Estimate, Traits, exact
+from zonda.core.plan.bounds import Context, Estimate, Traits, calibration, exact
 from zonda.core.plan.planning import Planning
 
 from .efficiency import Efficiency

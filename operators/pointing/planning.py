@@ -14,8 +14,7 @@ import numpy as np
 from zonda.core.data import Observation
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
-from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import Estimate, exact, not_simulated
+from zonda.core.plan.bounds import Context, Estimate, exact, not_simulated
 from zonda.core.plan.planning import Planning
 
 from .base import Pointing

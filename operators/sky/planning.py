@@ -10,10 +10,10 @@ import numpy as np
 from zonda.core.data import Observation
 from zonda.core.instrument import Band
 from zonda.core.knobs import Knob
-from zonda.core.plan.context import Context
-from zonda.core.plan.estimate import (
+from zonda.core.plan.bounds import (
     Bound,
     Choice,
+    Context,
     Effect,
     Estimate,
     Saving,

@@ -26,7 +26,7 @@ from zonda.core.errors import InputError
 from zonda.core.instrument import Band
 from zonda.core.operator import Operator
 from zonda.core.output import Output
-from zonda.core.plan.estimate import Estimate, Traits
+from zonda.core.plan.bounds import Estimate, Traits
 from zonda.core.plan.planning import Planning
 from zonda.core.site import Site
 from zonda.operators.noise.models import NoiseModel

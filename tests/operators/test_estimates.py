@@ -10,7 +10,7 @@ import pytest
 import zonda
 from zonda.core.data import Data
 from zonda.core.instrument import Band
-from zonda.core.plan.context import Context, Coverage
+from zonda.core.plan.bounds import Context, Coverage
 from zonda.core.plan.planning import planning_of
 from zonda.operators.atmosphere.planning import Calibrated, _slope, calibrated
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere, BandTransfer

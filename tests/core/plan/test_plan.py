@@ -13,14 +13,13 @@ import pytest
 import zonda
 from zonda.core import cli
 from zonda.core.configuration.diagnostics import ConfigurationError
+from zonda.core.configuration.header import Limits
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.plan import decide as deciding
 from zonda.core.plan.bands import for_run
-from zonda.core.plan.budget import Limits, limits
-from zonda.core.plan.context import Context, Coverage
-from zonda.core.plan.decide import Decided
-from zonda.core.plan.estimate import Choice, Effect, Saving, figure, full, kelvin
+from zonda.core.plan.bounds import Choice, Context, Coverage, Effect, Saving, figure, full, kelvin
+from zonda.core.plan.decide import Decided, limits
 from zonda.core.plan.pointing import cover, samples_of
 
 SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]

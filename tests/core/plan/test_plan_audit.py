@@ -14,7 +14,7 @@ import pytest
 import zonda
 from zonda.core import cli
 from zonda.core.plan.audit import SHORTEST, Audit, Checked, _compare, _Result, audit, extent
-from zonda.core.plan.estimate import Choice
+from zonda.core.plan.bounds import Choice
 from zonda.core.plan.prediction import SECONDS, sliced
 
 SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]

@@ -13,7 +13,7 @@ import zonda
 from zonda.core.errors import ZondaError
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.plan.audit import Checked, audit
-from zonda.core.plan.context import Depth
+from zonda.core.plan.bounds import Depth
 from zonda.core.plan.planner import NAME
 from zonda.core.plan.structure import only
 from zonda.core.signal import Signal
