@@ -126,11 +126,12 @@ def accuracy(
     it with the Pareto front found so far.
     """
     from ..campaign.campaign_file import plural
+    from ..campaign.engines import engine
     from ..configuration.pipeline_file import load
-    from .measure import measuring
+    from .bench import Setup
     from .metrics import get
     from .settings import knobs_of, shortened
-    from .study import Setup, study
+    from .study import most_runs, study
 
     file = load(pipeline, settings)
     get(metric)
@@ -147,24 +148,13 @@ def accuracy(
         product_path("out/accuracy", f"{file.header.name}.{metric}") if output is None else output
     )
     check_output_folder(folder)
-    with measuring(threads) as pool:
-        setup = Setup(
-            pipeline,
-            tuple(settings),
-            metric,
-            wanted,
-            shorter,
-            repeats=repeats,
-            seeds=numbers,
-            threads=threads,
-            budget=budget,
-            pool=pool,
-        )
+    setup = Setup(pipeline, settings, metric, wanted, shorter, repeats, numbers, threads, budget)
+    with engine("processes", workers=1, threads=threads) as pool:
         _say(
             f"{metric} of {file.header.name}: {plural(len(turned), 'knob')}, at most"
-            f" {setup.planned(turned)} runs (--budget {budget}) after a first one that compiles"
+            f" {most_runs(setup, turned)} runs (--budget {budget}) after a first one that compiles"
         )
-        found = study(file, setup, turned, say=_say)
+        found = study(file, setup, turned, pool, say=_say)
         if found.interrupted and pool.stop is not None:
             pool.stop()
 

@@ -23,7 +23,6 @@ from ..output import Output
 from ..plan.planning import planning_of
 from ..storage.files import write_text
 from .bands import metric_of
-from .measure import Request, execute, measure
 from .metrics import get
 from .pareto import Point, cheapest
 from .settings import LENGTH, Setting, knobs_of, overrides
@@ -283,18 +282,14 @@ def achieved(
     """
     measures = metric_of(file, metric)
     measures.check(file.operators, file.runs)
-    reference = overrides(tightest(knobs_of(file)))
 
     def found(given: Sequence[str]) -> Any:
-        return measure(
-            Request(pipeline, tuple(given), metric, repeats=0, threads=threads or 1)
-        ).found[0]
+        return measures.measure(Variant(pipeline, tuple(given)).run([measures], threads=threads))
 
-    enough = len(measures.steps(list(file.operators))) == len(
-        file.operators
-    ) and not measures.signals(file.runs)
-    own = measures.measure(data) if data is not None and enough else found(settings)
-    tightened = found((*settings, *reference))
+    added = len(measures.steps(list(file.operators))) > len(file.operators)
+    enough = data is not None and not added and not measures.signals(file.runs)
+    own = measures.measure(data) if enough and data is not None else found(settings)
+    tightened = found((*settings, *overrides(tightest(knobs_of(file)))))
     return measures.error(own, tightened), dict(measures.errors(own, tightened))
 
 
@@ -318,7 +313,7 @@ def retest(
 
     def found(setting: dict[str, str]) -> Any:
         variant = Variant(pipeline, (*base, *overrides(setting)))
-        return metric.measure(execute(variant.file, metric, 1, timed=False)[0])
+        return metric.measure(variant.run([metric], threads=1))
 
     reference = found(front.reference)
     chosen = sorted((p for p in front.points if p.error > 0), key=lambda p: -p.error)[:points]

@@ -1,11 +1,9 @@
-"""One setting measured, in a process that stays warm from one setting to the next.
+"""One run of a setting, timed by step, in a process that stays warm from one run to the next.
 
 The first run in the process pays for imports, compiled code and caches and is reported apart. Each
-run after it begins from the file anew, so that what an operator object keeps is made again. The
-reference (all knobs at their tightest) runs again after every `BETWEEN` runs: CPU seconds are
-ratios to its last run, which cancels the load that other programs put on the machine. Operators
-that act at the end of a run (pictures, reports, files of maps) are left out: they cost the same at
-every setting.
+run after it begins from the file anew, so that what an operator object keeps is made again; one in
+which code had to be compiled is made again, too. Operators that act at the end of a run (pictures,
+reports, files of maps) are left out: they cost the same at every setting.
 """
 
 from __future__ import annotations
@@ -15,12 +13,11 @@ import ctypes
 import gc
 import os
 import resource
-import statistics
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Mapping
 from concurrent.futures import BrokenExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,235 +27,102 @@ from ..faults import faults_named
 
 if TYPE_CHECKING:
     from ..campaign.engines import Pool
-    from ..configuration.pipeline_file import PipelineFile
     from ..data import Data
-    from .metrics import Metric
 
 REST = "(rest)"
 """CPU seconds that no operator's stage accounts for."""
 
-BETWEEN = 8
-"""Runs of settings between two of the reference."""
-
 
 @dataclass(frozen=True)
-class Request:
-    """A measurement that the process is asked for.
-
-    Attributes
-    ----------
-    pipeline, overrides, yardstick
-        Path or shipped name; overrides of the setting, and of the reference that it is timed
-        against (empty: none).
-    metric, seeds
-        Name of the metric, and the seeds at which it is measured (None: the file's).
-    repeats, threads
-        Timed runs at the first seed (0: none is timed), and threads of every run.
-    """
-
-    pipeline: str
-    overrides: tuple[str, ...]
-    metric: str
-    yardstick: tuple[str, ...] = ()
-    seeds: tuple[int | None, ...] = (None,)
-    repeats: int = 1
-    threads: int = 1
-
-
-@dataclass(frozen=True)
-class Measured:
-    """The result of a request.
+class TimedRun:
+    """Figures of one run.
 
     Attributes
     ----------
     found
-        Value of the metric at each seed.
+        Value of the metric; None where the run had not all that the metric needs.
     steps
-        CPU seconds of each step (label), one for each timed run; `REST` is what else the process
-        used.
-    yardstick
-        CPU seconds of the reference's last run before each; empty: none ran.
+        CPU seconds of each step (label); `REST` is what else the process used.
+    memory
+        Peak resident memory of the process in the run, bytes, libraries included.
     first
         CPU seconds of the first run of the process, compilation and caches included; 0 where the
         process was warm.
-    memory
-        Peak resident memory of the process in the timed runs, bytes, libraries included.
-    runs, cpu
-        Number of runs that this took, and their CPU seconds, but for the first run.
     """
 
-    found: tuple[Any, ...]
-    steps: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    yardstick: tuple[float, ...] = ()
-    first: float = 0.0
+    found: Any
+    steps: Mapping[str, float] = field(default_factory=dict)
     memory: int = 0
-    runs: int = 1
-    cpu: float = 0.0
+    first: float = 0.0
 
     @property
-    def timed(self) -> int:
-        """Number of timed runs."""
-        return max((len(seconds) for seconds in self.steps.values()), default=0)
-
-    def cost(self, step: str = "") -> tuple[float, float]:
-        """CPU time of a step, or of all, in units of the reference's run: (median, half the range)
-        over the runs.
-
-        Medians are added over steps, and half ranges in quadrature: a run that was disturbed in one
-        step counts in the others.
-        """
-        chosen = [self.steps.get(step, (0.0,))] if step else list(self.steps.values())
-        units = self.yardstick or (1.0,) * max((len(s) for s in chosen), default=0)
-        ratios = [[seconds / unit for seconds, unit in zip(s, units, strict=False)] for s in chosen]
-        middle = sum(statistics.median(r) for r in ratios)
-        return middle, sum(((max(r) - min(r)) / 2) ** 2 for r in ratios) ** 0.5
+    def cpu(self) -> float:
+        """CPU seconds of the whole run."""
+        return sum(self.steps.values())
 
 
-@dataclass(frozen=True)
-class Refused:
-    """An error of a run, as it travels between processes."""
-
-    message: str
-    place: str
-    cure: str
-
-
-@contextlib.contextmanager
-def measuring(threads: int) -> Iterator[Pool]:
-    """A pool of one process for `measure`; it ends with the context."""
-    from ..campaign.engines import engine
-
-    with engine("processes", workers=1, threads=threads) as pool:
-        yield pool
-
-
-def measure(request: Request, pool: Pool | None = None) -> Measured:
-    """Measure a setting in the process of ``pool``, or in one of its own.
+def run_in(pool: Pool, variant: Variant, *how: Any) -> TimedRun:
+    """Make a `timed_run` in the process of a pool.
 
     Raises `ZondaError` as the run does, or where the process dies; another one takes its place.
     """
-    if pool is None:
-        with measuring(request.threads) as own:
-            return measure(request, own)
-    place = " ".join(request.overrides) or request.pipeline
     assert pool.executor is not None
     try:
-        result = pool.executor.submit(work, request).result()
+        return pool.executor.submit(timed_run, variant, *how).result()
     except BrokenExecutor:
         assert pool.remake is not None
         pool.executor = pool.remake()
         raise ZondaError(
             "the measuring process was killed",
-            place=place,
+            place=str(variant),
             cure="it may have run out of memory: shorten the scans with --duration",
         ) from None
-    if isinstance(result, Measured):
-        return result
-    raise ZondaError(result.message, place=result.place or place, cure=result.cure)
 
 
-def work(request: Request) -> Measured | Refused:
-    """Carry out a request in this process; an error is returned."""
-    import traceback
+_warm = False
+"""True when this process has made a run."""
+
+
+def timed_run(
+    variant: Variant, metric: str, threads: int | None, seed: int | None, alone: bool
+) -> TimedRun:
+    """Run a variant in this process.
+
+    ``alone``: as the user's own run, without the steps and signals that the metric adds.
+    """
+    global _warm
+    from numba.core.event import install_recorder
+
+    from .bands import metric_of
 
     with (
         open(os.devnull, "w") as nothing,
         contextlib.redirect_stdout(nothing),
         contextlib.redirect_stderr(nothing),
+        faults_named(),
     ):
-        try:
-            with faults_named():
-                return _worker.measured(request)
-        except ZondaError as err:
-            message = str(err) if hasattr(err, "diagnostics") else err.message
-            return Refused(message, err.place, err.cure)
-        except Exception as err:
-            said = "".join(traceback.format_exception(err)).strip().splitlines()[-12:]
-            message = "the measuring process failed:\n" + "\n".join(said)
-            return Refused(message, "", "`zonda run` shows the same fault")
+        measures = metric_of(variant.file, metric)
 
+        def run() -> tuple[Data, float]:
+            start, file = time.process_time(), replace(variant).file
+            own = steps_for(file, [measures]) if alone else None
+            added = () if alone else [measures]
+            data = run_file(file, added, operators=own, seed=seed, threads=threads)
+            return data, time.process_time() - start
 
-class _Worker:
-    """State of a measuring process: the reference's last run and how many runs ago it was."""
-
-    def __init__(self) -> None:
-        self.warm = False
-        self.reference = 0.0
-        self.since = BETWEEN
-        self.runs, self.cpu = 0, 0.0
-
-    def measured(self, request: Request) -> Measured:
-        """See `work`."""
-        from .bands import metric_of
-
-        variant = Variant(request.pipeline, request.overrides)
-        metric = metric_of(variant.file, request.metric)
-        first, seed, self.runs, self.cpu = 0.0, request.seeds[0], 0, 0.0
-        if request.repeats and not self.warm:
-            start = time.process_time()
-            execute(variant.file, metric, request.threads, True, seed)
-            first, self.warm = time.process_time() - start, True
-        timings: list[dict[str, float]] = []
-        yardstick: list[float] = []
-        found: list[Any] = []
-        memory = 0
-        for _ in range(request.repeats):
-            if request.yardstick and request.yardstick != request.overrides:
-                yardstick.append(self._reference(request, metric))
-            data, whole, seconds = self._timed(request, request.overrides, metric, seed)
-            memory = max(memory, peak_memory())
-            timings.append(by_step(data, seconds))
-            if request.yardstick == request.overrides:
-                self.reference, self.since = seconds, 0
-                yardstick.append(seconds)
-            if whole and not found:
-                found = [metric.measure(data)]
-            del data
-        for seed in request.seeds[len(found) :]:
-            start = time.process_time()
-            file = Variant(request.pipeline, request.overrides).file
-            data, _ = execute(file, metric, request.threads, False, seed)
-            found.append(metric.measure(data))
-            del data
-            self._count(time.process_time() - start)
-        labels = dict.fromkeys(label for row in timings for label in row)
-        steps = {label: tuple(row.get(label, 0.0) for row in timings) for label in labels}
-        return Measured(tuple(found), steps, tuple(yardstick), first, memory, self.runs, self.cpu)
-
-    def _reference(self, request: Request, metric: Metric) -> float:
-        """CPU seconds of the reference's last run, made where that is too long ago."""
-        if self.since >= BETWEEN:
-            self.reference = self._timed(request, request.yardstick, metric, request.seeds[0])[2]
-            self.since = 0
-        return self.reference
-
-    def _timed(
-        self, request: Request, overrides: tuple[str, ...], metric: Metric, seed: int | None
-    ) -> tuple[Data, bool, float]:
-        """A run as the user's, again where code had to be compiled: its data, whether they hold
-        what the metric needs, and its CPU seconds.
-        """
-        from numba.core.event import install_recorder
-
+        first = run()[1] if alone and not _warm else 0.0
+        _warm = True
         while True:
             reset_peak_memory()
-            start = time.process_time()
             with install_recorder("numba:compile") as compiled:
-                file = Variant(request.pipeline, overrides).file
-                data, whole = execute(file, metric, request.threads, True, seed)
-            seconds = time.process_time() - start
-            self._count(seconds)
-            if not compiled.buffer:
-                return data, whole, seconds
+                data, seconds = run()
+            if not (alone and compiled.buffer):
+                break
             del data
-
-    def _count(self, seconds: float) -> None:
-        self.runs += 1
-        self.since += 1
-        self.cpu += seconds
-
-
-_worker = _Worker()
+        memory, own = peak_memory(), steps_for(variant.file, [measures])
+        adds = measures.signals(variant.file.runs) or len(measures.steps(list(own))) > len(own)
+        found = None if alone and adds else measures.measure(data)
+        return TimedRun(found, by_step(data, seconds), memory, first)
 
 
 def by_step(data: Data, used: float) -> dict[str, float]:
@@ -290,20 +154,3 @@ def peak_memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
         1 if sys.platform == "darwin" else 1024
     )
-
-
-def execute(
-    file: PipelineFile,
-    metric: Metric,
-    threads: int | None,
-    timed: bool,
-    seed: int | None = None,
-) -> tuple[Data, bool]:
-    """Run a pipeline file without what acts at its end; and whether the data hold what the metric
-    needs. ``timed``: without the steps and signals that the metric adds, too.
-    """
-    if not timed:
-        return run_file(file, [metric], seed=seed, threads=threads), True
-    own = steps_for(file, [metric])
-    data = run_file(file, operators=own, seed=seed, threads=threads)
-    return data, len(metric.steps(list(own))) == len(own) and not metric.signals(file.runs)

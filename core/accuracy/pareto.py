@@ -16,8 +16,9 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from .bench import Bench
 from .settings import Setting
-from .sweep import Alone, Bench, Sweep
+from .sweep import Alone, Sweep
 
 SAME_MEMORY = 1.02
 """Peak memory within this factor counts as equal: allocators do not repeat to the byte."""
@@ -74,7 +75,7 @@ def search(bench: Bench, found: Sweep, allowed: float, most: int = 40) -> list[P
         return points[-1]
 
     def may_go_on() -> bool:
-        return len(points) < most and bench.may(1)
+        return len(points) < most and bench.may(bench.missing())
 
     best = _relaxed(turning, tried(found.reference), allowed, tried, may_go_on)
     while may_go_on():

@@ -9,169 +9,18 @@ redraw. The other rungs are measured if a share of the runs is left for the join
 from __future__ import annotations
 
 import math
-import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import combinations, pairwise
-
-import numpy as np
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 from ..errors import ZondaError
-from .measure import Measured
-from .metrics import Metric
-from .settings import PipelineKnob, Setting, overrides
-
-Run = Callable[[Setting, Sequence[int | None], Setting | None], Measured]
-"""Measures a setting at some seeds, and times it (at the first) against the setting that is its
-yardstick; None: it is not timed.
-"""
+from .bench import Bench
+from .settings import PipelineKnob, Setting
 
 FOR_SEARCH = 0.25
 """Share of the runs that is left for joint settings."""
 NOT_MEASURED = "not measured: more --budget"
 UNKNOWN = "not measured, which counts as 100 %"
-
-
-class Bench:
-    """Measures settings, each once, and compares them.
-
-    Parameters
-    ----------
-    run
-        Measures.
-    metric
-        Compares.
-    yardstick
-        The setting that all are timed against: costs are ratios to its runs, so that the load of
-        the machine cancels.
-    seeds
-        For knobs that redraw and for the realization scatter; the first is the one all settings
-        share.
-    say
-        Is told after each measurement which it was.
-    budget
-        Runs that may be made, whose CPU time may be that of as many runs of the yardstick.
-    """
-
-    def __init__(
-        self,
-        run: Run,
-        metric: Metric,
-        yardstick: Setting,
-        seeds: Sequence[int | None] = (None,),
-        say: Callable[[str], None] = lambda what: None,
-        budget: float = math.inf,
-    ) -> None:
-        self.run, self.metric, self.yardstick, self.say = run, metric, yardstick, say
-        self.seeds, self.budget = tuple(seeds), budget
-        self.runs, self.cpu, self._dearest = 0, 0.0, 0.0
-        self.names = {frozenset(yardstick.items()): "reference"}
-        self._references: list[float] = []
-        self._done: dict[frozenset[tuple[str, str]], Measured] = {}
-        self._refused: dict[frozenset[tuple[str, str]], ZondaError] = {}
-
-    def measure(self, setting: Setting, all_seeds: bool = False) -> Measured:
-        """The measurement of a setting; made where it is not there yet. Raises `ZondaError` where
-        the run refuses the setting.
-        """
-        key = frozenset(setting.items())
-        if key in self._refused:
-            raise self._refused[key]
-        for seed in self.seeds[self._seeds(setting) : len(self.seeds) if all_seeds else 1]:
-            before = self._done.get(key)
-            try:
-                new = self.run(setting, (seed,), self.yardstick if before is None else None)
-            except ZondaError as err:
-                self._refused[key] = err
-                self.runs += 1
-                self._report(setting, "refused")
-                raise
-            self.runs += new.runs
-            self.cpu += new.cpu
-            self._dearest = max(self._dearest, new.cpu / new.runs)
-            self._references += [s for s in new.yardstick if s not in self._references]
-            self._done[key] = replace(before, found=before.found + new.found) if before else new
-            self._report(setting, f"{new.cpu:.1f} CPU s" + (f", seed {seed}" if before else ""))
-        return self._done[key]
-
-    def may(self, runs: float) -> bool:
-        """True if so many runs more are within the budget, each as dear as the dearest so far."""
-        first = self._done.get(frozenset(self.yardstick.items()))
-        unit = first.cpu / first.runs if first else 0.0
-        seconds = self.cpu + runs * self._dearest
-        return max(self.runs + runs, seconds / unit if unit > 0 else 0.0) <= self.budget
-
-    def missing(self, setting: Setting, all_seeds: bool) -> int:
-        """Number of runs that `measure` would make."""
-        if self.refusal(setting) is not None:
-            return 0
-        return max((len(self.seeds) if all_seeds else 1) - self._seeds(setting), 0)
-
-    def has(self, setting: Setting) -> bool:
-        """True if the setting is measured."""
-        return self._seeds(setting) > 0
-
-    def refusal(self, setting: Setting) -> ZondaError | None:
-        """The error of a setting that cannot be run."""
-        return self._refused.get(frozenset(setting.items()))
-
-    def settings(self) -> Iterator[Setting]:
-        """The settings measured so far whose random numbers are the reference's, in order."""
-        keys = self.yardstick.keys()
-        for done in self._done:
-            if (setting := dict(done)).keys() == keys:
-                yield {key: setting[key] for key in keys}
-
-    def _seeds(self, setting: Setting) -> int:
-        done = self._done.get(frozenset(setting.items()))
-        return len(done.found) if done else 0
-
-    def _report(self, setting: Setting, words: str) -> None:
-        what = self.names.get(frozenset(setting.items()), "")
-        what = what or " ".join(overrides(differences(setting, self.yardstick)))
-        of = f" of at most {self.budget:g}" if math.isfinite(self.budget) else ""
-        self.say(f"run {self.runs}{of}: {what}: {words}")
-
-    def seconds(self, setting: Setting, step: str = "") -> tuple[float, float]:
-        """CPU seconds of a setting, or of one of its steps, and their spread, on the scale of the
-        yardstick's own runs. The spread of a single run is that of all runs of the yardstick (of a
-        step: of its first ones).
-        """
-        reference, measured = self.measure(self.yardstick), self.measure(setting)
-        totals = [sum(run) for run in zip(*reference.steps.values(), strict=True)] + list(
-            reference.yardstick
-        )
-        scale = statistics.median(totals) if reference.yardstick else 1.0
-        middle, spread = measured.cost(step)
-        if measured.timed == 1 and step:
-            spread = replace(reference, yardstick=()).cost(step)[1] / scale
-        elif measured.timed == 1 and self._references:
-            spread = (max(self._references) - min(self._references)) / 2 / scale
-        return scale * middle, scale * spread
-
-    def error(self, setting: Setting, reference: Setting) -> float:
-        """Error of a setting against a reference with the same random numbers."""
-        return self.metric.error(self.measure(setting).found[0], self.measure(reference).found[0])
-
-    def errors(self, setting: Setting, reference: Setting) -> dict[str, float]:
-        """`error` of each band, by its name; empty where the camera has one."""
-        return dict(
-            self.metric.errors(self.measure(setting).found[0], self.measure(reference).found[0])
-        )
-
-    def mean_error(self, setting: Setting, reference: Setting) -> tuple[float, float]:
-        """Change of the mean over seeds and its standard error (`Metric.mean_error`)."""
-        return self.metric.mean_error(
-            self.measure(setting, True).found, self.measure(reference, True).found
-        )
-
-    def scatter(self, reference: Setting) -> float | None:
-        """Realization scatter in units of the error: rms over pairs of seeds of their error,
-        divided by sqrt(2).
-        """
-        found = self.measure(reference).found
-        pairs = [self.metric.error(a, b) ** 2 for a, b in combinations(found, 2)]
-        return float(np.sqrt(np.mean(pairs) / 2)) if pairs else None
 
 
 @dataclass(frozen=True)
@@ -311,7 +160,8 @@ def sweep(bench: Bench, knobs: Sequence[PipelineKnob]) -> Sweep:
     must run.
     """
     found = Sweep(tightest(knobs))
-    bench.measure(found.reference, all_seeds=True)
+    every = bench.may(bench.missing(found.reference, all_seeds=True))
+    bench.measure(found.reference, all_seeds=every)
     for knob, value, spare in _in_order(knobs, bench):
         setting, reference = found.turned(knob, value), found.turned(knob, knob.tightest)
         first = found.turned(knob, knob.ladder[0])
@@ -341,7 +191,8 @@ def _in_order(
     for k in redrawn:
         yield k, k.tightest, 0.0
         yield from ((k, v, 0.0) for v in k.ladder if v == k.present or k.present not in k.ladder)
-    spare = FOR_SEARCH * bench.budget if math.isfinite(bench.budget) else 0.0
+    budget = bench.setup.budget
+    spare = FOR_SEARCH * budget if math.isfinite(budget) else 0.0
     for place in range(2, max((len(k.ladder) for k in knobs), default=0) + 1):
         yield from ((k, k.ladder[-place], spare) for k in knobs if len(k.ladder) >= place)
 
@@ -417,8 +268,3 @@ def convergence(steps: Sequence[float], resolutions: Sequence[float] = ()) -> tu
             " that series"
         ),
     )
-
-
-def differences(setting: Mapping[str, str], reference: Mapping[str, str]) -> Setting:
-    """Values of a setting that differ from the reference."""
-    return {k: v for k, v in setting.items() if reference.get(k) != v}

@@ -7,10 +7,11 @@ from itertools import product
 
 import pytest
 
-from zonda.core.accuracy.measure import Measured
+from zonda.core.accuracy.bench import Bench, Setup
+from zonda.core.accuracy.measure import TimedRun
 from zonda.core.accuracy.metrics import Metric
 from zonda.core.accuracy.settings import PipelineKnob
-from zonda.core.accuracy.sweep import Bench, tightest
+from zonda.core.accuracy.sweep import tightest
 
 
 @dataclass
@@ -40,18 +41,14 @@ class Toy:
     def seconds(self, setting):
         return 1 + sum(b * int(setting[f"Step{i}.n"]) for i, b in enumerate(self.costs))
 
-    def run(self, setting, seeds, yardstick):
+    def run(self, setting, seed=None, alone=True):
         self.calls += 1
-        steps = {
-            f"Step{i}": (b * int(setting[f"Step{i}.n"]),) * 3 for i, b in enumerate(self.costs)
-        }
-        found = tuple(self.value(setting, s) for s in seeds)
-        return Measured(
-            found, steps | {"(rest)": (1.0,) * 3}, (self.seconds(yardstick),) * 3, 2.0, 10**8
-        )
+        steps = {f"Step{i}": b * int(setting[f"Step{i}.n"]) for i, b in enumerate(self.costs)}
+        return TimedRun(self.value(setting, seed), steps | {"(rest)": 1.0}, 10**8)
 
-    def bench(self, metric, run=None):
-        return Bench(run or self.run, metric, tightest(self.knobs()))
+    def bench(self, metric, run=None, yardstick=None, say=lambda what: None, **more):
+        yardstick = tightest(self.knobs()) if yardstick is None else yardstick
+        return Bench(run or self.run, metric, yardstick, setup_of(**more), say)
 
     def all_settings(self):
         for values in product(self.ladder, repeat=len(self.errors)):
@@ -60,6 +57,10 @@ class Toy:
 
 class Value(Metric):
     """The toy's value."""
+
+
+def setup_of(target=0.01, **more):
+    return Setup("toy", (), "value", target, **{"shorter": {}, **more})
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import pytest
 
+from zonda.core.accuracy.measure import TimedRun
 from zonda.core.accuracy.pareto import Point, cheapest, pareto, search
 from zonda.core.accuracy.sweep import sweep
 
@@ -28,7 +29,7 @@ def test_the_cheapest_that_meets_the_target_is_found(toy, metric, target):
 
 def test_the_search_is_economical(toy, metric):
     searched(toy, metric, 0.01)
-    assert toy.calls < 13 + 25 < SETTINGS  # 13 of the knobs alone
+    assert toy.calls < 14 + 30 < SETTINGS  # 14 of the knobs alone, and some of the reference
 
 
 def test_the_front_is_the_true_one_within_a_tenth(toy, metric):
@@ -53,14 +54,12 @@ def test_joint_errors_are_measured_not_added(toy, metric):
 
 
 def test_a_saving_within_the_noise_is_none(toy, metric):
-    def run(setting, seeds, yardstick):
-        measured = toy.run(setting, seeds, yardstick)
-        measured.steps["Step0"] = tuple(
-            t + d for t, d in zip(measured.steps["Step0"], (-1.0, 0.0, 1.0), strict=True)
-        )
-        return measured
+    def run(setting, seed, alone):
+        found = toy.run(setting)
+        noise = (-1.0, 0.0, 1.0)[toy.calls % 3]
+        return TimedRun(found.found, found.steps | {"Step0": found.steps["Step0"] + noise})
 
-    bench = toy.bench(metric, run)
+    bench = toy.bench(metric, run, repeats=3)
     found = sweep(bench, toy.knobs())
     assert all(p.setting["Step0.n"] == "32" for p in search(bench, found, 0.1))
 

@@ -7,10 +7,11 @@ import pytest
 
 import zonda
 from zonda.core.accuracy import fronts as store
+from zonda.core.accuracy.bench import Setup
 from zonda.core.accuracy.fronts import Retest
 from zonda.core.accuracy.report import lines
 from zonda.core.accuracy.settings import knobs_of
-from zonda.core.accuracy.study import Setup, study
+from zonda.core.accuracy.study import study
 from zonda.core.errors import InputError
 
 TEXT = """
@@ -31,21 +32,18 @@ LAW = {"HighpassFilter.oversampling": (10.0, 0.05), "CommonModeFilter.residual":
 """Errors and costs of the toy measurement below."""
 
 
-def toy_run(setting, seeds, yardstick):
+def toy_run(setting, seed, alone):
     """A map whose difference from the reference is known: no process, no scan."""
     import numpy as np
 
-    from zonda.core.accuracy.measure import Measured
+    from zonda.core.accuracy.measure import TimedRun
 
     coarse = 1 / float(setting.get("HighpassFilter.oversampling", 24))
     loose = float(setting.get("CommonModeFilter.residual", 1e-6))
     signal = np.full((4, 4), 1 + 0.1 * coarse + loose)
-    seconds = {
-        "HighpassFilter": (1 / coarse,) * 3,
-        "CommonModeFilter": (-float(np.log10(loose)),) * 3,
-    }
+    seconds = {"HighpassFilter": 1 / coarse, "CommonModeFilter": -float(np.log10(loose))}
     product = {"I": {"signal": signal, "weights": np.ones((4, 4)), "noise": np.ones((4, 4))}}
-    return Measured((product,) * len(seeds), seconds, (), 1.0, 10**8)
+    return TimedRun(product, seconds, 10**8, 1.0)
 
 
 @pytest.fixture
@@ -217,18 +215,18 @@ def test_ctrl_c_leaves_the_front_so_far(made):
     path, file, whole = made
     calls = 0
 
-    def run(setting, seeds, yardstick):
+    def run(setting, seed, alone):
         nonlocal calls
         calls += 1
-        if calls == 5:
+        if calls == 6:
             raise KeyboardInterrupt
-        return toy_run(setting, seeds, yardstick)
+        return toy_run(setting, seed, alone)
 
     setup, knobs = Setup(str(path), (), "map_rms", 0.005, {}), knobs_of(file)[-3:-1]
     found = study(file, setup, knobs, run=run)
     assert found.interrupted
     assert [p.setting for p in found.points] == [p.setting for p in whole.points][:4]
-    assert "interrupted after 4 runs" in "\n".join(lines(found))
-    calls = 4
+    assert "interrupted after 5 runs" in "\n".join(lines(found))
+    calls = 5
     with pytest.raises(KeyboardInterrupt):  # nothing is found yet
         study(file, setup, knobs, run=run)

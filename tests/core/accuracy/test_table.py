@@ -4,30 +4,17 @@ from dataclasses import replace
 
 import pytest
 
-from zonda.core.accuracy.measure import Measured
-from zonda.core.accuracy.pareto import Point, cheapest
+from zonda.core.accuracy.measure import TimedRun
+from zonda.core.accuracy.pareto import Point
 from zonda.core.accuracy.report import lines
-from zonda.core.accuracy.study import Setup, Study
-from zonda.core.accuracy.sweep import Alone, Bench, Rung, Sweep, sweep, tightest
+from zonda.core.accuracy.study import Study
+from zonda.core.accuracy.sweep import Alone, Rung, Sweep, sweep, tightest
 
-
-def study_of(found, points, target=0.01, shorter=None, **more):
-    setup = Setup("toy", (), "value", target, shorter or {}, **more)
-    return Study(
-        setup,
-        "a toy",
-        found,
-        points[0],
-        tuple(points),
-        cheapest(points, target, found.left),
-        None,
-        None,
-        1.0,
-    )
+from .conftest import Value, setup_of
 
 
 def said(found, points, **more):
-    return "\n".join(lines(study_of(found, points, **more)))
+    return "\n".join(lines(Study(setup_of(**more), "a toy", found, points[0], tuple(points))))
 
 
 def test_what_is_called_the_cheapest_is_the_cheapest():
@@ -60,23 +47,15 @@ def redrawing(toy, present, noise=0.0):
     standard error of its rungs.
     """
 
-    def run(setting, seeds, yardstick):
+    def run(setting, seed, alone):
         n = int(setting.get("Step0.n", present))
-        found = tuple(1 + 0.4 / n**2 + noise * (-1) ** seed * (n != 32) for seed in seeds)
-        return Measured(found, {"Step0": (1.0,)})
+        found = 1 + 0.4 / n**2 + noise * (-1) ** seed * (n != 32)
+        return TimedRun(found, {"Step0": 1.0}, 10**8)
 
     knob, other = toy.knobs()[:2]
     knob = replace(knob, redraws=True, present=present)
-    return sweep(Bench(run, metric_of(toy), tightest([other]), seeds=range(4)), [knob, other])
-
-
-def metric_of(toy):
-    from zonda.core.accuracy.metrics import Metric
-
-    class Value(Metric):
-        pass
-
-    return Value()
+    bench = toy.bench(Value(), run, tightest([other]), seeds=tuple(range(4)))
+    return sweep(bench, [knob, other])
 
 
 @pytest.mark.parametrize("present", ["4", "8", "32"])

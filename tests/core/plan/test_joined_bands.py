@@ -10,9 +10,9 @@ import pytest
 
 import zonda
 from zonda.core.accuracy.bands import metric_of
-from zonda.core.accuracy.measure import execute
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import PipelineError
+from zonda.core.experiment import run_file
 from zonda.core.plan.audit import Audit, audit_of_bands
 from zonda.core.plan.bands import PlanOfBands
 
@@ -106,8 +106,7 @@ def test_accuracy_is_measured_of_the_bands_together() -> None:
     """What is measured is the map of a run, which is that of the joined bands."""
     file = parse(TEXT)
     metric = metric_of(file, "map_rms")
-    data, complete = execute(file, metric, 1, timed=False)
-    assert complete
+    data = run_file(file, [metric], threads=1)
     run, by_band = (
         f.pipeline().run(f.scene(), output=Path(), threads=1).products
         for f in (file, parse(TEXT, overrides=[BY_BAND]))
