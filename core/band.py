@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
+from .configuration.diagnostics import mistake, refusal
 from .configuration.files import InputPath
 from .configuration.parameters import Parameters, named, named_or_written
 from .configuration.units import Angle, Fraction, Hertz, KelvinRootSecond
-from .configuration.values import mistake, refusal
 from .errors import InputError
 from .registry import RegistryError, bands
 from .storage import packed

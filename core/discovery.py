@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 import warnings
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -150,41 +149,6 @@ def plugin_of(module: str) -> str:
         ):
             return found.origin
     return ""
-
-
-def others_may_declare(group: str) -> bool:
-    """True if a distribution beside zonda's own may have entry points in ``group``.
-
-    A look into the folders on sys.path that spares importing `importlib.metadata`, a third of the
-    time of ``zonda --help``.
-    """
-    if os.environ.get("ZONDA_PLUGINS") == "":
-        return False
-    for folder in dict.fromkeys(path or "." for path in sys.path):
-        if not os.path.isdir(folder):
-            if os.path.exists(folder) and not folder.endswith(
-                f"python{sys.version_info[0]}{sys.version_info[1]}.zip"
-            ):
-                return True  # a zip file: let importlib.metadata look
-            continue
-        try:
-            names = [
-                n for n in os.listdir(folder) if n.endswith((".dist-info", ".egg-info", ".egg"))
-            ]
-        except OSError:
-            continue
-        for name in names:
-            if name.endswith(".egg"):
-                return True
-            if re.match(rf"{HOST}(-\d|\.egg-info)", name, re.IGNORECASE):
-                continue
-            try:
-                with open(os.path.join(folder, name, "entry_points.txt"), "rb") as file:
-                    if f"[{group}]".encode() in file.read():
-                        return True
-            except OSError:
-                continue
-    return False
 
 
 def refresh() -> None:

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from .accuracy.metrics import Metric, OfFunction, get
+from .configuration.diagnostics import TextValue, mistake, refusal
 from .configuration.parameters import Parameters
-from .configuration.values import TextValue, mistake, refusal
 from .errors import InputError, PipelineError, ZondaError
 from .pages import html_table
 from .signal import Signal

@@ -21,7 +21,7 @@ from pydantic_core import PydanticCustomError
 
 from .array_table import OF_INSTRUMENT, ArrayTable, read_array, stated_by
 from .band import NO_BAND, PER_BAND, SPEED_OF_LIGHT, Band, BandOfCamera, CameraBand
-from .configuration.diagnostics import nearest
+from .configuration.diagnostics import mistake, nearest, refusal
 from .configuration.files import InputPath, find
 from .configuration.parameters import Parameters, named, named_or_written, quantity
 from .configuration.units import (
@@ -34,7 +34,6 @@ from .configuration.units import (
     KelvinRootSecond,
     Metres,
 )
-from .configuration.values import mistake, refusal
 from .errors import InputError, ZondaError
 from .focalplane import Focalplane
 from .layouts import Layout, hexagonal_packing, rings, wafers

@@ -9,10 +9,10 @@ from typing import Annotated, Any, Protocol, runtime_checkable
 import numpy as np
 from pydantic import BeforeValidator, Field, SerializeAsAny, field_validator
 
+from .configuration.diagnostics import mistake
 from .configuration.parameters import Parameters, named
 from .configuration.target import Target
 from .configuration.time import Instant
-from .configuration.values import mistake
 from .errors import ZondaError
 from .instrument import Instrument
 from .registry import instruments, sites, weather_sources

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from .configuration.docstrings import described, source_is_known
+from .configuration.describe import described, source_is_known
 from .data import STREAMS, Block, Data, Observation, Stream
 from .mapmaker import MapMaker, filters
 from .numerics.chunks import TILE_SAMPLES

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from .band import PASSBAND, PER_BAND
-from .configuration.diagnostics import nearest
+from .configuration.diagnostics import mistake, nearest
 from .configuration.parameters import named
-from .configuration.values import mistake
 from .registry import bands as registered_bands
 from .registry import instruments
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import ValidationInfo
 
+from .configuration.diagnostics import TextValue, mistake, refusal
 from .configuration.parameters import Parameters
 from .configuration.units import Unit
-from .configuration.values import TextValue, mistake, refusal
 from .errors import InputError, ZondaError
 from .registry import weather_sources
 from .types import Floats

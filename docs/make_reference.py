@@ -8,8 +8,7 @@ import json
 import typing
 from pathlib import Path
 
-from zonda.core.configuration.describe import choices, members, types_in
-from zonda.core.configuration.docstrings import described, own_doc
+from zonda.core.configuration.describe import choices, described, members, own_doc, types_in
 from zonda.core.configuration.units import Unit
 from zonda.core.instrument import Band, CameraBand, Instrument, Telescope
 from zonda.core.plan.planning import planning_class

@@ -12,8 +12,7 @@ import numpy as np
 from pydantic import Field, JsonValue, model_validator
 
 from zonda.core.block import Block
-from zonda.core.configuration.diagnostics import nearest
-from zonda.core.configuration.values import refusal
+from zonda.core.configuration.diagnostics import nearest, refusal
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.flags import DETECTOR_MASK, PROCESSING

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..configuration import overrides
 from ..configuration.diagnostics import Diagnostic
-from ..configuration.header import KEYS, Header
-from ..configuration.mistakes import Mistakes
+from ..configuration.loaded import KEYS, Header
+from ..configuration.steps import Mistakes
 from ..registry import declared, makers, operators, operators_that
 from .entries import setting
 from .settings import MOST_TASKS, Campaign, Sweep

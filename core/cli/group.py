@@ -90,10 +90,6 @@ class Commands(click.Group):
             self._import(name)
         if not self._extended:
             self._extended = True
-            from ..discovery import others_may_declare
-
-            if not others_may_declare("zonda.hooks"):
-                return
             from ..hooks import manager
 
             built_in = dict(self.commands)

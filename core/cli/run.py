@@ -13,7 +13,7 @@ from . import complete
 from .request import RunRequest
 
 if TYPE_CHECKING:
-    from ..configuration.header import Accuracy
+    from ..configuration.loaded import Accuracy
     from ..configuration.pipeline_file import PipelineFile
     from ..data import Data
 

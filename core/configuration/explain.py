@@ -10,9 +10,8 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from .describe import types_in, unit_of
+from .describe import described, types_in, unit_of
 from .diagnostics import ConfigurationError, Diagnostic, nearest
-from .docstrings import described
 from .units import Unit
 from .yaml_places import Document, Path, Span
 
@@ -34,16 +33,6 @@ _WANTED = {
     "path": "the path of a file or folder",
 }
 """Expected values for pydantic's errors of type or parsing, by the first word of their kind."""
-SYNONYMS = {
-    **dict.fromkeys(("steps", "pipeline", "ops"), "operators"),
-    **dict.fromkeys(("camera", "telescope", "receiver"), "instrument"),
-    **dict.fromkeys(("location", "observatory", "place"), "site"),
-    **dict.fromkeys(("date", "start", "begin", "epoch"), "time"),
-    **dict.fromkeys(("position", "source", "center", "field"), "target"),
-    **dict.fromkeys(("pwv", "atmosphere"), "weather"),
-    **dict.fromkeys(("output", "folder", "out"), "outputs"),
-}
-"""Keys that people write for another one."""
 
 _IN_PYTHON = {"a mapping of keys": "a dict", "true or false": "True or False"}
 
@@ -165,10 +154,9 @@ class _Validated:
             if self.keys and len(loc) == 1
             else (field.alias or name for name, field in fields.items())
         )
-        meant = SYNONYMS.get(str(key).lower(), "")
         inner = getattr(owner or self.model, "KEYS_BELONG_IN", "") if "." in str(key) else ""
         known = f"write {inner}: {{{key}: [...]}}" if inner else "not a known key"
-        hint = f"did you mean '{meant}'?" if meant in options else nearest(key, options, known)
+        hint = nearest(key, options, known)
         inside = self.name(loc[:-1])
         message = f"unknown {'parameter' if self.python else 'key'} '{key}' for {inside}"
         return Diagnostic(

@@ -10,8 +10,7 @@ from typing import Annotated, Any, Protocol, Self, runtime_checkable
 
 from pydantic import BaseModel, BeforeValidator, ValidationInfo
 
-from .diagnostics import nearest
-from .values import mistake
+from .diagnostics import mistake, nearest
 
 MOST_NAMED = 4
 """Files of a folder that a message names."""

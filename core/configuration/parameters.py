@@ -18,8 +18,8 @@ from pydantic import (
 
 from ..errors import ZondaError
 from ..pages import html_table
-from .docstrings import described, own_doc, remember_place
-from .values import refusal
+from .describe import described, own_doc, remember_place
+from .diagnostics import refusal
 
 
 def quantity(default: str, **limits: Any) -> Any:

@@ -31,13 +31,11 @@ from . import overrides as settings
 from . import yaml_places
 from .diagnostics import ConfigurationError, Diagnostic, nearest
 from .explain import without_meant
-from .header import KEYS, SCENE_KEYS, Header
+from .loaded import KEYS, SCENE_KEYS, Header, refusal
 from .loaded import PipelineFile as PipelineFile
 from .loaded import Step as Step
-from .loaded import refusal
 from .locate import locate, read
-from .mistakes import Mistakes
-from .steps import noun, read_steps
+from .steps import Mistakes, noun, read_steps
 from .target import WithMap
 from .yaml_places import Document, Source, Span
 

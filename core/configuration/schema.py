@@ -17,8 +17,8 @@ from ..errors import ZondaError
 from ..operator import Operator
 from ..scene import Scene
 from ..variants import LIKE
-from .docstrings import own_doc
-from .header import KEYS
+from .describe import own_doc
+from .loaded import KEYS
 
 _MODE: JsonSchemaMode = "validation"
 

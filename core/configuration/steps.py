@@ -3,16 +3,77 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
 
 from .. import registry
 from ..assembly.order import check_order
+from ..components import Registry
 from ..errors import ZondaError
 from ..operator import Operator
-from .explain import glued
+from .diagnostics import ConfigurationError, Diagnostic, refused
+from .explain import explain, glued
 from .loaded import Step
-from .mistakes import Mistakes
-from .yaml_places import Path, Span
+from .parameters import Parameters
+from .yaml_places import Document, Span
+from .yaml_places import Path as Place
+
+P = TypeVar("P", bound=Parameters)
+
+
+class Mistakes:
+    """A document and what was found wrong with it.
+
+    Parameters
+    ----------
+    folder
+        Where relative paths in the document are looked for first.
+    """
+
+    def __init__(
+        self, document: Document, folder: str | Path | None, found: list[Diagnostic]
+    ) -> None:
+        self.document, self.found = document, found
+        self.context = {"folder": folder}
+
+    def wrong(self, message: str, span: Span, label: str = "", help: str = "") -> None:
+        """Note a mistake."""
+        self.found.append(Diagnostic(message, span, label, help))
+
+    def validate(
+        self, model: type[P], value: Any, at: Place, who: str, keys: Iterable[str] = ()
+    ) -> P | None:
+        """Validated ``value`` at ``at``, or None if it is mistaken. ``who`` and ``keys`` are those
+        of `explain`.
+        """
+        try:
+            return model.model_validate(value, context=self.context)
+        except ValidationError as err:
+            self.found += explain(err, model, self.document, at, who, keys)
+        except ZondaError as err:
+            self.refused(err, self.document.mark(at).start)
+        return None
+
+    def refused(self, err: ZondaError, span: Span) -> None:
+        """Note an error that says what is wrong at ``span``."""
+        self.found.append(refused(err, span))
+
+    def named(self, given: dict[str, Any], key: str, names: Registry, at: Place) -> bool:
+        """Put what the name stands for in its place; False where there is no such thing."""
+        if not isinstance(given.get(key), str):
+            return True
+        try:
+            given[key] = names.create(given[key], self.context["folder"])
+        except ConfigurationError as err:
+            self.found += err.diagnostics
+            return False
+        except ZondaError as err:
+            self.refused(err, self.document.mark(at).value)
+            return False
+        return True
 
 
 def read_steps(mistakes: Mistakes) -> list[Step | None]:
@@ -63,7 +124,7 @@ def read_steps(mistakes: Mistakes) -> list[Step | None]:
     return steps
 
 
-def _step(mistakes: Mistakes, item: Any, at: Path) -> tuple[Step | None, Operator | None]:
+def _step(mistakes: Mistakes, item: Any, at: Place) -> tuple[Step | None, Operator | None]:
     """A step, and what stands for it in the check of the order: both None where the operator is not
     known.
     """

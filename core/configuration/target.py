@@ -14,7 +14,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from pydantic import GetJsonSchemaHandler
 
-from .values import TextValue, mistake
+from .diagnostics import TextValue, mistake
 
 Frame = Literal["icrs", "galactic", "horizontal"]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Any, ClassVar
 
-from .values import TextValue, mistake
+from .diagnostics import TextValue, mistake
 
 SECOND = 1_000_000_000
 """Nanoseconds in a second."""

@@ -21,8 +21,7 @@ import astropy.units as u
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
-from .diagnostics import nearest
-from .values import mistake
+from .diagnostics import mistake, nearest
 
 
 class Kind(NamedTuple):

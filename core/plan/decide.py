@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ..configuration.diagnostics import nearest
-from ..configuration.header import Limits
+from ..configuration.loaded import Limits
 from ..errors import ZondaError
 from .bounds import Choice, Effect
 

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from zonda.core.configuration.diagnostics import refusal
 from zonda.core.configuration.parameters import Parameters, quantity
 from zonda.core.configuration.units import Angle, Fraction, Metres, MetresPerSecond
-from zonda.core.configuration.values import refusal
 from zonda.core.errors import ZondaError
 from zonda.core.operator import Operator
 from zonda.core.types import Floats

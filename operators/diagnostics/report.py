@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from zonda.core.configuration.docstrings import described, own_doc
+from zonda.core.configuration.describe import described, own_doc
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.figures import Figures

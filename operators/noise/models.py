@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from zonda.core.configuration.diagnostics import refusal
 from zonda.core.configuration.parameters import Parameters
 from zonda.core.configuration.units import KelvinRootSecond
-from zonda.core.configuration.values import refusal
 from zonda.core.errors import ZondaError
 from zonda.core.registry import noise_models
 from zonda.core.types import Floats

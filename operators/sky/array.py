@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import core_schema
 
-from zonda.core.configuration.values import mistake
+from zonda.core.configuration.diagnostics import mistake
 from zonda.core.errors import InputError
 from zonda.core.maps.header import exact_header
 from zonda.core.maps.map_reading import is_healpix

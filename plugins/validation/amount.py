@@ -7,8 +7,8 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+from zonda.core.configuration.diagnostics import TextValue, mistake
 from zonda.core.configuration.units import read_unit
-from zonda.core.configuration.values import TextValue, mistake
 
 FURTHER = ("", "sigma", "samples")
 """Units of counts, which astropy does not know."""

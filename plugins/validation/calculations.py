@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError, validate_call
 
+from zonda.core.configuration.diagnostics import TextValue, mistake
 from zonda.core.configuration.units import (
     Angle,
     AngularSpeed,
@@ -24,7 +25,6 @@ from zonda.core.configuration.units import (
     Metres,
     Seconds,
 )
-from zonda.core.configuration.values import TextValue, mistake
 from zonda.core.types import Floats
 
 from .amount import Amount

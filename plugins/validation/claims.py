@@ -13,8 +13,8 @@ import zonda.pipelines
 from zonda.core.configuration import yaml_places
 from zonda.core.configuration.diagnostics import ConfigurationError, Diagnostic
 from zonda.core.configuration.locate import read as read_text
-from zonda.core.configuration.mistakes import Mistakes
 from zonda.core.configuration.parameters import Parameters
+from zonda.core.configuration.steps import Mistakes
 from zonda.core.configuration.yaml_places import Source, Span
 
 from .amount import Amount

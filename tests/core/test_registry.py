@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from zonda.core import discovery, registry
+from zonda.core import registry
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.discovery import API_VERSION
@@ -278,13 +278,3 @@ def test_reading_the_registry_imports_nothing_heavy() -> None:
         f" {heavy} if m in sys.modules])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
-
-
-def test_others_may_declare(plugin: Plugin, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = plugin("zonda-hills", "1.2", {"zonda.sites": {"hill": "zt_hills:hill"}}, zt_hills=SITE)
-    monkeypatch.setattr(sys, "path", [str(folder)])
-    assert not discovery.others_may_declare("zonda.hooks")
-    plugin("zonda-more", "1", {"zonda.hooks": {"more": "zt_more"}})
-    assert discovery.others_may_declare("zonda.hooks")
-    monkeypatch.setenv("ZONDA_PLUGINS", "")
-    assert not discovery.others_may_declare("zonda.hooks")

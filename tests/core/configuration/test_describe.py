@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 import zonda
-from zonda.core.configuration.describe import choices, kind
-from zonda.core.configuration.docstrings import own_doc
+from zonda.core.configuration.describe import choices, kind, own_doc
 from zonda.core.registry import operators
 
 

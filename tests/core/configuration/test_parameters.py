@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic._internal._docs_extraction import extract_docstrings_from_cls
 
 from zonda.core import registry
-from zonda.core.configuration.docstrings import _of_class, described
+from zonda.core.configuration.describe import _of_class, described
 from zonda.core.configuration.parameters import Parameters
 
 

@@ -13,7 +13,7 @@ import pytest
 import zonda
 from zonda.core import cli
 from zonda.core.configuration.diagnostics import ConfigurationError
-from zonda.core.configuration.header import Limits
+from zonda.core.configuration.loaded import Limits
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.plan import decide as deciding
