@@ -38,9 +38,10 @@ from .test_campaign_kills import (
 
 __all__ = ["nursery", "place", "whole_run"]
 
-pytestmark = pytest.mark.skipif(
-    not Path("/proc/self/task").exists(), reason="finds processes in /proc"
-)
+pytestmark = [
+    pytest.mark.nightly,
+    pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds processes in /proc"),
+]
 
 
 def wait_for(condition: Callable[[], bool], alive: Callable[[], bool]) -> None:

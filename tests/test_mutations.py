@@ -36,6 +36,7 @@ def test_there_are_ten_at_least() -> None:
     assert len({mutation.breaks for mutation in MUTATIONS}) >= 10
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.breaks.__name__)
 def test_a_check_fails_without_the_safeguard(
     mutation: Mutation, monkeypatch: pytest.MonkeyPatch

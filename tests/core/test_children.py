@@ -119,10 +119,12 @@ def test_a_run_with_its_pictures(hostile: Path) -> None:
     )
 
 
+@pytest.mark.nightly
 def test_a_plan(hostile: Path) -> None:
     unsprung(hostile, zonda(hostile, "plan", "mustang2_cluster", *SHORT[:4]))
 
 
+@pytest.mark.nightly
 def test_a_study_of_accuracy(hostile: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = hostile.parent / "a.yaml"
     path.write_text(CAMPAIGN.replace("campaign: {nights: 2}\n", ""))
@@ -133,6 +135,7 @@ def test_a_study_of_accuracy(hostile: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert not (hostile.parent / "sprung").exists()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("engine", ["serial", "processes"])
 def test_a_campaign(hostile: Path, engine: str) -> None:
     (hostile.parent / "c.yaml").write_text(CAMPAIGN)

@@ -168,6 +168,7 @@ def test_the_lock_is_held_while_a_kernel_is_compiled(
             lock.on_start(None)
 
 
+@pytest.mark.nightly
 def test_compile_leaves_nothing_to_compile(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -94,6 +94,7 @@ def test_mistakes_write_nothing(here, capsys, arguments, said):
     assert list(here.iterdir()) == []
 
 
+@pytest.mark.nightly
 def test_the_tests_of_a_new_plugin_pass_at_once(here, capsys):
     """Installed from its folder into another one, so that other tests do not see it; without
     network.
