@@ -17,7 +17,7 @@ from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.run import block_maker
 from zonda.operators.atmosphere.turbulence import covariance, lattice
 from zonda.operators.atmosphere.weather import bands
-from zonda.operators.filters import brick_wall, mode_search
+from zonda.operators.filters import brick_wall, common_mode
 from zonda.operators.maps import bin_map
 from zonda.operators.maps.sums import DATA
 from zonda.operators.noise import pink, white
@@ -102,22 +102,22 @@ def gaps_that_ring(patch: Patch) -> None:
 
 
 def modes_beyond_the_rank(patch: Patch) -> None:
-    patch.setattr(mode_search.ModeSearch, "_choose", lambda self, found, gram: self.step.modes)
+    patch.setattr(common_mode.ModeSearch, "_choose", lambda self, found, gram: self.step.modes)
 
 
 def dead_detectors_that_take_part(patch: Patch) -> None:
-    begin = mode_search.Gram.__init__
+    begin = common_mode.Gram.__init__
 
     def all_of_them(self: Any, *arguments: Any, **others: Any) -> None:
         begin(self, *arguments, **others)
         self.constant[:] = False
         self.not_finite[:] = False
 
-    patch.setattr(mode_search.Gram, "__init__", all_of_them)
+    patch.setattr(common_mode.Gram, "__init__", all_of_them)
 
 
 def float32_whatever_the_ratio(patch: Patch) -> None:
-    patch.setattr(mode_search, "_check_precision", lambda *arguments: None)
+    patch.setattr(common_mode, "_check_precision", lambda *arguments: None)
 
 
 def mean_emission_in_float32(patch: Patch) -> None:

@@ -27,18 +27,36 @@ terms of order sigma_2 / sigma_1.
 from __future__ import annotations
 
 import copy
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
-from zonda.core.data import Block, Data, Stream
+from zonda.core.data import Block, Observation, Stream
+from zonda.core.errors import PipelineError
 from zonda.core.flags import DEAD
 from zonda.core.kernels import kernel
+from zonda.core.signal import MAIN
+from zonda.core.types import Floats
 
-from .mode_search import CommonModeParameters, Modes, ModeSearch
+from . import focal_plane_mean
+from .gram import Gram, Usable
+from .lanczos import NOTHING, Ritz, lanczos
+from .rows import LinearFilter
+from .source_mask import MASKED, Inside, SourceMask, counts
+
+ROUNDING = 2.0**-24 / np.sqrt(3.0)
+"""rms of float32's relative rounding error."""
+
+KEPT = "modes kept because the data do not determine them (rank)"
+UNDETERMINED = "degenerate modes (the next singular value is nearly as large)"
+"""Counts of the log. Degenerate: the next singular value is more than `gap` times the mode's own.
+"""
 
 
-class CommonModeFilter(CommonModeParameters):
+class CommonModeFilter(LinearFilter):
     """Filter that removes the leading singular modes of each scan, equation (1). Flagged samples
     and detectors are excluded.
 
@@ -47,11 +65,52 @@ class CommonModeFilter(CommonModeParameters):
     takes part.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
     knows_means: ClassVar[bool] = True
-    linear: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
+
+    modes: int = Field(1, ge=1, le=100)
+    """How many modes to remove."""
+    group: Literal["band", "wafer", "all"] = "band"
+    """Whose modes are found together: those of all detectors of a band, of each wafer of it, or of
+    all bands of the camera.
+    """
+    method: Literal["svd", "mean"] = "svd"
+    """Singular modes, or the mean of all detectors at each instant (one mode), which needs little
+    memory.
+    """
+    residual: float = Field(1e-6, gt=1e-12, lt=1e-1)
+    """Largest residual of a removed mode, equation (2)."""
+    gap: float = Field(0.9, gt=0, lt=1)
+    """A mode is determined by the data while the next singular value is at most this times its own.
+    """
+    scale: Literal["none", "rms"] = "none"
+    """`rms`: the modes are those of streams of unit rms, equation (4), as in the mapper of maria
+    1.0.0.
+    """
+    mask: SourceMask | None = None
+    """Source whose samples are not used to find the modes, which are subtracted there too. Where it
+    covers all detectors at an instant, nothing is subtracted: choose it smaller than the field of
+    view."""
+    on_undetermined: Literal["mean", "skip", "remove"] = "mean"
+    """What to do with a mode that is not determined: remove the detectors' mean (in place of the
+    first), skip or remove it.
+    """
+
+    @model_validator(mode="after")
+    def _one_mean(self) -> CommonModeFilter:
+        if self.method == "mean" and self.modes != 1:
+            raise ValueError(
+                "method: mean removes one mode; leave modes at 1 or choose method: svd"
+            )
+        of_svd = {"residual", "gap", "on_undetermined"} & self.model_fields_set
+        if self.method == "mean" and of_svd:
+            raise ValueError(
+                f"{sorted(of_svd)[0]} belongs to method: svd; the detectors' mean is exact and"
+                " always determined"
+            )
+        if self.method == "mean" and self.scale == "rms":
+            raise ValueError("scale: rms belongs to method: svd; the detectors' mean has no scale")
+        return self
 
     @property
     def all_bands(self) -> bool:
@@ -63,12 +122,8 @@ class CommonModeFilter(CommonModeParameters):
         scale = None if measured.scale is None else measured.scale[rows]
         return Modes(measured.detectors[:, rows], measured.times, scale)
 
-    def check(self, data: Data) -> list[str]:
-        """Refuse a mask whose file cannot be used."""
-        for observation in data.observations[:1] if self.mask is not None else ():
-            if self.mask is not None:
-                self.mask.of(observation)
-        return []
+    def _inside(self, observation: Observation) -> Inside | None:
+        return self.mask.of(observation) if self.mask else None
 
     def measure(self, stream: Stream, model: Modes | None = None) -> Modes:
         """Find the modes; given those of the complete signal (``model``), their times in this
@@ -91,7 +146,7 @@ class CommonModeFilter(CommonModeParameters):
 
     def _modes(self, stream: Stream, model: Modes | None) -> Modes:
         """The modes of all detectors that are not flagged; see `measure`."""
-        search = ModeSearch(self, stream, self.mask.of(stream.observation) if self.mask else None)
+        search = ModeSearch(self, stream, self._inside(stream.observation))
         return search.found() if model is None else search.of(model)
 
     def _wafer_by_wafer(self, stream: Stream, model: Modes | None) -> Modes:
@@ -111,6 +166,185 @@ class CommonModeFilter(CommonModeParameters):
             for found in zip(*((p.detectors, p.times) for p in parts), strict=True)
         )
         return Modes(detectors, times, None, tuple(parts))
+
+
+@dataclass
+class Modes:
+    """Modes to remove: u (k, n_det), unit vectors, and v (k, n_samp), K_RJ; with a ``scale``
+    (n_det,), K_RJ, R u and v / K_RJ.
+    """
+
+    detectors: Floats
+    times: Floats
+    scale: Floats | None = None
+    parts: tuple[Modes, ...] = ()
+    """Those of each wafer, where modes are found wafer by wafer."""
+
+
+@dataclass(frozen=True)
+class ModeSearch:
+    """The modes of one stream.
+
+    Attributes
+    ----------
+    step
+        Parameters of the filter.
+    inside
+        Samples in the source mask, which are not used; None: no mask.
+    """
+
+    step: CommonModeFilter
+    stream: Stream
+    inside: Inside | None
+
+    def found(self) -> Modes:
+        """The modes of all detectors that are not flagged; the log says what they are.
+
+        Raises PipelineError if float32 cannot carry the mean emission, or the modes.
+        """
+        step, stream = self.step, self.stream
+        place = f"{step.label}, {stream.observation.name}"
+        if stream.means.get("signal") is not None and stream.dtype != np.float64:
+            raise PipelineError(
+                "the mean emission, tens of kelvin, is still part of the signal and float32 cannot"
+                " carry it",
+                place=place,
+                cure="put a HighpassFilter before, or set precision: float64",
+            )
+        detectors, found = self._mean_mode() if step.method == "mean" else self._singular_modes()
+        self._tell(detectors, found)
+        _check_precision(found, detectors, stream, place)
+        scale = np.ones(detectors.use.size) if detectors.scale is None else detectors.scale
+        modes = found.detectors[: found.count] * scale
+        return Modes(modes, found.times[: found.count], detectors.scale)
+
+    def of(self, model: Modes) -> Modes:
+        """Equation (3) of `common_mode`: v_i = B^T u_i, or B^T R^-1 u_i, of given modes."""
+        stream, inside = self.stream, self.inside
+        modes = model.detectors if model.scale is None else model.detectors / model.scale
+        use, good = np.asarray(modes.any(axis=0)), stream.observation.good_samples
+        if self.step.method == "mean":
+            total = focal_plane_mean.read(stream, use, good, inside).total
+            times = [total * u.max(initial=0.0) for u in modes]
+        else:
+            with ThreadPoolExecutor(max(1, stream.threads)) as pool:
+                gram = Gram(stream, pool, use, inside=inside)
+                gram.scale = model.scale
+                times = [gram.apply(u)[1] for u in modes]
+        array = np.array(times).reshape(len(modes), stream.shape[1])
+        return Modes(model.detectors, array, model.scale)
+
+    def _singular_modes(self) -> tuple[Usable, Ritz]:
+        """The leading singular modes, with the number of those to remove."""
+        step, stream, inside = self.step, self.stream, self.inside
+        with ThreadPoolExecutor(max(1, stream.threads)) as pool:
+            gram = Gram(stream, pool, None, _sees_nothing(stream), inside, step.scale == "rms")
+            gap = None if step.on_undetermined == "remove" else step.gap
+            found = lanczos(gram, step.modes, step.residual, gap)
+            found.count = self._choose(found, gram)
+        return gram, found
+
+    def _mean_mode(self) -> tuple[Usable, Ritz]:
+        """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
+        stream, inside, observation = self.stream, self.inside, self.stream.observation
+        good = observation.good_samples
+        detectors = Usable(observation.good_detectors, int(good.sum()))
+        reading = focal_plane_mean.read(stream, detectors.use, good, inside)
+        if detectors.judge(reading.sums, reading.squares, _sees_nothing(stream)):
+            reading = focal_plane_mean.read(stream, detectors.use, good, inside)
+        if detectors.n_good == 0:
+            found = Ritz.nothing(detectors.use.size, stream.shape[1])
+        else:
+            root = np.sqrt(detectors.n_good)
+            v = reading.total / root
+            rank = 1 + (reading.least_left > NOTHING * detectors.energy)
+            u, values = detectors.use / root, np.array([v @ v])
+            found = Ritz(values, u[None], v[None], np.zeros(1), rank, 1, "detector mean")
+        found.count = min(1, max(0, found.rank - 1))
+        observation.tally.count(self.step.label, KEPT, 1 - found.count)
+        return detectors, found
+
+    def _choose(self, found: Ritz, gram: Gram) -> int:
+        """Number of modes to remove; may replace the modes by the detectors' mean."""
+        step, tally = self.step, self.stream.observation.tally
+        wanted = min(step.modes, max(0, found.rank - 1))
+        size = np.append(np.sqrt(np.maximum(found.values, 0.0)), 0.0)
+        determined = max(
+            (i + 1 for i in range(wanted) if size[i + 1] <= step.gap * size[i]), default=0
+        )
+        tally.count(step.label, KEPT, step.modes - wanted)
+        tally.count(step.label, UNDETERMINED, wanted - determined)
+        if determined == wanted or step.on_undetermined == "remove":
+            return wanted
+        if step.on_undetermined == "mean" and determined == 0:
+            u = gram.use / np.sqrt(gram.n_good)
+            found.detectors, found.times = u[None], gram.apply(u)[1][None]
+            found.residuals = np.zeros(1)
+            found.what = "detector mean, because the first mode is degenerate"
+            return 1
+        return determined
+
+    def _tell(self, detectors: Usable, found: Ritz) -> None:
+        """State what was found; flag the dead detectors, which the complete signal shows."""
+        stream, inside = self.stream, self.inside
+        observation, tally, who = stream.observation, stream.observation.tally, self.step.label
+        if inside is not None:
+            masked, covered = counts(inside, observation.n_detectors, observation.n_samples)
+            tally.count(who, MASKED, masked, observation.n_detectors * observation.n_samples)
+            what = "instants with all detectors in the source mask: no mode removed"
+            tally.count(who, what, covered, observation.n_samples)
+        if stream.signal == MAIN:
+            useless = {"not finite": detectors.not_finite, "constant": detectors.constant}
+            for name, dead in useless.items():
+                tally.count(who, f"detectors flagged: signal {name}", int(dead.sum()))
+                observation.detector_flags[dead] |= DEAD
+        sizes = np.sqrt(
+            np.maximum(found.values[: self.step.modes + 1], 0.0)
+            / max(1, detectors.n_good * detectors.n_used)
+        )
+        values = ", ".join(f"{s:.4g}" for s in sizes)
+        worst = found.residuals[: found.count].max(initial=0.0)
+        unit = "K" if detectors.scale is None else "of the detectors' rms"
+        tally.state(
+            who,
+            f"{observation.name}: singular values / sqrt(detectors x samples)",
+            f"{values or 'none'} {unit}",
+        )
+        tally.state(
+            who,
+            f"{observation.name}: residual of the modes",
+            f"{worst:.1e} after {found.steps} steps",
+        )
+        tally.state(who, f"{observation.name}: modes removed", f"{found.count} ({found.what})")
+
+
+def _check_precision(found: Ritz, detectors: Usable, stream: Stream, place: str) -> None:
+    if stream.dtype != np.float32 or not found.count or detectors.energy <= 0:
+        return
+    left = (
+        max(detectors.energy - float(found.energies[: found.count].sum()), 0.0) / detectors.energy
+    )
+    if 0.01 * np.sqrt(left) < ROUNDING:
+        unit = 1.0 if detectors.scale is None else float(np.median(detectors.scale[detectors.use]))
+        rms, ratio = (
+            unit * np.sqrt(detectors.energy / (detectors.n_good * detectors.n_used)),
+            1 / max(np.sqrt(left), 1e-30),
+        )
+        raise PipelineError(
+            f"the common mode, {rms:.3g} K rms, is {ratio:.1e} times what is left, more than"
+            " float32 can carry",
+            place=place,
+            cure="set precision: float64",
+        )
+
+
+def _sees_nothing(stream: Stream) -> bool:
+    """True if a detector in order may have a constant signal: that of the sky alone, or one that is
+    not the complete signal, which shows dead detectors."""
+    of_the_sky = bool(stream.components) and all(
+        c.enters == "above the atmosphere" for c in stream.components
+    )
+    return stream.signal != MAIN or of_the_sky
 
 
 @kernel(fastmath={"contract", "nsz"})

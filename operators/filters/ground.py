@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import ClassVar, Literal
 
 import numba as nb
 import numpy as np
@@ -35,29 +34,22 @@ from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
-from zonda.core.data import Block, Observation
 from zonda.core.flags import has_a_signal
 from zonda.core.kernels import kernel
-from zonda.core.operator import Operator
+from zonda.core.observation import Observation
 from zonda.core.types import Floats
 
 from .baseline import Basis, Fit, dot, keep_used, lessen, polynomials, runs, solved
-from .rows import AT_ONCE, Mask, Rows, by_rows, read, write
+from .rows import AT_ONCE, LinearFilter, Mask, Removal, Rows, read, write
 
 
-class GroundFilter(Operator):
+class GroundFilter(LinearFilter):
     """Remove a template of each detector in bins of the boresight's azimuth, fitted together with a
     trend in time.
 
     What the ground adds repeats with the azimuth at constant elevation. Flagged samples are not
     used for the fit; turnarounds are.
     """
-
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    knows_means: ClassVar[bool] = True
-    linear: ClassVar[bool] = True
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     bin: Angle = quantity("0.5 deg", gt=0, le=1)
     """Width of the bins of the mount's azimuth."""
@@ -69,7 +61,7 @@ class GroundFilter(Operator):
     """Order of the polynomial in time that is fitted and removed with the template (0: none besides
     the mean, which is the template's)."""
 
-    def prepare(self, observation: Observation) -> Template:
+    def prepare(self, observation: Observation) -> tuple[Removal, None]:
         """The template's bins and the trend of this observation. Warns where all samples are in one
         bin.
         """
@@ -85,14 +77,8 @@ class GroundFilter(Operator):
                 f"{self.label}: {text}: the template is a mean; choose a smaller bin", stacklevel=2
             )
         observation.tally.state(self.label, f"{observation.name}: bins of the template", f"{size}")
-        use = has_a_signal(observation.flags)
-        return Template.of(
-            number, polynomials(observation.n_samples, self.trend).functions[1:], use
-        )
-
-    def exec(self, block: Block, state: Template) -> None:
-        """Subtract the template and the trend from each row."""
-        by_rows(self.label, block, lambda rows, _: state.remove(rows))
+        trend = polynomials(observation.n_samples, self.trend).functions[1:]
+        return Template.of(number, trend, has_a_signal(observation.flags)), None
 
 
 def _bins(observation: Observation, width: float, split: bool) -> NDArray[np.int64]:
@@ -151,7 +137,7 @@ class Template:
         trend = Fit.of(Basis.of(within, np.zeros(len(bins), np.int64), len(raw)), use)
         return cls(bins, raw, use, runs(bins), share, trend)
 
-    def remove(self, rows: Rows) -> int:
+    def remove(self, rows: Rows, masked: Mask | None = None) -> int:
         """Equation (3) on rows in place. Returns how many samples were not finite; they stay as
         they were.
         """

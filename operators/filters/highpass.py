@@ -1,11 +1,18 @@
 """High-pass filters of whole scans: a brick wall without phase (`brick_wall`), or the causal Bessel
-filter of `bessel`.
+filter of the paper's authors.
+
+The mapper of maria 1.0.0 (`maria/utils/signal.py`) filters with ``scipy.signal.bessel(4, 2 f / f_s,
+"high")`` in second-order sections and ``scipy.signal.sosfilt``: four poles, normalized so that the
+phase at f is half-way (``norm="phase"``), made digital by the bilinear transform. The filter is
+causal, so that a source is followed by a trough; its initial state is zero, so that a scan that
+does not begin with zero has a transient, which decays within about 1 / f.
 """
 
 from __future__ import annotations
 
-from functools import partial
-from typing import ClassVar, Literal, NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,28 +23,34 @@ from zonda.core.configuration.units import Hertz, Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.flags import TRIMMED, has_a_signal
-from zonda.core.operator import Operator
 from zonda.core.types import AnyFloats, Floats
 
 from .baseline import Fit, polynomials
-from .bessel import BesselPlan, sections
 from .brick_wall import HighpassPlan, first_kept, plan_highpass
-from .rows import SPOILT, in_double
-from .source_mask import Inside, SourceMask, check_mask, check_masks, filter_outside
+from .rows import SPOILT, LinearFilter, Mask, Rows
+from .source_mask import Inside, SourceMask, filter_outside
 
 ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a line are removed"
 
-
-class State(NamedTuple):
-    """Filter, flagged samples and source mask for `HighpassFilter.exec`."""
-
-    plan: HighpassPlan | BesselPlan
-    bad: NDArray[np.intp]
-    inside: Inside | None
+POLES = 4
+"""Of the Bessel filter, as in the authors' code."""
 
 
-class HighpassParameters(Operator):
-    """Parameters of `HighpassFilter`."""
+class HighpassFilter(LinearFilter):
+    """High-pass filter of each detector's scan: a brick wall without phase, equations (1) and (2)
+    of `brick_wall`, or the causal Bessel filter of the paper's authors.
+
+    The brick wall drops the modelled mean emission that accompanies the signal analytically, before
+    anything else; with a `mask`, it acts on all of the signal. A scan that is shorter than 1 /
+    `frequency` loses its mean and a line alone; the log says so. A frequency so near the Nyquist
+    frequency that nothing of a scan is left is refused.
+
+    The Bessel filter acts on all of the signal, and begins in the state zero: what does not begin
+    with zero has a transient of about 1 / `frequency`, which `degree`, `Detrend` and `Taper` lessen
+    and `trim` flags.
+    """
+
+    knows_means: ClassVar[bool] = True
 
     frequency: Hertz = quantity("0.08 Hz", gt=0)
     """Cutoff: lower frequencies are removed (`brick_wall`), or attenuated as the fourth power of
@@ -61,7 +74,7 @@ class HighpassParameters(Operator):
     """
 
     @model_validator(mode="after")
-    def _has_a_degree(self) -> HighpassParameters:
+    def _one_response(self) -> HighpassFilter:
         if self.degree is None and self.response == "brick_wall":
             raise ValueError(
                 "a brick wall needs a degree of 0 or more; degree: null belongs to response: bessel"
@@ -72,139 +85,77 @@ class HighpassParameters(Operator):
             )
         return self
 
-
-class HighpassFilter(HighpassParameters):
-    """High-pass filter of each detector's scan: a brick wall without phase, equations (1) and (2)
-    of `brick_wall`, or the causal Bessel filter of the paper's authors (`bessel`).
-
-    The brick wall drops the modelled mean emission that accompanies the signal analytically, before
-    anything else; with a `mask`, it acts on all of the signal. A scan that is shorter than 1 /
-    `frequency` loses its mean and a line alone; the log says so. A frequency so near the Nyquist
-    frequency that nothing of a scan is left is refused.
-
-    The Bessel filter acts on all of the signal, and begins in the state zero: what does not begin
-    with zero has a transient of about 1 / `frequency`, which `degree`, `Detrend` and `Taper` lessen
-    and `trim` flags.
-    """
-
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    knows_means: ClassVar[bool] = True
-    linear: ClassVar[bool] = True
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
-
     def check(self, data: Data) -> list[str]:
         """Scans that are shorter than one cycle of the cut. Raises PipelineError where a run would
         find nothing left of one.
         """
-        for observation in data.observations:
-            place = f"{self.label}, {observation.name}"
-            self._trimmed(*observation.sampling, place)
-            self._check_cut(*observation.sampling, place)
-        check_masks(self.mask, data, self.label)
-        short, every = (
-            sum(o.duration * self.frequency < 1 for o in data.observations),
-            len(data.observations),
-        )
+        super().check(data)
+        scans = data.observations
+        for scan in scans:
+            self._check_length(scan)
+        short = sum(scan.duration * self.frequency < 1 for scan in scans)
         text = (
-            f"{short} of {every} scans are shorter than 1/frequency, {1 / self.frequency:g} s:"
+            f"{short} of {len(scans)} scans are shorter than 1/frequency, {1 / self.frequency:g} s:"
             f" {self._short()}"
         )
         return [text] if short else []
 
-    def prepare(self, observation: Observation) -> State:
+    def prepare(self, observation: Observation) -> tuple[Bridged, Inside | None]:
         """Tables for this observation's length, flagged samples; flags the trimmed ends."""
-        fine = has_a_signal(observation.flags)
-        self._trim(observation)
-        observation.tally.count(
-            self.label, "flagged samples bridged before filtering", int((~fine).sum()), fine.size
-        )
-        inside = self.mask.of(observation) if self.mask else None
-        if inside is not None:
-            check_mask(inside, observation, f"{self.label}, {observation.name}")
+        n, rate, tally = observation.n_samples, observation.sample_rate, observation.tally
+        fine, trimmed = has_a_signal(observation.flags), self._check_length(observation)
+        observation.flags[:trimmed] |= TRIMMED
+        observation.flags[n - trimmed :] |= TRIMMED
+        tally.count(self.label, "samples trimmed", 2 * trimmed, n)
+        bad = np.flatnonzero(~fine)
+        tally.count(self.label, "flagged samples bridged before filtering", bad.size, n)
+        inside = self._inside(observation)
         if self.response == "bessel":
-            return State(self._bessel(observation, fine), np.flatnonzero(~fine), inside)
+            trend = None if self.degree is None else Fit.of(polynomials(n, self.degree), fine)
+            return Bridged(causal(self.frequency, rate), bad, trend), inside
         if observation.smooth.get("atmosphere") is not None and inside is None:
-            observation.tally.state(self.label, "smooth mean emission", "removed analytically")
-        return State(self._planned(observation), np.flatnonzero(~fine), inside)
+            tally.state(self.label, "smooth mean emission", "removed analytically")
+        degree = self.degree or 0
+        plan = plan_highpass(n, self.frequency / rate, degree, self.oversampling)
+        if plan.cut == 0:
+            left = f"nothing is left of {n} sample{'s' if n > 1 else ''}"
+            text = self._short() if n > 1 + min(degree, 1) else left
+            tally.state(self.label, f"{observation.name} is shorter than 1/frequency", text)
+        return Bridged(lambda row: plan.apply(row[None]), bad, plan=plan), inside
 
-    def exec(self, block: Block, state: State) -> None:
+    def exec(self, block: Block, state: tuple[Bridged, Inside | None]) -> None:
         """Filter the block's rows in place."""
-        plan, bad, inside = state
-        if inside is None and isinstance(plan, HighpassPlan):
+        bridged, inside = state
+        if inside is not None or bridged.plan is None:
+            super().exec(block, state)
+        else:
             block.means.pop("signal", None)
-            block.observation.tally.count(
-                self.label, SPOILT, plan.apply(block.detdata["signal"], bad)
-            )
-            return
-        act = plan.apply if isinstance(plan, BesselPlan) else partial(_brick_wall, plan)
-        in_double(self.label, block, lambda rows, masked: act(rows, bad, masked), inside)
+            spoilt = bridged.plan.apply(block.detdata["signal"], bridged.bad)
+            block.observation.tally.count(self.label, SPOILT, spoilt)
 
-    def _check_cut(self, n: int, rate: float, place: str) -> None:
-        """Raise PipelineError for a cut at which nothing is left of a scan of ``n`` samples."""
-        text = (
-            f"a cut at {self.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz"
-            " contain no higher frequency"
-        )
-        if self.response == "bessel":
-            if self.frequency >= rate / 2:
-                raise PipelineError(
-                    text, place=place, cure=f"choose a frequency below {rate / 2:.6g} Hz"
-                )
-        elif first_kept(n, self.frequency / rate) >= n:
-            cure = f"choose a frequency below {(n - 1) / n * rate / 2:.6g} Hz, or lengthen the scan"
-            raise PipelineError(text, place=place, cure=cure)
-
-    def _bessel(self, observation: Observation, fine: NDArray[np.bool_]) -> BesselPlan:
-        """The causal filter of a scan.
-
-        Raises PipelineError for a cutoff at the Nyquist frequency or above.
+    def _check_length(self, observation: Observation) -> int:
+        """Samples at either end that are trimmed. Raises PipelineError where nothing is left of a
+        scan.
         """
-        rate = observation.sample_rate
-        self._check_cut(observation.n_samples, rate, f"{self.label}, {observation.name}")
-        trend = (
-            None
-            if self.degree is None
-            else Fit.of(polynomials(observation.n_samples, self.degree), fine)
-        )
-        return BesselPlan(sections(self.frequency, rate), trend)
-
-    def _trimmed(self, n: int, rate: float, place: str) -> int:
-        """Samples at either end that are trimmed of ``n``. Raises PipelineError where nothing is
-        left.
-        """
+        (n, rate), place = observation.sampling, f"{self.label}, {observation.name}"
         trimmed = min(round(self.trim * rate), n)
         if 2 * trimmed >= n and trimmed:
             text = (
                 f"trimming {self.trim:g} s at either end leaves nothing of a scan of {n / rate:g} s"
             )
             raise PipelineError(text, place=place, cure="shorten trim or lengthen the scan")
+        bessel = self.response == "bessel"
+        if self.frequency >= rate / 2 if bessel else first_kept(n, self.frequency / rate) >= n:
+            highest, more = rate / 2, ""
+            if not bessel:
+                highest, more = (n - 1) / n * rate / 2, ", or lengthen the scan"
+            raise PipelineError(
+                f"a cut at {self.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz"
+                " contain no higher frequency",
+                place=place,
+                cure=f"choose a frequency below {highest:.6g} Hz{more}",
+            )
         return trimmed
-
-    def _trim(self, observation: Observation) -> None:
-        """Flag the ends of a scan."""
-        n = observation.n_samples
-        trimmed = self._trimmed(n, observation.sample_rate, f"{self.label}, {observation.name}")
-        observation.flags[:trimmed] |= TRIMMED
-        observation.flags[n - trimmed :] |= TRIMMED
-        observation.tally.count(self.label, "samples trimmed", 2 * trimmed, n)
-
-    def _planned(self, observation: Observation) -> HighpassPlan:
-        """The plan for a scan's length; says, or refuses, where nothing or little is left."""
-        n, rate = observation.n_samples, observation.sample_rate
-        self._check_cut(n, rate, f"{self.label}, {observation.name}")
-        degree = self.degree or 0
-        plan = plan_highpass(n, self.frequency / rate, degree, self.oversampling)
-        if plan.cut == 0:
-            text = (
-                self._short()
-                if n > 1 + min(degree, 1)
-                else f"nothing is left of {n} sample{'s' if n > 1 else ''}"
-            )
-            observation.tally.state(
-                self.label, f"{observation.name} is shorter than 1/frequency", text
-            )
-        return plan
 
     def _short(self) -> str:
         """Statement about a scan that is shorter than one cycle of the cut."""
@@ -213,17 +164,57 @@ class HighpassFilter(HighpassParameters):
         return ONLY_A_LINE if self.degree else ONLY_THE_MEAN
 
 
-def _brick_wall(
-    plan: HighpassPlan, rows: Floats, bad: NDArray[np.intp], masked: NDArray[np.bool_] | None
-) -> int:
-    """Equation (1) of `source_mask` on rows (n_det, N) in place; returns how many samples were not
-    finite.
+@dataclass(frozen=True)
+class Bridged:
+    """A filter ``act`` of one row in place, behind the subtraction of a ``trend``.
+
+    Equation (1) of `source_mask`: the samples ``bad`` and those of a mask are bridged.
     """
 
-    def act(row: AnyFloats) -> None:
-        plan.apply(row[None])
+    act: Callable[[AnyFloats], object]
+    bad: NDArray[np.intp]
+    trend: Fit | None = None
+    plan: HighpassPlan | None = None
+    """The brick wall, which without a mask acts on rows of any precision."""
 
-    return sum(
-        filter_outside(row, bad, None if masked is None else masked[d], act)
-        for d, row in enumerate(rows)
-    )
+    def remove(self, rows: Rows, masked: Mask | None = None) -> int:
+        """Filter rows in float64; see `Removal`."""
+        double = rows.double(slice(None), rows.values.shape[1])
+        if self.trend is not None:
+            self.trend.remove(Rows.of(double), masked)
+        masks = [None] * len(double) if masked is None else masked
+        pairs = zip(double, masks, strict=True)
+        spoilt = sum(filter_outside(row, self.bad, mask, self.act) for row, mask in pairs)
+        rows.values[...] = double
+        return spoilt
+
+
+def sections(frequency: float, rate: float) -> Floats:
+    """(2, 6) second-order sections of the Bessel filter; ``frequency`` below half of the sample
+    ``rate``, Hz.
+    """
+    from scipy.signal import bessel
+
+    return np.asarray(bessel(POLES, 2 * frequency / rate, "high", output="sos"), np.float64)
+
+
+def causal(frequency: float, rate: float) -> Callable[[AnyFloats], None]:
+    """The Bessel filter of a row in place."""
+    from scipy.signal import sosfilt
+
+    sos = sections(frequency, rate)
+
+    def act(row: AnyFloats) -> None:
+        row[...] = sosfilt(sos, row)
+
+    return act
+
+
+def amplitude(frequency: Floats, cutoff: float, rate: float) -> Floats:
+    """|H| of the Bessel filter at frequencies (n,), Hz; beyond half of the sample ``rate`` that
+    there.
+    """
+    from scipy.signal import sosfreqz
+
+    at = np.minimum(frequency, rate / 2)
+    return np.abs(sosfreqz(sections(cutoff, rate), 2 * np.pi * at / rate)[1])

@@ -23,10 +23,9 @@ from zonda.core.plan.bounds import (
 )
 from zonda.core.plan.planning import Planning
 
-from .bessel import amplitude
 from .common_mode import CommonModeFilter
 from .gram import MOST_COPIED
-from .highpass import HighpassFilter
+from .highpass import HighpassFilter, amplitude
 from .rows import ROWS
 
 COARSE_KNOTS, LEAST_KNOTS = 8, 0.02
@@ -135,7 +134,7 @@ def low_part(context: Context, cut: float) -> float:
 class DetrendPlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = "zonda.operators.filters.detrend:Detrend"
+    of = "zonda.operators.filters.polynomial:Detrend"
 
     def memory(self, observation: Observation) -> int:
         """Bytes: the polynomials, and a row in float64; with a mask, its pointing, and where some
@@ -184,7 +183,7 @@ def _left_in(context: Context) -> dict[str, float]:
 class DesplinePlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = "zonda.operators.filters.despline:Despline"
+    of = "zonda.operators.filters.polynomial:Despline"
 
     def memory(self, observation: Observation) -> int:
         """The splines at each sample, and what they are made from; a row in float64."""

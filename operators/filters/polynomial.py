@@ -1,7 +1,7 @@
-"""Removes a polynomial from every interval of each detector's scan.
+"""Filters that subtract polynomials and splines from each detector's scan (`baseline`).
 
-In interval i, B_i the Legendre polynomials up to `order` over its samples and g the samples that
-are used,
+`PolynomialFilter` treats every interval by itself. In interval i, B_i the Legendre polynomials up
+to `order` over its samples and g the samples that are used,
 
     y = x - B_i^T (B_ig B_ig^T)^-1 B_ig x_g                                                      (1)
 
@@ -14,24 +14,27 @@ a constant, so that what is removed does not jump there; it is flagged, and no m
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from zonda.core.data import Block, Data, Observation
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Seconds
+from zonda.core.data import Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.flags import TRIMMED, has_a_signal
 from zonda.core.intervals import ranges
 from zonda.core.numerics.smooth import product
-from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .baseline import Basis, Fit, polynomials
-from .rows import Rows, by_rows
-from .source_mask import Inside, SourceMask, check_mask, check_masks
+from .baseline import Basis, Fit, polynomials, splines
+from .rows import LinearFilter, Removal, Rows
+from .source_mask import Inside, SourceMask
+
+MOST_KNOTS = 2000
+"""Knots of a scan: the normal equations are solved whole."""
 
 Part = Literal[
     "whole",
@@ -45,19 +48,64 @@ Part = Literal[
 """The whole scan, or one of TOAST's names of intervals (`core.intervals`)."""
 
 
-class PolynomialFilter(Operator):
+class Detrend(LinearFilter):
+    """Remove the polynomial that fits each detector's scan best, the mean of the atmosphere
+    included: equation (1) of `baseline`.
+
+    Order 1 is what the mapper of maria 1.0.0 does first (``scipy.signal.detrend``). Flagged samples
+    are not used.
+    """
+
+    order: int = Field(1, ge=0, le=20)
+    """Order of the polynomial (0: the mean, 1: a line)."""
+    mask: SourceMask | None = None
+    """Source whose samples are not used for the fit; it is subtracted there too."""
+
+    def prepare(self, observation: Observation) -> tuple[Removal, Inside | None]:
+        """The fit to this observation's good samples."""
+        basis = polynomials(observation.n_samples, self.order)
+        return Fit.of(basis, has_a_signal(observation.flags)), self._inside(observation)
+
+
+class Despline(LinearFilter):
+    """Remove the cubic spline that fits each detector's scan best: equation (1) of `baseline` with
+    B-splines.
+
+    The knots are those of the mapper of maria 1.0.0: equally spaced, and centred on the scan. (Its
+    own spacing is always 60 s: it gives `get_bspline_basis` the spacing under a name that this
+    ignores.) Flagged samples are not used.
+    """
+
+    knots: Seconds = quantity("60 s", gt=0)
+    """Time between two knots."""
+
+    def _inside(self, observation: Observation) -> None:
+        """No mask. Raises PipelineError for a scan of more than `MOST_KNOTS` knots."""
+        if observation.duration > MOST_KNOTS * self.knots:
+            raise PipelineError(
+                f"knots every {self.knots:g} s are more than {MOST_KNOTS} in a scan of"
+                f" {observation.duration:g} s",
+                place=f"{self.label}, {observation.name}",
+                cure="choose longer knots, or a HighpassFilter",
+            )
+
+    def prepare(self, observation: Observation) -> tuple[Removal, Inside | None]:
+        """The fit to this observation's good samples."""
+        self._inside(observation)
+        basis = splines(observation.n_samples, self.knots * observation.sample_rate)
+        observation.tally.state(
+            self.label, f"{observation.name}: functions fitted to each detector", f"{basis.size}"
+        )
+        return Fit.of(basis, has_a_signal(observation.flags)), None
+
+
+class PolynomialFilter(LinearFilter):
     """Remove the polynomial that fits each interval of each detector's scan best (least squares).
 
     Flagged samples are not used for the fit; turnarounds are, where the interval contains them.
     Where an interval has too few samples for all orders, the polynomials that they determine are
     removed.
     """
-
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    knows_means: ClassVar[bool] = True
-    linear: ClassVar[bool] = True
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     order: int = Field(3, ge=0, le=20)
     """Order of the polynomials (0: the mean, 1: a line)."""
@@ -68,18 +116,16 @@ class PolynomialFilter(Operator):
     """Source whose samples are not used for the fit; it is subtracted there too."""
 
     def check(self, data: Data) -> list[str]:
-        """Refuse intervals that a scan does not have."""
-        for observation in data.observations if self.interval != "whole" else ():
+        """Refuse intervals that a scan does not have, and a mask that cannot be used."""
+        for observation in data.observations:
             if not observation.intervals.get(self.interval):
                 self._parts(observation)
-        return check_masks(self.mask, data, self.label)
+        return super().check(data)
 
-    def prepare(self, observation: Observation) -> tuple[Pieces, Inside | None]:
+    def prepare(self, observation: Observation) -> tuple[Removal, Inside | None]:
         """The fits to this observation's good samples; flags what is in no interval."""
-        n = observation.n_samples
-        parts = [slice(0, n)] if self.interval == "whole" else self._parts(observation)
-        use = has_a_signal(observation.flags)
-        pieces = Pieces.of(parts, self.order, use)
+        n, parts = observation.n_samples, self._parts(observation)
+        pieces = Pieces.of(parts, self.order, has_a_signal(observation.flags))
         observation.flags[pieces.outside] |= TRIMMED
         observation.tally.count(
             self.label, "samples between intervals, flagged", int(pieces.outside.sum()), n
@@ -87,33 +133,22 @@ class PolynomialFilter(Operator):
         observation.tally.state(
             self.label, f"{observation.name}: polynomials of order {self.order}", f"{len(parts)}"
         )
-        inside = self.mask.of(observation) if self.mask else None
-        if inside is not None:
-            check_mask(inside, observation, f"{self.label}, {observation.name}")
-        return pieces, inside
+        return pieces, self._inside(observation)
 
     def _parts(self, observation: Observation) -> list[slice]:
         """The intervals of a scan. Raises PipelineError where there are none of that name."""
-        found = [
-            p
-            for p in ranges(observation.intervals.get(self.interval, []), observation.seconds)
-            if p.stop > p.start
-        ]
+        if self.interval == "whole":
+            return [slice(0, observation.n_samples)]
+        spans = ranges(observation.intervals.get(self.interval, []), observation.seconds)
+        found = [p for p in spans if p.stop > p.start]
         if not found:
-            there = (
-                ", ".join(name for name, spans in observation.intervals.items() if spans) or "none"
-            )
+            there = [name for name, spans in observation.intervals.items() if spans]
             raise PipelineError(
-                f"the scan has no interval {self.interval!r}; it has {there}",
+                f"the scan has no interval {self.interval!r}; it has {', '.join(there) or 'none'}",
                 place=f"{self.label}, {observation.name}",
                 cure="choose one of these, or interval: whole",
             )
         return found
-
-    def exec(self, block: Block, state: tuple[Pieces, Inside | None]) -> None:
-        """Subtract the fits from each row."""
-        pieces, inside = state
-        by_rows(self.label, block, pieces.remove, inside)
 
 
 @dataclass(frozen=True)
@@ -143,14 +178,10 @@ class Pieces:
         outside = np.ones(len(use), bool)
         for part in parts:
             outside[part] = False
-        fits = [
-            Fit(_basis(n, order), use[p], _inverse(n, order, use[p]))
-            for p in parts
-            for n in (p.stop - p.start,)
-        ]
+        fits = [Fit.of(polynomials(p.stop - p.start, order), use[p]) for p in parts]
         starts, stops = [0, *(p.stop for p in parts)], [*(p.start for p in parts), len(use)]
         gaps = [
-            (k, slice(a, b), _basis(b - a, 1))
+            (k, slice(a, b), polynomials(b - a, 1))
             for k, (a, b) in enumerate(zip(starts, stops, strict=True))
             if b > a
         ]
@@ -175,19 +206,3 @@ class Pieces:
             )  # through the samples on either side of the gap
             lines.subtract(rows.at(gap.start), np.stack(line, axis=1))
         return spoilt
-
-
-@lru_cache(maxsize=16)
-def _basis(n: int, order: int) -> Basis:
-    """`polynomials`, once for intervals of equal length."""
-    return polynomials(n, order)
-
-
-def _inverse(n: int, order: int, use: NDArray[np.bool_]) -> Floats:
-    """`Basis.inverse`, once for intervals of equal length all of whose samples are used."""
-    return _whole(n, order) if use.all() else _basis(n, order).inverse(use)
-
-
-@lru_cache(maxsize=256)
-def _whole(n: int, order: int) -> Floats:
-    return _basis(n, order).inverse(np.ones(n, bool))

@@ -7,20 +7,20 @@ used: a copy of whole rows would not stay in the cache.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.block import Block
+from zonda.core.data import Block, Data, Observation
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.smooth import series_into
+from zonda.core.operator import Operator
 from zonda.core.types import AnyFloats, Floats
 
-from .source_mask import MASKED, Inside
+from .source_mask import MASKED, Inside, SourceMask
 
 SPOILT = "samples not finite"
 """Count of samples that are left as they are."""
@@ -68,56 +68,60 @@ class Rows(NamedTuple):
         return out
 
 
-def by_rows(
-    label: str,
-    block: Block,
-    remove: Callable[[Rows, Mask | None], int],
-    inside: Inside | None = None,
-) -> None:
-    """Let ``remove`` change the signal of a block, its mean included; no mean is left beside it.
+class Removal(Protocol):
+    """A linear fit to each detector's scan, and its subtraction."""
 
-    ``remove(rows, masked)`` changes up to `ROWS` detectors in place and returns how many samples
-    were not finite; ``masked`` (n_det, n_samp): which of them are ``inside`` a source mask. The
-    step ``label`` counts both.
+    def remove(self, rows: Rows, masked: Mask | None = None) -> int:
+        """Change up to `ROWS` detectors in place; return how many samples were not finite.
+
+        ``masked`` (n_det, n_samp): samples in a source mask.
+        """
+
+
+class LinearFilter(Operator):
+    """Base of the filters of the signal, each detector's whole scan by itself.
+
+    ``prepare`` returns the `Removal` that acts on every row and the samples in the source mask.
     """
-    signal, mean, tally = (
-        block.detdata["signal"],
-        block.means.pop("signal", None),
-        block.observation.tally,
-    )
-    spoilt, inside_mask = 0, 0
-    for part in chunks(len(signal), ROWS):
-        detectors = slice(block.detectors.start + part.start, block.detectors.start + part.stop)
-        rows, masked = Rows.of(signal[part]), None
-        if mean is not None:
-            lines, cell, between = mean.series(detectors, block.samples, np.dtype(np.float64))
-            rows = Rows(signal[part], lines, cell, between, block.samples.start, 0)
+
+    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
+    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    knows_means: ClassVar[bool] = True
+    linear: ClassVar[bool] = True
+    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
+
+    def check(self, data: Data) -> list[str]:
+        """Refuse a source mask that cannot be used."""
+        for observation in data.observations:
+            self._inside(observation)
+        return []
+
+    def _inside(self, observation: Observation) -> Inside | None:
+        """Samples of a scan in the filter's source mask; None: it has none.
+
+        Raises InputError for a file that cannot be used, PipelineError for a mask that covers the
+        scan.
+        """
+        mask: SourceMask | None = getattr(self, "mask", None)
+        return mask.of_part(observation, self.label) if mask else None
+
+    def exec(self, block: Block, state: Any) -> None:
+        """Subtract the fit from each row and its mean; no mean is left beside the rows."""
+        (fit, inside), signal, tally = state, block.detdata["signal"], block.observation.tally
+        mean, spoilt, n_masked = block.means.pop("signal", None), 0, 0
+        for part in chunks(len(signal), ROWS):
+            detectors = slice(block.detectors.start + part.start, block.detectors.start + part.stop)
+            rows, masked = Rows.of(signal[part]), None
+            if mean is not None:
+                lines, cell, between = mean.series(detectors, block.samples, np.dtype(np.float64))
+                rows = Rows(signal[part], lines, cell, between, block.samples.start, 0)
+            if inside is not None:
+                masked = inside.at(detectors, block.samples)
+                n_masked += int(masked.sum())
+            spoilt += fit.remove(rows, masked)
         if inside is not None:
-            masked = inside.at(detectors, block.samples)
-            inside_mask += int(masked.sum())
-        spoilt += remove(rows, masked)
-    if inside is not None:
-        tally.count(label, MASKED, inside_mask, signal.size)
-    tally.count(label, SPOILT, spoilt)
-
-
-def in_double(
-    label: str,
-    block: Block,
-    remove: Callable[[Floats, Mask | None], int],
-    inside: Inside | None = None,
-) -> None:
-    """Act as `by_rows` with a function that changes samples (n_det, n_samp) of whole rows in
-    float64.
-    """
-
-    def on_a_copy(rows: Rows, masked: Mask | None) -> int:
-        copy = rows.double(slice(None), rows.values.shape[1])
-        spoilt = remove(copy, masked)
-        rows.values[...] = copy
-        return spoilt
-
-    by_rows(label, block, on_a_copy, inside)
+            tally.count(self.label, MASKED, n_masked, signal.size)
+        tally.count(self.label, SPOILT, spoilt)
 
 
 @kernel(fastmath=False)

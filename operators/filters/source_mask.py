@@ -14,9 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from astropy.wcs import WCS
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
@@ -24,18 +27,23 @@ from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.parameters import Parameters
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle
-from zonda.core.data import Data
-from zonda.core.errors import PipelineError
+from zonda.core.errors import InputError, PipelineError
+from zonda.core.maps.header import with_known_frame
 from zonda.core.numerics.chunks import chunks, empty
-from zonda.core.numerics.projection import rotation_matrices
+from zonda.core.numerics.projection import pixel_matrix, ray_coefficients, rotation_matrices
 from zonda.core.observation import Observation
+from zonda.core.storage.files import reading
+from zonda.core.storage.fits_files import check_size, opened
 from zonda.core.types import AnyFloats, Floats
 
 from .brick_wall import bridge
-from .mask_image import read_mask
+
+CURE = "give a two-dimensional image with a celestial WCS, 0 where there is no source"
 
 RADIUS = math.radians(1 / 60)
 """Of a disc, where none is given."""
+ENOUGH = 256
+"""Instants of a look at a scan from which it is judged whether a mask covers it."""
 MASKED = "samples in the source mask, not used to find what is removed"
 """A count of the log."""
 
@@ -69,10 +77,29 @@ class SourceMask(Parameters):
             raise ValueError("give either file, an image, or radius and centre of a disc")
         return self
 
+    def of_part(self, observation: Observation, label: str) -> Inside:
+        """Samples of a scan that are inside; some must be outside.
+
+        Raises InputError for a file that cannot be used, and PipelineError where the mask covers
+        all that the middle detector sees.
+        """
+        inside, plane = self.of(observation), observation.focalplane
+        middle, n = int(np.argmin(np.hypot(plane.xi, plane.eta))), observation.n_samples
+        judged = n >= min(ENOUGH, observation.sampling[0])
+        if judged and inside.at(slice(middle, middle + 1), slice(0, n)).all():
+            raise PipelineError(
+                "the source mask covers the whole scan",
+                place=f"{label}, {observation.name}",
+                cure="choose a smaller one",
+            )
+        return inside
+
     def of(self, observation: Observation) -> Inside:
         """Samples of a scan that are inside. Raises InputError for a file that cannot be used."""
         if self.file is not None:
-            return read_mask(self.file).of(observation)
+            masked, matrix = _read(self.file, self.file.stat().st_mtime_ns)
+            h = np.ascontiguousarray(ray_coefficients(observation.boresight_radec, matrix).T)
+            return InsideImage(h, observation.focalplane.xi, observation.focalplane.eta, masked)
         ra, dec = self.centre.icrs() if self.centre else observation.centre
         centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
         seen = empty((3, observation.n_samples))
@@ -90,10 +117,6 @@ class SourceMask(Parameters):
 
 class Inside(Protocol):
     """Samples of a scan in a mask."""
-
-    @property
-    def n_detectors(self) -> int:
-        """Number of the scan's detectors."""
 
     def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:
         """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
@@ -117,11 +140,6 @@ class InsideDisc:
     rays: Floats
     half_chord: float
 
-    @property
-    def n_detectors(self) -> int:
-        """Number of the scan's detectors."""
-        return int(self.rays.shape[1])
-
     def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:
         """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
         a, b = self.rays[:, detectors], self.centre[:, samples]
@@ -131,9 +149,9 @@ class InsideDisc:
         return np.asarray(found <= (2 * self.half_chord) ** 2)
 
 
-def counts(inside: Inside, n_samples: int) -> tuple[int, int]:
+def counts(inside: Inside, n_detectors: int, n_samples: int) -> tuple[int, int]:
     """(samples of all detectors inside, instants at which all detectors are)."""
-    every, number, covered = slice(0, inside.n_detectors), 0, 0
+    every, number, covered = slice(0, n_detectors), 0, 0
     for samples in chunks(n_samples, 1 << 10):
         found = inside.at(every, samples)
         number, covered = number + int(found.sum()), covered + int(found.all(axis=0).sum())
@@ -144,7 +162,7 @@ def filter_outside(
     row: AnyFloats,
     bad: NDArray[np.intp],
     inside: NDArray[np.bool_] | None,
-    act: Callable[[AnyFloats], None],
+    act: Callable[[AnyFloats], object],
 ) -> int:
     """Equation (1) on one detector's scan ``row`` (N,) in place; ``act`` is F, in place.
 
@@ -169,25 +187,67 @@ def filter_outside(
     return int(lost.size)
 
 
-def check_mask(inside: Inside, observation: Observation, place: str) -> None:
-    """Raise PipelineError where a mask covers all that the middle detector sees."""
-    middle = int(np.argmin(np.hypot(observation.focalplane.xi, observation.focalplane.eta)))
-    if inside.at(slice(middle, middle + 1), slice(0, observation.n_samples)).all():
-        raise PipelineError(
-            "the source mask covers the whole scan", place=place, cure="choose a smaller one"
-        )
+@dataclass(frozen=True)
+class InsideImage:
+    """Samples in masked pixels; none beyond the image.
 
-
-ENOUGH = 256
-"""Instants of a look at a scan from which it is judged whether a mask covers it."""
-
-
-def check_masks(mask: SourceMask | None, data: Data, label: str) -> list[str]:
-    """Check a mask for `Operator.check`. Raises InputError for a file that cannot be used, and
-    PipelineError as `check_mask`.
+    Attributes
+    ----------
+    h
+        (9, n_samp): coefficients of equation (1) of `core.numerics.projection`.
+    xi, eta
+        (n_det,): offsets of the detectors, rad.
     """
-    for observation in data.observations if mask is not None else ():
-        inside = mask.of(observation) if mask is not None else None
-        if inside is not None and observation.n_samples >= min(ENOUGH, observation.sampling[0]):
-            check_mask(inside, observation, f"{label}, {observation.name}")
-    return []
+
+    h: Floats
+    xi: Floats
+    eta: Floats
+    masked: NDArray[np.bool_]
+
+    def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:
+        """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
+        xi, eta, h = self.xi[detectors, None], self.eta[detectors, None], self.h[:, samples]
+        x, y, w = (h[k] * xi + h[k + 1] * eta + h[k + 2] for k in (0, 3, 6))
+        ny, nx = self.masked.shape
+        with np.errstate(invalid="ignore", divide="ignore"):
+            column, row = np.floor(x / w + 0.5), np.floor(y / w + 0.5)
+            here = (w > 0) & (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
+        found = np.zeros(here.shape, bool)
+        found[here] = self.masked[row[here].astype(np.int64), column[here].astype(np.int64)]
+        return found
+
+
+@lru_cache(4)
+def _read(path: Path, changed: int) -> tuple[NDArray[np.bool_], Floats]:
+    """Masked pixels (ny, nx) of the first image of a FITS file, and the matrix (3, 3) from
+    directions on the sky to its pixels (`projection.pixel_matrix`).
+
+    Raises InputError for what is no image with a tangent-plane (TAN) WCS, for NaN, which is neither
+    masked nor not, and for zeros alone.
+    """
+    place = f"source mask {path}"
+    with opened(path, place, CURE) as hdus:
+        hdu = next((h for h in hdus if h.is_image and len(h.shape) == 2), None)
+        if hdu is None:
+            raise InputError("has no two-dimensional image", place=place, cure=CURE)
+        check_size(hdu, place)
+        values, header = np.array(hdu.data), hdu.header.copy()
+    if np.isnan(values).any():
+        raise InputError(
+            "has pixels that are NaN",
+            place=place,
+            cure="write 1 where samples are masked and 0 elsewhere",
+        )
+    if not values.any():
+        raise InputError(
+            "all of its pixels are 0: it masks nothing",
+            place=place,
+            cure="write 1 where samples are masked, or leave it out",
+        )
+    header, _ = with_known_frame(header, place)
+    try:
+        with reading(place, "a FITS image with world coordinates", CURE):
+            wcs = WCS(header, naxis=2)
+        return values != 0, pixel_matrix(wcs)
+    except InputError as err:
+        raise InputError(err.message, place=place, cure=err.cure or CURE) from None

@@ -7,7 +7,7 @@ is Tukey's window (`scipy.signal.windows.tukey`), a the share of the scan in whi
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -15,16 +15,15 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation
 from zonda.core.numerics.chunks import chunks
-from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .rows import ROWS
+from .rows import ROWS, LinearFilter
 
 MEAN = "samples with mean emission under the window: put a Detrend before it"
 """A count of the log."""
 
 
-class Taper(Operator):
+class Taper(LinearFilter):
     """Multiply each scan by Tukey's window, equation (1), so that a filter behind it finds no jump
     at its ends.
 
@@ -37,10 +36,8 @@ class Taper(Operator):
     and what it takes off is rounded as a part of it. The log says so.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    linear: ClassVar[bool] = True
     knows_means: ClassVar[bool] = True
+    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "sample"
 
     share: Fraction = quantity("10 %", ge=0, le=1)
     """Share of the scan in which the window is not 1, half of it at either end."""

@@ -9,9 +9,8 @@ from zonda.core.errors import PipelineError, ZondaError
 from zonda.core.types import Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.detectors.time_constant import TimeConstant
-from zonda.operators.filters.common_mode import CommonModeFilter
+from zonda.operators.filters.common_mode import UNDETERMINED, CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
-from zonda.operators.filters.mode_search import UNDETERMINED
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing.stare import PointingStare

@@ -15,11 +15,9 @@ import zonda.testing
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.filters.baseline import Fit, polynomials, splines
-from zonda.operators.filters.bessel import BesselPlan, amplitude, sections
 from zonda.operators.filters.common_mode import CommonModeFilter
-from zonda.operators.filters.despline import Despline
-from zonda.operators.filters.detrend import Detrend
-from zonda.operators.filters.highpass import HighpassFilter
+from zonda.operators.filters.highpass import Bridged, HighpassFilter, amplitude, causal
+from zonda.operators.filters.polynomial import Despline, Detrend
 from zonda.operators.filters.rows import Rows
 from zonda.operators.filters.taper import Taper
 
@@ -92,7 +90,7 @@ def test_the_amplitude_of_waves():
     t = np.arange(60000) / RATE
     for f in (0.02, 0.08, 0.4):
         wave = np.sin(2 * np.pi * f * t)[None]
-        BesselPlan(sections(CUT, RATE), None).apply(wave, NONE, None)
+        Bridged(causal(CUT, RATE), NONE).remove(Rows.of(wave))
         last = wave[
             0, -20000:
         ]  # whole waves at these frequencies; the transient has decayed by e^-100 and more
@@ -105,7 +103,7 @@ def test_it_is_causal():
     """Nothing before a source, a trough behind it."""
     source = np.exp(-0.5 * ((np.arange(20000) - 10000) / 8.0) ** 2)[None]
     before = source.copy()
-    BesselPlan(sections(CUT, RATE), None).apply(source, NONE, None)
+    Bridged(causal(CUT, RATE), NONE).remove(Rows.of(source))
     assert np.abs(source[0, :9900]).max() < 1e-15
     assert source[0, 10050:10200].max() < 0
     assert source.max() > 0.8 * before.max()
@@ -116,13 +114,13 @@ def test_it_is_causal():
 def test_bessel_is_linear_and_acts_on_each_detector_alone(n, degree, seed):
     rows = np.random.default_rng(seed).standard_normal((3, n))
     fit = None if degree is None else Fit.of(polynomials(n, degree), np.ones(n, bool))
-    plan = BesselPlan(sections(0.5, RATE), fit)
+    plan = Bridged(causal(0.5, RATE), NONE, fit)
     whole, part = rows.copy(), rows[1:2].copy()
-    plan.apply(whole, NONE, None)
-    plan.apply(part, NONE, None)
+    plan.remove(Rows.of(whole))
+    plan.remove(Rows.of(part))
     np.testing.assert_array_equal(whole[1], part[0])
     mixed = (2 * rows[0] - 3 * rows[1])[None]
-    plan.apply(mixed, NONE, None)
+    plan.remove(Rows.of(mixed))
     np.testing.assert_allclose(mixed[0], 2 * whole[0] - 3 * whole[1], rtol=0, atol=1e-10)
 
 

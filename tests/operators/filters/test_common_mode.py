@@ -14,9 +14,8 @@ from zonda.core.errors import PipelineError
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
-from zonda.operators.filters.common_mode import CommonModeFilter
+from zonda.operators.filters.common_mode import UNDETERMINED, CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
-from zonda.operators.filters.mode_search import UNDETERMINED
 from zonda.operators.maps.bin_map import BinMap
 from zonda.plugins.checks import scenes
 

@@ -10,9 +10,8 @@ import pytest
 from zonda.core.flags import INVALID
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.filters.baseline import Fit, polynomials, splines
-from zonda.operators.filters.detrend import Detrend
 from zonda.operators.filters.ground import GroundFilter, Template
-from zonda.operators.filters.polynomial import Pieces, PolynomialFilter
+from zonda.operators.filters.polynomial import Detrend, Pieces, PolynomialFilter
 from zonda.operators.filters.rows import AT_ONCE, ROWS, Rows
 
 N = 3 * AT_ONCE + 77

@@ -14,8 +14,7 @@ import zonda.testing
 from zonda.core.errors import PipelineError
 from zonda.core.flags import INVALID, TRIMMED
 from zonda.core.intervals import ranges
-from zonda.operators.filters.detrend import Detrend
-from zonda.operators.filters.polynomial import Pieces, PolynomialFilter
+from zonda.operators.filters.polynomial import Detrend, Pieces, PolynomialFilter
 from zonda.operators.filters.rows import Rows
 from zonda.plugins.checks import scenes
 

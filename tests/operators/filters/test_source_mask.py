@@ -13,8 +13,8 @@ import zonda.testing
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.numerics.projection import directions
 from zonda.operators.filters.common_mode import CommonModeFilter
-from zonda.operators.filters.detrend import Detrend
 from zonda.operators.filters.highpass import HighpassFilter
+from zonda.operators.filters.polynomial import Detrend
 from zonda.operators.filters.source_mask import SourceMask, counts
 
 N_DET, N = 37, 6000
@@ -45,7 +45,7 @@ def test_it_is_a_disc_on_the_sky(bench):
     near = np.abs(distance(bench, observation) - radius) < 1e-9 * radius
     np.testing.assert_array_equal(found[~near], (distance(bench, observation) <= radius)[~near])
     np.testing.assert_array_equal(inside.at(slice(3, 9), slice(100, 333)), found[3:9, 100:333])
-    assert counts(inside, N) == (int(found.sum()), int(found.all(axis=0).sum()))
+    assert counts(inside, N_DET, N) == (int(found.sum()), int(found.all(axis=0).sum()))
     elsewhere = SourceMask(radius="25 arcsec", centre="05h +21d").of(observation)
     assert not elsewhere.at(slice(0, N_DET), slice(0, N)).any()
 
@@ -267,7 +267,7 @@ def test_an_image_is_looked_up_at_the_nearest_pixel(bench, tmp_path):
     disc = SourceMask(**MASK).of(observation).at(slice(0, N_DET), slice(0, N))
     np.testing.assert_array_equal(found[~edge], disc[~edge])
     np.testing.assert_array_equal(inside.at(slice(3, 9), slice(100, 333)), found[3:9, 100:333])
-    assert counts(inside, N) == (int(found.sum()), int(found.all(axis=0).sum()))
+    assert counts(inside, N_DET, N) == (int(found.sum()), int(found.all(axis=0).sum()))
     assert found.any()
     assert not found.all()
 
