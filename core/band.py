@@ -13,7 +13,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from .configuration.diagnostics import mistake, refusal
 from .configuration.files import InputPath
 from .configuration.parameters import Parameters, named, named_or_written
-from .configuration.units import Angle, Fraction, Hertz, KelvinRootSecond
+from .configuration.units import Angle, Fraction, Hertz, KelvinRootSecond, RadioFrequency
 from .errors import InputError
 from .registry import RegistryError, bands
 from .storage import packed
@@ -28,9 +28,9 @@ class Band(Parameters):
 
     name: str
     """Registered name."""
-    low: Hertz | None = None
+    low: RadioFrequency | None = None
     """Lower edge of a flat band."""
-    high: Hertz | None = None
+    high: RadioFrequency | None = None
     """Upper edge of a flat band."""
     file: InputPath | None = None
     """Table of two columns, frequency in GHz and transmission (any scale); `#` begins a comment."""

@@ -33,6 +33,7 @@ from .configuration.units import (
     Hertz,
     KelvinRootSecond,
     Metres,
+    SampleRate,
 )
 from .errors import InputError, ZondaError
 from .focalplane import Focalplane
@@ -161,7 +162,7 @@ class Instrument(Parameters):
     """Pink noise falls as f^-slope."""
     pink_minimum_frequency: Hertz = quantity("1 mHz", gt=0)
     """Below this frequency pink noise is flat."""
-    sample_rate: Hertz = Field(gt=0, le=1e6)
+    sample_rate: SampleRate = Field(gt=0, le=1e6)
     """Read-out rate."""
     provenance: str = ""
     """Sources of these numbers: a text, or a mapping of what a number is to its source."""

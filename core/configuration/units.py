@@ -58,7 +58,7 @@ KINDS = {
         "an angular jerk", ("0.2 deg/s3",), ("deg/s3", "arcmin/s3", "arcsec/s3", "rad/s3"), 1e6
     ),
     "s": Kind("a time", ("20 min", "600 s"), ("s", "min", "h", "ms"), 1e15),
-    "Hz": Kind("a frequency", ("90 GHz", "100 Hz"), ("Hz", "mHz", "GHz"), 1e18),
+    "Hz": Kind("a frequency", ("0.1 Hz", "100 Hz"), ("Hz", "mHz", "GHz"), 1e18),
     "m": Kind("a length", ("1.8 mm", "1 km"), ("m", "mm", "km"), 1e20),
     "m / s": Kind("a speed", ("10 m/s", "36 km/h"), ("m/s",), 1e15),
     "K": Kind("a temperature", ("150 mK", "270 K"), ("K", "mK", "uK"), 1e15),
@@ -262,6 +262,10 @@ AngularJerk = Annotated[float, Unit("rad / s3")]
 Seconds = Annotated[float, Unit("s")]
 """s."""
 Hertz = Annotated[float, Unit("Hz")]
+"""Hz, of samples and noise."""
+RadioFrequency = Annotated[float, Unit("Hz", "90 GHz", "350 GHz")]
+"""Hz, of light."""
+SampleRate = Annotated[float, Unit("Hz", "100 Hz")]
 """Hz."""
 Metres = Annotated[float, Unit("m")]
 """m."""

@@ -18,7 +18,7 @@ from zonda.core import flags
 from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
-from zonda.core.configuration.units import Fraction, Hertz
+from zonda.core.configuration.units import Fraction, RadioFrequency
 from zonda.core.errors import InputError
 from zonda.core.intervals import Intervals, runs
 from zonda.core.operator import Operator
@@ -113,7 +113,7 @@ class RecordedFiles(Operator):
     one run, in this order. Files with the same times and other bands are one scan."""
     signal: str | None = "signal"
     """Name of the stream; none: no stream is read, the file's pointing alone is used."""
-    band: Hertz | None = Field(None, gt=0)
+    band: RadioFrequency | None = Field(None, gt=0)
     """Centre of the only band whose detectors are used, e.g. 93 GHz; none: all bands, each with
     maps of its own.
     """

@@ -15,7 +15,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
-from zonda.core.configuration.units import Angle, Fraction, Hertz, Seconds
+from zonda.core.configuration.units import Angle, Fraction, SampleRate, Seconds
 from zonda.core.errors import PointingError
 from zonda.core.intervals import Intervals
 from zonda.core.numerics.celestial import Boresight, CelestialTransform
@@ -98,7 +98,7 @@ class Pointing(Operator):
     east and north, for az/el towards azimuth and up)."""
     offset_size: Angle = quantity("1 arcmin", gt=0, le=0.1)
     """Side of the box of `offsets: box`."""
-    sample_rate: Hertz | None = Field(None, gt=0, le=1e6)
+    sample_rate: SampleRate | None = Field(None, gt=0, le=1e6)
     """Read-out rate; the instrument's where absent."""
     jitter: Seconds = quantity("0 s", ge=0, le=1)
     """rms by which samples are taken early or late (Gaussian, known: the times in the products are

@@ -13,7 +13,13 @@ from pydantic import Field, field_validator
 
 from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.parameters import quantity
-from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed, Fraction, Hertz
+from zonda.core.configuration.units import (
+    Angle,
+    AngularAcceleration,
+    AngularSpeed,
+    Fraction,
+    SampleRate,
+)
 from zonda.core.errors import PointingError
 from zonda.core.flags import IRREGULAR, TURNAROUND
 from zonda.core.intervals import runs
@@ -61,7 +67,7 @@ class ScheduleParameters(Operator):
     """Largest speed of nods."""
     elevation_acceleration: AngularAcceleration = quantity("1 deg/s2", gt=0)
     """Acceleration of nods."""
-    sample_rate: Hertz | None = Field(None, gt=0, le=1e6)
+    sample_rate: SampleRate | None = Field(None, gt=0, le=1e6)
     """Read-out rate; the instrument's where absent."""
     check_limits: Literal["error", "warn"] = "error"
     """Whether a scan beyond the telescope's largest speed, acceleration or jerk is an error, or a

@@ -23,7 +23,7 @@ from pydantic import Field
 
 from zonda.core.block import Block
 from zonda.core.configuration.files import InputPath
-from zonda.core.configuration.units import Hertz
+from zonda.core.configuration.units import RadioFrequency
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band
@@ -62,7 +62,7 @@ class PointSources(Operator):
 
     catalogue: InputPath
     """Table of the sources."""
-    frequency: Hertz | None = Field(None, gt=0)
+    frequency: RadioFrequency | None = Field(None, gt=0)
     """Frequency of the fluxes, where the catalogue has no column of it. Default: the band's centre.
     """
     scale: float = Field(1.0, ge=-1e30, le=1e30)

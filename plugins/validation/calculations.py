@@ -23,6 +23,7 @@ from zonda.core.configuration.units import (
     Kelvin,
     KelvinRootSecond,
     Metres,
+    RadioFrequency,
     Seconds,
 )
 from zonda.core.types import Floats
@@ -98,19 +99,19 @@ def product(factors: list[str | float]) -> float:
 
 
 @_register
-def rayleigh_distance(aperture: Metres, frequency: Hertz) -> float:
+def rayleigh_distance(aperture: Metres, frequency: RadioFrequency) -> float:
     """z_r = pi (D/2)^2 / lambda of the paper's beam, m."""
     return math.pi * (aperture / 2) ** 2 * frequency / LIGHT
 
 
 @_register
-def rayleigh_height(aperture: Metres, frequency: Hertz, elevation: Angle) -> float:
+def rayleigh_height(aperture: Metres, frequency: RadioFrequency, elevation: Angle) -> float:
     """Height at which a line of sight at an elevation reaches the Rayleigh distance, m."""
     return rayleigh_distance(aperture, frequency) * math.sin(elevation)
 
 
 @_register
-def beam_width(aperture: Metres, frequency: Hertz, distance: Metres) -> float:
+def beam_width(aperture: Metres, frequency: RadioFrequency, distance: Metres) -> float:
     """FWHM of the paper's beam at a distance along the line of sight, D sqrt(1 + (z / z_r)^2),
     m.
     """
@@ -118,20 +119,20 @@ def beam_width(aperture: Metres, frequency: Hertz, distance: Metres) -> float:
 
 
 @_register
-def far_field_fwhm(aperture: Metres, frequency: Hertz) -> float:
+def far_field_fwhm(aperture: Metres, frequency: RadioFrequency) -> float:
     """Angular FWHM of the paper's beam far away, D / z_r = (4 / pi) lambda / D, rad."""
     return aperture / rayleigh_distance(aperture, frequency)
 
 
 @_register
-def diffraction_fwhm(aperture: Metres, frequency: Hertz, factor: Fraction = 1.22) -> float:
+def diffraction_fwhm(aperture: Metres, frequency: RadioFrequency, factor: Fraction = 1.22) -> float:
     """factor lambda / D, rad."""
     return factor * LIGHT / frequency / aperture
 
 
 @_register
 def beam_shift(
-    aperture: Metres, frequency: Hertz, distance: Metres, factor: Fraction = 1.0
+    aperture: Metres, frequency: RadioFrequency, distance: Metres, factor: Fraction = 1.0
 ) -> float:
     """Separation of the lines of sight of detectors that are factor lambda / D apart, at a
     distance, m.
@@ -141,7 +142,7 @@ def beam_shift(
 
 @_register
 def disc_overlap(
-    aperture: Metres, frequency: Hertz, distance: Metres, factor: Fraction = 1.0
+    aperture: Metres, frequency: RadioFrequency, distance: Metres, factor: Fraction = 1.0
 ) -> float:
     """Share of area that two discs of the beam's FWHM have in common, their centres `beam_shift`
     apart.
@@ -154,7 +155,7 @@ def disc_overlap(
 
 @_register
 def gaussian_overlap(
-    aperture: Metres, frequency: Hertz, distance: Metres, factor: Fraction = 1.0
+    aperture: Metres, frequency: RadioFrequency, distance: Metres, factor: Fraction = 1.0
 ) -> float:
     """Common volume of two Gaussian beams of unit volume, erfc(d / (sqrt(8) sigma)), d the
     `beam_shift`.
@@ -184,7 +185,7 @@ def atmosphere_in_scan(
 
 
 @_register
-def flux_per_beam(temperature: Kelvin, fwhm: Angle, frequency: Hertz) -> float:
+def flux_per_beam(temperature: Kelvin, fwhm: Angle, frequency: RadioFrequency) -> float:
     """Flux of a Rayleigh-Jeans temperature that fills a Gaussian beam, 2 k T nu^2 / c^2 x pi fwhm^2
     / (4 ln 2), W m^-2 Hz^-1.
     """

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic_core import PydanticCustomError
 
+import zonda
 from zonda.core.configuration.parameters import Parameters, quantity
 from zonda.core.configuration.units import (
     KINDS,
@@ -195,3 +196,16 @@ def test_schema_shows_unit_and_examples() -> None:
     angle = All.model_json_schema()["properties"]["angle"]
     assert angle["x-unit"] == "rad"
     assert "4 arcmin" in angle["examples"]
+
+
+@pytest.mark.parametrize(
+    ("make", "example"),
+    [
+        (lambda: zonda.HighpassFilter(frequency=3), "0.1 Hz"),
+        (lambda: zonda.Band(name="x", low=3, high="4 GHz"), "90 GHz"),
+        (lambda: zonda.PointingStare(sample_rate=3), "100 Hz"),
+    ],
+)
+def test_an_example_is_of_the_parameters_own_size(make, example):
+    with pytest.raises(ZondaError, match=f"such as '{example}'"):
+        make()
