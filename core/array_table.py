@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from .configuration.diagnostics import nearest
 from .errors import InputError
 from .focalplane import Focalplane
-from .storage.table_mistakes import Mistakes
 from .types import Floats
 
 if TYPE_CHECKING:
@@ -42,20 +41,20 @@ QUANTITIES = {
 """Columns of numbers and their units inside."""
 TEXTS = ("name", "band", "wafer", "dead")
 """Columns of text."""
-POSITIVE = (
+POSITIVE = {
     "fwhm",
     "main_beam_efficiency",
     "illumination_efficiency",
     "slope",
     "pink_minimum_frequency",
-)
+}
 LARGEST = {
     "polarization_efficiency": 1.0,
     "main_beam_efficiency": 1.0,
     "illumination_efficiency": 1.0,
     "slope": 3.0,
 }
-SIGNED = ("xi", "eta", "polarization_angle")
+SIGNED = {"xi", "eta", "polarization_angle"}
 FARTHEST = math.tan(0.5)
 """Largest distance of a detector from the boresight, tan(rad): half the largest field of view of an
 `Instrument`.
@@ -79,6 +78,8 @@ ALIASES = {
 """
 LEAKAGE = "pol_leakage"
 """TOAST's cross-polar leakage e, in place of the efficiency (1 - e) / (1 + e)."""
+KNOWN = (*TEXTS, *QUANTITIES, LEAKAGE)
+"""Columns that are read."""
 ANGLE, PLACE = ("polarization_angle",), ("xi", "eta")
 NOT_READ: dict[str, tuple[tuple[str, ...], str]] = {
     "psd_net": (
@@ -118,23 +119,20 @@ class ArrayTable:
 
     Attributes
     ----------
-    place
-        The file, as messages call it.
+    table
+        The file.
     names, bands
         Of each detector; ``bands`` is empty where there is no such column.
     columns
         By name, (n,) SI: `QUANTITIES`, and ``wafer`` and ``dead`` as whole numbers.
-    lines
-        Line of the file of each; of the heading last.
     notes
         Which columns were read under another name, and which are not used.
     """
 
-    place: str
-    names: list[str]
-    bands: list[str]
+    table: Table
+    names: Sequence[str]
+    bands: Sequence[str]
     columns: Mapping[str, NDArray[Any]]
-    lines: Sequence[int]
     notes: Sequence[str] = ()
 
     @property
@@ -164,43 +162,31 @@ class ArrayTable:
 
         A camera of one band may be one of several that the table has.
         """
+        table, has = self.table, f"the instrument has: {', '.join(counts)}"
         if several and not self.bands:
             cure = f"add it, with the name of a band in each row: {', '.join(counts)}"
-            raise InputError(
-                "has no column 'band', and the instrument has several", place=self.place, cure=cure
-            )
+            table.note(None, "has no column 'band', and the instrument has several", cure)
+            table.check()
         unknown = [k for k, band in enumerate(self.bands) if band not in counts]
-        if unknown and (several or len(unknown) == len(self.names)):
-            mistakes = Mistakes(self.place)
+        if several or len(unknown) == len(self.names):
             for k in unknown:
-                hint = nearest(self.bands[k], list(counts))
-                cure = f"{hint + ' ' if hint else ''}the instrument has: {', '.join(counts)}"
-                mistakes.add(
-                    self.lines[k],
-                    f"detector {self.names[k]} is of the unknown band {self.bands[k]!r}",
-                    cure,
-                )
-            mistakes.tell()
+                text = f"detector {self.names[k]} is of the unknown band {self.bands[k]!r}"
+                table.note(k, text, f"{nearest(self.bands[k], list(counts))} {has}".strip())
+            table.check()
+        bands = sorted(set(self.bands))
         for band, stated in counts.items():
             found = len(self.rows(band))
-            if not found:
-                text = (
-                    f"has no detector of the band {band}; its bands:"
-                    f" {', '.join(sorted(set(self.bands)))}"
-                )
-                cure = f"give the band {band} a row or more, or leave it out of the instrument"
-                raise InputError(text, place=self.place, cure=cure)
-            if found != stated:
+            text = f"has no detector of the band {band}; its bands: {', '.join(bands)}"
+            cure = f"give the band {band} a row or more, or leave it out of the instrument"
+            if found and found != stated:
                 of = f" of the band {band}" if self.bands else ""
-                rest = (
-                    f"; others are of {', '.join(sorted(set(self.bands) - set(counts)))}"
-                    if unknown
-                    else ""
-                )
-                text = f"detectors{of}: {found} rows, but the instrument states {stated}{rest}"
-                raise InputError(
-                    text, place=self.place, cure=f"leave out detectors, or write detectors: {found}"
-                )
+                rest = f"; others are of {', '.join(b for b in bands if b not in counts)}"
+                text = f"detectors{of}: {found} rows, but the instrument states {stated}"
+                text += rest if unknown else ""
+                cure = f"leave out detectors, or write detectors: {found}"
+            if found != stated or not found:
+                table.note(None, text, cure)
+                table.check()
 
 
 def read_array(path: Path) -> ArrayTable:
@@ -221,169 +207,134 @@ def _read(path: Path, changed: int, size: int) -> ArrayTable:
     from .storage.ecsv import read_table  # most runs read no table
 
     table = read_table(path)
-    mistakes = Mistakes(table.place)
-    table, notes = _by_known_names(table, mistakes)
-    _check_columns(table, mistakes)
-    names = table.texts("name") if "name" in table.columns else [""] * len(table)
+    notes = _rename(table)
+    _check_columns(table)
+    names = table.texts("name") if "name" in table.columns else []
     seen: dict[str, int] = {}
-    for name, line in zip(names if "name" in table.columns else (), table.lines, strict=False):
+    for row, name in enumerate(names):
         if not name or name in seen:
             text = f"name {name!r} is that of line {seen[name]} too" if name else "has no name"
-            mistakes.add(line, text, "give each detector a name of its own")
-        seen.setdefault(name, line)
+            table.note(row, text, "give each detector a name of its own")
+        seen.setdefault(name, table.lines[row])
     columns: dict[str, NDArray[Any]] = {}
     for key, unit in QUANTITIES.items():
         if key in table.columns:
-            with mistakes.noted():
-                columns[key] = table.numbers(key, unit)
-            _check_limits(table, key, mistakes)
+            columns[key] = table.numbers(key, unit)
+            _check_limits(table, key)
     if "polarization_angle" in columns:
-        _check_angles(table, mistakes)
+        _check_angles(table)
+        columns.setdefault("polarization_efficiency", np.ones(len(table)))
     if LEAKAGE in table.columns:
-        _add_efficiency(table, columns, mistakes)
-    if {"xi", "eta"} <= columns.keys():
-        _check_distances(table, names, np.hypot(columns["xi"], columns["eta"]), mistakes)
-    if "polarization_angle" in columns:
-        columns.setdefault("polarization_efficiency", np.ones(len(names)))
+        if "polarization_efficiency" in table.columns:
+            text = f"has {LEAKAGE!r} beside 'polarization_efficiency'"
+            table.note(-1, text, "remove one of the two columns")
+        leakage = table.numbers(LEAKAGE)
+        _note_values(table, LEAKAGE, (leakage < 0) | (leakage > 1), "give 0 to 1")
+        if "polarization_angle" in columns:
+            columns["polarization_efficiency"] = (1 - leakage) / (1 + leakage)
+    if names and {"xi", "eta"} <= columns.keys():
+        _check_distances(table, names, np.hypot(columns["xi"], columns["eta"]))
     if "wafer" in table.columns:
         columns["wafer"] = _numbered(table.texts("wafer"))
     if "dead" in table.columns:
-        columns["dead"] = _dead(table, mistakes)
-    mistakes.tell()
+        dead = [text.lower() for text in table.texts("dead")]
+        wrong = np.array([text not in DEAD for text in dead])
+        table.note_rows(wrong, lambda row: f"dead is {dead[row]!r}", "write true or false")
+        columns["dead"] = np.array([DEAD.get(text, 0) for text in dead], np.int64)
+    table.check()
     bands = table.texts("band") if "band" in table.columns else []
-    known = (*TEXTS, *QUANTITIES, LEAKAGE)
-    if unused := [name for name in table.columns if name not in known]:
+    if unused := [name for name in table.columns if name not in KNOWN]:
         notes.append(f"not used: {', '.join(unused)}")
-    return ArrayTable(table.place, names, bands, columns, table.lines, notes)
+    return ArrayTable(table, names, bands, columns, notes)
 
 
-def _by_known_names(table: Table, mistakes: Mistakes) -> tuple[Table, list[str]]:
-    """The table with our names for columns that others call otherwise (`ALIASES`), and notes of
-    them.
-    """
-    columns, notes = dict[str, tuple[list[str], str]](), list[str]()
+def _rename(table: Table) -> list[str]:
+    """Give columns that others call otherwise (`ALIASES`) our names; notes of them."""
+    columns, notes = dict[str, tuple[Sequence[str], str]](), list[str]()
     there = {ALIASES.get(written.lower(), written) for written in table.columns}
     for written, column in table.columns.items():
-        own = written if written in (*TEXTS, *QUANTITIES) else ALIASES.get(written.lower(), written)
+        own = written if written in KNOWN else ALIASES.get(written.lower(), written)
         if own != written and (own in table.columns or own in columns):
             if own == "name":
                 own = written  # of several names, one is enough
             else:
-                mistakes.add(
-                    table.lines[-1],
-                    f"has {written!r} beside {own!r}",
-                    "remove one of the two columns",
-                )
+                text = f"has {written!r} beside {own!r}"
+                table.note(-1, text, "remove one of the two columns")
                 continue
         if own != written:
             notes.append(f"{written} is read as {own}")
         instead, cure = NOT_READ.get(own.lower(), ((), ""))
         if cure and not (instead and there.issuperset(instead)):
-            mistakes.add(table.lines[-1], f"has a column {written!r}, which is not read", cure)
+            table.note(-1, f"has a column {written!r}, which is not read", cure)
         columns[own] = column
-    return replace(table, columns=columns), notes
+    table.columns = columns
+    return notes
 
 
-def _check_angles(table: Table, mistakes: Mistakes) -> None:
+def _check_angles(table: Table) -> None:
     """Angles of polarization that are in another unit than written: turns and turns of rad, or
     degrees that are parts of pi.
     """
     values, unit = table.values("polarization_angle"), table.columns["polarization_angle"][1]
     size = np.abs(values[np.isfinite(values) & (values != 0)])
-    cure = "see that the unit of the angles is right"
-    if unit in ("rad", "radian") and size.size and size.max() > 4 * np.pi:
-        mistakes.add(
-            table.lines[-1],
-            f"polarization_angle goes to {size.max():g} rad, more than two turns",
-            cure,
-        )
-    parts = size / (np.pi / 24)
-    if (
-        unit in ("deg", "degree")
-        and 0 < size.max(initial=0) < 6.3
-        and (np.abs(parts - np.round(parts)) < 0.02).all()
-    ):
-        text = (
-            f"polarization_angle has {', '.join(f'{v:g}' for v in np.unique(size)[:3])} deg: parts"
-            " of pi, as in rad"
-        )
-        mistakes.add(table.lines[-1], text, cure)
+    largest, parts = size.max(initial=0), size / (np.pi / 24)
+    text = ""
+    if unit in ("rad", "radian") and largest > 4 * np.pi:
+        text = f"polarization_angle goes to {largest:g} rad, more than two turns"
+    near = (np.abs(parts - np.round(parts)) < 0.02).all()
+    if unit in ("deg", "degree") and 0 < largest < 6.3 and near:
+        some = ", ".join(f"{v:g}" for v in np.unique(size)[:3])
+        text = f"polarization_angle has {some} deg: parts of pi, as in rad"
+    if text:
+        table.note(-1, text, "see that the unit of the angles is right")
 
 
-def _add_efficiency(table: Table, columns: dict[str, NDArray[Any]], mistakes: Mistakes) -> None:
-    """The efficiency that follows from TOAST's leakage, for detectors with an angle."""
-    if "polarization_efficiency" in table.columns:
-        mistakes.add(
-            table.lines[-1],
-            f"has {LEAKAGE!r} beside 'polarization_efficiency'",
-            "remove one of the two columns",
-        )
-        return
-    with mistakes.noted():
-        leakage = table.numbers(LEAKAGE)
-        for row in np.flatnonzero((leakage < 0) | (leakage > 1)).tolist():
-            mistakes.add(
-                table.lines[row], f"{LEAKAGE} is {table.texts(LEAKAGE)[row]}", "give 0 to 1"
-            )
-        if "polarization_angle" in columns:
-            columns["polarization_efficiency"] = (1 - leakage) / (1 + leakage)
-
-
-def _check_columns(table: Table, mistakes: Mistakes) -> None:
+def _check_columns(table: Table) -> None:
     """Check that the required columns are there and none is misspelt."""
-    known = (*TEXTS, *QUANTITIES, LEAKAGE)
-    misspelt = {
-        c: hint
-        for c in table.columns
-        if c not in known
-        and c.lower() not in NOT_READ
-        and (hint := nearest(c, [k for k in known if k not in table.columns]))
+    lacking = [key for key in KNOWN if key not in table.columns]
+    hints = {
+        column: nearest(column, lacking)
+        for column in table.columns
+        if column not in KNOWN and column.lower() not in NOT_READ
     }
-    for column, hint in misspelt.items():
-        mistakes.add(table.lines[-1], f"has an unknown column {column!r}", hint)
+    for column, hint in hints.items():
+        if hint:
+            table.note(-1, f"has an unknown column {column!r}", hint)
     for name in ("name", "xi", "eta"):
-        if name not in table.columns and not any(repr(name) in hint for hint in misspelt.values()):
+        if name in lacking and not any(repr(name) in hint for hint in hints.values()):
             cure = f"a table of detectors has name, xi and eta; it has: {', '.join(table.columns)}"
-            mistakes.add(table.lines[-1], f"has no column {name!r}", cure)
+            table.note(-1, f"has no column {name!r}", cure)
 
 
-def _check_limits(table: Table, key: str, mistakes: Mistakes) -> None:
+def _check_limits(table: Table, key: str) -> None:
     """Check the limits of a column: those of a pure number, and zero, hold in every unit."""
-    values = table.values(key)
+    values, most = table.values(key), LARGEST.get(key, np.inf)
     low = -np.inf if key in SIGNED else 0.0
     limits = "more than 0" if key in POSITIVE else "0 or more"
-    limits += f", at most {LARGEST[key]:g}" if key in LARGEST else ""
-    for row in np.flatnonzero(
-        (values < low) | (values > LARGEST.get(key, np.inf)) | ((values == 0) & (key in POSITIVE))
-    ).tolist():
-        mistakes.add(table.lines[row], f"{key} is {table.texts(key)[row]}", f"give {limits}")
+    limits += f", at most {most:g}" if key in LARGEST else ""
+    wrong = (values < low) | (values > most) | ((values == 0) & (key in POSITIVE))
+    _note_values(table, key, wrong, f"give {limits}")
 
 
-def _check_distances(table: Table, names: list[str], away: Floats, mistakes: Mistakes) -> None:
-    for row in np.flatnonzero(away > FARTHEST).tolist():
-        degrees, most = (math.degrees(math.atan(tangent)) for tangent in (away[row], FARTHEST))
-        text = f"detector {names[row]} looks {degrees:.4g} deg away from the boresight"
-        mistakes.add(
-            table.lines[row],
-            text,
-            f"give xi and eta within {most:.4g} deg; see that their units are right",
-        )
+def _note_values(table: Table, key: str, wrong: NDArray[np.bool_], cure: str) -> None:
+    table.note_rows(wrong, lambda row: f"{key} is {table.texts(key)[row]}", cure)
 
 
-def _numbered(texts: list[str]) -> NDArray[np.int64]:
+def _check_distances(table: Table, names: Sequence[str], away: Floats) -> None:
+    degrees, most = np.degrees(np.arctan(away)), math.degrees(math.atan(FARTHEST))
+    table.note_rows(
+        away > FARTHEST,
+        lambda row: f"detector {names[row]} looks {degrees[row]:.4g} deg away from the boresight",
+        f"give xi and eta within {most:.4g} deg; see that their units are right",
+    )
+
+
+def _numbered(texts: Sequence[str]) -> NDArray[np.int64]:
     """Whole numbers as they are; names by their place in the alphabet."""
     try:
         return np.array([int(text) for text in texts], np.int64)
     except ValueError:
         return np.unique(texts, return_inverse=True)[1].astype(np.int64).ravel()
-
-
-def _dead(table: Table, mistakes: Mistakes) -> NDArray[np.int64]:
-    texts = [text.lower() for text in table.texts("dead")]
-    for text, line in zip(texts, table.lines, strict=False):
-        if text not in DEAD:
-            mistakes.add(line, f"dead is {text!r}", "write true or false")
-    return np.array([DEAD.get(text, 0) for text in texts], np.int64)
 
 
 def stated_by(table: ArrayTable, band: str, stated: Mapping[str, Any]) -> dict[str, Any]:

@@ -299,12 +299,14 @@ class Instrument(Parameters):
                 cure = f"leave out field_of_view, or write at least {field}"
                 raise InputError(
                     f"has detectors in a field of {field}, more than field_of_view",
-                    place=table.place,
+                    place=table.table.place,
                     cure=cure,
                 )
             if self.polarization == "pairs" and "polarization_angle" not in table.columns:
                 cure = "add it, or leave out polarization: pairs, which belongs to layouts"
-                raise InputError("has no column 'polarization_angle'", place=table.place, cure=cure)
+                raise InputError(
+                    "has no column 'polarization_angle'", place=table.table.place, cure=cure
+                )
         except ZondaError as err:
             raise refusal(err, at=("focalplane",)) from None
         return self

@@ -78,10 +78,6 @@ ALLOWED = {
     ): "cdsapi, by its name, when the user asks to fetch",
     ("core/components.py", "import_module"): "names from the registries' own declarations",
     (
-        "operators/pointing/schedule_files.py",
-        "yaml.load",
-    ): "astropy's, as its own reader of ECSV: yaml.SafeLoader, numbers and units",
-    (
         "plugins/checks/dispatch.py",
         "subprocess.run",
     ): "zonda itself, as a child; no shell; the folder's path is one argument",

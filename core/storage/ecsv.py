@@ -1,12 +1,13 @@
-"""Small tables as text: ECSV (Astropy enhancement proposal 6), a CSV file with units, descriptions
-and provenance on top.
+"""Tables as text: ECSV (Astropy enhancement proposal 6), and text with commas, semicolons, tabs,
+bars or blanks between its columns, whose heading names them and their units: ``ra [deg]``.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,25 @@ from astropy import units as u
 from astropy.table.meta import get_header_from_yaml
 from numpy.typing import NDArray
 
+from ..configuration.time import Instant
 from ..errors import InputError
 from .files import atomic_path, reading
-from .table_mistakes import Mistakes, TableError
 
 LARGEST = 1 << 28
-"""Bytes of a file that is read as a small table."""
+"""Bytes of a table that is read."""
+MOST_TOLD = 12
+"""Mistakes that are told one by one; the others are counted."""
+BRACKETED = re.compile(r"(.*?)\s*(?:\[(.*)\]|\((degs?|degrees?|°|rad|radians?|s|secs?|seconds?)\))")
+"""Name and unit of a column's heading; only such units stand in round brackets."""
+SPELLED = {
+    "degs": "deg",
+    "degrees": "deg",
+    "radians": "rad",
+    "sec": "s",
+    "secs": "s",
+    "seconds": "s",
+}
+"""Units as headings write them, in small letters, that astropy does not know."""
 
 
 @dataclass(frozen=True)
@@ -54,58 +68,91 @@ def write_ecsv(path: str | Path, columns: Sequence[Column], meta: Mapping[str, A
     return Path(path)
 
 
-@dataclass(frozen=True)
 class Table:
-    """A small table that was read.
+    """A table that was read. It collects the mistakes that are found in it; `check` tells them.
 
     Attributes
     ----------
     place
         The file, as messages call it.
     columns
-        By name: texts and the unit as it is written (empty: none).
+        By name: texts, or an array of numbers, and the unit as it is written (empty: none).
     lines
-        Line of the file of each row, from 1; of the heading last.
+        Line of the file of each row, from 1; of the heading last. 0: the file has no lines.
+    meta
+        What the head of an ECSV file states beside the columns.
     """
 
-    place: str
-    columns: Mapping[str, tuple[list[str], str]]
-    lines: Sequence[int]
+    def __init__(
+        self,
+        place: str,
+        columns: Mapping[str, tuple[Any, str]],
+        lines: Sequence[int],
+        meta: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.place, self.columns, self.lines, self.meta = place, columns, lines, meta or {}
+        self._mistakes: list[tuple[int, str, str]] = []
 
     def __len__(self) -> int:
-        return len(next(iter(self.columns.values()))[0]) if self.columns else 0
+        return len(self.lines) - 1
 
-    def texts(self, name: str) -> list[str]:
-        """A column as it is written. Raises `TableError` where there is none of this name."""
-        if name not in self.columns:
-            cure = f"it has: {', '.join(self.columns)}"
-            raise TableError(self.place, [(self.lines[-1], f"has no column {name!r}", cure)])
-        return self.columns[name][0]
+    def note(self, row: int | None, message: str, cure: str) -> None:
+        """Note a mistake in a row; -1: in the heading, None: in the table as a whole."""
+        self._mistakes.append((0 if row is None else self.lines[row], message, cure))
+
+    def note_rows(self, wrong: NDArray[np.bool_], message: Callable[[int], str], cure: str) -> None:
+        """Note a mistake in each ``wrong`` row (n,)."""
+        for row in np.flatnonzero(wrong).tolist():
+            self.note(row, message(row), cure)
+
+    def check(self) -> None:
+        """Raise `InputError` about all mistakes at once, each with its line."""
+        found, self._mistakes = sorted(self._mistakes, key=lambda mistake: mistake[0]), []
+        told = [(f"line {line}: {text}" if line else text, cure) for line, text, cure in found]
+        if len(told) == 1:
+            raise InputError(told[0][0], place=self.place, cure=told[0][1])
+        if told:
+            cures = [f"{text}; {cure}" if cure else text for text, cure in told[:MOST_TOLD]]
+            cures += [f"and {len(told) - MOST_TOLD} more"] if len(told) > MOST_TOLD else []
+            raise InputError(f"{len(told)} mistakes", place=self.place, cure="\n".join(cures))
+
+    def texts(self, name: str) -> Sequence[str]:
+        """A column as it is written; empty texts, and a mistake, where there is none."""
+        if name in self.columns:
+            found: Sequence[str] = self.columns[name][0]
+            return found
+        self.note(-1, f"has no column {name!r}", f"it has: {', '.join(self.columns)}")
+        return [""] * len(self)
+
+    def values(self, name: str) -> NDArray[np.float64]:
+        """A column as numbers, in the unit in which it is written; NaN for another text."""
+        column = self.columns[name][0]
+        numbers = [_number(text) for text in column] if isinstance(column, list) else column
+        return np.asarray(numbers, np.float64)
 
     def numbers(self, name: str, unit: str = "") -> NDArray[np.float64]:
         """A column of finite numbers, in ``unit``; where that is empty, the column has none.
 
-        Raises `TableError` for a column without a unit, of another kind, and for every row that is
-        not a finite number.
+        A column that is not there, has no unit or one of another kind, and every row that is not a
+        finite number, are mistakes.
         """
-        texts, mistakes = self.texts(name), Mistakes(self.place)
-        factor = 1.0
-        with mistakes.noted():
-            factor = self._factor(name, self.columns[name][1], unit)
-        values = self.values(name)
-        for row in np.flatnonzero(~np.isfinite(values)).tolist():
-            text = f"{name} is {texts[row]!r}, not a finite number"
-            mistakes.add(self.lines[row], text, "mend or remove that row")
-        mistakes.tell()
+        texts = self.texts(name)
+        if name not in self.columns:
+            return np.full(len(self), np.nan)
+        factor, values = self.factor(name, unit), self.values(name)
+        self.note_rows(
+            ~np.isfinite(values),
+            lambda row: f"{name} is {texts[row]!r}, not a finite number",
+            "mend or remove that row",
+        )
         return values * factor
 
-    def values(self, name: str) -> NDArray[np.float64]:
-        """A column as numbers, in the unit in which it is written; NaN where it has another
-        text.
-        """
-        return np.array([_number(text) for text in self.texts(name)])
+    def factor(self, name: str, unit: str, otherwise: str = "") -> float:
+        """The unit of a column in terms of ``unit``; 1, and a mistake, where it is none.
 
-    def _factor(self, name: str, written: str, unit: str) -> float:
+        ``otherwise``: the unit of a column that states none.
+        """
+        written = self.columns[name][1] or otherwise
         if not unit and not written:
             return 1.0
         from ..configuration.units import KINDS  # slow to import, and pictures need tables alone
@@ -113,22 +160,29 @@ class Table:
         named = KINDS[unit].display if unit in KINDS else (unit,)
         accepted = f"{', '.join(named[:-1])} or {named[-1]}" if len(named) > 1 else unit
         if not written:
-            cure = (
-                f"give it in {accepted}: in ECSV 'unit: {named[0]}', in CSV a heading such as"
-                f" {name} [{named[0]}]"
-            )
-            raise TableError(self.place, [(self.lines[-1], f"{name} has no unit", cure)])
+            heading = f"in ECSV 'unit: {named[0]}', in CSV a heading such as {name} [{named[0]}]"
+            self.note(-1, f"{name} has no unit", f"give it in {accepted}: {heading}")
+            return 1.0
         try:
-            return float(u.Unit(written).to(u.Unit(unit)))
+            return float(u.Unit(SPELLED.get(written.lower(), written)).to(u.Unit(unit)))
         except (ValueError, u.UnitConversionError):
-            cure = (
-                f"give it in {accepted}, or another unit of its kind"
-                if unit
-                else "leave the unit out"
-            )
-            raise TableError(
-                self.place, [(self.lines[-1], f"{name} has the unit {written!r}", cure)]
-            ) from None
+            other = f"give it in {accepted}, or another unit of its kind"
+            cure = other if unit else "leave the unit out"
+            self.note(-1, f"{name} has the unit {written!r}", cure)
+            return 1.0
+
+    def instants(self, name: str, *, optional: bool = False) -> list[Instant | None]:
+        """A column of times; None, and a mistake, for another text. ``optional``: it may be
+        empty.
+        """
+        found: list[Instant | None] = []
+        for row, text in enumerate(self.texts(name)):
+            try:
+                found.append(Instant.parse(text) if text or not optional else None)
+            except ValueError as err:
+                found.append(None)
+                self.note(row, f"{name}: {err}", "write it as 2024-11-25T07:00:00.5 (UTC)")
+        return found
 
 
 def _number(text: str) -> float:
@@ -139,98 +193,76 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def read_table(path: Path) -> Table:
-    """Read ECSV, or CSV whose first line names the columns, with units in brackets: ``ra [deg], dec
-    [deg]``.
+def read_table(path: Path, place: str = "", text: str | None = None) -> Table:
+    """Read a table. The heading of text is the first line that is no comment; where that has
+    numbers, a comment above with as many fields. ``text``: the content, if it was read before.
 
     Raises InputError for another kind of file, rows of unequal length, columns of one name, or a
     table without rows.
     """
-    place = str(path)
-    with reading(
-        place,
-        "a table",
-        "give ECSV, or CSV whose first line names the columns, with their units in brackets",
-    ):
-        if path.stat().st_size > LARGEST:
-            raise InputError(
-                f"is larger than {LARGEST >> 20} MB", place=place, cure="give a small table"
-            )
-        text = path.read_text(encoding="utf-8-sig")
-    names, units, rows, lines = _ecsv(text, place) if text.startswith("# %ECSV") else _csv(text)
-    mistakes = Mistakes(place)
+    place = place or str(path)
+    text = read_text(path, place) if text is None else text
+    written = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    body = [(number, line) for number, line in written if not line.startswith("#")]
+    meta: Mapping[str, Any] = {}
+    if text.startswith("# %ECSV"):
+        cure = "write it with astropy: table.write(path, format='ascii.ecsv')"
+        with reading(place, "ECSV", cure):
+            head = get_header_from_yaml(line[2:] for _, line in written if line.startswith("# "))
+            numbers, rows = _cells(body, str(head.get("delimiter", " ")))
+            described = {column["name"]: str(column.get("unit", "")) for column in head["datatype"]}
+            named = [(name, described[name]) for name in rows[0]]
+            meta = head["meta"] if isinstance(head.get("meta"), Mapping) else {}
+    else:
+        first = body[0][1] if body else ""
+        mark = max(",;\t|", key=first.count)
+        mark = mark if mark in first else " "
+        numbers, rows = _cells(body, mark)
+        if rows and any(math.isfinite(_number(cell)) for cell in rows[0]):
+            above = [(k, line.lstrip("# ")) for k, line in written if k < body[0][0]]
+            fitting = [
+                both
+                for both in zip(*_cells(above, mark), strict=True)
+                if len(both[1]) == len(rows[0])
+            ]
+            fitting.sort(key=lambda both: any("[" in cell for cell in both[1]))
+            for number, heading in fitting[-1:]:
+                numbers, rows = [number, *numbers], [heading, *rows]
+        found = [(word, BRACKETED.fullmatch(word)) for word in (rows[0] if rows else [])]
+        named = [(m[1], m[2] or m[3] or "") if m else (word, "") for word, m in found]
+    names = [name for name, _ in named]
+    table = Table(place, {}, [*numbers[1:], *(numbers[:1] or [1])], meta)
     for name in sorted({n for n in names if names.count(n) > 1}):
-        mistakes.add(lines[-1], f"has two columns {name!r}", "rename one of them")
-    for row, line in zip(rows, lines, strict=False):
+        table.note(-1, f"has two columns {name!r}", "rename one of them")
+    for k, row in enumerate(rows[1:]):
         if len(row) != len(names):
             cure = f"write {len(names)} values: {', '.join(names)}"
-            mistakes.add(line, f"has {len(row)} values, not {len(names)}", cure)
-    if not rows:
-        mistakes.add(0, "has no rows", "give a table with a row or more")
-    mistakes.tell()
-    columns = [list(column) for column in zip(*rows, strict=True)]
-    return Table(place, {n: (c, u) for n, u, c in zip(names, units, columns, strict=True)}, lines)
+            table.note(k, f"has {len(row)} values, not {len(names)}", cure)
+    if not rows[1:]:
+        table.note(None, "has no rows", "give a table with a row or more")
+    table.check()
+    columns = [list(column) for column in zip(*rows[1:], strict=True)]
+    table.columns = {n: (c, unit) for (n, unit), c in zip(named, columns, strict=True)}
+    return table
 
 
-Cells = list[list[str]]
-Written = tuple[list[str], list[str], Cells, list[int]]
-"""Names, units and rows of a table, and `Table.lines`."""
-
-
-def _csv(text: str) -> Written:
-    """CSV. The heading is the first line that is no comment; where that has numbers, a comment
-    above with as many fields.
+def read_text(path: Path, place: str) -> str:
+    """The text of a table. Raises InputError for a file that is larger than `LARGEST`, or no
+    text.
     """
-    written = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    numbers, rows = _cells(
-        [(number, line) for number, line in written if not line.startswith("#")], ","
-    )
-    if rows and any(math.isfinite(_number(cell)) for cell in rows[0]):
-        above = [
-            (number, line.lstrip("# "))
-            for number, line in written
-            if line.startswith("#") and number < numbers[0]
-        ]
-        fitting = [
-            (number, row)
-            for number, row in zip(*_cells(above, ","), strict=True)
-            if len(row) == len(rows[0])
-        ]
-        with_units = [(number, row) for number, row in fitting if any("[" in cell for cell in row)]
-        if fitting:
-            number, heading = (with_units or fitting)[-1]
-            numbers, rows = [number, *numbers], [heading, *rows]
-    named = [word.partition("[") for word in (rows[0] if rows else [])]
-    names, units = (
-        [name.strip() for name, _, _ in named],
-        [unit.strip("] ") for _, _, unit in named],
-    )
-    return (
-        names,
-        units,
-        [[cell.strip() for cell in row] for row in rows[1:]],
-        [*numbers[1:], *(numbers[:1] or [1])],
-    )
+    cure = "give ECSV, or text whose heading names the columns, with their units in brackets"
+    with reading(place, "a table", cure):
+        if path.stat().st_size > LARGEST:
+            text = f"is larger than {LARGEST >> 20} MB"
+            raise InputError(text, place=place, cure="give a small table")
+        return path.read_text(encoding="utf-8-sig")
 
 
-def _cells(lines: Sequence[tuple[int, str]], comma: str) -> tuple[list[int], Cells]:
+def _cells(lines: Sequence[tuple[int, str]], mark: str) -> tuple[list[int], list[list[str]]]:
     """Cells of numbered lines, and the number of the line of each row."""
-    reader = csv.reader((line for _, line in lines), delimiter=comma, skipinitialspace=True)
+    texts = (line.strip(" ") for _, line in lines)
+    if mark == " ":  # a unit in brackets belongs to the name before it
+        texts = (re.sub(r"\s+(?=[\[(])", "", line) for line in texts)
+    reader = csv.reader(texts, delimiter=mark, skipinitialspace=True)
     found = [(lines[reader.line_num - 1][0], row) for row in reader]
-    return [number for number, _ in found], [row for _, row in found]
-
-
-def _ecsv(text: str, place: str) -> Written:
-    with reading(place, "ECSV", "write it with astropy: table.write(path, format='ascii.ecsv')"):
-        lines = text.splitlines()
-        head = get_header_from_yaml(line[2:] for line in lines if line.startswith("# "))
-        described = {column["name"]: str(column.get("unit", "")) for column in head["datatype"]}
-        body = [
-            (number, line)
-            for number, line in enumerate(lines, 1)
-            if line.strip() and not line.startswith("#")
-        ]
-        numbers, rows = _cells(body, str(head.get("delimiter", " ")))
-        names = rows[0]
-        units = [described[name] for name in names]
-    return names, units, rows[1:], [*numbers[1:], numbers[0]]
+    return [number for number, _ in found], [[cell.strip() for cell in row] for _, row in found]

@@ -27,7 +27,6 @@ from zonda.core.kernels import kernel
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.storage.ecsv import read_table
-from zonda.core.storage.table_mistakes import Mistakes
 from zonda.core.types import Floats
 
 NEXT = 1.2
@@ -149,26 +148,22 @@ def read_shares(path: Path, plane: Focalplane) -> Shares:
     """C from a table of `COLUMNS`."""
     table = read_table(path)
     number = {name: k for k, name in enumerate(plane.names)}
-    mistakes = Mistakes(table.place)
     index = []
     for column in COLUMNS[:2]:
         names = table.texts(column)
-        for name, line in zip(names, table.lines, strict=False):
+        for row, name in enumerate(names):
             if name not in number:
                 cure = f"the names are such as {', '.join(plane.names[:3])}"
-                mistakes.add(line, f"{column} {name!r} is no detector of the focal plane", cure)
+                table.note(row, f"{column} {name!r} is no detector of the focal plane", cure)
         index.append(np.array([number.get(name, -1) for name in names], np.int64))
     detector, source = index
-    for row in np.flatnonzero((detector == source) & (detector >= 0)).tolist():
-        mistakes.add(
-            table.lines[row],
-            "is a detector's share of itself",
-            "remove it; gains are not crosstalk",
-        )
-    share = np.zeros(len(table))
-    with mistakes.noted():
-        share = table.numbers(COLUMNS[2])
-    mistakes.tell()
+    table.note_rows(
+        (detector == source) & (detector >= 0),
+        lambda row: "is a detector's share of itself",
+        "remove it; gains are not crosstalk",
+    )
+    share = table.numbers(COLUMNS[2])
+    table.check()
     if len(set(zip(detector.tolist(), source.tolist(), strict=True))) < len(share):
         raise InputError(
             "a pair of detectors is there twice", place=table.place, cure="remove one of the rows"

@@ -4,21 +4,19 @@ instruments read it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import astropy.units as u
 import numpy as np
-from astropy.table import Table
 from numpy.typing import NDArray
 
 from zonda.core import flags
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import TILE_DETECTORS, chunks
-from zonda.core.storage.ecsv import Column, write_ecsv
-from zonda.core.storage.files import reading
+from zonda.core.storage.ecsv import Column, read_table, write_ecsv
 from zonda.core.types import Floats
 
 from .recorded_scan import rows_of_bands
@@ -28,8 +26,6 @@ from .time_ordered_data import TimeOrderedData
 
 UNITS = {"net": "K s(1/2)", "knee": "Hz", "slope": ""}
 """Columns and their SI units."""
-
-CURE = "give a table that `zonda noise` wrote: ECSV with columns name, net, knee and slope"
 
 
 @dataclass(frozen=True)
@@ -60,33 +56,33 @@ def read_noise(path: Path) -> NoiseTable:
     """Read a table. Raises InputError where it is none, lacks a column, or has a value that cannot
     be.
     """
-    place = f"noise table {path}"
-    with reading(place, "ECSV", CURE):
-        table = Table.read(path, format="ascii.ecsv")
-        if lacking := [name for name in ("name", *UNITS) if name not in table.colnames]:
-            raise InputError(f"has no column {lacking[0]}", place=place, cure=CURE)
-        names = [str(name) for name in table["name"]]
-        columns = {}
-        for name, unit in UNITS.items():
-            values = np.asarray(np.ma.filled(table[name], np.nan), np.float64)
-            columns[name] = values * (
-                u.Unit(table[name].unit).to(unit) if table[name].unit is not None and unit else 1.0
-            )
+    try:
+        return _read(path)
+    except InputError as err:
+        err.cure += "\nor make the table anew: zonda noise FILE"
+        raise
+
+
+def _read(path: Path) -> NoiseTable:
+    table = read_table(path, f"noise table {path}")
+    names, columns = table.texts("name"), {}
+    for name, otherwise in (("net", np.nan), ("knee", 0.0), ("slope", 1.0)):
+        if any(table.texts(name)):
+            unit = UNITS[name]
+            values = table.values(name) * table.factor(name, unit, unit)
+            wrong = ~np.isfinite(values) | (values < 0)
+            columns[name] = np.where(wrong, otherwise, values)  # without 1/f noise it has neither
+    net = columns.get("net", np.zeros(len(table)))
+    cure = "leave the detector out of the pipeline's file, or give it a number"
+    table.note_rows(
+        np.isnan(net),
+        lambda row: f"net of detector {names[row]} is {table.texts('net')[row]}",
+        cure,
+    )
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(
-            f"detector {twice!r} is there twice", place=place, cure="leave one of the rows out"
-        )
-    for name, values in columns.items():
-        bad = np.flatnonzero(~np.isfinite(values) | (values < 0))
-        if bad.size and name == "net":
-            cure = "leave the detector out of the pipeline's file, or give it a number"
-            raise InputError(
-                f"net of detector {names[bad[0]]} is {values[bad[0]]:g}", place=place, cure=cure
-            )
-        values[bad] = {"net": 0.0, "knee": 0.0, "slope": 1.0}[
-            name
-        ]  # a detector without 1/f noise has neither
+        twice = next(name for name, number in Counter(names).items() if number > 1)
+        table.note(None, f"detector {twice!r} is there twice", "leave one of the rows out")
+    table.check()
     return NoiseTable(path, {name: row for row, name in enumerate(names)}, columns)
 
 

@@ -1,10 +1,17 @@
 """Recorded pointing in files: HDF5 (TOAST's layout and plain datasets), FITS tables, CSV and ASTE's
 antenna logs.
+
+The antenna logs of the ASTE telescope, as DESHIMA's observations have them (``.ant``), are text,
+one row every 0.1 s. A line of names begins with ``#time``; rows have the UTC time
+(``20171113070543.1``), 17 numbers in degrees and millimetres and what the telescope did. The beam
+is where the programme without the pointing model's corrections wanted it, plus the error of
+tracking (as DESHIMA's own package demerge takes it):
+
+    azimuth = az-prog(no-cor) + az-real - az-prg,      the same for the elevation.          (1)
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,14 +22,13 @@ from numpy.typing import NDArray
 
 from zonda.core import flags
 from zonda.core.configuration.time import SECOND, Instant
-from zonda.core.configuration.units import factor_to
 from zonda.core.errors import InputError
 from zonda.core.intervals import Intervals
 from zonda.core.storage import fits_files, hdf5_files
+from zonda.core.storage.ecsv import Table, read_table, read_text
 from zonda.core.storage.files import reading
 from zonda.core.types import Floats
 
-from .antenna_log import BEGINS, read_log
 from .recording import Recording, longest_rising
 
 ALIASES = {
@@ -55,23 +61,17 @@ ALIASES = {
 }
 """Our name of a column, and names that files have for it, in small letters."""
 
-UNITS = {
-    **dict.fromkeys(("deg", "degs", "degree", "degrees", "°"), "deg"),
-    **dict.fromkeys(("rad", "radian", "radians"), "rad"),
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
-    "ms": "ms",
-    "arcmin": "arcmin",
-    "arcsec": "arcsec",
-}
-"""Units as headings write them, in small letters, and as we do."""
-ISO = re.compile(r"\d{4}-\d{2}-\d{2}([T ]\d{2}:\d{2}(:\d{2}(\.\d{1,9})?)?)?")
+TOAST_UNITS = {"time": "s", "seconds": "s", "az": "rad", "el": "rad"}
+"""Of TOAST's layout, which does not state them."""
+
+STATES = {"SCAN": 0, "ON": 0, "ACC": flags.TURNAROUND, "TRAN": flags.TURNAROUND}
+"""What ASTE did, and the flags of such a row; of others: `flags.IRREGULAR` (slews, off-source
+positions). The row "END" is no measurement.
+"""
 
 Clock = Literal["unix", "mjd", "scene"]
 
 CURE = "give HDF5, a FITS table, CSV or an antenna log of ASTE"
-
-Columns = Mapping[str, tuple[Any, str | None]]
-"""By name in small letters: values and unit."""
 
 
 @dataclass
@@ -80,8 +80,8 @@ class RecordedTable:
 
     Attributes
     ----------
-    columns
-        Those of one number per row.
+    table
+        Columns of one number per row, by their names in small letters.
     start
         What a column ``seconds`` counts from, where the file says it.
     bits
@@ -93,11 +93,11 @@ class RecordedTable:
         (2, n) each, as ``times`` count or, ``in_seconds``, as ``seconds`` do.
     """
 
-    columns: Columns
+    table: Table
     start: Instant | None = None
     bits: Literal["toast", "before", "any"] = "any"
     radec: Floats | None = None
-    intervals: dict[str, Floats] = field(default_factory=dict)
+    intervals: dict[str, Any] = field(default_factory=dict)
     in_seconds: bool = False
 
 
@@ -118,144 +118,107 @@ def read_recording(path: Path, clock: Clock, mask: int | None = None) -> Recordi
         Unreadable, without the columns, without units, or with directions that cannot be.
     """
     place = f"recorded pointing {path}"
-    try:
-        with path.open("rb") as file:
-            magic = file.read(9)
-        if magic == BEGINS:
-            start, seconds, azimuth, elevation, bits = read_log(path, place)
-            _check_latitude(elevation, "el", place)
-            return Recording(
-                start, seconds, azimuth, elevation, "azel", _flags(bits, "toast", mask)
-            )
-        kind = (
-            _hdf5
-            if magic.startswith(b"\x89HDF")
-            else _fits
-            if magic.startswith(b"SIMPLE  =")
-            else _csv
-        )
-        return _recording(kind(path, place), clock, mask, place)
-    except OSError as err:
-        raise InputError(f"cannot be read: {err}", place=place, cure=CURE) from None
+    with reading(place, "a recording", CURE), path.open("rb") as file:
+        magic = file.read(9)
+    kinds = ((b"#time ra-", _antenna_log), (b"\x89HDF", _hdf5), (b"SIMPLE  =", _fits), (b"", _text))
+    read = next(read for begins, read in kinds if magic.startswith(begins))
+    return _recording(read(path, place), clock, mask, place)
 
 
-def _csv(path: Path, place: str) -> RecordedTable:
-    """Text: columns with commas, semicolons, tabs or blanks between them, under a line of their
-    names and units.
+def _text(path: Path, place: str) -> RecordedTable:
+    """Text: names as ``az [deg]``, ``Azimuth(deg)``, ``az_deg`` or ``az``; times as numbers or
+    dates.
     """
-    with reading(
-        place,
-        "CSV",
-        "write rows of equally many numbers, under a line such as: time [s], az [deg], el [deg]",
-    ):
-        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte order mark
-    header, _, rest = text.partition("\n")
-    header = header.lstrip("# ").strip()
-    mark = max(",;\t", key=header.count)
-    comma = mark if mark in header else None
-    words = header.split(comma) if comma else re.findall(r"\S+(?:\s*[\[(][^\])]*[\])])?", header)
-    names = [_heading(word) for word in words]
-    try:
-        table = np.genfromtxt(rest.splitlines(), delimiter=comma, ndmin=2)
-    except ValueError as err:
-        raise InputError(
-            f"cannot be read as CSV: {err}", place=place, cure="write rows of equally many numbers"
-        ) from None
-    if table.size == 0 or table.shape[1] != len(names):
-        raise InputError(
-            f"the first line names {len(names)} columns, the rows have"
-            f" {table.shape[1] if table.size else 0}",
-            place=place,
-            cure="begin with a line such as: time [s], az [deg], el [deg]",
+    table = read_table(path, place)
+    known = {name for names in ALIASES.values() for name in names}
+    columns: dict[str, tuple[Any, str]] = {}
+    for heading, (texts, unit) in table.columns.items():
+        name, (short, _, behind) = (
+            heading.lower().replace(" ", "_"),
+            heading.lower().rpartition("_"),
         )
-    found = RecordedTable({name: (table[:, k], unit) for k, (name, unit) in enumerate(names)})
-    for k, (name, _) in enumerate(names):
-        if name in ALIASES["time"] and np.isnan(table[:, k]).all():
-            texts = [
-                line.split(comma)[k].strip().strip("\"'")
-                for line in rest.splitlines()
-                if line.strip()
-            ]
-            found.start, seconds = _dates(texts, place)
-            found.columns = {**found.columns, name: (seconds, "s"), "seconds": (seconds, "s")}
-            break
+        columns |= (
+            {short: (texts, behind)}
+            if short in known and name not in known
+            else {name: (texts, unit)}
+        )
+    table.columns = columns
+    return _dated(RecordedTable(table))
+
+
+def _dated(found: RecordedTable) -> RecordedTable:
+    """The table with times that are dates as ``seconds``, from a whole second before the first."""
+    table = found.table
+    for name in ALIASES["time"]:
+        if name in table.columns and np.isnan(table.values(name)).all():
+            times = table.instants(name, optional=True)
+            first = next((time.nanoseconds for time in times if time), 0) // SECOND * SECOND
+            if not first:
+                table.note(-1, f"{name} has no number and no date", "write seconds since 1970")
+            table.check()
+            seconds = [np.nan if t is None else (t.nanoseconds - first) / SECOND for t in times]
+            found.start = Instant(first)
+            table.columns = {**table.columns, **dict.fromkeys((name, "seconds"), (seconds, "s"))}
     return found
 
 
-def _heading(text: str) -> tuple[str, str | None]:
-    """Name in small letters and unit of ``az [deg]``, ``Azimuth(deg)``, ``az_deg`` or ``az``."""
-    match = re.fullmatch(r"(.*?)\s*[\[(](.*?)[\])]", text.strip())
-    known = {name for names in ALIASES.values() for name in names}
-    if match is None:
-        behind = re.fullmatch(r"(.*?)[_ .](\w+)", text.strip())
-        match = (
-            behind if behind and behind[1].lower() in known and behind[2].lower() in UNITS else None
-        )
-    name, unit = (match[1], match[2].strip()) if match else (text, "")
-    plain = name.strip().strip("\"'").lower().replace(" ", "_")
-    return plain, UNITS.get(unit.lower(), unit) or None
-
-
-def _dates(texts: list[str], place: str) -> tuple[Instant, Floats]:
-    """A whole second next to the first of dates (ISO 8601, UTC), and seconds since then; NaN for an
-    empty text.
-    """
-    plain = [re.sub(r"(Z|[+-]00:?00)$", "", text) for text in texts]
-    wrong = next(
-        (text for text, p in zip(texts, plain, strict=True) if p and not ISO.fullmatch(p)), None
+def _antenna_log(path: Path, place: str) -> RecordedTable:
+    """A log of ASTE; it also writes `prog` for `prg`, and one name too few."""
+    text = read_text(path, place).replace("(center) type", "(center) el-prog(center) type", 1)
+    table = read_table(path, place, text)
+    states = table.texts("type")
+    rows = [row for row, state in enumerate(states) if state != "END"]
+    table.lines = [table.lines[row] for row in (*rows, -1)]
+    table.columns = {
+        name.replace("prog(no-cor)", "prg(no-cor)"): ([texts[row] for row in rows], unit)
+        for name, (texts, unit) in table.columns.items()
+    }
+    if not rows:
+        table.note(None, "has no row of a scan", "give the log of another observation")
+    wanted, real, own = (
+        [np.radians(table.numbers(f"{axis}-{kind}")) for axis in ("az", "el")]
+        for kind in ("prg", "real", "prg(no-cor)")
     )
-    if wrong is not None or not any(plain):
-        what = (
-            f"time is {wrong!r}, no date"
-            if wrong is not None
-            else "has no time that is a number or a date"
-        )
-        raise InputError(
-            what,
-            place=place,
-            cure="write dates as 2024-11-25T07:00:00.5 (UTC), or seconds since 1970",
-        )
-    with reading(place, "CSV", "write dates as 2024-11-25T07:00:00.5 (UTC)"):
-        instants = np.array([p.replace(" ", "T") or "NaT" for p in plain], "datetime64[ns]")
-    first = instants[~np.isnat(instants)][0].astype("datetime64[s]")
-    seconds = (instants - first) / np.timedelta64(1, "s")
-    return Instant(int(first.astype(np.int64)) * SECOND), np.asarray(seconds, np.float64)
+    table.check()
+    late = (real[0] - wanted[0] + np.pi) % (2 * np.pi) - np.pi  # within half a turn
+    bits = [STATES.get(states[row], flags.IRREGULAR) for row in rows]
+    dates = [
+        f"{t[:4]}-{t[4:6]}-{t[6:8]}T{t[8:10]}:{t[10:12]}:{t[12:]}" for t in table.texts("time")
+    ]
+    table.columns = {
+        "time": (dates, ""),
+        "az": (own[0] + late, "rad"),
+        "el": (own[1] + real[1] - wanted[1], "rad"),
+        "flags": (np.array(bits), ""),
+    }
+    return _dated(RecordedTable(table, bits="toast"))
 
 
 def _fits(path: Path, place: str) -> RecordedTable:
     from astropy.io import fits
 
     with fits_files.opened(path, place, CURE) as file:
-        for table in file:
-            fits_files.check_size(table, place)
-            names = (
-                {name.lower() for name in getattr(table.columns, "names", [])}
-                if isinstance(table, fits.BinTableHDU)
-                else set()
-            )
-            if any(names >= {a, b} for a in ALIASES["az"] for b in ALIASES["el"]) or names >= {
-                "ra",
-                "dec",
-            }:
-                columns = {
-                    c.name.lower(): (np.asarray(table.data[c.name], np.float64), c.unit)
-                    for c in table.columns
-                    if c.dim is None
-                    and np.asarray(table.data[c.name]).ndim == 1
-                    and np.asarray(table.data[c.name]).dtype.kind in "fiub"
-                }
-                start = file[0].header.get("DATE-OBS") if "seconds" in columns else None
-                found = RecordedTable(
-                    columns, Instant.parse(start) if start else None, in_seconds=True
-                )
-                if names >= {"boresight_azel", "boresight_radec"}:  # SaveTOD's
-                    found.bits = "toast" if "FLAGBITS" in table.header else "before"
-                    _check_rotation(table.data["BORESIGHT_AZEL"], place)
-                    found.radec = np.asarray(table.data["BORESIGHT_RADEC"], np.float64)
-                    found.intervals = (
-                        _fits_intervals(file["INTERVALS"].data) if "INTERVALS" in file else {}
-                    )
-                return found
+        for hdu in file:
+            fits_files.check_size(hdu, place)
+            columns = hdu.columns if isinstance(hdu, fits.BinTableHDU) else ()
+            names = {column.name.lower() for column in columns}
+            azel = any(names >= {a, b} for a in ALIASES["az"] for b in ALIASES["el"])
+            if not azel and not names >= {"ra", "dec"}:
+                continue
+            given = {c.name.lower(): (np.asarray(hdu.data[c.name]), c.unit or "") for c in columns}
+            found = RecordedTable(_of_numbers(given, place), in_seconds=True)
+            start = file[0].header.get("DATE-OBS")
+            if "seconds" in names and start:
+                found.start = Instant.parse(start)
+            if names >= {"boresight_azel", "boresight_radec"}:  # SaveTOD's
+                found.bits = "toast" if "FLAGBITS" in hdu.header else "before"
+                _check_rotation(given["boresight_azel"][0], place)
+                found.radec = np.asarray(given["boresight_radec"][0], np.float64)
+                for row in file["INTERVALS"].data if "INTERVALS" in file else ():
+                    spans = found.intervals.setdefault(str(row["NAME"]), [])
+                    spans.append([row["START"], row["STOP"]])
+                found.intervals = {k: np.array(v, np.float64).T for k, v in found.intervals.items()}
+            return found
     raise InputError(
         "has no table with az and el, or ra and dec",
         place=place,
@@ -263,68 +226,50 @@ def _fits(path: Path, place: str) -> RecordedTable:
     )
 
 
+def _of_numbers(columns: Mapping[str, tuple[NDArray[Any], str]], place: str) -> Table:
+    """The table of those columns that have one number per row."""
+    plain = {
+        n: (v, unit) for n, (v, unit) in columns.items() if v.ndim == 1 and v.dtype.kind in "fiub"
+    }
+    return Table(place, plain, [0] * (1 + max([len(v) for v, _ in plain.values()] or [0])))
+
+
 def _hdf5(path: Path, place: str) -> RecordedTable:
     import h5py
+
+    def read(item: Any, kinds: str = "fiub") -> Any:
+        """The numbers of a data set; None for something else."""
+        if not isinstance(item, h5py.Dataset) or item.dtype.kind not in kinds:
+            return None
+        hdf5_files.check_size(item, place)
+        return item[()]
 
     with hdf5_files.opened(path, place, "HDF5", CURE) as file:
         toast = "shared" in file
         group = file["shared"] if toast else file.get("pointing", file)
-        columns: dict[str, tuple[Any, str | None]] = {}
-        for name, values in group.items():
-            if (
-                not isinstance(values, h5py.Dataset)
-                or values.ndim != 1
-                or values.dtype.kind not in "fiub"
-            ):
-                continue
-            hdf5_files.check_size(values, place)
-            unit = values.attrs.get("units", values.attrs.get("unit"))
-            known = next((ours for ours, names in ALIASES.items() if name.lower() in names), None)
-            si = (
-                {"time": "s", "seconds": "s", "az": "rad", "el": "rad"}.get(known or "")
-                if toast
-                else None
-            )
-            columns[name.lower()] = (values[:], str(unit) if unit is not None else si)
-        found = RecordedTable(columns)
+        ours = {name: our for our, names in ALIASES.items() for name in names}
+        columns = {}
+        for name, item in group.items():
+            if (values := read(item)) is not None:
+                si = TOAST_UNITS.get(ours.get(name.lower(), ""), "") if toast else ""
+                unit = item.attrs.get("units", item.attrs.get("unit", si))
+                columns[name.lower()] = (np.asarray(values), str(unit))
+        found = RecordedTable(_of_numbers(columns, place))
         if toast:
             other = file["metadata/other"].attrs if "metadata/other" in file else {}
             start = other.get("zonda_start_utc")
             found.start = Instant.parse(str(start)) if start is not None else None
             found.bits = "before" if start is not None and "zonda_flags" not in other else "toast"
-            parts = (
-                file["intervals"].items() if isinstance(file.get("intervals"), h5py.Group) else ()
-            )
-            for dataset in (
-                group.get("boresight_azel"),
-                group.get("boresight_radec"),
-                *(spans for _, spans in parts),
-            ):
-                if isinstance(dataset, h5py.Dataset):
-                    hdf5_files.check_size(dataset, place)
-            if "boresight_azel" in group:
-                _check_rotation(group["boresight_azel"], place)
-            if (
-                isinstance(radec := group.get("boresight_radec"), h5py.Dataset)
-                and radec.dtype.kind == "f"
-            ):
-                found.radec = np.asarray(radec[()], np.float64)
-            kept = (
-                (name, spans)
-                for name, spans in parts
-                if isinstance(spans, h5py.Dataset) and spans.dtype.kind in "fiu"
-            )
-            found.intervals = {name: np.asarray(spans[()], np.float64) for name, spans in kept}
+            if (azel := read(group.get("boresight_azel"))) is not None:
+                _check_rotation(azel, place)
+            if (radec := read(group.get("boresight_radec"), "f")) is not None:
+                found.radec = np.asarray(radec, np.float64)
+            parts = file.get("intervals")
+            spans = {n: read(i, "fiu") for n, i in parts.items()} if hasattr(parts, "items") else {}
+            found.intervals = {
+                n: np.asarray(v, np.float64) for n, v in spans.items() if v is not None
+            }
         return found
-
-
-def _fits_intervals(rows: Any) -> dict[str, Floats]:
-    """Intervals of SaveTOD's table: (2, n) by name."""
-    if not {"NAME", "START", "STOP"} <= set(rows.names):
-        return {}
-    names = np.asarray(rows["NAME"]).astype(str)
-    spans = np.array([rows["START"], rows["STOP"]], np.float64)
-    return {str(name): spans[:, names == name] for name in dict.fromkeys(names)}
 
 
 def _check_rotation(quaternions: Any, place: str) -> None:
@@ -346,49 +291,51 @@ def _check_rotation(quaternions: Any, place: str) -> None:
         )
 
 
-def _recording(table: RecordedTable, clock: Clock, mask: int | None, place: str) -> Recording:
-    columns, start = table.columns, table.start
+def _recording(given: RecordedTable, clock: Clock, mask: int | None, place: str) -> Recording:
+    table, start = given.table, given.start
     found = {
-        ours: columns[name] for ours, names in ALIASES.items() for name in names if name in columns
+        ours: name for ours, names in ALIASES.items() for name in names if name in table.columns
     }
     frame: Literal["azel", "icrs"] = "azel" if {"az", "el"} <= set(found) else "icrs"
     which = ("az", "el") if frame == "azel" else ("ra", "dec")
-    lacks = [name for name in which if name not in found] + ["time"] * (
-        not {"time", "seconds"} & set(found)
-    )
+    lacks = [name for name in which if name not in found]
+    lacks += ["time"] * (not {"time", "seconds"} & set(found))
     if lacks:
-        there = ", ".join(columns) or "none"
+        there = ", ".join(table.columns) or "none"
         raise InputError(
             f"has no column {' and '.join(lacks)}; columns: {there}",
             place=place,
             cure="name them time, az and el",
         )
-    longitude, latitude = (_in_si(*found[name], "rad", name, place) for name in which)
+    factors = [table.factor(found[name], "rad") for name in which]
+    times: dict[str, Floats] = {}
+    for name in {"time", "seconds"} & set(found):
+        factor = 1.0 if clock == "mjd" else table.factor(found[name], "s", "s")
+        times[name] = table.values(found[name]) * factor
+    table.check()
+    longitude, latitude = (table.values(found[n]) * f for n, f in zip(which, factors, strict=True))
     _check_latitude(latitude, which[1], place)
     if start is not None and "seconds" in found:
-        seconds = _in_si(*found["seconds"], "s", "seconds", place)
+        seconds = times["seconds"]
     else:
-        seconds, start = _times(*found["time" if "time" in found else "seconds"], clock, place)
-    if table.radec is not None and table.radec.shape != (len(seconds), 4):
-        shape = " x ".join(map(str, table.radec.shape))
+        seconds, start = _times(times["time" if "time" in times else "seconds"], clock, place)
+    if not len(longitude) == len(latitude) == len(seconds):
+        cure = "give time, az and el of each instant"
+        raise InputError("its columns have different lengths", place=place, cure=cure)
+    if given.radec is not None and given.radec.shape != (len(seconds), 4):
+        shape = " x ".join(map(str, given.radec.shape))
         raise InputError(
             f"boresight_radec is {shape}, not {len(seconds)} x 4",
             place=place,
             cure="save the file again",
         )
-    radec = table.radec if frame == "azel" else None
-    times = (
-        seconds
-        if table.in_seconds or "time" not in found
-        else np.asarray(found["time"][0], np.float64)
-    )
-    parts = _intervals(table.intervals, times, seconds, place)
-    bits, trimmed = (
-        np.zeros(len(seconds), np.uint8),
-        _within(parts.pop(flags.TRIMMED_INTERVALS, []), seconds),
-    )
+    counted = seconds if given.in_seconds else times.get("time", seconds)
+    parts = _intervals(given.intervals, counted, seconds, place)
+    trimmed = _within(parts.pop(flags.TRIMMED_INTERVALS, []), seconds)
+    bits = np.zeros(len(seconds), np.uint8)
     if "flags" in found:
-        bits = _flags(found["flags"][0], table.bits, mask, trimmed)
+        bits = _flags(table.values(found["flags"]), given.bits, mask, trimmed)
+    radec = given.radec if frame == "azel" else None
     return Recording(start, seconds, longitude, latitude, frame, bits, radec, parts)
 
 
@@ -451,16 +398,10 @@ def _intervals(
     return found
 
 
-def _times(
-    values: Any, unit: str | None, clock: Clock, place: str
-) -> tuple[Floats, Instant | None]:
+def _times(times: Floats, clock: Clock, place: str) -> tuple[Floats, Instant | None]:
     """Seconds, and what they count from: a whole second or day next to the first, so that
     differences are exact.
     """
-    days = clock == "mjd"
-    times = (
-        np.asarray(values, np.float64) if days else _in_si(values, unit or "s", "s", "time", place)
-    )
     if clock == "scene":
         return times, None
     finite = times[np.isfinite(times)]
@@ -468,10 +409,9 @@ def _times(
         raise InputError(
             "has no time that is a number", place=place, cure="check the column of times"
         )
-    first = int(np.floor(finite[0]))
-    since = first * SECOND if not days else (first - 40587) * 86400 * SECOND
+    first, days = int(np.floor(finite[0])), clock == "mjd"
     try:
-        start = Instant(since)
+        start = Instant((first - 40587) * 86400 * SECOND if days else first * SECOND)
         year = start.datetime.year
     except (OverflowError, ValueError):
         year = 0
@@ -486,20 +426,3 @@ def _times(
             ),
         )
     return (times - first) * (86400.0 if days else 1.0), start
-
-
-def _in_si(values: Any, unit: str | None, si: str, name: str, place: str) -> Floats:
-    if not unit:
-        raise InputError(
-            f"{name} has no unit",
-            place=place,
-            cure=f"write one, e.g. {name} [deg] in the first line of a CSV",
-        )
-    factor = factor_to(si, unit)
-    if factor is None:
-        raise InputError(
-            f"{unit!r} is no unit of {name}",
-            place=place,
-            cure=f"use {'deg or rad' if si == 'rad' else 's'}",
-        )
-    return np.asarray(values, np.float64) * factor

@@ -14,7 +14,7 @@ from zonda.core.numerics.sphere import separation
 from .limits import LargestMotion
 from .observed import report
 from .samples_per_beam import SamplesPerBeam
-from .schedule_files import Row, read_schedule, read_site
+from .schedule_files import Row, SchedulesSite, read_schedule
 from .scheduled import ScheduleParameters
 from .sun_and_moon import distances
 
@@ -73,7 +73,7 @@ class PointingSchedule(ScheduleParameters):
     def check(self, data: Data) -> list[str]:
         """Number of scans, their places and speeds, and distances from Sun and Moon."""
         first, rate = len(data.observations), self.sample_rate or data.scene.instrument.sample_rate
-        rows = read_schedule(self.schedule, self.nod.duration)
+        rows, _ = read_schedule(self.schedule, self.nod.duration)
         looked = _some(rows)
         self._observe(data, min(rate, CHECKED / sum(row.duration for row in looked)), looked)
         made = data.observations[first:]
@@ -94,11 +94,11 @@ class PointingSchedule(ScheduleParameters):
             f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(topics)
         ]
 
-    def _compare_sites(self, data: Data) -> None:
+    def _compare_sites(self, data: Data, stated: SchedulesSite | None) -> None:
         """Warn where the schedule was made for another site; PointingError where that is far
         away.
         """
-        stated, site = read_site(self.schedule), data.scene.site
+        site = data.scene.site
         if stated is None:
             return
         there = np.array([stated.longitude]), np.array([stated.latitude])
@@ -124,8 +124,9 @@ class PointingSchedule(ScheduleParameters):
     def _observe(self, data: Data, rate: float, some: Sequence[Row] = ()) -> None:
         """Append the scans of all rows, or of ``some``, sampled at ``rate`` [Hz]."""
         scene, before = data.scene, len(data.observations)
-        rows = some or read_schedule(self.schedule, self.nod.duration)
-        self._compare_sites(data)
+        rows, site = read_schedule(self.schedule, self.nod.duration)
+        rows = list(some) or rows
+        self._compare_sites(data, site)
         if abs(scene.time.seconds_since(rows[0].start)) > ANOTHER_DAY:
             text = (
                 f"the schedule begins {rows[0].start}, the weather is that of {scene.time}: set the"

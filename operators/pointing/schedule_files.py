@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
 import warnings
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +12,7 @@ import numpy as np
 
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
-from zonda.core.storage.ecsv import Table, read_table
-from zonda.core.storage.files import reading
-from zonda.core.storage.table_mistakes import Mistakes
-from zonda.core.types import Floats
+from zonda.core.storage.ecsv import Table, read_table, read_text
 
 COLUMNS = (
     "start_time",
@@ -31,6 +26,7 @@ COLUMNS = (
     "subscan_index",
 )
 """In the order of version 4."""
+ANGLES = ("boresight_angle", "azmin", "azmax", "el")
 OVERLAP = 1.0
 """s: rows may overlap by as much, since schedules round their times to seconds."""
 WIDEST_WRAP = np.pi
@@ -88,55 +84,31 @@ class SchedulesSite:
     longitude: float
 
 
-def read_site(path: Path) -> SchedulesSite | None:
-    """The site that the head of a schedule states; None where it states none, or one that is not
-    known (TOAST's default).
+def read_schedule(path: Path, nods: float = 0.0) -> tuple[list[Row], SchedulesSite | None]:
+    """The rows of a schedule, and the site that it was made for: None where it states none, or one
+    that is not known (TOAST's default).
 
-    Raises InputError for a latitude or longitude that is none.
+    ``nods``: seconds before each scan in which the telescope nods. Raises InputError for a file
+    that is none, and for a row that makes no sense.
     """
-    lines = path.read_text(encoding="utf-8").splitlines()
-    if lines and lines[0].startswith("# %ECSV"):
-        about = _head_of_ecsv(lines)
-        found = [about.get(key) for key in ("site_name", "site_lat", "site_lon")]
-    else:
-        first = next(line for line in lines if line.strip() and not line.startswith("#"))
-        fields = first.split("|") if "|" in first else first.split()
-        found = [fields[0].strip(), fields[2], fields[3]]
-    if found[1] is None or found[2] is None:
+    text = read_text(path, str(path))
+    table = read_table(path, text=text) if text.startswith("# %ECSV") else _of_text(text, str(path))
+    return _rows(table, nods), _site(table)
+
+
+def _site(table: Table) -> SchedulesSite | None:
+    """Raises InputError for a latitude or longitude that is none."""
+    name, *stated = (table.meta.get(key) for key in ("site_name", "site_lat", "site_lon"))
+    if None in stated:
         return None
     try:
-        latitude, longitude = (_degrees(value) for value in found[1:])
+        latitude, longitude = (_degrees(value) for value in stated)
     except ValueError:
-        text = f"its site's latitude and longitude are {found[1]!r} and {found[2]!r}"
-        raise InputError(text, place=str(path), cure="write them in degrees") from None
-    if found[0] in (None, "Unknown") and latitude == longitude == 0:
+        text = f"its site's latitude and longitude are {stated[0]!r} and {stated[1]!r}"
+        raise InputError(text, place=table.place, cure="write them in degrees") from None
+    if name in (None, "Unknown") and latitude == longitude == 0:
         return None
-    return SchedulesSite(str(found[0]), math.radians(latitude), math.radians(longitude))
-
-
-def _head_of_ecsv(lines: list[str]) -> dict[str, Any]:
-    """The table's provenance: a mapping, or a list of them."""
-    from astropy.io.misc import yaml
-
-    head = [line[2:] for line in lines if line.startswith("# ")]
-    begin = next((k for k, line in enumerate(head) if line.startswith("meta:")), len(head))
-    end = next(
-        (
-            k
-            for k, line in enumerate(head[begin + 1 :], begin + 1)
-            if not line.startswith((" ", "-"))
-        ),
-        len(head),
-    )
-    try:
-        about = (yaml.load("\n".join(head[begin:end])) or {}).get("meta")
-    except Exception:  # what other programs wrote there with tags of their own
-        return {}
-    if isinstance(about, list):
-        return dict(
-            pair for one in about for pair in (one.items() if isinstance(one, Mapping) else [one])
-        )
-    return dict(about) if isinstance(about, Mapping) else {}
+    return SchedulesSite(str(name), math.radians(latitude), math.radians(longitude))
 
 
 def _degrees(value: Any) -> float:
@@ -153,168 +125,108 @@ def _degrees(value: Any) -> float:
     return float(degrees)
 
 
-def read_schedule(path: Path, nods: float = 0.0) -> list[Row]:
-    """The rows of a schedule. Raises InputError for a file that is none, and for a row that makes
-    no sense.
-
-    ``nods``: seconds before each scan in which the telescope nods.
-    """
-    place = str(path)
-    with reading(place, "a schedule", CURE), path.open(encoding="utf-8") as file:
-        first = file.readline()
-    return _rows(read_table(path) if first.startswith("# %ECSV") else _of_text(path, place), nods)
-
-
-def _of_text(path: Path, place: str) -> Table:
+def _of_text(text: str, place: str) -> Table:
     """The table of a text schedule: a line about the site, then the fields of a row a line, between
     bars or blanks.
 
     Rows that are SPECIAL (cooler cycles) are no scans; as in TOAST they are left out.
     """
-    with reading(place, "a schedule", CURE):
-        text = path.read_text(encoding="utf-8").splitlines()
-    written = [
-        (number, line)
-        for number, line in enumerate(text, 1)
-        if line.strip() and not line.startswith("#")
-    ]
-    special = [number for number, line in written if re.match(r"\s*SPECIAL\b", line)]
-    written = [(number, line) for number, line in written if number not in special]
+    lines, rows, special = [], [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.strip() and not line.startswith("#"):
+            fields = [f.strip() for f in line.split("|")] if "|" in line else line.split()
+            if fields[0].startswith("SPECIAL"):
+                special.append(number)
+                continue
+            lines.append(number)
+            rows.append(fields)
     if special:
-        text_of = (
-            f"{len(special)} rows are SPECIAL, no scans (line"
-            f" {special[0]}{', ...' * (len(special) > 1)})"
-        )
-        warnings.warn(f"{place}: {text_of}: they are left out", stacklevel=2)
-    rows = [
-        [field.strip() for field in line.split("|")] if "|" in line else line.split()
-        for _, line in written
-    ]
+        more = f"(line {special[0]}{', ...' * (len(special) > 1)}): they are left out"
+        told = f"{place}: {len(special)} rows are SPECIAL, no scans {more}"
+        warnings.warn(told, stacklevel=2)
     if len(rows) < 2 or len(rows[0]) != 5:
-        raise InputError(
-            "is no schedule: there is no line about the site, or none behind it",
-            place=place,
-            cure=CURE,
-        )
-    mistakes, lines = Mistakes(place), [number for number, _ in written]
+        cause = "is no schedule: there is no line about the site, or none behind it"
+        raise InputError(cause, place=place, cure=CURE)
+    (name, _, latitude, longitude, _), *rows = rows
+    meta = {"site_name": name, "site_lat": latitude, "site_lon": longitude}
+    table = Table(place, {}, [*lines[1:], lines[0]], meta)
     found = []
-    for line, row in zip(lines[1:], rows[1:], strict=True):
+    for k, row in enumerate(rows):
         if len(row) in TWO_WORDS:
             row = [f"{row[0]} {row[1]}", f"{row[2]} {row[3]}", *row[4:]]
         if len(row) not in CONCISE:
-            mistakes.add(line, f"has {len(row)} fields, not {len(COLUMNS)}", CURE)
+            table.note(k, f"has {len(row)} fields, not {len(COLUMNS)}", CURE)
             continue
         found.append([row[k] for k in CONCISE[len(row)]])
-    mistakes.tell()
-    columns = [list(column) for column in zip(*found, strict=True)]
-    units = dict.fromkeys(("boresight_angle", "azmin", "azmax", "el"), "deg")
-    named = {
-        name: (column, units.get(name, "")) for name, column in zip(COLUMNS, columns, strict=True)
-    }
-    return Table(place, named, [*lines[1:], lines[0]])
+    table.check()
+    units = dict.fromkeys(ANGLES, "deg")
+    columns = zip(COLUMNS, map(list, zip(*found, strict=True)), strict=True)
+    table.columns = {name: (column, units.get(name, "")) for name, column in columns}
+    return table
 
 
 def _rows(table: Table, nods: float) -> list[Row]:
-    mistakes, angles = Mistakes(table.place), dict[str, Floats]()
-    texts, times = dict[str, list[str]](), dict[str, list[Instant]]()
-    for name in ("boresight_angle", "azmin", "azmax", "el"):
-        with mistakes.noted():
-            angles[name] = table.numbers(name, "rad")
-    for name in ("name", "scan_index", "subscan_index"):
-        with mistakes.noted():
-            texts[name] = table.texts(name)
-    for name in ("start_time", "stop_time"):
-        with mistakes.noted():
-            times[name] = _times(table, name)
-    mistakes.tell()
-    begin, end = times["start_time"], times["stop_time"]
+    turn, low, high, elevation = (table.numbers(name, "rad") for name in ANGLES)
+    name, scan, subscan = (table.texts(n) for n in ("name", "scan_index", "subscan_index"))
+    begin, end = (table.instants(name) for name in ("start_time", "stop_time"))
+    table.check()
     found = []
-    for k in range(len(table)):
-        low, high = float(angles["azmin"][k]), float(angles["azmax"][k])
-        if high < low:
-            high += 2 * np.pi
+    for k, (first, last) in enumerate(zip(begin, end, strict=True)):
+        assert first is not None
+        assert last is not None
         row = Row(
-            name=texts["name"][k],
-            number=(texts["scan_index"][k], texts["subscan_index"][k]),
-            start=begin[k],
-            duration=end[k].seconds_since(begin[k]),
-            azimuth=(low, high),
-            elevation=float(angles["el"][k]),
-            rotation=float(angles["boresight_angle"][k]),
+            name=name[k],
+            number=(scan[k], subscan[k]),
+            start=first,
+            duration=last.seconds_since(first),
+            azimuth=(float(low[k]), float(high[k]) + (2 * np.pi if high[k] < low[k] else 0.0)),
+            elevation=float(elevation[k]),
+            rotation=float(turn[k]),
         )
-        wrong = _what_is_wrong(row) or _wrong_limits(row, float(angles["azmax"][k]))
-        if wrong:
-            message, cure = wrong
-            mistakes.add(table.lines[k], f"{row.label}: {message}", cure)
+        if wrong := _what_is_wrong(row, float(high[k])):
+            table.note(k, f"{row.label}: {wrong[0]}", wrong[1])
         found.append(row)
-    _note_overlaps(found, nods, table.lines, mistakes)
-    mistakes.tell()
+    _note_overlaps(found, nods, table)
+    table.check()
     return found
 
 
-def _what_is_wrong(row: Row) -> tuple[str, str] | None:
-    """Cause and cure."""
+def _what_is_wrong(row: Row, stated: float) -> tuple[str, str] | None:
+    """Cause and cure. ``stated``: azmax as it is written [rad]."""
     cure = "mend or remove that row"
     if row.duration <= 0:
         return "stop_time is not later than start_time", cure
     if not 0 < row.elevation <= np.pi / 2:
         return f"el is {np.degrees(row.elevation):g} deg, not between 0 and 90 deg", cure
-    if row.azimuth[1] - row.azimuth[0] > 2 * np.pi * (1 + 1e-12):
-        return "azmin and azmax are more than a turn apart", cure
-    return None
-
-
-def _wrong_limits(row: Row, stated: float) -> tuple[str, str] | None:
-    """Cause and cure of limits that are no sweep. ``stated``: azmax as it is written [rad]."""
     low, high = row.azimuth
     text = f"azmin is {np.degrees(low):g} deg and azmax {np.degrees(stated):g} deg"
+    if high - low > 2 * np.pi * (1 + 1e-12):
+        return "azmin and azmax are more than a turn apart", cure
     if high - low < 1e-12:
-        return (
-            f"{text}: there is no sweep between them",
-            "give limits that differ, or remove that row",
-        )
+        cure = "give limits that differ, or remove that row"
+        return f"{text}: there is no sweep between them", cure
     if stated < low and high - low > WIDEST_WRAP * (1 + 1e-12):
         wide = f"azmax: {np.degrees(high):g} deg where the sweep is as wide"
-        return (
-            f"{text}: that is a sweep of {np.degrees(high - low):g} deg through north",
-            f"exchange them, or write {wide}",
-        )
+        sweep = f"that is a sweep of {np.degrees(high - low):g} deg through north"
+        return f"{text}: {sweep}", f"exchange them, or write {wide}"
     return None
 
 
-def _note_overlaps(rows: list[Row], nods: float, lines: Sequence[int], mistakes: Mistakes) -> None:
+def _note_overlaps(rows: list[Row], nods: float, table: Table) -> None:
     """Note each row that begins, with its ``nods`` [s] before it, before an earlier one stops: the
     telescope is in one place at a time."""
     sound = [k for k, row in enumerate(rows) if row.duration > 0]
     begins = {k: rows[k].start.seconds_since(rows[sound[0]].start) for k in sound}
     before, stops = -1, -math.inf
     for k in sorted(sound, key=begins.__getitem__):
-        early, what, cure = (
-            stops - begins[k],
-            "begins",
-            "shift or shorten one of them, or remove one",
-        )
+        early, what = stops - begins[k], "begins"
+        cure = "shift or shorten one of them, or remove one"
         if early <= OVERLAP + 1e-6 and nods:
-            early, cure = (
-                early + nods,
-                f"leave {nods:.6g} s between the rows for the nods, or change elevation_nods",
-            )
+            early += nods
+            cure = f"leave {nods:.6g} s between the rows for the nods, or change elevation_nods"
             what = f"its elevation nods of {nods:.6g} s begin"
         if early > OVERLAP + 1e-6:
-            other = f"{rows[before].label} (line {lines[before]})"
-            mistakes.add(
-                lines[k], f"{rows[k].label}: {what} {early:.6g} s before {other} stops", cure
-            )
+            other = f"{rows[before].label} (line {table.lines[before]})"
+            table.note(k, f"{rows[k].label}: {what} {early:.6g} s before {other} stops", cure)
         if begins[k] + rows[k].duration > stops:
             before, stops = k, begins[k] + rows[k].duration
-
-
-def _times(table: Table, name: str) -> list[Instant]:
-    found, mistakes = [], Mistakes(table.place)
-    for text, line in zip(table.texts(name), table.lines, strict=False):
-        try:
-            found.append(Instant.parse(re.sub(r"\s*\+00:00$", "Z", text)))
-        except ValueError as err:
-            mistakes.add(line, f"{name}: {err}", "write it as 2025-03-01T06:00:00+00:00")
-    mistakes.tell()
-    return found

@@ -35,7 +35,6 @@ from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.plausible import FLUX, doubt
 from zonda.core.storage.ecsv import read_table
-from zonda.core.storage.table_mistakes import Mistakes
 from zonda.core.types import Floats
 
 REACH = 6.0
@@ -142,38 +141,19 @@ class Catalogue:
         """
         table = read_table(step.catalogue)
         units = {"ra": "rad", "dec": "rad", "flux": "Jy", "spectral_index": "", "frequency": "Hz"}
-        mistakes, found = Mistakes(table.place), dict[str, Floats]()
-        for name in [
-            "ra",
-            "dec",
-            "flux",
-            *({"spectral_index", "frequency"} & table.columns.keys()),
-        ]:
-            with mistakes.noted():
-                found[name] = table.numbers(name, units[name])
-        for row in np.flatnonzero(np.abs(found.get("ra", np.zeros(0))) > 2 * np.pi + 1e-9).tolist():
-            mistakes.add(
-                table.lines[row],
-                f"ra is {np.degrees(found['ra'][row]):g} deg",
-                "mend that row, or the unit of ra",
-            )
-        for row in np.flatnonzero(found.get("frequency", np.ones(0)) <= 0).tolist():
-            mistakes.add(
-                table.lines[row], f"frequency is {found['frequency'][row]:g} Hz", "mend that row"
-            )
-        for row in np.flatnonzero(
-            np.abs(found.get("spectral_index", np.zeros(0))) > STEEPEST
-        ).tolist():
-            text = f"spectral_index is {found['spectral_index'][row]:g}, beyond {STEEPEST:g}"
-            mistakes.add(table.lines[row], text, "mend that row")
-        for row in np.flatnonzero(
-            np.abs(found.get("dec", np.zeros(0))) > np.pi / 2 + 1e-12
-        ).tolist():
-            mistakes.add(
-                table.lines[row], f"dec is {np.degrees(found['dec'][row]):g} deg", "mend that row"
-            )
-        mistakes.tell()
-        ra, dec, flux = found["ra"], found["dec"], found["flux"]
+        optional = {"spectral_index", "frequency"} & table.columns.keys()
+        found = {n: table.numbers(n, units[n]) for n in ("ra", "dec", "flux", *optional)}
+        ra, dec, flux = (found[name] for name in ("ra", "dec", "flux"))
+        for name, least, most, scale, unit in (
+            ("ra", -360.0, 360.0, 180 / np.pi, " deg"),
+            ("dec", -90.0, 90.0, 180 / np.pi, " deg"),
+            ("spectral_index", -STEEPEST, STEEPEST, 1.0, ""),
+            ("frequency", 1e-9, np.inf, 1.0, " Hz"),
+        ):
+            for row, value in enumerate((found.get(name, flux[:0]) * scale).tolist()):
+                if value < least - 1e-10 or value > most + 1e-10:
+                    table.note(row, f"{name} is {value:g}{unit}", "mend that row, or its unit")
+        table.check()
         index = found.get("spectral_index", np.zeros(len(flux)))
         if "frequency" in table.columns:
             if step.frequency is not None:

@@ -107,8 +107,14 @@ def test_csv_has_its_units_in_brackets(tmp_path):
 def test_what_is_wrong_is_named(tmp_path, text, what, match):
     path = tmp_path / "bad.csv"
     path.write_text(text, encoding="utf-8")
+
+    def read():
+        table = read_table(path)
+        table.numbers(*what)
+        table.check()
+
     with pytest.raises(InputError, match=match) as caught:
-        read_table(path).numbers(*what)
+        read()
     assert "bad.csv" in str(caught.value)
 
 

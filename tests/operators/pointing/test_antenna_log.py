@@ -100,9 +100,9 @@ def with_elevation(line: str, degrees: str) -> str:
     [
         (
             lambda lines: [*lines[:3], lines[3].replace("20171103", "2017111x")],
-            "line 5 is no row of an antenna log",
+            "line 5: time",
         ),
-        (lambda lines: [*lines[:3], lines[3][:60] + "\n"], "line 5 "),
+        (lambda lines: [*lines[:3], lines[3][:60] + "\n"], "line 5: has "),
         (lambda lines: [], "has no row of a scan"),
         (
             lambda lines: [*lines[:3], with_elevation(lines[3], "140.00000")],
@@ -121,15 +121,19 @@ def test_bad_logs(tmp_path: Path, change: Any, message: str) -> None:
 
 
 def test_a_log_of_other_columns(tmp_path: Path) -> None:
-    """Its names are read, too: columns in another order would be other angles."""
-    lines, _, _ = rows()
+    """Its names are read: columns in another order are the same angles."""
+    lines, azimuth, _ = rows()
     path = tmp_path / "other.ant"
-    path.write_text(
-        HEAD.replace("az-real el-real", "el-real az-real") + "\n" + "".join(lines) + END
-    )
-    with pytest.raises(
-        InputError, match="column 6 of the antenna log is el-real, where az-real is read"
-    ):
+    path.write_text(HEAD.replace("az-real", "az-rel") + "\n" + "".join(lines) + END)
+    with pytest.raises(InputError, match="has no column 'az-real'"):
         observed(path)
-    path.write_text(HEAD.replace("az-prg(no-cor)", "az-prog(no-cor)") + "\n" + "".join(lines) + END)
-    assert observed(path)
+    swapped = [line.split(" ") for line in lines]
+    for words in swapped:
+        words[5], words[6] = words[6], words[5]
+    head = HEAD.replace("az-real el-real", "el-real az-real")
+    head = head.replace("az-prg(no-cor)", "az-prog(no-cor)")
+    path.write_text(head + "\n" + "".join(" ".join(words) for words in swapped) + END)
+    (o,) = observed(path)
+    np.testing.assert_allclose(
+        (np.degrees(o.azimuth) - azimuth + 180) % 360, 180, rtol=0, atol=1.6e-5
+    )

@@ -298,9 +298,9 @@ def test_bad_files(tmp_path: Path) -> None:
     t = np.arange(10.0)
     for header, message in (
         ("time [s], az, el [deg]", "az has no unit"),
-        ("time [s], az [s], el [deg]", "'s' is no unit of az"),
+        ("time [s], az [s], el [deg]", "az has the unit 's'"),
         ("time [s], x [deg], y [deg]", "has no column ra and dec; columns: time, x, y"),
-        ("time [s], az [deg]", "the first line names 2 columns, the rows have 3"),
+        ("time [s], az [deg]", "line 2: has 3 values, not 2"),
         ("time [s], az [deg], el [rad]", r"el is 2578.\d+ deg in row 0"),
     ):
         with pytest.raises(InputError, match=message):
@@ -308,7 +308,7 @@ def test_bad_files(tmp_path: Path) -> None:
                 write_csv(tmp_path / "bad.csv", UNIX + t, 10 * t, 45 + 0 * t, header), "unix"
             )
     (tmp_path / "ragged.csv").write_text("time [s], az [deg], el [deg]\n1,2,3\n1,2\n")
-    with pytest.raises(InputError, match="cannot be read as CSV"):
+    with pytest.raises(InputError, match="line 3: has 2 values, not 3"):
         read_recording(tmp_path / "ragged.csv", "unix")
     (tmp_path / "half.h5").write_bytes(b"\x89HDF\r\n\x1a\nrest")
     with pytest.raises(InputError, match="cannot be read"):
@@ -663,6 +663,7 @@ def test_odd_items_in_toasts_layout(saved: Any, observe: Callable[..., Data]) ->
         ("# ctime az_deg el_deg", " ", "unix"),
         ("time [s] az [deg] el [deg]", "  ", "unix"),
         ("datetime,az_deg,el_deg,remark", ",", "z"),
+        ("time; az [degrees]; el [deg]", ";", "+2"),
     ],
 )
 def test_logs_as_people_have_them(tmp_path: Path, header: str, comma: str, time: str) -> None:
@@ -674,6 +675,7 @@ def test_logs_as_people_have_them(tmp_path: Path, header: str, comma: str, time:
         "unix": [f"{UNIX + s:.1f}" for s in t],
         "iso": [f"2024-11-25T07:00:{s:04.1f}" for s in t],
         "z": [f"2024-11-25 07:00:{s:04.1f}Z" for s in t],
+        "+2": [f"2024-11-25T09:00:{s:04.1f}+02:00" for s in t],
     }[time]
     rows = [
         comma.join([d, f"{180 + s:.4f}", "50", *(["ok"] if "remark" in header else [])])
@@ -693,9 +695,7 @@ def test_logs_as_people_have_them(tmp_path: Path, header: str, comma: str, time:
     np.testing.assert_allclose(np.degrees(found.latitude), 50, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "text", ["yesterday", "2024-13-25T07:00:00", "2024-11-25T07:00:00+02:00", "25/11/2024 07:00"]
-)
+@pytest.mark.parametrize("text", ["yesterday", "2024-13-25T07:00:00", "25/11/2024 07:00"])
 def test_what_is_no_date_in_utc_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "log.csv"
     path.write_text("time, az [deg], el [deg]\n" + "".join(f"{text},180,50\n" for _ in range(3)))

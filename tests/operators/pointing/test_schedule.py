@@ -24,7 +24,7 @@ from zonda.core.registry import instruments
 from zonda.core.scene import Scene
 from zonda.operators.pointing.constant_elevation import Nod, Sweep
 from zonda.operators.pointing.schedule import PointingSchedule
-from zonda.operators.pointing.schedule_files import read_schedule, read_site
+from zonda.operators.pointing.schedule_files import read_schedule
 
 ROWS = [
     (
@@ -107,8 +107,8 @@ def scans(path, **more):
 
 def test_both_versions_are_the_same(tmp_path):
     five, four = (
-        read_schedule(version_5(tmp_path / "a.ecsv")),
-        read_schedule(version_4(tmp_path / "a.txt")),
+        read_schedule(version_5(tmp_path / "a.ecsv"))[0],
+        read_schedule(version_4(tmp_path / "a.txt"))[0],
     )
     assert five == four
     assert [row.label for row in five] == ["patch-0-0", "patch-0-1"]
@@ -213,7 +213,7 @@ def test_the_site_of_the_schedule_is_compared(tmp_path, version, recwarn):
             "# - site_lon: !astropy.units.Quantity {unit: *id001, value: -67.79}\n# schema",
         )
         path.write_text(text)
-    stated = read_site(path)
+    stated = read_schedule(path)[1]
     assert (stated.name, stated.latitude) == ("atacama", pytest.approx(np.radians(-22.96)))
     assert stated.longitude == pytest.approx(np.radians(-67.79))
     scans(path)
@@ -238,22 +238,19 @@ def test_the_site_of_the_schedule_is_compared(tmp_path, version, recwarn):
 
 def test_a_schedule_without_a_site_and_a_wrong_one(tmp_path):
     path = version_5(tmp_path / "a.ecsv")
-    assert read_site(path) is None  # no longitude
+    assert read_schedule(path)[1] is None  # no longitude
     text = path.read_text()
-    for wrong, found in (("!other.Tag {a: 1}", None), ("north", "latitude")):
+    for wrong, found in (("!other.Tag {a: 1}", "cannot be read as ECSV"), ("north", "latitude")):
         path.write_text(text.replace("# schema", f"# - site_lon: {wrong}\n# schema"))
-        if found is None:
-            assert read_site(path) is None
-        else:
-            with pytest.raises(InputError, match=found):
-                read_site(path)
+        with pytest.raises(InputError, match=found):
+            read_schedule(path)
     unknown = (
         version_4(tmp_path / "a.txt")
         .read_text()
         .replace("atacama | LAT | -22.960 | -67.790", "Unknown | LAT | 0.0 | 0.0")
     )
     (tmp_path / "b.txt").write_text(unknown)
-    assert read_site(tmp_path / "b.txt") is None
+    assert read_schedule(tmp_path / "b.txt")[1] is None
 
 
 def test_nods_come_before_the_scan(tmp_path):
@@ -448,9 +445,8 @@ def test_rows_that_can_be(tmp_path, change_of_the_second):
     """Rows that touch, or overlap by the second to which times are rounded, sweeps through north,
     and wide ones that say so.
     """
-    assert (
-        len(read_schedule(version_5(tmp_path / "a.ecsv", change(1, **change_of_the_second)))) == 2
-    )
+    path = version_5(tmp_path / "a.ecsv", change(1, **change_of_the_second))
+    assert len(read_schedule(path)[0]) == 2
 
 
 def test_nods_that_begin_before_the_row_before_stops(tmp_path):
@@ -673,7 +669,7 @@ def test_every_version_of_text(version, tmp_path):
     """As TOAST reads them: dates and times are one field between bars, two words between blanks."""
     path = tmp_path / "s.txt"
     path.write_text(HEAD_OF_TEXT + TEXTS[version] + "\n")
-    (row,) = read_schedule(path)
+    (row,), _ = read_schedule(path)
     assert (row.name, row.number) == ("field_a", ("21", "3"))
     assert row.start.isoformat().startswith("2027-06-23T08:01:00")
     assert row.duration == 600
@@ -689,7 +685,7 @@ def test_special_rows_are_left_out_and_told(tmp_path):
         " 09:00:00|0.0|cooler|100|125|48|0|0\n"
     )
     with pytest.warns(UserWarning, match=r"1 rows are SPECIAL, no scans \(line 4\)"):
-        assert len(read_schedule(path)) == 1
+        assert len(read_schedule(path)[0]) == 1
 
 
 def test_rows_of_no_version(tmp_path):

@@ -107,8 +107,8 @@ def test_the_mean_is_that_of_a_band(night, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("name,net,knee\nd00,1,1\n", "cannot be read as ECSV|no column"),
-        ("not a table", "cannot be read as ECSV|no column"),
+        ("name,net,knee\nd00,1,1\n", "no column"),
+        ("not a table", "has no rows"),
     ],
 )
 def test_other_tables_are_refused(night, tmp_path, text, message):
