@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from astropy import table as astropy_table
-from astropy import units as u
 from astropy.table.meta import get_header_from_yaml
 from numpy.typing import NDArray
 
@@ -155,7 +154,7 @@ class Table:
         written = self.columns[name][1] or otherwise
         if not unit and not written:
             return 1.0
-        from ..configuration.units import KINDS  # slow to import, and pictures need tables alone
+        from ..configuration.units import KINDS, factor_to  # slow, and pictures need tables alone
 
         named = KINDS[unit].display if unit in KINDS else (unit,)
         accepted = f"{', '.join(named[:-1])} or {named[-1]}" if len(named) > 1 else unit
@@ -163,13 +162,12 @@ class Table:
             heading = f"in ECSV 'unit: {named[0]}', in CSV a heading such as {name} [{named[0]}]"
             self.note(-1, f"{name} has no unit", f"give it in {accepted}: {heading}")
             return 1.0
-        try:
-            return float(u.Unit(SPELLED.get(written.lower(), written)).to(u.Unit(unit)))
-        except (ValueError, u.UnitConversionError):
+        factor = factor_to(unit, SPELLED.get(written.lower(), written))
+        if factor is None:
             other = f"give it in {accepted}, or another unit of its kind"
             cure = other if unit else "leave the unit out"
             self.note(-1, f"{name} has the unit {written!r}", cure)
-            return 1.0
+        return factor or 1.0
 
     def instants(self, name: str, *, optional: bool = False) -> list[Instant | None]:
         """A column of times; None, and a mistake, for another text. ``optional``: it may be
