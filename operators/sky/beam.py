@@ -14,7 +14,7 @@ q-th point and multiplied in Fourier space by the analytic transform of B,
 with J [rad per pixel] the linear map from pixels to the tangent plane, so rotated, skewed and
 oblong pixels are right. A single bright pixel comes out as an exact Gaussian of the FWHM, a uniform
 image ripples by 4 exp(-2 pi^2 (sigma / pixel)^2): 3e-6 at 2 pixels per FWHM. J is constant here:
-images for which it is not are spread (`spread`).
+images for which it is not are gridded (`gridding`).
 
 Along an axis with fewer the image is taken as smooth instead (`Convolved.coarse`): the cubic spline
 through its pixels, with the transform

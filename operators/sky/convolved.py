@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -14,12 +13,12 @@ from zonda.core.types import Floats
 
 from .beam import REACH, SIGMA, Convolved, convolve, convolve_evenly, distinct
 from .brightness import Brightness, conversion, on_own_pixels, resampled, too_bright
-from .geometry import placed, turned
-from .grid import Grid, is_flat, is_resolved, own_pixels, tangent_grid
-from .inputs import WcsMap
+from .geometry import moved, placed
+from .grid import Grid, is_resolved, own_pixels, tangent_grid
+from .gridding import Gridding
+from .input_map import ImageMap
 from .limits import check_brightness, odd_pixels
 from .sky_input import SkyInput
-from .spread import Spread
 from .state import Beam
 from .units import DOUBT
 
@@ -48,65 +47,57 @@ class ConvolvedSky(SkyInput):
         )
 
     def grid_of(self, observation: Observation) -> Grid:
-        """The grid on which the map will be convolved; nothing is convolved, interpolated or spread
-        yet.
-        """
+        """The grid on which the map will be convolved; nothing is computed on it yet."""
         found, _ = self.beam_widths(observation)
         widths = float(found.min(initial=np.inf)), float(found.max(initial=0.0))
         source, identity = self._input(observation.focalplane.polarized)
         band = observation.instrument.band
         key = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
-        if isinstance(source, WcsMap):
+        if isinstance(source, ImageMap):
             centre = self.centre.icrs() if isinstance(self.centre, Target) else None
-            if self.centre == "target" or (centre is None and source.wcs is None):
+            if self.centre == "target" or (centre is None and source.placeless):
                 centre = observation.centre
-            moved = (
-                source
-                if centre is None or source.wcs is None
-                else turned(source, centre, self.place)
-            )
             wcs = placed(source, centre)
+            if centre is not None:
+                source = moved(source, centre, self.place)
             if wcs is not None:
-                placeless = replace(source, wcs=wcs)
+                own = own_pixels(source, wcs, key)
                 reach = REACH * SIGMA * widths[1]
-                if not is_resolved(placeless, widths[0]) or is_flat(
-                    source, wcs, observation, reach
-                ):
-                    return own_pixels(source, wcs, key, moved.turn)
-                moved = placeless if source.wcs is None else moved
-            source, key = moved, key if centre is None else (*key, centre)
+                if not is_resolved(source, widths[0]) or own.is_flat_under(observation, reach):
+                    return own
+            key = key if centre is None else (*key, centre)
         return tangent_grid(source, observation, widths, self.pixels_per_fwhm, key, self.place)
 
     def brightness_on(self, grid: Grid, band: Band) -> Brightness:
         """The map on the grid, in K_RJ."""
-        return self._brightness(grid, band, grid.spread)
+        return self._brightness(grid, band, grid.gridding)
 
-    def _brightness(self, grid: Grid, band: Band, spread: Spread | None) -> Brightness:
-        """`brightness_on`, with another spread of the map's pixels over the grid."""
+    def _brightness(self, grid: Grid, band: Band, gridding: Gridding | None) -> Brightness:
+        """`brightness_on`, with another gridding of the map's pixels."""
 
         def make() -> Brightness:
             found = conversion(grid, band, self.spectral_index)
             if not grid.resampled:
                 return on_own_pixels(grid, found, self.scale, self.place)
             progress = self._progress(
-                f"{'interpolating' if spread is None else 'spreading'} {self.source}"
+                f"{'interpolating' if gridding is None else 'spreading'} {self.source}"
             )
-            return resampled(grid, found, self.scale, self.outside, self.place, progress, spread)
+            return resampled(grid, found, self.scale, self.outside, self.place, progress, gridding)
 
-        return cast(Brightness, self._cache.get((*grid.key, spread), make))
+        return cast(Brightness, self._cache.get((*grid.key, gridding), make))
 
     def with_beam(self, grid: Grid, band: Band, fwhm: float) -> Beam:
         """The map convolved with one beam.
 
-        Where the map is spread over the grid the beam is right all over it; else it is that at the
+        Where the map is gridded the beam is right all over it; else it is that at the
         tangent point.
         """
         linear = self.interpolation == "linear"
 
         def make() -> Beam:
-            sky, evenly = self.brightness_on(grid, band), grid.spread
+            sky, evenly = self.brightness_on(grid, band), grid.gridding
             if evenly is not None and fwhm != evenly.fwhm and not grid.is_flat:
-                evenly = Spread(fwhm, evenly.share)
+                evenly = Gridding(fwhm, evenly.share)
                 sky = self._brightness(grid, band, evenly)
 
             def convolved(values: Floats, outside: float) -> Convolved:
@@ -155,12 +146,9 @@ class ConvolvedSky(SkyInput):
         source = (
             self.read_input(polarized, header_alone=True) if large else self._input(polarized)[0]
         )
-        if isinstance(source, WcsMap) and self.beam != "none":
+        if isinstance(source, ImageMap) and self.beam != "none":
             beam = instrument.beam_fwhm if self.fwhm is None else self.fwhm
-            scale = source.scale
-            if scale is None:
-                scale = np.radians(np.asarray(source.wcs.pixel_scale_matrix))
-            if text := odd_pixels(scale, source.values.shape, beam):
+            if text := odd_pixels(source.sides, source.shape, beam):
                 warnings.warn(f"{self.label}: {self.file or self.source}: {text}", stacklevel=2)
         beams = np.array([camera.beam_fwhm for camera in instrument.cameras.values()])
         self.warn_of_beams(source, beams)

@@ -9,20 +9,15 @@ from typing import Any
 import numpy as np
 
 from zonda.core.configuration.target import Target
-from zonda.core.errors import InputError
 from zonda.core.maps.map_reading import chosen, is_healpix
-from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
+from zonda.core.numerics.projection import pixel_matrix
 from zonda.core.numerics.sphere import angle_between, angles, unit_vectors
 from zonda.core.storage.files import reading
 from zonda.core.storage.fits_files import opened
 from zonda.core.types import Floats
 
-from .geometry import geometry, is_plain_tan, placed, turned
-from .inputs import WcsMap
-from .region import Disc
-
-LATTICE = 17
-"""Pixels along each side from which the extent of a map is taken."""
+from .geometry import geometry, moved, placed
+from .input_map import ImageMap
 
 
 @dataclass(frozen=True)
@@ -72,49 +67,20 @@ def footprint(
     ``pixel_size`` [rad] and ``centre`` as `SkyMap` has them. Raises `InputError` as
     `read.read_map`.
     """
-    wcs, scale = geometry(place, header, pixel_size, centre is not None, {})
-    turn = None
+    wcs, placeless = geometry(place, header, shape, pixel_size, centre is not None, {})
+    values = np.broadcast_to(np.float64(0.0), shape)
+    image = ImageMap(values=values, unit="K_RJ", wcs=wcs, placeless=placeless)
+    if centre is None and placeless:
+        return None
+    tangent = placed(image, None if centre is None else centre.icrs())
     if centre is not None:
-        image = WcsMap(np.broadcast_to(np.float64(0.0), shape), "K_RJ", wcs, scale)
-        if (moved := placed(image, centre.icrs())) is None:
-            turn = turned(image, centre.icrs(), place).turn
-        else:
-            wcs = moved
-    if wcs is None:
-        return None
-    try:
-        turn = wcs_frame_rotation(wcs) if turn is None else turn
-    except InputError:  # FK4 is no rotation of ICRS
-        return None
+        image = moved(image, centre.icrs(), place)
     with reading(place, "FITS", "check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"):
-        found, _ = extent(wcs, turn, shape)
-    if found is None:
+        disc, _ = image.extent
+    if disc is None:
         return None
-    return Footprint(
-        found.centre, found.radius, pixel_matrix(wcs) if is_plain_tan(wcs) else None, shape
-    )
-
-
-def extent(wcs: Any, turn: Floats, shape: tuple[int, int]) -> tuple[Disc | None, bool]:
-    """A circle that holds an image, None where its middle is beyond its projection; and whether all
-    of it is on the sky.
-
-    ``turn`` (3, 3): from ICRS directions to those in the frame of ``wcs``.
-    """
-    ny, nx = shape
-    x, y = np.meshgrid(np.linspace(0, nx - 1, LATTICE), np.linspace(0, ny - 1, LATTICE))
-    lon, lat = np.radians(
-        wcs.wcs_pix2world(
-            [[(nx - 1) / 2, (ny - 1) / 2], *zip(x.ravel(), y.ravel(), strict=True)], 0
-        ).T
-    )
-    lon, lat = (lon, lat) if wcs.wcs.lng == 0 else (lat, lon)
-    rays = unit_vectors(lon, lat) @ turn
-    middle, known = rays[0], np.isfinite(rays.sum(axis=1))
-    if not known[0]:
-        return None, False
-    radius = float(angle_between(rays[known], middle).max(initial=0.0)) * (1 + 2 / LATTICE)
-    return Disc(middle, min(radius, np.pi)), bool(known.all())
+    matrix = None if tangent is None else pixel_matrix(tangent)
+    return Footprint(disc.centre, disc.radius, matrix, shape)
 
 
 def header_of(

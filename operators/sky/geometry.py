@@ -19,9 +19,8 @@ from zonda.core.numerics.sphere import angles, local_axes
 from zonda.core.storage.files import first_line
 from zonda.core.types import Floats
 
-from .inputs import WcsMap
+from .input_map import ImageMap
 from .limits import check_geometry, check_sides
-from .resample import ImageOnSky
 
 _ANGLES = {
     **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
@@ -42,9 +41,16 @@ _IN_RADIANS = {
 
 
 def geometry(
-    place: str, header: Any, pixel_size: float | None, centred: bool, notes: dict[str, str]
-) -> tuple[Any, Floats | None]:
-    """(wcs, scale) of `WcsMap`, or the error that says what is missing."""
+    place: str,
+    header: Any,
+    shape: tuple[int, ...],
+    pixel_size: float | None,
+    centred: bool,
+    notes: dict[str, str],
+) -> tuple[Any, bool]:
+    """`ImageMap`'s ``wcs`` and ``placeless`` of an image of ``shape`` (..., ny, nx), or the error
+    that says what is missing.
+    """
     header = _with_known_units(header, place)
     scaled = _has_scale(header)
     if not scaled and pixel_size is None:
@@ -72,7 +78,10 @@ def geometry(
             "the file has no WCS: its centre is put on the target, its first axis runs west, its"
             " second north"
         )
-        return None, _plain_scale(place, header, scaled, pixel_size)
+        bare = WCS(naxis=2)
+        bare.wcs.ctype, bare.wcs.radesys = ["RA---TAN", "DEC--TAN"], "ICRS"
+        bare.wcs.crpix = (np.array(shape[:-3:-1]) + 1) / 2
+        return rescaled(bare, np.degrees(_plain_scale(place, header, pixel_size))), True
     header, note = _with_frame(header, place)
     if note:
         notes["coordinates"] = note
@@ -82,7 +91,7 @@ def geometry(
     wcs, matrix = _wcs(header, place)
     check_geometry(matrix if pixel_size is None else np.eye(2) / 60, wcs.wcs.crpix, header, place)
     if pixel_size is None:
-        return wcs, None
+        return wcs, False
     if not is_plain_tan(wcs):
         raise InputError(
             "pixel_size cannot replace the scale of a map in projection"
@@ -94,7 +103,7 @@ def geometry(
         f"{np.degrees(pixel_size) * 3600:g} arcsec as given; the header's scale is overridden"
     )
     cd = matrix if scaled else np.diag([-1.0, 1.0])
-    return rescaled(wcs, cd / np.linalg.norm(cd, axis=0) * np.degrees(pixel_size)), None
+    return rescaled(wcs, cd / np.linalg.norm(cd, axis=0) * np.degrees(pixel_size)), False
 
 
 def _with_known_units(header: Any, place: str) -> Any:
@@ -179,7 +188,7 @@ def _no_position(place: str, keys: str) -> InputError:
     )
 
 
-def _plain_scale(place: str, header: Any, scaled: bool, pixel_size: float | None) -> Floats:
+def _plain_scale(place: str, header: Any, pixel_size: float | None) -> Floats:
     """(2, 2) rad for a map without celestial axes: the first axis runs west whatever the sign of
     its CDELT.
     """
@@ -223,7 +232,7 @@ def is_plain_tan(wcs: Any) -> bool:
     return True
 
 
-def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
+def placed(image: ImageMap, centre: tuple[float, float] | None) -> Any:
     """The TAN `WCS` of an image, or None where it must be resampled (another projection,
     distortions).
 
@@ -231,71 +240,59 @@ def placed(image: WcsMap, centre: tuple[float, float] | None) -> Any:
     ----------
     centre
         ICRS (ra, dec) [rad]: the image's centre, pixel ((nx + 1) / 2, (ny + 1) / 2) counted from 1,
-        is put there. An image that has a place is moved as a whole (`turned`); one that has none
+        is put there. An image that has a place is moved as a whole (`moved`); one that has none
         touches the sky there, its second axis north. None: where the header puts it.
 
     """
-    if image.wcs is not None and not is_plain_tan(image.wcs):
+    if not is_plain_tan(image.wcs):
         return None
     if centre is None:
         return image.wcs
-    rows, columns = image.values.shape
-    middle = np.array([(columns + 1) / 2, (rows + 1) / 2])
-    wcs = WCS(naxis=2)
+    rows, columns = image.shape
+    wcs, old = WCS(naxis=2), image.wcs.wcs
     wcs.wcs.radesys, wcs.wcs.lonpole = "ICRS", 180.0
-    if image.wcs is None:
-        assert image.scale is not None  # the reader gives one or the other
-        wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix = (
-            ["RA---TAN", "DEC--TAN"],
-            np.degrees(centre),
-            middle,
-        )
-        return rescaled(wcs, np.degrees(image.scale))
-    lng, lat = image.wcs.wcs.lng, image.wcs.wcs.lat
-    wcs.wcs.ctype = ["DEC--TAN", "RA---TAN"] if lng == 1 else ["RA---TAN", "DEC--TAN"]
-    crpix = np.asarray(image.wcs.wcs.crpix[:2], np.float64)
-    turn = turned(image, centre).turn
-    assert turn is not None  # it was made
-    own = (
-        local_axes(*np.radians([image.wcs.wcs.crval[lng], image.wcs.wcs.crval[lat]])) @ turn
-    )  # of the tangent point, in ICRS there
-    ra, dec = centre if (crpix == middle).all() else (float(v) for v in angles(own[0]))
+    wcs.wcs.ctype = ["DEC--TAN", "RA---TAN"] if old.lng == 1 else ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.crpix = np.asarray(old.crpix[:2], np.float64)
+    # the axes of the tangent point, in ICRS there
+    own = local_axes(*np.radians([old.crval[old.lng], old.crval[old.lat]])) @ _turned(image, centre)
+    is_middle = (wcs.wcs.crpix == [(columns + 1) / 2, (rows + 1) / 2]).all()
+    ra, dec = centre if is_middle else (float(v) for v in angles(own[0]))
     _, east, north = local_axes(ra, dec)
     angle = float(np.arctan2(own[2] @ east, own[2] @ north)) + np.radians(
-        float(image.wcs.wcs.lonpole) - 180.0
+        float(old.lonpole) - 180.0
     )
     matrix = np.asarray(image.wcs.pixel_scale_matrix, np.float64)
-    if (
-        abs(angle) > ROUNDED
-    ):  # east and north of the image's matrix are its own: each is turned from north to east
+    if abs(angle) > ROUNDED:
+        # east and north of the image's matrix are its own: each is turned from north to east
         c, s = np.cos(angle), np.sin(angle)
-        matrix = np.array([[c, s], [-s, c]] if lng == 0 else [[c, -s], [s, c]]) @ matrix
-    wcs.wcs.crval = np.degrees([dec, ra] if lng == 1 else [ra, dec])
-    wcs.wcs.crpix = crpix
+        matrix = np.array([[c, s], [-s, c]] if old.lng == 0 else [[c, -s], [s, c]]) @ matrix
+    wcs.wcs.crval = np.degrees([dec, ra] if old.lng == 1 else [ra, dec])
     return rescaled(wcs, matrix)
 
 
-def turned(image: WcsMap, centre: tuple[float, float], place: str = "") -> WcsMap:
+def moved(image: ImageMap, centre: tuple[float, float], place: str) -> ImageMap:
     """An image of any projection moved over the sky with its centre to ``centre``, ICRS (ra, dec)
     [rad].
 
     The sphere is turned, so that the image keeps its shape, and directions at its centre keep their
     angles from ICRS north: what lies east stays east, whatever the frame of the image. Its Q and U
-    turn with it.
+    turn with it; those of an image without a place are counted from the meridians there.
 
     Raises InputError where the image's centre is beyond its projection.
     """
-    rows, columns = image.values.shape
-    sky = ImageOnSky(replace(image, turn=None))
-    middle = sky.directions(np.array((columns - 1) / 2), np.array((rows - 1) / 2))
-    if not np.isfinite(middle).all():
+    if image.placeless:
+        return replace(image, wcs=placed(image, centre), placeless=False)
+    turn = _turned(image, centre)
+    if not np.isfinite(turn).all():
         raise InputError(
             f"the middle of the map is beyond its projection {', '.join(image.wcs.wcs.ctype)}",
             place=place,
             cure="remove centre, or cut the map",
         )
-    lon, lat = (float(v) for v in angles(middle))
-    back = local_axes(lon, lat).T @ local_axes(
-        *centre
-    )  # from ICRS directions there to those where the image was
-    return replace(image, turn=sky.to_own(lon, lat) @ back)
+    return replace(image, moved=turn)
+
+
+def _turned(image: ImageMap, centre: tuple[float, float]) -> Floats:
+    """(3, 3) from ICRS directions about ``centre`` to the image's own about its middle."""
+    middle = local_axes(*(float(v) for v in angles(image.directions(image.middle))))
+    return np.asarray(image.turn @ (middle.T @ local_axes(*centre)))

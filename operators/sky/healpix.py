@@ -14,7 +14,7 @@ from zonda.core.maps.stokes_names import columns_of_q_and_u, intensity_column, i
 from zonda.core.types import Floats
 
 from . import stokes
-from .inputs import HealpixMap, Wanted
+from .input_map import HealpixMap, Wanted
 from .units import beam_solid_angle, check_beam, filled, made_with, unit_of
 
 
@@ -42,46 +42,36 @@ def read_healpix(hdu: Any, place: str, wanted: Wanted) -> HealpixMap:
         notes.pop(STOKES, None)
         sign = stokes.sign_of_u(header, wanted.convention, False, place, notes)
     if wanted.header_alone:
+        values, pixels = np.zeros((1, 0)), None
         nside = table.nside(table.length(first))
-        _check_beam(place, beam, nside, wanted, notes)
-        return HealpixMap(
-            np.zeros(0), np.zeros(0, np.int64), nside, nested, frame, unit, beam, notes
-        )
-    values = np.stack([table.numbers(k) for k in columns])
-    nside = table.nside(values.shape[1])
-    pixels = table.pixels(nside, values.shape[1])
-    _check_beam(place, beam, nside, wanted, notes)
+    else:
+        values = np.stack([table.numbers(k) for k in columns])
+        nside = table.nside(values.shape[1])
+        pixels = table.pixels(nside, values.shape[1])
     if pixels is not None:
         order = np.argsort(pixels, kind="stable")
         pixels, values = pixels[order], values[:, order]
     pixels, values = _seen(pixels, values, header, place)
-    where = "entry {} of those that are seen (counted from 1)"
-    zeroed = filled(place, values[0], wanted.missing, where)
-    if len(columns) > 1:
-        values[2] *= sign
-        zeroed += filled(place, values[1:], wanted.missing, f"plane {{}} of Q and U, {where}")
-    values *= factor
-    q_and_u = values[1:] if len(columns) > 1 else None
-    return HealpixMap(
-        values[0],
-        pixels,
-        nside,
-        nested,
-        frame,
-        unit,
-        beam,
-        notes,
-        zeroed,
-        q_and_u,
-        made_with(header, wanted.input_beam),
+    found = HealpixMap(
+        values=values[0],
+        unit=unit,
+        beam_solid_angle=beam,
+        notes=notes,
+        beam=made_with(header, wanted.input_beam),
+        pixels=pixels,
+        nside=nside,
+        nest=nested,
+        frame=frame,
     )
-
-
-def _check_beam(
-    place: str, beam: float | None, nside: int, wanted: Wanted, notes: dict[str, str]
-) -> None:
-    side = float(np.sqrt(np.pi / 3) / nside)
-    check_beam(place, beam, (side, side), (), wanted.input_beam is not None, notes)
+    check_beam(place, beam, found.sides, (), wanted.input_beam is not None, notes)
+    where = "entry {} of those that are seen (counted from 1)"
+    found.zeroed = filled(place, values[0], wanted.missing, where)
+    if len(values) > 1:
+        values[2] *= sign
+        found.zeroed += filled(place, values[1:], wanted.missing, f"plane {{}} of Q and U, {where}")
+        found.polarization = values[1:]
+    values *= factor
+    return found
 
 
 def _check_wanted(place: str, wanted: Wanted) -> None:

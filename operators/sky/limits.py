@@ -77,12 +77,12 @@ def check_geometry(matrix: Floats, crpix: Any, header: Any, place: str) -> None:
             )
 
 
-def odd_pixels(matrix: Floats, shape: tuple[int, ...], beam: float) -> str:
+def odd_pixels(sides: Floats, shape: tuple[int, ...], beam: float) -> str:
     """Warning about pixels that are far too large or too small for a beam, or empty.
 
-    ``matrix`` (2, 2): pixel scale [rad]; ``shape``: (ny, nx); ``beam``: FWHM [rad].
+    ``sides`` (2,): of a pixel [rad]; ``shape``: (ny, nx); ``beam``: FWHM [rad].
     """
-    x, y = (float(side) / ARCSEC for side in np.linalg.norm(matrix, axis=0))
+    x, y = (float(side) / ARCSEC for side in sides)
     across, fwhm = max(x * shape[1], y * shape[0]), beam / ARCSEC
     text = f"its pixels are {x:.4g} x {y:.4g} arcsec"
     cure = "are CDELT1 and CDELT2 in degrees?"

@@ -27,7 +27,7 @@ from zonda.core.types import Floats
 
 from .brightness import conversion
 from .grid import Grid
-from .resample import extremes
+from .gridding import extremes
 from .skymap import SkyMap
 
 CUBIC = 3e-3
@@ -71,7 +71,7 @@ class SkyPlanning(Planning[SkyMap]):
         widths, _ = self.operator.beam_widths(observation)
         grid = self.operator.grid_of(observation)
         angles = 0 if grid.pole is None else 40 * observation.n_samples
-        each = 2 if grid.spread is None or grid.is_flat else 3  # pixels are spread for each beam
+        each = 2 if grid.gridding is None or grid.is_flat else 3  # pixels are spread for each beam
         source = grid.source.nbytes if grid.resampled else 0
         return (5 + each * len(widths)) * grid.nbytes + source + angles
 

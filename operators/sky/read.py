@@ -7,7 +7,7 @@ error lists the header keys and the parameters that would mend it.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -29,13 +29,11 @@ from . import stokes
 from .array import GIVEN, ArrayMap
 from .geometry import geometry
 from .healpix import read_healpix
-from .inputs import HealpixMap, Wanted, WcsMap
+from .input_map import ImageMap, InputMap, Wanted
 from .units import beam_solid_angle, check_beam, filled, made_with, unit_of
 
-T = TypeVar("T", WcsMap, HealpixMap, WcsMap | HealpixMap)
 
-
-def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
+def read_map(path: Path, **options: Any) -> InputMap:
     """An image or HEALPix table of a FITS file; of Stokes parameters I, and a note names those that
     are not used.
 
@@ -57,7 +55,7 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
         hdu, notes = chosen(hdus, wanted.hdu, place)
         check_size(hdu, place, whole=not wanted.header_alone)
         if is_healpix(hdu):
-            found: WcsMap | HealpixMap = read_healpix(hdu, place, wanted)
+            found: InputMap = read_healpix(hdu, place, wanted)
         else:
             q_and_u = None
             if wanted.hdu is None:
@@ -72,7 +70,7 @@ def read_map(path: Path, **options: Any) -> WcsMap | HealpixMap:
         return _told(found, hdu.header.get(GIVEN))
 
 
-def read_array(array: ArrayMap, place: str, **options: Any) -> WcsMap | HealpixMap:
+def read_array(array: ArrayMap, place: str, **options: Any) -> InputMap:
     """Read an array or HDU in memory as `read_map` reads a file."""
     wanted = Wanted(**options)
     if array.table is not None:
@@ -81,7 +79,7 @@ def read_array(array: ArrayMap, place: str, **options: Any) -> WcsMap | HealpixM
     return _told(_image(place, array.values, array.header, wanted), array.text)
 
 
-def _told(found: T, given: object) -> T:
+def _told(found: InputMap, given: object) -> InputMap:
     """The map, with a note of the array that it was in Python."""
     if given:
         found.notes["input"] = f"{given}, in {found.unit}, given in Python"
@@ -132,7 +130,7 @@ def _check_extension(hdu: Any, first: Any, wanted: Wanted, place: str) -> None:
 
 def _image(
     place: str, values: Floats, header: Any, wanted: Wanted, q_and_u: Floats | None = None
-) -> WcsMap:
+) -> ImageMap:
     if values.ndim < 2 or values.size == 0:
         raise InputError(
             "the image has no pixels", place=place, cure="give a two-dimensional image"
@@ -156,39 +154,31 @@ def _image(
     planes = planes_of_q_and_u(header, values.shape, plane) if wanted.polarized else None
     unit, factor = unit_of(place, header, "BUNIT", wanted.unit, notes)
     beam = beam_solid_angle(place, header, unit, wanted.input_beam, notes)
-    wcs, scale = geometry(place, header, wanted.pixel_size, wanted.centred, notes)
-    sides = np.radians(np.asarray(wcs.pixel_scale_matrix)) if scale is None else scale
-    x, y = np.linalg.norm(sides, axis=0)
-    check_beam(
-        place, beam, (float(x), float(y)), values.shape[-2:], wanted.input_beam is not None, notes
+    wcs, placeless = geometry(place, header, values.shape, wanted.pixel_size, wanted.centred, notes)
+    found = ImageMap(
+        values=values[plane],
+        unit=unit,
+        beam_solid_angle=beam,
+        notes=notes,
+        beam=made_with(header, wanted.input_beam),
+        wcs=wcs,
+        placeless=placeless,
     )
+    check_beam(place, beam, found.sides, found.shape, wanted.input_beam is not None, notes)
     if planes is not None and not wanted.header_alone:
         q_and_u = np.stack([np.array(values[k], np.float64) for k in planes])
     if planes is not None or q_and_u is not None:
         notes.pop(STOKES, None)
         sign = stokes.sign_of_u(header, wanted.convention, True, place, notes)
     if wanted.header_alone:
-        return WcsMap(values[plane], unit, wcs, scale, beam, notes)
-    values = np.array(values[plane], np.float64)
-    zeroed = filled(place, values, wanted.missing, "row {}, column {} (counted from 1)")
-    values *= factor
+        return found
+    found.values = np.array(values[plane], np.float64)
+    where = "row {}, column {} (counted from 1)"
+    found.zeroed = filled(place, found.values, wanted.missing, where)
+    found.values *= factor
     if q_and_u is not None:
-        zeroed += filled(
-            place,
-            q_and_u,
-            wanted.missing,
-            "plane {} of Q and U, row {}, column {} (counted from 1)",
-        )
+        found.zeroed += filled(place, q_and_u, wanted.missing, f"plane {{}} of Q and U, {where}")
         q_and_u *= factor
         q_and_u[1] *= sign
-    return WcsMap(
-        values,
-        unit,
-        wcs,
-        scale,
-        beam,
-        notes,
-        zeroed,
-        polarization=q_and_u,
-        beam=made_with(header, wanted.input_beam),
-    )
+        found.polarization = q_and_u
+    return found

@@ -1,10 +1,12 @@
-"""The part of a tangent-plane lattice that the detectors of a scan reach: all that is read from a
-larger map.
+"""The part of a tangent-plane lattice that the detectors of a scan reach, which is all that is read
+from a larger map; and the blocks in which that is worked on.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.projection import boresights
+from zonda.core.numerics.projection import boresights, pixel_matrix
 from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import Floats
 
@@ -30,10 +32,15 @@ there.
 """
 TILE = 64
 """Side, in points, of the squares that are worked on or not."""
+BLOCK = 8 * TILE
+"""Side, in points, of a block."""
 SPARSE = 0.5
 """Share of the tiles that are reached above which all are worked on: scans of nearly one shape then
 share them.
 """
+
+Progress = Callable[[int, int], None]
+"""Called with the number of points that are done, and of all."""
 
 
 @dataclass(frozen=True)
@@ -186,3 +193,92 @@ def tangent_wcs(ra: float, dec: float, box: tuple[int, int, int, int], step: flo
     wcs.pixel_shape = (x1 - x0, y1 - y0)
     wcs.wcs.set()
     return wcs
+
+
+def no_progress(done: int, total: int) -> None:
+    """Progress callback that does nothing."""
+
+
+def directions_on(matrix: Floats, x: Any, y: Any) -> Floats:
+    """ICRS directions (..., 3) of 0-based points of a TAN grid with `pixel_matrix` ``matrix``."""
+    rays = np.stack([x, y, np.ones(np.shape(x))], axis=-1) @ np.linalg.inv(matrix).T
+    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+
+def places_on(matrix: Floats, d: Floats) -> tuple[Floats, Floats]:
+    """0-based points (x, y) of a TAN grid at which ICRS directions (n, 3) lie."""
+    x, y, depth = matrix @ d.T
+    return np.ascontiguousarray(x / depth), np.ascontiguousarray(y / depth)
+
+
+@dataclass(frozen=True)
+class Block:
+    """Points of a TAN grid of ``step`` [rad] with `pixel_matrix` ``matrix``.
+
+    Attributes
+    ----------
+    y, x
+        (n,).
+    box
+        (x0, x1, y0, y1) columns x0 .. x1 - 1 and rows y0 .. y1 - 1, which hold the points.
+    tiles
+        `Region.tiles` of the grid.
+    """
+
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+    matrix: Floats
+    step: float
+    box: tuple[int, int, int, int]
+    tiles: NDArray[np.bool_] | None
+
+    @cached_property
+    def d(self) -> Floats:
+        """(n, 3) ICRS directions of the points."""
+        return directions_on(self.matrix, self.x, self.y)
+
+    @property
+    def rim(self) -> Floats:
+        """(m, 3) ICRS directions around the block, a step beyond it."""
+        (x0, x1), (y0, y1) = ((int(k.min()) - 1, int(k.max()) + 1) for k in (self.x, self.y))
+        along, up = np.arange(x0, x1 + 1), np.arange(y0, y1 + 1)
+        x = np.concatenate([along, along, np.full(len(up), x0), np.full(len(up), x1)])
+        y = np.concatenate([np.full(len(along), y0), np.full(len(along), y1), up, up])
+        return directions_on(self.matrix, x, y)
+
+    def nearest(self, d: Floats) -> NDArray[np.bool_]:
+        """True if ICRS directions (n, 3) are nearest to points of the block."""
+        x0, x1, y0, y1 = self.box
+        with np.errstate(invalid="ignore", divide="ignore"):
+            x, y = (np.rint(k) for k in places_on(self.matrix, d))
+            inside = (x >= x0) & (x < x1) & (y >= y0) & (y < y1) & (d @ self.matrix[2] > 0)
+        if self.tiles is not None:
+            tile = (k[inside].astype(int) // TILE for k in (y, x))
+            inside[inside] = self.tiles[tuple(tile)]
+        return np.asarray(inside, np.bool_)
+
+
+def blocks(
+    target: Any, tiles: NDArray[np.bool_] | None, progress: Progress, thin: int = 1
+) -> Iterator[Block]:
+    """The points of the TAN grid ``target`` in squares of `BLOCK`; of the ``tiles`` that are True,
+    where given.
+
+    ``thin``: only every ``thin``-th point along each axis.
+    """
+    nx, ny = target.pixel_shape
+    matrix, step = pixel_matrix(target), float(np.radians(abs(target.wcs.cdelt[1])))
+    total, done = nx * ny if tiles is None else int(tiles.sum()) * TILE**2, 0
+    progress(0, total)
+    for y0 in range(0, ny, BLOCK):
+        for x0 in range(0, nx, BLOCK):
+            y1, x1 = min(y0 + BLOCK, ny), min(x0 + BLOCK, nx)
+            y, x = (k.ravel() for k in np.mgrid[y0:y1:thin, x0:x1:thin])
+            if tiles is not None:
+                wanted = tiles[y // TILE, x // TILE]
+                y, x = y[wanted], x[wanted]
+            if not y.size:
+                continue
+            yield Block(y, x, matrix, step, (x0, x1, y0, y1), tiles)
+            done += y.size * thin * thin
+            progress(min(done, total), total)

@@ -10,10 +10,10 @@ from zonda.core.hooks import manager
 from zonda.core.maps.map_reading import STOKES
 from zonda.core.types import Floats
 
-from .inputs import HealpixMap, WcsMap
+from .input_map import InputMap
 from .parameters import SkyParameters
 from .read import read_array, read_map
-from .resample import Progress, no_progress
+from .region import Progress, no_progress
 from .units import DOUBT, seen_twice
 
 LARGE = 1 << 26
@@ -23,19 +23,15 @@ LARGE = 1 << 26
 class SkyInput(SkyParameters):
     """A map of the sky that is read from a file or an array."""
 
-    def _input(self, polarized: bool) -> tuple[WcsMap | HealpixMap, tuple[Hashable, ...]]:
+    def _input(self, polarized: bool) -> tuple[InputMap, tuple[Hashable, ...]]:
         """The map, read once for all observations, and its key in the cache."""
         identity = (*self._identity(), *(["polarized"] if polarized else []))
         return (
-            cast(
-                "WcsMap | HealpixMap", self._cache.get(identity, lambda: self.read_input(polarized))
-            ),
+            cast(InputMap, self._cache.get(identity, lambda: self.read_input(polarized))),
             identity,
         )
 
-    def read_input(
-        self, polarized: bool = False, header_alone: bool = False
-    ) -> WcsMap | HealpixMap:
+    def read_input(self, polarized: bool = False, header_alone: bool = False) -> InputMap:
         """The map of the file or the array; with Q and U if the camera is ``polarized``."""
         given = {
             name: getattr(self, name)
@@ -62,7 +58,7 @@ class SkyInput(SkyParameters):
                 )
         return source
 
-    def warn_of_beams(self, source: WcsMap | HealpixMap, telescope: Floats) -> str:
+    def warn_of_beams(self, source: InputMap, telescope: Floats) -> str:
         """Warn if a map that was made with a beam is convolved with those of detectors, FWHM (n,)
         [rad]. Returns the statement about it, empty if there is none.
         """

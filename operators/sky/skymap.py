@@ -15,7 +15,7 @@ from zonda.core.product import Product
 from zonda.core.storage.fits_files import header_of
 
 from .convolved import ConvolvedSky
-from .inputs import HealpixMap
+from .input_map import HealpixMap
 from .state import SkyState
 
 POLARIZED = ("polarization", "axis")

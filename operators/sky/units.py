@@ -152,7 +152,7 @@ def beam_solid_angle(
 def check_beam(
     place: str,
     area: float | None,
-    pixels: tuple[float, float],
+    pixels: Floats,
     shape: tuple[int, ...],
     given: bool,
     notes: dict[str, str],
@@ -163,7 +163,7 @@ def check_beam(
     Parameters
     ----------
     pixels
-        rad, sides of a pixel along (x, y).
+        (2,) sides of a pixel along (x, y), rad.
     shape
         (ny, nx), () of a HEALPix map.
     given

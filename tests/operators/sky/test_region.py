@@ -7,8 +7,8 @@ import pytest
 from zonda.core.errors import InputError
 from zonda.core.plan.planning import planning_of
 from zonda.operators.sky import region as regions
+from zonda.operators.sky.gridding import interpolated
 from zonda.operators.sky.region import TILE, Disc, region, tangent_wcs
-from zonda.operators.sky.resample import resample_healpix, resample_image
 from zonda.operators.sky.skymap import SkyMap
 
 ARCMIN = np.pi / 10800
@@ -121,7 +121,7 @@ def test_blocks_are_told(made, save, tmp_path, kind):
             column_units="K_RJ",
             dtype=np.float64,
         )
-        resample_healpix(
+        interpolated(
             read_map(tmp_path / "h.fits"),
             target,
             progress=lambda done, total: told.append((done, total)),
@@ -130,7 +130,7 @@ def test_blocks_are_told(made, save, tmp_path, kind):
         header = made.tan_header((18, 36), ra=0.0, dec=0.0, cdelt=(-36000.0, 36000.0))
         header["CTYPE1"], header["CTYPE2"] = "RA---CAR", "DEC--CAR"
         image = read_map(save(np.ones((18, 36)), header))
-        resample_image(image, target, progress=lambda done, total: told.append((done, total)))
+        interpolated(image, target, progress=lambda done, total: told.append((done, total)))
     assert [done for done, _ in told] == [k * 512**2 for k in range(5)]
     assert {total for _, total in told} == {1024**2}
 
@@ -152,7 +152,7 @@ def test_planning_interpolates_nothing(made, tmp_path, monkeypatch):
     def refuse(*arguments):
         raise AssertionError("interpolated")
 
-    monkeypatch.setattr(brightness, "resample_healpix", refuse)
+    monkeypatch.setattr(brightness, "interpolated", refuse)
     operator = SkyMap(file=tmp_path / "h.fits")
     small, wide = strip(made, 5.0, fwhm=3600.0), strip(made, 60.0, fwhm=3600.0)
     assert planning_of(operator).traits(wide).peak == pytest.approx(2.0)

@@ -12,10 +12,10 @@ from astropy.wcs import WCS
 from zonda.core.errors import InputError
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.operators.sky.brightness import tangent_areas
-from zonda.operators.sky.inputs import WcsMap
+from zonda.operators.sky.gridding import interpolated
+from zonda.operators.sky.input_map import ImageMap
 from zonda.operators.sky.read import read_map
 from zonda.operators.sky.region import tangent_wcs
-from zonda.operators.sky.resample import ImageOnSky, resample_healpix
 from zonda.operators.sky.skymap import SkyMap
 
 ARCMIN = np.pi / 10800
@@ -123,9 +123,8 @@ def test_outside_a_resampled_map(made, save):
 def test_pixel_areas(made, kind):
     header = made.tan_header((60, 70), cdelt=(-600.0, 600.0))
     header["CTYPE1"], header["CTYPE2"] = f"RA---{kind}", f"DEC--{kind}"
-    areas = ImageOnSky(WcsMap(np.zeros((60, 70)), "K_RJ", WCS(header), None)).areas(
-        *np.meshgrid(np.arange(70), np.arange(60))
-    )
+    image = ImageMap(values=np.zeros((60, 70)), unit="K_RJ", wcs=WCS(header))
+    areas = image.areas(tuple(np.indices((60, 70))))
     if kind == "ZEA":  # equal-area by name
         np.testing.assert_allclose(areas, (600 * ARCMIN / 60) ** 2, rtol=1e-5)
     if kind == "TAN":
@@ -249,7 +248,7 @@ def test_constant_healpix_is_constant(made, tmp_path):
     values[np.random.default_rng(2).random(values.size) < 0.3] = healpy.UNSEEN
     healpy.write_map(tmp_path / "c.fits", values, coord="C", column_units="K_RJ", dtype=np.float64)
     source = read_map(tmp_path / "c.fits")
-    got, covered, poor = resample_healpix(
+    (got,), covered, poor = interpolated(
         source, tangent_wcs(1.0, 0.4, (-14, 15, -14, 15), np.radians(0.3))
     )
     assert 0.5 < covered.mean() < 0.9
