@@ -155,7 +155,8 @@ class ConfigurationError(ZondaError):
             key=lambda d: (d.span.source.name != place, d.span.line, d.span.column),
         )
         count = f"{len(found)} mistake{'s' if len(found) != 1 else ''}"
-        super().__init__(f"{count} in {place}", place="")
+        where = dict.fromkeys(d.span.source.name for d in found)
+        super().__init__(f"{count} in {' and '.join(filter(None, where)) or place}", place="")
         self.diagnostics, self.place = found, place
 
     def __reduce__(self) -> tuple[type[ConfigurationError], tuple[list[Diagnostic], str]]:

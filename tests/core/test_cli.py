@@ -208,7 +208,7 @@ error: unknown key 'valu' for Ones
 """
     assert expected in err
     assert "did you mean 'seed'?" in err
-    assert err.endswith("2 mistakes in p.yaml\n")
+    assert err.endswith("2 mistakes in --set\n")
     assert not (here / "out").exists()
 
 

@@ -390,7 +390,7 @@ def test_every_mistake_at_once(toys: Any) -> None:
         ("--set", 1),
     ]
     error = ConfigurationError(found, "t.yaml")
-    assert str(error).endswith("6 mistakes in t.yaml")
+    assert str(error).endswith("6 mistakes in t.yaml and --set")
     assert "\033" not in str(error)
     assert "\033" in error.render(colour=True)
 
