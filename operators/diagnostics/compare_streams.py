@@ -1,9 +1,40 @@
-"""`CompareStreams`: a stream of a run beside another one."""
+"""`CompareStreams`: a stream of a run beside another one.
+
+With X, Y the Fourier transforms of the segments of two streams x, y (Welch 1967: they overlap by
+half, are freed of a straight line and weighted by a Hann window), n the equivalent number of
+independent segments, < > their mean, and one-sided spectra per Hz
+
+    P_x = <|X|^2>,   P_y = <|Y|^2>,   P_xy = <X Y^*>,   P_d = P_x + P_y - 2 Re P_xy,   (1)
+
+    sigma_x^2 = sum P_x df,   g = Re sum P_xy / sum P_y,
+    r = Re sum P_xy / (sum P_x sum P_y)^1/2,   (2)
+
+    C(f) = |P_xy|^2 / (P_x P_y).                                                                 (3)
+
+All sums are over the frequencies above zero: what is slower than a segment is not in them. The
+estimate of C is biased,
+
+    <C> - C = (1 - C)^2 / n                                                                      (4)
+
+to first order in 1/n (Carter, Knapp & Nuttall 1973; Bendat & Piersol 2010, section 9.2):
+independent streams have 1/n, a single segment has 1. The mean over detectors and scans has the same
+bias. With the residual e = x - g y of the spectrum P_e = P_x + g^2 P_y - 2 g Re P_xy, Gaussian
+streams, and df' = 35/18 df for what the window shares between neighbouring frequencies,
+
+    var g = df' sum P_e P_y / (2 n (sum P_y)^2),
+    var ln sigma^2 = df' sum P^2 / (n (sum P)^2) / (1 + 1/n),   (5)
+    var r = (1 - r^2)^2
+            (r^2 (var ln sigma_e^2 + var ln sigma_y^2) / 4 + (sigma_y / sigma_x)^2 var g)  (6)
+
+(first-order propagation of r^-2 = 1 + sigma_e^2 / (g sigma_y)^2; of white streams of N samples it
+is (1 - r^2)^2 / N).
+"""
 
 from __future__ import annotations
 
-import threading
-from dataclasses import dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -14,30 +45,30 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.operator import Operator
-from zonda.core.storage.ecsv import write_ecsv
-from zonda.core.storage.files import product_path
+from zonda.core.pages import html_table
+from zonda.core.product import Record
+from zonda.core.storage.ecsv import Column
 from zonda.core.stream_names import AnyStream, check_signals, streams_asked, streams_needed
+from zonda.core.types import Floats
 
-from .power_spectrum import Welch, calibration, on_sky, quick_length
-from .series import about, check_streams, count_flagged, key_of, no_stream, spread_evenly
-from .stream_statistics import Pair, StreamComparison, pair
+from .power_spectrum import Chosen, Welch, welch_of
+from .series import (
+    check_streams,
+    count_flagged,
+    key_of,
+    publish,
+    spread_evenly,
+    unit_of_stream,
+)
 
 LEAST_SEGMENTS = 8
 """A segment is at most this part of the scan: with a single one the coherence is 1 whatever the
 streams.
 """
-
-
-@dataclass
-class Pairs:
-    """Spectra of one scan by detector, and the segment's length in samples (0: the scan is too
-    short).
-    """
-
-    detectors: NDArray[np.int64]
-    length: int
-    found: dict[int, Pair] = field(default_factory=dict)
-    lock: threading.Lock = field(default_factory=threading.Lock)
+FIGURES = ("rms", "rms_reference", "rms_difference", "correlation", "gain")
+"""Figures of each detector; the last two have standard errors."""
+SHARED = 35 / 18
+"""Neighbouring frequencies behind a Hann window: 1 + 2 (2/3)^2 + 2 (1/6)^2."""
 
 
 class CompareStreams(Operator):
@@ -96,23 +127,38 @@ class CompareStreams(Operator):
         """The stream and its reference."""
         return self.stream, self.reference
 
-    def prepare(self, observation: Observation) -> Pairs:
+    def prepare(self, observation: Observation) -> Chosen:
         check_signals(self.streams, observation, self.label)
-        length = min(
-            observation.n_samples // LEAST_SEGMENTS, round(self.segment * observation.sample_rate)
-        )
         count_flagged(observation, self.label, "the comparison includes")
-        chosen = spread_evenly(observation, self.detectors)
-        return Pairs(chosen, quick_length(length) if length >= 4 else 0)
+        welch = welch_of(observation, self.segment, observation.n_samples // LEAST_SEGMENTS)
+        return Chosen(spread_evenly(observation, self.detectors), welch)
 
-    def exec(self, block: Block, state: Pairs) -> None:
-        here = (state.detectors >= block.detectors.start) & (state.detectors < block.detectors.stop)
-        for detector in state.detectors[here] if state.length else ():
-            self._add(block, state, int(detector))
+    def exec(self, block: Block, state: Chosen) -> None:
+        for detector, streams in state.streams(block, self.streams, self.label):
+            x, y = streams.values()
+            if np.isfinite(x).all() and np.isfinite(y).all():
+                assert state.welch is not None
+                state.found[detector] = pair(x, y, state.welch)
+            else:
+                block.observation.tally.count(
+                    self.label, "detectors left out for samples that are not finite", 1
+                )
 
-    def collect(self, data: Data, observation: Observation, state: Pairs) -> None:
-        if (found := self._finished(observation, state)) is not None:
-            data.add(self.label, found)
+    def collect(self, data: Data, observation: Observation, state: Chosen) -> None:
+        """Compare in the order of the detectors."""
+        every = sorted(state.found)
+        if state.welch is None or not every:
+            why = (
+                "too short to compare streams"
+                if state.welch is None
+                else "without a detector to compare"
+            )
+            observation.tally.count(self.label, f"scans {why}", 1)
+            return
+        names = [observation.focalplane.names[d] for d in every]
+        pairs = [state.found[d] for d in every]
+        found = StreamComparison.of_pairs(self, pairs, state.welch, names)
+        data.add(self.label, found)
 
     def finalize(self, data: Data) -> None:
         found: StreamComparison | None = data.take(self.label)
@@ -122,51 +168,202 @@ class CompareStreams(Operator):
         data.tally.count(self.label, other, found.of_another_length)
         for figure, text in found.lines():
             data.tally.state(self.label, figure, text)
-        data.products[found.product] = found
-        if data.output is not None:
-            meta = about(
-                data,
-                STREAM=found.stream,
-                REFERENCE=found.reference,
-                SCANS=found.observations,
-                SEGMENTS=found.segments,
-            )
-            tables = {"": found.columns(), "_detectors": found.detector_columns()}
-            for behind, columns in tables.items():
-                name = data.named(f"{found.product}{behind}")
-                write_ecsv(product_path(data.output, name, ".ecsv"), columns, meta)
-
-    def _add(self, block: Block, state: Pairs, detector: int) -> None:
-        """The spectra of one detector, whose whole scan is in the block."""
-        for name in self.streams:
-            if name not in block.detdata:
-                raise no_stream(name, block.detdata, self.label)
-        factor = calibration(block, detector)
-        with np.errstate(invalid="ignore", over="ignore"):
-            x, y = (on_sky(block, detector, name, factor) for name in self.streams)
-        if not (np.isfinite(x).all() and np.isfinite(y).all()):
-            block.observation.tally.count(
-                self.label, "detectors left out for samples that are not finite", 1
-            )
-            return
-        found = pair(x, y, block.observation.sample_rate, state.length)
-        with state.lock:
-            state.found[detector] = found
-
-    def _finished(self, observation: Observation, state: Pairs) -> StreamComparison | None:
-        """Comparison of one scan, in the order of the detectors; None where there is none, which is
-        counted.
-        """
-        if not state.found:
-            why = (
-                "without a detector to compare" if state.length else "too short to compare streams"
-            )
-            observation.tally.count(self.label, f"scans {why}", 1)
-            return None
-        every = sorted(state.found)
-        welch = Welch(observation.n_samples, observation.sample_rate, state.length)
-        names = [observation.focalplane.names[d] for d in every]
-        what = (*self.streams, self.label, key_of(self, "stream_comparison"))
-        return StreamComparison.of_pairs(
-            [state.found[d] for d in every], welch.frequency, welch.independent, names, what
+        publish(
+            data,
+            found.product,
+            found,
+            {"": found.columns(), "_detectors": found.detector_columns()},
+            STREAM=found.stream,
+            REFERENCE=found.reference,
+            SCANS=found.observations,
+            SEGMENTS=found.segments,
         )
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Spectra and cross-spectrum of one detector's two streams, equation (1): (n,) each, per Hz."""
+
+    power: Floats
+    reference: Floats
+    cross: NDArray[np.complex128]
+
+    @property
+    def coherence(self) -> Floats:
+        """Equation (3); NaN where a spectrum is zero."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(np.abs(self.cross) ** 2 / (self.power * self.reference), np.float64)
+
+    def rest(self, gain: float) -> Floats:
+        """P_e of x - gain y; P_d for 1."""
+        rest = self.power + gain**2 * self.reference - 2 * gain * self.cross.real
+        return np.asarray(np.maximum(rest, 0.0), np.float64)
+
+
+def pair(x: Floats, y: Floats, welch: Welch) -> Pair:
+    """Spectra and cross-spectrum of two series (n_samp,), equation (1)."""
+    both = zip(welch.transforms(x), welch.transforms(y), strict=True)
+    found = welch.density(np.stack([abs(a) ** 2, abs(b) ** 2, a * b.conj()]) for a, b in both)
+    return Pair(found[0].real, found[1].real, found[2])
+
+
+def figures(found: Pair, step: float, segments: float) -> tuple[Floats, Floats]:
+    """`FIGURES` (5,) of one detector and their standard errors: equations (2), (5), (6). ``step``:
+    df, Hz; NaN where a stream is zero.
+    """
+    values, errors = np.full((2, len(FIGURES)), math.nan)
+    parts = found.power, found.reference, found.rest(1.0)
+    values[:3] = [math.sqrt(float(p.sum()) * step) for p in parts]
+    x, y, cross = (float(p.sum()) for p in (found.power, found.reference, found.cross.real))
+    if not (x > 0 and y > 0):
+        return values, errors
+    gain, r = cross / y, max(-1.0, min(1.0, cross / math.sqrt(x * y)))
+    rest = found.rest(gain)
+    shared = SHARED / segments  # df' / df / n, of sums without df
+
+    def log_variance(p: Floats) -> float:
+        total = float(p.sum())
+        return shared * float((p / total) @ (p / total)) / (1 + 1 / segments) if total > 0 else 0.0
+
+    var_gain = shared * float(rest @ found.reference) / (2 * y * y)
+    inner = r * r * (log_variance(rest) + log_variance(found.reference)) / 4 + y / x * var_gain
+    values[3:] = r, gain
+    errors[3:] = (1 - r * r) * math.sqrt(inner), math.sqrt(var_gain)
+    return values, errors
+
+
+@dataclass
+class StreamComparison(Record):
+    """Comparison of a stream of a run with another.
+
+    Attributes
+    ----------
+    stream, reference
+        x and y.
+    label, product
+        Of the step; name among the products.
+    names
+        (n_det) detectors.
+    values, errors
+        (n_det, 5) `FIGURES` and their standard errors, means over the scans; NaN where there is
+        none, and for `rms_difference` where the streams have not the same unit.
+    frequency
+        (n,) Hz, without zero.
+    power, coherence
+        (3, n) mean spectra P_x, P_y, P_d over detectors and scans; (n,) mean of equation (3).
+    segments
+        n of one scan.
+    observations, of_another_length
+        Scans in the mean, and those left out since their detectors or frequencies differ.
+    """
+
+    stream: str
+    reference: str
+    label: str
+    product: str
+    names: list[str]
+    values: Floats
+    errors: Floats
+    frequency: Floats
+    power: Floats
+    coherence: Floats
+    segments: float
+    observations: int = 1
+    of_another_length: int = 0
+
+    @classmethod
+    def of_pairs(
+        cls, step: CompareStreams, pairs: Sequence[Pair], welch: Welch, names: list[str]
+    ) -> StreamComparison:
+        """Comparison of one scan, from the spectra of each detector."""
+        f, segments = welch.frequency, welch.independent
+        found = np.array([figures(p, float(f[0]), segments) for p in pairs])
+        power = np.mean([(p.power, p.reference, p.rest(1.0)) for p in pairs], axis=0)
+        if unit_of_stream(step.stream) != unit_of_stream(step.reference):
+            found[:, 0, FIGURES.index("rms_difference")] = power[2] = np.nan
+        coherence = np.mean([p.coherence for p in pairs], axis=0)
+        key = key_of(step, "stream_comparison")
+        what = (*step.streams, step.label, key, names)
+        return cls(*what, found[:, 0], found[:, 1], f, power, coherence, segments)
+
+    def __iadd__(self, other: StreamComparison) -> StreamComparison:
+        """The mean of all scans, each with the same weight."""
+        self.of_another_length += other.of_another_length
+        if self.names != other.names or self.frequency.shape != other.frequency.shape:
+            self.of_another_length += other.observations
+            return self
+        n, m = self.observations, other.observations
+        for name in ("values", "power", "coherence"):
+            setattr(self, name, (getattr(self, name) * n + getattr(other, name) * m) / (n + m))
+        self.errors = np.hypot(self.errors * n, other.errors * m) / (n + m)
+        self.observations = n + m
+        return self
+
+    def over_detectors(self, figure: str) -> tuple[float, float, float]:
+        """(mean over detectors, their standard deviation, standard error of one detector or NaN) of
+        one of `FIGURES`.
+        """
+        k = FIGURES.index(figure)
+        values = self.values[:, k]
+        scatter = float(values.std(ddof=1)) if values.size > 1 else math.nan
+        return float(values.mean()), scatter, float(self.errors[:, k].mean())
+
+    @property
+    def bias(self) -> Floats:
+        """(n,) of the coherence, equation (4)."""
+        return np.asarray((1 - self.coherence) ** 2 / self.segments, np.float64)
+
+    def columns(self) -> list[Column]:
+        """The table of the spectra."""
+        x, y, d = self.power
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = x / y
+        own, other = (
+            {"K_RJ": "K2 / Hz", "m": "m2 / Hz"}.get(unit_of_stream(n), "1 / Hz")
+            for n in (self.stream, self.reference)
+        )
+        less = f"of {self.stream} - {self.reference}; nan: not the same unit"
+        coherence = "|P_xy|^2 / (P_x P_y), mean over detectors and scans"
+        bias = "(1 - C)^2 / n: expected excess of the coherence, not subtracted"
+        return [
+            Column("frequency", self.frequency, "Hz", ""),
+            Column("power", x, own, f"of {self.stream}, mean over detectors and scans"),
+            Column("power_reference", y, other, f"of {self.reference}"),
+            Column("power_difference", d, own, less),
+            Column("ratio", ratio, "", "power / power_reference"),
+            Column("coherence", self.coherence, "", coherence),
+            Column("coherence_bias", self.bias, "", bias),
+        ]
+
+    def detector_columns(self) -> list[Column]:
+        """The table of the figures of each detector."""
+        unit = {"K_RJ": "K", "m": "m"}
+        own, other = (unit.get(unit_of_stream(name), "") for name in (self.stream, self.reference))
+        kinds = {
+            "rms": (own, f"of {self.stream}, faster than a segment"),
+            "rms_reference": (other, f"of {self.reference}"),
+            "rms_difference": (own, "nan: not the same unit"),
+            "correlation": ("", "coefficient of correlation"),
+            "gain": ("", f"of {self.stream} on {self.reference}: least squares"),
+        }
+        rows = [Column("detector", self.names, "", "")]
+        for k, (name, about) in enumerate(kinds.items()):
+            rows.append(Column(name, self.values[:, k], *about))
+            if "rms" not in name:
+                rows.append(Column(f"{name}_error", self.errors[:, k], "", "standard error"))
+        return rows
+
+    def lines(self) -> list[tuple[str, str]]:
+        """(figure, mean and scatter over detectors)."""
+        found = []
+        for figure in FIGURES:
+            mean, scatter, error = self.over_detectors(figure)
+            of = self.reference if figure == "rms_reference" else self.stream
+            text = f"{mean:.4g}{f' {unit_of_stream(of)}' if 'rms' in figure else ''}".rstrip()
+            text += f" +- {error:.2g}" if math.isfinite(error) else ""
+            text += f", scatter over detectors {scatter:.2g}" if math.isfinite(scatter) else ""
+            found.append((figure.replace("rms_", "rms of the "), text))
+        return found
+
+    def _repr_html_(self) -> str:
+        return html_table(f"{self.stream} and {self.reference}", self.lines())

@@ -14,14 +14,12 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_sources
-from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
+from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.output import Output
-from zonda.core.storage.ecsv import Column, write_ecsv
-from zonda.core.storage.files import product_path
 from zonda.core.types import Floats
 
 from .comparison.radial import RadialSpectra, radial_spectra, ring_edges
-from .series import about, check_map, key_of, kinds_of_maps
+from .series import check_map, key_of, kinds_of_maps, publish
 from .stokes_spectra import on_the_plane, sphere_spectra
 from .transfer_function import window_of
 
@@ -54,31 +52,6 @@ class MapSpectra:
     spectra: RadialSpectra
     names: dict[str, str]
     fwhm: float
-
-    def columns(self) -> list[Column]:
-        """The table, largest scale first."""
-        s, plain = self.spectra, {name: name.replace("/", "_") for name in self.spectra.power}
-        return [
-            Column("scale", s.scale / ARCSEC, "arcsec", "1 / mean wavenumber of the ring"),
-            Column("wavenumber", 1 / s.scale, "rad-1", "mean over the ring's modes"),
-            *(Column(plain[n], p, "K2 sr", "power spectral density") for n, p in s.power.items()),
-            *(
-                Column(
-                    f"{plain[n]}_white", p, "K2 sr", "of white noise with the map's standard errors"
-                )
-                for n, p in s.white.items()
-            ),
-            *(
-                Column(n.replace("/", "_"), p, "K2 sr", "cross power spectral density")
-                for n, p in s.cross.items()
-            ),
-            Column(
-                "modes",
-                s.modes,
-                "",
-                "independent modes; relative standard error of the power: modes^-1/2",
-            ),
-        ]
 
 
 class MapSpectrum(Output):
@@ -135,12 +108,7 @@ class MapSpectrum(Output):
         found = map_spectra(
             data.products, Wanted(self.maps, self.bins, self.least_coverage, self.taper), self.label
         )
-        key = key_of(self, "map_spectra")
-        data.products[key] = found
-        if data.output is not None:
-            write_ecsv(
-                product_path(data.output, data.named(key), ".ecsv"), found.columns(), about(data)
-            )
+        publish(data, key_of(self, "map_spectra"), found, {"": found.spectra.columns("K")})
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -13,23 +12,14 @@ from zonda.core.configuration.units import Seconds
 from zonda.core.data import Data, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.storage.ecsv import write_ecsv
-from zonda.core.storage.files import product_path
 
 from .components import Lagged, components
-from .series import Modes, about, key_of, spread_evenly
+from .series import Modes, key_of, publish, spread_evenly
 
 MOST_ROWS = 4096
 """Detectors times delays: the covariance of more takes minutes and gigabytes."""
 KEPT = 64
 """Singular values that are kept of each scan."""
-
-
-@dataclass
-class Found:
-    """Modes that `ModeSpectrum.measure` finds, for `ModeSpectrum.collect`."""
-
-    modes: Modes | None = None
 
 
 class ModeSpectrum(Operator):
@@ -69,7 +59,8 @@ class ModeSpectrum(Operator):
                 self.prepare(alone)
         return []
 
-    def prepare(self, observation: Observation) -> Found:
+    def prepare(self, observation: Observation) -> list[Modes]:
+        """The place of what `measure` will find."""
         count = min(self.detectors, observation.n_detectors)
         if count * (self.delays + 1) > MOST_ROWS:
             raise PipelineError(
@@ -77,53 +68,26 @@ class ModeSpectrum(Operator):
                 place=self.label,
                 cure=f"set detectors to {max(2, MOST_ROWS // (self.delays + 1))}, or fewer delays",
             )
-        return Found()
+        return []
 
     def measure(self, stream: Stream, model: Any = None) -> Any:
         """Read the stream twice: for the covariance, and for the streams of the modes."""
-        stream.state.modes = self._find(stream)
-        return stream.state
-
-    def collect(self, data: Data, observation: Observation, state: Found) -> None:
-        if state.modes is not None:
-            data.add(self.label, state.modes)
-
-    def finalize(self, data: Data) -> None:
-        found: Modes | None = data.take(self.label)
-        if found is None:
-            return
-        data.products[found.product] = found
-        if data.output is not None:
-            meta = about(data, SCAN=found.observation)
-            for behind, columns, more in (
-                ("", found.columns(), {"SCANS": len(found.values)}),
-                ("_streams", found.stream_columns(), {}),
-            ):
-                name = data.named(f"{found.product}{behind}")
-                write_ecsv(product_path(data.output, name, ".ecsv"), columns, meta | more)
-
-    def _find(self, stream: Stream) -> Modes | None:
-        """The modes of one scan; None where there are none, which is counted."""
-        observation = stream.observation
+        observation, tally = stream.observation, stream.observation.tally
         chosen = spread_evenly(observation, self.detectors)
         lag = max(1, round(self.delay * observation.sample_rate))
         lagged = Lagged(stream, chosen, self.delays, lag)
         if chosen.size < 2 or np.count_nonzero(lagged.good) < 2:
-            observation.tally.count(
-                self.label, "scans without two detectors and two samples: no modes", 1
-            )
-            return None
+            tally.count(self.label, "scans without two detectors and two samples: no modes", 1)
+            return stream.state
         found = components(lagged, self.modes, center=self.center, normalize=self.normalize)
-        observation.tally.count(
-            self.label, "detectors left out: signal not finite", int(np.count_nonzero(~found.used))
-        )
+        left = int(np.count_nonzero(~found.used))
+        tally.count(self.label, "detectors left out: signal not finite", left)
         if not found.energy > 0:
-            observation.tally.count(self.label, "scans whose signal is constant: no modes", 1)
-            return None
-        values, n = np.zeros((1, KEPT)), min(KEPT, found.values.size)
-        values[0, :n] = found.values[:n]
-        return Modes(
-            values,
+            tally.count(self.label, "scans whose signal is constant: no modes", 1)
+            return stream.state
+        values = found.values[:KEPT]
+        modes = Modes(
+            np.pad(values, (0, KEPT - values.size))[None],
             np.array([found.energy]),
             observation.seconds,
             found.times,
@@ -136,3 +100,16 @@ class ModeSpectrum(Operator):
             self.label,
             key_of(self, "modes"),
         )
+        stream.state.append(modes)
+        return stream.state
+
+    def collect(self, data: Data, observation: Observation, state: list[Modes]) -> None:
+        for modes in state:
+            data.add(self.label, modes)
+
+    def finalize(self, data: Data) -> None:
+        found: Modes | None = data.take(self.label)
+        if found is not None:
+            tables = {"": found.columns(), "_streams": found.stream_columns()}
+            scans = {"SCAN": found.observation, "SCANS": len(found.values)}
+            publish(data, found.product, found, tables, **scans)

@@ -10,7 +10,7 @@ from zonda.core.plan.planning import Planning
 
 from .map_spectra import MapSpectrum
 from .plot_operators import Plots
-from .power_spectrum import CHUNK, PowerSpectrum
+from .power_spectrum import PowerSpectrum
 from .report import Report
 from .time_streams import TimeStreams
 from .transfer_function import TransferFunction
@@ -99,4 +99,4 @@ class CompareStreamsPlanning(Planning[Any]):
         step, n = self.operator, observation.n_samples
         count: int = min(observation.n_detectors, step.detectors)
         length: float = min(n / LEAST_SEGMENTS, step.segment * observation.sample_rate)
-        return round(16 * n + (64 * CHUNK + 16 * count) * length)
+        return round(16 * n + (64 + 16 * count) * length)

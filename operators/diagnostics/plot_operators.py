@@ -21,6 +21,7 @@ from zonda.core.output import Output, output_folder
 from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.types import AnyFloats, Floats
 
+from .compare_streams import StreamComparison
 from .comparison.files import plane_of
 from .comparison.statistics import Comparison
 from .drawing.comparison_plots import draw_comparison, draw_map_spectra, draw_stream_comparison
@@ -41,7 +42,6 @@ from .drawing.pictures import (
 from .drawing.plots import ScanTrack
 from .map_spectra import MapSpectra
 from .series import Modes, Spectrum, TimeStream
-from .stream_statistics import StreamComparison
 from .transfer_function import Transfer
 
 __all__ = ["Picture", "Plots", "pictures"]

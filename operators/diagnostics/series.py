@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,8 @@ from zonda.core.errors import PipelineError
 from zonda.core.pages import html_table
 from zonda.core.product import Record
 from zonda.core.signal import is_stream
-from zonda.core.storage.ecsv import Column
+from zonda.core.storage.ecsv import Column, write_ecsv
+from zonda.core.storage.files import product_path
 from zonda.core.stream_names import UNITS
 from zonda.core.types import Floats
 
@@ -63,16 +64,16 @@ class Spectrum(Record):
     def __iadd__(self, other: Spectrum) -> Spectrum:
         """The mean of all scans, each with the same weight."""
         self.of_another_length += other.of_another_length
-        if self.psd.keys() != other.psd.keys() or not _close(self.frequency, other.frequency):
+        f, g = self.frequency, other.frequency
+        alike = f.shape == g.shape and np.allclose(f, g, rtol=1e-12)
+        if self.psd.keys() != other.psd.keys() or not alike:
             self.of_another_length += other.observations
             return self
         n, m = self.observations, other.observations
-        self.psd = {k: (self.psd[k] * n + other.psd[k] * m) / (n + m) for k in self.psd}
-        both = self.closed_forms.keys() & other.closed_forms.keys()
-        self.closed_forms = {
-            k: (self.closed_forms[k] * n + other.closed_forms[k] * m) / (n + m)
-            for k in sorted(both)
-        }
+        for name in ("psd", "closed_forms"):
+            own, more = getattr(self, name), getattr(other, name)
+            means = {k: (own[k] * n + more[k] * m) / (n + m) for k in own if k in more}
+            setattr(self, name, means)
         self.white_level = (self.white_level * n + other.white_level * m) / (n + m)
         self.averages += other.averages
         self.detectors, self.observations = other.detectors, n + m
@@ -108,32 +109,64 @@ class Spectrum(Record):
         """
         if not {"pink", "white"} <= set(self.psd):
             return None
-        edges = np.geomspace(self.frequency[0], self.frequency[-1], 31)
-        bins = np.clip(np.searchsorted(edges, self.frequency, "right") - 1, 0, 29)
-        sums = [
-            np.bincount(bins, w, 30)
-            for w in (np.log(self.frequency), self.psd["pink"], self.psd["white"])
-        ]
-        count = np.bincount(bins, minlength=30)
-        used = count > 0
-        log_f, pink, white = (s[used] / count[used] for s in sums)
-        if not (pink > 0).all() or not (white > 0).all():
-            return None
-        ratio = np.log(pink / white)
-        above = np.flatnonzero(ratio > 0)
-        if not above.size or above[-1] + 1 == ratio.size:
-            return None
-        k = above[-1]
-        return float(np.exp(np.interp(0.0, [-ratio[k], -ratio[k + 1]], [log_f[k], log_f[k + 1]])))
+        pink, white = self.psd["pink"], self.psd["white"]
+        found = crossing(self.frequency, pink, white)
+        return None if isinstance(found, str) else found[0]
+
+
+BINS, NEAR = 30, 1.5
+"""Bins of two spectra that cross; the factor in frequency within which their slope is taken."""
+CORRELATED = 35 / 18
+"""c of equation (1): correlation of neighbouring frequencies through Welch's Hann window."""
+
+
+def slope(x: Floats, y: Floats) -> tuple[float, float]:
+    """Least-squares slope of y (n,) over x and its standard error, n > 2:
+
+    b = sum (x - <x>) (y - <y>) / sum (x - <x>)^2,
+    sigma_b^2 = c s^2 / sum (x - <x>)^2,   s^2 the variance of the residuals             (1)
+    """
+    spread = x - x.mean()
+    squares = float(spread @ spread)
+    b = float(spread @ y) / squares
+    rest = y - y.mean() - b * spread
+    return b, math.sqrt(CORRELATED * float(rest @ rest) / (x.size - 2) / squares)
+
+
+def crossing(frequency: Floats, upper: Floats, lower: Floats) -> tuple[float, float] | str:
+    """Highest frequency f_x at which a spectrum exceeds another, and its standard error, Hz; a text
+    where the two do not cross.
+
+    Spectra are averaged in `BINS` equal bins in ln f. With the residuals s and the slope d of the
+    logarithm of their ratio within a factor `NEAR`,
+
+        ln f_x: zero of the line through both bins,   sigma_ln f = (c / n)^(1/2) s / |d|     (2)
+    """
+    good = (upper > 0) & (lower > 0)
+    f, ratio = np.log(frequency[good]), np.log(upper[good] / lower[good])
+    reach = float(np.ptp(f)) if f.size > 1 else 1.0
+    number = np.clip((BINS * (f - f.min(initial=np.inf)) / reach).astype(int), 0, BINS - 1)
+    count = np.bincount(number, minlength=BINS)
+    used = count > 0
+    middle = np.bincount(number, f, BINS)[used] / count[used]
+    above, below = (np.bincount(number, part[good], BINS)[used] for part in (upper, lower))
+    mean = np.log(above / below)
+    higher = np.flatnonzero(mean > 0)
+    if not higher.size or higher[-1] + 1 == mean.size:
+        return "exceeds everywhere" if higher.size else "nowhere exceeds"
+    k = int(higher[-1])
+    at = float(np.interp(0.0, [-mean[k], -mean[k + 1]], middle[[k, k + 1]]))
+    near = abs(f - at) <= math.log(NEAR)
+    if np.count_nonzero(near) < 4:
+        return math.exp(at), math.nan
+    b, error = slope(f[near], ratio[near])
+    scatter = error * float(np.std(f[near]))  # (c / n)^(1/2) s
+    return math.exp(at), math.exp(at) * scatter / abs(b) if b else math.nan
 
 
 def unit_of_stream(name: str) -> str:
     """K_RJ; ``m`` or empty for streams of other kinds."""
     return UNITS.get(name, "K_RJ")
-
-
-def _close(a: Floats, b: Floats) -> bool:
-    return a.shape == b.shape and np.allclose(a, b, rtol=1e-12)
 
 
 @dataclass
@@ -176,6 +209,18 @@ def about(data: Data, **more: Any) -> dict[str, Any]:
         **more,
     }
     return {key: value for key, value in meta.items() if value not in ("", None)}
+
+
+def publish(
+    data: Data, key: str, product: Any, tables: Mapping[str, Sequence[Column]], **more: Any
+) -> None:
+    """Make a product, and where there is an output folder write its ``tables``, by what stands
+    behind its name; ``more``: beside their provenance.
+    """
+    data.products[key] = product
+    for behind, columns in tables.items() if data.output is not None else ():
+        path = product_path(data.output, data.named(f"{key}{behind}"), ".ecsv")
+        write_ecsv(path, columns, about(data, **more))
 
 
 def key_of(operator: Operator, usual: str) -> str:
@@ -285,10 +330,8 @@ class Modes(Record):
 
     def __iadd__(self, other: Modes) -> Modes:
         """Values of all scans; streams and vectors of the first."""
-        self.values, self.energy = (
-            np.concatenate([self.values, other.values]),
-            np.concatenate([self.energy, other.energy]),
-        )
+        self.values = np.concatenate([self.values, other.values])
+        self.energy = np.concatenate([self.energy, other.energy])
         return self
 
     @property
@@ -299,55 +342,42 @@ class Modes(Record):
     @property
     def shares(self) -> Floats:
         """(n,) mean over the scans of each mode's share of the variance."""
-        return np.asarray(self._shares().mean(axis=0), np.float64)
+        return np.asarray((self.values**2 / self.energy[:, None]).mean(axis=0))
 
     @property
     def error(self) -> Floats:
         """(n,) standard error of `shares` from their scatter over scans; NaN for one scan."""
-        each = self._shares()
+        each = self.values**2 / self.energy[:, None]
         n = len(each)
-        return np.asarray(
-            each.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(each.shape[1], np.nan),
-            np.float64,
-        )
-
-    def _shares(self) -> Floats:
-        return np.asarray(self.values**2 / self.energy[:, None], np.float64)
+        return each.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(each.shape[1], np.nan)
 
     def columns(self) -> list[Column]:
         """The table of the singular values, the largest first."""
         used = self.values.any(axis=0)
-        unit, share = {"K_RJ": "K"}.get(self.unit, ""), self.shares[used]
-        rms = np.sqrt((self.values[:, used] ** 2).mean(axis=0))
+        share, rms = self.shares[used], np.sqrt((self.values[:, used] ** 2).mean(axis=0))
+        error = "standard error of share from its scatter over scans; nan: one scan"
+        before = "share of this mode and those before"
         return [
             Column("mode", np.arange(1, share.size + 1), "", "the largest first"),
-            Column("singular_value", rms, unit, "/ sqrt(rows x samples), rms over the scans"),
+            Column("singular_value", rms, self._fits, "/ sqrt(rows x samples), rms over the scans"),
             Column("share", share, "", "of the variance, mean over the scans"),
-            Column(
-                "error",
-                self.error[used],
-                "",
-                "standard error of share from its scatter over scans; nan: one scan",
-            ),
-            Column("cumulative", np.cumsum(share), "", "share of this mode and those before"),
+            Column("error", self.error[used], "", error),
+            Column("cumulative", np.cumsum(share), "", before),
         ]
 
     def stream_columns(self) -> list[Column]:
         """The leading modes in time."""
         text = "v(t) = sum over detectors (and delays) of u A"
-        columns = [
-            Column(f"mode_{k + 1}", row, {"K_RJ": "K"}.get(self.unit, ""), text)
-            for k, row in enumerate(self.streams)
-        ]
         return [
             Column("seconds", self.seconds, "s", f"since the start of {self.observation}"),
-            *columns,
+            *(Column(f"mode_{k}", row, self._fits, text) for k, row in enumerate(self.streams, 1)),
         ]
 
+    @property
+    def _fits(self) -> str:
+        return "K" if self.unit == "K_RJ" else ""
+
     def _repr_html_(self) -> str:
-        rows = [
-            (f"mode {k + 1}", f"{100 * share:.3g} %")
-            for k, share in enumerate(self.shares[:8])
-            if share > 0
-        ]
+        shares = enumerate(self.shares[:8], 1)
+        rows = [(f"mode {k}", f"{100 * share:.3g} %") for k, share in shares if share > 0]
         return html_table(f"Modes of {self.detectors} detectors", rows)

@@ -24,11 +24,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from zonda.core.configuration.units import Angle
@@ -40,12 +38,11 @@ from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.output import Output
 from zonda.core.pages import html_table
 from zonda.core.signal import Signal, product_name, stream_of
-from zonda.core.storage.ecsv import Column, write_ecsv
-from zonda.core.storage.files import product_path
+from zonda.core.storage.ecsv import Column
 from zonda.core.types import Floats
 
-from .comparison.radial import tapered
-from .series import check_map, key_of, kinds_of_maps, plane_key
+from .comparison.radial import Rings, correlation, scale_of, tapered
+from .series import check_map, key_of, kinds_of_maps, plane_key, publish
 
 NOT_TAN, CURE = (
     "a transfer function needs a TAN map of the signal",
@@ -152,11 +149,9 @@ class TransferFunction(Output):
             empty,
         )
         key, of = (plane_key(name, plane) for name in (key_of(self, "transfer_function"), self.map))
-        found = data.products[key] = Transfer(
-            rings, edges, self.modes, maps[0].fwhm, self.label, of
-        )
-        if data.output is not None:
-            found.write(product_path(data.output, data.named(key), ".ecsv"), data.provenance)
+        found = Transfer(rings, edges, self.modes, maps[0].fwhm, self.label, of)
+        command = data.provenance.get("command")
+        publish(data, key, found, {"": found.columns()}, COMMAND=command, **found.meta)
 
     def _edges(self, before: MapProduct, window: Floats) -> Floats:
         """(bins + 1,) wavenumbers between the rings, rad^-1."""
@@ -191,7 +186,7 @@ def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:
 
 
 @dataclass(frozen=True)
-class Rings:
+class Found:
     """Equations (1) to (3), (n,) each: NaN where a ring has no modes or no power.
 
     Attributes
@@ -214,7 +209,7 @@ class Rings:
     modes: Floats
 
 
-def compare(before: Floats, after: Floats, window: Floats, pixel: float, edges: Floats) -> Rings:
+def compare(before: Floats, after: Floats, window: Floats, pixel: float, edges: Floats) -> Found:
     """Equations (1) to (3) of two maps (ny, nx) of pixels of side ``pixel`` [rad]; NaN counts as
     nothing.
 
@@ -227,54 +222,19 @@ def compare(before: Floats, after: Floats, window: Floats, pixel: float, edges: 
     edges
         (n + 1,) wavenumbers between the rings, rad^-1, ascending.
     """
-    known = np.isfinite(before) & np.isfinite(after)
-    window = np.where(known, window, 0.0)
-    a, b = (_spectrum(np.where(known, m, 0.0), window) for m in (before, after))
-    k = np.hypot(*np.meshgrid(*(np.fft.fftfreq(n, pixel) for n in window.shape), indexing="ij"))
-    correlated = (
-        window.size * (window**4).sum() / (window**2).sum() ** 2 if window.any() else np.inf
-    )
-    rows = [
-        _ring(a[ring], b[ring], k[ring], correlated)
-        for low, high in pairwise(edges)
-        for ring in [(k >= low) & (k < high)]
-    ]
-    found = np.array(rows, np.float64).reshape(-1, 6)
+    rings = Rings((before, after), window, pixel, edges)
+    a, b = (rings.transform(m) for m in (before, after))
+    power, modes = rings.sum(abs(a) ** 2), rings.number / 2 / (c := correlation(rings.window))
     with np.errstate(invalid="ignore", divide="ignore"):
-        each = found[:, 4] / found[:, 5]
-        found[~(each > NO_POWER * np.nanmax(each, initial=0.0)), 1:4] = np.nan
-    return Rings(*found.T)
-
-
-def _ring(
-    a: NDArray[np.complex128], b: NDArray[np.complex128], k: Floats, correlated: float
-) -> tuple[float, ...]:
-    """One row of `Rings`."""
-    power, independent = float((abs(a) ** 2).sum()), k.size / 2 / correlated
-    if power == 0 or not k.size:
-        return (
-            float(k.mean()) if k.size else math.nan,
-            math.nan,
-            math.nan,
-            math.nan,
-            power,
-            independent,
-        )
-    transfer = float((b * a.conj()).real.sum()) / power
-    amplitude = math.sqrt(float((abs(b) ** 2).sum()) / power)
-    error = math.nan
-    if independent >= 2:
-        rest = ((b - transfer * a) * a.conj()).real
-        error = (
-            math.sqrt(independent / (independent - 1) * 2 * correlated * float((rest**2).sum()))
-            / power
-        )
-    return float(k.mean()), transfer, error, amplitude, power, independent
-
-
-def _spectrum(values: Floats, window: Floats) -> NDArray[np.complex128]:
-    mean = (values * window).sum() / window.sum() if window.any() else 0.0
-    return np.asarray(np.fft.fft2((values - mean) * window), np.complex128)
+        transfer = rings.sum((b * a.conj()).real) / power
+        amplitude = np.sqrt(rings.sum(abs(b) ** 2) / power)
+        rest = (b - np.append(transfer, 0.0)[rings.ring].reshape(a.shape) * a) * a.conj()
+        error = np.sqrt(modes / (modes - 1) * 2 * c * rings.sum(rest.real**2)) / power
+        error[modes < 2] = np.nan
+        each = power / modes
+        for values in (transfer, error, amplitude):
+            values[~(each > NO_POWER * np.nanmax(each, initial=0.0))] = np.nan
+    return Found(rings.mean_wavenumber(), transfer, error, amplitude, power, modes)
 
 
 def window_of(
@@ -322,7 +282,7 @@ class Transfer:
         Of the step, and of the map that it looked at.
     """
 
-    rings: Rings
+    rings: Found
     edges: Floats
     modes: str
     fwhm: float
@@ -332,15 +292,17 @@ class Transfer:
     @property
     def scale(self) -> Floats:
         """(n,) angular scales 1/k, rad; in a ring without modes its middle."""
-        k = self.rings.wavenumber
-        return np.asarray(
-            1 / np.where(np.isfinite(k), k, np.sqrt(self.edges[1:] * self.edges[:-1])), np.float64
-        )
+        return scale_of(self.rings.wavenumber, self.edges)
 
     @property
     def kilolambda(self) -> Floats:
         """(n,) the same as lengths of baselines in 1000 wavelengths."""
         return np.asarray(1e-3 / self.scale, np.float64)
+
+    @property
+    def meta(self) -> dict[str, str]:
+        """Cards of the table."""
+        return {"MODES": self.modes, "MAP": self.map, "BEAM": f"{self.fwhm / ARCSEC:.6g} arcsec"}
 
     def columns(self) -> list[Column]:
         """The table, largest scale first."""
@@ -365,19 +327,6 @@ class Transfer:
             Column("amplitude", r.amplitude, "", "sqrt(sum |b|^2 / sum |a|^2)"),
             Column("modes", r.modes, "", "independent modes"),
         ]
-
-    def write(self, path: Any, provenance: Any) -> None:
-        """An ECSV table that `astropy.table.Table.read` knows."""
-        meta = {
-            "PIPELINE": str(provenance.get("name", "")),
-            "SEED": provenance.get("seed"),
-            "ZONDA": str(provenance.get("versions", {}).get("zonda", "")),
-            "COMMAND": str(provenance.get("command", "")),
-            "MODES": self.modes,
-            "MAP": self.map,
-            "BEAM": f"{self.fwhm / ARCSEC:.6g} arcsec",
-        }
-        write_ecsv(path, self.columns(), {k: v for k, v in meta.items() if v not in ("", None)})
 
     def _repr_html_(self) -> str:
         r = self.rings

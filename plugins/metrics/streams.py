@@ -37,11 +37,7 @@ from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.figures import FigureMetric
 from zonda.core.types import Floats
-from zonda.operators.diagnostics.series import Modes, Spectrum
-
-BINS, NEAR = 30, 1.5
-CORRELATED = 35 / 18
-"""c of equation (1)."""
+from zonda.operators.diagnostics.series import Modes, Spectrum, crossing, slope
 
 
 class _OfSpectrum(FigureMetric):
@@ -115,15 +111,6 @@ class PsdSlope(_OfSpectrum):
         return f"d ln P / d ln f of {self.stream} from {self.low:g} to {self.high:g} Hz"
 
 
-def slope(x: Floats, y: Floats) -> tuple[float, float]:
-    """Equation (1): slope of y (n,) over x and its standard error, n > 2."""
-    spread = x - x.mean()
-    squares = float(spread @ spread)
-    b = float(spread @ y) / squares
-    rest = y - y.mean() - b * spread
-    return b, math.sqrt(CORRELATED * float(rest @ rest) / (x.size - 2) / squares)
-
-
 class Crossing(_OfSpectrum):
     """Highest frequency at which a stream's spectrum exceeds another's, or a level, equation (2),
     Hz.
@@ -150,46 +137,19 @@ class Crossing(_OfSpectrum):
             if self.net
             else stream_in(spectrum, self.other, "crossing")
         )
-        return crossing(spectrum.frequency, psd, level)
+        found = crossing(spectrum.frequency, psd, level)
+        if isinstance(found, str):
+            raise InputError(
+                f"the first spectrum {found} the second",
+                place="crossing",
+                cure="choose other streams or another level",
+            )
+        return found
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """Describe the figure in words."""
         other = f"2 NET^2 with {self.net:.4g} K s(1/2)" if self.net else self.other
         return f"highest frequency at which {self.stream} exceeds {other}"
-
-
-def crossing(frequency: Floats, upper: Floats, lower: Floats) -> tuple[float, float]:
-    """Equation (2): f_x and its standard error, Hz. Raises InputError where the two do not
-    cross.
-    """
-    good = (upper > 0) & (lower > 0)
-    f, ratio = np.log(frequency[good]), np.log(upper[good] / lower[good])
-    number = (
-        np.clip((BINS * (f - f[0]) / (f[-1] - f[0])).astype(int), 0, BINS - 1)
-        if f.size > 1
-        else np.zeros(f.size, int)
-    )
-    count = np.bincount(number, minlength=BINS)
-    used = count > 0
-    middle = np.bincount(number, f, BINS)[used] / count[used]
-    sums = [np.bincount(number, part[good], BINS)[used] for part in (upper, lower)]
-    mean = np.log(sums[0] / sums[1])
-    above = np.flatnonzero(mean > 0)
-    if not above.size or above[-1] + 1 == mean.size:
-        which = "nowhere exceeds" if not above.size else "exceeds everywhere"
-        raise InputError(
-            f"the first spectrum {which} the second",
-            place="crossing",
-            cure="choose other streams or another level",
-        )
-    k = int(above[-1])
-    at = float(np.interp(0.0, [-mean[k], -mean[k + 1]], middle[[k, k + 1]]))
-    near = abs(f - at) <= math.log(NEAR)
-    if np.count_nonzero(near) < 4:
-        return math.exp(at), math.nan
-    b, error = slope(f[near], ratio[near])
-    scatter = error * float(np.std(f[near]))  # (c / n)^(1/2) s
-    return math.exp(at), math.exp(at) * scatter / abs(b) if b else math.nan
 
 
 class FirstComponent(FigureMetric):

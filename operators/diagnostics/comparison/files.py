@@ -545,7 +545,7 @@ def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> 
     about = {key: value for key, value in meta.items() if value not in ("", None)}
     about |= {"REFERENCE": found.names[0], "MAP": found.names[1]}
     about |= {key.upper(): value for key, value in found.figures.items() if math.isfinite(value)}
-    write_ecsv(paths[1], spectra_columns(found), about)
+    write_ecsv(paths[1], found.spectra.columns(fits_unit(found.unit), coherence=True), about)
     p, unit = found.profiles, fits_unit(found.unit)
     columns = [Column("radius", p.radius / ARCSEC, "arcsec", "middle of the ring")]
     for name in p.mean:
@@ -560,31 +560,6 @@ def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> 
         )
     write_ecsv(paths[2], columns, about)
     return paths
-
-
-def spectra_columns(found: Comparison) -> list[Column]:
-    """The table of radial spectra, largest scale first."""
-    s, unit = found.spectra, fits_unit(found.unit)
-    return [
-        Column("scale", s.scale / ARCSEC, "arcsec", "1 / mean wavenumber of the ring"),
-        Column("wavenumber", 1 / s.scale, "rad-1", "mean over the ring's modes"),
-        *(
-            Column(n, p, f"{unit}2 sr" if unit else "sr", "power spectral density")
-            for n, p in s.power.items()
-        ),
-        Column(
-            "coherence",
-            s.coherence,
-            "",
-            "Re sum a b* / sqrt(sum |a|^2 sum |b|^2), a the reference, b the map",
-        ),
-        Column(
-            "modes",
-            s.modes,
-            "",
-            "independent modes; relative standard error of the power: modes^-1/2",
-        ),
-    ]
 
 
 def fits_unit(unit: str) -> str:

@@ -35,13 +35,16 @@ with x to the west and y to the north.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.types import Floats
+from zonda.core.numerics.angles import ARCSEC
+from zonda.core.storage.ecsv import Column
+from zonda.core.types import AnyFloats, Floats
 
 DRAWS = 48
 """Draws of noise by which modes of smoothed maps are counted: their number is right to 20 %."""
@@ -49,32 +52,14 @@ DRAWS = 48
 
 def cell(steps: float | Floats) -> Floats:
     """(2, 2) J of a cell, or of the side of a square pixel."""
-    return (
-        np.array([[-steps, 0.0], [0.0, steps]])
-        if np.ndim(steps) == 0
-        else np.asarray(steps, np.float64)
-    )
+    if np.ndim(steps) == 0:
+        return np.array([[-steps, 0.0], [0.0, steps]])
+    return np.asarray(steps, np.float64)
 
 
-def lengths(steps: float | Floats) -> tuple[float, float]:
-    """Lengths of a pixel along y and x, rad."""
-    x, y = np.hypot(*cell(steps))
-    return float(y), float(x)
-
-
-def waves(shape: tuple[int, int], steps: float | Floats) -> tuple[Floats, Floats]:
-    """(k_north, k_west) [rad^-1] of the modes of `numpy.fft.fft2`, (ny, nx) each. ``steps``: a cell
-    or a side.
-    """
-    j = cell(steps)
-    if not j[0, 1] and not j[1, 0]:
-        north, west = np.meshgrid(
-            np.fft.fftfreq(shape[0], j[1, 1]), np.fft.fftfreq(shape[1], -j[0, 0]), indexing="ij"
-        )
-        return north, west
-    f_y, f_x = np.meshgrid(*(np.fft.fftfreq(n) for n in shape), indexing="ij")
-    east, north = np.tensordot(np.linalg.inv(j).T, np.stack([f_x, f_y]), 1)
-    return north, -east
+def lengths(steps: float | Floats) -> Floats:
+    """(2,) lengths of a pixel along y and x, rad."""
+    return np.asarray(np.hypot(*cell(steps))[::-1], np.float64)
 
 
 def tapered(inside: NDArray[np.bool_], steps: float | Floats, taper: float | None = None) -> Floats:
@@ -87,14 +72,59 @@ def tapered(inside: NDArray[np.bool_], steps: float | Floats, taper: float | Non
     from scipy.ndimage import distance_transform_edt
 
     sides = lengths(steps)
-    even = sides[0] == sides[1]
-    depth = distance_transform_edt(np.pad(inside, 1), sampling=None if even else sides)[
-        1:-1, 1:-1
-    ] * (sides[0] if even else 1.0)
+    depth = distance_transform_edt(np.pad(inside, 1), sampling=sides)[1:-1, 1:-1]
     width = depth.max(initial=0.0) if taper is None else taper
-    return np.asarray(
-        np.sin(np.pi / 2 * np.minimum(depth / max(width, *sides), 1)) ** 2, np.float64
-    )
+    share = np.minimum(depth / max(width, *sides), 1)
+    return np.asarray(np.sin(np.pi / 2 * share) ** 2, np.float64)
+
+
+class Rings:
+    """Fourier modes of maps under a window, in rings of wavenumbers k.
+
+    Attributes
+    ----------
+    window
+        (ny, nx), 0 where a map is NaN.
+    north, west, k
+        (ny, nx) wavenumbers of `numpy.fft.fft2`, rad^-1.
+    ring
+        (ny nx,) ring of each mode, `count` for those in none.
+    number
+        (count,) modes of each ring.
+    """
+
+    def __init__(self, maps: Any, window: Floats, steps: float | Floats, edges: Floats) -> None:
+        known = np.logical_and.reduce([np.isfinite(values) for values in maps])
+        self.window = np.where(known, window, 0.0)
+        size = window.shape[::-1]
+        waves = np.stack(np.meshgrid(*(np.fft.fftfreq(n, 1 / n) for n in size)))  # along x and y
+        east, self.north = np.tensordot(np.linalg.inv(cell(steps) * size).T, waves, 1)
+        self.west, self.count = -east, len(edges) - 1
+        self.k = np.hypot(self.north, self.west)
+        ring = np.searchsorted(edges, self.k, "right") - 1
+        self.ring = np.where((ring >= 0) & (ring < self.count), ring, self.count).ravel()
+        self.number = self.sum(np.ones(window.shape))
+
+    def transform(self, values: Floats) -> NDArray[np.complex128]:
+        """Fourier transform of w (m - <m>_w)."""
+        w, m = self.window, np.where(self.window != 0, values, 0.0)
+        mean = (m * w).sum() / w.sum() if w.any() else 0.0
+        return np.asarray(np.fft.fft2((m - mean) * w), np.complex128)
+
+    def sum(self, values: AnyFloats) -> Floats:
+        """(count,) sums over the modes of each ring."""
+        return np.asarray(np.bincount(self.ring, values.ravel(), self.count + 1)[: self.count])
+
+    def mean_wavenumber(self) -> Floats:
+        """(count,) rad^-1; NaN without modes."""
+        with np.errstate(invalid="ignore"):
+            return self.sum(self.k) / self.number
+
+
+def correlation(window: Floats) -> float:
+    """Number c of modes that share what one holds: n_pixels sum w^4 / (sum w^2)^2."""
+    total = float((window**2).sum())
+    return window.size * float((window**4).sum()) / total**2 if total else math.inf
 
 
 @dataclass(frozen=True)
@@ -135,10 +165,33 @@ class RadialSpectra:
     @property
     def scale(self) -> Floats:
         """(n,) wavelengths, rad; of a ring without modes its middle."""
-        middle = np.sqrt(self.edges[1:] * self.edges[:-1])
-        return np.asarray(
-            1 / np.where(np.isfinite(self.wavenumber), self.wavenumber, middle), np.float64
-        )
+        return scale_of(self.wavenumber, self.edges)
+
+    def columns(self, unit: str, coherence: bool = False) -> list[Column]:
+        """The table, largest scale first; ``unit``: of the maps, as FITS has it."""
+        square = f"{unit}2 sr" if unit else "sr"
+        plain = {name: name.replace("/", "_") for name in (*self.power, *self.cross)}
+        white = "of white noise with the map's standard errors"
+        modes = "independent modes; relative standard error of the power: modes^-1/2"
+        both = "Re sum a b* / sqrt(sum |a|^2 sum |b|^2), a the reference, b the map"
+        return [
+            Column("scale", self.scale / ARCSEC, "arcsec", "1 / mean wavenumber of the ring"),
+            Column("wavenumber", 1 / self.scale, "rad-1", "mean over the ring's modes"),
+            *(Column(plain[n], p, square, "power spectral density") for n, p in self.power.items()),
+            *(Column(f"{plain[n]}_white", p, square, white) for n, p in self.white.items()),
+            *(
+                Column(plain[n], p, square, "cross power spectral density")
+                for n, p in self.cross.items()
+            ),
+            *([Column("coherence", self.coherence, "", both)] if coherence else []),
+            Column("modes", self.modes, "", modes),
+        ]
+
+
+def scale_of(wavenumber: Floats, edges: Floats) -> Floats:
+    """(n,) angular scales 1/k, rad; in a ring without modes its middle."""
+    middle = np.sqrt(edges[1:] * edges[:-1])
+    return np.asarray(1 / np.where(np.isfinite(wavenumber), wavenumber, middle), np.float64)
 
 
 def ring_edges(shape: tuple[int, int], steps: float | Floats, bins: int) -> Floats:
@@ -149,10 +202,7 @@ def ring_edges(shape: tuple[int, int], steps: float | Floats, bins: int) -> Floa
     modes of the longer side of the map are apart.
     """
     sides = lengths(steps)
-    step, highest = (
-        1 / max(n * side for n, side in zip(shape, sides, strict=True)),
-        0.5 / max(sides),
-    )
+    step, highest = 1 / float((sides * shape).max()), 0.5 / float(sides.max())
     edges = [0.75 * step]
     ratio = (highest / edges[0]) ** (1 / bins)
     while edges[-1] < highest * (1 - 1e-9) and len(edges) <= bins:
@@ -189,98 +239,65 @@ def radial_spectra(
         and NAME_B, equation (3), whose noise is the mean of both, and the cross spectra NAME_TE,
         NAME_TB and NAME_EB (T where there is an I).
     """
-    known = np.logical_and.reduce([np.isfinite(values) for values in maps.values()])
-    window = np.where(known, window, 0.0)
-    square = float((window**2).sum())
+    rings, polarized = Rings(maps.values(), window, steps, edges), polarized or {}
+    w = rings.window
+    square = float((w**2).sum())
     area = abs(float(np.linalg.det(cell(steps)))) / square if square else math.nan
-    transforms = {}
-    for name, values in maps.items():
-        kept = np.where(known, values, 0.0)
-        mean = float((kept * window).sum() / window.sum()) if square else 0.0
-        transforms[name] = np.fft.fft2((kept - mean) * window)
-    north, west = waves((window.shape[0], window.shape[1]), steps)
-    k = np.hypot(north, west)
+    waves = {name: rings.transform(values) for name, values in maps.items()}
     pairs: dict[str, tuple[str, str]] = {}
-    for name, (q, u) in (polarized or {}).items():
-        q_k, u_k = transforms.pop(q), transforms.pop(u)
-        angle = 2 * np.arctan2(west, north)
-        cosine, sine = np.cos(angle), np.sin(angle)
-        transforms[f"{name}_E"], transforms[f"{name}_B"] = (
-            q_k * cosine + u_k * sine,
-            u_k * cosine - q_k * sine,
-        )
-        t, e, b = ({"T": name, "E": f"{name}_E", "B": f"{name}_B"}[letter] for letter in "TEB")
-        pairs |= {
-            f"{name}_{both}": two
-            for both, two in (("TE", (t, e)), ("TB", (t, b)), ("EB", (e, b)))
-            if two[0] in transforms
-        }
-    count, n = len(edges) - 1, np.searchsorted(edges, k, "right") - 1
-    ring = np.where((n >= 0) & (n < count), n, count).ravel()
+    angle = 2 * np.arctan2(rings.west, rings.north)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    for name, (q, u) in polarized.items():
+        q_k, u_k = waves.pop(q), waves.pop(u)
+        waves[f"{name}_E"] = q_k * cosine + u_k * sine
+        waves[f"{name}_B"] = u_k * cosine - q_k * sine
+        letters = {"T": name, "E": f"{name}_E", "B": f"{name}_B"}
+        for both in ("TE", "TB", "EB"):
+            if letters[both[0]] in waves:
+                pairs[f"{name}_{both}"] = letters[both[0]], letters[both[1]]
+    errors = [np.where(w != 0, w * n, 0.0) for n in (noise or {}).values()]
+    weighed = errors[0] if errors else w
 
-    def summed(values: Floats) -> Floats:
-        return np.asarray(np.bincount(ring, values.ravel(), count + 1)[:count], np.float64)
+    def mean(values: Floats) -> Floats:
+        return area * rings.sum(values) / rings.number
 
-    number = np.bincount(ring, minlength=count + 1)[:count]
-    weighed = next((np.where(known, window * n, 0.0) for n in (noise or {}).values()), window)
-    total = float((weighed**2).sum())
-    correlated = window.size * float((weighed**4).sum()) / total**2 if total else math.inf
     with np.errstate(invalid="ignore", divide="ignore"):
-        power = {
-            name: area * summed(np.abs(values) ** 2) / number for name, values in transforms.items()
+        power = {name: mean(np.abs(values) ** 2) for name, values in waves.items()}
+        cross = {n: mean((waves[a] * waves[b].conj()).real) for n, (a, b) in pairs.items()}
+        coherence = np.full(rings.count, math.nan)
+        if len(maps) > 1:
+            (a, p), (b, q_) = [(waves[name], power[name]) for name in list(waves)[:2]]
+            coherence = mean((a * b.conj()).real) / np.sqrt(p * q_)
+        white = {
+            name: mean(_of_noise(error, steps, smoothing))
+            for name, error in zip(noise or {}, errors, strict=True)
         }
-        first, second = (list(transforms.values()) * 2)[:2]
-        cross = summed((first * second.conj()).real) / np.sqrt(
-            summed(np.abs(first) ** 2) * summed(np.abs(second) ** 2)
-        )
-        crosses = {
-            name: area * summed((transforms[a] * transforms[b].conj()).real) / number
-            for name, (a, b) in pairs.items()
-        }
-        wavenumber = summed(k) / number
-        expected = {
-            name: _of_noise(np.where(known, window * n, 0.0), steps, smoothing)
-            for name, n in (noise or {}).items()
-        }
-        white = {name: area * summed(values) / number for name, values in expected.items()}
-        modes, draws = number / 2 / correlated, None
+        modes, draws = rings.number / 2 / correlation(weighed), None
         if smoothing and white:
-            passed = np.exp(-((2 * np.pi * k * smoothing) ** 2) / 2)
-            own = next(iter(white.values()))
-            draws = np.array(
-                [area * summed(found) / number / own for found in _drawn(weighed, passed)]
-            )
-            modes = np.where(number > 0, 1 / draws.var(axis=0, ddof=1), 0.0)
-    for name, (q, u) in (polarized or {}).items():
+            passed = np.exp(-((2 * np.pi * rings.k * smoothing) ** 2) / 2)
+            own, rng = next(iter(white.values())), np.random.default_rng(1)
+            passed /= math.sqrt(float((passed**2).mean()))
+            drawn = []
+            for _ in range(DRAWS):  # noise like equation (2)'s
+                even = np.fft.ifft2(np.fft.fft2(rng.standard_normal(w.shape)) * passed).real
+                drawn.append(mean(np.abs(np.fft.fft2(weighed * even)) ** 2) / own)
+            draws = np.array(drawn)
+            modes = np.where(rings.number > 0, 1 / draws.var(axis=0, ddof=1), 0.0)
+    for name, (q, u) in polarized.items():
         if q in white and u in white:
             white[f"{name}_E"] = white[f"{name}_B"] = (white.pop(q) + white.pop(u)) / 2
-    if len(maps) < 2:
-        cross = np.full(count, math.nan)
-    return RadialSpectra(edges, wavenumber, power, modes, white, cross, crosses, draws)
-
-
-def _drawn(error: Floats, passed: Floats) -> Iterator[Floats]:
-    """|m_k|^2 of `DRAWS` draws of noise like equation (2)'s; ``passed``: of the amplitude of each
-    mode by the smoothing.
-    """
-    rng = np.random.default_rng(1)
-    passed = passed / math.sqrt(float((passed**2).mean()))
-    for _ in range(DRAWS):
-        even = np.fft.ifft2(np.fft.fft2(rng.standard_normal(error.shape)) * passed).real
-        yield np.abs(np.fft.fft2(error * even)) ** 2
+    k = rings.mean_wavenumber()
+    return RadialSpectra(edges, k, power, modes, white, coherence, cross, draws)
 
 
 def _of_noise(error: Floats, steps: float | Floats, smoothing: float) -> Floats:
     """Equation (2) for each mode: w n is ``error`` (ny, nx)."""
     if not smoothing:
         return np.full(error.shape, float((error**2).sum()))
-    ny, nx = error.shape
-    lags = np.stack(
-        np.meshgrid(np.fft.fftfreq(nx, 1 / nx), np.fft.fftfreq(ny, 1 / ny))
-    )  # x and y, in pixels
-    east, north = np.tensordot(cell(steps), lags, 1)
-    correlation = np.fft.ifft2(np.abs(np.fft.fft2(error)) ** 2).real
-    found = np.fft.fft2(correlation * np.exp(-(east**2 + north**2) / (4 * smoothing**2))).real
+    lags = np.meshgrid(*(np.fft.fftfreq(n, 1 / n) for n in error.shape[::-1]))  # x, y in pixels
+    away = (np.tensordot(cell(steps), np.stack(lags), 1) ** 2).sum(axis=0)
+    found = np.fft.ifft2(np.abs(np.fft.fft2(error)) ** 2).real
+    found = np.fft.fft2(found * np.exp(-away / (4 * smoothing**2))).real
     return np.asarray(np.maximum(found, 0.0), np.float64)
 
 
@@ -311,11 +328,8 @@ def profiles(
     ``distance``: of the pixels from the middle of the rings [rad]; all of one shape. ``beam_area``
     [sr]: area in which pixels are not independent.
     """
-    known = (
-        np.logical_and.reduce([np.isfinite(values) for values in maps.values()])
-        & np.isfinite(distance)
-        & (areas > 0)
-    )
+    finite = [np.isfinite(values) for values in (*maps.values(), distance)]
+    known = np.logical_and.reduce([*finite, areas > 0])
     ring, weight = (distance[known] / width).astype(np.int64), areas[known]
     number, covered = np.bincount(ring), np.bincount(ring, weight)
     independent = np.maximum(np.minimum(number, covered / beam_area if beam_area else np.inf), 1.0)

@@ -23,10 +23,10 @@ from zonda.core.numerics.angles import ARCSEC, angle_text
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
+    from ..compare_streams import StreamComparison
     from ..comparison.radial import RadialSpectra
     from ..comparison.statistics import Comparison
     from ..map_spectra import MapSpectra
-    from ..stream_statistics import StreamComparison
 
 CONTOURS = (-8.0, -4.0, -2.0, 2.0, 4.0)
 """Default levels of the contours on SNR maps."""

@@ -11,9 +11,9 @@ import zonda
 from tests.scenes import in_blocks
 from zonda.core.errors import ZondaError
 from zonda.core.numerics.smooth import SmoothField
+from zonda.operators.diagnostics.compare_streams import FIGURES, StreamComparison, figures, pair
 from zonda.operators.diagnostics.plot_operators import Plots, pictures
 from zonda.operators.diagnostics.power_spectrum import PowerSpectrum, Welch
-from zonda.operators.diagnostics.stream_statistics import FIGURES, StreamComparison, figures, pair
 from zonda.plugins.checks import scenes
 
 N, RATE, LENGTH = 20000, 50.0, 500
@@ -33,7 +33,7 @@ def streams(seed=5):
 @pytest.mark.parametrize("length", [256, 501, 2000])
 def test_cross_spectra_are_scipys(length):
     x, y = np.random.default_rng(1).normal(size=(2, 6000)) + 3.0
-    found = pair(x, x[::-1] + 0.3 * x + y, RATE, length)
+    found = pair(x, x[::-1] + 0.3 * x + y, Welch(6000, RATE, length))
     how = {"fs": RATE, "nperseg": length, "noverlap": length - length // 2, "detrend": "linear"}
     other = x[::-1] + 0.3 * x + y
     np.testing.assert_allclose(found.power, scipy.signal.csd(x, x, **how)[1][1:].real, rtol=1e-10)
@@ -105,19 +105,13 @@ def test_the_errors_hold_for_coloured_noise():
     """
     rng = np.random.default_rng(3)
     poles = ([1.0], [1.0, -np.exp(-2 * np.pi * 0.5 / RATE)])
-    found = []
+    found, welch = [], Welch(8000, RATE, LENGTH)
     for _ in range(400):
         y, e = scipy.signal.lfilter(*poles, rng.normal(size=(2, 8000)))
-        found.append(
-            figures(
-                pair(0.7 * y + 0.5 * e, y, RATE, LENGTH),
-                RATE / LENGTH,
-                Welch(8000, RATE, LENGTH).independent,
-            )
-        )
+        found.append(figures(pair(0.7 * y + 0.5 * e, y, welch), RATE / LENGTH, welch.independent))
     values, errors = (np.array(rows) for rows in zip(*found, strict=True))
     scatter = values[:, 3:].std(axis=0, ddof=1)
-    np.testing.assert_allclose(np.sqrt((errors**2).mean(axis=0)), scatter, rtol=0.14)
+    np.testing.assert_allclose(np.sqrt((errors[:, 3:] ** 2).mean(axis=0)), scatter, rtol=0.14)
 
 
 def test_a_mean_beside_the_stream_counts(make_observation, data):
@@ -221,9 +215,8 @@ def test_the_stream_of_a_signal_as_it_is_filtered():
     )
     assert (found.stream, found.reference) == ("signal", "signal/quiet")
     rate = scenes.camera(7).sample_rate
-    expected = [
-        pair(a, b, rate, round(rate / found.frequency[0])) for a, b in zip(x, y, strict=True)
-    ]
+    welch = Welch(x.shape[1], rate, round(rate / found.frequency[0]))
+    expected = [pair(a, b, welch) for a, b in zip(x, y, strict=True)]
     # tod() holds the float32 streams that the step read, whose means are zero behind the filter:
     # the same spectra
     for row, name in ((0, "power"), (1, "reference")):

@@ -11,6 +11,7 @@ import zonda
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCSEC
+from zonda.core.storage.ecsv import write_ecsv
 from zonda.operators.diagnostics.drawing.plots import plot_transfer
 from zonda.operators.diagnostics.plot_operators import Plots, pictures
 from zonda.operators.diagnostics.transfer_function import (
@@ -144,7 +145,8 @@ def transfer() -> Transfer:
 def test_the_table_is_read_by_astropy(transfer, tmp_path):
     from astropy.table import Table
 
-    transfer.write(tmp_path / "t.ecsv", {"name": 'a "b": é', "seed": 7, "versions": {"zonda": "1"}})
+    meta = {"PIPELINE": 'a "b": é', "SEED": 7, **transfer.meta}
+    write_ecsv(tmp_path / "t.ecsv", transfer.columns(), meta)
     table = Table.read(tmp_path / "t.ecsv")
     assert table.meta["PIPELINE"] == 'a "b": é'
     assert (table.meta["SEED"], table.meta["MODES"], table.meta["BEAM"]) == (7, "sky", "8.5 arcsec")

@@ -349,7 +349,7 @@ def test_every_picture_is_written(data, products, make_observation):
 )
 def test_no_labels_overlap(picture, values, wcs, spectrum, stream, make_observation):
     """No two tick labels of an axis overlap, nor do texts and titles."""
-    from zonda.operators.diagnostics.transfer_function import Rings, Transfer
+    from zonda.operators.diagnostics.transfer_function import Found, Transfer
 
     hits = np.geomspace(1, 1e5, 3000).reshape(50, 60)
     if picture == "polar map":
@@ -369,7 +369,7 @@ def test_no_labels_overlap(picture, values, wcs, spectrum, stream, make_observat
         values = np.tile(values, (1, 5)) * 1e6
     edges = 1 / np.geomspace(400, 12, 13) / ARCSEC
     ring = np.linspace(0.1, 1, 12)
-    rings = Rings(np.sqrt(edges[1:] * edges[:-1]), ring, ring / 10, ring, ring, ring)
+    rings = Found(np.sqrt(edges[1:] * edges[:-1]), ring, ring / 10, ring, ring, ring)
     ax = {
         "spectra": lambda: plot_spectra(spectrum),
         "streams": lambda: plot_tod(
