@@ -13,7 +13,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 import zonda
-from zonda.core.configuration.calls import ParameterError
+from zonda.core.configuration.parameters import ParameterError
 from zonda.plugins.checks.scenes import TARGET, camera, scene
 
 BASE = {

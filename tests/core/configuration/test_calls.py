@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.core.configuration.calls import ParameterError
+from zonda.core.configuration.parameters import ParameterError
 from zonda.core.errors import ZondaError
 
 SCENE = {

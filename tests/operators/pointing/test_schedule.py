@@ -11,8 +11,8 @@ import pytest
 
 import zonda
 import zonda.testing
-from zonda.core.configuration.calls import ParameterError
 from zonda.core.configuration.diagnostics import ConfigurationError
+from zonda.core.configuration.parameters import ParameterError
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PointingError

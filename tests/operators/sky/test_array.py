@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 import zonda
-from zonda.core.configuration.calls import ParameterError
+from zonda.core.configuration.parameters import ParameterError
 from zonda.core.errors import InputError, ZondaError
 from zonda.plugins.checks.scenes import TARGET, camera, scene
 
