@@ -220,9 +220,6 @@ def check_whole(folder: Path) -> None:
         if path.parent.name == TASKS:
             if path.name in keys or path.name.startswith("layout"):
                 parts.read(path, keys.get(path.name, "layout"))
-            elif path.name.startswith("combined"):
-                assert job
-                parts.read(path, job.combinations[int(path.stem[-4:])].layout)
             else:
                 json.loads(path.read_text())
         elif path.name.endswith(".yaml"):

@@ -35,13 +35,17 @@ class Lost:
 
 
 class Work(ABC, Generic[T, R]):
-    """A list of calls, one for each item: how they are made and how their results are recorded."""
+    """A list of calls on an engine, one for each item: how they are made and how their results are
+    recorded.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path, pool: Pool) -> None:
+        self.folder, self.pool = folder, pool
         self.stop = False
         """Set to begin no more of them."""
         self.attempts = Counter[T]()
         """How often each was begun."""
+        self._shown: Registry = {}
 
     @abstractmethod
     def call(self, item: T) -> tuple[Callable[..., R], *tuple[Any, ...]]:
@@ -54,52 +58,69 @@ class Work(ABC, Generic[T, R]):
     def ended(self, item: T, result: R | Lost) -> bool:
         """End a call; True if it is tried again."""
 
+    def carry_out(self, items: Sequence[T]) -> None:
+        """Make all calls; where this raises, workers of this machine have ended.
 
-def carry_out(work: Work[T, R], items: Sequence[T], pool: Pool, folder: Path) -> None:
-    """Make all calls; where this raises, workers of this machine have ended.
+        A broken pool is replaced. Whatever was at work when it broke is tried again at the end, one
+        call at a time, so that one that kills its worker does not take others with it.
 
-    A broken pool is replaced. Whatever was at work when it broke is tried again at the end, one
-    call at a time, so that one that kills its worker does not take others with it.
+        Raises
+        ------
+        PipelineError
+            Where the engine has stopped for good.
+        """
+        pool, waiting, suspects = self.pool, deque(items), deque[T]()
+        at_work: dict[Future[tuple[R, list[Warned]]], T] = {}
+        ended: set[Future[tuple[R, list[Warned]]]] = set()
+        try:
+            while True:
+                batch: list[T] = []
+                for future in ended:
+                    item, result = at_work.pop(future), self._result(future)
+                    if self.ended(item, result):
+                        (suspects if isinstance(result, Lost) else waiting).append(item)
+                room = pool.workers + pool.ahead - len(at_work)
+                while waiting and not self.stop and len(batch) < room:
+                    batch.append(waiting.popleft())
+                if suspects and not batch and not at_work and not self.stop:
+                    batch.append(suspects.popleft())
+                self.attempts.update(batch)
+                self.began(batch)
+                for item in batch:
+                    at_work[_submit(pool, *self.call(item))] = item
+                if not at_work:
+                    return
+                ended, _ = wait(at_work, return_when=FIRST_COMPLETED)
+                if any(
+                    isinstance(f.exception(), BrokenExecutor) for f in ended if not f.cancelled()
+                ):
+                    ended, _ = wait(at_work)
+                    if pool.remake is None:
+                        raise self._gone()
+                    pool.executor = pool.remake()
+        except BaseException:
+            for future in at_work:
+                future.cancel()
+            if pool.stop is not None:
+                pool.stop()
+            raise
 
-    Raises
-    ------
-    PipelineError
-        Where the engine has stopped for good.
-    """
-    waiting, suspects = deque(items), deque[T]()
-    at_work: dict[Future[tuple[R, list[Warned]]], T] = {}
-    ended: set[Future[tuple[R, list[Warned]]]] = set()
-    shown: Registry = {}
-    try:
-        while True:
-            batch: list[T] = []
-            for future in ended:
-                item, result = at_work.pop(future), _result(future, folder, shown)
-                if work.ended(item, result):
-                    (suspects if isinstance(result, Lost) else waiting).append(item)
-            room = pool.workers + pool.ahead - len(at_work)
-            while waiting and not work.stop and len(batch) < room:
-                batch.append(waiting.popleft())
-            if suspects and not batch and not at_work and not work.stop:
-                batch.append(suspects.popleft())
-            work.attempts.update(batch)
-            work.began(batch)
-            for item in batch:
-                at_work[_submit(pool, *work.call(item))] = item
-            if not at_work:
-                return
-            ended, _ = wait(at_work, return_when=FIRST_COMPLETED)
-            if any(isinstance(f.exception(), BrokenExecutor) for f in ended if not f.cancelled()):
-                ended, _ = wait(at_work)
-                if pool.remake is None:
-                    raise _gone(folder)
-                pool.executor = pool.remake()
-    except BaseException:
-        for future in at_work:
-            future.cancel()
-        if pool.stop is not None:
-            pool.stop()
-        raise
+    def _result(self, future: Future[tuple[R, list[Warned]]]) -> R | Lost:
+        """The result of a call, whose warnings are shown."""
+        try:
+            result, found = future.result()
+        except CancelledError:
+            raise self._gone() from None
+        except Exception as err:
+            # of the call, or of the engine: a Dask worker that died again and again, a task that
+            # cannot be sent
+            return Lost(err)
+        show(found, self._shown)
+        return result
+
+    def _gone(self) -> PipelineError:
+        cure = f"zonda resume {self.folder}"
+        return PipelineError("the engine has stopped", place=str(self.folder), cure=cure)
 
 
 def _submit(
@@ -114,20 +135,3 @@ def _submit(
             err if isinstance(err, BrokenExecutor) else CancelledError()
         )  # a worker was killed; all is gone
         return future
-
-
-def _result(future: Future[tuple[R, list[Warned]]], folder: Path, shown: Registry) -> R | Lost:
-    try:
-        result, found = future.result()
-    except CancelledError:
-        raise _gone(folder) from None
-    except (
-        Exception
-    ) as err:  # of the engine: a Dask worker that died again and again, a task that cannot be sent
-        return Lost(err)
-    show(found, shown)
-    return result
-
-
-def _gone(folder: Path) -> PipelineError:
-    return PipelineError("the engine has stopped", place=str(folder), cure=f"zonda resume {folder}")

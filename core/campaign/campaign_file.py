@@ -10,22 +10,31 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter
 
+from ..configuration.time import Instant
 from ..errors import InputError
 from ..storage.files import write_text
 
-FORMAT = 3
+if TYPE_CHECKING:
+    from ..configuration.loaded import PipelineFile
+    from ..scene import Scene
+
+FORMAT = 4
 """Of a campaign's folder: this file, the partial products and the records beside them."""
 
 FILE = "campaign.json"
 TASKS = "tasks"
 """Folder of partial products, layouts and the state of tasks."""
+
+RECORD = "tasks.npz"
+"""Record of the tasks of a set of products that is written."""
 
 INPUTS = "inputs"
 """Folder of arrays that were given in Python."""
@@ -44,6 +53,30 @@ class OtherFormat(InputError):
 
 
 @dataclass(frozen=True)
+class PlannedEntry:
+    """One entry of a campaign.
+
+    Attributes
+    ----------
+    pipeline
+        Number of its pipeline in `Job.pipelines`.
+    seed, time
+        Of its scene; the time in ns since 1970 (`Instant`).
+    about
+        Its place on the campaign's axes, for tables and messages.
+    """
+
+    pipeline: int
+    seed: int
+    time: int
+    about: str
+
+    def scene(self, file: PipelineFile) -> Scene:
+        """The scene of its pipeline file, with its seed and start."""
+        return file.scene().model_copy(update={"seed": self.seed, "time": Instant(self.time)})
+
+
+@dataclass(frozen=True)
 class Task:
     """One scan of an entry, or all of them.
 
@@ -53,35 +86,25 @@ class Task:
         Its place in the campaign, and in the order of the reduction.
     key
         Hash of what its product depends on.
-    pipeline
-        Number of its pipeline in `Job.pipelines`.
     combination
         Number of what it is co-added into.
     entry
-        Number of its entry in the campaign.
+        Number of its entry in `Job.entries`.
     scans
         Positions of its scans among those of its entry.
     before
         Number of scans of the combination before it.
-    seed, time
-        Of its scene; the time in ns since 1970 (`Instant`).
     samples
         Detectors x samples.
-    about
-        Its place on the campaign's axes, for tables.
     """
 
     number: int
     key: str
-    pipeline: int
     combination: int
     entry: int
     scans: tuple[int, ...]
     before: int
-    seed: int
-    time: int
     samples: int
-    about: str
 
     @property
     def product(self) -> str:
@@ -136,6 +159,7 @@ class Job:
     source: tuple[str, ...]
     files: Mapping[str, str]
     combinations: tuple[Combination, ...]
+    entries: tuple[PlannedEntry, ...]
     tasks: tuple[Task, ...] = field(repr=False)
     same_machine: bool = False
     figures: bool = False
@@ -153,13 +177,25 @@ class Job:
         """``2 sets of products``."""
         return f"{plural(len(self.combinations), 'set')} of products"
 
-    def incomplete(self, done: Collection[int]) -> set[int]:
-        """Numbers of the combinations of which a task is not among those ``done``."""
-        return {task.combination for task in self.tasks if task.number not in done}
+    @cached_property
+    def tasks_of(self) -> list[list[Task]]:
+        """The tasks of each combination, in the order of the reduction."""
+        found: list[list[Task]] = [[] for _ in self.combinations]
+        for task in self.tasks:
+            found[task.combination].append(task)
+        return found
 
-    def tasks_of(self, combination: int) -> list[Task]:
-        """The tasks of a combination, in the order of the reduction."""
-        return [task for task in self.tasks if task.combination == combination]
+    def entry_of(self, task: Task) -> PlannedEntry:
+        """The entry of a task."""
+        return self.entries[task.entry]
+
+    def identity(self, combination: int) -> str:
+        """Identity of the record of a combination: of all its tasks."""
+        return digest_of_text("".join(task.key for task in self.tasks_of[combination]))
+
+    def record(self, folder: Path, combination: int) -> Path:
+        """Path of the record of a combination whose products are written, beside these."""
+        return folder / self.combinations[combination].folder / RECORD
 
     def write(self, folder: Path) -> None:
         """Write it to its folder, atomically. Raises `OutputError`."""
@@ -207,20 +243,6 @@ class Job:
 def layout_path(folder: Path, combination: int) -> Path:
     """File of the layouts of a combination."""
     return folder / TASKS / f"layout-{combination:04d}.npz"
-
-
-def key_of(
-    version: str,
-    pipeline: str,
-    seed: int,
-    time: int,
-    scans: tuple[int, ...],
-    first: bool,
-    layout: str,
-) -> str:
-    """Hash of all that a task's product depends on."""
-    parts = [version, pipeline, seed, time, list(scans), first, layout]
-    return hashlib.blake2b(json.dumps(parts).encode(), digest_size=16).hexdigest()
 
 
 def _inside(folder: str) -> bool:

@@ -233,58 +233,67 @@ def _counts(table: Table) -> dict[str, int]:
 
 
 def _lines(job: Job, table: Table, listed: bool) -> list[str]:
+    from ..tables import aligned
     from .campaign_file import plural
 
-    counts = _counts(table)
     done = [(task, row) for task, row in table if row.state == "done"]
     samples = sum(task.samples for task, _ in done)
     seconds = sum(row.seconds for _, row in done)
-    lines = [f"{job.name}: {plural(len(job.tasks), 'task')}, {job.sets}"]
-    lines += [
-        f"  {state:<8} {number}" for state, number in counts.items() if number or state == "done"
-    ]
     share = samples / job.samples if job.samples else 1.0
     rate = f", {samples / seconds:.3g} samples/s of each worker" if seconds else ""
-    lines.append(f"  samples  {samples:.3g} of {job.samples:.3g} ({100 * share:.0f} %){rate}")
-    lines += _machines(done)
+    about: list[tuple[str, Any]] = [
+        (state, n) for state, n in _counts(table).items() if n or state == "done"
+    ]
+    about += [
+        ("samples", f"{samples:.3g} of {job.samples:.3g} ({100 * share:.0f} %){rate}"),
+        *_machines(done),
+    ]
+    lines = [f"{job.name}: {plural(len(job.tasks), 'task')}, {job.sets}"]
+    lines += aligned(about, indent="  ")
+    places = {
+        task.number: (
+            job.entry_of(task).about,
+            f"scan {task.scans[0]}" if len(task.scans) == 1 else f"{len(task.scans)} scans",
+        )
+        for task in job.tasks
+    }
     if listed:
-        lines += ["", "  task  state    attempts  seconds  worker                  entry"]
-        for task, row in table:
-            scans = f"scan {task.scans[0]}" if len(task.scans) == 1 else f"{len(task.scans)} scans"
-            about = ", ".join(filter(None, (task.about, scans)))
-            lines.append(
-                f"  {task.number:>4}  {row.state:<7}  {row.attempts:>8}  {row.seconds:>7.1f} "
-                f" {row.host:<22}  {about}"
-            )
-    troubled = [(task, row) for task, row in table if row.error and (row.state != "done" or listed)]
-    for task, row in troubled[:20]:
+        rows = [
+            (r.number, r.state, r.attempts, f"{r.seconds:.1f}", r.host, _text(places[r.number]))
+            for _, r in table
+        ]
+        head = ("task", "state", "attempts", "seconds", "worker", "entry")
+        lines += ["", *aligned(rows, head, "><>><", indent="  ")]
+    troubled = [row for _, row in table if row.error and (row.state != "done" or listed)]
+    for row in troubled[:20]:
         text = row.error.strip().splitlines()
         shown = text if listed or not row.error.startswith("Traceback") else text[-1:]
-        lines += [
-            "",
-            f"task {task.number} ({', '.join(filter(None, (row.state, task.about)))}):",
-            *(f"  {t}" for t in shown),
-        ]
+        what = _text((row.state, places[row.number][0]))
+        lines += ["", f"task {row.number} ({what}):", *(f"  {t}" for t in shown)]
     if len(troubled) > 20:
         lines += ["", f"and {len(troubled) - 20} more: zonda status --json"]
     return lines
 
 
-def _machines(done: Table) -> list[str]:
+def _text(words: Sequence[str]) -> str:
+    return ", ".join(filter(None, words))
+
+
+def _machines(done: Table) -> list[tuple[str, str]]:
     """The machines that the tasks ran on."""
     from .campaign_file import plural
     from .machines import EFFECT, differences, kinds, short
 
     found = kinds(row.machine for _, row in done)
     if len(found) < 2:
-        return [f"  machine  {short(machine)}" for machine, _ in found]
-    lines = [f"  machine  {len(found)} kinds: {EFFECT}"]
-    lines += [f"           {plural(count, 'task')}: {short(machine)}" for machine, count in found]
-    lines += [
-        f"           the {n}. has {differences(machine, found[0][0])}"
+        return [("machine", short(machine)) for machine, _ in found]
+    texts = [f"{len(found)} kinds: {EFFECT}"]
+    texts += [f"{plural(count, 'task')}: {short(machine)}" for machine, count in found]
+    texts += [
+        f"the {n}. has {differences(machine, found[0][0])}"
         for n, (machine, _) in enumerate(found[1:], 2)
     ]
-    return lines
+    return [("" if n else "machine", text) for n, text in enumerate(texts)]
 
 
 def _as_dict(job: Job, table: Table) -> dict[str, Any]:
@@ -307,7 +316,7 @@ def _as_dict(job: Job, table: Table) -> dict[str, Any]:
                 },
                 "machine": made_on.index(row.machine) if row.machine else None,
                 "samples": task.samples,
-                "entry": task.about,
+                "entry": job.entry_of(task).about,
                 "scans": list(task.scans),
                 "combination": task.combination,
             }

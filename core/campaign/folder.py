@@ -1,9 +1,9 @@
 """A campaign's output folder, whose files are the state of its tasks.
 
-A task is done if its partial product is there, or if the record of its combination lists it; that
-is written under another name and renamed before any part is removed, and all of them become one
-file when the campaign is finished. A task that failed has a file `000123.failed` beside it, which
-says why. One more file names the tasks at work, for `zonda status` alone.
+A task is done if its partial product is there, or if the record of its set of products lists it;
+that is written under another name and renamed before any part is removed. A task that failed has a
+file `000123.failed` beside it, which says why. One more file names the tasks at work, for `zonda
+status` alone.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, fields
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from ..errors import InputError, OutputError, ZondaError
 from ..storage.files import discard, put, temporary_sibling, write_text, writing
 from . import machines, parts
-from .campaign_file import FILE, TASKS, Job, OtherFormat, Say, Task, digest_of_text, plural
+from .campaign_file import FILE, RECORD, TASKS, Job, OtherFormat, Say, Task, plural
 
 RESOLVED = "resolved.yaml"
 
@@ -38,13 +39,15 @@ def check_free(folder: Path) -> None:
         )
 
 
-def make_way(folder: Path) -> None:
-    """Remove what an earlier campaign left besides its products. The caller holds the folder's
-    lock.
+def make_way(folder: Path, job: Job | None = None) -> None:
+    """Remove what an earlier campaign left besides its products, and records where those of ``job``
+    will stand. The caller holds the folder's lock.
     """
-    for old in (folder / FILE, folder / FINISHED):
+    records = [job.record(folder, number) for number in range(len(job.combinations))] if job else []
+    for old in (folder / FILE, folder / RECORD, *records):
         old.unlink(missing_ok=True)
-    shutil.rmtree(folder / TASKS, ignore_errors=True)
+    if job is None:
+        shutil.rmtree(folder / TASKS, ignore_errors=True)
 
 
 def finished(folder: Path) -> bool:
@@ -75,41 +78,6 @@ def publish(job: Job, folder: Path) -> None:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def verify(record: Record, tasks: Sequence[Task], say: Say, same_machine: bool) -> list[Task]:
-    """Read the products of tasks, and return the tasks whose products are missing or damaged.
-
-    ``same_machine``: products of another kind of machine than the first task's are removed.
-    """
-    found, missing, damaged, strange = [], [], 0, 0
-    for task in tasks:
-        path = task.path(record.folder)
-        try:
-            parts.read(path, task.key)
-            row = done_row(task, record.folder)
-        except InputError:
-            row = None
-        if row is None:
-            missing.append(task)
-            damaged += path.exists()
-        else:
-            found.append((task, row))
-    known = sorted((row for row in record.rows() if row.machine), key=lambda row: row.number)
-    first = next(filter(None, (machines.kind(row.machine) for row in known)), None)
-    for task, row in found:
-        if same_machine and machines.kind(row.machine) not in (first, frozenset()):
-            discard(task.path(record.folder))
-            missing.append(task)
-            strange += 1
-        else:
-            record.known(row)
-    record.reset(missing)
-    if strange:
-        say(f"{plural(strange, 'task')} ran on another kind of machine than the first: run again")
-    if damaged:
-        say(f"{plural(damaged, 'partial product')} damaged: run again")
-    return sorted(missing, key=lambda task: task.number)
-
-
 def clean(folder: Path) -> None:
     """Remove temporary files that killed workers left anywhere in the folder. No worker may be
     active there.
@@ -136,8 +104,6 @@ def write_sources(job: Job, folder: Path) -> None:
 
 STATES = ("waiting", "claimed", "done", "failed")
 AT_WORK = "at-work{share}.json"
-FINISHED = "tasks.npz"
-"""Record of all tasks of a campaign that is finished."""
 
 
 @dataclass(frozen=True)
@@ -173,45 +139,39 @@ class Record:
     ----------
     share
         Of a job of an array, to tell its file of tasks at work from those of others.
+
+    Attributes
+    ----------
+    done
+        Rows of the tasks that are known to be done, by number.
+    combined
+        Combinations whose products are written: what was kept of each when it was combined.
     """
 
     def __init__(self, job: Job, folder: Path, share: str = "") -> None:
         self.job, self.folder = job, folder
+        self.done: dict[int, TaskRow] = {}
+        self.combined: dict[int, Any] = {}
         self._path = folder / TASKS / AT_WORK.format(share=share)
         self._at_work: set[int] = set()
         self._attempts = Counter[int]()
-        self._done: dict[int, TaskRow] = {}
-        self._combined: dict[int, dict[int, TaskRow]] = {}
-        whole = _read_rows(folder / FINISHED, _identity(job))
-        wanted: dict[int, set[int]] = {}
-        for task in job.tasks:
-            wanted.setdefault(task.combination, set()).add(task.number)
-        for number, tasks in wanted.items():
-            path, layout = _combined_path(folder, number), job.combinations[number].layout
-            found = {n: whole[n] for n in tasks if n in whole} or _read_rows(path, layout)
-            if found.keys() == tasks:
-                self._combined[number] = found
-
-    @property
-    def complete(self) -> set[int]:
-        """Numbers of the tasks that are known to be done."""
-        return set(self._done).union(*self._combined.values())
-
-    @property
-    def combined(self) -> set[int]:
-        """Combinations whose products are written."""
-        return set(self._combined)
+        for number in range(len(job.combinations)):
+            try:
+                tree = parts.read(job.record(folder, number), job.identity(number))
+                rows = [dict(zip(COLUMNS, row, strict=True)) for row in tree["tasks"]]
+                found = [
+                    TaskRow(**row | {"machine": tree["machines"][row["machine"]]}) for row in rows
+                ]
+                self.combined[number] = tree["figures"]
+                self.done |= {row.number: row for row in found}
+            except (InputError, KeyError, TypeError, IndexError, ValueError):
+                continue  # missing or damaged: its tasks are done again
 
     def rows(self) -> Iterator[TaskRow]:
         """The state of every task, in order."""
         at_work = _at_work(self.folder)
         for task in self.job.tasks:
-            known = self._combined.get(task.combination, self._done).get(task.number)
-            yield known or _row(task, self.folder, at_work)
-
-    def known(self, row: TaskRow) -> None:
-        """Take in a task that is done."""
-        self._done[row.number] = row
+            yield self.done.get(task.number) or _row(task, self.folder, task.number in at_work)
 
     def claim(self, numbers: Iterable[int]) -> None:
         """Record that tasks are given to workers."""
@@ -221,12 +181,13 @@ class Record:
             self._at_work |= set(numbers)
             self._write()
 
-    def done(self, task: Task, host: str, seconds: float, machine: str) -> None:
+    def succeeded(self, task: Task, host: str, seconds: float, machine: str) -> None:
         """Record that a task's product is complete."""
         self._at_work.discard(task.number)
-        error, _ = _failure(task, self.folder)
-        attempts = self._attempts[task.number]
-        self.known(TaskRow(task.number, "done", attempts, error, host, seconds, machine))
+        attempts, error = self._attempts[task.number], _failure(task, self.folder).error
+        self.done[task.number] = TaskRow(
+            task.number, "done", attempts, error, host, seconds, machine
+        )
 
     def failed(self, task: Task, host: str, seconds: float, error: str, again: bool) -> None:
         """Record that an attempt failed; ``again``: another one follows."""
@@ -236,102 +197,108 @@ class Record:
         write_text(_failed_path(task, self.folder), json.dumps(asdict(row)))
         self._write()
 
-    def put_off(self) -> None:
-        """Tasks at work wait again."""
+    def put_off(self, tasks: Iterable[Task] = ()) -> None:
+        """Tasks at work wait again, and these with all their attempts before them."""
+        for task in tasks:
+            discard(_failed_path(task, self.folder))
         self._at_work.clear()
         self._write()
 
-    def reset(self, tasks: Iterable[Task]) -> None:
-        """Tasks wait again, with all their attempts before them."""
-        for task in tasks:
-            discard(_failed_path(task, self.folder))
-        self.put_off()
-
-    def combine(self, number: int) -> None:
-        """Record that a combination's products are written."""
-        found = {task.number: self._done[task.number] for task in self.job.tasks_of(number)}
-        layout = self.job.combinations[number].layout
-        _write_rows(_combined_path(self.folder, number), layout, found)
-        self._combined[number] = found
+    def combine(self, number: int, figures: Any) -> None:
+        """Record that a combination's products are written, and the figures measured of them."""
+        rows = [self.done[task.number] for task in self.job.tasks_of[number]]
+        made_on = list(dict.fromkeys(row.machine for row in rows))
+        table = [(*astuple(row)[:-1], made_on.index(row.machine)) for row in rows]
+        tree = {"machines": made_on, "tasks": table, "figures": figures}
+        parts.write(self.job.record(self.folder, number), self.job.identity(number), tree)
+        self.combined[number] = figures
 
     def finish(self) -> None:
-        """Record that all combinations are written, and remove the folder of partial products."""
-        rows = {n: row for found in self._combined.values() for n, row in found.items()}
-        _write_rows(self.folder / FINISHED, _identity(self.job), rows)
+        """Remove the folder of partial products: all combinations are written."""
         if not self.job.keep_tasks:
             shutil.rmtree(self.folder / TASKS, ignore_errors=True)
 
     def discard_parts(self, number: int) -> None:
         """Remove the partial products of a combination."""
-        for task in self.job.tasks_of(number):
+        for task in self.job.tasks_of[number]:
             discard(task.path(self.folder))
             discard(_failed_path(task, self.folder))
+
+    def verify(self, tasks: Sequence[Task], say: Say, same_machine: bool) -> list[Task]:
+        """Read the products of tasks, and return the tasks whose products are missing or damaged.
+
+        ``same_machine``: products of another kind of machine than the first task's are removed.
+        """
+        found: list[tuple[Task, TaskRow]] = []
+        missing, damaged, strange = [], 0, 0
+        for task in tasks:
+            path = task.path(self.folder)
+            try:
+                parts.read(path, task.key)
+                found.append((task, done_row(task, self.folder)))
+            except InputError:
+                missing.append(task)
+                damaged += path.exists()
+        known = sorted((row for row in self.rows() if row.machine), key=lambda row: row.number)
+        first = next(filter(None, (machines.kind(row.machine) for row in known)), None)
+        for task, row in found:
+            if same_machine and machines.kind(row.machine) not in (first, frozenset()):
+                discard(task.path(self.folder))
+                missing.append(task)
+                strange += 1
+            else:
+                self.done[task.number] = row
+        self.put_off(missing)
+        if strange:
+            say(
+                f"{plural(strange, 'task')} ran on another kind of machine than the first: run"
+                " again"
+            )
+        if damaged:
+            say(f"{plural(damaged, 'partial product')} damaged: run again")
+        return sorted(missing, key=lambda task: task.number)
 
     def _write(self) -> None:
         with writing(self._path):
             put(self._path, json.dumps(sorted(self._at_work)).encode())
 
 
-def done_row(task: Task, folder: Path) -> TaskRow | None:
-    """The row of a task whose partial product is there; None: it is not, or its head is damaged."""
+def done_row(task: Task, folder: Path) -> TaskRow:
+    """The row of a task whose partial product is there. Raises `InputError` where it is not, or its
+    head is damaged.
+    """
+    made, failure = parts.head(task.path(folder), task.key), _failure(task, folder)
     try:
-        made = parts.head(task.path(folder), task.key)
         host, seconds, machine = str(made["host"]), float(made["seconds"]), str(made["machine"])
-    except (InputError, KeyError, TypeError, ValueError):
-        return None
-    error, attempts = _failure(task, folder)
-    return TaskRow(task.number, "done", attempts + 1, error, host, seconds, machine)
+    except (KeyError, TypeError, ValueError) as err:
+        raise InputError(f"cannot be used: {err}", place=str(task.path(folder))) from None
+    attempts = failure.attempts + 1
+    return TaskRow(task.number, "done", attempts, failure.error, host, seconds, machine)
 
 
-def _row(task: Task, folder: Path, at_work: set[int]) -> TaskRow:
+def _row(task: Task, folder: Path, at_work: bool) -> TaskRow:
     """The state of a task whose combination is not finished."""
-    if (row := done_row(task, folder)) is not None:
-        return row
-    state = "claimed" if task.number in at_work else "waiting"
     try:
-        found = json.loads(_failed_path(task, folder).read_text(encoding="utf-8"))
-        row = TaskRow(**found)
-        attempts, seconds = int(row.attempts), float(row.seconds)
-    except (OSError, ValueError, TypeError):
-        return TaskRow(task.number, state, int(state == "claimed"))
-    return TaskRow(
-        task.number,
-        "failed" if row.state == "failed" and state != "claimed" else state,
-        attempts + (state == "claimed"),
-        str(row.error),
-        str(row.host),
-        seconds,
-    )
+        return done_row(task, folder)
+    except InputError:
+        row = _failure(task, folder)
+    if at_work:
+        return replace(row, state="claimed", attempts=row.attempts + 1)
+    return row
 
 
-def _failure(task: Task, folder: Path) -> tuple[str, int]:
-    """Error of the last attempt that failed, and the number of attempts up to it."""
-    if not _failed_path(task, folder).exists():
-        return "", 0
-    row = _row(task, folder, set())
-    return row.error, row.attempts
-
-
-def _write_rows(path: Path, identity: str, rows: Mapping[int, TaskRow]) -> None:
-    machines = list(dict.fromkeys(row.machine for row in rows.values()))
-    table = [(*astuple(row)[:-1], machines.index(row.machine)) for row in rows.values()]
-    parts.write(path, identity, {"machines": machines, "tasks": table})
-
-
-def _read_rows(path: Path, identity: str) -> dict[int, TaskRow]:
-    """Tasks that a file lists, by number; none if it is missing or damaged."""
+def _failure(task: Task, folder: Path) -> TaskRow:
+    """The row that the last attempt that failed left; that of a task that waits where none did."""
     try:
-        tree = parts.read(path, identity)
-        table = [dict(zip(COLUMNS, row, strict=True)) for row in tree["tasks"]]
-        rows = [TaskRow(**{**row, "machine": tree["machines"][row["machine"]]}) for row in table]
-    except (InputError, KeyError, TypeError, IndexError, ValueError):
-        return {}
-    return {row.number: row for row in rows}
-
-
-def _identity(job: Job) -> str:
-    """Identity of a whole campaign: of all its tasks."""
-    return digest_of_text("".join(task.key for task in job.tasks))
+        found: Mapping[str, Any] = json.loads(
+            _failed_path(task, folder).read_text(encoding="utf-8")
+        )
+        state = "failed" if found["state"] == "failed" else "waiting"
+        error, host = str(found["error"]), str(found["host"])
+        attempts, seconds = int(found["attempts"]), float(found["seconds"])
+        return TaskRow(task.number, state, attempts, error, host, seconds)
+    except (OSError, ValueError, TypeError, KeyError):
+        return TaskRow(task.number)
 
 
 def _at_work(folder: Path) -> set[int]:
@@ -343,10 +310,6 @@ def _at_work(folder: Path) -> set[int]:
         except (OSError, ValueError, TypeError):
             continue
     return found
-
-
-def _combined_path(folder: Path, number: int) -> Path:
-    return folder / TASKS / f"combined-{number:04d}.npz"
 
 
 def _failed_path(task: Task, folder: Path) -> Path:

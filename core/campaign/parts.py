@@ -1,18 +1,14 @@
-"""Partial products, layouts and records as files: plain values and arrays in a zip archive, whose
-own checksums tell a damaged one. No pickles.
+"""Partial products, layouts and records as files: plain values and arrays in numpy's npz, whose own
+checksums tell a damaged one. No pickles.
 
-A file holds ``head.json`` (its identity, and how it was made), ``values.json``, a tree of mappings,
-lists and plain values in which ``{"array": k}`` stands for the k-th array, and ``0.npy``, ``1.npy``
-...
+The array ``head`` holds the file's identity and how it was made, ``values`` a tree of mappings,
+lists and plain values, both as JSON; a mapping with the key `ARRAY` stands for an array.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +19,7 @@ import numpy as np
 from ..errors import InputError
 from ..storage.files import atomic_path
 
-HEAD, VALUES = "head.json", "values.json"
+ARRAY = "\0array"
 
 
 def write(
@@ -35,17 +31,24 @@ def write(
     Raises `OutputError` where it cannot be written, TypeError for a value that is neither plain nor
     an array.
     """
-    arrays: list[Any] = []
-    text = json.dumps(_flatten(tree, arrays), allow_nan=True)
-    content = [_npy(array) for array in arrays]
-    with (
-        atomic_path(path) as temporary,
-        zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive,
-    ):
-        _put(archive, HEAD, json.dumps({"identity": identity, "made": dict(made or {})}))
-        _put(archive, VALUES, text)
-        for k, data in enumerate(content):
-            _put(archive, f"{k}.npy", data)
+    arrays: dict[str, Any] = {}
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.generic):
+            return value.item()
+        if not isinstance(value, np.ndarray) or value.dtype.hasobject:
+            kind = type(value).__name__
+            raise TypeError(f"a partial product holds plain values and arrays, not {kind}")
+        arrays[str(len(arrays))] = value
+        return {ARRAY: str(len(arrays) - 1)}
+
+    texts = {
+        "values": json.dumps(tree, default=plain),
+        "head": json.dumps({"identity": identity, "made": dict(made or {})}),
+    }
+    arrays |= {name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()}
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **arrays)
 
 
 def read(path: Path, identity: str) -> dict[str, Any]:
@@ -53,9 +56,10 @@ def read(path: Path, identity: str) -> dict[str, Any]:
     of another identity.
     """
     with _opened(path, identity) as (archive, _):
-        content = [archive.read(f"{k}.npy") for k in range(len(archive.namelist()) - 2)]
-        arrays = [np.load(io.BytesIO(data), allow_pickle=False) for data in content]
-        tree: dict[str, Any] = _restore(json.loads(archive.read(VALUES)), arrays)
+        tree: dict[str, Any] = json.loads(
+            archive["values"].tobytes(),
+            object_hook=lambda found: archive[found[ARRAY]] if ARRAY in found else found,
+        )
         return tree
 
 
@@ -75,65 +79,16 @@ def digest_of(path: Path) -> str:
 
 
 @contextmanager
-def _opened(path: Path, identity: str) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
+def _opened(path: Path, identity: str) -> Iterator[tuple[Any, dict[str, Any]]]:
     """An archive and how it was made; what goes wrong in the body is an `InputError`."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            found = json.loads(archive.read(HEAD))
+        with np.load(path, allow_pickle=False) as archive:
+            found = json.loads(archive["head"].tobytes())
             if found["identity"] != identity:
                 raise ValueError("it is the product of another task")
             yield archive, found["made"]
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        EOFError,
-        IndexError,
-        zipfile.BadZipFile,
-        zlib.error,
-        RuntimeError,
-    ) as err:
+    except Exception as err:  # a damaged archive fails in any way
         cure = "zonda resume looks for such files and makes them anew"
         raise InputError(
             f"cannot be used: {str(err) or type(err).__name__}", place=str(path), cure=cure
         ) from None
-
-
-def _put(archive: zipfile.ZipFile, name: str, data: str | bytes) -> None:
-    archive.writestr(
-        zipfile.ZipInfo(name), data
-    )  # without the time of day: the same product is the same bytes
-
-
-def _npy(array: Any) -> bytes:
-    stream = io.BytesIO()
-    np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
-    return stream.getvalue()
-
-
-def _flatten(value: Any, arrays: list[Any]) -> Any:
-    if isinstance(value, np.ndarray):
-        arrays.append(value)
-        return {"array": len(arrays) - 1}
-    if isinstance(value, Mapping):
-        if "array" in value or not all(isinstance(k, str) for k in value):
-            raise TypeError("the keys of a partial product are texts other than 'array'")
-        return {k: _flatten(v, arrays) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_flatten(v, arrays) for v in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    raise TypeError(f"a partial product holds plain values and arrays, not {type(value).__name__}")
-
-
-def _restore(value: Any, arrays: list[Any]) -> Any:
-    if isinstance(value, dict):
-        return (
-            arrays[value["array"]]
-            if set(value) == {"array"}
-            else {k: _restore(v, arrays) for k, v in value.items()}
-        )
-    return [_restore(v, arrays) for v in value] if isinstance(value, list) else value

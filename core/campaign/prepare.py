@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from .campaign_file import (
     INPUTS,
     Combination,
     Job,
+    PlannedEntry,
     Task,
     digest_of_text,
-    key_of,
     layout_path,
     plural,
 )
@@ -30,8 +30,6 @@ from .settings import MOST_TASKS, Campaign
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
-    from ..configuration.time import Instant
-    from ..scene import Scene
 
 
 MEASURED = 8
@@ -53,20 +51,6 @@ class CampaignFile:
     def campaign(self) -> Campaign:
         """The file's campaign, or one of a single entry."""
         return self.file.header.campaign or Campaign()
-
-
-@dataclass(frozen=True)
-class Look:
-    """Pointing of one entry: number of its pipeline, seed, start; its name in messages."""
-
-    pipeline: int
-    seed: int
-    time: Instant
-    place: str
-
-    def scene(self, files: Sequence[PipelineFile]) -> Scene:
-        """The scene of one of these files, at its time."""
-        return scene_of(files[self.pipeline], self.seed, self.time)
 
 
 @dataclass(frozen=True)
@@ -113,6 +97,7 @@ def job(
         source=tuple(source.file.resolved_yaml(folder) for source in sources),
         files=draft.inputs,
         combinations=tuple(draft.combinations),
+        entries=tuple(draft.entries),
         tasks=tuple(draft.tasks),
         same_machine=first.same_machine,
         figures=any(source.campaign.figures for source in sources),
@@ -130,36 +115,34 @@ class _Draft:
         self.pipelines: list[str] = []
         self.plans: list[tuple[tuple[str, ...], ...]] = []
         self.combinations: list[Combination] = []
+        self.entries: list[PlannedEntry] = []
         self.tasks: list[Task] = []
         self.inputs: dict[str, str] = {}
         self.need = 0
         self._files: list[PipelineFile] = []
-        self._entries = 0
 
     def add(self, source: CampaignFile) -> None:
         """Add all entries of a pipeline file."""
         found = _entries(source)
         self.inputs |= _inputs(source.file, self._folder)
-        together: dict[str, list[tuple[int, Entry]]] = {}
-        for number, entry in enumerate(found, self._entries):
-            together.setdefault(repr(entry.combination), []).append((number, entry))
-        self._entries += len(found)
+        together: dict[str, list[int]] = {}
+        for number, entry in enumerate(found):
+            together.setdefault(repr(entry.combination), []).append(number)
         planned: dict[tuple[tuple[str, ...], float], int] = {}
-        done = 0
+        entries: dict[int, PlannedEntry] = {}
         for members in together.values():
-            share, looks = 1 / math.sqrt(len(members)), []
-            for _, entry in members:
-                self._say(done, len(found), "campaign: plans and grids")
-                done += 1
-                if (
-                    entry.settings,
-                    share,
-                ) not in planned:  # those that differ in seed and night alone share a plan
-                    planned[entry.settings, share] = self._plan(source, entry, share)
-                looks.append(
-                    Look(planned[entry.settings, share], entry.seed, entry.time, about(entry))
+            share = 1 / math.sqrt(len(members))
+            for number in members:
+                self._say(len(entries), len(found), "campaign: plans and grids")
+                entry, plan = found[number], (found[number].settings, share)
+                if plan not in planned:  # those that differ in seed and night alone share a plan
+                    planned[plan] = self._plan(source, entry, share)
+                entries[number] = PlannedEntry(
+                    planned[plan], entry.seed, entry.time.nanoseconds, about(entry)
                 )
-            self._combine(source, members, looks)
+            own = {number + len(self.entries): entries[number] for number in members}
+            self._combine(source, found[members[0]], own)
+        self.entries += [entries[number] for number in range(len(found))]
 
     def _plan(self, source: CampaignFile, entry: Entry, share: float) -> int:
         """Plan an entry's pipeline; its number."""
@@ -168,7 +151,7 @@ class _Draft:
 
         with within(f"entry {about(entry) or source.file.header.name}"):
             file = _with_budget(source.load(entry.settings), share)
-            scene = scene_of(file, entry.seed, entry.time)
+            scene = file.scene().model_copy(update={"seed": entry.seed, "time": entry.time})
             if entry.settings:  # the error names the entry, not a line of the file
                 run_checks(file.pipeline(), scene)
             else:
@@ -186,57 +169,52 @@ class _Draft:
         return len(self.pipelines) - 1
 
     def _combine(
-        self, source: CampaignFile, members: Sequence[tuple[int, Entry]], looks: Sequence[Look]
+        self, source: CampaignFile, first: Entry, entries: Mapping[int, PlannedEntry]
     ) -> None:
         """One set of products: the layout of all that is co-added, and its tasks."""
-        layouts, scans = common_layouts(looks, self._files, self._folder)
-        firsts = {look.pipeline: look for look in reversed(looks)}
-        for look in list(firsts.values())[:MEASURED]:
-            pipeline = self._files[look.pipeline].pipeline()
-            data = pipeline.point(look.scene(self._files), layouts, self._folder, laid_out=True)
-            self.need = max(self.need, pipeline.least_memory(data.observations))
-        name, subfolder = _names(source, members[0][1], self.combinations)
-        path = layout_path(self._folder, len(self.combinations))
-        parts.write(path, "layout", {"layouts": layouts})
-        self.combinations.append(
-            Combination(name, subfolder, parts.digest_of(path), members[0][1].combination)
-        )
-        before = 0
-        for (number, _), look, samples in zip(members, looks, scans, strict=True):
-            every = tuple(range(len(samples)))
-            for own in [every] if source.campaign.task == "entry" else [(k,) for k in every]:
-                self._task(number, look, own, before, sum(samples[k] for k in own))
-                before += len(own)
-
-    def _task(
-        self, entry: int, look: Look, scans: tuple[int, ...], before: int, samples: int
-    ) -> None:
         from zonda import __version__
 
-        time, combination = look.time.nanoseconds, len(self.combinations) - 1
-        pipeline, layout = self.pipelines[look.pipeline], self.combinations[combination].layout
-        key = key_of(__version__, pipeline, look.seed, time, scans, before == 0, layout)
-        number = len(self.tasks)
-        if number == MOST_TASKS:
-            raise InputError(
-                f"a campaign of more than {MOST_TASKS} tasks",
-                cure="set campaign.task: entry, or make it smaller",
-            )
-        self.tasks.append(
-            Task(
-                number,
-                key,
-                look.pipeline,
-                combination,
-                entry,
-                scans,
-                before,
-                look.seed,
-                time,
-                samples,
-                look.place,
-            )
-        )
+        members = list(entries.values())
+        layouts, scans = common_layouts(members, self._files, self._folder)
+        firsts = {entry.pipeline: entry for entry in reversed(members)}
+        for entry in list(firsts.values())[:MEASURED]:
+            file = self._files[entry.pipeline]
+            pipeline = file.pipeline()
+            data = pipeline.point(entry.scene(file), layouts, self._folder, laid_out=True)
+            self.need = max(self.need, pipeline.least_memory(data.observations))
+        name, subfolder = _names(source, first, self.combinations)
+        path = layout_path(self._folder, len(self.combinations))
+        parts.write(path, "layout", {"layouts": layouts})
+        layout, before = parts.digest_of(path), 0
+        self.combinations.append(Combination(name, subfolder, layout, first.combination))
+        for (number, entry), samples in zip(entries.items(), scans, strict=True):
+            every = tuple(range(len(samples)))
+            for own in [every] if source.campaign.task == "entry" else [(k,) for k in every]:
+                made_of = (
+                    __version__,
+                    self.pipelines[entry.pipeline],
+                    entry.seed,
+                    entry.time,
+                    own,
+                    before == 0,
+                    layout,
+                )
+                task = Task(
+                    len(self.tasks),
+                    digest_of_text(json.dumps(made_of)),
+                    len(self.combinations) - 1,
+                    number,
+                    own,
+                    before,
+                    sum(samples[k] for k in own),
+                )
+                if task.number == MOST_TASKS:
+                    raise InputError(
+                        f"a campaign of more than {MOST_TASKS} tasks",
+                        cure="set campaign.task: entry, or make it smaller",
+                    )
+                self.tasks.append(task)
+                before += len(own)
 
 
 def _entries(source: CampaignFile) -> list[Entry]:
@@ -288,11 +266,6 @@ def about(entry: Entry) -> str:
     return ", ".join(f"{k}={v}" for k, v in entry.values.items())
 
 
-def scene_of(file: PipelineFile, seed: int, time: Instant) -> Scene:
-    """The file's scene with another seed and start."""
-    return file.scene().model_copy(update={"seed": seed, "time": time})
-
-
 def changed(job: Job, folder: Path) -> list[str]:
     """Files that have changed since the campaign in ``folder`` was planned."""
     return [
@@ -303,7 +276,7 @@ def changed(job: Job, folder: Path) -> list[str]:
 
 
 def common_layouts(
-    looks: Sequence[Look], files: Sequence[PipelineFile], folder: Path
+    entries: Sequence[PlannedEntry], files: Sequence[PipelineFile], folder: Path
 ) -> tuple[dict[str, Mapping[str, Any]], list[tuple[int, ...]]]:
     """The layouts of all scans of a combination; and the samples (detectors x samples) of each
     entry's scans.
@@ -314,22 +287,22 @@ def common_layouts(
     layouts: dict[str, Mapping[str, Any]] = {}
     by_start: dict[tuple[int, int], tuple[int, ...]] = {}
     by_pipeline: dict[int, tuple[int, ...]] = {}
-    for look in looks:
-        at = look.pipeline, look.time.nanoseconds
-        if at in by_start:
+    for entry in entries:
+        if (entry.pipeline, entry.time) in by_start:
             continue
         settled = bool(layouts) and all(layout.get("fixed") for layout in layouts.values())
-        if not settled or look.pipeline not in by_pipeline:
-            with within(f"entry {look.place}"):
-                data = files[look.pipeline].pipeline().point(look.scene(files), layouts, folder)
+        if not settled or entry.pipeline not in by_pipeline:
+            file = files[entry.pipeline]
+            with within(f"entry {entry.about}"):
+                data = file.pipeline().point(entry.scene(file), layouts, folder)
             layouts = data.layouts
             bands = len(data.observations) // len(data.scans)
             sizes = [o.n_detectors * o.n_samples for o in data.observations]
-            by_pipeline[look.pipeline] = tuple(
+            by_pipeline[entry.pipeline] = tuple(
                 sum(sizes[k : k + bands]) for k in range(0, len(sizes), bands)
             )
-        by_start[at] = by_pipeline[look.pipeline]
-    return layouts, [by_start[look.pipeline, look.time.nanoseconds] for look in looks]
+        by_start[entry.pipeline, entry.time] = by_pipeline[entry.pipeline]
+    return layouts, [by_start[entry.pipeline, entry.time] for entry in entries]
 
 
 def restore_layout(job: Job, folder: Path, number: int) -> None:
@@ -337,16 +310,11 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
     the same as before.
     """
     from ..configuration.pipeline_file import parse
-    from ..configuration.time import Instant
 
-    first = {task.entry: task for task in reversed(job.tasks_of(number))}
-    looks = [
-        Look(t.pipeline, t.seed, Instant(t.time), t.about)
-        for t in sorted(first.values(), key=lambda t: t.number)
-    ]
+    numbers = dict.fromkeys(task.entry for task in job.tasks_of[number])
     files = [parse(text, name="campaign", folder=folder) for text in job.pipelines]
-    path = layout_path(folder, number)
-    parts.write(path, "layout", {"layouts": common_layouts(looks, files, folder)[0]})
+    path, entries = layout_path(folder, number), [job.entries[entry] for entry in numbers]
+    parts.write(path, "layout", {"layouts": common_layouts(entries, files, folder)[0]})
     if parts.digest_of(path) != job.combinations[number].layout:
         raise InputError(
             "differs from the layout that was planned",
@@ -407,8 +375,7 @@ def _stamp(path: Path, kind: str) -> str:
         if kind == "text":
             return f"text:{digest_of_text(path.read_text(encoding='utf-8', errors='replace'))}"
         if kind == "bytes":
-            with open(path, "rb") as content:
-                return f"bytes:{hashlib.file_digest(content, 'blake2b').hexdigest()[:32]}"
+            return f"bytes:{parts.digest_of(path)}"
         stat = path.stat()
     except OSError:
         return "missing"

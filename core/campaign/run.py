@@ -19,7 +19,6 @@ from .folder import (
     make_way,
     publish,
     sources_of,
-    verify,
     write_sources,
 )
 from .machines import Watch
@@ -60,6 +59,7 @@ def begin(
         make_way(folder)  # of the layouts of a campaign that does not begin
         raise
     _describe(made, folder, say)
+    make_way(folder, made)
     write_sources(made, folder)
     made.write(folder)
     record = Record(made, folder)
@@ -92,7 +92,7 @@ def resume(
         if number not in record.combined and parts.digest_of(layout) != combination.layout:
             restore_layout(job, folder, number)
     waiting = [task for task in job.tasks if task.combination not in record.combined]
-    missing = verify(record, waiting, say, strict)
+    missing = record.verify(waiting, say, strict)
     return _work(record, pool, _watch(record, strict, say), missing)
 
 
@@ -128,7 +128,7 @@ def share(
     share_out(pool, job.need, job.name)
     mine = [task for task in job.tasks if task.number % which[1] == which[0] - 1]
     record = Record(job, folder, f".{which[0]}-of-{which[1]}")
-    missing = verify(record, mine, say, same_machine=False)
+    missing = record.verify(mine, say, same_machine=False)
     result = Tasks(record, pool, _watch(record, job.same_machine, say)).run(missing)
     _tell(result, say)
     _fail(result, len(mine))
@@ -164,27 +164,23 @@ def _watch(record: Record, strict: bool, say: Say) -> Watch:
     return Watch(known, strict, record.folder, say)
 
 
-def _work(record: Record, pool: Pool, watch: Watch, missing: Sequence[Task]) -> CampaignResult:
+def _work(record: Record, pool: Pool, watch: Watch, tasks: Sequence[Task]) -> CampaignResult:
     """Run tasks, combine what is complete, remove partial products."""
     job, folder = record.job, record.folder
-    result = Tasks(record, pool, watch).run(missing)
+    result = Tasks(record, pool, watch).run(tasks)
     if result.tasks:
         _tell(result, watch.say)
-    done = record.complete
-    waiting = record.combined | job.incomplete(done)
-    Combinations(record, result).run(
-        [n for n in range(len(job.combinations)) if n not in waiting], pool
-    )
+    incomplete = {task.combination for task in job.tasks if task.number not in record.done}
+    ready = [n for n in range(len(job.combinations)) if n not in incomplete | set(record.combined)]
+    Combinations(record, result, pool).run(ready)
     clean(folder)  # of workers that were killed while they wrote
     _fail(result, len(job.tasks))
-    if len(done) < len(job.tasks):
+    if missing := len(job.tasks) - len(record.done):
         raise PipelineError(
-            f"{len(job.tasks) - len(done)} tasks were not run",
-            place=str(folder),
-            cure=f"zonda resume {folder}",
+            f"{missing} tasks were not run", place=str(folder), cure=f"zonda resume {folder}"
         )
     if job.figures:
-        table.write(job, folder)
+        table.write(record)
     record.finish()
     return result
 

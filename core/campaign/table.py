@@ -10,27 +10,22 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..configuration.units import factor_to
-from ..errors import InputError
-from ..figures import Figure, Figures
+from ..figures import Figure
 from ..pages import render
 from ..storage.ecsv import Column
 from ..storage.files import atomic_path, write_text
 from ..tables import Table
 
 if TYPE_CHECKING:
-    from ..data import Data
-    from .campaign_file import Job
+    from .folder import Record
 
-FOLDER = "figures"
-"""Folder with the figures of each combination, in files named by its number."""
 LOGARITHMIC = 8.0
 """Ratio of the largest to the smallest swept value from which the axis is logarithmic."""
 
@@ -63,23 +58,9 @@ class Point:
         return self.scatter / math.sqrt(len(self.values))
 
 
-def keep(folder: Path, number: int, data: Data) -> None:
-    """Write the figures of a combination's finished data to the campaign's folder."""
-    found = [
-        figure
-        for product in data.products.values()
-        if isinstance(product, Figures)
-        for figure in product
-    ]
-    rows = [[f.name, f.value, f.unit, f.error, f.description] for f in found]
-    write_text(_path(folder, number), json.dumps(rows))
-
-
-def write(job: Job, folder: Path) -> None:
-    """Write the table of a campaign whose combinations are all finished. Raises InputError where
-    figures are missing.
-    """
-    points = collected(job, folder)
+def write(record: Record) -> None:
+    """Write the table of a campaign whose combinations are all finished."""
+    job, folder, points = record.job, record.folder, collected(record)
     axes = list(dict.fromkeys(key for point in points for key, _ in point.axes))
     columns = [
         Column(key, [_text(dict(p.axes).get(key)) for p in points], "", "value on this axis")
@@ -114,8 +95,9 @@ def write(job: Job, folder: Path) -> None:
     write_text(folder / "sweep.html", page)
 
 
-def collected(job: Job, folder: Path) -> list[Point]:
+def collected(record: Record) -> list[Point]:
     """Figures at every point, figure by figure."""
+    job = record.job
     found: dict[tuple[str, str], tuple[tuple[tuple[str, Any], ...], list[Figure]]] = {}
     for number, combination in enumerate(job.combinations):
         axes = tuple(
@@ -131,7 +113,7 @@ def collected(job: Job, folder: Path) -> list[Point]:
                 ]
             ]
         )
-        for figure in _read(folder, number):
+        for figure in (Figure(*row) for row in record.combined[number]):
             found.setdefault((figure.name, place), (axes, []))[1].append(figure)
     order = list(dict.fromkeys(name for name, _ in found))
     points = [
@@ -230,19 +212,3 @@ def _positions(values: Sequence[Any]) -> tuple[list[float], str, list[str]]:
 
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else "" if value is None else json.dumps(value)
-
-
-def _path(folder: Path, number: int) -> Path:
-    return folder / FOLDER / f"{number:06d}.json"
-
-
-def _read(folder: Path, number: int) -> Iterator[Figure]:
-    path = _path(folder, number)
-    try:
-        for name, value, unit, error, description in json.loads(path.read_text(encoding="utf-8")):
-            yield Figure(str(name), float(value), str(unit), float(error), str(description))
-    except (OSError, ValueError, TypeError) as err:
-        cure = "remove the output folder and run the sweep again"
-        raise InputError(
-            f"the figures of a run cannot be read: {err}", place=str(path), cure=cure
-        ) from None

@@ -14,26 +14,29 @@ import contextlib
 import os
 import socket
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from zonda import __version__
+
 from .. import hooks
-from ..configuration.time import Instant
 from ..data import Data
 from ..errors import InputError, OutputError, PipelineError, PointingError, ZondaError
 from ..faults import faults_named
+from ..figures import Figures
+from ..pipeline import Part
 from ..storage.files import check_output_folder, discard
-from . import machines, parts, table
-from .calls import Lost, Work, carry_out
-from .campaign_file import Job, Task, layout_path, plural
+from . import machines, parts
+from .calls import Lost, Work
+from .campaign_file import Job, PlannedEntry, Task, layout_path, plural
 from .engines import Pool, engine_failed
 from .folder import Record, clean
 from .machines import Watch
 from .partial import NotCombined, Partial
-from .prepare import scene_of
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
@@ -45,8 +48,8 @@ class Order:
 
     Attributes
     ----------
-    task, pipeline
-        What to do: the task and its planned pipeline as YAML.
+    entry, pipeline
+        Its entry, and the planned pipeline as YAML.
     layout
         Digest of the layouts' file.
     folder
@@ -54,16 +57,17 @@ class Order:
     threads, memory
         For this task; None: all of the machine's. The memory is that of the worker's whole process.
     version
-        Of the zonda that sends it.
+        Version of the zonda that sends it.
     """
 
     task: Task
+    entry: PlannedEntry
     pipeline: str
     layout: str
     folder: Path
     threads: int | None
     memory: int | None
-    version: str
+    version: str = __version__
 
 
 @dataclass(frozen=True)
@@ -96,8 +100,6 @@ def perform(order: Order) -> Outcome:
     """Run a task. Never raises an `Exception`: the outcome states what failed."""
     begin, host = time.monotonic(), f"{socket.gethostname()}:{os.getpid()}"
     try:
-        from zonda import __version__
-
         if __version__ != order.version:
             raise PipelineError(
                 f"this worker has zonda {__version__}, the campaign {order.version}",
@@ -110,8 +112,6 @@ def perform(order: Order) -> Outcome:
         stop = isinstance(err, OutputError | NotCombined)
         return Outcome(host, time.monotonic() - begin, error=str(err), final=final, stop=stop)
     except Exception as err:
-        import traceback
-
         text = "".join(traceback.format_exception(err)).rstrip()
         stop = isinstance(err, OSError)
         return Outcome(host, time.monotonic() - begin, error=text, stop=stop)
@@ -120,18 +120,11 @@ def perform(order: Order) -> Outcome:
 @faults_named()
 def _run(order: Order, host: str, begin: float) -> tuple[float, str]:
     """Write the product of a task; wall time since ``begin``, and the machine."""
-    from ..configuration.time import Instant
-    from ..pipeline import Part
-    from .prepare import scene_of
-
     task, folder, file = order.task, order.folder, pipeline_of(order.pipeline, order.folder)
-    part = Part(
-        task.scans,
-        layouts_in(layout_path(folder, task.combination), order.layout),
-        f"{task.entry:06d}-",
-    )
+    layouts = layouts_in(layout_path(folder, task.combination), order.layout)
+    part = Part(task.scans, layouts, f"{task.entry:06d}-")
     data = file.pipeline().run_part(
-        scene_of(file, task.seed, Instant(task.time)),
+        order.entry.scene(file),
         part,
         output=folder / "entries" / f"{task.entry:06d}",  # the time streams of one entry together
         threads=order.threads,
@@ -174,33 +167,32 @@ FAN = 32
 
 @dataclass(frozen=True)
 class Combined:
-    """Result of a combination: its tally (who, what, value, is a count), or its error."""
+    """Result of a combination: its tally (who, what, value, is a count), and the figures that were
+    measured of its products.
+    """
 
     tally: tuple[tuple[str, str, str, bool], ...] = ()
-    error: ZondaError | None = None
+    figures: tuple[tuple[Any, ...], ...] = ()
 
 
 def combine(folder: Path, number: int) -> Combined:
-    """Add up one combination's parts, finish its products and write them. Errors are returned, not
-    raised.
-    """
-    try:
-        data = combined(Job.read(folder), folder, number)
-    except ZondaError as err:
-        return Combined(error=err)
+    """Add up one combination's parts, finish its products and write them."""
+    data = combined(Job.read(folder), folder, number)
     counts = {(who, what) for who, what, _ in data.tally.counts()}
+    measured = [product for product in data.products.values() if isinstance(product, Figures)]
     return Combined(
-        tuple((who, what, value, (who, what) in counts) for who, what, value in data.tally.told())
+        tuple((who, what, value, (who, what) in counts) for who, what, value in data.tally.told()),
+        tuple(astuple(figure) for figures in measured for figure in figures),
     )
 
 
 @faults_named()
 def combined(job: Job, folder: Path, number: int) -> Data:
     """Finished data of `combine`. Raises `InputError` if a part is missing or damaged."""
-    combination, tasks = job.combinations[number], job.tasks_of(number)
-    first = tasks[0]
+    combination, tasks = job.combinations[number], job.tasks_of[number]
+    first = job.entry_of(tasks[0])
     file = pipeline_of(job.pipelines[first.pipeline], folder)
-    pipeline, scene = file.pipeline(), scene_of(file, first.seed, Instant(first.time))
+    pipeline, scene = file.pipeline(), first.scene(file)
     data = Data(scene, output=check_output_folder(folder / combination.folder))
     data.provenance = {
         **pipeline.provenance(scene),
@@ -209,22 +201,15 @@ def combined(job: Job, folder: Path, number: int) -> Data:
         "plan": job.plans[first.pipeline],
         "campaign": f"{combination.name or job.name}: {plural(len(tasks), 'task')}",
     }
-    data.layouts, data.laid_out = (
-        dict(layouts_in(layout_path(folder, number), combination.layout)),
-        True,
-    )
+    layouts = layouts_in(layout_path(folder, number), combination.layout)
+    data.layouts, data.laid_out = dict(layouts), True
     depth = 1
     while FAN**depth < len(tasks):
         depth += 1
     whole = _sum(tasks, folder, 0, depth)
-    data.partial, data.tally, data.observations = (
-        whole.products,
-        whole.tally,
-        whole.observations(scene),
-    )
+    data.partial, data.tally = whole.products, whole.tally
+    data.observations = whole.observations(scene)
     pipeline.finish(data)
-    if job.figures:
-        table.keep(folder, number, data)
     return data
 
 
@@ -272,20 +257,17 @@ class Tasks(Work[Task, Outcome]):
     """The tasks of a campaign. ``watch`` compares the machines that they run on."""
 
     def __init__(self, record: Record, pool: Pool, watch: Watch) -> None:
-        super().__init__()
-        self.job, self.folder = record.job, record.folder
-        self.record, self.pool, self.watch = record, pool, watch
+        super().__init__(record.folder, pool)
+        self.job, self.record, self.watch = record.job, record, watch
         self.result = CampaignResult(record.folder)
         self._failures = 0
 
     def run(self, tasks: Sequence[Task]) -> CampaignResult:
         """Run these tasks; on an interrupt, those at work wait again."""
-        self._all, self._begin = (
-            {"total": len(tasks), "all_samples": sum(task.samples for task in tasks)},
-            time.monotonic(),
-        )
+        self._all = {"total": len(tasks), "all_samples": sum(task.samples for task in tasks)}
+        self._begin = time.monotonic()
         try:
-            carry_out(self, tasks, self.pool, self.folder)
+            self.carry_out(tasks)
         except BaseException:
             with contextlib.suppress(Exception):
                 self.record.put_off()
@@ -299,15 +281,15 @@ class Tasks(Work[Task, Outcome]):
 
     def call(self, item: Task) -> tuple[Callable[[Order], Outcome], Order]:
         """See `Work.call`."""
-        from zonda import __version__
-
-        layout, pipeline = (
-            self.job.combinations[item.combination].layout,
-            self.job.pipelines[item.pipeline],
-        )
-        folder, pool = self.folder.resolve(), self.pool
+        job, entry = self.job, self.job.entry_of(item)
         return perform, Order(
-            item, pipeline, layout, folder, pool.threads, pool.memory, __version__
+            item,
+            entry,
+            job.pipelines[entry.pipeline],
+            job.combinations[item.combination].layout,
+            self.folder.resolve(),
+            self.pool.threads,
+            self.pool.memory,
         )
 
     def began(self, items: list[Task]) -> None:
@@ -323,18 +305,17 @@ class Tasks(Work[Task, Outcome]):
         ):
             discard(item.path(self.folder))
             outcome = replace(outcome, error=error, final=True, stop=True)
-        again = (
-            bool(outcome.error) and not outcome.final and self.attempts[item] <= self.job.retries
-        )
-        if not outcome.error:
-            self.record.done(item, outcome.host, outcome.seconds, outcome.machine)
+        host, seconds, error = outcome.host, outcome.seconds, outcome.error
+        again = bool(error) and not outcome.final and self.attempts[item] <= self.job.retries
+        if not error:
+            self.record.succeeded(item, host, seconds, outcome.machine)
             self.result.tasks += 1
             self.result.samples += item.samples
         else:
             self._failures += 1
-            self.record.failed(item, outcome.host, outcome.seconds, outcome.error, again)
+            self.record.failed(item, host, seconds, error, again)
             if not again:
-                self.result.failed[number] = outcome.error
+                self.result.failed[number] = error
                 self.stop = self.stop or outcome.stop
         hooks.manager().hook.zonda_campaign_progress(
             done=self.result.tasks, failed=self._failures, samples=self.result.samples,
@@ -348,19 +329,14 @@ class Combinations(Work[int, Combined]):
     and memory.
     """
 
-    def __init__(self, record: Record, result: CampaignResult) -> None:
-        super().__init__()
-        self.job, self.folder, self.record, self.result = (
-            record.job,
-            record.folder,
-            record,
-            result,
-        )
-        self._error: ZondaError | None = None
+    def __init__(self, record: Record, result: CampaignResult, pool: Pool) -> None:
+        super().__init__(record.folder, pool)
+        self.job, self.record, self.result = record.job, record, result
+        self._error: Exception | None = None
 
-    def run(self, numbers: Sequence[int], pool: Pool) -> None:
+    def run(self, numbers: Sequence[int]) -> None:
         """Combine these. Raises the first error, when what was at work has ended."""
-        carry_out(self, numbers, pool, self.folder)
+        self.carry_out(numbers)
         if self._error is not None:
             raise self._error
 
@@ -370,24 +346,21 @@ class Combinations(Work[int, Combined]):
 
     def ended(self, item: int, result: Combined | Lost) -> bool:
         """Record that products are written, and remove their parts."""
-        if isinstance(result, Lost):
-            if not engine_failed(result.error):
-                raise result.error
+        if not isinstance(result, Lost):
+            self.record.combine(item, result.figures)
+            name = self.job.combinations[item].name
+            self.result.tally += [(name, *row) for row in result.tally]
+            if not self.job.keep_tasks:
+                self.record.discard_parts(item)
+            return False
+        error = result.error
+        if engine_failed(error):
             if self.attempts[item] <= self.job.retries:
                 return True
-            message = f"the engine failed when it combined the maps: {result}"
-            error: ZondaError | None = PipelineError(
-                message, place=str(self.folder), cure=f"zonda resume {self.folder}"
+            error = PipelineError(
+                f"the engine failed when it combined the maps: {result}",
+                place=str(self.folder),
+                cure=f"zonda resume {self.folder}",
             )
-        else:
-            error = result.error
-        if error is not None:
-            self._error, self.stop = self._error or error, True
-            return False
-        assert isinstance(result, Combined)
-        self.record.combine(item)
-        name = self.job.combinations[item].name
-        self.result.tally += [(name, *row) for row in result.tally]
-        if not self.job.keep_tasks:
-            self.record.discard_parts(item)
+        self._error, self.stop = self._error or error, True
         return False

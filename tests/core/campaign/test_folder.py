@@ -42,7 +42,7 @@ def test_a_campaign_that_ends_well_leaves_none(bench, monkeypatch):
 @pytest.mark.parametrize("command", ["resume", "status", "run"])
 def test_the_folder_of_an_older_version_is_refused(bench, undisturbed, capsys, command):
     _, _, text = (undisturbed / FILE).read_text().rstrip().partition("\n")
-    text = text.replace('"format":3', '"format":2', 1)
+    text = text.replace('"format":4', '"format":3', 1)
     out = bench.new()
     out.mkdir()
     (out / FILE).write_text(f'{{"digest": "{digest_of_text(text)}"}}\n{text}\n')

@@ -404,9 +404,9 @@ def test_every_transition_is_in_the_files(bench, monkeypatch):
     out = half(bench, monkeypatch)
     job = Job.read(out)
     record, other = Record(job, out), Record(job, out)
-    assert record.complete == set()  # nothing is combined
+    assert record.done == {}  # nothing is combined
     task = job.tasks[5]
-    record.reset([task])
+    record.put_off([task])
     assert next(r for r in other.rows() if r.number == 5).state == "waiting"
     record.claim([5])
     assert [(r.state, r.attempts) for r in other.rows()][5] == ("claimed", 1)
@@ -418,7 +418,7 @@ def test_every_transition_is_in_the_files(bench, monkeypatch):
     record.put_off()
     assert [(r.state, r.attempts, r.error) for r in other.rows()][5] == ("failed", 2, "never")
     record.claim([5])
-    record.done(task, "h", 2.0, "{}")
+    record.succeeded(task, "h", 2.0, "{}")
     assert [(r.state, r.attempts, r.error) for r in record.rows()][5] == ("done", 3, "never")
     assert isinstance(SerialExecutor().submit(len, "ab").result(), int)
 
@@ -427,6 +427,7 @@ def test_a_combination_is_finished_if_its_record_lists_its_tasks(bench, undistur
     """A record of other tasks, as of another campaign, counts as none."""
     job = Job.read(undisturbed)
     record = Record(job, undisturbed)
-    assert (record.combined, record.complete) == ({0}, set(range(12)))
+    assert record.combined.keys() == {0}
+    assert record.done.keys() == set(range(12))
     shorter = replace(job, tasks=job.tasks[:-1])
-    assert Record(shorter, undisturbed).combined == set()
+    assert Record(shorter, undisturbed).combined == {}
