@@ -82,11 +82,12 @@ class Image:
 
     def plot(self, ax: Any = None, *, title: str = "", limit: float | None = None) -> Any:
         """Draw the image, and return the matplotlib Axes. ``limit``: where the colours end;
-        default: what 99.5 % of the pixels stay below.
+        default: what 99.95 % of the pixels stay below.
         """
-        from .picture import Shown, draw
+        from .map_plots import notebook_axes, plot_map
 
-        return draw(Shown(self.values, self.wcs, self.unit, title), ax, limit)
+        ax = notebook_axes(self.values.shape, self.wcs) if ax is None else ax
+        return plot_map(self.values, self.wcs, ax=ax, title=title, limit=limit, unit=self.unit)
 
 
 def _turned(q_and_u: Floats, poles: tuple[Floats, Floats], image: Image, number: int) -> Floats:

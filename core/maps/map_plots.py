@@ -13,21 +13,19 @@ from ..canvas import DPI, PALE, log_labels, unit_of
 from ..numerics.angles import angle_text
 from ..types import AnyFloats
 from .grid import wcs_grid
+from .map_arrays import MapArrays
+from .on_plane import on_plane
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
     from matplotlib.axes import Axes
 
-IMAGE = (4.23, 4.28)
-"""Largest width and height of an image, in."""
-LONG, THIN = 8.4, 1.05
-"""Width of an image of a strip, and the least height or width of one, in; a longer strip is
-stretched across.
-"""
-STRIP = 2.2
-"""Width over height from which an image is a strip, with its colour bar below."""
-BAR, SECOND, LABELS, TITLE = 0.2, 0.75, 1.05, 4.4
-"""Width of a colour bar, room for a second scale of it, for the labels of axes and a title, in."""
+IMAGE, LONG = 4.25, 8.4
+"""Largest width or height of an image, and width of a strip, in."""
+STRIP, TALL = 8.0, 4.0
+"""Width over height, and height over width, beyond which an image is stretched."""
+WIDE = 2.2
+"""Width over height from which an image has its colour bar below."""
 SHOWN = 99.95
 """Per cent of the pixels of a noise-free map that its colour scale covers."""
 ONE_SIDED = 0.05
@@ -38,58 +36,38 @@ POSITIVE, NEGATIVE, FAR = "inferno", "Blues_r", "viridis"
 """Colours of positive skies, of negative ones (as in the diverging scale), and of maps far from
 zero.
 """
-MOST_TURNED = np.tan(np.radians(30.0))
-"""Slope of meridians and parallels to the edges from which an image has lines of both."""
 
 
-def map_axes(shape: tuple[int, ...], wcs: WCS, count: int = 1, scales: int = 1) -> list[Any]:
-    """World axes of a new figure for ``count`` images (ny, nx), each with ``bar_axes`` for its
-    colour bar.
-
-    Pixels have the shape that they have on the sky in the middle of the image. Strips are wide, one
-    below the other, with their colour bars below; a strip too thin to be seen is stretched, and its
-    axis says so. Images side by side have their latitudes written once. ``scales`` (1 or 2) is the
-    number of scales of a colour bar.
+def map_axes(shape: tuple[int, ...], wcs: WCS, count: int = 1, figure: Any = None) -> list[Any]:
+    """World axes of a new figure (or ``figure``) for ``count`` images (ny, nx): strips one below
+    the other, others side by side, with their latitudes written once.
     """
-    import astropy.visualization.wcsaxes  # noqa: F401  (before Figure.add_axes takes a WCS)
+    import astropy.visualization.wcsaxes  # noqa: F401  (before subplots take a WCS)
     from matplotlib.figure import Figure
 
-    ny, nx = shape
-    xx, _, yy = wcs_grid(wcs, (ny, nx)).middle
-    across = nx * np.sqrt(xx / yy)  # in the pixels' height
-    strip = across > STRIP * ny
-    scale = min((LONG if strip else IMAGE[0]) / across, IMAGE[1] / ny)
-    width, height = max(across * scale, THIN), max(ny * scale, THIN)
-    stretched = width / across / (height / ny)
-    beside = 0.1 + (SECOND if scales == 2 and not strip else 0.0)
-    pitch = height + 1.7 if strip else max(TITLE, width + beside + BAR + LABELS) + 0.2
-    size = (width + 2, count * pitch + 0.5) if strip else (count * pitch + LABELS, height + 2)
-    figure = Figure(figsize=size, dpi=DPI)
-    upright, whole = _upright(wcs, shape), _all_sky(wcs, shape)
+    width, height, _ = _proportions(wcs, shape)
+    strip = width > WIDE * height
+    scale = min((LONG if strip else IMAGE) / width, IMAGE / height)
+    size = scale * width + 2, scale * height + 1.5
+    rows, columns = (count, 1) if strip else (1, count)
+    figure = Figure(dpi=DPI) if figure is None else figure
+    figure.set_size_inches(columns * size[0], rows * size[1])
+    figure.set_layout_engine("compressed")
+    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": wcs}).ravel()
+    for ax in () if strip else axes[1:]:
+        ax.inner = True
+    return list(axes)
 
-    def place(x: float, y: float, w: float, h: float) -> tuple[float, float, float, float]:
-        return x / size[0], y / size[1], w / size[0], h / size[1]
 
-    made = []
-    for k in range(count):
-        x, y = (1.0, (count - 1 - k) * pitch + 1.2) if strip else (LABELS + k * pitch, 1.0)
-        under = 0.7 + (0.3 if scales == 2 else 0.0)
-        ax: Any = figure.add_axes(place(x, y, width, height), projection=wcs)
-        ax.bar_axes = figure.add_axes(
-            place(x + 0.1 * width, y - under, 0.8 * width, 0.14)
-            if strip
-            else place(x + width + beside, y, BAR, height)
-        )
-        ax.bar_below = strip
-        ax.title_pad = 6.0 if upright or whole else 36.0  # above labels on the upper edge
-        _label(ax, upright, whole, latitudes=strip or k == 0 or not upright)
-        if not 0.99 < stretched < 1.01:
-            name = ax.coords[0].get_axislabel()
-            how = f"{1 / stretched:.2g}×" if stretched < 1 else f"{stretched:.2g}×"
-            other = f"{names_of(wcs)[1]} " if stretched < 1 else ""
-            ax.coords[0].set_axislabel(f"{name}, {other}stretched {how}")
-        made.append(ax)
-    return made
+def _proportions(wcs: WCS, shape: tuple[int, ...]) -> tuple[float, float, float]:
+    """Width and height of an image on the sky, in pixels' heights, and by how much it is stretched
+    across: a strip is at least as wide or high as `TALL` and `STRIP` say.
+    """
+    xx, _, yy = wcs_grid(wcs, (shape[0], shape[1])).middle
+    across = shape[1] * math.sqrt(xx / yy)
+    ratio = across / shape[0]
+    stretched = min(max(ratio, 1 / TALL), STRIP) / ratio
+    return across * stretched, float(shape[0]), stretched
 
 
 def wcs_of(header: Any) -> WCS:
@@ -99,75 +77,69 @@ def wcs_of(header: Any) -> WCS:
     return WCS(dict(header), naxis=2).celestial
 
 
-def names_of(wcs: WCS) -> tuple[str, str, str]:
-    """Names of the two axes of a map and of their frame: RA, Dec, ICRS; l, b, Galactic."""
-    first, second = wcs.wcs.ctype
-    if first.startswith("GLON"):
-        return "l", "b", "Galactic"
-    if first.startswith("RA"):
-        return "RA", "Dec", wcs.wcs.radesys or "ICRS"
-    return first.split("-")[0].lower() or "x", second.split("-")[0].lower() or "y", "as in the file"
-
-
-def _label(ax: Any, upright: bool, whole: bool, latitudes: bool) -> None:
-    """Name the axes, and draw meridians and parallels where these do not follow the edges."""
-    first, second, frame = names_of(ax.wcs)
-    for axis, name, room in zip(ax.coords, (first, second), (0.8, 0.7), strict=True):
-        axis.set_axislabel(f"{name} ({frame})", minpad=room if upright else 1.0)
+def _label(ax: Any, shape: tuple[int, ...], stretched: float) -> None:
+    """Name the axes, and draw meridians and parallels. On images of the whole sky, whose corners
+    are off it, longitudes are written on the equator and latitudes on the central meridian.
+    """
+    wcs = ax.wcs
+    names = [kind.split("-")[0].lower() for kind in wcs.wcs.ctype]
+    frame = "as in the file"
+    if names[0] == "glon":
+        names, frame = ["l", "b"], "Galactic"
+    elif names[0] == "ra":
+        names, frame = ["RA", "Dec"], wcs.wcs.radesys or "ICRS"
+    more = f", {'' if stretched > 1 else names[1] + ' '}stretched "
+    more += f"{max(stretched, 1 / stretched):.2g}×"
+    ax.coords.grid(color="0.4", linewidth=0.6, alpha=0.7)
+    corners = np.array([0, shape[1] - 1, 0, shape[1] - 1]), np.array([0, 0, *[shape[0] - 1] * 2])
+    whole = not np.isfinite(wcs.wcs_pix2world(*corners, 0)).any()
+    for k, (axis, name) in enumerate(zip(ax.coords, names, strict=True)):
         axis.set_ticklabel(size=9, exclude_overlapping=True, simplify=False)
+        axis.set_axislabel(f"{name} ({frame}){'' if k or 0.99 < stretched < 1.01 else more}")
         if axis.coord_type in ("longitude", "latitude"):
             axis.set_separator("ʰᵐˢ" if name == "RA" else "°′″")
-    if not latitudes:
-        ax.coords[1].set_ticklabel_visible(False)
-        ax.coords[1].set_axislabel("")
-    if not upright:
-        ax.coords.grid(color="0.4", linewidth=0.6, alpha=0.7)
-    if whole:
-        _label_lines(ax)
-        ax.coords[0].set_axislabel(f"{first} on its lines, {second} on its lines ({frame})")
-        ax.coords[0].set_axislabel_visibility_rule("always")
-        ax.coords[1].set_axislabel("")
-
-
-def _label_lines(ax: Any) -> None:
-    """Write longitudes on the equator and latitudes on the central meridian of the whole sky."""
-    for k, span in enumerate(((0.0, 330.0), (-80.0, 80.0))):
-        axis = ax.coords[k]
+        if not whole:
+            continue
         axis.set_ticks_visible(False)
         axis.set_ticklabel_visible(False)
-        values, spacing = axis.locator(*span)
-        texts = axis.formatter(values, spacing)
-        middle = float(ax.wcs.wcs.crval[0]) if k else 0.0
-        for value, text in zip(values.to_value("deg"), texts, strict=True):
-            at = (middle, value) if k else (value, middle)
-            x, y = ax.wcs.wcs_world2pix([at], 0)[0]
+        values, spacing = axis.locator(*((-80.0, 80.0) if k else (0.0, 330.0)))
+        middle = float(wcs.wcs.crval[0]) if k else 0.0
+        for value, text in zip(
+            values.to_value("deg"), axis.formatter(values, spacing), strict=True
+        ):
+            x, y = wcs.wcs_world2pix([(middle, value) if k else (value, middle)], 0)[0]
             ax.text(x, y, text, fontsize=8, ha="center", va="center", zorder=4, bbox=PALE)
+    if getattr(ax, "inner", False):
+        ax.coords[1].set_ticklabel_visible(False)
+        ax.coords[1].set_axislabel("")
+    if whole:
+        ax.coords[0].set_axislabel_visibility_rule("always")
+        ax.coords[0].set_axislabel(f"{names[0]} and {names[1]} on their lines ({frame})")
+        ax.coords[1].set_axislabel("")
 
 
-def _upright(wcs: WCS, shape: tuple[int, ...]) -> bool:
-    """True if meridians run up and parallels across, within 30 deg, all along the edges."""
-    ny, nx = shape
-    along, h = np.linspace(0.001, 0.999, 33), 1e-3 * min(nx, ny)
-    low, high = np.full(33, 0.001), np.full(33, 0.999)
-    x = np.concatenate([along, along, low, high]) * nx - 0.5
-    y = np.concatenate([low, high, along, along]) * ny - 0.5
-    slopes = []
-    for dx, dy in ((h, 0.0), (0.0, h)):
-        lon0, lat0 = wcs.wcs_pix2world(x - dx, y - dy, 0)
-        lon1, lat1 = wcs.wcs_pix2world(x + dx, y + dy, 0)
-        east = ((lon1 - lon0 + 180) % 360 - 180) * np.cos(np.radians((lat0 + lat1) / 2))
-        slopes += [east, lat1 - lat0]
-    east_x, north_x, east_y, north_y = slopes
-    one_way = all((s > 0).all() or (s < 0).all() for s in (east_x, north_y))  # False for NaN
-    turned = (abs(north_x) > MOST_TURNED * abs(north_y)) | (abs(east_y) > MOST_TURNED * abs(east_x))
-    return one_way and not turned.any()
+def draw_map(product: MapArrays, ax: Any, plane: str, title: str, limit: float | None) -> Any:
+    """`MapProduct.plot`."""
+    if product.polarization is not None and plane in ("I", "Q", "U", "P"):
+        return draw_map(product.stokes(plane), ax, "signal", title or plane, limit)
+    found, title = product.plane(plane), title or plane.replace("_", " ")
+    shown, wcs = on_plane(product, {plane: np.where(product.hits > 0, found.values[0], np.nan)})
+    values = shown[plane]
+    ax = notebook_axes(values.shape, wcs) if ax is None else ax
+    if found.smoothing == "mean":
+        more: dict[str, Any] = {"fwhm": product.resolution, "unit": product.unit}
+        return plot_map(values, wcs, ax=ax, title=title, limit=limit, **more)
+    known = values[np.isfinite(values)]
+    limits = float(known.min(initial=0.0)), limit or float(known.max(initial=0.0))
+    unit = found.unit or found.fits_unit(product.unit)
+    return plot_plain(values, wcs, limits, FAR, unit, ax=ax, title=title)
 
 
-def _all_sky(wcs: WCS, shape: tuple[int, ...]) -> bool:
-    """True if the corners of an image are off the sky, as of all-sky projections."""
-    ny, nx = shape
-    x, y = np.array([0, nx - 1, 0, nx - 1]), np.array([0, 0, ny - 1, ny - 1])
-    return not np.isfinite(wcs.wcs_pix2world(x, y, 0)).any()
+def notebook_axes(shape: tuple[int, ...], wcs: WCS) -> Any:
+    """World axes of a figure of pyplot, which notebooks show."""
+    from matplotlib import pyplot as plt
+
+    return map_axes(shape, wcs, figure=plt.figure())[0]
 
 
 def plot_map(
@@ -231,8 +203,9 @@ def plot_plain(
     """
     from matplotlib.colors import Normalize
 
-    shown = np.ma.masked_invalid(values)
-    drawn: Axes = _show(ax, wcs, shown, label, title, colours, Normalize(*limits))
+    drawn: Axes = _show(
+        ax, wcs, np.ma.masked_invalid(values), label, title, colours, Normalize(*limits)
+    )
     return drawn
 
 
@@ -251,23 +224,19 @@ def plot_coverage(
     """
     from matplotlib.colors import LogNorm, Normalize
 
-    factor = None if per_beam is None else np.asarray(per_beam, np.float32)
-    even = factor is not None and float(factor.max()) <= 1.01 * float(factor.min())
-    ax = map_axes(hits.shape, wcs, scales=2 if even else 1)[0]
-    seen = np.asarray(hits, np.float32)
-    values = seen if factor is None else seen * factor
-    used = values[seen > 0]
+    factor = np.asarray(1.0 if per_beam is None else per_beam, np.float32)
+    shown = np.ma.masked_where(hits <= 0, np.asarray(hits, np.float32) * factor)
+    used = shown.compressed()
     top, middle = (float(used.max()), float(np.median(used))) if used.size else (1.0, 1.0)
-    least = 1.0 if factor is None else float(used.min()) if used.size else 0.1
-    wide = top > 30 * middle
-    norm = LogNorm(min(max(least, middle / 30), top / 2), top) if wide else Normalize(0, top)
+    norm: Any = Normalize(0, top)
+    if top > 30 * middle:
+        norm = LogNorm(min(max(float(used.min()), middle / 30), top / 2), top)
     label, head = "samples per pixel", "Samples per pixel"
-    if factor is not None:
+    if per_beam is not None:
         label, head = "integration time of all detectors [s per beam]", "Integration time per beam"
-    shown = np.ma.masked_where(seen <= 0, values)
-    _show(ax, wcs, shown, label, title or head, "cividis", norm)
-    if factor is not None and even:
-        _count_samples(ax, float(factor.mean()))
+    ax = _show(None, wcs, shown, label, title or head, "cividis", norm)
+    if per_beam is not None and float(factor.max()) <= 1.01 * float(factor.min()):
+        _count_samples(ax.images[0].colorbar, float(factor.mean()))
     return ax  # type: ignore[no-any-return]
 
 
@@ -311,21 +280,19 @@ def noise_text(words: str, short: bool = False) -> str:
     return text.replace(" x ", " × ").replace(" - ", " − ")
 
 
-def _count_samples(ax: Any, per_beam: float) -> None:
+def _count_samples(bar: Any, per_beam: float) -> None:
     """Add a second scale to the colour bar, in samples per pixel."""
-    bar = ax.bar_axes
     both = (lambda seconds: seconds / per_beam), (lambda samples: samples * per_beam)
-    if ax.bar_below:
-        second = bar.secondary_xaxis("top", functions=both)
-        second.set_xlabel("samples per pixel", fontsize=8, labelpad=2)
-        axis, limits = second.xaxis, bar.get_xlim()
+    if bar.orientation == "horizontal":
+        second = bar.ax.secondary_xaxis("top", functions=both)
+        axis = second.xaxis
     else:
-        second = bar.secondary_yaxis("left", functions=both)
-        second.set_ylabel("samples per pixel", fontsize=9)
-        axis, limits = second.yaxis, bar.get_ylim()
+        second = bar.ax.secondary_yaxis("left", functions=both)
+        axis = second.yaxis
+    axis.set_label_text("samples per pixel", fontsize=9)
     second.tick_params(labelsize=8)
-    if ax.images[0].norm.__class__.__name__ == "LogNorm":
-        log_labels(axis, *(edge / per_beam for edge in limits))
+    if bar.long_axis.get_scale() == "log":
+        log_labels(axis, bar.vmin / per_beam, bar.vmax / per_beam)
 
 
 def _range_of(values: AnyFloats, limit: float | None) -> tuple[float, float, str]:
@@ -353,39 +320,38 @@ def _range_of(values: AnyFloats, limit: float | None) -> tuple[float, float, str
 def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, norm: Any) -> Any:
     """Draw an image with its title and colour bar into ``ax`` or a new figure; the axes.
 
-    The colour bar has a pointed end where values lie beyond it.
+    Pixels have the shape that they have on the sky in the middle of the image; the axes say where
+    an image is stretched. The colour bar has a pointed end where values lie beyond it.
     """
     import matplotlib as mpl
 
     ax = map_axes(values.shape, wcs)[0] if ax is None else ax
-    if hasattr(ax, "coords") and not hasattr(ax, "bar_axes"):
-        _label(ax, upright=True, whole=False, latitudes=True)
+    width, height, stretched = _proportions(wcs, values.shape)
+    aspect: Any = "equal"
+    if hasattr(ax, "coords"):
+        aspect = height / values.shape[0] / (width / values.shape[1])
+        _label(ax, values.shape, stretched)
+    cmap = mpl.colormaps[colours].with_extremes(bad="0.85")
     picture = ax.imshow(
-        values,
-        origin="lower",
-        interpolation="nearest",
-        aspect="auto" if hasattr(ax, "bar_axes") else "equal",
-        cmap=mpl.colormaps[colours].with_extremes(bad="0.85"),
-        norm=norm,
+        values, origin="lower", interpolation="nearest", aspect=aspect, cmap=cmap, norm=norm
     )
     low, high = picture.get_clim()
     spare = 1e-6 * (high - low)  # of rounding
-    beyond = (
-        bool(np.ma.less(values, low - spare).any()),
-        bool(np.ma.greater(values, high + spare).any()),
+    below, above = (
+        (values < low - spare).any() is np.True_,
+        (values > high + spare).any() is np.True_,
     )
-    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond)
-    own, under = getattr(ax, "bar_axes", None), getattr(ax, "bar_below", False)
     bar = ax.figure.colorbar(
         picture,
-        extend=extend or "neither",
-        orientation="horizontal" if under else "vertical",
-        **({"ax": ax} if own is None else {"cax": own}),
+        ax=ax,
+        extend={(1, 1): "both", (1, 0): "min", (0, 1): "max"}.get((below, above), "neither"),
+        location="bottom" if width > WIDE * height else "right",
+        aspect=30,
     )
-    if norm.__class__.__name__ == "LogNorm":
-        log_labels(bar.ax.xaxis if under else bar.ax.yaxis, low, high)
+    if bar.long_axis.get_scale() == "log":
+        log_labels(bar.long_axis, low, high)
     bar.set_label(label)
-    ax.set_title(title, pad=getattr(ax, "title_pad", None))
+    ax.set_title(title)
     return ax
 
 

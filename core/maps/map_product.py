@@ -61,9 +61,10 @@ class MapProduct(MapArrays):
         ax
             Axes to draw into; default: a new figure with sky coordinates.
         limit
-            Where the colours end, in the map's unit; default: what 99.5 % of the pixels stay below.
+            Where the colours end, in the map's unit; default: what 99.95 % of the pixels stay
+            below.
         """
-        from .picture import draw_map
+        from .map_plots import draw_map
 
         return draw_map(self, ax, plane, title, limit)
 

@@ -16,13 +16,15 @@ from .map_arrays import MapArrays
 def on_plane(
     product: MapArrays, planes: Mapping[str, AnyFloats], size: int = 400
 ) -> tuple[dict[str, AnyFloats], Any]:
-    """``planes`` of a map on a grid of at most ``size`` x ``size`` points of a plane about its
-    centre; its astropy WCS.
+    """``planes`` of a TAN map and its astropy WCS; of others on a grid of at most ``size`` x
+    ``size`` points of a plane about its centre.
 
     The plane is the tangent plane, or for maps of more than 60 deg the equal-area one (ZEA); the
     grid reaches as far as the pixels with hits (of a HEALPix map, its pixels). Each point takes the
     value of the pixel it lies in; elsewhere counts (integers) are 0, other planes NaN.
     """
+    if product.projection == "TAN":
+        return dict(planes), product.wcs
     wcs, (nx, ny) = _plane(product, size)
     x, y = np.meshgrid(np.arange(nx), np.arange(ny))
     world = wcs.pixel_to_world_values(x, y)

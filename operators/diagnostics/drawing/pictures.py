@@ -112,10 +112,7 @@ class Flat:
         if product.smoothed_by and product.projection != "HEALPix":
             seen = smoother(product.grid, product.smoothed_by)(seen)
         found: dict[str, Any] = {**planes, "hits": product.known_hits, "seen": seen}
-        if product.projection == "TAN":
-            wcs = wcs_of(product.header)
-        else:
-            found, wcs = on_plane(product, found)
+        found, wcs = on_plane(product, found)
         hits, seen = found.pop("hits"), np.nan_to_num(found.pop("seen"))
         used = seen[hits > 0]
         return cls(

@@ -150,7 +150,7 @@ def test_pictures_are_drawn_into_the_axes_that_are_given(brightness):
     own = brightness.to("uK_CMB").plot(limit=5.0)
     assert own.figure is not figure
     assert own.images[0].get_clim() == (-5.0, 5.0)
-    assert own.images[0].colorbar.ax.get_ylabel() == "uK_CMB"
+    assert own.images[0].colorbar.ax.get_ylabel() == "brightness [uK_CMB]"
     lon, lat = own.coords[0], own.coords[1]
     assert (lon.get_axislabel(), lat.get_axislabel()) == ("RA (ICRS)", "Dec (ICRS)")
     with pytest.raises(InputError, match=r"no plane 'nois'(.|\n)*did you mean 'noise'"):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from zonda.core.instrument import Band
+from zonda.core.maps.map_plots import plot_map
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.picture import Shown, draw
 from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
 from zonda.operators.diagnostics.report_results import expected
 from zonda.operators.maps.grid import tangent_wcs
@@ -144,7 +144,7 @@ def test_the_beam_of_a_picture_is_round_on_the_sky():
     from matplotlib.figure import Figure
 
     ax = Figure().add_subplot()
-    draw(Shown(one.signal, one.wcs, "K_RJ", fwhm=FWHM), ax, None)
+    plot_map(one.signal, one.wcs, fwhm=FWHM, ax=ax)
     (beam,) = ax.patches
     sizes = sorted([beam.width, beam.height])
     assert sizes == pytest.approx(

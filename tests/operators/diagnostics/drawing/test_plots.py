@@ -82,7 +82,7 @@ def test_pictures_have_the_proportions_of_the_sky(kind, steps, dec):
         shape[1] / 2 + 0.5,
         shape[0] / 2 + 0.5 - (dec * 3600 / dy if kind == "CAR" else 0),
     ]
-    ax = plot_map(np.random.default_rng(1).standard_normal(shape), wcs, fwhm=40 * ARCSEC)
+    ax = drawn(plot_map(np.random.default_rng(1).standard_normal(shape), wcs, fwhm=40 * ARCSEC))
     box = ax.get_window_extent()
     assert box.width / box.height == pytest.approx(1.0, rel=0.02)
     beam = ellipses(ax)[0].get_window_extent()
@@ -148,7 +148,7 @@ def ellipses(ax):
 
 
 def drawn(ax):
-    ax.figure.canvas.draw()
+    FigureCanvasAgg(ax.figure).draw()
     return ax
 
 
@@ -433,7 +433,7 @@ def test_a_strip_fills_its_frame(shape, stretched, wcs):
     assert max(box.width / whole.width, box.height / whole.height) > 0.65
     assert stretched in ax.get_xlabel()
     assert ("stretched" in ax.get_xlabel()) == bool(stretched)
-    bar = ax.bar_axes.get_window_extent()
+    bar = ax.images[0].colorbar.ax.get_window_extent()
     assert (bar.width > bar.height) == (shape[1] > shape[0])
 
 
@@ -653,8 +653,9 @@ def test_maps_side_by_side_have_their_latitudes_written_once(values, wcs):
     first, second = map_axes(values.shape, wcs, 2)
     for ax in (first, second):
         plot_map(values, wcs, ax=ax)
+    drawn(first)
     assert first.get_ylabel()
     assert not second.get_ylabel()
-    assert first.get_position().width == pytest.approx(second.get_position().width)
+    assert first.get_position().width == pytest.approx(second.get_position().width, rel=1e-3)
     assert second.get_position().x1 < 1
-    assert second.bar_axes.get_position().x1 < 1
+    assert second.images[0].colorbar.ax.get_position().x1 < 1
