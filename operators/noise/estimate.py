@@ -116,21 +116,17 @@ def spectrum(
 
     ``row`` (n,) K; ``good`` (n,): samples that may be used.
     """
-    step = length // 2
-    begins = np.arange(0, len(row) - length + 1, step)
-    spoilt = np.r_[0, np.cumsum(~(good & np.isfinite(row)))]
-    begins = begins[spoilt[begins + length] == spoilt[begins]]
-    frequency = np.asarray(np.fft.rfftfreq(length, 1 / rate)[1:], np.float64)
-    if len(begins) < FEWEST:
-        return frequency, np.full(len(frequency), np.nan), 0
-    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
-    line = np.linspace(-1.0, 1.0, length)
-    parts = np.stack([row[b : b + length] for b in begins])
-    parts = parts - parts.mean(axis=1, keepdims=True)
-    parts -= (parts @ line / (line @ line))[:, None] * line
-    power = np.abs(np.fft.rfft(parts * window, axis=1)[:, 1:]) ** 2 * (
-        2 / (rate * (window @ window))
+    from scipy.signal import detrend, spectrogram
+
+    good = good & np.isfinite(row)
+    found, _, power = spectrogram(
+        np.where(good, row, 0.0), rate, "hann", length, length // 2, detrend=detrend
     )
+    spoilt, begins = np.r_[0, np.cumsum(~good)], np.arange(power.shape[1]) * (length // 2)
+    whole = spoilt[begins + length] == spoilt[begins]
+    frequency, power = np.asarray(found[1:], np.float64), power[1:, whole].T
+    if len(power) < FEWEST:
+        return frequency, np.full(len(frequency), np.nan), 0
     level = power[:, power.shape[1] // 2 :].mean(axis=1)
     away = np.abs(level - np.median(level))
     power = power[away <= OUTLYING * 1.4826 * np.median(away)]
@@ -156,8 +152,7 @@ def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
     log_p = (
         np.log(p) + np.diag(covariance) / 2
     )  # the mean of a logarithm lies below the logarithm of the mean
-    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-    alike = whiten.sum(axis=1)  # a level that all bins have in common
+    alike = np.linalg.solve(covariance, np.ones(len(p)))  # weighs a level that all have in common
     start = math.log(float(np.median(p[f > f[-1] / 3])))
     middle = math.sqrt(f[0] * f[-1])
 
@@ -165,47 +160,41 @@ def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
     near, share = _mixed(every[:MIXED], frequency[0])
     log_near = np.log(near / middle)
 
-    def residual(x: Any) -> Any:
-        red = np.exp(x[1] - x[2] * log_f)
-        red[:MIXED] = np.exp(x[1] - x[2] * log_near) @ share
-        return whiten @ (np.log(bins.mean(np.exp(x[0]) + red)) - log_p)
+    def law(_: Any, white: float, red: float, slope: float) -> Floats:
+        power = np.exp(red - slope * log_f)
+        power[:MIXED] = np.exp(red - slope * log_near) @ share
+        return np.log(bins.mean(np.exp(white) + power))
 
-    from scipy.optimize import least_squares
+    def cost(found: Floats) -> float:
+        return float((found - log_p) @ np.linalg.solve(covariance, found - log_p))
 
-    low = float(log_p[0])
+    from scipy.optimize import curve_fit
+
     limits = [-np.inf, start - 40, LEAST_SLOPE], [np.inf, np.inf, 4.0]
-    guesses = [
-        [start, max(low, start - 2.0) - slope * math.log(middle / f[0]), slope]
-        for slope in (1.0, 2.0)
-    ]
-    found = min(
-        (least_squares(residual, guess, bounds=limits) for guess in guesses),
-        key=lambda tried: float(tried.cost),
-    )
-    level, variance = float(alike @ whiten @ log_p / (alike @ alike)), float(1 / (alike @ alike))
-    white_cost = 0.5 * float(np.sum((whiten @ (level - log_p)) ** 2))
-    inside = float(found.x[1] - found.x[0]) < float(found.x[2]) * math.log(
-        f[-1] / middle
-    )  # the knee lies below the last frequency
-    if (
-        white_cost - found.cost < 3.0 or not inside
-    ):  # two more parameters do as much by chance in one of twenty cases
-        net = math.sqrt(math.exp(level) / 2)
-        chi = 2 * white_cost / max(len(f) - 1, 1)
+    tried = []
+    for slope in (1.0, 2.0):
+        red = max(float(log_p[0]), start - 2.0) - slope * math.log(middle / f[0])
+        found = curve_fit(law, f, log_p, [start, red, slope], covariance, True, bounds=limits)
+        tried.append((cost(law(f, *found[0])), *found))
+    chi, (white, red, slope), errors = min(tried, key=lambda one: one[0])
+    level, variance = float(alike @ log_p / alike.sum()), float(1 / alike.sum())
+    of_white = cost(np.full(len(f), level))
+    inside = red - white < slope * math.log(f[-1] / middle)  # the knee is below the last frequency
+    if of_white - chi < 6.0 or not inside:
+        # Two more parameters do as much by chance in one of twenty cases.
+        net, chi = math.sqrt(math.exp(level) / 2), of_white / max(len(f) - 1, 1)
         return Noise(net, net * math.sqrt(variance) / 2, 0.0, float(f[0]), 1.0, 0.0, segments, chi)
-    white, red, slope = found.x
-    covariance = np.linalg.pinv(np.asarray(found.jac).T @ np.asarray(found.jac))
     net, knee = math.sqrt(math.exp(white) / 2), middle * math.exp((red - white) / slope)
     gradient = np.array([-1.0, 1.0, -(red - white) / slope]) / slope  # of ln knee
     return Noise(
         net,
-        net * math.sqrt(covariance[0, 0]) / 2,
+        net * math.sqrt(errors[0, 0]) / 2,
         knee,
-        knee * math.sqrt(float(gradient @ covariance @ gradient)),
+        knee * math.sqrt(float(gradient @ errors @ gradient)),
         float(slope),
-        math.sqrt(covariance[2, 2]),
+        math.sqrt(errors[2, 2]),
         segments,
-        2 * found.cost / max(len(f) - 3, 1),
+        chi / max(len(f) - 3, 1),
     )
 
 

@@ -164,7 +164,7 @@ def power_law_filter(f_min: float, slope: float, poles: int) -> PowerLawFilter:
     """
     if not 0 < f_min < 0.5:
         text = f"minimum_frequency is {2 * f_min:.3g} times the Nyquist frequency"
-        raise InputError(text, place="pink noise", cure="choose a lower minimum_frequency")
+        raise InputError(text, cure="choose a lower minimum_frequency")
     fits: list[PowerLawFilter] = []
     enough = _GOOD if poles <= _FEW else _BETTER
     for ends in [e for e in (1, 0, 2, 3, 4) if e <= poles - 2]:
@@ -178,7 +178,6 @@ def power_law_filter(f_min: float, slope: float, poles: int) -> PowerLawFilter:
         raise InputError(
             f"{poles} poles fit f^-{slope:g} from {f_min:.2g} of the sampling rate up only to"
             f" {100 * best.error:.0f} %",
-            place="pink noise",
             cure="raise poles or minimum_frequency",
         )
     return best

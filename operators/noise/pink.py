@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from zonda.core.configuration.units import Fraction, Hertz, KelvinRootSecond
-from zonda.core.errors import InputError
+from zonda.core.errors import placed
 from zonda.core.operator import Operator
 from zonda.core.plausible import KNEE, doubt
+from zonda.core.types import Floats
 
-from .level import Amplitude, NoiseLevel, announced, resolve
-from .models import FixedNet
+from .models import Amplitude, FixedNet, NoiseLevel, announced, resolve
 from .one_over_f import PowerLawFilter, power_law_filter
 from .streams import Streams, StreamsOfSlopes
 
@@ -88,7 +88,7 @@ class PinkNoise(Operator):
         for rate in {observation.sampling[1] for observation in data.observations}:
             for observation in data.observations[0].of_each_band():
                 if spectrum := PinkSpectrum.of(self, observation):
-                    _fitted(self, replace(spectrum, rate=rate), observation)
+                    replace(spectrum, rate=rate).filters(self)
         return []
 
     def prepare(self, observation: Observation) -> _State | None:
@@ -139,42 +139,25 @@ class _State(NamedTuple):
     """
 
 
-def _fitted(
-    pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation
-) -> dict[float, PowerLawFilter]:
-    """The filter of the spectrum's own slope, and of each that a detector has.
-
-    Raises InputError where the number of poles cannot fit the spectrum (see `power_law_filter`).
-    """
-    slopes = [spectrum.slope, *spectrum.of_detectors(pink, observation).slopes]
-    try:
-        return {slope: replace(spectrum, slope=slope).filter(pink.poles) for slope in slopes}
-    except InputError as err:
-        raise InputError(err.message, place=pink.label, cure=err.cure) from None
-
-
 def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation) -> _State:
-    """Raises InputError as `_fitted`."""
-    each, laws = spectrum.of_detectors(pink, observation), _fitted(pink, spectrum, observation)
-    law = laws[spectrum.slope]
+    """Raises InputError as `PinkSpectrum.filters`."""
+    laws, slopes = spectrum.filters(pink), spectrum.different
     observation.tally.state(
-        pink.label, "power over that of white noise", each.describe() + spectrum.describe(law)
+        pink.label, "power over that of white noise", spectrum.describe(laws[spectrum.slope])
     )
     resolve(observation)
     level = level_of(pink, observation)
-    net = level.sky_net(observation)
-    spectrum.state(observation, net, each)
-    squares = np.where(observation.good_detectors, net**2, 0.0) / max(
-        int(observation.good_detectors.sum()), 1
-    )
+    net, good = level.sky_net(observation), observation.good_detectors
+    spectrum.state(observation, net)
+    squares = np.where(good, net**2, 0.0) / max(int(good.sum()), 1)
     observation.closed_forms.setdefault("pink", []).append(
-        lambda f: 2 * each.over_white(f, squares)
+        lambda f: 2 * spectrum.over_white(f, squares)
     )
-    gain = np.sqrt([laws[slope].gain for slope in each.slope.tolist()])
-    amplitude = Amplitude(pink.label, level, observation, each.factor * gain)
+    gain = np.sqrt([laws[slope].gain for slope in spectrum.slopes.tolist()])
+    amplitude = Amplitude(pink.label, level, observation, spectrum.factors * gain)
     key, start = observation.detector_key(pink.label), observation.detector_key(pink.label, "start")
-    made = {slope: Streams(laws[slope], key, start) for slope in each.slopes}
-    streams = made[each.slopes[0]] if len(made) == 1 else StreamsOfSlopes(each.slope, made)
+    made = {slope: Streams(laws[slope], key, start) for slope in slopes}
+    streams = made[slopes[0]] if len(made) == 1 else StreamsOfSlopes(spectrum.slopes, made)
     common = np.zeros((len(made), observation.n_samples if pink.shared else 0), np.float32)
     if pink.shared:  # the same deviates through the filter of each slope
         keys = [observation.detector_key(pink.label, "shared", *more) for more in ((), ("start",))]
@@ -188,125 +171,110 @@ class PinkSpectrum:
     """The spectrum of pink noise over that of white noise: (f / knee)^-slope from ``minimum`` to
     the Nyquist frequency.
 
-    Frequencies in Hz; ``rate`` is that of the samples.
+    Attributes
+    ----------
+    knee, slope, minimum, rate
+        What the step asks for, else the instrument's; ``rate`` is that of the samples. Hz.
+    knees, slopes
+        (n_det,) of the single detectors: those that the instrument's focal plane has, where the
+        step states none.
     """
 
     knee: float
     slope: float
     minimum: float
     rate: float
+    knees: Floats = field(repr=False)
+    slopes: Floats = field(repr=False)
 
     @classmethod
     def of(cls, pink: PinkNoise, observation: Observation) -> PinkSpectrum | None:
-        """Spectrum that the step asks for, else the instrument's; None: no pink noise."""
-        instrument = observation.instrument
+        """Spectrum of an observation; None: no pink noise."""
+        instrument, n = observation.instrument, observation.n_detectors
         knee = instrument.knee if pink.knee is None else pink.knee
-        if pink.knee is None and not knee:  # the median; single detectors may have some
-            knee = float(instrument.focalplane().knee.max())
-        minimum = pink.minimum_frequency or instrument.pink_minimum_frequency
-        return (
-            cls(knee, pink.slope or instrument.slope, minimum, observation.sample_rate)
-            if knee
-            else None
-        )
+        plane = instrument.focalplane() if pink.knee is None or pink.slope is None else None
+        if plane and pink.knee is None and not knee:  # the median; single detectors may have some
+            knee = float(plane.knee.max())
+        if not knee:
+            return None
+        slope, minimum = pink.slope or instrument.slope, pink.minimum_frequency
+        knees, slopes = np.full(n, knee), np.full(n, slope)
+        if plane and plane.names == observation.focalplane.names:
+            if pink.knee is None and np.ptp(plane.knee):
+                knees = plane.knee
+            if pink.slope is None and np.ptp(plane.slope):
+                slopes = np.clip(plane.slope.round(1), 0.1, 3.0)
+        minimum = minimum or instrument.pink_minimum_frequency
+        return cls(knee, slope, minimum, observation.sample_rate, knees, slopes)
 
     @property
     def factor(self) -> float:
         """Root of the spectrum at its ``minimum``."""
         return float((self.knee / self.minimum) ** (self.slope / 2))
 
-    def over_white(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(f / knee)^-slope, level below the minimum."""
-        return np.asarray(
-            (np.maximum(frequency, self.minimum) / self.knee) ** -self.slope, np.float64
-        )
+    @property
+    def factors(self) -> Floats:
+        """(n_det,) `factor` of each detector; by single numbers, whose powers have the same bits
+        anywhere.
+        """
+        pairs = zip(self.knees.tolist(), self.slopes.tolist(), strict=True)
+        return np.array([(knee / self.minimum) ** (slope / 2) for knee, slope in pairs])
+
+    @property
+    def different(self) -> list[float]:
+        """The different slopes."""
+        return [float(slope) for slope in np.unique(self.slopes)]
 
     def filter(self, poles: int) -> PowerLawFilter:
         """The recursive filter that makes it of white noise of the rms `factor`."""
         return power_law_filter(self.minimum / self.rate, self.slope, poles)
 
-    def describe(self, law: PowerLawFilter) -> str:
-        """The spectrum in words, with the errors of its filter."""
-        text = (
-            f"(f / {self.knee:g} Hz)^-{self.slope:g} from {self.minimum:g} Hz to"
-            f" {self.rate / 2:g} Hz "
-        )
-        text += f"within {100 * law.error:.2g} %, "
-        return (
-            text
-            + f"levelling off below to {law.plateau:.2g} times its value at {self.minimum:g} Hz"
-        )
+    def filters(self, pink: PinkNoise) -> dict[float, PowerLawFilter]:
+        """The filter of the spectrum's own slope, and of each that a detector has.
 
-    def of_detectors(self, pink: PinkNoise, observation: Observation) -> Detectors:
-        """The spectra of the single detectors: those that the instrument's focal plane has, where
-        the step states none.
+        Raises InputError where the number of poles cannot fit the spectrum (see
+        `power_law_filter`).
         """
-        n, instrument = observation.n_detectors, observation.instrument
-        knee, slope = np.full(n, self.knee), np.full(n, self.slope)
-        if pink.knee is None or pink.slope is None:
-            plane = instrument.focalplane()
-            if plane.names == observation.focalplane.names:
-                knee = plane.knee if pink.knee is None and np.ptp(plane.knee) else knee
-                slope = (
-                    np.clip(plane.slope.round(1), 0.1, 3.0)
-                    if pink.slope is None and np.ptp(plane.slope)
-                    else slope
-                )
-        return Detectors(knee, slope, self.minimum)
+        with placed(pink.label):
+            return {
+                slope: replace(self, slope=slope).filter(pink.poles)
+                for slope in [self.slope, *self.different]
+            }
 
-    def state(self, observation: Observation, net: NDArray[np.float64], each: Detectors) -> None:
+    def describe(self, law: PowerLawFilter) -> str:
+        """The spectrum in words: differences between detectors, and the errors of its filter."""
+        spans = [
+            f"{what} {values.min():.4g} to {values.max():.4g}{unit}"
+            for what, values, unit in (("knee", self.knees, " Hz"), ("slope", self.slopes, ""))
+            if np.ptp(values)
+        ]
+        text = f"{', '.join(spans)}; at the median " if spans else ""
+        return (
+            f"{text}(f / {self.knee:g} Hz)^-{self.slope:g} from {self.minimum:g} Hz to"
+            f" {self.rate / 2:g} Hz within {100 * law.error:.2g} %, levelling off below to"
+            f" {law.plateau:.2g} times its value at {self.minimum:g} Hz"
+        )
+
+    def over_white(self, frequency: Floats, weights: Floats) -> Floats:
+        """Sum over detectors of ``weights`` (n_det,) times the spectra over those of white noise,
+        (n,).
+        """
+        f = np.maximum(frequency, self.minimum)
+        found = np.zeros(len(f))
+        for slope in self.different:
+            mine = self.slopes == slope
+            found += np.sum(weights[mine] * self.knees[mine] ** slope) * f**-slope
+        return found
+
+    def state(self, observation: Observation, net: Floats) -> None:
         """Write it to the focal plane, where the knee refers to the white noise of that: here it
         refers to ``net`` (n_det,).
         """
         plane = observation.focalplane
         white = np.where(plane.net > 0, plane.net, net)
         ratio = np.divide(net, white, out=np.ones(len(plane)), where=white > 0)
-        plane.knee = each.knee * ratio ** (2 / each.slope)
-        plane.slope, plane.minimum_frequency = each.slope.copy(), np.full(len(plane), self.minimum)
-
-
-@dataclass(frozen=True)
-class Detectors:
-    """Spectra as `PinkSpectrum`, of each detector: ``knee`` and ``slope`` (n_det,)."""
-
-    knee: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    minimum: float
-
-    @property
-    def slopes(self) -> list[float]:
-        """The different slopes."""
-        return [float(slope) for slope in np.unique(self.slope)]
-
-    @property
-    def factor(self) -> NDArray[np.float64]:
-        """(n_det,) root of the spectrum at its ``minimum``; by single numbers, whose powers have
-        the same bits anywhere.
-        """
-        pairs = zip(self.knee.tolist(), self.slope.tolist(), strict=True)
-        return np.array([(knee / self.minimum) ** (slope / 2) for knee, slope in pairs])
-
-    def describe(self) -> str:
-        """Differences between detectors in words; empty if there are none."""
-        spans = [
-            f"{what} {values.min():.4g} to {values.max():.4g}{unit}"
-            for what, values, unit in (("knee", self.knee, " Hz"), ("slope", self.slope, ""))
-            if np.ptp(values)
-        ]
-        return f"{', '.join(spans)}; at the median " if spans else ""
-
-    def over_white(
-        self, frequency: NDArray[np.float64], weights: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Sum over detectors of ``weights`` (n_det,) times the spectra over those of white noise,
-        (n,).
-        """
-        f = np.maximum(frequency, self.minimum)
-        found = np.zeros(len(f))
-        for slope in self.slopes:
-            mine = self.slope == slope
-            found += np.sum(weights[mine] * self.knee[mine] ** slope) * f**-slope
-        return found
+        plane.knee = self.knees * ratio ** (2 / self.slopes)
+        plane.slope, plane.minimum_frequency = self.slopes.copy(), np.full(len(plane), self.minimum)
 
 
 def level_of(pink: PinkNoise, observation: Observation) -> WhiteLevel:

@@ -69,9 +69,8 @@ class PinkPlanning(Planning[PinkNoise]):
         kept = -(-n_det // TILE_DETECTORS) * (n_samp // CHECKPOINT + 3)
         common = 12 * n_samp if pink.shared > 0 else 0
         if spectrum := PinkSpectrum.of(pink, observation):
-            slopes = spectrum.of_detectors(pink, observation).slope
-            kept = math.ceil(kept * filters_in_a_tile(slopes))
-            common *= len(np.unique(slopes))
+            kept = math.ceil(kept * filters_in_a_tile(spectrum.slopes))
+            common *= len(spectrum.different)
         return kept * (4 * TILE_DETECTORS * (pink.poles + 3) + 300) + common + 80 * n_det
 
     def traits(self, observation: Observation) -> Traits:
@@ -126,10 +125,8 @@ class PinkPlanning(Planning[PinkNoise]):
         """rms of the white noise that is filtered, in the calibrated stream; of the noisiest
         detector, K.
         """
-        each = spectrum.of_detectors(self.operator, observation)
-        return float(
-            np.max(calibrated(level_of(self.operator, observation), observation) * each.factor)
-        )
+        level = calibrated(level_of(self.operator, observation), observation)
+        return float(np.max(level * spectrum.factors))
 
 
 def calibrated(level: WhiteLevel, observation: Observation) -> Floats:

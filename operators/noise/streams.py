@@ -93,13 +93,7 @@ class Streams:
             ones = SmoothField.constant(np.ones(n_det), sample + n_samp)
             level = ones.series(slice(0, n_det), slice(sample, sample + n_samp), out.dtype)
         shares = np.sqrt(np.array([1 - shared, shared])).astype(out.dtype)
-        edges = [
-            detector,
-            *range(
-                (detector // TILE_DETECTORS + 1) * TILE_DETECTORS, detector + n_det, TILE_DETECTORS
-            ),
-        ]
-        for low, high in pairwise([*edges, detector + n_det]):
+        for low, high in _pieces(detector, detector + n_det, TILE_DETECTORS):
             rows = slice(low - detector, high - detector)
             part = Series(level.lines[rows], level.first, level.inside)
             self._add_tile(low, sample, out[rows], part, common, shares, over)
@@ -123,28 +117,15 @@ class Streams:
         with tile.lock:
             nearest = max(k for k in tile.kept if k <= sample)
             state = tile.kept[nearest].copy()
-            law = self._rate, self._tap, self._pairs
-            for start, stop in _pieces(nearest, sample):
-                _filter(
-                    self.key,
-                    number,
-                    start,
-                    stop - start,
-                    state,
-                    *law,
-                    0,
-                    *level,
-                    common[:0],
-                    shares,
-                    over,
-                    out[:0],
-                )
-                self._keep(tile, stop, state)
-            for start, stop in _pieces(sample, sample + out.shape[1]):
-                part = slice(start - sample, stop - sample)
-                these = common[part], shares, over, out[:, part]
-                _filter(self.key, number, start, stop - start, state, *law, lane, *level, *these)
-                self._keep(tile, stop, state)
+            law, stop = (self._rate, self._tap, self._pairs), sample + out.shape[1]
+            pieces = [(nearest, sample), (sample, stop)]
+            for begin, end in (p for piece in pieces for p in _pieces(*piece, CHECKPOINT)):
+                part, rows = slice(begin - sample, end - sample), out
+                if begin < sample:  # on the way there
+                    part, rows = slice(0, 0), out[:0]
+                these = common[part], shares, over, rows[:, part]
+                _filter(self.key, number, begin, end - begin, state, *law, lane, *level, *these)
+                self._keep(tile, end, state)
 
     def _keep(self, tile: _Tile, sample: int, state: NDArray[np.float32]) -> None:
         if tile.last % CHECKPOINT and tile.last != sample:
@@ -191,18 +172,10 @@ class StreamsOfSlopes:
         in the order of ``made``.
         """
         n_det, n_samp = out.shape
-        edges = [
-            detector,
-            *range(
-                (detector // TILE_DETECTORS + 1) * TILE_DETECTORS, detector + n_det, TILE_DETECTORS
-            ),
-        ]
-        for low, high in pairwise([*edges, detector + n_det]):
+        for low, high in _pieces(detector, detector + n_det, TILE_DETECTORS):
             rows = slice(low - detector, high - detector)
-            part, tile = (
-                Series(level.lines[rows], level.first, level.inside),
-                np.empty((high - low, n_samp), out.dtype),
-            )
+            part = Series(level.lines[rows], level.first, level.inside)
+            tile = np.empty((high - low, n_samp), out.dtype)
             for slope in np.unique(self._slopes[low:high]).tolist():
                 mine = common[list(self._made).index(slope)]
                 self._made[slope].add(low, sample, tile, part, mine, shared, over=True)
@@ -213,9 +186,9 @@ class StreamsOfSlopes:
                         out[rows][row] += tile[row]
 
 
-def _pieces(start: int, stop: int) -> list[tuple[int, int]]:
-    """Cut a range at the multiples of `CHECKPOINT`."""
-    cuts = [start, *range((start // CHECKPOINT + 1) * CHECKPOINT, stop, CHECKPOINT), stop]
+def _pieces(start: int, stop: int, size: int) -> list[tuple[int, int]]:
+    """Cut a range at the multiples of ``size``."""
+    cuts = [start, *range((start // size + 1) * size, stop, size), stop]
     return list(pairwise(cuts)) if stop > start else []
 
 

@@ -17,8 +17,7 @@ from zonda.core.numerics.smooth import series_into
 from zonda.core.operator import Operator
 from zonda.core.plausible import NET, doubt
 
-from .level import Amplitude, NoiseLevel, resolve
-from .models import FixedNet, NoiseModel, noise_model
+from .models import Amplitude, FixedNet, NoiseLevel, NoiseModel, noise_model, resolve
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

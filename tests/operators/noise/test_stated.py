@@ -11,7 +11,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
 from zonda.operators.io.save_tod import load_tod
-from zonda.operators.noise.level import rms_of_inverse
+from zonda.operators.noise.models import rms_of_inverse
 from zonda.operators.noise.white import WhiteNoise
 from zonda.plugins.checks.scenes import camera
 
