@@ -23,7 +23,7 @@ from zonda.operators.maps.sums import DATA
 from zonda.operators.noise import pink, white
 from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing import recording
-from zonda.operators.sky import read
+from zonda.operators.sky.map_header import MapHeader
 
 Patch = pytest.MonkeyPatch
 
@@ -135,7 +135,7 @@ def mean_emission_in_float32(patch: Patch) -> None:
 
 def nan_pixels_that_stay(patch: Patch) -> None:
     patch.setattr(
-        read, "filled", lambda place, values, missing, first: int((~np.isfinite(values)).sum())
+        MapHeader, "filled", lambda header, values, first: int((~np.isfinite(values)).sum())
     )
 
 

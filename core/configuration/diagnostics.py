@@ -16,7 +16,7 @@ from .yaml_places import Span
 
 
 class TextValue:
-    """A pydantic field type that `parse` reads and ``str`` writes."""
+    """A pydantic field type that `parse` reads and `dump` writes."""
 
     json_schema: ClassVar[dict[str, Any]] = {"type": "string"}
 
@@ -25,13 +25,19 @@ class TextValue:
         """From text, or whatever else stands for such a value. Raises what `mistake` makes."""
         raise NotImplementedError
 
+    def dump(self) -> Any:
+        """What stands for it in files; as a default its text."""
+        return str(self)
+
     @classmethod
     def __get_pydantic_core_schema__(
         cls, source: Any, handler: GetCoreSchemaHandler
     ) -> core_schema.CoreSchema:
         return core_schema.no_info_plain_validator_function(
             cls.parse,
-            serialization=core_schema.plain_serializer_function_ser_schema(str, when_used="json"),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                cls.dump, when_used="json"
+            ),
         )
 
     @classmethod

@@ -18,7 +18,7 @@ from zonda.core.types import Floats
 from .grid import Grid
 from .gridding import Gridding, gridded, interpolated
 from .input_map import ImageMap
-from .limits import check_brightness
+from .map_header import check_brightness
 from .region import Progress, directions_on
 
 if TYPE_CHECKING:

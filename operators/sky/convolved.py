@@ -17,10 +17,9 @@ from .geometry import moved, placed
 from .grid import Grid, is_resolved, own_pixels, tangent_grid
 from .gridding import Gridding
 from .input_map import ImageMap
-from .limits import check_brightness, odd_pixels
+from .map_header import DOUBT, check_brightness, odd_pixels
 from .sky_input import SkyInput
 from .state import Beam
-from .units import DOUBT
 
 if TYPE_CHECKING:
     from zonda.core.data import Data, Observation
@@ -113,7 +112,7 @@ class ConvolvedSky(SkyInput):
                 float(np.abs(intensity.coefficients["float64"]).max(initial=0.0)),
                 sky.notes["conversion"],
             ):
-                warnings.warn(f"{self.label}: {self.file or self.source}: {text}", stacklevel=2)
+                self.warn(text)
             more = () if sky.polarization is None else sky.polarization
             return Beam.of(
                 sky, fwhm, intensity, tuple(convolved(values, 0.0).coefficients for values in more)
@@ -137,19 +136,14 @@ class ConvolvedSky(SkyInput):
             any(o.focalplane.polarized for o in data.observations)
             or instrument.focalplane().polarized
         )
-        large = (
-            self.map is None
-            and self.file is not None
-            and self.file.exists()
-            and self.file.stat().st_size > LOOKED_WHOLE
-        )
+        large = self._bytes > LOOKED_WHOLE
         source = (
             self.read_input(polarized, header_alone=True) if large else self._input(polarized)[0]
         )
         if isinstance(source, ImageMap) and self.beam != "none":
             beam = instrument.beam_fwhm if self.fwhm is None else self.fwhm
             if text := odd_pixels(source.sides, source.shape, beam):
-                warnings.warn(f"{self.label}: {self.file or self.source}: {text}", stacklevel=2)
+                self.warn(text)
         beams = np.array([camera.beam_fwhm for camera in instrument.cameras.values()])
         self.warn_of_beams(source, beams)
         lines = [f"{what}: {text}" for what, text in source.notes.items() if what != DOUBT]

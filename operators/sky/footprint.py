@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from zonda.core.configuration.target import Target
-from zonda.core.maps.map_reading import chosen, is_healpix
 from zonda.core.numerics.projection import pixel_matrix
 from zonda.core.numerics.sphere import angle_between, angles, unit_vectors
-from zonda.core.storage.files import reading
-from zonda.core.storage.fits_files import opened
 from zonda.core.types import Floats
 
-from .geometry import geometry, moved, placed
-from .input_map import ImageMap
+from .geometry import moved, placed
+from .input_map import ImageMap, InputMap
 
 
 @dataclass(frozen=True)
@@ -51,54 +46,24 @@ class Footprint:
         ny, nx = self.shape
         return bool(depth > 0 and -0.5 <= x / depth <= nx - 0.5 and -0.5 <= y / depth <= ny - 0.5)
 
+    @classmethod
+    def of(cls, image: InputMap, centre: Target | None, place: str) -> Footprint | None:
+        """Of a map that is put at ``centre``; None where it has no place of its own: HEALPix, or an
+        image without a WCS. Raises InputError as `moved`.
+        """
+        if not isinstance(image, ImageMap) or (image.placeless and centre is None):
+            return None
+        at = None if centre is None else centre.icrs()
+        wcs = placed(image, at)
+        disc, _ = (image if at is None else moved(image, at, place)).extent
+        matrix = None if wcs is None else pixel_matrix(wcs)
+        return None if disc is None else cls(disc.centre, disc.radius, matrix, image.shape)
+
     @property
     def target(self) -> Target:
         """Its centre as text, to 1e-9 deg."""
         ra, dec = np.degrees(angles(self.centre))
         return Target.parse(f"{ra:.9f} deg {dec:.9f} deg")
-
-
-def footprint(
-    header: Any, shape: tuple[int, int], pixel_size: float | None, centre: Target | None, place: str
-) -> Footprint | None:
-    """The footprint of an image (`header_of`); None where it has no place of its own: an image
-    without a WCS.
-
-    ``pixel_size`` [rad] and ``centre`` as `SkyMap` has them. Raises `InputError` as
-    `read.read_map`.
-    """
-    wcs, placeless = geometry(place, header, shape, pixel_size, centre is not None, {})
-    values = np.broadcast_to(np.float64(0.0), shape)
-    image = ImageMap(values=values, unit="K_RJ", wcs=wcs, placeless=placeless)
-    if centre is None and placeless:
-        return None
-    tangent = placed(image, None if centre is None else centre.icrs())
-    if centre is not None:
-        image = moved(image, centre.icrs(), place)
-    with reading(place, "FITS", "check CTYPE, CRVAL, CRPIX, CDELT, PC or CD"):
-        disc, _ = image.extent
-    if disc is None:
-        return None
-    matrix = None if tangent is None else pixel_matrix(tangent)
-    return Footprint(disc.centre, disc.radius, matrix, shape)
-
-
-def header_of(
-    path: Path, wanted: int | str | None, place: str
-) -> tuple[Any, tuple[int, int]] | None:
-    """Header and (ny, nx) of a file's first image, or of the extension ``wanted``; None: a HEALPix
-    table.
-    """
-    with opened(
-        path, place, "check the file, e.g. with fitsinfo or fitsverify, or copy it again"
-    ) as hdus:
-        hdu, _ = chosen(hdus, wanted, place)
-        if is_healpix(hdu):
-            return None
-        return hdu.header.copy(), (
-            int(hdu.header.get("NAXIS2", 1)),
-            int(hdu.header.get("NAXIS1", 1)),
-        )
 
 
 def off_the_map(found: Footprint, centre: tuple[float, float], label: str) -> str:

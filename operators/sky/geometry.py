@@ -9,10 +9,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from astropy import units as u
 from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
-from zonda.core.maps.header import number, text, with_known_frame
+from zonda.core.maps.header import text, with_known_frame
 from zonda.core.maps.map_reading import is_celestial
 from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.numerics.sphere import angles, local_axes
@@ -20,139 +21,152 @@ from zonda.core.storage.files import first_line
 from zonda.core.types import Floats
 
 from .input_map import ImageMap
-from .limits import check_geometry, check_sides
+from .map_header import MapHeader
 
-_ANGLES = {
-    **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
-    **dict.fromkeys(("rad", "radian", "radians"), "rad"),
-    **dict.fromkeys(("arcmin", "arcminute", "arcminutes"), "arcmin"),
-    **dict.fromkeys(("arcsec", "arcsecond", "arcseconds", "asec"), "arcsec"),
-    "mas": "mas",
+ANGLES = {
+    **dict.fromkeys(("deg", "degree", "degrees"), u.deg),
+    **dict.fromkeys(("rad", "radian", "radians"), u.rad),
+    **dict.fromkeys(("arcmin", "arcminute", "arcminutes"), u.arcmin),
+    **dict.fromkeys(("arcsec", "arcsecond", "arcseconds", "asec"), u.arcsec),
+    "mas": u.mas,
 }
+"""Values of CUNIT that are read."""
 ROUNDED = 1e-12
 """rad by which a map that is moved along is not turned."""
-_IN_RADIANS = {
-    "deg": np.pi / 180,
-    "rad": 1.0,
-    "arcmin": np.pi / 10800,
-    "arcsec": np.pi / 648000,
-    "mas": np.pi / 648e6,
-}
+FARTHEST = 1e9
+"""Pixel of the reference point."""
+EQUINOXES = (1500.0, 2500.0)
+UNITS = "CUNIT1 and CUNIT2 ('deg' or 'rad')"
 
 
-def geometry(
-    place: str,
-    header: Any,
-    shape: tuple[int, ...],
-    pixel_size: float | None,
-    centred: bool,
-    notes: dict[str, str],
-) -> tuple[Any, bool]:
-    """`ImageMap`'s ``wcs`` and ``placeless`` of an image of ``shape`` (..., ny, nx), or the error
-    that says what is missing.
-    """
-    header = _with_known_units(header, place)
-    scaled = _has_scale(header)
-    if not scaled and pixel_size is None:
-        raise InputError(
-            "the pixel size is missing",
-            place=place,
-            cure=(
-                "set the header keys CDELT1, CDELT2 and CUNIT1, CUNIT2 ('deg' or 'rad'), or the"
-                " operator's parameter pixel_size: 1 arcsec"
-            ),
+class ImageHeader(MapHeader):
+    """The header of an image, from which its world coordinates follow."""
+
+    def geometry(self, shape: tuple[int, ...]) -> tuple[Any, bool]:
+        """`ImageMap`'s ``wcs`` and ``placeless`` of an image of ``shape`` (..., ny, nx), or the
+        error that says what is missing.
+        """
+        header, wanted = self._with_known_units(), self.wanted
+        scaled = any(f"CD{i}_{j}" in header for i in (1, 2) for j in (1, 2)) or all(
+            f"CDELT{k}" in header for k in (1, 2)
         )
-    if not all(_celestial(header, axis) for axis in "12"):
-        if pixel_size is None and not header.get("CUNIT1"):
-            raise InputError(
-                "the unit of the pixel size is missing",
-                place=place,
-                cure=(
-                    "set the header keys CUNIT1 and CUNIT2 ('deg' or 'rad'), or the operator's"
-                    " parameter pixel_size: 1 arcsec"
-                ),
+        or_size = "or the operator's parameter pixel_size: 1 arcsec"
+        if not scaled and wanted.pixel_size is None:
+            cure = f"set the header keys CDELT1, CDELT2, {UNITS}, {or_size}"
+            raise self.error("the pixel size is missing", cure)
+        if not all(_celestial(header, axis) for axis in "12"):
+            if wanted.pixel_size is None and not header.get("CUNIT1"):
+                cure = f"set the header keys {UNITS}, {or_size}"
+                raise self.error("the unit of the pixel size is missing", cure)
+            if wanted.pixel_size is None:
+                self._check_position(["CTYPE1", "CTYPE2", "CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2"])
+            self.notes["position"] = (
+                "the file has no WCS: its centre is put on the target, its first axis runs west,"
+                " its second north"
             )
-        if pixel_size is None and not centred:
-            raise _no_position(place, "CTYPE1, CTYPE2, CRVAL1, CRVAL2, CRPIX1, CRPIX2")
-        notes["position"] = (
-            "the file has no WCS: its centre is put on the target, its first axis runs west, its"
-            " second north"
+            bare = WCS(naxis=2)
+            bare.wcs.ctype, bare.wcs.radesys = ["RA---TAN", "DEC--TAN"], "ICRS"
+            bare.wcs.crpix = (np.array(shape[:-3:-1]) + 1) / 2
+            # the first axis runs west whatever the sign of its CDELT
+            return rescaled(bare, self._sides(header) * [[-1, 0], [0, 1]]), True
+        header = self._with_frame(header)
+        needed = ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2")
+        self._check_position([key for key in needed if key not in header])
+        wcs, matrix = self._wcs(header)
+        if wanted.pixel_size is None:
+            self.check_sides(np.hypot(*matrix), "check CDELT1, CDELT2, PC and CD")
+            return wcs, False
+        if not is_plain_tan(wcs):
+            kind = ", ".join(wcs.wcs.ctype)
+            message = f"pixel_size cannot replace the scale of a map in projection {kind}"
+            raise self.error(message, "remove pixel_size, or give a TAN map")
+        size = np.degrees(wanted.pixel_size)
+        self.notes["pixel size"] = (
+            f"{size * 3600:g} arcsec as given; the header's scale is overridden"
         )
-        bare = WCS(naxis=2)
-        bare.wcs.ctype, bare.wcs.radesys = ["RA---TAN", "DEC--TAN"], "ICRS"
-        bare.wcs.crpix = (np.array(shape[:-3:-1]) + 1) / 2
-        return rescaled(bare, np.degrees(_plain_scale(place, header, pixel_size))), True
-    header, note = _with_frame(header, place)
-    if note:
-        notes["coordinates"] = note
-    absent = [k for k in ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2") if k not in header]
-    if absent and not centred:
-        raise _no_position(place, ", ".join(absent))
-    wcs, matrix = _wcs(header, place)
-    check_geometry(matrix if pixel_size is None else np.eye(2) / 60, wcs.wcs.crpix, header, place)
-    if pixel_size is None:
-        return wcs, False
-    if not is_plain_tan(wcs):
-        raise InputError(
-            "pixel_size cannot replace the scale of a map in projection"
-            f" {', '.join(wcs.wcs.ctype)}",
-            place=place,
-            cure="remove pixel_size, or give a TAN map",
-        )
-    notes["pixel size"] = (
-        f"{np.degrees(pixel_size) * 3600:g} arcsec as given; the header's scale is overridden"
-    )
-    cd = matrix if scaled else np.diag([-1.0, 1.0])
-    return rescaled(wcs, cd / np.linalg.norm(cd, axis=0) * np.degrees(pixel_size)), False
+        cd = matrix if scaled else np.diag([-1.0, 1.0])
+        return rescaled(wcs, cd / np.linalg.norm(cd, axis=0) * size), False
 
-
-def _with_known_units(header: Any, place: str) -> Any:
-    """A copy of the header whose celestial axes have units that FITS knows."""
-    header = header.copy()
-    for key in ("CUNIT1", "CUNIT2"):
-        written = text(header, key, place)
-        if written and written.lower() in _ANGLES:
-            header[key] = _ANGLES[written.lower()]
-        elif written and _celestial(header, key[-1]):
-            raise InputError(
-                f"{key} = '{written}' is no angle", place=place, cure=f"set {key} to 'deg' or 'rad'"
+    def _check_position(self, absent: list[str]) -> None:
+        """Raise InputError if keys of the position are ``absent`` and it is needed."""
+        if absent and not self.wanted.centred:
+            raise self.error(
+                "the map has no world coordinates, so its position on the sky is unknown",
+                f"set the header keys {', '.join(absent)}, or the operator's parameter centre"
+                " (a position, or 'target')",
             )
-    return header
 
+    def _with_known_units(self) -> Any:
+        """A copy of the header whose celestial axes have units that FITS knows."""
+        header = self.header.copy()
+        for axis in "12":
+            key = f"CUNIT{axis}"
+            written = text(header, key, self.place)
+            if written and written.lower() in ANGLES:
+                header[key] = ANGLES[written.lower()].name
+            elif written and _celestial(header, axis):
+                raise self._no_angle(key, written)
+        return header
 
-def _with_frame(header: Any, place: str) -> tuple[Any, str]:
-    """`with_known_frame`; axes that are neither equatorial nor Galactic are refused."""
-    kinds = {str(header[f"CTYPE{axis}"]).upper()[:4] for axis in "12"}
-    if kinds not in ({"GLON", "GLAT"}, {"RA--", "DEC-"}):
-        raise InputError(
-            f"the axes {header['CTYPE1']}, {header['CTYPE2']} are neither equatorial nor Galactic",
-            place=place,
-            cure="give a map in ICRS, FK5, FK4 or Galactic coordinates",
-        )
-    return with_known_frame(header, place)
+    def _no_angle(self, key: str, written: str) -> InputError:
+        return self.error(f"{key} = '{written}' is no angle", f"set {key} to 'deg' or 'rad'")
 
+    def _with_frame(self, header: Any) -> Any:
+        """`with_known_frame`; axes that are neither equatorial nor Galactic are refused."""
+        kinds = {str(header[f"CTYPE{axis}"]).upper()[:4] for axis in "12"}
+        if kinds not in ({"GLON", "GLAT"}, {"RA--", "DEC-"}):
+            axes = f"{header['CTYPE1']}, {header['CTYPE2']}"
+            raise self.error(
+                f"the axes {axes} are neither equatorial nor Galactic",
+                "give a map in ICRS, FK5, FK4 or Galactic coordinates",
+            )
+        header, note = with_known_frame(header, self.place)
+        if note:
+            self.notes["coordinates"] = note
+        for key in ("EQUINOX", "EPOCH"):
+            year = header.get(key)
+            if isinstance(year, int | float) and not EQUINOXES[0] <= year <= EQUINOXES[1]:
+                message = f"{key} = {year:g} is no year of an equinox"
+                raise self.error(message, f"set {key}, e.g. to 2000.0")
+        return header
 
-def _wcs(header: Any, place: str) -> tuple[Any, Floats]:
-    """The WCS of a header and its pixel scale matrix (2, 2) [deg]."""
-    try:
-        wcs = WCS(header, naxis=2)
-        wcs.wcs.set()
-        matrix = np.asarray(wcs.pixel_scale_matrix)
-    except Exception as err:  # wcslib has a dozen exception classes of its own
-        raise InputError(
-            f"the WCS is broken: {first_line(err)}",
-            place=place,
-            cure="check CTYPE, CRVAL, CRPIX, CDELT, PC or CD",
-        ) from err
-    with np.errstate(over="ignore"):
-        area = np.linalg.det(matrix)
-    if not np.isfinite([*matrix.ravel(), *wcs.wcs.crval, *wcs.wcs.crpix]).all() or area == 0.0:
-        raise InputError(
-            "the WCS is singular: its pixels have no area",
-            place=place,
-            cure="check CDELT1, CDELT2, PC and CD",
-        )
-    return wcs, matrix
+    def _wcs(self, header: Any) -> tuple[Any, Floats]:
+        """The WCS of a header and its pixel scale matrix (2, 2) [deg]."""
+        try:
+            wcs = WCS(header, naxis=2)
+            wcs.wcs.set()
+            matrix = np.asarray(wcs.pixel_scale_matrix)
+        except Exception as err:  # wcslib has a dozen exception classes of its own
+            message = f"the WCS is broken: {first_line(err)}"
+            raise self.error(message, "check CTYPE, CRVAL, CRPIX, CDELT, PC or CD") from err
+        with np.errstate(over="ignore"):
+            area = np.linalg.det(matrix)
+        numbers = [*matrix.ravel(), *wcs.wcs.crval, *wcs.wcs.crpix]
+        if not np.isfinite(numbers).all() or area == 0.0:
+            message = "the WCS is singular: its pixels have no area"
+            raise self.error(message, "check CDELT1, CDELT2, PC and CD")
+        if np.abs(wcs.wcs.crpix).max() > FARTHEST:
+            message = f"the reference point is pixel {', '.join(f'{p:.3g}' for p in wcs.wcs.crpix)}"
+            raise self.error(message, f"CRPIX1 and CRPIX2 may be up to {FARTHEST:g}")
+        return wcs, matrix
+
+    def _sides(self, header: Any) -> Floats:
+        """(2,) sides [deg] of the pixels of a map without celestial axes."""
+        if self.wanted.pixel_size is not None:
+            return np.asarray(np.degrees(np.full(2, self.wanted.pixel_size)))
+        sizes, cure = [], "check CDELT1 and CDELT2"
+        for k in (1, 2):
+            written = str(header.get(f"CUNIT{k}") or header.get("CUNIT1")).strip()
+            if written not in ANGLES:
+                raise self._no_angle(f"CUNIT{k}", written)
+            step = self.number(f"CDELT{k}")
+            if step is None:
+                step = math.hypot(*(self.number(f"CD{i}_{k}") or 0.0 for i in (1, 2)))
+            sizes.append(abs(step) * ANGLES[written].to("rad"))
+        if not all(np.isfinite(s) and s > 0 for s in sizes):
+            raise self.error("the pixel size is zero or not finite", cure)
+        self.check_sides(np.degrees(sizes), cure)
+        return np.asarray(np.degrees(sizes))
 
 
 def rescaled(wcs: Any, matrix: Floats) -> Any:
@@ -170,49 +184,6 @@ def rescaled(wcs: Any, matrix: Floats) -> Any:
 
 def _celestial(header: Any, axis: str) -> bool:
     return is_celestial(str(header.get(f"CTYPE{axis}", "")))
-
-
-def _has_scale(header: Any) -> bool:
-    cd = any(f"CD{i}_{j}" in header for i in (1, 2) for j in (1, 2))
-    return cd or all(f"CDELT{k}" in header for k in (1, 2))
-
-
-def _no_position(place: str, keys: str) -> InputError:
-    return InputError(
-        "the map has no world coordinates, so its position on the sky is unknown",
-        place=place,
-        cure=(
-            f"set the header keys {keys}, or the operator's parameter centre (a position, or"
-            " 'target')"
-        ),
-    )
-
-
-def _plain_scale(place: str, header: Any, pixel_size: float | None) -> Floats:
-    """(2, 2) rad for a map without celestial axes: the first axis runs west whatever the sign of
-    its CDELT.
-    """
-    if pixel_size is not None:
-        return np.diag([-pixel_size, pixel_size])
-    sizes = []
-    for k in (1, 2):
-        written = str(header.get(f"CUNIT{k}") or header.get("CUNIT1")).strip()
-        if written not in _IN_RADIANS:
-            raise InputError(
-                f"CUNIT{k} = '{written}' is no angle",
-                place=place,
-                cure=f"set CUNIT{k} to 'deg' or 'rad'",
-            )
-        step = number(header, f"CDELT{k}", place)
-        if step is None:
-            step = math.hypot(*(number(header, f"CD{i}_{k}", place) or 0.0 for i in (1, 2)))
-        sizes.append(abs(step) * _IN_RADIANS[written])
-    if not all(np.isfinite(s) and s > 0 for s in sizes):
-        raise InputError(
-            "the pixel size is zero or not finite", place=place, cure="check CDELT1 and CDELT2"
-        )
-    check_sides(np.degrees(sizes), place, "check CDELT1 and CDELT2")
-    return np.diag([-sizes[0], sizes[1]])
 
 
 def is_plain_tan(wcs: Any) -> bool:

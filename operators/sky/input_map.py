@@ -1,5 +1,5 @@
 """Input maps of the sky: images of any projection and HEALPix maps, whose pixels are looked up by
-directions; and the user's options for reading them.
+directions.
 """
 
 from __future__ import annotations
@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,43 +49,6 @@ Pixels = tuple[NDArray[Any], ...]
 """Pixels of a map as an index of its values: rows and columns, or places in the list."""
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """Parameters of `SkyMap` that say how a file is read, angles in rad.
-
-    Attributes
-    ----------
-    centred
-        True where the caller says where the map's centre lies: then the header's position is not
-        needed.
-    plane
-        Of a cube, counted from 1; one number for each axis that is longer than one. None: the only
-        one, or that of Stokes I.
-    polarized
-        True where Q and U are read, too.
-    convention
-        Of them: `SkyMap.polarization_convention`.
-    column
-        Of a HEALPix table, by name or counted from 1: the column of I.
-    header_alone
-        True for a look at a large file: everything but its values is read and checked; they are
-        zeros.
-    """
-
-    unit: str | None = None
-    pixel_size: float | None = None
-    centred: bool = False
-    missing: Literal["error", "zero"] = "error"
-    input_beam: float | None = None
-    coordsys: Literal["icrs", "galactic", "ecliptic"] | None = None
-    plane: tuple[int, ...] | None = None
-    hdu: int | str | None = None
-    polarized: bool = False
-    convention: Literal["cosmo", "iau"] | None = None
-    column: int | str | None = None
-    header_alone: bool = False
-
-
 @dataclass(kw_only=True)
 class InputMap:
     """A map of the sky as its file has it.
@@ -96,8 +59,6 @@ class InputMap:
         float64 in `unit`: (ny, nx), row 0 the file's first row; or (n,) of a list of pixels.
     unit
         ``Jy/pixel``, ``Jy/beam``, ``MJy/sr``, ``K_RJ``, ``K_CMB`` or ``y``.
-    beam_solid_angle
-        sr, of the beam of a ``Jy/beam`` map.
     notes
         What was chosen or changed, for the tally.
     zeroed
@@ -111,7 +72,6 @@ class InputMap:
 
     values: Floats
     unit: str
-    beam_solid_angle: float | None = None
     notes: dict[str, str] = field(default_factory=dict)
     zeroed: int = 0
     polarization: Floats | None = None
@@ -120,6 +80,13 @@ class InputMap:
     @property
     def nbytes(self) -> int:
         return self.values.nbytes + (0 if self.polarization is None else self.polarization.nbytes)
+
+    @property
+    def beam_solid_angle(self) -> float | None:
+        """sr."""
+        if self.beam is None:
+            return None
+        return float(np.pi / (4 * np.log(2)) * self.beam[0] * self.beam[1])
 
     @property
     def kind(self) -> str:

@@ -1,10 +1,9 @@
-"""The parameters of `SkyMap`, and the checks that need the map's header alone."""
+"""The parameters of `SkyMap`."""
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Literal, Self, cast
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -12,15 +11,11 @@ from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Kelvin
-from zonda.core.data import Data, percent
-from zonda.core.errors import InputError
-from zonda.core.numerics.projection import share_outside
 from zonda.core.operator import Operator
 from zonda.core.storage.files import atomic_path
 
-from .array import ArrayMap, WorldCoordinates, check_shape, checked_unit
+from .array_map import ArrayMap, WorldCoordinates, checked_unit
 from .beam import PIXELS_PER_FWHM
-from .footprint import Footprint, footprint, header_of, off_the_map, position
 from .state import Cache
 
 
@@ -112,7 +107,7 @@ class SkyParameters(Operator):
         if self.hdu is not None:
             raise ValueError("hdu is for files; give that HDU as map")
         if self.wcs is not None:
-            check_shape(self.map, self.wcs)
+            self.wcs.check(self.map)
         checked_unit(self.map, self.unit)
         return self
 
@@ -147,77 +142,3 @@ class SkyParameters(Operator):
         with atomic_path(path) as temporary:
             array.write(temporary)
         return self.model_copy(update={"file": path, "map": None, "wcs": None})
-
-    def map_centre(self) -> Target:
-        """The middle of the input map, for ``target: map``. Raises InputError where it has none of
-        its own.
-        """
-        if self.centre == "target":
-            cure = "give the target as coordinates, or remove centre: target"
-            raise InputError(
-                "target: map and centre: target each refer to the other",
-                place=self.place,
-                cure=cure,
-            )
-        found = (
-            self.centre
-            if isinstance(self.centre, Target)
-            else getattr(self._footprint(), "target", None)
-        )
-        if found is None:
-            cure = "give the target as coordinates"
-            raise InputError(
-                "the map has no centre on the sky (HEALPix, or no WCS)", place=self.place, cure=cure
-            )
-        return found
-
-    def _header(self) -> tuple[Any, tuple[int, int]] | None:
-        """Header and (ny, nx) of an image; None of a HEALPix map."""
-        array = self.array()
-        if array is not None:
-            return (
-                None
-                if array.table is not None
-                else (array.header, (array.values.shape[-2], array.values.shape[-1]))
-            )
-        return header_of(cast(Path, self.file), self.hdu, self.place)
-
-    def _footprint(self) -> Footprint | None:
-        found, centre = self._header(), self.centre if isinstance(self.centre, Target) else None
-        return None if found is None else footprint(*found, self.pixel_size, centre, self.place)
-
-    def _copies(self, data: Data) -> str:
-        """Warning about a map that goes with the target, if there are several targets, or empty."""
-        found, targets = self._header(), len({o.centre for o in data.observations})
-        placeless = self.centre is None and found is not None and "CTYPE1" not in found[0]
-        if targets < 2 or not (self.centre == "target" or placeless):
-            return ""
-        cure = "give centre a position, or remove it for a map that knows its own"
-        return (
-            f"{self.label}: the map {self.source} is put on each of {targets} targets, as a copy of"
-            f" its own; {cure}"
-        )
-
-    def check(self, data: Data) -> list[str]:
-        """Check that scans are about a point of the map, by its header; states the share of samples
-        outside.
-        """
-        if text := self._copies(data):
-            warnings.warn(text, stacklevel=2)
-        if self.centre == "target" or (found := self._footprint()) is None:
-            return []
-        for text in dict.fromkeys(
-            off_the_map(found, o.centre, self.label) for o in data.observations
-        ):
-            if text:
-                warnings.warn(text, stacklevel=2)
-        lines = [f"centre of the input map: {position(*found.target.icrs())}"]
-        if found.matrix is not None and data.observations:
-            scans = (
-                (o.boresight_radec, o.focalplane.xi, o.focalplane.eta) for o in data.observations
-            )
-            lines.append(
-                "samples outside the input map: about"
-                f" {percent(share_outside(scans, found.matrix, found.shape), 2)}"
-            )
-        return lines

@@ -6,36 +6,37 @@ error lists the header keys and the parameters that would mend it.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from zonda.core.errors import InputError
-from zonda.core.maps.header import text
+from zonda.core.maps.header import marked_bad, text
 from zonda.core.maps.map_reading import (
     STOKES,
+    HealpixTable,
     chosen,
     is_healpix,
+    not_used,
     plane_of_cube,
     planes_of_q_and_u,
 )
-from zonda.core.maps.stokes_names import columns_of_q_and_u
-from zonda.core.storage.files import reading
+from zonda.core.maps.stokes_names import columns_of_q_and_u, intensity_column, is_polarized
 from zonda.core.storage.fits_files import check_size, opened
 from zonda.core.types import Floats
 
-from . import stokes
-from .array import GIVEN, ArrayMap
-from .geometry import geometry
-from .healpix import read_healpix
-from .input_map import ImageMap, InputMap, Wanted
-from .units import beam_solid_angle, check_beam, filled, made_with, unit_of
+from .array_map import GIVEN, ArrayMap
+from .geometry import ImageHeader
+from .input_map import HealpixMap, ImageMap, InputMap
+from .map_header import MapHeader, Wanted
 
 
-def read_map(path: Path, **options: Any) -> InputMap:
-    """An image or HEALPix table of a FITS file; of Stokes parameters I, and a note names those that
-    are not used.
+def read_map(source: Path | ArrayMap, **options: Any) -> InputMap:
+    """An image or HEALPix table of a FITS file or in memory; of Stokes parameters I, and a note
+    names those that are not used.
 
     Parameters
     ----------
@@ -49,136 +50,160 @@ def read_map(path: Path, **options: Any) -> InputMap:
         which no plane is wanted; no I; options that do not apply.
     """
     wanted = Wanted(**options)
-    place = f"sky map {path}"
     cure = "check the file, e.g. with fitsinfo or fitsverify, or copy it again"
-    with opened(path, place, cure) as hdus:
-        hdu, notes = chosen(hdus, wanted.hdu, place)
+    hdus: AbstractContextManager[Any]
+    made: InputMap
+    if isinstance(source, ArrayMap):
+        place, hdus = f"sky map {source.name}", nullcontext([source.hdu])
+    else:
+        place = f"sky map {source}"
+        hdus = opened(source, place, cure)
+    with hdus as found:
+        hdu, notes = chosen(found, wanted.hdu, place)
         check_size(hdu, place, whole=not wanted.header_alone)
         if is_healpix(hdu):
-            found: InputMap = read_healpix(hdu, place, wanted)
+            made = _healpix(HealpixTable(hdu, place), MapHeader(hdu.header, place, wanted, notes))
         else:
-            q_and_u = None
-            if wanted.hdu is None:
-                notes |= stokes.of_extensions(
-                    hdu.name, [other.name for other in hdus if other.is_image], place
-                )
-                q_and_u = _extensions(hdus, hdu, wanted, place) if wanted.polarized else None
-            found = _image(place, _pixels(hdu, wanted), hdu.header, wanted, q_and_u)
-        found.notes = notes | found.notes
-        if found.polarization is not None:
-            found.notes.pop(STOKES, None)
-        return _told(found, hdu.header.get(GIVEN))
-
-
-def read_array(array: ArrayMap, place: str, **options: Any) -> InputMap:
-    """Read an array or HDU in memory as `read_map` reads a file."""
-    wanted = Wanted(**options)
-    if array.table is not None:
-        with reading(place, "FITS", "check the table"):
-            return _told(read_healpix(array.table, place, wanted), array.text)
-    return _told(_image(place, array.values, array.header, wanted), array.text)
-
-
-def _told(found: InputMap, given: object) -> InputMap:
-    """The map, with a note of the array that it was in Python."""
+            made = _image(hdu, found, ImageHeader(hdu.header, place, wanted, notes))
+        given = source.text if isinstance(source, ArrayMap) else hdu.header.get(GIVEN)
+    if made.polarization is not None:
+        notes.pop(STOKES, None)
     if given:
-        found.notes["input"] = f"{given}, in {found.unit}, given in Python"
-    return found
+        notes["input"] = f"{given}, in {made.unit}, given in Python"
+    return made
+
+
+def _unused(what: str, names: Sequence[str], read: int | None = None) -> dict[str, str]:
+    """The note about Stokes parameters among ``names`` beside the one that is read."""
+    unused = [name for k, name in enumerate(names) if k != read and is_polarized(name)]
+    return {STOKES: f"{what} is read as I; {not_used(unused)}"} if unused else {}
+
+
+def _filled(header: MapHeader, found: InputMap, planes: Floats, factor: float, where: str) -> None:
+    """Put ``planes`` (1 or 3, ...) of I, or I, Q and U in COSMO's convention, into a map; in its
+    unit they are times ``factor``. ``where`` names a pixel by its indices.
+    """
+    found.zeroed = header.filled(planes[0], where)
+    if len(planes) > 1:
+        found.zeroed += header.filled(planes[1:], f"plane {{}} of Q and U, {where}")
+        found.polarization = planes[1:]
+    planes *= factor
+    found.values = planes[0]
+
+
+def _image(hdu: Any, hdus: Any, header: ImageHeader) -> ImageMap:
+    place, wanted, notes = header.place, header.wanted, header.notes
+    beside = _beside(hdu, hdus, header) if wanted.hdu is None else []
+    images = [hdu, *beside]
+    values = [_pixels(image, wanted) for image in images]
+    if values[0].ndim < 2 or values[0].size == 0:
+        raise header.error("the image has no pixels", "give a two-dimensional image")
+    if values[0].dtype.kind not in "iuf":
+        message = f"its pixels are {values[0].dtype}, not numbers"
+        raise header.error(message, "give an image of numbers")
+    header.refuse("{} is for HEALPix maps", coordsys=wanted.coordsys, column=wanted.column)
+    shape = values[0].shape
+    plane, more = plane_of_cube(header.header, shape, wanted.plane, place)
+    notes |= more
+    found = planes_of_q_and_u(header.header, shape, plane) if wanted.polarized else None
+    planes = [values[0][plane], *values[1:]]
+    if found is not None:
+        planes = [values[0][k] for k in (plane, *found)]
+    units = [text(image.header, "BUNIT", place) for image in beside]
+    unit, factor = header.unit("BUNIT", units, "images")
+    beam = header.beam(unit)
+    wcs, placeless = header.geometry(shape)
+    image = ImageMap(
+        values=planes[0], unit=unit, beam=beam, notes=notes, wcs=wcs, placeless=placeless
+    )
+    header.check_beam(image, float((image.sides[::-1] * image.shape).max()))
+    sign = header.sign_of_u(True) if len(planes) > 1 else 1.0
+    if not wanted.header_alone:
+        stack = np.array(planes, np.float64)
+        stack[2:] *= sign
+        _filled(header, image, stack, factor, "row {}, column {} (counted from 1)")
+    return image
 
 
 def _pixels(hdu: Any, wanted: Wanted) -> Floats:
     """The array of an image; of the header alone one of zeros that takes no memory."""
-    return (
-        np.broadcast_to(np.float64(0.0), hdu.shape) if wanted.header_alone else np.asarray(hdu.data)
-    )
-
-
-def _extensions(hdus: Any, first: Any, wanted: Wanted, place: str) -> Floats | None:
-    """(2, ny, nx) Q and U of a file that has them as extensions beside its ``first`` image; None
-    where it has none.
-    """
-    images = [hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) == 2]
-    found = columns_of_q_and_u([hdu.name for hdu in images])
-    if found is None:
-        return None
-    if any(images[k].shape != first.shape for k in found):
-        raise InputError(
-            "its images of I, Q and U differ in size",
-            place=place,
-            cure="give three images of one grid",
-        )
-    for k in found:
-        check_size(images[k], place, whole=not wanted.header_alone)
-        _check_extension(images[k], first, wanted, place)
-    return np.stack([np.asarray(_pixels(images[k], wanted), np.float64) for k in found])
-
-
-def _check_extension(hdu: Any, first: Any, wanted: Wanted, place: str) -> None:
-    """Refuse an image of Q or U in another unit than that of I."""
-    units = [text(h.header, "BUNIT", place) for h in (first, hdu)]
-    if wanted.unit is None and units[1] not in ("", units[0]):
-        cure = (
-            "write all three in one unit, or set the operator's parameter unit, which then holds"
-            " for all"
-        )
-        raise InputError(
-            f"its image {hdu.name} is in {units[1]}, and I in {units[0] or '(none)'}",
-            place=place,
-            cure=cure,
-        )
-
-
-def _image(
-    place: str, values: Floats, header: Any, wanted: Wanted, q_and_u: Floats | None = None
-) -> ImageMap:
-    if values.ndim < 2 or values.size == 0:
-        raise InputError(
-            "the image has no pixels", place=place, cure="give a two-dimensional image"
-        )
-    if values.dtype.kind not in "iuf":
-        raise InputError(
-            f"its pixels are {values.dtype}, not numbers",
-            place=place,
-            cure="give an image of numbers",
-        )
-    for name, is_given in (
-        ("coordsys", wanted.coordsys is not None),
-        ("column", wanted.column is not None),
-    ):
-        if is_given:
-            cure = f"remove {name}" + (
-                ": CTYPE says what an image's are" if name == "coordsys" else ""
-            )
-            raise InputError(f"{name} is for HEALPix maps", place=place, cure=cure)
-    plane, notes = plane_of_cube(header, values.shape, wanted.plane, place)
-    planes = planes_of_q_and_u(header, values.shape, plane) if wanted.polarized else None
-    unit, factor = unit_of(place, header, "BUNIT", wanted.unit, notes)
-    beam = beam_solid_angle(place, header, unit, wanted.input_beam, notes)
-    wcs, placeless = geometry(place, header, values.shape, wanted.pixel_size, wanted.centred, notes)
-    found = ImageMap(
-        values=values[plane],
-        unit=unit,
-        beam_solid_angle=beam,
-        notes=notes,
-        beam=made_with(header, wanted.input_beam),
-        wcs=wcs,
-        placeless=placeless,
-    )
-    check_beam(place, beam, found.sides, found.shape, wanted.input_beam is not None, notes)
-    if planes is not None and not wanted.header_alone:
-        q_and_u = np.stack([np.array(values[k], np.float64) for k in planes])
-    if planes is not None or q_and_u is not None:
-        notes.pop(STOKES, None)
-        sign = stokes.sign_of_u(header, wanted.convention, True, place, notes)
     if wanted.header_alone:
-        return found
-    found.values = np.array(values[plane], np.float64)
-    where = "row {}, column {} (counted from 1)"
-    found.zeroed = filled(place, found.values, wanted.missing, where)
-    found.values *= factor
-    if q_and_u is not None:
-        found.zeroed += filled(place, q_and_u, wanted.missing, f"plane {{}} of Q and U, {where}")
-        q_and_u *= factor
-        q_and_u[1] *= sign
-        found.polarization = q_and_u
+        return np.broadcast_to(np.float64(0.0), hdu.shape)
+    return np.asarray(hdu.data)
+
+
+def _beside(first: Any, hdus: Any, header: MapHeader) -> list[Any]:
+    """Images of Q and U beside the ``first`` one, if they are wanted and there; a note names them
+    otherwise.
+    """
+    if is_polarized(first.name):
+        raise header.error(
+            f"its first image, {first.name}, is no intensity",
+            "put the image of I first, or name it by the operator's parameter hdu",
+        )
+    what = f"the first image{f', {first.name},' if first.name else ''}"
+    header.notes |= _unused(what, [hdu.name for hdu in hdus if hdu.is_image])
+    images = [hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) == 2]
+    found = columns_of_q_and_u([hdu.name for hdu in images]) if header.wanted.polarized else None
+    beside = [images[k] for k in found or ()]
+    if any(hdu.shape != first.shape for hdu in beside):
+        raise header.error(
+            "its images of I, Q and U differ in size", "give three images of one grid"
+        )
+    for hdu in beside:
+        check_size(hdu, header.place, whole=not header.wanted.header_alone)
+    return beside
+
+
+def _healpix(table: HealpixTable, header: MapHeader) -> HealpixMap:
+    """The map of a table in its column of I (`intensity_column`)."""
+    place, wanted, notes = header.place, header.wanted, header.notes
+    header.refuse(
+        "{} does not apply to a HEALPix map",
+        centre=wanted.centred,
+        pixel_size=wanted.pixel_size,
+        plane=wanted.plane,
+    )
+    nest, names = table.nest, table.names
+    frame, more = table.frame(wanted.coordsys)
+    first = intensity_column(names, wanted.column, place)
+    notes |= more | _unused(f"column {names[first]}", names, first)
+    if len(names) > 1 + (table.pixel_column is not None) or wanted.column is not None:
+        notes["column"] = f"{names[first]} ({first + 1} of {len(names)}: {', '.join(names)})"
+    others = columns_of_q_and_u(names) if wanted.polarized else None
+    if is_polarized(names[first]):
+        others = None
+    columns = [first, *(others or ())]
+    units = [str(header.header.get(f"TUNIT{1 + k}", "") or "").strip() for k in columns[1:]]
+    unit, factor = header.unit(f"TUNIT{1 + first}", units, "columns")
+    beam = header.beam(unit)
+    sign = header.sign_of_u(False) if others else 1.0
+    if wanted.header_alone:
+        values, pixels, nside = np.zeros((1, 0)), None, table.nside(table.length(first))
+    else:
+        values = np.stack([table.numbers(k) for k in columns])
+        nside = table.nside(values.shape[1])
+        pixels = table.pixels(nside, values.shape[1])
+    if pixels is not None:
+        order = np.argsort(pixels, kind="stable")
+        pixels, values = pixels[order], values[:, order]
+    unseen = marked_bad(values, header.header, place)
+    values[1:][unseen[1:]] = np.nan
+    if unseen[0].any():
+        seen = ~unseen[0]
+        pixels = np.flatnonzero(seen) if pixels is None else pixels[seen]
+        values = values[:, seen]
+    found = HealpixMap(
+        values=values[0],
+        unit=unit,
+        beam=beam,
+        notes=notes,
+        pixels=pixels,
+        nside=nside,
+        nest=nest,
+        frame=frame,
+    )
+    header.check_beam(found, math.pi)
+    values[2:] *= sign
+    _filled(header, found, values, factor, "entry {} of those that are seen (counted from 1)")
     return found

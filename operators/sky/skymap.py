@@ -68,7 +68,7 @@ class SkyMap(ConvolvedSky):
     provides: ClassVar[frozenset[str]] = frozenset({"sky"})
 
     def check(self, data: Data) -> list[str]:
-        """See `SkyParameters.check`; adds the lines about the map that reading it gives."""
+        """See `SkyInput.check`; adds the lines about the map that reading it gives."""
         return [*super().check(data), *self._looked_at(data)]
 
     def prepare(self, observation: Observation) -> SkyState:

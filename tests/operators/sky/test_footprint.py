@@ -7,13 +7,13 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.configuration.target import Target
-from zonda.operators.sky import footprint as module
 from zonda.operators.sky.footprint import off_the_map
+from zonda.operators.sky.skymap import SkyMap
 
 
 def footprint(path, pixel_size, centre, hdu=None):
-    found = module.header_of(path, hdu, str(path))
-    return None if found is None else module.footprint(*found, pixel_size, centre, str(path))
+    size = None if pixel_size is None else f"{pixel_size} rad"
+    return SkyMap(file=path, pixel_size=size, centre=centre, hdu=hdu)._footprint()
 
 
 def write(path, ctype, crval, shape=(40, 60), step=0.01, **cards):
