@@ -121,7 +121,8 @@ def _sweep(
 ) -> None:
     """Work on every block of a pass, on several threads; the first error stops all ``passes``."""
     settings, blocks = one.execution.settings, one.blocks
-    total, what = len(blocks), f"{scan}: {', '.join(o.label for o in one.stage.segment.operators)}"
+    working = (o for o in one.stage.segment.operators if type(o).exec is not Operator.exec)
+    total, what = len(blocks), f"{scan}: {', '.join(o.label for o in working)}"
     threads = min([settings.threads, *(other.execution.settings.threads for other in passes)])
     if threads == 1 or total == 1:
         for done, block in enumerate(blocks, 1):
