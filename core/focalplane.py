@@ -181,17 +181,18 @@ class Focalplane:
         """
         return Focalplane(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
+    def rows(self, index: NDArray[np.intp]) -> Focalplane:
+        """Some of the detectors, in this order: copies."""
+        found = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "names"}
+        return Focalplane([self.names[row] for row in index], **found)
+
     def of_band(self, number: int) -> Focalplane:
         """The detectors of one band, in their order, as those of a camera that has no other:
         copies.
         """
-        rows = np.flatnonzero(self.band == number)
-        found: dict[str, Any] = {
-            f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "names"
-        }
-        return Focalplane(
-            [self.names[row] for row in rows], **(found | {"band": np.zeros(len(rows), np.int64)})
-        )
+        found = self.rows(np.flatnonzero(self.band == number))
+        found.band[:] = 0
+        return found
 
     @classmethod
     def of_bands(cls, planes: Mapping[str, Focalplane], suffix: bool = True) -> Focalplane:

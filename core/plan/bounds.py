@@ -5,7 +5,7 @@ they follow from.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from ..data import Observation
 from ..mapmaker import joins
 from ..numerics.radiation import LEAST_TRANSMISSION
+from ..numerics.smooth import SmoothField
 from ..operator import Operator
 from ..scene import Scene
-from ..signal import MAIN, Component, Formed
+from ..types import Floats
 
 METRICS = {
     "map_rms": "rms error of a map pixel, K",
@@ -207,14 +208,8 @@ def exact(name: str, size: Bound, formula: str, what: str = "exact") -> Effect:
 
 def not_simulated(name: str, what: str, bound: Bound, formula: str) -> Effect:
     """An effect that nature has and zonda leaves out, with a bound on what that costs."""
-    return Effect(
-        name, (Choice("not simulated", what, bound=bound, formula=formula),), bound, formula
-    )
-
-
-def describe(bound: Bound, metrics: Iterable[str]) -> str:
-    """A bound in the products' units, the metrics that matter only."""
-    return ", ".join(f"{m} {figure(m, bound[m])}" for m in METRICS if m in bound and m in metrics)
+    choice = Choice("not simulated", what, bound=bound, formula=formula)
+    return Effect(name, (choice,), bound, formula)
 
 
 def figure(metric: str, value: float) -> str:
@@ -279,25 +274,6 @@ class Depth:
     weighed: float
 
 
-@dataclass(frozen=True)
-class Work:
-    """Steps and signals of each observation.
-
-    Attributes
-    ----------
-    steps
-        The operators that act on it, in order.
-    signals
-        The signals that are formed, the complete one first.
-    components
-        Names of all streams that become part of a signal.
-    """
-
-    steps: tuple[Operator, ...] = ()
-    signals: tuple[Formed, ...] = (Formed(MAIN, frozenset()),)
-    components: frozenset[Component] = frozenset()
-
-
 @dataclass
 class Context:
     """Everything that `Planning.estimate` may look at.
@@ -308,8 +284,6 @@ class Context:
         Observations have their pointing, and efficiencies and noise levels where those are given.
     operators
         Those that take part, in order, labelled.
-    work
-        What they do with each observation.
     traits
         By label.
     coverage
@@ -321,7 +295,6 @@ class Context:
     scene: Scene
     observations: list[Observation]
     operators: list[Operator]
-    work: Work = Work()
     traits: dict[str, Traits] = field(default_factory=dict)
     coverage: Coverage | None = None
     metrics: frozenset[str] = frozenset()
@@ -366,9 +339,7 @@ class Context:
     @cached_property
     def mean_emission(self) -> float:
         """Largest mean emission in the calibrated stream, K; 0: there is none."""
-        return max(
-            (float(_calibrated_mean(o).max(initial=0.0)) for o in self.observations), default=0.0
-        )
+        return max(map(_calibrated_mean, self.observations), default=0.0)
 
     @cached_property
     def passed(self) -> float:
@@ -511,9 +482,21 @@ class Context:
         modes in the data, with `other_modes`."""
         return add(bound, self.other_modes()) if self.turns else dict(bound)
 
+    def of_all(self, share: float, common: bool = True) -> dict[str, float]:
+        """Bound on an error that is a share of all that is in the stream, the mean emission and the
+        sky included.
+        """
+        rms = share * (self.fluctuation + self.mean_emission)
+        return self.bound(rms, self.first.duration, common) | self.sky_error(share)
+
     def sky_error(self, share: float) -> dict[str, float]:
         """Bound on peak and transfer function from a relative error of the sky's signal."""
         return {"peak": share * self.peak, "transfer": share}
+
+
+def evenly(number: int, most: int) -> NDArray[np.intp]:
+    """At most so many numbers from 0 to ``number`` - 1, evenly spaced, with first and last."""
+    return np.linspace(0, number - 1, min(most, number)).astype(int)
 
 
 def calibration(observation: Observation) -> float:
@@ -524,27 +507,23 @@ def calibration(observation: Observation) -> float:
     return float(1 / passed.min()) if passed.size else 1.0
 
 
-def _calibrated_mean(o: Observation) -> NDArray[np.float64]:
-    """(n_det,) largest mean emission of a scan behind the calibration, K."""
+def _calibrated_mean(o: Observation) -> float:
+    """Largest mean emission of a scan behind the calibration, K; 0: there is none."""
     emission, transmission = o.smooth.get("atmosphere"), o.smooth.get("transmission")
     if emission is None:
-        return np.zeros(1)
+        return 0.0
     share = o.focalplane.illumination_efficiency / o.focalplane.main_beam_efficiency
-    passed: NDArray[Any] = np.ones(1)
+    largest = share * _largest(emission)
     if transmission is not None:
-        passed = np.maximum(
-            -_largest(transmission.weights, -transmission.coefficients), LEAST_TRANSMISSION
-        )
-    return np.asarray(
-        share * _largest(emission.weights, emission.coefficients) / passed, np.float64
-    )
+        largest = largest / np.maximum(-_largest(transmission, -1), LEAST_TRANSMISSION)
+    return float(largest.max(initial=0.0))
 
 
-def _largest(weights: NDArray[Any], coefficients: NDArray[Any]) -> NDArray[Any]:
-    """(n_det,) largest value of a smooth field over the scan: at the node where the detectors' mean
-    is largest, and at `INSTANTS` others at most; all nodes of all detectors would take
-    gigabytes."""
-    nodes = coefficients.shape[1]
-    evenly = np.linspace(0, nodes - 1, min(INSTANTS, nodes)).astype(int)
-    at = np.r_[evenly, np.argmax(weights.mean(axis=0) @ coefficients)]
-    return np.asarray((weights @ coefficients[:, at]).max(axis=1))
+def _largest(field: SmoothField, sign: int = 1) -> Floats:
+    """(n_det,) largest value of a smooth field times ``sign`` over the scan: at the node where the
+    detectors' mean is largest, and at `INSTANTS` others at most; all nodes of all detectors would
+    take gigabytes.
+    """
+    values = sign * field.coefficients
+    at = np.r_[evenly(values.shape[1], INSTANTS), np.argmax(field.weights.mean(axis=0) @ values)]
+    return np.asarray((field.weights @ values[:, at]).max(axis=1))

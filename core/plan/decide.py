@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from ..configuration.diagnostics import nearest
 from ..configuration.loaded import Limits
@@ -23,32 +22,21 @@ SHARE = 0.1
 """Share of the noise that is allowed where the user states none."""
 
 
-def limits(budget: Any, map_noise: float, sample_noise: float) -> dict[str, float]:
-    """Largest bound by metric. ``budget``: a share of the noise (a number), or `Limits`.
-
-    Raises
-    ------
-    ZondaError
-        For a share that is not a number from 0 to 1.
-    """
-    given = (
-        {metric: v for metric, v in budget if v is not None} if isinstance(budget, Limits) else {}
-    )
-    share = SHARE if isinstance(budget, Limits) else float(budget)
-    if not 0 <= share <= 1:
-        raise ZondaError(
-            f"the budget is a share of the noise from 0 to 1, got {share:g}",
-            place="budget",
-            cure="write e.g. 10 %",
-        )
-    in_map, transfer = given.get("map_rms", share * map_noise), TRANSFER * min(1.0, share / SHARE)
+def limits(budget: float | Limits, map_noise: float, sample_noise: float) -> dict[str, float]:
+    """Largest bound by metric. ``budget``: a share of the noise from 0 to 1, or `Limits`."""
+    stated, share = {}, SHARE
+    if isinstance(budget, Limits):
+        stated = {metric: value for metric, value in budget if value is not None}
+    else:
+        share = budget
+    in_map = stated.get("map_rms", share * map_noise)
     return {
         "map_rms": in_map,
         "peak": in_map,
-        "transfer": transfer,
+        "transfer": TRANSFER * min(1.0, share / SHARE),
         "tod": share * sample_noise,
         "psd": share,
-        **given,
+        **stated,
     }
 
 
@@ -86,9 +74,9 @@ class Decided:
         """Source of the bound."""
         return self.choice.formula or self.effect.formula
 
-    def bound(self, k: int, metric: str) -> float:
-        """Error that choice ``k`` adds; NaN counts as infinite."""
-        value = self.effect.choices[k].bound.get(metric, 0.0) if k else 0.0
+    def error(self, metric: str) -> float:
+        """Error that the choice adds; NaN counts as infinite."""
+        value = self.choice.bound.get(metric, 0.0) if self.chosen else 0.0
         return math.inf if math.isnan(value) else value
 
     def means(self, name: str) -> bool:
@@ -119,55 +107,43 @@ def decide(
     joined
         Steps for which the bounds do not hold (`Context.joined`): likewise.
     """
-    chosen = {d.name: len(d.effect.choices) - 1 if d.name in forced else 0 for d in effects}
-    left = {
-        m: allowed[m] - sum(d.bound(chosen[d.name], m) for d in effects if d.name in forced)
-        for m in allowed
-    }
+    forms = [replace(d, chosen=k) for d in effects for k in range(len(d.effect.choices))]
+    taken = {form.name: form for form in forms if form.name in forced}  # the last: the coarsest
+    left = {m: v - sum(form.error(m) for form in taken.values()) for m, v in allowed.items()}
 
-    def share(rung: tuple[Decided, int]) -> float:
-        """Share of the budget that a form takes."""
-        used = {m: rung[0].bound(rung[1], m) for m in allowed}
-        return max((b / allowed[m] if allowed[m] else math.inf for m, b in used.items() if b > 0),
-                   default=0.0)  # fmt: skip
+    def order(form: Decided) -> tuple[float, float, float]:
+        """Largest measured saving first, then what planning classes state in seconds, then the
+        smallest share of the budget.
+        """
+        used = [(form.error(m), allowed[m]) for m in allowed if form.error(m) > 0]
+        share = max((b / limit if limit else math.inf for b, limit in used), default=0.0)
+        saves = form.choice.saves
+        return -(saves.share if saves else 0.0), -form.choice.seconds, share
 
-    free = {*(d.name for d in effects)} - {*kept} - {*forced} if prune_all and not joined else set()
-    rungs = [
-        (d, k)
-        for d in effects
-        for k, choice in enumerate(d.effect.choices)
-        if k and d.name in free and choice.pays
-    ]
-    for d, k in sorted(rungs, key=lambda rung: (*_order(rung), share(rung))):
-        used = {m: d.bound(k, m) for m in left}
-        if not chosen[d.name] and all(used[m] <= left[m] for m in left):
-            chosen[d.name] = k
-            left = {m: left[m] - used[m] for m in left}
+    free = prune_all and not joined
+    tried = [f for f in forms if free and f.chosen and f.choice.pays and f.name not in kept]
+    for form in sorted(tried, key=order):
+        if form.name not in taken and all(form.error(m) <= left[m] for m in left):
+            taken[form.name] = form
+            left = {m: left[m] - form.error(m) for m in left}
     stated = dict.fromkeys(kept, "--keep") | dict.fromkeys(forced, "--drop")
 
     def reason(d: Decided) -> str:
+        coarser = d.effect.choices[1:]
         if not d.simulated:
             over = [m for m, v in d.choice.bound.items() if v > left.get(m, math.inf)]
-            words = f"may exceed what is left of the budget for {' and '.join(over)}"
-            return words if over else "within the budget"
-        if d.name in stated or chosen[d.name]:
+            return f"above the budget: {', '.join(over)}" if over else "within the budget"
+        if d.name in stated or d.name in taken:
             return stated.get(d.name, "within the budget")
-        coarser = d.effect.choices[1:]
         if joined and coarser:
             return f"{joined} joins the bands"
-        if not prune_all or not coarser:
-            return "" if prune_all else "--no-prune"
+        if not prune_all:
+            return "--no-prune"
         if not any(choice.pays for choice in coarser):
-            return "a coarser form would save nothing"
-        return "a coarser form would exceed the budget"
+            return "coarser saves nothing" if coarser else ""
+        return "coarser exceeds the budget"
 
-    return [replace(d, chosen=chosen[d.name], reason=reason(d)) for d in effects]
-
-
-def _order(rung: tuple[Decided, int]) -> tuple[float, float]:
-    """Largest measured saving first, then those that a planning class states in seconds."""
-    choice = rung[0].effect.choices[rung[1]]
-    return -(choice.saves.share if choice.saves else 0.0), -choice.seconds
+    return [replace(taken.get(d.name, d), reason=reason(d)) for d in effects]
 
 
 def named(names: Sequence[str], effects: Sequence[Decided], labels: Sequence[str]) -> set[str]:
@@ -189,8 +165,5 @@ def check_droppable(drop: Sequence[str], effects: Sequence[Decided], labels: Seq
         mine = [d for d in effects if name in (d.name, d.effect.name)]
         if mine and name not in labels and all(len(d.effect.choices) == 1 for d in mine):
             what = "has no coarser form" if mine[0].simulated else "is not simulated"
-            raise ZondaError(
-                f"{name!r} cannot be dropped: it {what}",
-                place="zonda plan",
-                cure="remove this --drop",
-            )
+            text = f"{name!r} cannot be dropped: it {what}"
+            raise ZondaError(text, place="zonda plan", cure="remove this --drop")

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from ..configuration.pipeline_file import PipelineFile
 from ..errors import ZondaError
 from ..machine import available_memory, available_threads
+from ..pipeline import Pipeline
+from ..run.settings import Settings
 from .bounds import OTHER_MODES, Bound, Choice, Context, Effect, Estimate, add, exact, full
 from .decide import Decided, check_droppable, decide, limits, named
 from .planning import planning_of
 from .pointing import context_of
 from .prediction import memory_of
 from .result import Plan
-from .structure import Structure, prune
+from .structure import Structure, chain_of, prune
 
 NAME = "everything"
 """Name of the effect of an operator that is dropped altogether."""
@@ -46,72 +49,54 @@ def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") 
     labels = [o.label for o in pipeline.operators]
     structure = Structure.of_all(pipeline)
     if wishes.prune_all:
-        structure = prune(pipeline, [k.partition(".")[0] if k not in labels else k
-                                     for k in wishes.keep])  # fmt: skip
+        keep = [name if name in labels else name.partition(".")[0] for name in wishes.keep]
+        structure = prune(pipeline, keep)
     context = context_of(pipeline, scene, structure, band)
     budget = limits(file.header.budget, context.map_noise, context.depth.sample)
     allowed = {m: v for m, v in budget.items() if m in context.metrics}
-    effects, left = _effects(file, structure, context, wishes.drop)
+    estimates = {o.label: planning_of(o).estimate(context) for o in context.operators}
+    effects = [Decided(label, e) for label, estimate in estimates.items() for e in estimate.effects]
+    effects.append(Decided("pipeline", _precision(pipeline.precision, context)))
+    check_droppable(wishes.drop, effects, labels)
+    left, remaining = context, structure
+    if whole := [label for label in structure.operators if label in wishes.drop]:
+        remaining = _without(pipeline, structure, whole)
+        pipeline = file.pipeline()
+        left = context_of(pipeline, file.scene(), remaining, band)
+        effects = [d for d in effects if d.operator not in whole]
+        effects += [Decided(o, _everything_of(o, estimates, context, left)) for o in whole]
     decided = decide(
         effects,
         allowed,
         kept=named(wishes.keep, effects, labels),
-        forced={
-            d.name
-            for d in effects
-            if d.effect.name == NAME or any(d.means(name) for name in wishes.drop)
-        },
+        forced={d.name for d in effects if d.effect.name == NAME or any(map(d.means, wishes.drop))},
         prune_all=wishes.prune_all,
         joined=context.joined,
     )
-    item = 8 if pipeline.precision == "float64" else 4
-    threads = wishes.threads or available_threads()
+    threads, free = wishes.threads or available_threads(), wishes.memory or available_memory() // 2
+    dtype = np.float64 if pipeline.precision == "float64" else np.float32
     return Plan(
         structure,
         tuple(decided),
         limits=allowed,
-        spent={
-            m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen > 0) for m in allowed
-        },
+        spent={m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen) for m in allowed},
         noise=(left.depth.sample, left.map_noise, left.coverage.hits if left.coverage else 0.0),
-        memory=memory_of(left, item, threads, wishes.memory or available_memory() // 2),
+        memory=memory_of(left, chain_of(pipeline, remaining), Settings(threads, free, dtype)),
         context=context,
     )
 
 
 def _check_arguments(file: Any, wishes: Wishes) -> None:
+    text = cure = ""
     if not isinstance(file, PipelineFile):
+        text = f"a plan is made of a pipeline file, not of {file!r:.60}"
         cure = "write zonda.plan(zonda.load(path_or_name))"
-        raise ZondaError(
-            f"a plan is made of a pipeline file, not of {file!r:.60}", place="zonda plan", cure=cure
-        )
     for what, names in (("keep", wishes.keep), ("drop", wishes.drop)):
         if isinstance(names, str):
+            text = f"{what} is a list of names, not the text {names!r}"
             cure = f"write {what}=[{names!r}]"
-            raise ZondaError(
-                f"{what} is a list of names, not the text {names!r}", place="zonda plan", cure=cure
-            )
-
-
-def _effects(
-    file: PipelineFile, structure: Structure, context: Context, drop: Sequence[str]
-) -> tuple[list[Decided], Context]:
-    """Effects of all operators, those of one that is dropped altogether as one; and the context
-    without such operators.
-    """
-    estimates = {o.label: planning_of(o).estimate(context) for o in context.operators}
-    pipeline = file.pipeline()
-    effects = [Decided(label, e) for label, estimate in estimates.items() for e in estimate.effects]
-    effects.append(Decided("pipeline", _precision(pipeline.precision, context)))
-    check_droppable(drop, effects, [o.label for o in pipeline.operators])
-    whole = [label for label in structure.operators if label in drop]
-    if not whole:
-        return effects, context
-    left = _without(file, structure, whole, context.band)
-    effects = [d for d in effects if d.operator not in whole]
-    return effects + [
-        Decided(label, _everything_of(label, estimates, context, left)) for label in whole
-    ], left
+    if text:
+        raise ZondaError(text, place="zonda plan", cure=cure)
 
 
 def _precision(precision: str, context: Context) -> Effect:
@@ -126,18 +111,15 @@ def _precision(precision: str, context: Context) -> Effect:
     return exact("precision", bound, formula, precision)
 
 
-def _without(
-    file: PipelineFile, structure: Structure, dropped: Sequence[str], band: str
-) -> Context:
-    """The context of the bounds without these operators (labels). Raises ZondaError if the others
-    cannot run without one.
+def _without(pipeline: Pipeline, structure: Structure, dropped: Sequence[str]) -> Structure:
+    """The structure without these operators (labels). Raises ZondaError if the others cannot run
+    without one.
     """
-    pipeline = file.pipeline()
     every = {o.label: o for o in pipeline.operators if o.label in structure.operators}
-    others = [o for label, o in every.items() if label not in dropped]
-    made = frozenset().union(*(o.provides for o in others if not o.requires & o.provides))
+    others = {label: o for label, o in every.items() if label not in dropped}
+    made = frozenset().union(*(o.provides for o in others.values() if not o.requires & o.provides))
     for label in dropped:
-        for o in others:
+        for o in others.values():
             if missing := (o.requires & every[label].provides) - made:
                 what = " and ".join(sorted(missing))
                 raise ZondaError(
@@ -146,8 +128,7 @@ def _without(
                     place="zonda plan",
                     cure="remove this --drop, or drop both",
                 )
-    kept = tuple(o.label for o in others)
-    return context_of(pipeline, file.scene(), dataclasses.replace(structure, operators=kept), band)
+    return replace(structure, operators=tuple(others))
 
 
 def _everything_of(

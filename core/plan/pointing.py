@@ -21,11 +21,11 @@ from ..output import Output
 from ..pipeline import Pipeline
 from ..run.bands import data_of_bands, distribute, of_one_band, points
 from ..scene import Scene
-from ..signal import is_stream
+from ..signal import MAIN, is_stream
 from ..types import Floats
-from .bounds import Context, Coverage, Depth
+from .bounds import Context, Coverage, Depth, evenly
 from .planning import planning_of
-from .structure import Structure, work
+from .structure import Structure, chain_of
 
 LOOKED_AT = 4
 """Observations whose levels of noise are looked at, apart from those at the extremes of elevation.
@@ -85,33 +85,28 @@ def context_of(pipeline: Pipeline, scene: Scene, structure: Structure, band: str
     ``pipeline`` is the planner's own copy.
     """
     operators = [o for o in pipeline.operators if o.label in structure.operators]
-    readers = frozenset(o.label for o in operators if planning_of(o).reads_streams)
-    data = observed(
-        [o for o in operators if o.label not in readers and not isinstance(o, Output)], scene, band
-    )
-    acting = work(pipeline, structure)
-    note_signals(data.observations, acting.components, acting.signals)
+    reading = [o for o in operators if planning_of(o).reads_streams]
+    readers = frozenset(o.label for o in reading)
+    others = [o for o in operators if o.label not in readers and not isinstance(o, Output)]
+    data = observed(others, scene, band)
+    chain = chain_of(pipeline, structure)
+    note_signals(data.observations, chain.components, chain.signals)
     shown = _some(data.observations)
     for observation in shown:
         for operator in operators:
             operator.configure(observation)
-    streams = frozenset().union(
-        *((o.optional | o.requires) - {"signal"} for o in operators if o.label in readers)
-    )
     context = Context(
         data.scene,
         data.observations,
         operators,
-        acting,
         readers=readers,
-        kept_streams=streams,
+        kept_streams=frozenset().union(*(o.optional | o.requires for o in reading)) - {MAIN},
         band=band,
         bands_alike=scene.instrument.focalplane().bands_alike if band else 1,
     )
     context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
-    context.depth = _depth(operators, shown, context)
-    pixels = [t.pixel for t in context.traits.values() if t.pixel > 0]
-    if pixels:
+    context.depth = _depth(shown, context)
+    if pixels := [t.pixel for t in context.traits.values() if t.pixel > 0]:
         context.coverage = cover(data.observations, min(pixels))
     context.metrics = _metrics(pipeline, structure, context)
     return context
@@ -121,160 +116,115 @@ def _some(observations: Sequence[Observation]) -> list[Observation]:
     """The first, the last, those at the lowest and at the highest elevation, and up to `LOOKED_AT`
     between them.
     """
-    evenly = np.linspace(0, len(observations) - 1, min(LOOKED_AT, len(observations))).astype(int)
-    low = min(range(len(observations)), key=lambda k: float(observations[k].elevation.min()))
-    high = max(range(len(observations)), key=lambda k: float(observations[k].elevation.max()))
-    return [observations[k] for k in sorted({*evenly.tolist(), low, high})]
+    low = np.argmin([o.elevation.min() for o in observations])
+    high = np.argmax([o.elevation.max() for o in observations])
+    return [observations[k] for k in sorted({*evenly(len(observations), LOOKED_AT), low, high})]
 
 
-def _depth(
-    operators: Sequence[Operator], observations: Sequence[Observation], context: Context
-) -> Depth:
+def _depth(observations: Sequence[Observation], context: Context) -> Depth:
     """See `Depth`. The quietest detector of all scans is noted in the traits."""
-    makers = [o for o in operators if context.traits[o.label].noise > 0]
-    if not makers:
-        return Depth(0.0, 0.0)
+    makers = [o for o in context.operators if context.traits[o.label].noise > 0]
     variances, numbers = [], []
     quietest = dict.fromkeys((o.label for o in makers), math.inf)
     for observation in observations:
         total = np.zeros(observation.n_detectors)
         for operator in makers:
             found = planning_of(operator).traits(observation)
-            total += found.noise**2 if found.each is None else found.each**2
+            total += (found.noise if found.each is None else found.each) ** 2
             quietest[operator.label] = min(quietest[operator.label], found.noise)
         variances.append(total)
         numbers.append(np.where(observation.good_detectors, float(observation.n_samples), 0.0))
     for label, level in quietest.items():
         context.traits[label] = replace(context.traits[label], noise=level)
     variance, number = np.concatenate(variances), np.concatenate(numbers)
-    if not number.any():
-        return Depth(0.0, 0.0)
-    sample = math.sqrt(float(number @ variance / number.sum()))
     used = number > 0
-    weighs = any(t.weighs for t in context.traits.values()) and bool((variance[used] > 0).all())
-    weighed = (
-        math.sqrt(float(number.sum() / (number[used] @ (1 / variance[used])))) if weighs else sample
-    )
+    if not makers or not used.any():
+        return Depth(0.0, 0.0)
+    sample = weighed = math.sqrt(float(number @ variance / number.sum()))
+    if any(t.weighs for t in context.traits.values()) and (variance[used] > 0).all():
+        weighed = math.sqrt(float(number.sum() / (number[used] @ (1 / variance[used]))))
     return Depth(sample, weighed)
 
 
 def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> frozenset[str]:
-    found = set()
-    if context.coverage is not None:
-        found |= {"map_rms", "peak"}
-        made = {name for o in context.operators for name in made_by(o) if is_stream(name)}
-        if made <= {"sky", "signal"} or any(
-            pipeline.runs[r].only == ["sky"] for r in structure.runs
-        ):
-            found.add("transfer")
-    if context.readers or context.coverage is None:
-        found |= {"tod", "psd"}
-    return frozenset(found)
+    """The errors that matter to the products."""
+    found = {"map_rms", "peak"} if context.coverage else {"tod", "psd"}
+    made = frozenset[str]().union(*map(made_by, context.operators))
+    alone = {name for name in made if is_stream(name)} <= {"sky", MAIN}
+    if context.coverage and (
+        alone or any(pipeline.runs[r].only == ["sky"] for r in structure.runs)
+    ):
+        found.add("transfer")
+    return frozenset(found | {"tod", "psd"} if context.readers else found)
 
 
 def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
     """Hits per pixel of side ``pixel`` [rad] and scan speed, from a thinned set of instants and
     detectors.
     """
-    points: list[Floats] = []
-    weights: list[Floats] = []
-    speeds: list[Floats] = []
-    passed: list[Floats] = []
-    centre = rotation_matrices(observations[0].boresight_radec[:1])[0]
-    number, most = max(POINTS // len(observations), 64), DETECTORS
-    if exact := sum(o.n_samples * o.n_detectors for o in observations) <= POINTS * DETECTORS:
-        number, most = (
-            max(sizes)
-            for sizes in zip(*((o.n_samples, o.n_detectors) for o in observations), strict=True)
-        )
-    for o in observations:
-        times = np.unique(np.linspace(0, o.n_samples - 1, min(number, o.n_samples)).astype(int))
-        rows = np.unique(np.linspace(0, o.n_detectors - 1, min(most, o.n_detectors)).astype(int))
-        turn = centre.T @ rotation_matrices(o.boresight_radec[times])
-        plane = np.array([-o.focalplane.eta[rows], -o.focalplane.xi[rows], np.ones(len(rows))])
-        looking = turn @ plane  # (time, 3, detector)
-        front = looking[:, 2] > 0.1
-        points.append(
-            np.array(
-                [
-                    looking[:, 0][front] / looking[:, 2][front],
-                    looking[:, 1][front] / looking[:, 2][front],
-                ]
-            )
-        )
-        weights.append(
-            np.full(points[-1].shape[1], o.n_samples * o.n_detectors / (len(times) * len(rows)))
-        )
-        passage = np.full(
-            len(times), float(o.n_samples)
-        )  # samples that a detector takes to cross a pixel, at these instants
-        if o.n_samples > 1:
-            at = times[:-1]
-            ends = rotation_matrices(o.boresight_radec[np.stack([at, at + 1], 1).ravel()])[
-                :, :, 2
-            ].reshape(-1, 2, 3)
-            speeds.append(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) * o.sample_rate)
-            crossing = (
-                o.sample_rate * pixel / np.maximum(np.append(speeds[-1], speeds[-1][-1:]), 1e-12)
-            )
-            passage = np.clip(crossing, 1.0, passage)
-        looked = np.maximum(passage * len(times) / o.n_samples, 1.0)
-        share = np.stack(
-            [1 / looked, o.n_samples * o.n_detectors / (len(times) * len(rows)) / passage]
-        )
-        passed.append(np.broadcast_to(share[:, :, None], (2, len(times), len(rows)))[:, front])
-    where, weight = np.concatenate(points, axis=1), np.concatenate(weights)
-    speed = float(np.median(np.concatenate(speeds))) if speeds else 0.0
+    most = POINTS * DETECTORS
+    exact = sum(o.n_samples * o.n_detectors for o in observations) <= most
+    instants, detectors = max(POINTS // len(observations), 64), DETECTORS
     if exact:
-        index = np.floor(where / pixel).astype(np.int64)
-        index -= index.min(axis=1, keepdims=True)
-        _, each = np.unique(index[0] * (index[1].max() + 1) + index[1], return_counts=True)
-        return Coverage(max(float(np.quantile(each, DEEP)), 1.0), pixel, speed, exact)
-    reach = np.maximum(np.ptp(where, axis=1), pixel)
-    cells = np.maximum(1, np.minimum(CELLS, np.floor(reach / pixel))).astype(int)
-    low = where.min(axis=1)
-    side = np.maximum(np.ptp(where, axis=1) / cells, 1e-15)
-    column, row = (
-        np.minimum(((where[k] - low[k]) / side[k]).astype(np.int64), cells[k] - 1) for k in (0, 1)
-    )
-    cell = column * cells[1] + row
-    covered = _covered(
-        where,
-        cell,
-        pixel,
-        max(float(side[0] * side[1]) / pixel**2, 1.0),
-        np.concatenate(passed, axis=1),
-    )
-    counts = np.bincount(cell, weight, len(covered))
-    hits = counts[covered > 0] / covered[covered > 0]
-    return Coverage(max(float(np.quantile(hits, DEEP)), 1.0), pixel, speed)
+        instants = detectors = most
+    centre = rotation_matrices(observations[0].boresight_radec[:1])[0]
+    points, speeds = [], [np.zeros(0)]
+    for o in observations:
+        times, rows = evenly(o.n_samples, instants), evenly(o.n_detectors, detectors)
+        plane = np.array([-o.focalplane.eta[rows], -o.focalplane.xi[rows], np.ones(len(rows))])
+        x, y, z = np.moveaxis(centre.T @ rotation_matrices(o.boresight_radec[times]) @ plane, 1, 0)
+        scale = np.maximum(z, 0.1)
+        # samples that a detector takes to cross a pixel, at these instants
+        passage = np.full(len(times), float(o.n_samples))
+        if o.n_samples > 1:
+            both = o.boresight_radec[np.stack([times[:-1], times[:-1] + 1], 1).ravel()]
+            ends = rotation_matrices(both)[:, :, 2].reshape(-1, 2, 3)
+            speeds.append(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) * o.sample_rate)
+            speed = np.maximum(np.append(speeds[-1], speeds[-1][-1:]), 1e-12)
+            passage = np.clip(o.sample_rate * pixel / speed, 1.0, passage)
+        each = o.n_samples * o.n_detectors / (len(times) * len(rows))
+        looked = 1 / np.maximum(passage * len(times) / o.n_samples, 1.0)
+        found = (x / scale, y / scale, each, looked[:, None], (each / passage)[:, None])
+        points.append(np.stack(np.broadcast_arrays(*found))[:, z > 0.1])
+    median = float(np.median(np.concatenate(speeds))) if len(speeds) > 1 else 0.0
+    where, counted = np.split(np.concatenate(points, axis=1), [2])
+    if exact:
+        deep = np.quantile(np.unique(_numbers(where, pixel), return_counts=True)[1], DEEP)
+    else:
+        deep = np.quantile(_hits(where, pixel, *counted), DEEP)
+    return Coverage(max(float(deep), 1.0), pixel, median, exact)
 
 
-def _covered(
-    where: Floats, cell: NDArray[np.int64], pixel: float, most: float, passages: Floats
-) -> Floats:
-    """Pixels in each cell that samples fall in, of ``most`` in it, from some points ``where`` (2,
-    n) that fall in u of them.
-
-    ``passages`` (2, n): what each point counts of the passages through pixels that were looked at,
-    and of all there are. Passages fall in u = P (1 - exp(-n / P)) of P pixels if they do so at
-    random: P follows from those that were looked at, and then the pixels that all of them fall in.
-    Few passages, each through a pixel of its own, do not tell P: it is the whole cell.
-    """
-    number = int(cell.max()) + 1
+def _numbers(where: Floats, pixel: float) -> NDArray[np.int64]:
+    """(n,) number of the pixel that each point (2, n) falls in."""
     index = np.floor(where / pixel).astype(np.int64)
     index -= index.min(axis=1, keepdims=True)
-    one = (cell * (index[0].max() + 1) + index[0]) * (index[1].max() + 1) + index[1]
-    _, first = np.unique(one, return_index=True)
-    u = np.bincount(cell[first], minlength=number).astype(np.float64)
-    looked, whole = (
-        np.maximum(np.bincount(cell, some, number), np.minimum(u, 1.0)) for some in passages
-    )
-    pixels = np.minimum(u, most)
+    return np.asarray(index[0] * (index[1].max() + 1) + index[1])
+
+
+def _hits(where: Floats, pixel: float, weight: Floats, looked: Floats, whole: Floats) -> Floats:
+    """Samples per pixel that samples fall in, for each cell of a coarse grid with points ``where``
+    (2, n).
+
+    ``weight`` (n,): number of samples that a point stands for. ``looked``, ``whole``: number of
+    passages through pixels that it counts of those that were looked at, and of all there are.
+    Passages fall in u = P (1 - exp(-n / P)) of P pixels if they do so at random: P follows from
+    those that were looked at, and then the pixels that all of them fall in. Few passages, each
+    through a pixel of its own, do not tell P: it is the whole cell.
+    """
+    extent = np.ptp(where, axis=1)
+    cells = np.clip(np.floor(extent / pixel), 1, CELLS).astype(int)
+    side = np.maximum(extent / cells, 1e-15)
+    index = ((where - where.min(axis=1, keepdims=True)) / side[:, None]).astype(np.int64)
+    index = np.minimum(index, cells[:, None] - 1)
+    cell, pixels = index[0] * cells[1] + index[1], _numbers(where, pixel)
+    _, first = np.unique(cell * (pixels.max() + 1) + pixels, return_index=True)
+    u = np.bincount(cell[first]).astype(np.float64)
+    seen, every = (np.maximum(np.bincount(cell, n), np.minimum(u, 1.0)) for n in (looked, whole))
+    most = max(float(side[0] * side[1]) / pixel**2, 1.0)
+    there = np.minimum(u, most)
     for _ in range(50):
-        pixels = np.minimum(
-            u / np.maximum(-np.expm1(-looked / np.maximum(pixels, 1e-9)), 1e-9), most
-        )
-    pixels = np.where(looked <= 1.02 * u, most, pixels)
-    covered = np.maximum(-pixels * np.expm1(-whole / np.maximum(pixels, 1e-9)), np.minimum(u, most))
-    return np.asarray(np.where(u > 0, np.maximum(covered, 1.0), 0.0), np.float64)
+        there = np.minimum(u / np.maximum(-np.expm1(-seen / np.maximum(there, 1e-9)), 1e-9), most)
+    there = np.where(seen <= 1.02 * u, most, there)
+    covered = np.maximum(-there * np.expm1(-every / np.maximum(there, 1e-9)), np.minimum(u, most))
+    return np.asarray((np.bincount(cell, weight) / np.maximum(covered, 1.0))[u > 0])

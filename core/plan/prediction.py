@@ -4,21 +4,18 @@ machine.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..data import Data, Observation
-from ..focalplane import Focalplane
 from ..mapmaker import joins, made_by, makes_products
 from ..operator import Operator
 from ..output import Output
@@ -26,6 +23,7 @@ from ..run.budget import BASE, share_in_step
 from ..run.schedule import Chain, schedule
 from ..run.settings import Settings
 from ..signal import Signal
+from ..types import Floats
 from .bounds import Context
 from .planning import planning_of
 
@@ -61,38 +59,31 @@ class Memory:
     products: float = 0.0
 
 
-def memory_of(context: Context, item: int, threads: int, memory: int) -> Memory:
-    """Memory of the pipeline, all signals.
-
-    Parameters
-    ----------
-    item
-        Bytes of one sample of a stream.
-    threads, memory
-        As in `Settings`, but the memory is that of the whole process.
+def memory_of(context: Context, chain: Chain, settings: Settings) -> Memory:
+    """Memory of a pipeline, all signals. ``settings``: as of a run, but the memory is that of the
+    whole process.
     """
     longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
+
+    def hold(operators: Iterable[Operator]) -> int:
+        return sum(planning_of(o).memory(longest) for o in operators)
+
+    outputs = [o for o in context.operators if isinstance(o, Output)]
     during = [o for o in context.operators if not isinstance(o, Output)]
-    held = POINTED * context.times + sum(planning_of(o).memory(longest) for o in during)
-    after = sum(planning_of(o).memory(longest) for o in context.operators if isinstance(o, Output))
-    dtype = np.float64 if item == 8 else np.float32
-    settings = Settings(threads, max(int(memory - BASE - held), 1), dtype)
-    work = context.work
-    chain = Chain(work.steps, work.signals, work.components)
-    products = sum(planning_of(o).memory(longest) for o in during if makes_products(o))
-    bands = context.bands_alike
-    in_step = None
-    if bands > 1:
-        alone = dataclasses.replace(
-            settings, memory=max(settings.memory - (bands - 1) * products, 1)
-        )
-        in_step = share_in_step(chain, longest, alone, bands, (bands - 1) * (held - products))
-    found = schedule(chain, longest, in_step or settings)
+    held, products = POINTED * context.times + hold(during), hold(filter(makes_products, during))
+    settings = replace(settings, memory=max(int(settings.memory - BASE - held), 1))
+    in_step, others = None, context.bands_alike - 1
+    if others:
+        alone = replace(settings, memory=max(settings.memory - others * products, 1))
+        more = others * (held - products)
+        in_step = share_in_step(chain, longest, alone, context.bands_alike, more)
+    found = schedule(chain, longest, in_step or settings).bytes
     if in_step is not None:
-        products = held + found.bytes
-    if any(map(joins, work.steps)):  # its part of the stream of all bands
-        products = held + found.bytes + item * longest.n_samples * longest.n_detectors
-    return Memory(BASE + max(held + found.bytes, after), products)
+        products = held + found
+    if any(map(joins, chain.steps)):  # its part of the stream of all bands
+        size = np.dtype(settings.dtype).itemsize
+        products = held + found + size * longest.n_samples * longest.n_detectors
+    return Memory(BASE + max(held + found, hold(outputs)), products)
 
 
 @dataclass(frozen=True)
@@ -128,57 +119,46 @@ def timed(file: PipelineFile, observations: Sequence[Observation]) -> Timing:
         As the pipeline does.
     """
     first, bands = observations[0], {o.instrument.band.name for o in observations}
-    detectors = first.n_detectors * len(bands)
-    seconds = min(SAMPLES / (detectors * first.sample_rate), SECONDS, first.duration)
-    if seconds < LEAST_SECONDS:
-        seconds = min(LEAST_SECONDS, first.duration)
-    every = max(1, math.ceil(seconds * first.sample_rate * detectors / SAMPLES))
-    small = _least([_run(file, seconds / SHORTER, every, False) for _ in range(TIMES)])
-    large = _least([_run(file, seconds, every, k == 0) for k in range(TIMES)])
+    rate = first.n_detectors * len(bands) * first.sample_rate
+    seconds = min(max(SAMPLES / rate, LEAST_SECONDS), SECONDS, first.duration)
+    every = max(1, math.ceil(seconds * rate / SAMPLES))
+    few, short = _least(file, Slice(seconds=seconds / SHORTER, every=every), outputs=False)
+    many, long = _least(file, Slice(seconds=seconds, every=every), outputs=True)
     scans = len(observations) / len(bands)
     samples = sum(o.n_detectors * o.n_samples for o in observations)
     setup: dict[str, float] = {}
     growing: dict[str, float] = {}
-    for label, (once, each) in large.seconds.items():
-        few = small.seconds.get(label, (0.0, 0.0))[1]
-        apart = large.samples - small.samples
-        rate = max(each - few, 0.0) / apart if apart else 0.0
-        growing[label] = rate * samples
-        setup[label] = once + scans * max(min(few, each) - rate * small.samples, 0.0)
+    for label, (once, each) in long.items():
+        less = short.get(label, np.zeros(2))[1]
+        slope = max(each - less, 0.0) / (many - few) if many > few else 0.0
+        growing[label] = float(slope * samples)
+        setup[label] = float(once + scans * max(min(less, each) - slope * few, 0.0))
     words = f"{seconds:.3g} s of the first scan"
     return Timing(setup, growing, words + (f", every {every}th detector" if every > 1 else ""))
 
 
-@dataclass(frozen=True)
-class _Run:
-    samples: int
-    seconds: Mapping[str, tuple[float, float]]
-    """CPU seconds of each step: once per run, and once per scan."""
-
-
-def _least(runs: Sequence[_Run]) -> _Run:
-    """Least time of each step of some runs of the same slice."""
-    found: dict[str, tuple[float, float]] = {}
-    for label in runs[0].seconds:
-        each = [run.seconds[label] for run in runs if label in run.seconds]
-        found[label] = min(once for once, _ in each), min(scan for _, scan in each)
-    return _Run(runs[0].samples, found)
-
-
-def _run(file: PipelineFile, seconds: float, every: int, outputs: bool) -> _Run:
-    steps = file.steps if outputs else [s for s in file.steps if not isinstance(s.operator, Output)]
-    part = dataclasses.replace(file, steps=_cut(steps, Slice(seconds=seconds, every=every)))
-    with TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the plan has warned
-        data = part.pipeline().run(part.scene(), output=folder, threads=1)
-    found: dict[str, tuple[float, float]] = {}
-    for label, stage, used in data.provenance["timings"]:
-        if label == Slice.__name__:
-            continue
-        once, each = found.get(label, (0.0, 0.0))
-        whole = stage in ("observe", "finalize")
-        found[label] = (once + used, each) if whole else (once, each + used)
-    return _Run(sum(o.n_detectors * o.n_samples for o in data.observations), found)
+def _least(file: PipelineFile, cut: Slice, outputs: bool) -> tuple[int, dict[str, Floats]]:
+    """Samples of a slice, and the least CPU seconds of each step in `TIMES` runs: once per run, and
+    once per scan. Outputs, if wanted, act in the first run.
+    """
+    least: dict[str, Floats] = {}
+    samples = 0
+    for k in range(TIMES):
+        shown = outputs and k == 0
+        steps = [s for s in file.steps if shown or not isinstance(s.operator, Output)]
+        part = replace(file, steps=_cut(steps, cut))
+        with TemporaryDirectory() as folder, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the plan has warned
+            data = part.pipeline().run(part.scene(), output=folder, threads=1)
+        found: dict[str, Floats] = {}
+        for label, stage, used in data.provenance["timings"]:
+            once = stage in ("observe", "finalize")
+            found[label] = found.get(label, 0.0) + np.array([once, not once]) * used
+        del found["Slice"]
+        for label, each in found.items():
+            least[label] = np.minimum(least.get(label, each), each)
+        samples = sum(o.n_detectors * o.n_samples for o in data.observations)
+    return samples, least
 
 
 class Slice(Operator):
@@ -205,14 +185,7 @@ class Slice(Operator):
         plane = o.focalplane
         outer = [int(f(v)) for v in (plane.xi, plane.eta) for f in (np.argmin, np.argmax)]
         kept = np.unique(np.r_[np.arange(0, len(plane), self.every), outer])
-        chosen = {f.name: _taken(getattr(plane, f.name), kept) for f in dataclasses.fields(plane)}
-        return dataclasses.replace(
-            o, focalplane=Focalplane(**chosen), detector_flags=o.detector_flags[kept]
-        )
-
-
-def _taken(values: Any, index: NDArray[np.intp]) -> Any:
-    return values[index] if isinstance(values, np.ndarray) else [values[k] for k in index]
+        return replace(o, focalplane=plane.rows(kept), detector_flags=o.detector_flags[kept])
 
 
 def _cut(steps: Sequence[Step], step: Slice) -> tuple[Step, ...]:
@@ -234,12 +207,13 @@ def sliced(
     ]
     cut = Slice(seconds=seconds, observations=observations, every=every)
     made = frozenset[str]().union(*(made_by(s.operator) for s in steps))
-    sky = "sky" in made and made & {"atmosphere", "white", "pink"}
-    runs = {"sky_alone": Signal(only=["sky"], modes="full")} if sky else {}
-    if sky and _has_own_modes(file):
-        runs["sky_with_own_modes"] = Signal(only=["sky"])
+    runs = {}
+    if "sky" in made and made & {"atmosphere", "white", "pink"}:
+        runs["sky_alone"] = Signal(only=["sky"], modes="full")
+        if _has_own_modes(file):
+            runs["sky_with_own_modes"] = Signal(only=["sky"])
     header = file.header.model_copy(update={"runs": runs})
-    return dataclasses.replace(file, steps=_cut(steps, cut), header=header)
+    return replace(file, steps=_cut(steps, cut), header=header)
 
 
 def _has_own_modes(file: PipelineFile) -> bool:

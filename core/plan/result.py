@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import shutil
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..maps.beams import expected_fwhm
 from ..operator import labels
-from .bounds import Context, describe, figure, kelvin
+from ..tables import aligned
+from .bounds import Context, figure, kelvin
 from .decide import Decided
 from .prediction import Memory, Timing
 from .structure import Structure
+
+WIDTH = 120
+"""Columns after which lines of text are broken."""
 
 Row = tuple[str, str, str, str]
 """(effect, decision, bound, formula or reason), for headers and the report."""
@@ -80,10 +83,9 @@ class PlanSummary:
 
 def unplanned(structure: Structure, why: str) -> PlanSummary:
     """A run that is not planned: its structure, and why nothing is coarsened."""
-    row = ("plan", "not made", "", why)
+    rows = [("plan", "not made", "", why), *omissions(structure)]
     words = f"simulated in full ({why})"
-    return PlanSummary(structure.operators, structure.runs, {}, [row, *omissions(structure)],
-                       words=words)  # fmt: skip
+    return PlanSummary(structure.operators, structure.runs, {}, rows, words=words)
 
 
 @dataclass(frozen=True)
@@ -125,8 +127,14 @@ class Plan:
     @property
     def summary(self) -> PlanSummary:
         """Summary for a run."""
-        return PlanSummary(self.operators, self.structure.runs, self.settings(), self.short(),
-                           self.memory, foreseen(self.memory, self.timing))  # fmt: skip
+        return PlanSummary(
+            self.operators,
+            self.structure.runs,
+            self.settings(),
+            self.short(),
+            self.memory,
+            foreseen(self.memory, self.timing),
+        )
 
     def apply(self, file: PipelineFile) -> PipelineFile:
         """The pipeline that is run: an ordinary one, with parameters changed and operators
@@ -147,8 +155,9 @@ class Plan:
         """Rows for headers: steps that are omitted by structure first."""
         found = omissions(self.structure)
         for d in self.decided:
-            bound = describe(d.choice.bound, self.context.metrics) if d.adds_error else ""
-            found.append((d.name, f"{d.choice.decision}: {d.choice.what}", bound, d.formula))
+            bound = d.choice.bound if d.adds_error else {}
+            errors = ", ".join(f"{m} {figure(m, bound[m])}" for m in self.limits if m in bound)
+            found.append((d.name, f"{d.choice.decision}: {d.choice.what}", errors, d.formula))
         return found
 
     def as_dict(self) -> dict[str, Any]:
@@ -180,9 +189,6 @@ class Plan:
             "reason": d.reason,
         }
 
-    def __str__(self) -> str:
-        return self.text()
-
     def _repr_html_(self) -> str:
         from ..pages import html_table
 
@@ -190,81 +196,82 @@ class Plan:
             "Plan", [(d.name, f"{d.choice.decision}: {d.choice.what}") for d in self.decided]
         )
 
-    def text(self, width: int | None = None) -> str:
-        """The table for a terminal of ``width`` columns; of this one where absent."""
-        width = width or max(80, min(shutil.get_terminal_size((120, 50)).columns, 140))
-        lines = [self._noise()]
-        for metric, limit in self.limits.items():
-            spent = figure(metric, self.spent[metric])
-            lines.append(f"budget for {metric}: {spent} of {figure(metric, limit)} spent")
-        said = []
+    def __str__(self) -> str:
+        said = [f"noise: {self._noise()}"]
         if joined := self.context.joined:
             said.append(
                 f"{joined} joins the bands: the bounds are of this band alone and need not hold, so"
                 " that nothing is coarsened"
             )
-        groups: dict[tuple[str, str], list[str]] = {}
-        for row in self.structure.rows:
-            groups.setdefault((row.run, row.reason), []).append(row.operator)
-        for (run, reason), operators in groups.items():
-            signal, steps = f"signal {run}" if run else "", ", ".join(filter(None, operators))
-            said.append(f"omitted: {': '.join(filter(None, (signal, steps)))} ({reason})")
-        for text in said:
-            lines += textwrap.wrap(text, width, subsequent_indent="    ")
-        derived = self.structure.derived
-        lines += [f"signal {run} is a remainder: {how}" for run, how in derived.items()]
-        return "\n".join([*lines, "", *self._table(width), "", str(self.summary)])
+        said += [f"{name} {what}: {why}" for name, what, _, why in omissions(self.structure)]
+        sums = [
+            (name, *(figure(m, values[m]) for m in self.limits))
+            for name, values in (("added by this plan", self.spent), ("budget", self.limits))
+        ]
+        changed = [d for d in self.decided if d.chosen]
+        absent = [d for d in self.decided if not d.simulated]
+        kept = [d for d in self.decided if not d.adds_error]
+        parts = [
+            map(wrapped, said),
+            aligned(sums, ["errors, at most", *self.limits], "<>"),
+            self._table("Left out or coarser, with the error that this adds at most:", changed),
+            self._table("In full, with what each effect contributes at most:", kept),
+            self._table("Not simulated by zonda, with the error of that at most:", absent),
+            [wrapped(f"{d.effect.name}: {d.formula}") for d in kept if not d.effect.size],
+            ["docs/plan.md and --json have the formulas", *self._times(), str(self.summary)],
+        ]
+        return "\n\n".join(filter(None, map("\n".join, parts)))
 
     def _noise(self) -> str:
         sample, pixel, hits = self.noise
-        if not pixel:
-            return f"noise: {kelvin(sample)} per sample; no map" if sample else "noise: none"
+        coverage, plane = self.context.coverage, self.context.first.focalplane
+        if not (pixel and coverage):
+            return f"{kelvin(sample)} per sample; no map" if sample else "none"
         words = (
-            f"noise: {kelvin(pixel)} per map pixel ({hits:.0f} samples in the deep part),"
+            f"{kelvin(pixel)} per map pixel ({hits:.0f} samples in the deep part),"
             f" {kelvin(sample)} per sample"
         )
-        coverage, plane = self.context.coverage, self.context.first.focalplane
-        fwhm, side = expected_fwhm(plane.fwhm, plane.net), coverage.pixel if coverage else math.inf
+        fwhm = expected_fwhm(plane.fwhm, plane.net)
         # sqrt(pixel area / (4 pi sigma^2)), where pixels are small
-        smoothing = side / fwhm * math.sqrt(2 * math.log(2) / math.pi)
-        if smoothing < 0.5:
-            beam, both = (
-                f"{math.degrees(f) * 3600:.3g} arcsec" for f in (fwhm, math.sqrt(2) * fwhm)
-            )
-            words += (
-                f";\n  {kelvin(pixel * smoothing)} in the map smoothed with the beam ({beam};"
-                f" resolution {both}), the white noise alone"
-            )
-        return words
+        smoothing = coverage.pixel / fwhm * math.sqrt(2 * math.log(2) / math.pi)
+        if smoothing >= 0.5:
+            return words
+        beam, both = (f"{math.degrees(f) * 3600:.3g} arcsec" for f in (fwhm, math.sqrt(2) * fwhm))
+        return (
+            f"{words}; {kelvin(pixel * smoothing)} in the map smoothed with the beam ({beam};"
+            f" resolution {both}), the white noise alone"
+        )
 
-    def _table(self, width: int) -> list[str]:
-        """Under each operator: each effect's form, the error of that or of leaving it out, and
-        why."""
-        lines: list[str] = []
-        column = max((len(d.effect.name) for d in self.decided), default=0) + 2
-        indent = " " * (column + 2)
-        operator = formula = ""
-        for d in self.decided:
-            if d.operator != operator:
-                operator, formula = d.operator, ""
-                used = self.timing.of(operator) if self.timing else 0.0
-                lines.append(operator + (f"  {duration(used)} of CPU time" if used else ""))
-            kind, what = d.choice.decision, d.choice.what
-            lines.append(
-                f"  {d.effect.name:<{column}}{what if kind == what else f'{kind}: {what}'}"
-            )
-            bound = d.choice.bound if d.adds_error else d.effect.size
-            bounds, saves = describe(bound, self.context.metrics), d.choice.saves
-            notes = [
-                f"{'error within' if d.adds_error else 'without it'} {bounds}" if bounds else "",
-                f"saved {100 * saves.share:.2g} % of {saves.scene}" if saves else "",
-                d.reason,
-                d.formula if d.formula != formula else "",
-            ]
-            formula = d.formula
-            lines += textwrap.wrap("; ".join(filter(None, notes)), width, initial_indent=indent,
-                                   subsequent_indent=indent)  # fmt: skip
-        return lines
+    def _table(self, title: str, decided: Sequence[Decided]) -> list[str]:
+        """Effects under their operators: form, bound in each metric, and why."""
+        bounds = [d.choice.bound if d.adds_error else d.effect.size for d in decided]
+        metrics = [m for m in self.limits if any(m in bound for bound in bounds)]
+        rows: list[Sequence[str]] = []
+        before = ""
+        for d, bound in zip(decided, bounds, strict=True):
+            if not bound:
+                continue  # a statement
+            if d.operator != before:
+                rows.append([d.operator])
+            before, saves = d.operator, d.choice.saves
+            why = f"; saved {100 * saves.share:.2g} % of {saves.scene}" if saves else ""
+            figures = (figure(m, bound[m]) if m in bound else "" for m in metrics)
+            rows.append([f"  {d.effect.name}", d.choice.what, *figures, d.reason + why])
+        head, align = ["", "", *metrics], "<<" + ">" * len(metrics) + "<"
+        return [title, *aligned(rows, head, align)] if rows else []
+
+    def _times(self) -> list[str]:
+        """CPU time of each step, where it was measured."""
+        if self.timing is None:
+            return []
+        each = {label: self.timing.of(label) for label in self.timing.growing}
+        text = ", ".join(f"{label} {duration(used)}" for label, used in each.items() if used > 0)
+        return [wrapped(f"CPU time: {text}")]
+
+
+def wrapped(text: str) -> str:
+    """Lines of text, indented from the second on."""
+    return textwrap.fill(text, WIDTH, subsequent_indent="  ")
 
 
 def omissions(structure: Structure) -> list[Row]:
@@ -279,24 +286,25 @@ def omissions(structure: Structure) -> list[Row]:
 
 def foreseen(memory: Memory, timing: Timing | None) -> str:
     """Memory, and time where it was measured, as one line."""
-    size = f"about {memory.bytes / 1e9:.2g} GB"
+    size = f"{memory.bytes / 1e9:.2g} GB"
     if timing is None:
-        return size
-    setup, total = sum(timing.setup.values()), timing.total
+        return f"about {size}"
+    setup = duration(sum(timing.setup.values()))
     return (
-        f"about {duration(total)} of CPU time ({duration(setup)} of it set-up) and"
-        f" {memory.bytes / 1e9:.2g} GB; measured on {timing.slice}"
+        f"about {duration(timing.total)} of CPU time ({setup} of it set-up) and {size}; measured"
+        f" on {timing.slice}"
     )
 
 
 def as_dict_of(memory: Memory, timing: Timing | None) -> dict[str, Any]:
     """Memory and time, for JSON."""
-    found: dict[str, Any] = {"bytes": memory.bytes}
-    if timing is not None:
-        found["cpu_seconds"] = timing.total
-        found["set_up"], found["with_samples"] = dict(timing.setup), dict(timing.growing)
-        found["slice"] = timing.slice
-    return found
+    times = timing and {
+        "cpu_seconds": timing.total,
+        "set_up": dict(timing.setup),
+        "with_samples": dict(timing.growing),
+        "slice": timing.slice,
+    }
+    return {"bytes": memory.bytes, **(times or {})}
 
 
 def duration(seconds: float) -> str:

@@ -10,7 +10,7 @@ the components can take its place, and no signal takes its singular modes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from ..assembly.signals import Signals, acting_steps, remainder
@@ -21,8 +21,8 @@ from ..mapmaker import MapMaker, filters, forms, made_by, makes_products
 from ..operator import Operator
 from ..output import Output, changes_observations, is_output
 from ..pipeline import Pipeline
+from ..run.schedule import Chain
 from ..signal import MAIN, TRANSMISSION, Component, is_stream, stream_of
-from .bounds import Work
 
 
 @dataclass(frozen=True)
@@ -76,97 +76,76 @@ def prune(pipeline: Pipeline, keep: Sequence[str] = ()) -> Structure:
     """
     rows: list[Row] = []
     in_memory = not any(map(is_output, pipeline.operators))
-    every = set().union(*(o.provides for o in pipeline.operators))
-    needed: dict[str, dict[str, str]] = {}  # by signal: label -> reason
+    every = frozenset[str]().union(*(o.provides for o in pipeline.operators))
+    needed: dict[str, set[str]] = {}  # labels of steps by signal
     for name in [*pipeline.runs, ""]:  # the complete signal last: the others may need its modes
         steps = steps_of(pipeline, name)
-        wanted = (
-            every if in_memory else _wanted(pipeline, name)
-        )  # where nothing is written, the products are the output
-        pinned = dict.fromkeys(keep, "asked for with --keep")
-        for other in [n for n in needed if not name and _takes_modes(pipeline, n)]:
-            pinned |= {
-                o.label: f"signal {other} takes its modes" for o in steps if o.couples == "all"
-            }
-        compared = _is_compared(pipeline, name)
+        # where nothing is written, the products are the output
+        wanted = every if in_memory else _wanted(pipeline, name)
+        pinned = {*keep}
+        if not name and any(_takes_modes(pipeline, other) for other in needed):
+            pinned |= {o.label for o in steps if o.couples == "all"}
+        # another step of the complete signal reads this one's stream too
+        compared = bool(name) and any(stream_of(name) in o.optional for o in pipeline.operators)
         found, left_out = _walk(steps, wanted | {MAIN} if compared else wanted, pinned)
-        if name and not compared and (reason := _useless(steps, found, wanted)):
+        reason = _useless(steps, found, wanted) if name and not compared else ""
+        if reason:
             rows.append(Row(name, "", reason))
         else:
             needed[name] = found
-            rows += [Row(name, label, reason) for label, reason in left_out.items()]
-    instead = _in_place_of_complete(pipeline, needed, {*keep}) if not in_memory else ""
+            rows += [Row(name, label, why) for label, why in left_out.items()]
+    instead = "" if in_memory else _in_place_of_complete(pipeline, needed, keep)
     if instead:
-        rows = [r for r in rows if r.run not in ("", instead)]
-        words = (
-            "the sky alone"
-            if pipeline.runs[instead].only == ["sky"]
-            else f"signal {instead.strip('_')}"
-        )
+        alone = pipeline.runs[instead].only == ["sky"]
+        words = "the sky alone" if alone else f"signal {instead.strip('_')}"
         reason = f"no step reads what a run of everything makes: {words} takes its place"
-        rows += [
-            Row("", o.label, reason)
-            for o in pipeline.signals.steps
-            if o.label not in needed[instead]
-        ]
         needed[""] = needed.pop(instead)
-    acting = {
-        o.label for o in pipeline.operators if isinstance(o, Output) or "boresight" in o.provides
-    }.union(*needed.values())
+        rows = [r for r in rows if r.run not in ("", instead)]
+        rows += [Row("", o.label, reason) for o in pipeline.signals.steps
+                 if o.label not in needed[""]]  # fmt: skip
+    acting = set().union(*needed.values())
+    # a signal cannot be without what is not there
     named = {part for name in needed if name for part in pipeline.runs[name].without or ()}
-    acting |= {
-        o.label for o in pipeline.operators if made_by(o) & named
-    }  # a signal is not without what is not there
+    for o in pipeline.operators:
+        if isinstance(o, Output) or "boresight" in o.provides or made_by(o) & named:
+            acting.add(o.label)
     rows = [r for r in rows if not r.operator or (r.operator in acting) == bool(r.run)]
     rows.sort(key=lambda r: ["", *pipeline.runs].index(r.run))
     runs = tuple(name for name in pipeline.runs if name in needed)
-    derived = {} if instead else remainders(pipeline, runs)
     return Structure(
         tuple(o.label for o in pipeline.operators if o.label in acting),
         runs,
         tuple(rows),
         instead,
-        derived,
+        {} if instead else remainders(pipeline, runs),
     )
 
 
-def _wanted(pipeline: Pipeline, name: str) -> set[str]:
+def _wanted(pipeline: Pipeline, name: str) -> frozenset[str]:
     """Products and components of a signal that outputs read. Those that ask for certain signals
     read of these alone.
     """
-    found: set[str] = set()
-    for o in pipeline.operators:
-        if isinstance(o, Output) and o.reads(name):
-            found |= o.requires | o.optional
-    return found
-
-
-def _is_compared(pipeline: Pipeline, name: str) -> bool:
-    """True if a step that acts on the complete signal reads the stream of another one, too."""
-    return bool(name) and any(stream_of(name) in o.optional for o in pipeline.operators)
+    outputs = [o for o in pipeline.operators if isinstance(o, Output) and o.reads(name)]
+    return frozenset[str]().union(*(o.requires | o.optional for o in outputs))
 
 
 def _in_place_of_complete(
-    pipeline: Pipeline, needed: Mapping[str, Mapping[str, str]], keep: set[str]
+    pipeline: Pipeline, needed: Mapping[str, Collection[str]], keep: Collection[str]
 ) -> str:
     """A signal whose components hold those of all other needed ones, where nothing reads what the
     complete one makes; else empty."""
     signals, wanted = pipeline.signals, _wanted(pipeline, "")
     steps = [o for o in signals.steps if o.label in needed[""]]
-    if any(_makes_something(o, wanted) or o.label in keep for o in steps) or any(
-        _takes_modes(pipeline, name) for name in needed if name
+    names = [name for name in needed if name]
+    if (
+        any(_makes_something(o, wanted) or o.label in keep for o in steps)
+        or any(_takes_modes(pipeline, name) for name in names)
+        or any(pipeline.runs[name].only is None for name in names)
     ):
         return ""
-    others = [name for name in needed if name and pipeline.runs[name].only is not None]
-    for name in others:
-        made = signals.makers(name)
-        if (
-            signals.all[name].filtered
-            and len(others) == len(needed) - 1
-            and all(signals.makers(n) <= made for n in others)
-        ):
-            return name
-    return ""
+    makers = {name: signals.makers(name) for name in names}
+    whole = (name for name in names if all(made <= makers[name] for made in makers.values()))
+    return next((name for name in whole if signals.all[name].filtered), "")
 
 
 def _takes_modes(pipeline: Pipeline, name: str) -> bool:
@@ -183,11 +162,11 @@ def _takes_modes(pipeline: Pipeline, name: str) -> bool:
     )
 
 
-def _useless(steps: Sequence[Operator], found: Mapping[str, str], wanted: set[str]) -> str:
+def _useless(steps: Sequence[Operator], found: Collection[str], wanted: frozenset[str]) -> str:
     """Why a signal is not needed; empty: it is needed."""
     acting = [o for o in steps if o.label in found]
     if not any(_makes_something(o, wanted) for o in acting):
-        made = any(_products(o) for o in steps)
+        made = any(map(_products, steps))
         return "no later step reads what it makes" if made else "nothing in it makes a product"
     if not any(is_stream(name) for o in acting for name in o.requires | o.optional):
         return "nothing in it depends on the sky, the atmosphere or the noise"
@@ -195,55 +174,34 @@ def _useless(steps: Sequence[Operator], found: Mapping[str, str], wanted: set[st
 
 
 def _walk(
-    steps: Sequence[Operator], wanted: set[str], keep: Mapping[str, str]
-) -> tuple[dict[str, str], dict[str, str]]:
-    """(needed, omitted) by label with reasons, going back through one signal's steps."""
-    read = {
-        name: "an output" for name in wanted if is_stream(name)
-    }  # stream or field -> who reads it
-    needed: dict[str, str] = {}
+    steps: Sequence[Operator], wanted: frozenset[str], keep: Collection[str]
+) -> tuple[set[str], dict[str, str]]:
+    """Labels of the steps of a signal that are needed, going back from its end, and why each of the
+    others is omitted.
+    """
+    read = {name for name in wanted if is_stream(name)}
+    needed: set[str] = set()
     left_out: dict[str, str] = {}
-    for operator in reversed(steps):
-        made = operator.provides
-        readers = sorted({read[name] for name in made if name in read})
-        if operator.label in keep:
-            reason = keep[operator.label]
-        elif readers:
-            reason = f"read by {', '.join(readers)}"
-        elif (
-            made
-            and all(map(is_stream, made))
-            and (MAIN not in made or type(operator).finalize is Operator.finalize)
-        ):
-            left_out[operator.label] = f"no step that is needed reads {' or '.join(sorted(made))}"
-            continue
-        elif changes_observations(operator):
-            reason = "changes the observations"
-        elif makes_products(operator) and not made & wanted:
-            left_out[operator.label] = f"no step writes or draws its {' or '.join(sorted(made))}"
-            continue
-        else:
-            reason = "an output"
-        needed[operator.label] = reason
-        changes = made & operator.requires  # reads what it writes: those above still matter
-        for name in made - changes:
-            if is_stream(name):
-                others = [o for o in steps[: list(steps).index(operator)] if name in o.provides]
-                if not others:
-                    read.pop(name, None)
-        for name in (
-            operator.requires
-            | operator.optional
-            | (_components_before(operator, steps) if forms(operator) else set())
-        ):
-            read.setdefault(name, operator.label)
+    for k, operator in reversed([*enumerate(steps)]):
+        made, before = operator.provides, steps[:k]
+        names = " or ".join(sorted(made))
+        if operator.label not in keep and not made & read:
+            ends = MAIN in made and type(operator).finalize is not Operator.finalize
+            if made and all(map(is_stream, made)) and not ends:
+                left_out[operator.label] = f"no step that is needed reads {names}"
+                continue
+            products = makes_products(operator) and not changes_observations(operator)
+            if products and not made & wanted:
+                left_out[operator.label] = f"no step writes or draws its {names}"
+                continue
+        needed.add(operator.label)
+        # of what it reads and writes, and of what others above make too, those above still matter
+        above = operator.requires.union(*(o.provides for o in before))
+        read -= {name for name in made - above if is_stream(name)}
+        read |= operator.requires | operator.optional
+        if forms(operator):  # of whatever components it finds
+            read |= {name for o in before for name in o.provides if isinstance(name, Component)}
     return needed, left_out
-
-
-def _components_before(operator: Operator, steps: Sequence[Operator]) -> set[str]:
-    """The components that a step which forms the signal finds, whatever steps make them."""
-    before = list(steps)[: list(steps).index(operator)]
-    return {name for o in before for name in o.provides if isinstance(name, Component)}
 
 
 def _products(operator: Operator) -> set[str]:
@@ -251,10 +209,12 @@ def _products(operator: Operator) -> set[str]:
     return {name for name in operator.provides if name != "boresight" and not is_stream(name)}
 
 
-def _makes_something(operator: Operator, wanted: set[str]) -> bool:
+def _makes_something(operator: Operator, wanted: Collection[str]) -> bool:
+    """True if it makes a product that is wanted, or something that is not known."""
     made = _products(operator)
-    unknown = not operator.provides and not changes_observations(operator)
-    return bool(made & wanted) or bool(made and not makes_products(operator)) or unknown
+    if not operator.provides:
+        return not changes_observations(operator)
+    return bool(made and (not makes_products(operator) or not made.isdisjoint(wanted)))
 
 
 def steps_of(pipeline: Pipeline, name: str) -> list[Operator]:
@@ -278,22 +238,18 @@ def steps_of(pipeline: Pipeline, name: str) -> list[Operator]:
 def remainders(pipeline: Pipeline, names: Iterable[str]) -> dict[str, str]:
     """The remainders among these signals: those that are not formed but follow from others."""
     kept = {*names}
-    return {
-        name: remainder(parts)
-        for name, parts in pipeline.signals.remainders.items()
-        if {name, *parts} <= kept
-    }
+    parts = pipeline.signals.remainders.items()
+    return {name: remainder(of) for name, of in parts if {name, *of} <= kept}
 
 
-def work(pipeline: Pipeline, structure: Structure) -> Work:
+def chain_of(pipeline: Pipeline, structure: Structure) -> Chain:
     """Steps and signals of each observation."""
-    signals = tuple(
-        pipeline.signals.all[name]
-        for name in ["", *structure.runs]
-        if name not in structure.derived
-    )
+    signals = pipeline.signals
+    formed = [name for name in ["", *structure.runs] if name not in structure.derived]
     acting = [o for o in pipeline.operators if o.label in structure.operators]
-    return Work(tuple(acting_steps(acting)), signals, pipeline.signals.components)
+    return Chain(
+        acting_steps(acting), tuple(signals.all[name] for name in formed), signals.components
+    )
 
 
 def only(file: PipelineFile, components: Sequence[str]) -> PipelineFile:

@@ -381,7 +381,7 @@ class AtmosphereBounds:
             "detector nodes and time steps",
             context.bound(left, self._longest, True),
             "rms left after subtraction of the detectors' mean",
-            f"within {p.tolerance:g} of what the detectors' mean leaves",
+            f"tolerance {p.tolerance:g}",
         )
 
     def lattice(self) -> Effect:
@@ -448,7 +448,7 @@ class AtmosphereBounds:
                 "opacity with elevation",
                 noise | context.sky_error(opacity),
                 "difference of the opacity over the elevations seen, x half the noise, x the sky",
-                "calibrated at the current elevation",
+                "calibrated sample by sample",
             ),
         ]
 

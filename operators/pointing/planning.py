@@ -110,7 +110,7 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
                 "time stamps",
                 shift(resolution),
                 "1.43 / FWHM x spacing of float64 at the scan's end x speed",
-                "float64 seconds since the start",
+                "float64 seconds",
             ),
         )
         return Estimate(effects)

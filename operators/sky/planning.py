@@ -108,7 +108,7 @@ class SkyPlanning(Planning[SkyMap]):
                 "coordinate precision",
                 context.sky_error(1.43 * COORDINATES),
                 "1.43 x 5e-4 pixel of a quarter beam",
-                "float32 offsets, float64 origins",
+                "float32 offsets",
             ),
             one_beam(context),
         )

@@ -31,7 +31,7 @@ def context():
     scene = zonda.load("mustang2_cluster").scene()
     data = Data(scene)
     zonda.PointingDaisy(scan_duration="100 s").observe(data)
-    found = Context(scene, data.observations, [], {}, metrics=frozenset({"peak", "transfer"}))
+    found = Context(scene, data.observations, [], metrics=frozenset({"peak", "transfer"}))
     found.coverage = Coverage(100.0, math.radians(2 / 3600), math.radians(50 / 3600))
     return found
 

@@ -250,13 +250,13 @@ def test_check_and_plan_know_a_campaign(bench, capsys):
     assert bench.command("plan", path) == 0
     shown = capsys.readouterr().out
     assert "the plan of the first one:" in shown
-    spent = next(line for line in shown.splitlines() if line.startswith("budget for map_rms"))
+    limits = next(line for line in shown.splitlines() if line.startswith("budget "))
     noise = next(line for line in shown.splitlines() if line.startswith("noise: "))
     # a tenth of the noise of a pixel, divided by the square root of the four nights that are
     # co-added
-    pixel, budget = float(noise.split()[1]), float(spent.split(" of ")[1].split()[0])
+    pixel, budget = float(noise.split()[1]), float(limits.split()[1])
     assert noise.split()[2] == "mK"
-    assert spent.split(" of ")[1].split()[1] == "uK"
+    assert limits.split()[2] == "uK"
     assert abs(budget / (1e3 * pixel * 0.1 / 2) - 1) < 0.01
 
 

@@ -68,7 +68,7 @@ def test_the_largest_saving_first_and_within_the_budget():
         {"map_rms": 1.0},
     )
     assert {name: d.chosen for name, d in found.items()} == {"small": 0, "large": 1, "smaller": 1}
-    assert found["small"].reason == "a coarser form would exceed the budget"
+    assert found["small"].reason == "coarser exceeds the budget"
 
 
 def test_of_equal_savings_the_smallest_error_first():
@@ -86,7 +86,7 @@ def test_the_form_that_saves_most_of_those_that_fit():
 def test_no_saving_no_error():
     found = decide([effect("free", (0.1, 0))], {"map_rms": 1.0})["free"]
     assert found.chosen == 0
-    assert found.reason == "a coarser form would save nothing"
+    assert found.reason == "coarser saves nothing"
 
 
 def test_seconds_that_a_planning_class_states_are_tried_last():
@@ -146,9 +146,6 @@ def test_limits():
     stated = limits(Limits(map_rms="3 uK"), 2.0, 30.0)
     assert stated["map_rms"] == stated["peak"] == pytest.approx(3e-6)
     assert stated["transfer"] == 0.01
-    for bad in (-0.1, 1.1, math.nan, math.inf):
-        with pytest.raises(ZondaError, match="share of the noise from 0 to 1"):
-            limits(bad, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -261,10 +258,10 @@ def test_the_table_and_json(made):
     shown = str(made)
     for words in (
         "noise: ",
-        "budget for map_rms",
+        "added by this plan",
         "AtmosphereLayers\n",
         "  layer 3  ",
-        "not simulated",
+        "Not simulated by zonda",
         " GB",
     ):
         assert words in shown
@@ -344,7 +341,7 @@ def test_hits_and_speed_of_a_real_scan(file):
 
 
 def test_errors_average_down_no_further_than_their_correlation():
-    context = Context(None, [], [], {})  # type: ignore[arg-type]
+    context = Context(None, [], [])  # type: ignore[arg-type]
     data = Data(zonda.load("mustang2_cluster", overrides=SHORT).scene())
     zonda.PointingDaisy(scan_duration="10 s").observe(data)
     context.observations = data.observations
@@ -373,7 +370,7 @@ SET = [a for s in SHORT for a in ("--set", s)]
 def test_command(capsys):
     status, out, _ = command(capsys, "plan", "mustang2_cluster", *SET, "--keep", "poles")
     assert status == 0
-    assert out.index("PinkNoise  ") < out.index("  poles") < out.index("--keep")
+    assert out.index("PinkNoise\n") < out.index("  poles") < out.index("--keep")
     assert max(map(len, out.splitlines())) <= 140
     status, out, _ = command(capsys, "plan", "mustang2_cluster", *SET, "--json", "--no-prune")
     assert all(e["decision"] in ("full", "not simulated") for e in json.loads(out)["effects"])

@@ -10,7 +10,7 @@ from zonda.core.operator import Operator
 from zonda.core.output import Output, StreamOutput
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan.planner import plan_band
-from zonda.core.plan.structure import Structure, prune, work
+from zonda.core.plan.structure import Structure, chain_of, prune
 from zonda.core.signal import Component, Signal
 
 
@@ -101,7 +101,7 @@ def test_each_further_signal_is_formed_filtered_and_mapped():
     pipeline = Pipeline(
         [POINT, SKY, AIR, NOISE, SUM, FILTER, MAP, SAVE], runs={"noiseless": {"only": ["sky"]}}
     )
-    found = work(pipeline, prune(pipeline))
+    found = chain_of(pipeline, prune(pipeline))
     assert [signal.name for signal in found.signals] == ["", "noiseless"]
 
 
@@ -110,7 +110,10 @@ def test_a_remainder_is_not_formed():
     pipeline = Pipeline([POINT, SKY, AIR, NOISE, SUM, FILTER, MAP, SAVE], runs=runs)
     for structure in (prune(pipeline), Structure.of_all(pipeline)):
         assert list(structure.derived) == ["source_free"]
-        assert [signal.name for signal in work(pipeline, structure).signals] == ["", "noiseless"]
+        assert [signal.name for signal in chain_of(pipeline, structure).signals] == [
+            "",
+            "noiseless",
+        ]
 
 
 def test_what_determines_singular_modes_stays():
