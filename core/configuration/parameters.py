@@ -6,6 +6,7 @@ import inspect
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from itertools import chain
 from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
@@ -59,12 +60,26 @@ def mistakes_of(
 
 
 def positional(model: type[BaseModel], values: tuple[Any, ...]) -> ParameterError:
-    """A call with values that have no names."""
+    """A call with values that have no names. The example is the first parameter; of a quantity one
+    that takes it, the model's own before inherited ones.
+    """
     fields = list(model.model_fields)
-    example = next((name for name in fields if name != "name"), "name")
+    bases = [base.model_fields for base in model.__mro__ if hasattr(base, "model_fields")]
+    own = sorted(fields, key=lambda name: sum(name in base for base in bases))
+    quantity = str(values[0])[:1].isdigit()
+    taking = (name for name in own if quantity and _takes(model, name, values[0]))
+    example = next((name for name in chain(taking, fields) if name != "name"), "name")
     label = f"name {'it' if len(values) == 1 else 'each'}, as in {example}={_short(values[0])}"
     message = f"{model.__name__} takes its parameters by their names"
     return _one(message, label, f"{model.__name__} takes: {', '.join(fields)}")
+
+
+def _takes(model: type[BaseModel], name: str, value: Any) -> bool:
+    try:
+        model.model_validate({name: value})
+    except ValidationError as err:
+        return all(one["loc"][:1] != (name,) for one in err.errors())
+    return True
 
 
 def changed(model: type[BaseModel], name: str) -> ParameterError:

@@ -8,9 +8,11 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..types import Floats
 from .chunks import empty
+from .sphere import angles
 
 _FAR = math.cos(math.radians(150))
 
@@ -52,6 +54,19 @@ def rotate(a: Floats, vector: Floats) -> Floats:
             vz + w * tz + qx * ty - qy * tx,
         ]
     ).T
+
+
+def directions(a: Floats) -> Floats:
+    """Directions (n, 3) of boresights (n, 4): their z axes."""
+    x, y, z, w = a.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+
+
+def middle(radec: Floats, good: NDArray[np.bool_]) -> tuple[float, float]:
+    """(ra, dec) [rad] of the mean direction of the boresights that are ``good`` (n,)."""
+    use = np.flatnonzero(good) if good.any() else np.arange(len(good))
+    ra, dec = angles(directions(radec[use[:: max(1, len(use) // 10_000)]]).mean(axis=0))
+    return float(ra % (2 * np.pi)), float(dec)
 
 
 def shortest_rotation(a: Floats, b: Floats) -> Floats:

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from zonda.core import flags
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
+from zonda.core.numerics.quaternions import middle
 from zonda.core.observation import Observation
 from zonda.core.signal import Component
 from zonda.core.types import Floats
 
 from .recorded_files import File, RecordedFiles, RecordedScan, Scan
-from .recorded_pointing import boresights, middle, state_celestial
+from .recorded_pointing import boresights, state_celestial
 from .recorded_scan import RecordedInstrument, joined
 from .recorded_stream import RecordedStream
 from .time_ordered_data import TimeOrderedData

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.celestial import CelestialTransform
-from zonda.core.numerics.quaternions import conjugate, multiply
-from zonda.core.numerics.sphere import angles
+from zonda.core.numerics.quaternions import conjugate, directions, multiply
 from zonda.core.types import Floats
 
 from .time_ordered_data import TimeOrderedData
@@ -22,11 +20,6 @@ if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.observation import Observation
     from zonda.core.site import Site
-
-LOOKED_AT = 10_000
-"""Samples of which the middle of a scan is taken, and at which recorded and recomputed directions
-are compared.
-"""
 
 GAP = 1.5
 """Sample intervals from which two samples are a gap apart."""
@@ -73,8 +66,8 @@ def boresights(
         return Found(azel, radec, "as recorded")
     transform = CelestialTransform(site, start, float(tod.seconds[-1]), tolerance)
     known = azel if len(azel) else radec
-    directions = _directions(known)
-    horizontal = directions if len(azel) else transform.horizontal(directions, tod.seconds)
+    looking = directions(known)
+    horizontal = looking if len(azel) else transform.horizontal(looking, tod.seconds)
     _, upright_azel, upright_radec = transform.boresight(horizontal, tod.seconds)
     # what the boresight is turned about itself: Rz(psi) of R = R_upright Rz(psi)
     turn = multiply(conjugate(upright_azel if len(azel) else upright_radec), known)
@@ -100,16 +93,3 @@ def state_celestial(label: str, observation: Observation, found: Found, rate: fl
             " and filters count samples"
         )
         observation.tally.state(label, f"{observation.name}: times of the samples", text)
-
-
-def middle(radec: Floats, good: NDArray[np.bool_]) -> tuple[float, float]:
-    """ICRS (ra, dec) [rad] of the mean direction of the samples that are used."""
-    use = np.flatnonzero(good) if good.any() else np.arange(len(good))
-    ra, dec = angles(_directions(radec[use[:: max(1, len(use) // LOOKED_AT)]]).mean(axis=0))
-    return float(ra % (2 * np.pi)), float(dec)
-
-
-def _directions(quaternions: Floats) -> Floats:
-    """Unit vectors (n, 3) of boresights (n, 4)."""
-    x, y, z, w = quaternions.T
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)

@@ -21,7 +21,7 @@ from zonda.core.flags import (
     in_file,
 )
 from zonda.core.intervals import Intervals, runs, samples_in
-from zonda.core.numerics.quaternions import detector_quaternions
+from zonda.core.numerics.quaternions import detector_quaternions, directions
 from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
 
@@ -216,8 +216,7 @@ class TimeOrderedData:
     @property
     def _directions(self) -> NDArray[np.float64]:
         """Detector directions in the boresight's frame, (3, n_det)."""
-        x, y, z, w = self.quats.T
-        return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+        return directions(self.quats).T
 
     @classmethod
     def of(

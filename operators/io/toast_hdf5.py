@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from zonda.core.flags import INVALID
+from zonda.core.numerics.quaternions import directions
+from zonda.core.numerics.sphere import angles
 from zonda.core.storage.files import writing
 from zonda.core.storage.hdf5_files import Disk
 from zonda.core.stream_names import UNITS
@@ -305,13 +307,5 @@ def _write_shared(file: Any, tod: TimeOrderedData) -> None:
 
 def tod_azimuth_elevation(tod: TimeOrderedData) -> tuple[AnyFloats, AnyFloats]:
     """Azimuth, as recorded where it is, and elevation of a scan, rad."""
-    azimuth, elevation = azimuth_elevation(tod.boresight_azel)
-    return azimuth if tod.azimuth is None else tod.azimuth, elevation
-
-
-def azimuth_elevation(boresight_azel: AnyFloats) -> tuple[AnyFloats, AnyFloats]:
-    """Azimuth (0 to 2 pi, north through east) and elevation of quaternions (n, 4), rad."""
-    x, y, z, w = boresight_azel.T
-    azimuth = -np.arctan2(2 * (y * z - w * x), 2 * (x * z + w * y))
-    elevation = np.arctan2(1 - 2 * (x * x + y * y), 2 * np.hypot(x * z + w * y, y * z - w * x))
-    return azimuth % (2 * np.pi), elevation
+    longitude, elevation = angles(directions(tod.boresight_azel))
+    return -longitude % (2 * np.pi) if tod.azimuth is None else tod.azimuth, elevation

@@ -6,20 +6,20 @@ import math
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
 from zonda.core.errors import PointingError
-from zonda.core.flags import TURNAROUND
-from zonda.core.intervals import Intervals, runs
+from zonda.core.intervals import Intervals
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import series
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
 
 from .base import Aim, Pointing
+from .observed import mark_turnarounds
 from .sun_and_moon import mark_sun
+from .sweep import Sweep
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
@@ -54,32 +54,25 @@ class PointingBackAndForth(Pointing):
     slows: ClassVar[dict[str, tuple[int, int]]] = {"speed": (-1, 1), "acceleration": (-1, 2)}
 
     @property
-    def turnaround(self) -> float:
-        """Duration T of a turnaround, s."""
-        return 4 * self.speed / self.acceleration
+    def sweep(self) -> Sweep:
+        """The way back and forth."""
+        return Sweep(self.throw, self.speed, self.acceleration, begin=-self.throw / 2)
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
-        leg, turn = self.throw / self.speed, self.turnaround
-        count, within = np.divmod(seconds, leg + turn)
-        u = np.clip((within - leg) / turn, 0.0, 1.0)
-        beyond = self.speed * turn * (u - u * u + (1 - np.cos(2 * np.pi * u)) / (2 * np.pi**2))
-        x = self.speed * np.minimum(within, leg) - self.throw / 2 + beyond
-        return np.where(count % 2 == 0, x, -x), np.zeros(len(seconds))
-
-    def in_turnaround(self, seconds: Floats) -> NDArray[np.bool_]:
-        """(n,) True in turnarounds."""
-        return np.asarray(
-            np.mod(seconds, self.throw / self.speed + self.turnaround) > self.throw / self.speed
-        )
+        return self.sweep.path(seconds), np.zeros(len(seconds))
 
     def directions(self, aim: Aim, seconds: Floats) -> Floats:
         longitude, elevation = _middle(aim, seconds)
         elevation += aim.offset[1]
-        _check_turn(
-            self.throw / 2 + self.speed**2 / self.acceleration * (1 + 4 / np.pi**2),
-            elevation,
-            self.label,
-        )
+        if elevation >= math.pi / 2 or (
+            self.throw / 2 + self.sweep.overshoot > math.pi * math.cos(elevation)
+        ):
+            raise PointingError(
+                "the scan spans more than a whole turn of azimuth at elevation"
+                f" {math.degrees(elevation):.2f} deg",
+                place=self.label,
+                cure="lower throw, or choose a lower elevation",
+            )
         found = series(3, len(seconds))
         for chunk in chunks(len(seconds)):
             x, _ = self.path(seconds[chunk])
@@ -88,25 +81,13 @@ class PointingBackAndForth(Pointing):
             )
         return found
 
-    def flag(self, seconds: Floats) -> NDArray[np.uint8]:
-        return np.where(self.flag_turnarounds & self.in_turnaround(seconds), TURNAROUND, 0).astype(
-            np.uint8
-        )
-
     def intervals(self, seconds: Floats) -> Intervals:
-        return _intervals(
-            seconds, self.throw / self.speed, self.turnaround, self.in_turnaround(seconds)
-        )
+        return self.sweep.intervals(seconds)
 
     def describe(self, observation: Observation) -> None:
         mark_sun(observation)
-        what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
-        observation.tally.count(
-            self.label,
-            what,
-            int(self.in_turnaround(observation.seconds).sum()),
-            observation.n_samples,
-        )
+        turning = self.sweep.turning(observation.seconds)
+        mark_turnarounds(self.label, observation, turning, self.flag_turnarounds)
 
 
 def _middle(aim: Aim, seconds: Floats) -> tuple[float, float]:
@@ -116,37 +97,3 @@ def _middle(aim: Aim, seconds: Floats) -> tuple[float, float]:
     middle = np.array([(seconds[0] + seconds[-1]) / 2])
     north, west, up = aim.transform.horizontal(unit_vectors(*aim.target.icrs()), middle)[0]
     return math.atan2(west, north), math.atan2(up, math.hypot(north, west))
-
-
-def _check_turn(widest: float, elevation: float, place: str) -> None:
-    """Refuse a scan that reaches ``widest`` [rad] from its middle, half a turn of azimuth or more
-    at its elevation.
-    """
-    if elevation >= math.pi / 2 or widest > math.pi * math.cos(elevation):
-        raise PointingError(
-            "the scan spans more than a whole turn of azimuth at elevation"
-            f" {math.degrees(elevation):.2f} deg",
-            place=place,
-            cure="lower throw, or choose a lower elevation",
-        )
-
-
-def _intervals(
-    seconds: Floats, leg: float, turnaround: float, turning: NDArray[np.bool_]
-) -> Intervals:
-    """TOAST's intervals. Left to right is towards larger azimuth; a turnaround has the direction of
-    the scan before it.
-
-    A throw goes from the middle of a turnaround to that of the next (the parameter `throw` is the
-    length of a *scan*).
-    """
-    cycle = leg + turnaround
-    first, throw = (np.floor(t / cycle) % 2 == 0 for t in (seconds, seconds + turnaround / 2))
-    found: Intervals = {}
-    for way, after, going in (("leftright", first, throw), ("rightleft", ~first, ~throw)):
-        found[f"throw_{way}"] = runs(going, seconds)
-        found[f"scan_{way}"] = runs(~turning & after, seconds)
-        found[f"turn_{way}"] = runs(turning & after, seconds)
-    for name, part in (("throw", "throw"), ("scanning", "scan"), ("turnaround", "turn")):
-        found[name] = sorted(found[f"{part}_leftright"] + found[f"{part}_rightleft"])
-    return found

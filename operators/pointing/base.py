@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -26,9 +26,9 @@ from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .limits import LargestMotion, check_elevation, excess, what_fits
+from .limits import LargestMotion, check_elevation, excess, what_fits, when_up
 from .motion import POINTS, LargestDerivative, Quantity, motion
-from .observed import Samples, centre_of, observed, report, state_times
+from .observed import centre_of, observed, report, state_times, transform_of
 from .samples_per_beam import SamplesPerBeam
 from .sun_and_moon import distances
 
@@ -69,7 +69,81 @@ class Aim(NamedTuple):
     """rad on the sky, towards east and north; for az/el targets towards azimuth and up."""
 
 
-class Pointing(Operator):
+class Scans(Operator):
+    """Base of the steps that simulate scans within the telescope's limits, one after the other."""
+
+    if TYPE_CHECKING:
+        sample_rate: float | None
+        check_limits: Literal["error", "warn"]
+        interpolation_error: float
+
+    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+
+    def every(self) -> Sequence[Any]:
+        """All scans, in their order."""
+        raise NotImplementedError
+
+    def some(self, scans: Sequence[Any]) -> list[Any]:
+        """Those scans that `check` looks at."""
+        raise NotImplementedError
+
+    def length(self, scan: Any) -> float:
+        """Duration of a scan, s."""
+        raise NotImplementedError
+
+    def maker(self, data: Data) -> Callable[[Any, float, LargestMotion], Observation]:
+        """A function of a scan and a sample rate [Hz] that makes the observation, and adds its
+        motion.
+        """
+        raise NotImplementedError
+
+    def summary(self, scans: Sequence[Any], made: Sequence[Observation]) -> str:
+        """The first line of what `check` says; ``made``: observations of those that it looks at."""
+        raise NotImplementedError
+
+    def observe(self, data: Data) -> None:
+        """Append an observation for each scan."""
+        self._observe(data, self.every(), self._rate(data))
+
+    def check(self, data: Data) -> list[str]:
+        """A selection of scans and instants: elevation, speed and acceleration, samples per beam,
+        distances from Sun and Moon.
+        """
+        rate, first, scans = self._rate(data), len(data.observations), self.every()
+        looked = self.some(scans)
+        lengths = [self.length(scan) for scan in looked]
+        self._observe(
+            data, looked, min(rate, max(INSTANTS_LOOKED_AT / sum(lengths), 1 / max(lengths)))
+        )
+        made = data.observations[first:]
+        for observation, length in zip(made, lengths, strict=True):
+            observation.seen_of = max(round(length * rate), 1), rate
+        elevations = np.degrees([(o.elevation.min(), o.elevation.max()) for o in made])
+        part = "" if len(looked) == len(scans) else f" ({len(looked)} of them looked at)"
+        topics = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
+        return [
+            self.summary(scans, made) + part,
+            f"elevation: {elevations.min():.2f} to {elevations.max():.2f} deg",
+            *distances(made),
+            *(f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(topics)),
+        ]
+
+    def _rate(self, data: Data) -> float:
+        """Read-out rate, Hz."""
+        return self.sample_rate or float(data.scene.instrument.sample_rate)
+
+    def _observe(self, data: Data, scans: Sequence[Any], rate: float) -> None:
+        """Append observations of scans, sampled at ``rate`` [Hz]."""
+        make, before = self.maker(data), len(data.observations)
+        moved, sampled = LargestMotion(data.scene.instrument.telescope), SamplesPerBeam()
+        for scan in scans:
+            observation = make(scan, rate, moved)
+            sampled.add(observation, self._rate(data))
+            data.observations.append(observation)
+        report(self.label, data.observations[before:], moved, sampled)
+
+
+class Pointing(Scans):
     """Base of the pointing operators: `scans` observations of `scan_duration`, `gap` apart, around
     one target.
 
@@ -77,8 +151,6 @@ class Pointing(Operator):
     so the parallactic rotation is in ``boresight_radec``. No refraction. A subclass gives `path`,
     the offsets from the target, or `directions`.
     """
-
-    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
 
     target: Target | None = None
     """Centre of the scans; the scene's target where absent."""
@@ -172,10 +244,6 @@ class Pointing(Operator):
                 )
         return found
 
-    def flag(self, seconds: Floats) -> NDArray[np.uint8]:
-        """Sample flags (n,), bits of `core.flags`."""
-        return np.zeros(len(seconds), np.uint8)
-
     def intervals(self, seconds: Floats) -> Intervals:
         """Parts of a scan whose samples are taken at ``seconds`` (n,), by TOAST's names; by default
         all is *scanning*.
@@ -203,52 +271,38 @@ class Pointing(Operator):
         """Number of scans of all targets."""
         return self.scans * len(self.targets or [None])
 
+    def every(self) -> Sequence[int]:
+        return range(self.number)
+
+    def some(self, scans: Sequence[int]) -> list[int]:
+        last, most = len(scans) - 1, min(len(scans), SCANS_LOOKED_AT)
+        return sorted({round(k) for k in np.linspace(0, last, most)})
+
+    def length(self, scan: int) -> float:
+        return self.scan_duration
+
+    def summary(self, scans: Sequence[int], made: Sequence[Observation]) -> str:
+        several = f" of {len(self.targets)} targets" if self.targets else ""
+        return f"{len(scans)} scan{'s' if len(scans) > 1 else ''}{several} from {made[0].start}"
+
     def observe(self, data: Data) -> None:
-        rate = self.sample_rate or data.scene.instrument.sample_rate
-        if self.number * self.scan_duration * rate > LONG:
+        if self.number * self.scan_duration * self._rate(data) > LONG:
             from zonda.core.data import Data
 
             with warnings.catch_warnings():  # observing warns again, with better figures
                 warnings.simplefilter("ignore")
                 self.check(Data(scene=data.scene, observations=list(data.observations)))
-        self._observe(data, range(self.number), rate)
+        super().observe(data)
 
     def check(self, data: Data) -> list[str]:
-        """A selection of scans and instants: elevation, speed and acceleration, samples per
-        beam.
-        """
-        rate = self.sample_rate or data.scene.instrument.sample_rate
-        looked = sorted(
-            {round(k) for k in np.linspace(0, self.number - 1, min(self.number, SCANS_LOOKED_AT))}
-        )
-        coarse = min(
-            rate,
-            max(INSTANTS_LOOKED_AT / (len(looked) * self.scan_duration), 1 / self.scan_duration),
-        )
-        self._seconds(
-            max(min(round(self.scan_duration * rate), POINTS), 1), rate, self._jitter_key(data, 0)
-        )
-        first = len(data.observations)
-        self.model_copy(update={"jitter": 0.0})._observe(data, looked, coarse)
-        made = data.observations[first:]
-        for observation in made:
-            observation.seen_of = max(round(self.scan_duration * rate), 1), rate
-        elevations = np.degrees([(o.elevation.min(), o.elevation.max()) for o in made])
-        part = "" if len(looked) == self.number else f" ({len(looked)} of them looked at)"
-        several = f" of {len(self.targets)} targets" if self.targets else ""
-        lines = [
-            f"{self.number} scan{'s' if self.number > 1 else ''}{several} from"
-            f" {made[0].start}{part}"
-        ]
-        lines.append(f"elevation: {elevations.min():.2f} to {elevations.max():.2f} deg")
-        motion = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
-        lines += distances(made)
-        return lines + [
-            f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(motion)
-        ]
+        if self.jitter:
+            rate = self._rate(data)
+            n = max(min(round(self.scan_duration * rate), POINTS), 1)
+            self._seconds(n, rate, self._jitter_key(data, 0))
+            return self.model_copy(update={"jitter": 0.0}).check(data)
+        return super().check(data)
 
-    def _observe(self, data: Data, which: Sequence[int], rate: float) -> None:
-        """Append the scans ``which``, sampled at ``rate`` [Hz]."""
+    def maker(self, data: Data) -> Callable[[int, float, LargestMotion], Observation]:
         scene = data.scene
         targets = self.targets or [t for t in (self.target or scene.target,) if t is not None]
         if not targets:
@@ -257,20 +311,17 @@ class Pointing(Operator):
                 place=self.label,
                 cure="give the scene or this operator a target, e.g. 05h00m00s +20d00m00s",
             )
-        begin, before, first = scene.time, data.n_scans, len(data.observations)
+        begin, before = scene.time, data.n_scans
         if data.observations:
             last = data.observations[-1]
             begin = last.start.shifted(last.duration + self.gap)
-        moved, sampled = LargestMotion(scene.instrument.telescope), SamplesPerBeam()
-        for k in which:
+
+        def make(k: int, rate: float, moved: LargestMotion) -> Observation:
             start = begin.shifted(k * (self.scan_duration + self.gap))
-            target = targets[k // self.scans]
-            observation = self.of_scan(k, scene.instrument)._scan(
-                data, target, start, before + k, self._offset(k), rate, moved
-            )
-            sampled.add(observation, self.sample_rate or scene.instrument.sample_rate)
-            data.observations.append(observation)
-        report(self.label, data.observations[first:], moved, sampled)
+            scan, target = self.of_scan(k, scene.instrument), targets[k // self.scans]
+            return scan._scan(data, target, start, before + k, self._offset(k), rate, moved)
+
+        return make
 
     def _jitter_key(self, data: Data, index: int) -> NDArray[np.uint32]:
         return stream_key(data.scene.seed, self.label, "jitter", index)
@@ -286,24 +337,33 @@ class Pointing(Operator):
         moved: LargestMotion,
     ) -> Observation:
         """The observation ``index``, sampled at ``rate`` [Hz]."""
-        scene, instrument = data.scene, data.scene.instrument
-        seconds = self._seconds(
-            max(round(self.scan_duration * rate), 1), rate, self._jitter_key(data, index)
-        )
-        beam = float(instrument.focalplane().fwhm.min())
-        transform = CelestialTransform(
-            scene.site, start, seconds[-1], self.interpolation_error * beam
-        )
+        scene, telescope = data.scene, data.scene.instrument.telescope
+        n = max(round(self.scan_duration * rate), 1)
+        seconds = self._seconds(n, rate, self._jitter_key(data, index))
+        transform = transform_of(scene, start, seconds[-1], self.interpolation_error)
         aim = Aim(transform, target, offset)
-        horizontal, *boresight = self.boresight(aim, seconds)
+        horizontal, azel, radec = self.boresight(aim, seconds)
         place = f"{self.label}, scan {index} from {start}"
         total = self.number * self.scan_duration + (self.number - 1) * self.gap
-        check_elevation(horizontal, transform, target, instrument.telescope, total, place)
-        samples = Samples(
-            seconds, rate, (boresight[0], boresight[1]), self.flag(seconds), self.intervals(seconds)
+        check_elevation(
+            f"the scan of target '{target}'",
+            horizontal,
+            telescope,
+            place,
+            lambda: when_up(horizontal, transform, target, telescope, total),
         )
         observation = observed(
-            self.label, scene, index, transform, centre_of(transform, target, seconds), samples
+            self.label,
+            scene,
+            index,
+            transform,
+            seconds=seconds,
+            sample_rate=rate,
+            boresight_azel=azel,
+            boresight_radec=radec,
+            centre=centre_of(transform, target, seconds),
+            flags=np.zeros(n, np.uint8),
+            intervals=self.intervals(seconds),
         )
         self._check_motion(observation, aim, None if self.jitter else horizontal, place, moved)
         if self.jitter > 0:
@@ -362,13 +422,14 @@ class Pointing(Operator):
             if horizontal is None
             else motion(horizontal, rate, limits, lambda step: track(self, step))
         )
-        over = excess(found, limits)
-        if over and self.check_limits == "error":
-            cure = what_fits(
+        moved.add(
+            observation.name,
+            found,
+            place if self.check_limits == "error" else "",
+            lambda over: what_fits(
                 self, self.slows, found, over, lambda scan: not excess(of(scan), limits)
-            )
-            raise PointingError(moved.too_fast(next(iter(over)), found), place=place, cure=cure)
-        moved.add(observation.name, found)
+            ),
+        )
 
     def _offset(self, k: int) -> tuple[float, float]:
         if self.offsets == "none":

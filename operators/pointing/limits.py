@@ -34,41 +34,41 @@ STILL = 1e-9
 
 
 def check_elevation(
+    what: str,
+    horizontal: Floats,
+    telescope: Telescope,
+    place: str,
+    cure: Callable[[], str],
+    when: Callable[[int], str] = lambda row: "",
+) -> None:
+    """Raise PointingError where a direction (n, 3) of ``what`` lies outside the telescope's
+    elevation limits. ``when``: the instant of a direction, in words.
+    """
+    if not len(horizontal):
+        return
+    rows = int(horizontal[:, 2].argmin()), int(horizontal[:, 2].argmax())
+    _, elevation = angles(horizontal[[*rows]])
+    low, high = telescope.elevation_min, telescope.elevation_max
+    under, over = low - elevation.min(), elevation.max() - high
+    if max(under, over) > 1e-9:
+        reached, way = (elevation.min(), "down") if under > over else (elevation.max(), "up")
+        where = f"goes {way} to elevation {np.degrees(reached):.2f} deg{when(rows[way == 'up'])}"
+        limits = f"{telescope.name} reaches {_range(low, high)}"
+        raise PointingError(f"{what} {where}; {limits}", place=place, cure=cure())
+
+
+def when_up(
     horizontal: Floats,
     transform: CelestialTransform,
     target: Target,
     telescope: Telescope,
     total: float,
-    place: str,
-) -> None:
-    """Raise PointingError where a direction (n, 3) lies outside the telescope's elevation limits;
-    say when none would.
-
-    ``total`` [s] is how long all scans take, for the message.
-    """
-    _, elevation = angles(horizontal[[horizontal[:, 2].argmin(), horizontal[:, 2].argmax()]])
-    low, high = telescope.elevation_min, telescope.elevation_max
-    under, over = low - elevation.min(), elevation.max() - high
-    if max(under, over) <= 1e-12:
-        return
-    worst = elevation.min() if under > over else elevation.max()
-    reached = f"{'down' if under > over else 'up'} to elevation {np.degrees(worst):.2f} deg"
-    raise PointingError(
-        f"the scan of target '{target}' goes {reached}; {telescope.name} reaches"
-        f" {_range(low, high)}",
-        place=place,
-        cure=_when(horizontal, transform, target, low, high, total),
-    )
-
-
-def _when(
-    horizontal: Floats,
-    transform: CelestialTransform,
-    target: Target,
-    low: float,
-    high: float,
-    total: float,
 ) -> str:
+    """The cure for a scan outside the limits of elevation: when it would be within them.
+
+    ``horizontal`` (n, 3): its directions. ``total`` [s]: how long all scans take.
+    """
+    low, high = telescope.elevation_min, telescope.elevation_max
     if target.frame == "horizontal":
         return f"choose an elevation from {_range(low, high)}, with room for the scan"
     site, start = transform.site, transform.start
@@ -136,6 +136,8 @@ LIMITS: dict[Quantity, str] = {
 }
 """Fields of a `Telescope`."""
 
+SLOWER = "lower speed or acceleration, or set check_limits: warn"
+
 WORDS = {1: "speed", 2: "acceleration", 3: "jerk"}
 
 ROUNDING = 1e-6
@@ -184,8 +186,20 @@ class LargestMotion:
         self._found: dict[Quantity, LargestDerivative] = {}
         self._where: dict[Quantity, str] = {}
 
-    def add(self, name: str, found: dict[Quantity, LargestDerivative]) -> None:
-        """Take a scan into account."""
+    def add(
+        self,
+        name: str,
+        found: dict[Quantity, LargestDerivative],
+        place: str = "",
+        cure: Callable[[dict[Quantity, float]], str] = lambda over: SLOWER,
+    ) -> None:
+        """Take a scan into account. Raises PointingError at ``place`` where it exceeds a limit;
+        where that is empty, it is a warning.
+        """
+        over = excess(found, self.limits)
+        if over and place:
+            text = self.too_fast(next(iter(over)), found)
+            raise PointingError(text, place=place, cure=cure(over))
         for q, peak in found.items():
             if q not in self._found or peak.figure > self._found[q].figure:
                 self._found[q], self._where[q] = peak, name

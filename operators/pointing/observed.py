@@ -8,48 +8,32 @@ import math
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.data import Observation
-from zonda.core.intervals import Intervals
+from zonda.core.flags import TURNAROUND
+from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
-    from zonda.core.numerics.celestial import CelestialTransform
+    from zonda.core.configuration.time import Instant
     from zonda.core.scene import Scene
 
     from .limits import LargestMotion
     from .samples_per_beam import SamplesPerBeam
 
 
-@dataclass(frozen=True)
-class Samples:
-    """The samples of a scan: when they are taken, where the boresight is then, and which are
-    flagged.
-
-    Attributes
-    ----------
-    seconds
-        (n,) since the start.
-    rate
-        Hz.
-    boresight
-        (n, 4), (n, 4) `Boresight.azel` and `Boresight.radec`.
-    flags, intervals
-        Of `Observation`.
-    """
-
-    seconds: Floats
-    rate: float
-    boresight: tuple[Floats, Floats]
-    flags: NDArray[np.uint8]
-    intervals: Intervals
+def transform_of(
+    scene: Scene, start: Instant, duration: float, interpolation_error: float
+) -> CelestialTransform:
+    """The celestial transformation of a scan; its error as a fraction of the smallest beam."""
+    beam = float(scene.instrument.focalplane().fwhm.min())
+    return CelestialTransform(scene.site, start, duration, interpolation_error * beam)
 
 
 def observed(
@@ -57,12 +41,11 @@ def observed(
     scene: Scene,
     index: int,
     transform: CelestialTransform,
-    centre: tuple[float, float],
-    samples: Samples,
     called: str = "",
+    **fields: Any,
 ) -> Observation:
-    """The scan of ``samples`` that begins where ``transform`` does, about ``centre``, ICRS (ra,
-    dec) [rad].
+    """The scan that begins where ``transform`` does; ``fields`` are those of `Observation` that
+    differ between scans.
 
     ``called``: what its name says beside its number; what files cannot be called becomes an
     underscore.
@@ -75,14 +58,8 @@ def observed(
         instrument=scene.instrument,
         focalplane=scene.instrument.focalplane(),
         start=transform.start,
-        seconds=samples.seconds,
-        sample_rate=samples.rate,
-        boresight_azel=samples.boresight[0],
-        boresight_radec=samples.boresight[1],
-        centre=centre,
         seed=scene.seed,
-        flags=samples.flags,
-        intervals=samples.intervals,
+        **fields,
     )
     beam = float(observation.focalplane.fwhm.min())
     error = (
@@ -107,6 +84,15 @@ def centre_of(
     middle = np.array([(seconds[0] + seconds[-1]) / 2])
     x, y, z = transform.icrs(unit_vectors([-target.longitude], [target.latitude]), middle)[0]
     return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
+
+
+def mark_turnarounds(
+    label: str, observation: Observation, turning: NDArray[np.bool_], flagged: bool
+) -> None:
+    """Count the samples ``turning`` (n,), and flag them if that is asked for."""
+    what = "samples in turnarounds" + (", flagged" if flagged else ", used")
+    observation.tally.count(label, what, int(turning.sum()), observation.n_samples)
+    observation.flags |= np.where(flagged & turning, TURNAROUND, 0).astype(np.uint8)
 
 
 def state_times(label: str, observation: Observation) -> None:

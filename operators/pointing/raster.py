@@ -1,18 +1,35 @@
-"""On-the-fly maps: rows of any position angle, in both directions in turn."""
+"""On-the-fly maps: rows of any position angle, in both directions in turn.
+
+A row of length w is crossed at constant speed v. Outside of it the telescope turns round within T
+as equations (1) and (2) of `sweep` say, and steps by s to the next row. With u the fraction of T
+that has passed, at constant or with continuous acceleration,
+
+    y = s (2 u^2; from u = 1/2 on 1 - 2 (1 - u)^2),                                        (1)
+    y = s [u - sin(2 pi u) / (2 pi)].                                                      (2)
+
+The largest accelerations of x and y are b v / T and c s / T^2, (b, c) = (2, 4) or (4, 2 pi). T is
+the shortest with (b v / T)^2 + (c s / T^2)^2 <= a^2 and a largest speed of y, 2 s / T, of at most
+v:
+
+    T^2 = [b^2 v^2 + sqrt(b^4 v^4 + 4 a^2 c^2 s^2)] / (2 a^2),
+    T >= 2 s / v.                                                                          (3)
+
+The last row is crossed twice, and the rows are then gone back: 1, 2, ..., n, n, ..., 2, 1, 1, 2,
+...; every second pass of a row has the other direction.
+"""
 
 from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
-from zonda.core.flags import TURNAROUND
 from zonda.core.intervals import Intervals, runs
 from zonda.core.numerics.celestial import Boresight
 from zonda.core.numerics.chunks import chunks
@@ -22,11 +39,23 @@ from zonda.core.types import Floats
 
 from .base import Aim, Pointing
 from .motion import rate_text
-from .rows import Rows, acceleration_of, side_of, spacing_of, speed_of
+from .observed import mark_turnarounds
+from .sweep import Sweep
 
 if TYPE_CHECKING:
     from zonda.core.data import Data, Observation
     from zonda.core.instrument import Instrument
+
+WIDEST = math.radians(5.0)
+"""Largest side of a raster that follows from the field of view."""
+BEAMS = 6
+"""Smallest side of such a raster, in beams."""
+SHARE = 0.3
+"""Fraction of the telescope's limits that it uses: the azimuth axis turns 1 / cos(elevation) times
+as fast as the beam.
+"""
+ROW_TIME, TURN_TIME = 5.0, 2.0
+"""Shortest time for a row and a turnaround whose speed and acceleration are not given, s."""
 
 
 def _kind(value: Any) -> str:
@@ -43,6 +72,54 @@ Angles = Annotated[
 
 RASTER = ": raster"
 """End of the log entry that states the raster of a scan."""
+
+AXES = ("", "azimuth_", "elevation_")
+"""Beginnings of the names of a telescope's limits."""
+
+
+@dataclass(frozen=True)
+class Rows(Sweep):
+    """A raster: ``n`` rows, ``spacing`` [rad] apart."""
+
+    spacing: float = 0.0
+    n: int = 1
+
+    @property
+    def turnaround(self) -> float:
+        """T of equation (3), s."""
+        b, c = (4.0, 2 * math.pi) if self.smooth else (2.0, 4.0)
+        step = self.spacing if self.n > 1 else 0.0
+        along, across = (b * self.speed) ** 2, 2 * self.acceleration * c * step
+        needed = math.sqrt((along + math.hypot(along, across)) / 2) / self.acceleration
+        return max(needed, 2 * step / self.speed)
+
+    @property
+    def speed_within(self) -> float:
+        """The speed, rad/s, whose turnarounds reach a row's length beyond its ends at this
+        acceleration; steps apart.
+        """
+        b, reach = (4.0, 0.25 + 1 / math.pi**2) if self.smooth else (2.0, 0.25)
+        return math.sqrt(self.acceleration * self.width / (b * reach))
+
+    @property
+    def pass_time(self) -> float:
+        """Duration of all rows once, and the turnarounds between them, s."""
+        return self.n * (self.leg + self.turnaround) - self.turnaround
+
+    def offsets(self, seconds: Floats) -> tuple[Floats, Floats]:
+        """(x, y) [rad] along the rows and across them, from the middle; each (n,)."""
+        number, _, u = self.passages(seconds)
+        step = np.where(u < 0.5, 2 * u * u, 1 - 2 * (1 - u) ** 2)
+        if self.smooth:
+            step = u - np.sin(2 * np.pi * u) / (2 * np.pi)
+        now, then = self.row(number), self.row(number + 1)
+        y = (now + (then - now) * step - (self.n - 1) / 2) * self.spacing
+        return self.path(seconds), np.asarray(y)
+
+    def row(self, number: Floats) -> Floats:
+        """Number of the row, from 0, that is crossed in the passage ``number``."""
+        within = np.mod(number, 2 * self.n)
+        return np.asarray(np.minimum(within, 2 * self.n - 1 - within))
 
 
 class RasterParameters(Pointing):
@@ -84,32 +161,36 @@ class RasterParameters(Pointing):
     slows: ClassVar[dict[str, tuple[int, int]]] = {"speed": (-1, 1), "acceleration": (-1, 2)}
 
     def of_scan(self, number: int, instrument: Instrument) -> Pointing:
-        """The raster of a scan with every value filled in."""
-        width = self.width if self.width is not None else side_of(instrument)
-        height = self.height if self.height is not None else width
-        crossed = self.angles == "cross_hatch" and number % 2 == 1
-        added = (
-            math.pi / 2
-            if crossed
-            else self.angles[number % len(self.angles)]
-            if isinstance(self.angles, list)
-            else 0.0
-        )
-        if crossed and height > 0:
-            width, height = height, width
-        speed = self.speed if self.speed is not None else speed_of(width, instrument)
-        telescope = instrument.telescope
+        """The raster of a scan with every value filled in.
+
+        The coverage of a disc of diameter D along rows s apart ripples by 4 J_1(pi D / s) / (pi D /
+        s), relative: 5 % at s = D / 4.
+        """
+        telescope, beam = instrument.telescope, instrument.beam_fwhm
+
+        def otherwise(name: str, *values: float) -> float:
+            """The parameter, or the least of the values and `SHARE` of the telescope's limits."""
+            given: float | None = getattr(self, name)
+            limits = [getattr(telescope, f"{axis}{name}_max", None) for axis in AXES]
+            share = (SHARE * limit for limit in limits if limit is not None)
+            return min(*values, *share) if given is None else given
+
+        field = min(instrument.field_of_view, WIDEST)
+        width = otherwise("width", max(instrument.field_of_view, BEAMS * beam), WIDEST)
+        height = otherwise("height", width, width)
+        added = self.angles[number % len(self.angles)] if isinstance(self.angles, list) else 0.0
+        if self.angles == "cross_hatch" and number % 2 == 1:
+            added = math.pi / 2
+            if height > 0:
+                width, height = height, width
+        speed = otherwise("speed", beam * instrument.sample_rate / 4, width / ROW_TIME)
         jerk = telescope.azimuth_jerk_max is not None or telescope.elevation_jerk_max is not None
         found = {
             "width": width,
             "height": height,
-            "spacing": self.spacing if self.spacing is not None else spacing_of(instrument),
+            "spacing": max(field / 4, beam / 2) if self.spacing is None else self.spacing,
             "speed": speed,
-            "acceleration": (
-                self.acceleration
-                if self.acceleration is not None
-                else acceleration_of(speed, telescope)
-            ),
+            "acceleration": otherwise("acceleration", 2 * speed / TURN_TIME, math.inf),
             "smooth": jerk if self.smooth is None else self.smooth,
             "position_angle": self.position_angle + added,
         }
@@ -122,7 +203,7 @@ class PointingRaster(RasterParameters):
 
     Each row is crossed at constant `speed`; the telescope turns round outside of it within the time
     T that `acceleration` allows, stepping to the next row (equations 1 to 3 of
-    `operators/pointing/rows.py`). All rows once take rows (width / speed + T) - T.
+    `operators/pointing/raster.py`). All rows once take rows (width / speed + T) - T.
     """
 
     @property
@@ -132,17 +213,11 @@ class PointingRaster(RasterParameters):
             float(value or 0.0)
             for value in (self.width, self.height, self.spacing, self.speed, self.acceleration)
         )
-        return Rows(
-            width,
-            spacing,
-            math.floor(height / spacing + 1e-9) + 1,
-            speed,
-            acceleration,
-            bool(self.smooth),
-        )
+        n, smooth = math.floor(height / spacing + 1e-9) + 1, bool(self.smooth)
+        return Rows(width, speed, acceleration, smooth, -width / 2, spacing, n)
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
-        along, across = self.rows.path(seconds)
+        along, across = self.rows.offsets(seconds)
         sine, cosine = math.sin(self.position_angle), math.cos(self.position_angle)
         return along * sine - across * cosine, along * cosine + across * sine
 
@@ -161,11 +236,6 @@ class PointingRaster(RasterParameters):
             found[chunk] = _beside(centre, x + aim.offset[0], y + aim.offset[1])
         return found
 
-    def flag(self, seconds: Floats) -> NDArray[np.uint8]:
-        return np.where(self.flag_turnarounds & self.rows.turning(seconds), TURNAROUND, 0).astype(
-            np.uint8
-        )
-
     def intervals(self, seconds: Floats) -> Intervals:
         turning = self.rows.turning(seconds)
         return {"scanning": runs(~turning, seconds), "turnaround": runs(turning, seconds)}
@@ -182,16 +252,14 @@ class PointingRaster(RasterParameters):
         ]
 
     def describe(self, observation: Observation) -> None:
-        rows, tally = self.rows, observation.tally
-        tally.state(
+        rows = self.rows
+        observation.tally.state(
             self.label,
             observation.name + RASTER,
             _stated(rows, self.position_angle, self.scan_duration),
         )
-        what = "samples in turnarounds" + (", flagged" if self.flag_turnarounds else ", used")
-        tally.count(
-            self.label, what, int(rows.turning(observation.seconds).sum()), observation.n_samples
-        )
+        turning = rows.turning(observation.seconds)
+        mark_turnarounds(self.label, observation, turning, self.flag_turnarounds)
         for text in _doubts(rows, self.scan_duration, 1 / observation.sample_rate):
             warnings.warn(f"{self.label}: {observation.name}{text}", stacklevel=2)
 

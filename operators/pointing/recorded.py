@@ -15,14 +15,15 @@ from zonda.core.configuration.files import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Fraction, Seconds
-from zonda.core.errors import InputError, PointingError
+from zonda.core.errors import InputError
 from zonda.core.intervals import part
-from zonda.core.numerics.celestial import CelestialTransform
-from zonda.core.numerics.sphere import angles, unit_vectors
+from zonda.core.numerics.quaternions import directions, middle
+from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .observed import Samples, centre_of, observed, report, state_times
+from .limits import check_elevation
+from .observed import centre_of, observed, report, state_times, transform_of
 from .recording import OUT_OF_ORDER, Comb, Recording, Scan, comb
 from .recording_files import Clock, read_recording
 from .samples_per_beam import SamplesPerBeam
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
     from zonda.core.configuration.time import Instant
     from zonda.core.data import Data, Observation
-    from zonda.core.instrument import Telescope
 
 MOST_CHECKED = 100_000
 """Samples of a scan that `zonda check` looks at."""
@@ -124,36 +124,40 @@ class PointingRecorded(Operator):
         scene = data.scene
         start = (recording.start or scene.time).shifted(float(scan.seconds[0]))
         seconds = scan.seconds - scan.seconds[0]
-        beam = float(scene.instrument.focalplane().fwhm.min())
-        transform = CelestialTransform(
-            scene.site, start, seconds[-1], self.interpolation_error * beam
-        )
+        transform = transform_of(scene, start, seconds[-1], self.interpolation_error)
         if recording.frame == "azel":
             horizontal = unit_vectors(-scan.longitude, scan.latitude)
         else:
             horizontal = transform.horizontal(unit_vectors(scan.longitude, scan.latitude), seconds)
         good = flags.good(scan.flags, flags.EXCLUDE_SAMPLE)
-        _check_elevation(
-            horizontal,
-            seconds,
-            good,
+        check_elevation(
+            "the boresight",
+            horizontal[good],
             scene.instrument.telescope,
             f"{self.label}, {self.file}",
-            start,
+            lambda: "flag these rows, or correct site, clock, units or the telescope's limits",
+            lambda row: f", {seconds[good][row]:.4g} s after {start}",
         )
         _, azel, computed = transform.boresight(horizontal, seconds)
         radec = computed if scan.radec is None else scan.radec
         target = self.target or scene.target
-        centre = centre_of(transform, target, seconds) if target else _middle(radec, good)
-        parts = part(recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1]))
-        samples = Samples(seconds, scan.rate, (azel, radec), scan.flags.copy(), parts)
+        centre = centre_of(transform, target, seconds) if target else middle(radec, good)
         observation = observed(
-            self.label, scene, len(data.observations), transform, centre, samples
+            self.label,
+            scene,
+            len(data.observations),
+            transform,
+            seconds=seconds,
+            sample_rate=scan.rate,
+            boresight_azel=azel,
+            boresight_radec=radec,
+            centre=centre,
+            flags=scan.flags.copy(),
+            intervals=part(recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1])),
         )
-        if recording.frame == "azel":
-            observation.recorded_azimuth = scan.longitude
         state_times(self.label, observation)
         if recording.frame == "azel":
+            observation.recorded_azimuth = scan.longitude
             _state_celestial(self.label, observation, computed, good)
         return observation
 
@@ -211,37 +215,6 @@ def _summary(scan: Scan, frame: str) -> str:
     return text
 
 
-def _check_elevation(
-    horizontal: Floats,
-    seconds: Floats,
-    good: NDArray[np.bool_],
-    telescope: Telescope,
-    place: str,
-    start: Instant,
-) -> None:
-    """Raise PointingError where an unflagged direction (n, 3) lies outside the telescope's
-    elevation limits.
-    """
-    _, elevation = angles(horizontal)
-    outside = (elevation < telescope.elevation_min - 1e-9) | (
-        elevation > telescope.elevation_max + 1e-9
-    )
-    if (wrong := np.flatnonzero(outside & good)).size:
-        limits = (
-            f"{np.degrees(telescope.elevation_min):g} deg to"
-            f" {np.degrees(telescope.elevation_max):g} deg"
-        )
-        where = (
-            f"elevation {np.degrees(elevation[wrong[0]]):.2f} deg, {seconds[wrong[0]]:.4g} s after"
-            f" {start}"
-        )
-        raise PointingError(
-            f"the boresight is at {where}; {telescope.name} reaches {limits}",
-            place=place,
-            cure="flag these rows, or correct site, clock, units or the telescope's limits",
-        )
-
-
 def _state_celestial(
     label: str, observation: Observation, computed: Floats, good: NDArray[np.bool_]
 ) -> None:
@@ -252,7 +225,7 @@ def _state_celestial(
     if observation.boresight_radec is not computed:
         looked = np.flatnonzero(good)[:: max(1, int(good.sum()) // MOST_CHECKED)]
         apart = np.linalg.norm(
-            _directions(observation.boresight_radec[looked]) - _directions(computed[looked]), axis=1
+            directions(observation.boresight_radec[looked]) - directions(computed[looked]), axis=1
         )
         most = 2 * float(np.arcsin(apart.max(initial=0.0) / 2))
         text = f"as recorded, up to {np.degrees(most) * 3600:.3g} arcsec from those {text}"
@@ -263,16 +236,3 @@ def _state_celestial(
                 stacklevel=4,
             )
     observation.tally.state(label, f"{observation.name}: directions on the sky", text)
-
-
-def _directions(quaternions: Floats) -> Floats:
-    """Unit vectors (n, 3) of boresights (n, 4)."""
-    x, y, z, w = quaternions.T
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
-
-
-def _middle(radec: Floats, good: NDArray[np.bool_]) -> tuple[float, float]:
-    """ICRS (ra, dec) of the mean direction."""
-    looked = np.flatnonzero(good)[:: max(1, int(good.sum()) // 10_000)]
-    ra, dec = angles(_directions(radec[looked]).mean(axis=0))
-    return float(ra % (2 * np.pi)), float(dec)

@@ -15,6 +15,7 @@ from zonda.core.flags import SUN_CLOSE, SUN_UP
 from zonda.core.intervals import Intervals, runs
 from zonda.core.numerics.bodies import Track, tracks
 from zonda.core.numerics.chunks import chunks
+from zonda.core.numerics.quaternions import directions
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
@@ -67,8 +68,7 @@ def looking(azel: Floats) -> Floats:
     """(n, 3) unit vectors north, east, up of boresights (n, 4), whose own axes are north, west,
     up.
     """
-    x, y, z, w = azel.T
-    return np.stack([2 * (x * z + w * y), -2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    return np.asarray(directions(azel) * [1.0, -1.0, 1.0])
 
 
 def distances(observations: Sequence[Observation]) -> list[str]:

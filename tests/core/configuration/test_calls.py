@@ -52,6 +52,11 @@ def scene(**changes: Any) -> zonda.Scene:
             "as in pixel='2 arcsec'",
         ),
         (
+            lambda: zonda.PointingDaisy("4 arcmin"),
+            "takes its parameters by their names",
+            "as in radius='4 arcmin'",
+        ),
+        (
             lambda: zonda.BinMap(projection="tan"),
             "must be 'TAN' or 'CAR', got 'tan'",
             "did you mean 'TAN'?",

@@ -30,7 +30,7 @@ def test_acceleration_is_bounded_and_everything_is_smooth(
     throw: float, speed: float, acceleration: float
 ) -> None:
     scan = operator(throw, speed, acceleration)
-    leg, turn = throw / speed, scan.turnaround
+    leg, turn = throw / speed, scan.sweep.turnaround
     # one leg's end, the whole turnaround, the next leg's beginning, in steps of a 1/4000 of the
     # turnaround
     t = leg + turn * np.linspace(-0.2, 1.2, 5601)
@@ -57,7 +57,7 @@ def test_legs_cross_the_throw_at_constant_speed() -> None:
     t = np.arange(0.003, 60, 0.01)  # none where a leg ends: there a last bit decides
     x, y = scan.path(t)
     assert not y.any()
-    steady = ~scan.in_turnaround(t)
+    steady = ~scan.sweep.turning(t)
     inside = np.abs(x) <= scan.throw / 2 * (1 + 1e-12)
     assert np.array_equal(steady, inside)
     both = steady[1:] & steady[:-1]

@@ -1,5 +1,6 @@
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,7 @@ from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.sphere import angles, unit_vectors
 from zonda.core.registry import instruments
 from zonda.core.scene import Scene
-from zonda.operators.pointing.raster import PointingRaster
-from zonda.operators.pointing.rows import Rows
+from zonda.operators.pointing.raster import PointingRaster, Rows
 
 ARCMIN = math.radians(1 / 60)
 SCAN = {
@@ -26,7 +26,7 @@ SCAN = {
     "speed": "1 arcmin/s",
     "acceleration": "1 arcmin/s2",
 }
-ROWS = Rows(10 * ARCMIN, ARCMIN, 5, ARCMIN, ARCMIN, False)
+ROWS = Rows(10 * ARCMIN, ARCMIN, ARCMIN, False, -5 * ARCMIN, ARCMIN, 5)
 
 
 def positive(low: float, high: float) -> st.SearchStrategy[float]:
@@ -45,10 +45,10 @@ def positive(low: float, high: float) -> st.SearchStrategy[float]:
 def test_turnarounds_keep_speed_and_acceleration(
     width: float, spacing: float, n: int, speed: float, acceleration: float, smooth: bool
 ) -> None:
-    rows = Rows(width, spacing, n, speed, acceleration, smooth)
+    rows = Rows(width, speed, acceleration, smooth, -width / 2, spacing, n)
     points = 4000
     u = np.linspace(0, 1, points + 1)
-    x, y = rows.path(rows.leg + rows.turnaround * np.clip(u, 1e-9, 1 - 1e-9))
+    x, y = rows.offsets(rows.leg + rows.turnaround * np.clip(u, 1e-9, 1 - 1e-9))
     step = rows.turnaround / points
     reach = max(abs(x).max(), abs(y).max())
     noise = (
@@ -73,7 +73,7 @@ def test_rows_are_straight_evenly_spaced_and_crossed_at_constant_speed_in_both_d
     passed = []
     for number in range(20):
         t = number * step + ROWS.leg * np.linspace(1e-6, 1 - 1e-6, 101)
-        x, y = ROWS.path(t)
+        x, y = ROWS.offsets(t)
         assert not ROWS.turning(t).any()
         assert np.ptp(y) == 0
         velocity = np.diff(x) / np.diff(t)
@@ -86,9 +86,9 @@ def test_rows_are_straight_evenly_spaced_and_crossed_at_constant_speed_in_both_d
     # T^2 = (4 + sqrt(16 + 4 16)) / 2, v = s = a = 1: b v = 2, c s = 4
     assert ROWS.turnaround == pytest.approx(math.sqrt((4 + math.sqrt(80)) / 2), rel=1e-12)
     assert ROWS.pass_time == pytest.approx(5 * 10 + 4 * ROWS.turnaround, rel=1e-12)
-    one = ROWS._replace(n=1)
+    one = replace(ROWS, n=1)
     assert one.turnaround == pytest.approx(2.0)  # 2 v / a
-    assert one._replace(smooth=True).turnaround == pytest.approx(4.0)
+    assert replace(one, smooth=True).turnaround == pytest.approx(4.0)
     assert not one.path(np.linspace(0, 50, 500))[1].any()
 
 
@@ -112,7 +112,7 @@ def test_rows_lie_at_the_position_angle_on_the_sky(
     x, y = offsets(o)
     sine, cosine = math.sin(math.radians(angle)), math.cos(math.radians(angle))
     along, across = x * sine + y * cosine, y * sine - x * cosine
-    expected = ROWS.path(o.seconds)
+    expected = ROWS.offsets(o.seconds)
     assert along == pytest.approx(expected[0] / ARCMIN, abs=1e-6)
     assert across == pytest.approx(expected[1] / ARCMIN, abs=1e-6)
 
@@ -150,7 +150,7 @@ def test_horizontal_axes_follow_the_target(observe: Callable[..., Data]) -> None
         unit_vectors(*o.centre), o.seconds
     )
     longitude, elevation = angles(track)
-    x, y = ROWS.path(o.seconds)
+    x, y = ROWS.offsets(o.seconds)
     # the gnomonic projection inverted (Calabretta & Greisen 2002)
     azimuth = np.remainder(o.azimuth + longitude + np.pi, 2 * np.pi) - np.pi
     assert np.tan(azimuth) == pytest.approx(
@@ -220,7 +220,7 @@ def test_coverage_is_uniform_inside() -> None:
     x, y = x / field, y / field  # a disc of diameter 1
     turn = math.radians(11)  # the lattice is not aligned with the rows
     across = y * math.cos(turn) + x * math.sin(turn)
-    rows = Rows(3.0, 0.25, 17, 1.0, 1.0, False)
+    rows = Rows(3.0, 1.0, 1.0, False, -1.5, 0.25, 17)
     middles = (np.arange(rows.n) - (rows.n - 1) / 2) * rows.spacing
     counts, _ = np.histogram(
         (middles[:, None] + across).ravel(), bins=40, range=(-1.0, 1.0)
@@ -263,12 +263,12 @@ def test_a_raster_that_is_cut_off_is_told(observe: Callable[..., Data]) -> None:
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_how_far_turnarounds_reach(smooth: bool) -> None:
-    rows = ROWS._replace(smooth=smooth)
-    x, _ = rows.path(rows.leg + rows.turnaround * np.linspace(0, 1, 2001))
+    rows = replace(ROWS, smooth=smooth)
+    x, _ = rows.offsets(rows.leg + rows.turnaround * np.linspace(0, 1, 2001))
     assert x.max() - rows.width / 2 == pytest.approx(
         rows.overshoot, rel=1e-12
     )  # u = 1/2 is one of the points
-    single = rows._replace(n=1, speed=rows._replace(n=1).speed_within)  # no step to the side
+    single = replace(rows, n=1, speed=replace(rows, n=1).speed_within)  # no step to the side
     assert single.overshoot == pytest.approx(single.width, rel=1e-12)
 
 

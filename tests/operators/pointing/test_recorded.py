@@ -373,7 +373,7 @@ def test_outside_the_telescopes_range_is_found_by_check(
     high = PointingRecorded(file=write_csv(tmp_path / "high.csv", UNIX + t, 10 + 0 * t, 45 + 0 * t))
     low = PointingRecorded(file=write_csv(tmp_path / "low.csv", UNIX + t, 10 + 0 * t, 3 + 0 * t))
     data = Data(observe(high).scene)
-    with pytest.raises(PointingError, match=r"the boresight is at elevation 3.00 deg"):
+    with pytest.raises(PointingError, match=r"the boresight goes down to elevation 3.00 deg"):
         low.check(data)
     assert high.check(data) == ["100 samples at 1 Hz, 99.0 s, elevation 45.00 to 45.00 deg"]
     assert [o.n_samples for o in data.observations] == [100]
@@ -384,7 +384,7 @@ def test_outside_the_telescopes_range(observe: Callable[..., Data], tmp_path: Pa
     path = write_csv(tmp_path / "low.csv", UNIX + t, 10 + 0 * t, np.where(t == 60, 3, 45))
     with pytest.raises(
         PointingError,
-        match=r"the boresight is at elevation 3.00 deg, 60 s after .*GBT reaches 5 deg to 90 deg",
+        match=r"the boresight goes down to elevation 3.00 deg, 60 s after .*GBT reaches 5 deg to 90 deg",
     ):
         observe(PointingRecorded(file=path))
     write_csv(path, UNIX + t, 10 + 0 * t, np.where(t == 60, NAN, 45))

@@ -22,9 +22,9 @@ from zonda.core.numerics.quaternions import conjugate, from_angles, multiply
 from zonda.core.pipeline import Pipeline
 from zonda.core.registry import instruments
 from zonda.core.scene import Scene
-from zonda.operators.pointing.constant_elevation import Nod, Sweep
 from zonda.operators.pointing.schedule import PointingSchedule
 from zonda.operators.pointing.schedule_files import read_schedule
+from zonda.operators.pointing.sweep import Nod, Sweep
 
 ROWS = [
     (
@@ -130,8 +130,8 @@ def test_turnarounds_are_continuous_and_as_fast_as_asked_for(smooth):
     np.testing.assert_allclose(
         np.abs(v[~sweep.turning(t[:-1]) & ~sweep.turning(t[1:])]), 0.03, rtol=1e-9
     )
-    assert x.max() - 0.5 == pytest.approx(sweep.beyond, rel=1e-5)
-    assert -x.min() == pytest.approx(sweep.beyond, rel=1e-5)
+    assert x.max() - 0.5 == pytest.approx(sweep.overshoot, rel=1e-5)
+    assert -x.min() == pytest.approx(sweep.overshoot, rel=1e-5)
 
 
 def test_rows_are_scanned_between_their_limits(tmp_path):
@@ -487,7 +487,7 @@ def test_files_that_are_no_schedule(tmp_path, text):
 
 
 def test_an_elevation_that_the_telescope_cannot_reach(tmp_path):
-    with pytest.raises(PointingError, match=r"goes to elevation 2.00 deg; .* reaches"):
+    with pytest.raises(PointingError, match=r"goes down to elevation 2.00 deg; .* reaches"):
         scans(version_5(tmp_path / "a.ecsv", change(0, el=2.0)))
 
 

@@ -1,12 +1,11 @@
-"""The track of a constant-elevation scan between two azimuths of the mount, and of a nod in
-elevation.
+"""Tracks of a mount: sweeps back and forth at constant speed, and nods in elevation.
 
-The scan begins at the lesser azimuth, towards larger ones. It crosses the width w at the constant
-rate v; outside the limits the mount turns round within T, u seconds after it began to:
+A sweep crosses the width w at the constant speed v, towards larger values first; outside of it the
+telescope turns round within T, at constant acceleration as TOAST's `SimGround` or with continuous
+acceleration. With u the fraction of T that has passed,
 
-    A = v u - a u^2 / 2,   T = 2 v / a   (constant acceleration, TOAST's `SimGround`),   (1)
-    A = v T [u/T - (u/T)^2 + (1 - cos(2 pi u / T)) / (2 pi^2)],
-    T = 4 v / a   (smooth, equation (1) of `azimuth_scan`).   (2)
+    x = w + v T (u - u^2),   T = 2 v / a,                                          (1)
+    x = w + v T [u - u^2 + (1 - cos(2 pi u)) / (2 pi^2)],   T = 4 v / a.           (2)
 
 A nod goes from one elevation to the next from rest to rest: constant acceleration, constant speed,
 constant deceleration.
@@ -26,54 +25,58 @@ from zonda.core.types import Floats
 
 @dataclass(frozen=True)
 class Sweep:
-    """Back and forth over ``width`` [rad] of azimuth at ``rate`` [rad/s], turned round with
-    ``acceleration`` [rad/s^2], all of the mount; ``smooth``: equation (2)."""
+    """Back and forth over ``width`` [rad] at ``speed`` [rad/s], turned round with at most
+    ``acceleration`` [rad/s^2].
+
+    ``smooth``: equation (2). ``begin``: where the width begins, rad.
+    """
 
     width: float
-    rate: float
+    speed: float
     acceleration: float
-    smooth: bool
+    smooth: bool = True
+    begin: float = 0.0
 
     @property
     def leg(self) -> float:
         """Duration of the part at constant speed, s."""
-        return self.width / self.rate
+        return self.width / self.speed
 
     @property
     def turnaround(self) -> float:
         """T, s."""
-        return (4 if self.smooth else 2) * self.rate / self.acceleration
+        return (4 if self.smooth else 2) * self.speed / self.acceleration
 
     @property
-    def beyond(self) -> float:
-        """Reach of a turnaround beyond the limits, rad."""
-        factor = 1 / 4 + 1 / np.pi**2 if self.smooth else 1 / 4
-        return self.rate * self.turnaround * float(factor)
+    def overshoot(self) -> float:
+        """Reach of a turnaround beyond the width, rad: equations (1) and (2) at u = 1/2."""
+        return self.speed * self.turnaround * (0.25 + 1 / math.pi**2 if self.smooth else 0.25)
+
+    def passages(self, seconds: Floats) -> tuple[Floats, Floats, Floats]:
+        """Number of the passage, from 0, seconds since it began, and u: each (n,)."""
+        number, within = np.divmod(seconds, self.leg + self.turnaround)
+        return number, within, np.clip((within - self.leg) / self.turnaround, 0.0, 1.0)
 
     def path(self, seconds: Floats) -> Floats:
-        """(n,) azimuth from the lesser limit, rad."""
-        if self.width == 0:
-            return np.zeros(len(seconds))
-        count, within = np.divmod(seconds, self.leg + self.turnaround)
-        u = np.clip((within - self.leg) / self.turnaround, 0.0, 1.0)
+        """x (n,), rad."""
+        number, within, u = self.passages(seconds)
         beyond = u - u * u
         if self.smooth:
             beyond += (1 - np.cos(2 * np.pi * u)) / (2 * np.pi**2)
-        x = self.rate * np.minimum(within, self.leg) + self.rate * self.turnaround * beyond
-        return np.where(count % 2 == 0, x, self.width - x)
+        x = self.speed * np.minimum(within, self.leg) + self.begin
+        x += self.speed * self.turnaround * beyond
+        return np.where(number % 2 == 0, x, 2 * self.begin + self.width - x)
 
     def turning(self, seconds: Floats) -> NDArray[np.bool_]:
         """(n,) True in turnarounds."""
-        if self.width == 0:
-            return np.zeros(len(seconds), bool)
         return np.asarray(np.mod(seconds, self.leg + self.turnaround) > self.leg)
 
-    def intervals(self, seconds: Floats, inside: NDArray[np.bool_]) -> Intervals:
-        """TOAST's intervals of the samples ``inside`` (n,); a throw goes from the middle of a
-        turnaround to that of the next.
+    def intervals(self, seconds: Floats, inside: NDArray[np.bool_] | bool = True) -> Intervals:
+        """TOAST's intervals of the samples ``inside`` (n,). Left to right is towards larger values;
+        a turnaround has the direction of the scan before it.
+
+        A throw goes from the middle of a turnaround to that of the next.
         """
-        if self.width == 0:
-            return {"scanning": runs(inside, seconds)}
         cycle, turning = self.leg + self.turnaround, self.turning(seconds)
         first, throw = (
             np.floor(t / cycle) % 2 == 0 for t in (seconds, seconds + self.turnaround / 2)
