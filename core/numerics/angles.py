@@ -10,6 +10,11 @@ FWHM_PER_SIGMA = math.sqrt(8 * math.log(2))
 """Full width at half maximum of a Gaussian of unit standard deviation."""
 
 
+def beam_area(fwhm: float) -> float:
+    """Solid angle of a Gaussian beam, sr."""
+    return math.pi / math.log(16) * fwhm**2
+
+
 def angle_text(value: float, digits: int = 3) -> str:
     """``4°``, ``1.5′``, ``8.5″``, of rad."""
     for unit, name in ((60 * ARCMIN, "°"), (ARCMIN, "′")):

@@ -15,14 +15,15 @@ from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.noise_figures import is_quiet, maps_of, noise_alone
+from zonda.core.maps.noise_figures import Noise, is_quiet, maps_of, noise_alone
 from zonda.core.maps.smoothing import smoother
+from zonda.core.numerics.angles import beam_area
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.output import Output
 from zonda.core.storage.files import product_path
 
 from .comparison.files import Wanted, plane_of, read_planes, write_comparison
-from .comparison.planes import Plane
+from .comparison.planes import EMPTY, NOT_EMPTY, Plane
 from .comparison.statistics import THRESHOLD, Comparison, Settings, compare
 from .comparison.stokes import on_meridians_of, planes_of, products_of
 from .series import about, check_map, key_of, plane_key
@@ -96,14 +97,13 @@ class CompareMaps(Output):
         """Read the `file`, and tell what it holds. Raises InputError where it cannot be read as a
         map.
         """
-        for name in (self.map, *([self.reference] if self.file is None else [])):
-            check_map(data, name, self.label)
+        check_map(data, self.map, self.label)
         if self.file is None:
+            check_map(data, self.reference, self.label)
             return []
         read = self._read()
         if not np.isfinite(read.planes["I"].values).any():
-            cure = "give a map that is not NaN everywhere"
-            raise InputError("no pixel has a value", place=f"{self.label}, {self.file}", cure=cure)
+            raise InputError(EMPTY, place=f"{self.label}, {self.file}", cure=NOT_EMPTY)
         for camera in data.scene.instrument.cameras.values():
             for plane in read.planes.values():
                 _in_kelvin(plane, camera.band)
@@ -114,45 +114,32 @@ class CompareMaps(Output):
         """Raises PipelineError where a map is missing, InputError where the two cannot be
         compared.
         """
-        references, maps = (
-            self._references(data),
-            products_of(_product(data, self.map, self.label), self.map),
-        )
+        references = self._references(data)
+        maps = products_of(_product(data, self.map, self.label), self.map)
         both = [plane for plane in maps if plane in references]
         if len(both) < max(len(maps), len(references)):
             which = "reference" if len(references) == 1 else "map"
             data.tally.state(self.label, "Q and U", f"not compared: the {which} has none")
-        references = on_meridians_of(
-            plane_of(maps["I"][1], self.map), {plane: references[plane] for plane in both}
-        )
-        for plane in both:
-            self._compare(data, plane, references[plane], maps[plane])
-
-    def _compare(self, data: Data, which: str, reference: Plane, product: tuple[str, Any]) -> None:
-        """Compare one of I, Q and U with that of the reference. ``product``: the map's name, and
-        the map.
-        """
-        name, found = product
+        first = plane_of(maps["I"][1], self.map)
+        references = on_meridians_of(first, {plane: references[plane] for plane in both})
         runs = data.provenance.get("runs", {})
-        plane = covered(
-            self._with_noise(data, which, plane_of(found, name)), found, self.least_coverage
-        )
-        plane = replace(plane, quiet=is_quiet(runs, self.map))
-        if self.file is None:
-            reference = replace(reference, quiet=is_quiet(runs, self.reference))
-        fwhm = self.beam or resolution(plane, reference, found)
-        made = compare(
-            reference, plane, Settings(fwhm or None, self.threshold, self.bins), self.label
-        )
-        of = "" if which == "I" else f"{which}: "
-        for note in made.notes:
-            what, text = note.split(": ", 1) if ": " in note else ("grid", note)
-            data.tally.state(self.label, of + what, text)
-        _tell(self.label, of, data, made)
-        key = plane_key(key_of(self, "comparison"), which)
-        data.products[key] = made
-        if data.output is not None:
-            write_comparison(made, product_path(data.output, data.named(key)), about(data))
+        settings = Settings(self.beam, self.threshold, self.bins)
+        for which in both:
+            name, found = maps[which]
+            plane = self._with_noise(data, which, plane_of(found, name))
+            plane = replace(
+                covered(plane, found, self.least_coverage), quiet=is_quiet(runs, self.map)
+            )
+            reference = references[which]
+            if self.file is None:
+                reference = replace(reference, quiet=is_quiet(runs, self.reference))
+            fwhm = self.beam or resolution(plane, reference, found) or None
+            made = compare(reference, plane, replace(settings, fwhm=fwhm), self.label)
+            _tell(self.label, "" if which == "I" else f"{which}: ", data, made)
+            key = plane_key(key_of(self, "comparison"), which)
+            data.products[key] = made
+            if data.output is not None:
+                write_comparison(made, product_path(data.output, data.named(key)), about(data))
 
     def _with_noise(self, data: Data, which: str, plane: Plane) -> Plane:
         """A plane with the noise of the complete map, also of a signal without noise, and with the
@@ -164,21 +151,13 @@ class CompareMaps(Output):
             return plane
         name = plane_key(complete, which) if whole.polarization is not None else complete
         maps = maps_of(data.products)
-        alone = (
-            noise_alone(maps, name)
-            if self.noise == "measured"
-            else noise_alone(maps, name, ["half_difference"])
-        )
+        sources: tuple[Noise, ...] = ("source_free", "half_difference")
+        alone = noise_alone(maps, name, sources[self.noise != "measured" :])
         noisy = plane_of(maps[name], name, alone)
         if noisy.values.shape != plane.values.shape:
             return plane
-        return replace(
-            plane,
-            noise=noisy.noise,
-            blurred=noisy.blurred,
-            alone=noisy.alone,
-            alone_of=noisy.alone_of,
-        )
+        fields = ("noise", "blurred", "alone", "alone_of")
+        return replace(plane, **{field: getattr(noisy, field) for field in fields})
 
     def _references(self, data: Data) -> dict[str, Plane]:
         """The planes of the reference, K_RJ."""
@@ -192,21 +171,14 @@ class CompareMaps(Output):
     def _read(self) -> ReadMap:
         """The file. Raises InputError as `read_planes`."""
         assert self.file is not None
-        plane = (
-            (self.plane,)
-            if isinstance(self.plane, int)
-            else None
-            if self.plane is None
-            else tuple(self.plane)
-        )
+        plane = None if self.plane is None else tuple(np.atleast_1d(self.plane).tolist())
         return read_planes(self.file, wanted=Wanted(self.hdu, plane, self.coordsys))
 
 
 def _in_kelvin(plane: Plane, band: Band) -> Plane:
     if plane.unit in ("K_RJ", ""):
         return replace(plane, unit="K_RJ")
-    beam = math.pi / math.log(16) * (plane.fwhm or 0.0) ** 2
-    factor: Any = to_kelvin_rj(plane.unit, band, 1.0, 0.0, beam)
+    factor: Any = to_kelvin_rj(plane.unit, band, 1.0, 0.0, beam_area(plane.fwhm or 0.0))
     if plane.unit == "Jy/pixel":
         factor = factor / np.broadcast_to(plane.grid.areas, plane.values.shape)
     return plane.scaled(factor, "K_RJ")
@@ -227,14 +199,13 @@ def covered(plane: Plane, product: Any, least: float) -> Plane:
     if not isinstance(product, MapProduct):
         return plane
     if product.projection == "TAN":
-        return replace(
-            plane, values=np.where(window_of(product, least=least) > 0, plane.values, np.nan)
-        )
-    areas, seen = np.broadcast_to(plane.grid.areas, product.hits.shape), product.known
-    depth = product.known_hits / areas  # samples per solid angle, under the beam
-    if product.fwhm > 0:
-        depth = smoother(plane.grid, product.fwhm)(np.nan_to_num(depth))
-    enough = depth >= least * np.percentile(depth[seen], 99) if seen.any() else seen
+        enough = window_of(product, least=least) > 0
+    else:
+        seen = product.known
+        depth = product.known_hits / np.broadcast_to(plane.grid.areas, seen.shape)
+        if product.fwhm > 0:  # samples per solid angle, under the beam
+            depth = smoother(plane.grid, product.fwhm)(np.nan_to_num(depth))
+        enough = depth >= least * np.percentile(depth[seen], 99) if seen.any() else seen
     return replace(plane, values=np.where(enough, plane.values, np.nan))
 
 
@@ -242,23 +213,21 @@ def _product(data: Data, name: str, place: str) -> Any:
     found = data.products.get(name)
     if isinstance(found, Image) or (isinstance(found, MapProduct) and found.contents == "all"):
         return found
-    known = [
-        key
-        for key, value in data.products.items()
-        if isinstance(value, Image | MapProduct) and not key.startswith("_")
-    ]
-    raise PipelineError(
-        f"there is no map {name!r}", place=place, cure=f"name one of these: {', '.join(known)}"
-    )
+    maps = ((key, p) for key, p in data.products.items() if isinstance(p, Image | MapProduct))
+    cure = f"name one of these: {', '.join(key for key, _ in maps if not key.startswith('_'))}"
+    raise PipelineError(f"there is no map {name!r}", place=place, cure=cure)
 
 
 def _tell(label: str, of: str, data: Data, found: Comparison) -> None:
     f = found.figures
-    data.tally.state(label, f"{of}gain of the map", f"{f['gain']:.4g} +- {f['gain error']:.2g}")
-    data.tally.state(label, f"{of}correlation", f"{f['correlation']:.4f}")
-    data.tally.state(label, f"{of}rms of the difference", f"{f['rms difference']:.3e} {found.unit}")
+    told = [note.split(": ", 1) if ": " in note else ("grid", note) for note in found.notes]
+    told += [
+        ("gain of the map", f"{f['gain']:.4g} +- {f['gain error']:.2g}"),
+        ("correlation", f"{f['correlation']:.4f}"),
+        ("rms of the difference", f"{f['rms difference']:.3e} {found.unit}"),
+    ]
     if f.get("chi2 values"):
         ratio, error = f["chi2"] / f["chi2 pixels"], math.sqrt(2 / f["chi2 values"])
-        data.tally.state(
-            label, f"{of}chi2 of the difference / pixels", f"{ratio:.4g} +- {error:.2g}"
-        )
+        told.append(("chi2 of the difference / pixels", f"{ratio:.4g} +- {error:.2g}"))
+    for what, text in told:
+        data.tally.state(label, of + what, text)

@@ -13,7 +13,7 @@ from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.maps.central import central_diameter, in_beams
 from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures
-from zonda.core.numerics.angles import angle_text, sides_text
+from zonda.core.numerics.angles import angle_text, beam_area, sides_text
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.operator import Operator
 from zonda.core.registry import declared
@@ -40,9 +40,7 @@ def flux_density(kelvin: float, fwhm: float, band: Band) -> str:
     """Flux density of a point source with a flat spectrum whose peak is ``kelvin`` behind a
     Gaussian beam of ``fwhm`` [rad].
     """
-    jansky = kelvin / to_kelvin_rj(
-        "Jy/beam", band, beam_solid_angle=math.pi / math.log(16) * fwhm**2
-    )
+    jansky = kelvin / to_kelvin_rj("Jy/beam", band, beam_solid_angle=beam_area(fwhm))
     return scaled(jansky, ((1, "\u00a0Jy"), (1e3, "\u00a0mJy"), (1e6, "\u00a0µJy")), least=0.9995)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from zonda.operators.diagnostics.comparison.files import Wanted
     from zonda.operators.diagnostics.comparison.planes import Plane
-    from zonda.operators.diagnostics.comparison.statistics import Comparison, Settings
+    from zonda.operators.diagnostics.comparison.statistics import Comparison
 
 ROWS = (
     ("rms of the reference", "rms reference", "", 1.0),
@@ -35,6 +33,48 @@ ROWS = (
 """What is printed: text, figure, its error, whether it has the map's unit."""
 
 
+def _levels(_context: Any, _option: Any, text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(level) for level in text.split(",") if level.strip())
+    except ValueError:
+        raise click.BadParameter(f"'{text}' is not a list of numbers, e.g. -4,-2,2,4") from None
+
+
+def _of_both(_context: Any, option: Any, given: tuple[str, ...]) -> Any:
+    """What an option says of the reference and of the map, and whether it said it twice."""
+    if len(given) > 2:
+        raise click.BadParameter("is given more than twice: there are two maps")
+    read = tuple(map(_numbers if option.name == "planes" else str, given))
+    first, second = (read * 2)[:2] if read else (None, None)
+    return first, second, len(given) > 1
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(n) for n in text.split(","))
+    except ValueError:
+        raise click.BadParameter(
+            f"'{text}' is not a number, or numbers with commas: 2 or 1,3"
+        ) from None
+
+
+def _quantity(unit: str) -> Any:
+    """Callback that reads an option in a unit."""
+
+    def read(_context: Any, option: Any, text: str | None) -> float | None:
+        from zonda.core.configuration.units import Unit
+        from zonda.plugins.commands.arguments import checked
+
+        return None if text is None else checked(option.opts[0], lambda: Unit(unit).parse(text))
+
+    return read
+
+
+def _twice(flag: str, name: str, metavar: str, text: str) -> Any:
+    """Option that may be given for each of the two maps."""
+    return click.option(flag, name, multiple=True, callback=_of_both, metavar=metavar, help=text)
+
+
 @click.command()
 @click.argument("first", metavar="REFERENCE", type=click.Path(path_type=Path))
 @click.argument("second", metavar="MAP", type=click.Path(path_type=Path))
@@ -52,40 +92,36 @@ ROWS = (
 )
 @click.option(
     "--frequency",
+    callback=_quantity("Hz"),
     metavar="FREQUENCY",
     help="For conversions, e.g. '93 GHz'.  [default: RESTFRQ of the files]",
 )
 @click.option(
     "--beam",
+    callback=_quantity("rad"),
     metavar="ANGLE",
     help="Common resolution (FWHM), e.g. '20 arcsec'.  [default: the wider of the two]",
 )
 @click.option(
     "--sky", is_flag=True, help="REFERENCE is a sky before any beam: it gets the whole common beam."
 )
-@click.option(
+@_twice(
     "--hdu",
     "hdus",
-    multiple=True,
-    metavar="HDU",
-    help=(
-        "Extension, by name or number; given twice: of REFERENCE and of MAP.  [default: the first"
-        " map]"
-    ),
+    "HDU",
+    "Extension, by name or number; given twice: of REFERENCE and of MAP.  [default: the first map]",
 )
-@click.option(
+@_twice(
     "--plane",
     "planes",
-    multiple=True,
-    metavar="N[,N]",
-    help="Plane of a cube, counted from 1; given twice: of REFERENCE and of MAP.",
+    "N[,N]",
+    "Plane of a cube, counted from 1; given twice: of REFERENCE and of MAP.",
 )
-@click.option(
+@_twice(
     "--coordsys",
     "systems",
-    multiple=True,
-    metavar="C|G|E",
-    help="Of a HEALPix map without COORDSYS; given twice: of REFERENCE and of MAP.",
+    "C|G|E",
+    "Of a HEALPix map without COORDSYS; given twice: of REFERENCE and of MAP.",
 )
 @click.option(
     "--threshold",
@@ -96,6 +132,7 @@ ROWS = (
 )
 @click.option(
     "--contours",
+    callback=_levels,
     default="-8,-4,-2,2,4",
     show_default=True,
     metavar="LEVELS",
@@ -109,21 +146,7 @@ ROWS = (
     default=("png",),
     show_default=True,
 )
-def compare(
-    first: Path,
-    second: Path,
-    output: Path,
-    unit: str | None,
-    frequency: str | None,
-    beam: str | None,
-    sky: bool,
-    hdus: tuple[str, ...],
-    planes: tuple[str, ...],
-    systems: tuple[str, ...],
-    threshold: float,
-    contours: str,
-    formats: tuple[str, ...],
-) -> None:
+def compare(first: Path, second: Path, output: Path, **options: Any) -> None:
     """Compare a map with a reference: print figures, write pictures, FITS images and tables.
 
     REFERENCE and MAP are FITS files (images in any projection, or HEALPix tables), or two folders
@@ -135,25 +158,8 @@ def compare(
     compared, Q and U from the meridians of MAP's frame. Maps whose headers state different bands
     (RESTFRQ, BAND) are compared with a warning.
     """
-    from zonda.core.configuration.units import Unit
-    from zonda.operators.diagnostics.comparison.statistics import Settings
-    from zonda.plugins.commands.arguments import checked
-
-    fwhm = None if beam is None else checked("--beam", lambda: Unit("rad").parse(beam))
-    hertz = (
-        None if frequency is None else checked("--frequency", lambda: Unit("Hz").parse(frequency))
-    )
-    levels, choices = _levels(contours), _choices(hdus, planes, systems)
     for name, one, other in pairs(first, second):
-        folder = output / name if name else output
-        _compare(
-            (one, other),
-            folder,
-            Settings(fwhm, threshold),
-            (unit, hertz, sky),
-            (levels, formats),
-            choices,
-        )
+        _compare((one, other), output / name, **options)
 
 
 def pairs(first: Path, second: Path) -> list[tuple[str, Path, Path]]:
@@ -162,27 +168,24 @@ def pairs(first: Path, second: Path) -> list[tuple[str, Path, Path]]:
     """
     from zonda.core.errors import InputError
 
-    folders = [path.is_dir() for path in (first, second)]
-    if folders == [False, False]:
-        return [("", first, second)]
-    if not all(folders):
-        folder, file = (first, second) if folders[0] else (second, first)
-        return [("", *((folder / "map.fits", file) if folders[0] else (file, folder / "map.fits")))]
-    names = [
-        {p.name for p in folder.glob("*.fits") if not _is_comparison(p)}
-        for folder in (first, second)
-    ]
-    both = sorted(names[0] & names[1])
-    if not both:
-        found = [", ".join(sorted(n)) or "none" for n in names]
-        cure = "give the folders of two runs that saved their maps (SaveMap), or two files"
-        raise InputError(
-            f"no map has the same name in both (*.fits: {found[0]}; {found[1]})",
-            place=f"{first}, {second}",
-            cure=cure,
-        )
-    single = len(both) == 1
-    return [("" if single else Path(name).stem, first / name, second / name) for name in both]
+    if first.is_dir() and second.is_dir():
+        names = [
+            {p.name for p in folder.glob("*.fits") if not _is_comparison(p)}
+            for folder in (first, second)
+        ]
+        both = sorted(names[0] & names[1])
+        if not both:
+            found = "; ".join(", ".join(sorted(n)) or "none" for n in names)
+            raise InputError(
+                f"no map has the same name in both (*.fits: {found})",
+                place=f"{first}, {second}",
+                cure="give the folders of two runs that saved their maps (SaveMap), or two files",
+            )
+        return [
+            (Path(name).stem if len(both) > 1 else "", first / name, second / name) for name in both
+        ]
+    one, other = (path / "map.fits" if path.is_dir() else path for path in (first, second))
+    return [("", one, other)]
 
 
 def _is_comparison(path: Path) -> bool:
@@ -191,125 +194,69 @@ def _is_comparison(path: Path) -> bool:
         return b"REFERENC=" in file.read(10 * 2880)
 
 
-def _levels(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(level) for level in text.split(",") if level.strip())
-    except ValueError:
-        raise click.BadParameter(
-            f"'{text}' is not a list of numbers, e.g. -4,-2,2,4", param_hint="'--contours'"
-        ) from None
-
-
 def _compare(
     paths: tuple[Path, Path],
     folder: Path,
-    settings: Settings,
-    given: tuple[str | None, float | None, bool],
-    look: tuple[tuple[float, ...], tuple[str, ...]],
-    choices: tuple[Wanted, Wanted],
+    *,
+    unit: str | None,
+    frequency: float | None,
+    beam: float | None,
+    sky: bool,
+    hdus: Any,
+    planes: Any,
+    systems: Any,
+    threshold: float,
+    contours: tuple[float, ...],
+    formats: tuple[str, ...],
 ) -> None:
-    """One comparison, printed and written to ``folder``. ``given``: unit, frequency [Hz], whether
-    the reference is a sky.
-
-    ``choices``: what to read of the two files.
-    """
+    """One comparison, printed and written to ``folder``."""
     from zonda.core.storage.files import atomic_path
     from zonda.operators.diagnostics.comparison import statistics
-    from zonda.operators.diagnostics.comparison.files import read_planes, write_comparison
+    from zonda.operators.diagnostics.comparison.files import Wanted, read_planes, write_comparison
     from zonda.operators.diagnostics.comparison.planes import common_beam
     from zonda.operators.diagnostics.comparison.stokes import on_meridians_of
     from zonda.operators.diagnostics.drawing.comparison_plots import draw_comparison
     from zonda.operators.diagnostics.drawing.pictures import Style
     from zonda.operators.diagnostics.series import plane_key
 
+    shared = not (planes[2] or systems[2])
     read = [
-        read_planes(path, _name(path, paths), wanted)
-        for path, wanted in zip(paths, choices, strict=True)
+        read_planes(path, _name(path, paths), Wanted(hdus[k], planes[k], systems[k], shared))
+        for k, path in enumerate(paths)
     ]
+    names = [_name(path, paths) for path in paths]
     if not read[0].is_of_the_band_of(read[1]):
-        both_bands = " and ".join(
-            f"{_name(path, paths)} of {one.band_in_words}"
-            for path, one in zip(paths, read, strict=True)
+        bands = " and ".join(
+            f"{name} of {one.band_in_words}" for name, one in zip(names, read, strict=True)
         )
-        click.echo(
-            f"warning: the maps are of different bands, {both_bands}: the sky itself differs"
-            " between them",
-            err=True,
-        )
+        what = "the sky itself differs between them"
+        click.echo(f"warning: the maps are of different bands, {bands}: {what}", err=True)
     maps = read[1].planes
     references = on_meridians_of(maps["I"], read[0].planes)
     both, written = [plane for plane in maps if plane in references], []
-    levels, formats = look
-    style = Style(0.0, 0.0, 0.0, levels, formats)
+    hertz = frequency or read[0].frequency or read[1].frequency
     for plane in both:
-        sky = replace(references[plane], fwhm=0.0) if given[2] else references[plane]
-        beam = settings.fwhm or common_beam(sky, maps[plane])
-        hertz = given[1] or read[0].frequency or read[1].frequency
-        one, other = _in_one_unit(references[plane], maps[plane], given[0], hertz, beam)
-        one = replace(one, fwhm=sky.fwhm)
-        found = statistics.compare(one, other, settings)
-        click.echo(
-            "\n".join(
-                [
-                    *([f"Stokes {plane}"] if len(both) > 1 else []),
-                    *lines(found),
-                    *([""] if len(both) > 1 else []),
-                ]
-            )
-        )
+        one = references[plane]
+        fwhm = 0.0 if sky else one.fwhm
+        common = beam or common_beam(replace(one, fwhm=fwhm), maps[plane])
+        one, other = _in_one_unit(one, maps[plane], unit, hertz, common)
+        settings = statistics.Settings(beam, threshold)
+        found = statistics.compare(replace(one, fwhm=fwhm), other, settings)
+        text = "\n".join(lines(found))
+        click.echo(f"Stokes {plane}\n{text}\n" if len(both) > 1 else text)
         name = plane_key("comparison", plane)
         written += write_comparison(found, folder / name, {})
-        for picture in map(style.printed, draw_comparison(name, found, levels)):
+        for sketch in draw_comparison(name, found, contours):
+            picture = Style(formats=formats).printed(sketch)
             for kind, content in picture.files.items():
                 path = folder / f"{picture.name}.{kind}"
                 with atomic_path(path) as temporary:
                     temporary.write_bytes(content)
                 written.append(path)
-    told = [f"{path}: {note}" for path, one in zip(paths, read, strict=True) for note in one.notes]
-    for note in [
-        *told,
-        *(_without(references, maps, paths) if not any("Q and U" in note for note in told) else []),
-    ]:
-        click.echo(note)
-    click.echo("\n" + "\n".join(map(str, written)))
-
-
-def _without(
-    references: Mapping[str, Plane], maps: Mapping[str, Plane], paths: tuple[Path, Path]
-) -> list[str]:
-    """Says that one of two files has no Q and U, where the other has."""
-    if references.keys() == maps.keys():
-        return []
-    return [f"Q and U: not compared: {_name(paths['Q' in references], paths)} has none"]
-
-
-def _choices(
-    hdus: tuple[str, ...], planes: tuple[str, ...], systems: tuple[str, ...]
-) -> tuple[Wanted, Wanted]:
-    """Planes of the reference and of the map to read. Raises BadParameter for more than two, or for
-    a name that is no plane.
-    """
-    from zonda.operators.diagnostics.comparison.files import Wanted
-
-    pairs = []
-    for name, given in (("--hdu", hdus), ("--plane", planes), ("--coordsys", systems)):
-        if len(given) > 2:
-            raise click.BadParameter(
-                "is given more than twice: there are two maps", param_hint=f"'{name}'"
-            )
-        pairs.append((given * 2)[:2] if given else (None, None))
-    numbers = []
-    for text in pairs[1]:
-        try:
-            numbers.append(None if text is None else tuple(int(n) for n in text.split(",")))
-        except ValueError:
-            raise click.BadParameter(
-                f"'{text}' is not a number, or numbers with commas: 2 or 1,3",
-                param_hint="'--plane'",
-            ) from None
-    once = max(len(planes), len(systems)) < 2
-    first, second = (Wanted(pairs[0][k], numbers[k], pairs[2][k], once) for k in (0, 1))
-    return first, second
+    notes = [f"{path}: {note}" for path, one in zip(paths, read, strict=True) for note in one.notes]
+    if references.keys() != maps.keys() and not any("Q and U" in note for note in notes):
+        notes.append(f"Q and U: not compared: {names['Q' in references]} has none")
+    click.echo("\n".join([*notes, "", *map(str, written)]))
 
 
 def _name(path: Path, paths: tuple[Path, Path]) -> str:
@@ -326,27 +273,21 @@ def _in_one_unit(
     from zonda.core.errors import InputError
     from zonda.operators.diagnostics.comparison.files import in_unit
 
-    if unit is None and not (reference.unit and other.unit) and reference.unit != other.unit:
-        bare = other if reference.unit else reference
-        known = reference.unit or other.unit
+    both = reference, other
+    if unit is None and bool(reference.unit) != bool(other.unit):
+        bare, known = both if other.unit else both[::-1]
         raise InputError(
-            f"has no unit, and the other map is in {known}",
+            f"has no unit, and the other map is in {known.unit}",
             place=bare.name,
             cure="set its header key BUNIT to what it is in",
         )
     wanted = unit or ("MJy/sr" if reference.unit == "Jy/pixel" else reference.unit)
-    per_beam = (
-        unit is None
-        and wanted == reference.unit == other.unit == "Jy/beam"
-        and not (reference.fwhm and other.fwhm)
-    )
-    if per_beam and beam <= max(reference.fwhm or 0.0, other.fwhm or 0.0):
-        return reference, other  # a beam is not known, so that nothing is smoothed
-    return (
-        (in_unit(reference, wanted, frequency, beam), in_unit(other, wanted, frequency, beam))
-        if wanted
-        else (reference, other)
-    )
+    beams = [plane.fwhm or 0.0 for plane in both]
+    per_beam = unit is None and wanted == reference.unit == other.unit == "Jy/beam"
+    if not wanted or (per_beam and min(beams) == 0 and beam <= max(beams)):
+        return both  # a beam is not known, so that nothing is smoothed
+    first, second = (in_unit(plane, wanted, frequency, beam) for plane in both)
+    return first, second
 
 
 def lines(found: Comparison) -> list[str]:
@@ -354,36 +295,31 @@ def lines(found: Comparison) -> list[str]:
     from zonda.core.numerics.angles import angle_text
     from zonda.core.tables import aligned
 
-    f, (first, second) = found.figures, found.names
+    f = found.figures
     factor, unit = _readable(f["rms reference"], found.unit)
-    rows: list[tuple[str, str]] = [("reference", first), ("map", second)]
-    rows.append(("pixels with both", f"{f['pixels']:.0f} of {angle_text(found.pixel)}"))
-    rows.append(("resolution (FWHM)", angle_text(found.fwhm) if found.fwhm else "not known"))
+    rows = [
+        ("reference", found.names[0]),
+        ("map", found.names[1]),
+        ("pixels with both", f"{f['pixels']:.0f} of {angle_text(found.pixel)}"),
+        ("resolution (FWHM)", angle_text(found.fwhm) if found.fwhm else "not known"),
+    ]
     for text, key, error, has_unit in ROWS:
         scale = factor if has_unit else 1.0
-        value = f"{f[key] * scale:.5g}" + (
-            f" +- {f[error] * scale:.2g}" if error and math.isfinite(f[error]) else ""
-        )
-        rows.append((text, value + (f" {unit}" if has_unit and unit else "")))
+        value = f"{f[key] * scale:.5g}"
+        if error and math.isfinite(f[error]):
+            value += f" +- {f[error] * scale:.2g}"
+        rows.append((text, f"{value} {unit}".rstrip() if has_unit else value))
     if "chi2" in f:
+        ratio = f["chi2"] / f["chi2 pixels"] if f["chi2 pixels"] else math.nan
         scatter = math.sqrt(2 / f["chi2 values"]) if f["chi2 values"] else math.nan
-        rows.append(
-            (
-                "chi2 of the difference / pixels",
-                f"{f['chi2']:.5g} / {f['chi2 pixels']:.0f} = {_ratio(f):.4g} +- {scatter:.2g}",
-            )
-        )
+        text = f"{f['chi2']:.5g} / {f['chi2 pixels']:.0f} = {ratio:.4g} +- {scatter:.2g}"
+        rows.append(("chi2 of the difference / pixels", text))
     return [*aligned(rows), "", *found.notes]
-
-
-def _ratio(figures: dict[str, Any]) -> float:
-    return float(figures["chi2"] / figures["chi2 pixels"]) if figures["chi2 pixels"] else math.nan
 
 
 def _readable(size: float, unit: str) -> tuple[float, str]:
     """Factor and name of the unit in which an rms of ``size`` reads well; kelvins only."""
-    if unit in ("K_RJ", "K_CMB"):
-        for factor, prefix in ((1e6, "u"), (1e3, "m")):
-            if abs(size) * factor < 1e3:
-                return factor, prefix + unit
+    for factor, prefix in ((1e6, "u"), (1e3, "m")) if unit in ("K_RJ", "K_CMB") else ():
+        if abs(size) * factor < 1e3:
+            return factor, prefix + unit
     return 1.0, unit

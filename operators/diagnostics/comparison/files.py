@@ -14,7 +14,7 @@ import numpy as np
 
 from zonda.core.errors import InputError
 from zonda.core.maps.beams import check_width
-from zonda.core.maps.grid import healpix_grid
+from zonda.core.maps.grid import HealpixPixels, healpix_grid
 from zonda.core.maps.header import marked_bad, number, text, with_known_frame
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_file import ascii_text
@@ -33,15 +33,15 @@ from zonda.core.maps.measured_noise import ELSEWHERE
 from zonda.core.maps.noise_figures import FREE
 from zonda.core.maps.planes import IQU
 from zonda.core.maps.stokes_names import columns_of_q_and_u, intensity_column
-from zonda.core.maps.units import KNOWN_UNITS, parse_unit
-from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
+from zonda.core.maps.units import KNOWN_UNITS, parse_unit, scale_of
+from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA, beam_area
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
 from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path
 from zonda.core.storage.fits_files import check_size, header_of, joined, opened, write_image
 from zonda.core.types import Floats
 
-from .planes import Plane
+from .planes import EMPTY, NOT_EMPTY, Plane
 from .statistics import Comparison
 
 SAME_BAND = 1e-3
@@ -56,7 +56,6 @@ NOISES = {
     "HALF_DIFFERENCE_U": "half U",
 }
 """Of a file's extensions and columns: standard errors, or variances; and noise alone."""
-FLUXES = ("Jy/pixel", "Jy/beam", "MJy/sr")
 CURES = Cures(
     plane="choose its plane ({ranges}): --plane {list}, or plane: {example}",
     coordsys=(
@@ -104,12 +103,8 @@ class ReadMap:
     @property
     def band_in_words(self) -> str:
         """Name and frequency, as far as they are stated."""
-        return " ".join(
-            [
-                *([self.band] if self.band else []),
-                *([f"{self.frequency / 1e9:.4g} GHz"] if self.frequency else []),
-            ]
-        )
+        hertz = f"{self.frequency / 1e9:.4g} GHz" if self.frequency else ""
+        return f"{self.band} {hertz}".strip()
 
 
 @dataclass(frozen=True)
@@ -161,57 +156,45 @@ def read_planes(path: Path, name: str = "", wanted: Wanted | None = None) -> Rea
     if not (read.own and FREE in read.measured_in.values() and beside.is_file()):
         return read
     free = _read(beside, name, wanted or Wanted())
-    made = {}
     for key, plane in read.planes.items():
-        found = free.planes.get(key)
-        alike = (
-            found is not None
-            and free.own
-            and found.unit == plane.unit
-            and _on_one_grid(found, plane)
-        )
-        if (
-            alike
-            and found is not None
-            and plane.noise is not None
-            and read.measured_in.get(key) == FREE
-        ):
-            white = plane.noise / (plane.factor or 1.0)
-            plane = replace(plane, noise=white, alone=found.values, alone_of=FREE, factor=None)
-        made[key] = plane
-    return replace(read, planes=made)
+        other = free.planes.get(key)
+        if other is None or plane.noise is None or read.measured_in.get(key) != FREE:
+            continue
+        if free.own and other.unit == plane.unit and _on_one_grid(other, plane):
+            noise = plane.noise / (plane.factor or 1.0)
+            alone: Any = {"alone": other.values, "alone_of": FREE, "factor": None}
+            read.planes[key] = replace(plane, noise=noise, **alone)
+    return read
 
 
 def _on_one_grid(a: Plane, b: Plane) -> bool:
-    if a.values.shape != b.values.shape or (a.pixels is None) != (b.pixels is None):
+    if a.values.shape != b.values.shape:
         return False
     if a.pixels is None or b.pixels is None:
-        return dict(a.header) == dict(b.header)
+        return a.pixels is b.pixels and dict(a.header) == dict(b.header)
     one, two = a.pixels, b.pixels
     alike = (one.nside, one.nest, one.frame) == (two.nside, two.nest, two.frame)
     return alike and np.array_equal(one.pixels, two.pixels)
 
 
 def _read(path: Path, name: str, wanted: Wanted) -> ReadMap:
-    place = str(path)
+    place, name = str(path), name or path.name
     with opened(path, place, "check the file, e.g. with fitsverify, or copy it again") as hdus:
         hdu, _ = chosen(hdus, wanted.hdu, place)
         check_size(hdu, place)
-        if not is_healpix(hdu):
-            if wanted.coordsys is not None and not wanted.shared:
-                raise InputError(
+        healpix = is_healpix(hdu)
+        if not wanted.shared:
+            if healpix and wanted.plane is not None:
+                what, cure = "plane is for images, and this is a HEALPix table", "remove it"
+                raise InputError(what, place=place, cure=cure)
+            if not healpix and wanted.coordsys is not None:
+                what, cure = (
                     "coordsys is for HEALPix maps",
-                    place=place,
-                    cure="remove it: CTYPE says what an image's are",
+                    "remove it: CTYPE says what an image's are",
                 )
-            return _told(
-                name or path.name, hdu.header, True, _images(hdus, hdu, wanted, place), place
-            )
-        if wanted.plane is not None and not wanted.shared:
-            raise InputError(
-                "plane is for images, and this is a HEALPix table", place=place, cure="remove it"
-            )
-        return _told(name or path.name, hdu.header, False, _healpix(hdu, wanted, place), place)
+                raise InputError(what, place=place, cure=cure)
+        found = _healpix(hdu, wanted, place) if healpix else _images(hdus, hdu, wanted, place)
+        return found.read(name, hdu.header, place)
 
 
 @dataclass(frozen=True)
@@ -226,73 +209,60 @@ class Found:
     notes: list[str] = field(default_factory=list)
     halves: str = "of two halves"
 
-
-def _told(name: str, about: Any, image: bool, found: Found, place: str) -> ReadMap:
-    """With what the header ``about`` says of the planes."""
-    label, factor = "", 1.0
-    if unit := str(found.unit or "").strip():
-        label, factor = parse_unit(
-            unit, place=place, temperature_scale=text(about, "TEMPSCAL", place) or None
-        )
-    major = number(about, "BMAJ", place)
-    minor = number(about, "BMIN", place) or major
-    fwhm = (
-        math.radians(math.sqrt(major * minor))
-        if major and minor and major > 0 and minor > 0
-        else None
-    )
-    hertz = number(about, "RESTFRQ", place) or number(about, "RESTFREQ", place)
-    convention = (text(about, "POLCCONV", place) or ("" if image else "COSMO")).upper()
-    values, notes = found.values, list(found.notes)
-    if "Q" in values and convention not in ("COSMO", "IAU"):
-        notes.append(
-            f"Q and U: not compared: {name} has them and no POLCCONV; set that header key to COSMO"
-            " or IAU"
-        )
-        values = {key: plane for key, plane in values.items() if key not in ("Q", "U")}
-    planes: dict[str, Plane] = {}
-    for key in IQU:
-        if key in values:
+    def read(self, name: str, about: Any, place: str) -> ReadMap:
+        """The planes with what the header ``about`` says of them."""
+        image = not isinstance(self.where, HealpixPixels)
+        unit, factor = "", 1.0
+        if written := str(self.unit or "").strip():
+            scale = text(about, "TEMPSCAL", place) or None
+            unit, factor = parse_unit(written, place=place, temperature_scale=scale)
+        major = number(about, "BMAJ", place) or 0.0
+        minor = number(about, "BMIN", place) or major
+        fwhm = math.radians(math.sqrt(major * minor)) if min(major, minor) > 0 else None
+        hertz = number(about, "RESTFRQ", place) or number(about, "RESTFREQ", place) or 0.0
+        convention = (text(about, "POLCCONV", place) or ("" if image else "COSMO")).upper()
+        letters, notes = [key for key in IQU if key in self.values], list(self.notes)
+        if "Q" in letters and convention not in ("COSMO", "IAU"):
+            unknown = f"{name} has them and no POLCCONV; set that header key to COSMO or IAU"
+            notes.append(f"Q and U: not compared: {unknown}")
+            letters = ["I"]
+        planes = {}
+        for key in letters:
             sign = -1.0 if key == "U" and convention == "IAU" else 1.0
-            noise, alone = values.get(f"noise {key}"), values.get(f"half {key}")
-            own, words = found.stated.get(key, (None, ""))
-            quiet = words == ELSEWHERE
-            if quiet:
+            noise, alone = self.values.get(f"noise {key}"), self.values.get(f"half {key}")
+            own, words = self.stated.get(key, (None, ""))
+            if quiet := words == ELSEWHERE:
                 own, words = None, ""
             if alone is not None:
-                own, words = None, f"half the difference, {found.halves}"
+                own, words = None, f"half the difference, {self.halves}"
             elif own is not None and noise is not None:
                 noise = noise * own
-            plane = Plane(
+            planes[key] = Plane(
                 name if key == "I" else f"{name} {key}",
-                sign * values[key],
-                found.where if image else None,
-                "",
-                fwhm,
-                noise,
-                None if image else found.where,
-                0.0,
-                alone,
-                words,
-                own,
+                sign * self.values[key],
+                self.where if image else None,
+                fwhm=fwhm,
+                noise=noise,
+                pixels=None if image else self.where,
+                alone=alone,
+                alone_of=words,
+                factor=own,
                 quiet=quiet,
+            ).scaled(factor, unit)
+        if fwhm and image:
+            shape, sides = planes["I"].values.shape, planes["I"].grid.sides
+            cure = "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them"
+            check_width(
+                fwhm, max(n * side for n, side in zip(shape, sides, strict=True)), place, cure
             )
-            planes[key] = plane.scaled(factor, label)
-    if fwhm and image and planes:
-        first = next(iter(planes.values()))
-        across = max(n * side for n, side in zip(first.values.shape, first.grid.sides, strict=True))
-        check_width(
-            fwhm, across, place, "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them"
+        return ReadMap(
+            planes,
+            hertz if hertz > 0 else None,
+            text(about, "BAND", place),
+            notes,
+            text(about, "ORIGIN", place).lower() == "zonda",
+            {key: words for key, (_, words) in self.stated.items()},
         )
-    origin = text(about, "ORIGIN", place).lower() == "zonda"
-    return ReadMap(
-        planes,
-        hertz if hertz and hertz > 0 else None,
-        text(about, "BAND", place),
-        notes,
-        origin,
-        {key: words for key, (_, words) in found.stated.items()},
-    )
 
 
 def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
@@ -321,27 +291,24 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
     planes = {"I": index, **dict(zip("QU", polarized, strict=False))}
     found = {key: np.asarray(hdu.data[at], np.float64) for key, at in planes.items()}
     stated: dict[str, tuple[float, str]] = {}
-    halves = "of two halves"
-    alone = STOKES not in told and len(planes) == 1
-    first = wanted.hdu is None and alone  # the extensions beside it are of it
-    alike = [other for other in hdus if other.is_image and other.shape == shape] if first else []
-    letters = columns_of_q_and_u([str(other.name) for other in alike])
-    for key, k in zip(("Q", "U"), letters or (), strict=False):
-        found[key] = np.asarray(alike[k].data[index], np.float64).reshape(shape[-2:])
-    for other in alike:
-        if (of := NOISES.get(str(other.name).upper())) is not None:
-            noise = np.asarray(other.data[index], np.float64).reshape(shape[-2:])
-            found[of] = _root(noise) if other.name.upper().startswith("COV") else noise
-            stated |= _stated(other.header, of, place)
-            halves = text(other.header, "JACKKNIF", place) or halves
+    halves, alike = "of two halves", []
+    if wanted.hdu is None and STOKES not in told and not polarized:  # extensions beside are of it
+        alike = [other for other in hdus if other.is_image and other.shape == shape]
+    letters = columns_of_q_and_u([str(other.name) for other in alike]) or ()
+    noises: Any = {k: NOISES.get(str(other.name).upper()) for k, other in enumerate(alike)}
+    for k, key in (noises | dict(zip(letters, "QU", strict=False))).items():
+        if key is not None:
+            values = np.asarray(alike[k].data[index], np.float64).reshape(shape[-2:])
+            found[key] = _root(values) if alike[k].name.upper().startswith("COV") else values
+        if noises[k] is not None:
+            stated |= _stated(alike[k].header, noises[k], place)
+            halves = text(alike[k].header, "JACKKNIF", place) or halves
     both = found.keys() >= {"Q", "U"}
     kept = {k: v for k, v in found.items() if both or k[-1] == "I"}
-    notes = [
-        f"{what}: {said}" for what, said in (("plane", told.get("plane")), ("frame", frame)) if said
-    ]
-    return Found(
-        wcs.celestial.to_header(relax=True), kept, header.get("BUNIT"), stated, notes, halves
-    )
+    told["frame"] = frame
+    notes = [f"{what}: {told[what]}" for what in ("plane", "frame") if told.get(what)]
+    where = wcs.celestial.to_header(relax=True)
+    return Found(where, kept, header.get("BUNIT"), stated, notes, halves)
 
 
 def _root(variance: Floats) -> Floats:
@@ -353,14 +320,11 @@ def _stated(header: Any, of: str, place: str) -> dict[str, tuple[float, str]]:
     """The factor on white noise that the header of a plane of noise states, and what it was
     measured in.
     """
-    factor = number(header, "NOISEFAC", place) if of.startswith("noise") else None
-    if of.startswith("noise") and text(header, "NOISEOF", place) == ELSEWHERE:
-        return {of[-1]: (1.0, ELSEWHERE)}
-    return (
-        {of[-1]: (factor, text(header, "NOISEOF", place) or "its file")}
-        if factor and factor > 0
-        else {}
-    )
+    if not of.startswith("noise"):
+        return {}
+    words = text(header, "NOISEOF", place)
+    factor = 1.0 if words == ELSEWHERE else number(header, "NOISEFAC", place) or 0.0
+    return {of[-1]: (factor, words or "its file")} if factor > 0 else {}
 
 
 def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
@@ -377,39 +341,27 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
         for name, key in NOISES.items()
         if name in names and key[-1] in columns
     }
-    planes = {key: table.numbers(k) for key, k in columns.items()}
-    planes = {
-        key: np.where(marked_bad(plane, header, place), np.nan, plane)
-        for key, plane in planes.items()
-    }
-    planes = {
-        key: _root(plane) if names[columns[key]].startswith("COV") else plane
-        for key, plane in planes.items()
-    }
-    nside, n = table.nside(planes["I"].size), planes["I"].size
+    planes = {}
+    for key, k in columns.items():
+        values = table.numbers(k)
+        values = np.where(marked_bad(values, header, place), np.nan, values)
+        planes[key] = _root(values) if names[k].startswith("COV") else values
+    n = planes["I"].size
+    nside = table.nside(n)
     pixels = table.pixels(nside, n)
     pixels = np.arange(n) if pixels is None else pixels
     seen = np.isfinite(planes["I"])
     if not seen.any():
-        raise InputError(
-            "no pixel has a value", place=place, cure="give a map that is not NaN everywhere"
-        )
+        raise InputError(EMPTY, place=place, cure=NOT_EMPTY)
     order = np.flatnonzero(seen)[np.argsort(pixels[seen])]
     where = healpix_grid(nside, table.nest, pixels[order], frame)
     stated: dict[str, tuple[float, str]] = {}
-    for of in ("I", *(("Q", "U") if "Q" in columns else ())):
-        stated |= _stated(
-            {"NOISEFAC": header.get(f"NOISFAC{of}"), "NOISEOF": header.get("NOISEOF")},
-            f"noise {of}",
-            place,
-        )
-    return Found(
-        where,
-        {key: v[order] for key, v in planes.items()},
-        header.get(f"TUNIT{1 + first}"),
-        stated,
-        halves=text(header, "JACKKNIF", place) or "of two halves",
-    )
+    for key in IQU if "Q" in columns else "I":
+        cards = {"NOISEFAC": header.get(f"NOISFAC{key}"), "NOISEOF": header.get("NOISEOF")}
+        stated |= _stated(cards, f"noise {key}", place)
+    values_of = {key: v[order] for key, v in planes.items()}
+    halves = text(header, "JACKKNIF", place) or "of two halves"
+    return Found(where, values_of, header.get(f"TUNIT{1 + first}"), stated, halves=halves)
 
 
 def plane_of(
@@ -428,11 +380,8 @@ def plane_of(
     noise: Floats | None = product.noise
     if not np.isfinite(product.noise).any():
         with np.errstate(divide="ignore"):
-            noise = (
-                None
-                if alone is None
-                else np.where(product.known, 1 / np.sqrt(product.hits), np.nan)
-            )
+            shape = np.where(product.known, 1 / np.sqrt(product.hits), np.nan)
+        noise = None if alone is None else shape
     pixels = None
     if product.pixels is not None:
         pixels = healpix_grid(product.nside, product.nest, product.pixels, product.frame)
@@ -461,28 +410,23 @@ def in_unit(plane: Plane, unit: str, frequency: float | None, beam: float = 0.0)
     try:
         wanted, factor = parse_unit(unit, place="unit")
     except InputError as error:
-        raise InputError(
-            error.message,
-            place="unit",
-            cure=f"use {KNOWN_UNITS}, with a prefix where you like: mK_RJ",
-        ) from error
+        cure = f"use {KNOWN_UNITS}, with a prefix where you like: mK_RJ"
+        raise InputError(error.message, place="unit", cure=cure) from error
     if wanted == "Jy/pixel":
-        cure = "use MJy/sr; smoothed and interpolated maps have no flux of their own pixels"
         raise InputError(
             "Jy/pixel depends on the pixel, and maps are compared as brightness",
             place="unit",
-            cure=cure,
+            cure="use MJy/sr; smoothed and interpolated maps have no flux of their own pixels",
         )
     if plane.unit == wanted != "Jy/beam":
         return plane.scaled(1 / factor, unit)
     if not plane.unit:
-        raise InputError(
-            f"has no unit, and {unit} is wanted", place=plane.name, cure="set the header key BUNIT"
-        )
-    known = plane.unit in FLUXES and wanted in FLUXES  # their ratio depends on no frequency
-    per = 1.0 if known else frequency
-    ratio = _kelvin(plane, plane.unit, per, plane.fwhm or 0.0) / _kelvin(plane, wanted, per, beam)
-    return plane.scaled(ratio / factor, unit)
+        what = f"has no unit, and {unit} is wanted"
+        raise InputError(what, place=plane.name, cure="set the header key BUNIT")
+    if "Jy" in plane.unit and "Jy" in wanted:
+        frequency = 1.0  # their ratio depends on none
+    own = _kelvin(plane, plane.unit, frequency, plane.fwhm or 0.0)
+    return plane.scaled(own / _kelvin(plane, wanted, frequency, beam) / factor, unit)
 
 
 def _kelvin(plane: Plane, unit: str, frequency: float | None, beam: float) -> float | Floats:
@@ -492,28 +436,21 @@ def _kelvin(plane: Plane, unit: str, frequency: float | None, beam: float) -> fl
     if unit == "K_RJ":
         return 1.0
     if frequency is None:
-        cure = "give the frequency: --frequency '93 GHz', or set the header key RESTFRQ"
         raise InputError(
             f"units differ ({plane.unit}), and their ratio depends on the frequency",
             place=plane.name,
-            cure=cure,
+            cure="give the frequency: --frequency '93 GHz', or set the header key RESTFRQ",
         )
     if unit in ("K_CMB", "y"):
         return float((cmb_slope if unit == "K_CMB" else thermal_sz)(frequency))
-    scale = float(intensity_to_kelvin(frequency))
-    if unit == "MJy/sr":
-        return scale * 1e-20
+    jansky = float(intensity_to_kelvin(frequency)) * 1e-26
+    if unit == "Jy/beam" and not beam > 0:
+        cure = "set the header keys BMAJ and BMIN"
+        raise InputError("is in Jy/beam, and its beam is not known", place=plane.name, cure=cure)
+    area: float | Floats = {"MJy/sr": 1e-6, "Jy/beam": beam_area(beam)}.get(unit, 0.0)
     if unit == "Jy/pixel":
-        return np.asarray(
-            scale * 1e-26 / np.broadcast_to(plane.grid.areas, plane.values.shape), np.float64
-        )
-    if not beam > 0:
-        raise InputError(
-            "is in Jy/beam, and its beam is not known",
-            place=plane.name,
-            cure="set the header keys BMAJ and BMIN",
-        )
-    return scale * 1e-26 / (math.pi / math.log(16) * beam**2)
+        area = np.broadcast_to(plane.grid.areas, plane.values.shape)
+    return jansky / area
 
 
 def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> list[Path]:
@@ -545,38 +482,24 @@ def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> 
     about = {key: value for key, value in meta.items() if value not in ("", None)}
     about |= {"REFERENCE": found.names[0], "MAP": found.names[1]}
     about |= {key.upper(): value for key, value in found.figures.items() if math.isfinite(value)}
-    write_ecsv(paths[1], found.spectra.columns(fits_unit(found.unit), coherence=True), about)
-    p, unit = found.profiles, fits_unit(found.unit)
+    unit = fits_unit(found.unit)
+    write_ecsv(paths[1], found.spectra.columns(unit, coherence=True), about)
+    p, error = found.profiles, "standard error from the scatter, one value per beam"
     columns = [Column("radius", p.radius / ARCSEC, "arcsec", "middle of the ring")]
-    for name in p.mean:
-        columns.append(Column(name, p.mean[name], unit, "mean in the ring"))
-        columns.append(
-            Column(
-                f"{name}_error",
-                p.error[name],
-                unit,
-                "standard error from the scatter, one value per beam",
-            )
-        )
+    for name, mean in p.mean.items():
+        columns.append(Column(name, mean, unit, "mean in the ring"))
+        columns.append(Column(f"{name}_error", p.error[name], unit, error))
     write_ecsv(paths[2], columns, about)
     return paths
 
 
 def fits_unit(unit: str) -> str:
     """The unit as FITS writes it where that is one word, else none: the header's text says it."""
-    return {
-        "K_RJ": "K",
-        "mK_RJ": "mK",
-        "uK_RJ": "uK",
-        "K_CMB": "K",
-        "mK_CMB": "mK",
-        "uK_CMB": "uK",
-    }.get(unit, "")
+    plain, scale = scale_of(unit)
+    return plain if scale else ""
 
 
 def _unit_cards(unit: str) -> list[tuple[str, str, str]]:
-    plain = fits_unit(unit)
-    cards = [("BUNIT", plain or unit, "brightness")] if unit else []
-    if plain:
-        cards.append(("TEMPSCAL", unit.lstrip("mun"), "temperature scale"))
-    return cards
+    plain, scale = scale_of(unit)
+    cards = [("BUNIT", plain, "brightness"), ("TEMPSCAL", scale, "temperature scale")]
+    return [card for card in cards if card[1]]

@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 from astropy.wcs import WCS
+from astropy.wcs.utils import pixel_to_pixel
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
@@ -50,6 +51,10 @@ NEIGHBOURS = 12
 """Pixels on either side that a cubic spline through values looks at: beyond, its weights are below
 2e-7.
 """
+
+
+EMPTY, NOT_EMPTY = "no pixel has a value", "give a map that is not NaN everywhere"
+"""Message about a map without values, and its cure."""
 
 
 @dataclass(frozen=True)
@@ -106,13 +111,9 @@ class Plane:
         """Source of its noise in words; empty if none is known."""
         if self.noise is None:
             return ""
-        if self.quiet and self.factor is None:
-            return ELSEWHERE
-        return (
-            WHITE
-            if self.factor is None
-            else f"{self.factor:.3g} x white noise, as in {self.alone_of}"
-        )
+        if self.factor is None:
+            return ELSEWHERE if self.quiet else WHITE
+        return f"{self.factor:.3g} x white noise, as in {self.alone_of}"
 
     @property
     def grid(self) -> MapGrid:
@@ -133,10 +134,13 @@ class Plane:
 
     def scaled(self, factor: float | Floats, unit: str) -> Plane:
         """In another unit."""
-        noise, alone = (
-            None if found is None else found * factor for found in (self.noise, self.alone)
+        return replace(
+            self,
+            values=self.values * factor,
+            unit=unit,
+            noise=None if self.noise is None else self.noise * factor,
+            alone=None if self.alone is None else self.alone * factor,
         )
-        return replace(self, values=self.values * factor, unit=unit, noise=noise, alone=alone)
 
     def smoothed(self, fwhm: float) -> Plane:
         """With a resolution of ``fwhm`` [rad], equations (1) and (2); as it is where its own is
@@ -145,9 +149,9 @@ class Plane:
         if self.fwhm is None or self.fwhm >= fwhm * (1 - EQUAL_BEAMS):
             return self
         more = math.sqrt(fwhm**2 - self.fwhm**2)
-        noise = (
-            None if self.noise is None else np.where(np.isfinite(self.values), self.noise, np.nan)
-        )
+        noise = self.noise
+        if noise is not None:
+            noise = np.where(np.isfinite(self.values), noise, np.nan)
         values, noise = smoothed(self.grid, self.values, more, noise=noise)
         if noise is not None and self.blurred:  # pixels were not independent before
             noise = noise * _left(self.blurred, more / FWHM_PER_SIGMA, self.pixel)
@@ -166,23 +170,16 @@ class Plane:
 
     def onto(self, other: Plane) -> Plane:
         """On the grid of another; NaN where it does not reach."""
-        there = {
-            "header": other.header,
-            "pixels": other.pixels,
-            "alone": None,
-            "spread": self.pixel**2,
-        }
+        there = {"header": other.header, "pixels": other.pixels, "alone": None}
         if self.pixels is not None:
             values, noise = _of_neighbours(self, other.grid)
-            return replace(self, values=values, noise=noise, **there)
-        x, y = positions(other.grid, self.grid)
-        values = _sampled(self.values, x, y, 3)
-        noise = None
-        if self.noise is not None:
-            noise = np.sqrt(_sampled(self.noise**2, x, y, 1)) * _kept(
-                x, y, self.blurred, self.grid.sides
-            )
-        return replace(self, values=values, noise=noise, **there)
+        else:
+            x, y = positions(other.grid, self.grid)
+            values, noise = _sampled(self.values, x, y, 3), None
+            if self.noise is not None:
+                noise = np.sqrt(_sampled(self.noise**2, x, y, 1))
+                noise = noise * _kept(x, y, self.blurred, self.grid.sides)
+        return replace(self, values=values, noise=noise, spread=self.pixel**2, **there)
 
     def independent(self, where: NDArray[np.bool_]) -> float:
         """Number of independent values of the noise in the pixels ``where``, at most their number.
@@ -219,24 +216,11 @@ def positions(target: MapGrid, source: MapGrid) -> tuple[Floats, Floats]:
     try:
         turn = source.turn @ target.turn.T
     except InputError:  # FK4 is no rotation of ICRS
-        if isinstance(target, ImagePixels):
-            return _by_astropy(target.wcs, source.wcs, target.shape)
-        raise
+        if not isinstance(target, ImagePixels):
+            raise
+        y, x = np.indices(target.shape, np.float64)
+        return pixel_to_pixel(target.wcs, source.wcs, x, y)  # type: ignore[no-any-return]
     return source.coordinates(target.directions() @ turn.T)
-
-
-def _by_astropy(target: Any, source: Any, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
-    from astropy.wcs.utils import pixel_to_pixel
-
-    y, x = np.indices(shape, np.float64)
-    try:
-        return pixel_to_pixel(target, source, x, y)  # type: ignore[no-any-return]
-    except Exception as error:
-        raise InputError(
-            f"the two projections cannot be compared: {error}",
-            place="WCS",
-            cure="check CTYPE and RADESYS",
-        ) from error
 
 
 def _sampled(values: Floats, x: Floats, y: Floats, order: int) -> Floats:
@@ -253,35 +237,29 @@ def _sampled(values: Floats, x: Floats, y: Floats, order: int) -> Floats:
         for at, n in ((x, nx), (y, ny))
     )
     near = np.where(inside, values[row, column], np.nan)
-    if _off(x, y, inside) < SAME or not inside.any():
+    if _whole(x, y, inside):
         return near
     missing = ~np.isfinite(values)
     if missing.any() and not missing.all():
-        values = values[
-            tuple(distance_transform_edt(missing, return_distances=False, return_indices=True))
-        ]
+        nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
     at = np.stack([np.where(inside, y, 0.0), np.where(inside, x, 0.0)])
-    if order == 1:
-        found = map_coordinates(values, at, order=1, mode="nearest")
-    else:
-        found = map_coordinates(values, at, order=3, mode="mirror")
-    return np.where(np.isfinite(near), found, np.nan)
+    edge: Any = {"order": order, "mode": "nearest" if order == 1 else "mirror"}
+    return np.where(np.isfinite(near), map_coordinates(values, at, **edge), np.nan)
 
 
-def _off(x: Floats, y: Floats, inside: NDArray[np.bool_]) -> float:
-    """Largest distance of the pixels ``inside`` from whole ones."""
-    return max(
-        float(np.abs(np.where(inside, at - np.rint(at), 0)).max(initial=0.0)) for at in (x, y)
-    )
+def _whole(x: Floats, y: Floats, known: NDArray[np.bool_]) -> bool:
+    """True if the positions that are ``known`` are whole pixels."""
+    away = [np.abs(at - np.rint(at))[known].max(initial=0.0) for at in (x, y)]
+    return bool(max(away) < SAME)
 
 
 def _kept(x: Floats, y: Floats, blurred: float, sides: tuple[float, float]) -> Floats:
     """Equation (3) of a cubic spline: n' / n at pixels (x, y) of an image with pixels of these
     sides (y, x).
     """
-    with np.errstate(invalid="ignore"):
-        if _off(x, y, np.isfinite(x) & np.isfinite(y)) < SAME:
-            return np.ones_like(x)
+    if _whole(x, y, np.isfinite(x) & np.isfinite(y)):
+        return np.ones_like(x)
     offsets = np.linspace(0.0, 1.0, 33)
     found = np.ones_like(x)
     for at, side in ((y, sides[0]), (x, sides[1])):
@@ -297,9 +275,7 @@ def _variances(offsets: Floats, sigma: float) -> Floats:
     from zonda.core.numerics.smooth import interpolating, spline_basis
 
     count = 2 * NEIGHBOURS
-    coefficients = interpolating(
-        np.eye(count)
-    )  # (pixel, coefficient): the splines through a one at each pixel
+    coefficients = interpolating(np.eye(count))  # (pixel, coefficient): through a one at each pixel
     middle = NEIGHBOURS - 1  # offsets lie between it and the next
     weights = coefficients[:, middle - 1 : middle + 3] @ spline_basis(offsets)  # (pixel, n)
     apart = np.subtract.outer(np.arange(count), np.arange(count))
@@ -316,19 +292,12 @@ def _of_neighbours(plane: Plane, target: MapGrid) -> tuple[Floats, Floats | None
     source = plane.pixels
     assert source is not None  # asked for of HEALPix maps alone
     directions = target.directions() @ target.turn @ source.turn.T
-    same = isinstance(target, HealpixPixels) and (target.nside, target.frame) == (
-        source.nside,
-        source.frame,
-    )
     own = source.pixels_at(directions)
     there = (own >= 0) & np.isfinite(plane.values[own])
-    if same:
-        values = np.where(there, plane.values[own], np.nan)
-        return values, None if plane.noise is None else np.where(there, plane.noise[own], np.nan)
-    lon, lat = (
-        np.arctan2(directions[..., 1], directions[..., 0]),
-        np.arcsin(np.clip(directions[..., 2], -1, 1)),
-    )
+    if _same_pixels(target, source):
+        noise = None if plane.noise is None else np.where(there, plane.noise[own], np.nan)
+        return np.where(there, plane.values[own], np.nan), noise
+    lon, lat = angles(directions)
     near, weights = healpy.get_interp_weights(
         source.nside, np.pi / 2 - lat.ravel(), lon.ravel(), nest=source.nest
     )
@@ -344,13 +313,14 @@ def _of_neighbours(plane: Plane, target: MapGrid) -> tuple[Floats, Floats | None
         noise = np.nan_to_num(plane.noise[place])
         apart = np.array(healpy.pix2vec(source.nside, source.pixels[place], nest=source.nest))
         apart = ((apart[:, :, None] - apart[:, None]) ** 2).sum(axis=0)
-        rho = (
-            np.exp(-apart / (4 * plane.blurred**2))
-            if plane.blurred
-            else (apart == 0).astype(np.float64)
-        )
+        rho = np.exp(-apart / (4 * plane.blurred**2)) if plane.blurred else (apart == 0) * 1.0
         variance = np.einsum("i...,ij...,j...->...", weights * noise, rho, weights * noise)
         return values, np.where(there, np.sqrt(variance), np.nan)
+
+
+def _same_pixels(a: Any, b: Any) -> bool:
+    both = isinstance(a, HealpixPixels) and isinstance(b, HealpixPixels)
+    return both and (a.nside, a.frame) == (b.nside, b.frame)
 
 
 def common(
@@ -368,46 +338,33 @@ def common(
     InputError
         ``fwhm`` is less than one of the two; the maps have no pixel with a value in common.
     """
-    target, notes = common_beam(reference, other) if fwhm is None else fwhm, []
+    target, notes, made = common_beam(reference, other) if fwhm is None else fwhm, [], []
     for plane in (reference, other):
         if not np.isfinite(plane.values).any():
-            raise InputError(
-                "no pixel has a value",
-                place=plane.name,
-                cure="give a map that is not NaN everywhere",
-            )
+            raise InputError(EMPTY, place=plane.name, cure=NOT_EMPTY)
         if plane.fwhm is None:
             notes.append(f"{plane.name}: its beam is not known (BMAJ), so that it is not smoothed")
         elif target < plane.fwhm * (1 - EQUAL_BEAMS):
-            beams = (
-                f"the beam of {angle_text(target)} is smaller than the map's,"
-                f" {angle_text(plane.fwhm)}"
-            )
-            raise InputError(beams, place=plane.name, cure="choose a larger one")
-    made = []
+            wide = angle_text(plane.fwhm)
+            what = f"the beam of {angle_text(target)} is smaller than the map's, {wide}"
+            raise InputError(what, place=plane.name, cure="choose a larger one")
     for plane in (reference, other):
         made.append(plane.smoothed(target).measured())
         if plane.fwhm is not None and made[-1].fwhm != plane.fwhm:
             before = f"from {angle_text(plane.fwhm)} " if plane.fwhm else ""
             notes.append(f"{plane.name}: smoothed {before}to {angle_text(target)}")
+    stays = int(_is_the_grid(made[1], made[0]))
+    grid, own = made[stays], made[1 - stays]
+    made[1 - stays] = own.onto(grid)
     first, second = made
-    if _is_the_grid(second, first):
-        moved, grid = first.onto(second), second
-        first = moved
-    else:
-        moved, grid = second.onto(first), first
-        second = moved
-    both = np.isfinite(first.values) & np.isfinite(second.values)
-    if not both.any():
+    if not (np.isfinite(first.values) & np.isfinite(second.values)).any():
         raise InputError(
             f"{reference.name} and {other.name} have no pixel in common",
             place="compare",
             cure="compare maps of one field",
         )
-    notes.append(
-        f"grid of {grid.name}, pixels of {angle_text(grid.pixel)}; {moved.name}"
-        f" {_how(grid, moved, reference, other)}"
-    )
+    pixels = f"grid of {grid.name}, pixels of {angle_text(grid.pixel)}"
+    notes.append(f"{pixels}; {own.name} is {_how(grid, own)}")
     return first, second, notes
 
 
@@ -417,11 +374,11 @@ def on_a_plane(
     """Planes of HEALPix pixels as images about their middle, with points as far apart as the pixels
     are and the value of the pixel that each lies in: header, and planes. For pictures and
     spectra."""
-    middle = pixels.directions().mean(axis=0)
-    centre = tuple(float(a) for a in angles(middle))
-    reach = float(
-        np.arccos(np.clip((pixels.directions() @ middle).min() / np.linalg.norm(middle), -1, 1))
-    )
+    directions = pixels.directions()
+    middle = directions.mean(axis=0)
+    longitude, latitude = (float(a) for a in angles(middle))
+    cosine = (directions @ middle).min() / np.linalg.norm(middle)
+    reach = float(np.arccos(np.clip(cosine, -1, 1)))
     size = int(min(MOST, max(8.0, 2 * reach / pixels.pixel + 2)))
     ones = np.ones(len(pixels.pixels))
     product = MapProduct(
@@ -431,7 +388,7 @@ def on_a_plane(
         ones,
         None,
         None,
-        (centre[0], centre[1]),
+        (longitude, latitude),
         pixels.pixel,
         frame=pixels.frame,
         nside=pixels.nside,
@@ -439,9 +396,8 @@ def on_a_plane(
         pixels=pixels.pixels,
     )
     made, wcs = on_plane(product, dict(planes), size=size)
-    return wcs.to_header(relax=True), {
-        key: np.asarray(values, np.float64) for key, values in made.items()
-    }
+    found = {key: np.asarray(values, np.float64) for key, values in made.items()}
+    return wcs.to_header(relax=True), found
 
 
 def cell_of(grid: ImagePixels) -> Floats:
@@ -478,17 +434,11 @@ def _is_the_grid(second: Plane, first: Plane) -> bool:
     return second.pixel < first.pixel * (1 - EQUAL_BEAMS)
 
 
-def _how(grid: Plane, moved: Plane, *given: Plane) -> str:
-    own = next(plane for plane in given if plane.name == moved.name)
+def _how(grid: Plane, own: Plane) -> str:
+    """How a map comes to a grid, in words."""
     if own.pixels is not None:
-        same = grid.pixels is not None and (grid.pixels.nside, grid.pixels.frame) == (
-            own.pixels.nside,
-            own.pixels.frame,
-        )
-        return "is on the same pixels" if same else "is interpolated between four neighbours"
-    x, y = positions(grid.grid, own.grid)
-    return (
-        "is on the same pixels"
-        if _off(x, y, np.isfinite(x) & np.isfinite(y)) < SAME
-        else "is interpolated by cubic splines"
-    )
+        same, how = _same_pixels(grid.pixels, own.pixels), "interpolated between four neighbours"
+    else:
+        x, y = positions(grid.grid, own.grid)
+        same, how = _whole(x, y, np.isfinite(x) & np.isfinite(y)), "interpolated by cubic splines"
+    return "on the same pixels" if same else how

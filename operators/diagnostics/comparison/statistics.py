@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.maps.grid import ImagePixels, MapGrid, image_grid
+from zonda.core.numerics.angles import beam_area
 from zonda.core.numerics.sphere import angles
 from zonda.core.types import Floats
 
@@ -123,8 +124,7 @@ def compare(
                 )
     pixel, fwhm = a.pixel, max(a.fwhm or 0.0, b.fwhm or 0.0)
     maps = {name: planes[name] for name in ("reference", "map", "difference")}
-    area = math.pi / math.log(16) * fwhm**2
-    found = profiles(maps, grid.distance(centre), areas, max(pixel, fwhm / 2), area)
+    found = profiles(maps, grid.distance(centre), areas, max(pixel, fwhm / 2), beam_area(fwhm))
     noisy = [plane for plane in (a, b) if plane.noise is not None and not plane.quiet]
     figures = figures_of(
         planes["reference"],
@@ -141,10 +141,11 @@ def compare(
         figures["chi2 values"] = min(
             figures["chi2 pixels"], *(plane.independent(both) for plane in noisy)
         )
-    noise = {name: plane for name, plane in (("snr", b), ("reference_snr", a)) if name in planes}
-    for name, plane in noise.items():
-        of = "the map" if name == "snr" else "the reference"
-        notes.append(f"noise of {of}: {plane.noise_in_words}")
+    noise = {}
+    for name, plane, of in (("snr", b, "map"), ("reference_snr", a, "reference")):
+        if name in planes:
+            noise[name] = plane.noise_in_words, plane.factor
+            notes.append(f"noise of the {of}: {plane.noise_in_words}")
     header = a.header
     if a.pixels is not None:
         header, planes = on_a_plane(a.pixels, planes)
@@ -154,51 +155,39 @@ def compare(
     spectra = radial_spectra(
         maps, tapered(known, cell), cell, ring_edges(known.shape, cell, settings.bins)
     )
-    if (uneven := _unevenness(flat, known)) > UNEVEN:
+    areas = np.broadcast_to(flat.areas, flat.shape)[known & np.isfinite(flat.areas)]
+    if areas.size and areas.max() > (1 + UNEVEN) * areas.min():
         notes.append(
-            f"solid angles of the pixels: they differ by a factor of {1 + uneven:.3g}; scales of"
-            " spectra are the middle's"
+            "solid angles of the pixels: they differ by a factor of"
+            f" {areas.max() / areas.min():.3g}; scales of spectra are the middle's"
         )
-    return Comparison(
-        names, planes, header, a.unit, fwhm, pixel, figures, spectra, found, notes, centre, label,
-        {name: (plane.noise_in_words, plane.factor) for name, plane in noise.items()},
-    )  # fmt: skip
+    about = header, a.unit, fwhm, pixel
+    return Comparison(names, planes, *about, figures, spectra, found, notes, centre, label, noise)
 
 
 def _cropped(a: Plane, b: Plane) -> tuple[Plane, Plane]:
     """The part of both in which both have values."""
     both = np.isfinite(a.values) & np.isfinite(b.values)
+    part: Any = both
     if a.pixels is not None:
-        pixels = replace(a.pixels, pixels=a.pixels.pixels[both])
-        first, second = (
-            replace(
-                p,
-                values=p.values[both],
-                noise=None if p.noise is None else p.noise[both],
-                pixels=pixels,
-                alone=None,
-            )
-            for p in (a, b)
-        )
-        return first, second
-    y, x = (np.flatnonzero(both.any(axis=axis)) for axis in (1, 0))
-    window = slice(int(y[0]), int(y[-1]) + 1), slice(int(x[0]), int(x[-1]) + 1)
-    header = {
-        key: a.header[key]
-        for key in a.header
-        if key and isinstance(a.header[key], bool | int | float | str)
-    }
-    for key, cut in (("CRPIX1", window[1]), ("CRPIX2", window[0])):
-        header[key] = float(header.get(key, 0.0)) - cut.start
+        where: Any = {"pixels": replace(a.pixels, pixels=a.pixels.pixels[both])}
+    else:
+        rows, columns = (np.flatnonzero(both.any(axis=axis)) for axis in (1, 0))
+        part = tuple(slice(int(n[0]), int(n[-1]) + 1) for n in (rows, columns))
+        cards = a.header.items()
+        header = {k: v for k, v in cards if k and isinstance(v, bool | int | float | str)}
+        for key, cut in (("CRPIX1", part[1]), ("CRPIX2", part[0])):
+            header[key] = float(header.get(key, 0.0)) - cut.start
+        where = {"header": header}
     first, second = (
         replace(
-            p,
-            values=p.values[window],
-            noise=None if p.noise is None else p.noise[window],
-            header=header,
+            plane,
+            values=plane.values[part],
+            noise=None if plane.noise is None else plane.noise[part],
             alone=None,
+            **where,
         )
-        for p in (a, b)
+        for plane in (a, b)
     )
     return first, second
 
@@ -212,13 +201,6 @@ def _weights(grid: MapGrid, known: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     if used.size and used.max() < (1 + EVEN) * used.min():
         return areas, (areas > 0).astype(np.float64)
     return areas, areas
-
-
-def _unevenness(grid: ImagePixels, known: NDArray[np.bool_]) -> float:
-    """Largest over smallest solid angle of the pixels ``known``, less one."""
-    areas = np.broadcast_to(grid.areas, grid.shape)[known]
-    areas = areas[np.isfinite(areas)]
-    return float(areas.max() / areas.min()) - 1 if areas.size else 0.0
 
 
 def _places(plane: Plane, centre: tuple[float, float]) -> tuple[Floats, Floats]:
@@ -235,12 +217,11 @@ def _places(plane: Plane, centre: tuple[float, float]) -> tuple[Floats, Floats]:
 
 def rms(values: Floats, weights: Floats | None = None) -> float:
     """Root mean square of what is known; NaN where nothing is."""
-    known = np.isfinite(values) if weights is None else np.isfinite(values) & (weights > 0)
+    w = np.ones(values.shape) if weights is None else weights
+    known = np.isfinite(values) & (w > 0)
     if not known.any():
         return math.nan
-    return float(
-        np.sqrt(np.average(values[known] ** 2, weights=None if weights is None else weights[known]))
-    )
+    return float(np.sqrt(np.average(values[known] ** 2, weights=w[known])))
 
 
 def _median_fidelity(planes: Mapping[str, Floats]) -> float:
@@ -296,31 +277,20 @@ def figures_of(
     found["correlation"] = float((w * u * v).sum() / scatter) if scatter > 0 else math.nan
     where: Any = np.indices(a.shape, np.float64) if places is None else places
     fit, error = _line(x, y, w, [place[both] for place in where])
-    found["gain"], found["gain error"], found["offset"], found["offset error"] = (
-        fit[0],
-        error[0],
-        fit[1],
-        error[1],
-    )
+    found |= {"gain": fit[0], "gain error": error[0], "offset": fit[1], "offset error": error[1]}
     peak = int(np.abs(x).argmax())
-    found["peak reference"], found["peak ratio"] = (
-        float(x[peak]),
-        float(y[peak] / x[peak]) if x[peak] else math.nan,
-    )
+    found["peak reference"] = float(x[peak])
+    found["peak ratio"] = float(y[peak] / x[peak]) if x[peak] else math.nan
     squares = [n[both] ** 2 for n in noise if n is not None]
     if squares:
         variance = np.sum(squares, axis=0)
         used = np.isfinite(variance) & (variance > 0)
-        found["chi2"], found["chi2 pixels"] = (
-            float(((y - x)[used] ** 2 / variance[used]).sum()),
-            float(np.count_nonzero(used)),
-        )
+        found["chi2"] = float(((y - x)[used] ** 2 / variance[used]).sum())
+        found["chi2 pixels"] = float(np.count_nonzero(used))
     return found
 
 
-def _line(
-    x: Floats, y: Floats, w: Floats, places: Sequence[Floats]
-) -> tuple[tuple[float, float], tuple[float, float]]:
+def _line(x: Floats, y: Floats, w: Floats, places: Sequence[Floats]) -> tuple[Any, Any]:
     """(gain, offset) and their standard errors, of values with weights at places (up, across)."""
     x0 = float((w * x).sum() / w.sum())
     up, across = (
@@ -334,14 +304,10 @@ def _line(
     used = np.flatnonzero(sums[0])
     fits = np.array([_solved(whole), *(_solved(whole - sums[:, k]) for k in used)])
     fits[:, 1] -= fits[:, 0] * x0
-    left = fits[1:]
-    n = len(left)
-    error = (
-        np.sqrt((n - 1) / n * ((left - left.mean(axis=0)) ** 2).sum(axis=0))
-        if n > 2
-        else np.full(2, math.nan)
-    )
-    return (float(fits[0, 0]), float(fits[0, 1])), (float(error[0]), float(error[1]))
+    n = len(used)
+    scatter = ((fits[1:] - fits[1:].mean(axis=0)) ** 2).sum(axis=0)
+    error = np.sqrt((n - 1) / n * scatter) if n > 2 else np.full(2, math.nan)
+    return fits[0].tolist(), error.tolist()
 
 
 def _solved(sums: Floats) -> tuple[float, float]:

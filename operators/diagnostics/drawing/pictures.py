@@ -64,9 +64,9 @@ class Style:
     ``central_diameter`` None: as the map.
     """
 
-    smooth: float | None
-    central_diameter: float | None
-    least_coverage: float
+    smooth: float | None = None
+    central_diameter: float | None = None
+    least_coverage: float = 0.0
     contours: tuple[float, ...] = ()
     formats: tuple[str, ...] = ("png",)
     dpi: float = DPI
