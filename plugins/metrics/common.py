@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,24 +22,40 @@ from zonda.core.types import Floats
 COVERED = 0.1
 """Share of the 99th percentile of the hits from which a pixel counts as covered."""
 
-SKY_ALONE = Signal(only=["sky"])
-UNFILTERED = Signal(only=["sky"], filters="none")
+
+def sky_alone(modes: str) -> tuple[Signal, Signal]:
+    """Signals of the sky alone with filters and without, with its own singular modes (``sky``) or
+    those of the complete data (``full``).
+    """
+    more: Any = {} if modes == "sky" else {"modes": "full"}
+    return Signal(only=["sky"], **more), Signal(only=["sky"], filters="none", **more)
+
+
+Kind = TypeVar("Kind")
+
+
+def product_of(data: Data, name: str, kind: type[Kind], metric: str, what: str) -> Kind:
+    """The product of that kind and name; else an InputError about ``metric`` that lists those that
+    there are. ``what``: the kind in words and its step, ``spectrum, PowerSpectrum``.
+    """
+    found = data.products.get(name)
+    if isinstance(found, kind):
+        return found
+    words, _, step = what.partition(", ")
+    there = ", ".join(sorted(key for key, p in data.products.items() if isinstance(p, kind)))
+    raise InputError(
+        f"there is no {words} {name!r}",
+        place=metric,
+        cure=f"those of this run: {there or f'none; add a {step}'}",
+    )
 
 
 def map_of(data: Data, metric: str, signal: str = "", name: str = "map") -> MapProduct:
     """The map ``name`` of a signal (empty: the complete one); else an InputError about
     ``metric``.
     """
-    product = data.products.get(product_name(stream_of(signal), name))
-    if not isinstance(product, MapProduct):
-        there = (
-            ", ".join(sorted(key for key, p in data.products.items() if isinstance(p, MapProduct)))
-            or "none"
-        )
-        wanted = product_name(stream_of(signal), name)
-        raise InputError(
-            f"there is no map {wanted!r}", place=metric, cure=f"the maps of this run: {there}"
-        )
+    wanted = product_name(stream_of(signal), name)
+    product = product_of(data, wanted, MapProduct, metric, "map, BinMap")
     needs_signal({name: product.contents}, metric, name)
     return product
 
@@ -112,26 +129,15 @@ def relative_error_of_rms(product: MapProduct, where: NDArray[np.bool_]) -> floa
         return math.nan
     cell, grid = 2 * math.pi * (product.smoothed_by / FWHM_PER_SIGMA) ** 2, product.grid
     if not isinstance(grid, ImagePixels):
-        independent = min(
-            grid.solid_angle(w != 0) / cell if cell else np.inf, float(np.count_nonzero(w))
-        )
-        return 1 / math.sqrt(2 * independent)
+        count = float(np.count_nonzero(w))
+        return 1 / math.sqrt(2 * min(grid.solid_angle(w != 0) / cell if cell else np.inf, count))
     rows, columns = (np.flatnonzero(w.any(axis=axis)) for axis in (1, 0))
     window = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
     w, grid = w[window], grid.window(*window)
-    wide = cell > float(np.nanmin(grid.areas))
-    pairs = (
-        float((w * smoother(grid, product.smoothed_by)(w) * cell / grid.areas).sum())
-        if wide
-        else float((w * w).sum())
-    )
-    return 1 / math.sqrt(2 * float(w.sum()) ** 2 / pairs)
-
-
-def flat(product: MapProduct, metric: str) -> MapProduct:
-    """A TAN map; PipelineError about ``metric`` for another."""
-    needs_tan(product.projection, metric)
-    return product
+    near = w  # the pixel alone
+    if cell > float(np.nanmin(grid.areas)):
+        near = smoother(grid, product.smoothed_by)(w) * cell / grid.areas
+    return 1 / math.sqrt(2 * float(w.sum()) ** 2 / float((w * near).sum()))
 
 
 def needs_tan(kind: str, metric: str) -> None:

@@ -32,6 +32,8 @@ from zonda.core.numerics.angles import angle_text
 from zonda.operators.diagnostics.comparison.statistics import Comparison
 from zonda.operators.diagnostics.map_spectra import MapSpectra
 
+from .common import product_of
+
 
 class Fidelity(FigureMetric):
     """Median fidelity of a map where its reference is bright, equation (1).
@@ -51,16 +53,7 @@ class Fidelity(FigureMetric):
         """Equation (1). Raises InputError where there is no comparison, or the reference is
         empty.
         """
-        found = data.products.get(self.comparison)
-        if not isinstance(found, Comparison):
-            there = (
-                ", ".join(k for k, p in data.products.items() if isinstance(p, Comparison))
-                or "none; add a CompareMaps"
-            )
-            cure = f"the comparisons of this run: {there}"
-            raise InputError(
-                f"there is no comparison {self.comparison!r}", place="fidelity", cure=cure
-            )
+        found = product_of(data, self.comparison, Comparison, "fidelity", "comparison, CompareMaps")
         size = np.abs(found.planes["reference"])
         peak = float(np.nanmax(size, initial=0.0))
         if peak == 0:
@@ -71,11 +64,9 @@ class Fidelity(FigureMetric):
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """Describe the figure in words."""
-        where = (
-            "at the reference's peak"
-            if self.least == 1
-            else f"where the reference has {100 * self.least:g} % of its peak"
-        )
+        where = f"where the reference has {100 * self.least:g} % of its peak"
+        if self.least == 1:
+            where = "at the reference's peak"
         return f"median of |reference| / max(|difference|, threshold) {where}"
 
 
@@ -109,39 +100,24 @@ class MapPower(FigureMetric):
         """Equation (2). Raises InputError where the map, its white level or modes of these scales
         are missing.
         """
-        found = data.products.get(self.spectra)
-        if not isinstance(found, MapSpectra):
-            there = (
-                ", ".join(k for k, p in data.products.items() if isinstance(p, MapSpectra))
-                or "none; add a MapSpectrum"
-            )
-            raise InputError(
-                f"there are no spectra {self.spectra!r}",
-                place="map_power",
-                cure=f"those of this run: {there}",
-            )
+        found = product_of(
+            data, self.spectra, MapSpectra, "map_power", "product of map spectra, MapSpectrum"
+        )
         rings = found.spectra
         if self.of not in rings.power or self.of not in rings.white:
             there = ", ".join(sorted(rings.power.keys() & rings.white.keys())) or "none"
-            cure = f"maps with a known level: {there}; name others in MapSpectrum.maps"
             raise InputError(
                 f"no spectrum and white level of the map {self.of!r} are known",
                 place="map_power",
-                cure=cure,
+                cure=f"maps with a known level: {there}; name others in MapSpectrum.maps",
             )
-        used = (
-            (rings.scale >= self.smallest)
-            & (rings.scale <= self.largest)
-            & np.isfinite(rings.power[self.of])
-        )
-        number = rings.modes[used]
+        power, level = rings.power[self.of], rings.white[self.of]
+        used = (rings.scale >= self.smallest) & (rings.scale <= self.largest) & np.isfinite(power)
+        number, power, level = rings.modes[used], power[used], level[used]
         if not number.sum() > 0:
             cure = "choose scales between two pixels and the map's size, or a wider range"
             raise InputError(f"no ring lies {self._range()}", place="map_power", cure=cure)
-        value = float(number @ rings.power[self.of][used]) / float(
-            number @ rings.white[self.of][used]
-        )
-        level = rings.white[self.of][used]
+        value = float(number @ power) / float(number @ level)
         if rings.draws is not None:
             together = rings.draws[:, used] @ (number * level)
             return value, value * float(together.std(ddof=1) / together.mean())
@@ -149,10 +125,8 @@ class MapPower(FigureMetric):
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """Describe the figure in words."""
-        return (
-            f"power of {self.of} over that of white noise by NET and samples, scales"
-            f" {self._range()}"
-        )
+        white = "that of white noise by NET and samples"
+        return f"power of {self.of} over {white}, scales {self._range()}"
 
     def _range(self) -> str:
         return f"from {angle_text(self.smallest)} to {angle_text(self.largest)}"

@@ -57,7 +57,9 @@ from zonda.core.accuracy.metrics import Metric
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.mapmaker import made_by
+from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.planes import IQU
 from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.operator import Operator
 from zonda.core.signal import Signal
@@ -66,8 +68,62 @@ from zonda.operators.diagnostics.series import Spectrum
 from zonda.operators.diagnostics.time_streams import TimeStreams
 from zonda.operators.diagnostics.transfer_function import compare
 
-from .common import COVERED, as_seen, at_beam, covered, extreme, input_of
-from .planes import OfPlanes
+from .common import COVERED, as_seen, at_beam, covered, extreme, input_of, needs_tan
+
+
+class OfPlanes(Metric):
+    """Base of metrics whose `measure` finds something of each plane: by its name, ``I`` alone or
+    ``I``, ``Q`` and ``U``.
+
+    A subclass has `between` and `summary` of one plane, and `floor_of`; `counted`, where not all
+    planes of a reference count.
+    """
+
+    def error(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> float:
+        return max(self._each(found, reference).values())
+
+    def errors(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> Mapping[str, float]:
+        each = self._each(found, reference)
+        return each if len(each) > 1 else {}
+
+    def mean_error(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:
+        planes = [
+            p
+            for p in IQU
+            if all(p in self.counted(one) for one in reference) and all(p in one for one in found)
+        ]
+        return max(
+            super(OfPlanes, self).mean_error(
+                [one[p] for one in found], [one[p] for one in reference]
+            )
+            for p in planes
+        )
+
+    def floor(self, reference: Mapping[str, Any]) -> float | None:
+        """The lowest of all planes; None where one has none."""
+        floors = [self.floor_of(reference[plane]) for plane in self.counted(reference)]
+        known = [floor for floor in floors if floor is not None]
+        return min(known) if len(known) == len(floors) else None
+
+    def counted(self, reference: Mapping[str, Any]) -> Sequence[str]:
+        """The planes of a reference in which errors are looked for."""
+        return list(reference)
+
+    def between(self, found: Any, reference: Any) -> float:
+        """`error` of one plane."""
+        raise NotImplementedError
+
+    def floor_of(self, reference: Any) -> float | None:
+        """`floor` of one plane."""
+        raise NotImplementedError
+
+    def _each(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> dict[str, float]:
+        return {
+            plane: self.between(found[plane], reference[plane])
+            for plane in self.counted(reference)
+            if plane in found
+        }
+
 
 RINGS, BINS, LAGS, SEPARATIONS = 8, 24, 12, 6
 POLARIZED = 1e-3
@@ -102,17 +158,15 @@ class MapRms(OfPlanes):
             cure = "fix the map: set BinMap.width and BinMap.centre"
             raise InputError("the map's size depends on the knobs", place="map_rms", cure=cure)
         known = np.isfinite(found["signal"]) & np.isfinite(reference["signal"])
-        difference = _mean_square(
-            found["signal"] - reference["signal"], reference["weights"], known
-        )
+        change = found["signal"] - reference["signal"]
+        difference = _mean_square(change, reference["weights"], known)
         return math.sqrt(difference / self._unit(reference)) if difference else 0.0
 
     def summary(self, found: dict[str, Floats]) -> Floats:
         """The map's rms in units of its noise."""
-        known = np.isfinite(found["signal"])
-        return np.array(
-            [math.sqrt(_mean_square(found["signal"], found["weights"], known) / self._unit(found))]
-        )
+        signal = found["signal"]
+        square = _mean_square(signal, found["weights"], np.isfinite(signal))
+        return np.array([math.sqrt(square / self._unit(found))])
 
     def floor_of(self, reference: dict[str, Floats]) -> float | None:
         """1, where the map knows its noise."""
@@ -179,32 +233,20 @@ class Transfer(OfPlanes):
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         _needs_map("transfer", operators)
-        if not any("sky" in made_by(o) for o in operators):
-            raise PipelineError(
-                "the metric transfer needs a sky, and no step makes one",
-                place="--metric",
-                cure="add a SkyMap",
-            )
+        sky = any("sky" in made_by(o) for o in operators)
+        _needs(sky, "the metric transfer needs a sky, and no step makes one", "add a SkyMap")
 
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
         """The sky alone, where the pipeline has no such signal."""
-        return (
-            {}
-            if any(run.only == ["sky"] for run in runs.values())
-            else {"sky_alone": Signal(only=["sky"])}
-        )
+        alone = any(run.only == ["sky"] for run in runs.values())
+        return {} if alone else {"sky_alone": Signal(only=["sky"])}
 
     def measure(self, data: Data) -> dict[str, Floats]:
         """Transfer (2, n) by plane: T_i, and its standard deviation from the instrument's noise in
         the main map.
         """
         sky, main = _map(data, _sky_alone(data.provenance.get("runs", {}))), _map(data)
-        if sky.projection != "TAN":
-            raise InputError(
-                "the metric transfer needs a TAN map",
-                place="transfer",
-                cure="leave BinMap.nside and projection out",
-            )
+        needs_tan(sky.projection, "transfer")
         image = input_of(data, "transfer")
         window = sky.known_hits / np.percentile(sky.hits[sky.known], 99)
         window = np.where(window >= COVERED, np.minimum(window, 1.0), 0.0)
@@ -212,25 +254,19 @@ class Transfer(OfPlanes):
         edges = np.geomspace(1 / side.min(), 1 / max(sky.fwhm, 2 * sky.pixel), RINGS + 1)
         noises, found, pole = main.by_stokes(), {}, wcs_frame_rotation(sky.wcs)[2]
         for plane, one in sky.by_stokes().items():
-            given = (
-                image
-                if plane == "I"
-                else None
-                if image.polarization is None
-                else image.stokes(plane, pole)
-            )
+            given: Image | None = image
+            if plane != "I":
+                given = None if image.polarization is None else image.stokes(plane, pole)
             if given is None or not np.nan_to_num(given.values).any():
                 continue
-            noise = float(
-                (window**2 * np.nan_to_num(noises[plane].noise) ** 2).sum()
-            )  # variance of each mode
+            # variance of each mode
+            noise = float((window**2 * np.nan_to_num(noises[plane].noise) ** 2).sum())
             rings = compare(as_seen(given, one), one.signal, window, sky.pixel, edges)
             use = rings.power > 1e-6 * rings.power.max()
             found[plane] = np.array([rings.transfer[use], np.sqrt(noise / 2 / rings.power[use])])
         if not found:
-            raise InputError(
-                "the input map is zero everywhere", place="transfer", cure="use a sky with a source"
-            )
+            cure = "use a sky with a source"
+            raise InputError("the input map is zero everywhere", place="transfer", cure=cure)
         return found
 
     def between(self, found: Floats, reference: Floats) -> float:
@@ -272,26 +308,19 @@ class Psd(_Binned):
     )
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        if not any("spectrum" in o.provides for o in operators):
-            cure = "add a PowerSpectrum where the spectrum matters, e.g. after Efficiency"
-            raise PipelineError(
-                "the metric psd needs a spectrum, and no step measures one",
-                place="--metric",
-                cure=cure,
-            )
+        _needs(
+            any("spectrum" in o.provides for o in operators),
+            "the metric psd needs a spectrum, and no step measures one",
+            "add a PowerSpectrum where the spectrum matters, e.g. after Efficiency",
+        )
 
     def measure(self, data: Data) -> Floats:
         """(2, n): P_j, and its relative standard error."""
-        spectrum = next(
-            (p for p in data.products.values() if isinstance(p, Spectrum) and "signal" in p.psd),
-            None,
-        )
+        every = (p for p in data.products.values() if isinstance(p, Spectrum))
+        spectrum = next((p for p in every if "signal" in p.psd), None)
         if spectrum is None:
-            raise InputError(
-                "no spectrum of the signal was measured",
-                place="psd",
-                cure="let PowerSpectrum.streams include signal",
-            )
+            cure = "let PowerSpectrum.streams include signal"
+            raise InputError("no spectrum of the signal was measured", place="psd", cure=cure)
         f = spectrum.frequency
         number = np.clip((BINS * np.log(f / f[0]) / np.log(f[-1] / f[0])).astype(int), 0, BINS - 1)
         count = np.bincount(number, minlength=BINS)
@@ -310,15 +339,12 @@ class Structure(_Binned):
     instead: ClassVar[str | None] = "name structure in zonda accuracy --metric"
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        if not any("atmosphere" in o.provides for o in operators) or not any(
-            "signal" in o.provides for o in operators
-        ):
-            cure = "add AtmosphereLayers and Efficiency"
-            raise PipelineError(
-                "the metric structure needs an atmosphere, and no step makes one",
-                place="--metric",
-                cure=cure,
-            )
+        made = frozenset[str]().union(*(o.provides for o in operators))
+        _needs(
+            {"atmosphere", "signal"} <= made,
+            "the metric structure needs an atmosphere, and no step makes one",
+            "add AtmosphereLayers and Efficiency",
+        )
 
     def steps(self, operators: list[Operator]) -> list[Operator]:
         """With a `TimeStreams` of the atmosphere, and of the noise, behind the step that forms the
@@ -326,11 +352,8 @@ class Structure(_Binned):
         """
         at = next(k for k, o in enumerate(operators) if "signal" in o.provides) + 1
         noisy = any("white" in o.provides for o in operators[:at])
-        trace = TimeStreams(
-            name=TRACE,
-            streams=["atmosphere", "white"] if noisy else ["atmosphere"],
-            detectors=TRACED,
-        )
+        streams = ["atmosphere", "white"] if noisy else ["atmosphere"]
+        trace = TimeStreams(name=TRACE, streams=streams, detectors=TRACED)
         return [*operators[:at], trace, *operators[at:]]
 
     def measure(self, data: Data) -> Floats:
@@ -347,9 +370,8 @@ class Structure(_Binned):
         plane = observation.focalplane
         noise = math.nan  # of one sample, in kelvins of the atmosphere
         if "white" in trace.streams:
-            noise = float(
-                trace.streams["white"].std() / plane.illumination_efficiency[index].mean()
-            )
+            epsilon = plane.illumination_efficiency[index].mean()
+            noise = float(trace.streams["white"].std() / epsilon)
         pairs = len(index) * (n - lags) / 2  # increments that overlap share a sample
         xi, eta = plane.xi[index], plane.eta[index]
         i, j = np.triu_indices(len(index), 1)
@@ -363,9 +385,8 @@ class Structure(_Binned):
         count = np.bincount(number, minlength=SEPARATIONS)
         across = np.bincount(number, squares, SEPARATIONS)[count > 0] / count[count > 0]
         # a bin's pairs share detectors: no more of them are independent than there are detectors
-        pairs = np.concatenate(
-            [pairs, np.minimum(count[count > 0], len(index) / 2) * seen.shape[1]]
-        )
+        number = np.minimum(count[count > 0], len(index) / 2)
+        pairs = np.concatenate([pairs, number * seen.shape[1]])
         d = np.concatenate([in_time, across])
         return np.array([d, _uncertain(d, noise, pairs)])
 
@@ -374,9 +395,8 @@ def _uncertain(d: Floats, noise: float, pairs: Floats) -> Floats:
     """Relative standard error of D from N differences that carry white noise of the given rms,
     equation (6).
     """
-    return np.asarray(
-        np.sqrt((8 * noise**4 + 8 * noise**2 * d) / pairs) / np.maximum(d, 1e-300), np.float64
-    )
+    error = np.sqrt((8 * noise**4 + 8 * noise**2 * d) / pairs)
+    return np.asarray(error / np.maximum(d, 1e-300), np.float64)
 
 
 def _mean_square(values: Floats, weights: Floats, use: NDArray[np.bool_]) -> float:
@@ -384,14 +404,17 @@ def _mean_square(values: Floats, weights: Floats, use: NDArray[np.bool_]) -> flo
     return float((weights[use] * values[use] ** 2).sum() / total) if total > 0 else 0.0
 
 
+def _needs(made: bool, message: str, cure: str) -> None:
+    if not made:
+        raise PipelineError(message, place="--metric", cure=cure)
+
+
 def _needs_map(metric: str, operators: Sequence[Operator]) -> None:
-    if not any("map" in o.provides for o in operators):
-        cure = "add `- BinMap` to the operators, or choose another metric: psd, structure"
-        raise PipelineError(
-            f"the metric {metric} needs a map, and no step of this pipeline makes one",
-            place="--metric",
-            cure=cure,
-        )
+    _needs(
+        any("map" in o.provides for o in operators),
+        f"the metric {metric} needs a map, and no step of this pipeline makes one",
+        "add `- BinMap` to the operators, or choose another metric: psd, structure",
+    )
 
 
 def _map(data: Data, run: str = "") -> MapProduct:
@@ -399,11 +422,8 @@ def _map(data: Data, run: str = "") -> MapProduct:
     for name, product in data.products.items():
         if isinstance(product, MapProduct) and name.rpartition("/")[0] == run:
             return product
-    raise InputError(
-        f"the run {run or 'itself'} made no map",
-        place="--metric",
-        cure="add `- BinMap` to the operators",
-    )
+    cure = "add `- BinMap` to the operators"
+    raise InputError(f"the run {run or 'itself'} made no map", place="--metric", cure=cure)
 
 
 def _sky_alone(runs: Mapping[str, Any]) -> str:

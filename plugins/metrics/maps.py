@@ -1,4 +1,4 @@
-"""Figures of maps: equations (1) to (5).
+"""Figures of maps: equations (1) to (6).
 
 With the map m, its weights w and the angle r of a pixel from the map's centre, after smoothing with
 the beam:
@@ -16,6 +16,12 @@ p is the extreme value over pixels with at least `COVERED` of the usual samples:
 without filters, the one of largest absolute value; of b, the sky alone behind the filters, the one
 of the same sign. n is the standard deviation by NET and samples; a noise map with the factor f
 takes what 1/f noise and the atmosphere add into account.
+
+With a the map of the sky alone without filters, b the same behind them, and the ring of wavenumbers
+|ln(k scale)| <= width / 2 under the window of `TransferFunction`, ``transfer_at`` is T or S:
+
+    T = Re sum b a* / sum |a|^2,
+    S = (sum |b|^2 / sum |a|^2)^(1/2).                                                           (6)
 """
 
 from __future__ import annotations
@@ -40,10 +46,9 @@ from zonda.core.maps.measured_noise import WHITE
 from zonda.core.numerics.angles import ARCMIN, angle_text
 from zonda.core.signal import Signal
 from zonda.core.types import Floats
+from zonda.operators.diagnostics.transfer_function import compare, window_of
 
 from .common import (
-    SKY_ALONE,
-    UNFILTERED,
     as_seen,
     at_beam,
     covered,
@@ -51,8 +56,80 @@ from .common import (
     input_of,
     map_of,
     needs_signal,
+    needs_tan,
+    product_of,
     relative_error_of_rms,
+    sky_alone,
 )
+
+
+class TransferAt(FigureMetric):
+    """Share of the sky that the filters leave at one angular scale, equation (6). A claim about it
+    must state its window.
+    """
+
+    scale: Angle = quantity("60 arcsec", gt=0)
+    """Angular scale 1/k."""
+    width: float = Field(0.5, gt=0, le=3)
+    """Width of the ring in ln k."""
+    kind: Literal["in_phase", "amplitude"] = "in_phase"
+    """T, the share that is left in phase; or S, the definition of the paper, which counts what
+    comes from elsewhere, too.
+    """
+    modes: Literal["sky", "full"] = "sky"
+    """Singular modes of the sky alone, or of the complete data."""
+    radius: Angle | None = Field(None, gt=0)
+    """Window: use only what lies this near to the map's centre."""
+    taper: Angle | None = Field(None, gt=0)
+    """Width of the window's cosine edge; where absent, it reaches to the middle."""
+    least_coverage: float = Field(0.1, ge=0, lt=1)
+    """Where the samples per pixel are below this share of their 99th percentile, the window is
+    zero.
+    """
+    map: str = Field("map", pattern=r"^[A-Za-z0-9_]+$")
+    """Which map, by its name among the products."""
+
+    def needs(self) -> tuple[Signal, ...]:
+        """The sky alone, with filters and without."""
+        return sky_alone(self.modes)
+
+    def named_signals(self) -> tuple[str, ...]:
+        """None but those of `needs`."""
+        return ()
+
+    def look(self, kinds: Mapping[str, str]) -> None:
+        """A TAN map of the signal."""
+        needs_signal(kinds, "transfer_at", self.map)
+        needs_tan(kinds.get(self.map, "TAN"), "transfer_at")
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (6); the standard error is that from the scatter of the ring's modes, for T
+        alone.
+        """
+        after, before = (map_of(data, "transfer_at", name, self.map) for name in names)
+        needs_tan(before.projection, "transfer_at")
+        window = window_of(before, self.radius, self.taper, self.least_coverage)
+        edges = np.exp(np.array([-0.5, 0.5]) * self.width) / self.scale
+        rings = compare(before.signal, after.signal, window, before.pixel, edges)
+        value = float((rings.transfer if self.kind == "in_phase" else rings.amplitude)[0])
+        if not math.isfinite(value):
+            cure = "choose a scale between two pixels and the window's diameter, or a larger width"
+            raise InputError(
+                f"no mode of {angle_text(self.scale)} has power in the window",
+                place="transfer_at",
+                cure=cure,
+            )
+        return value, float(rings.error[0]) if self.kind == "in_phase" else math.nan
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """Describe the figure in words."""
+        window = (
+            f"window within {angle_text(self.radius)}" if self.radius else "window of the coverage"
+        )
+        what = "share left in phase" if self.kind == "in_phase" else "root of the ratio of power"
+        ring = f"transfer function at {angle_text(self.scale)}, ring of {self.width:g} in ln k"
+        return f"{ring}: {what}, {window}, modes: {self.modes}"
+
 
 Smoothing = Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"]
 NAME = r"^[A-Za-z0-9_]+$"
@@ -78,25 +155,14 @@ class _OfSmoothMap(_OfMap):
 
     def smoothed(self, product: MapProduct) -> MapProduct:
         """The map as it is judged."""
-        return at_beam(
-            product,
-            (
-                {"beam": None, "none": 0.0}[self.smooth]
-                if isinstance(self.smooth, str)
-                else self.smooth
-            ),
-        )
+        width: Any = {"beam": None, "none": 0.0}.get(str(self.smooth), self.smooth)
+        return at_beam(product, width)
 
     def how(self) -> str:
         """The smoothing in words."""
-        given = (
-            self.smooth
-            if isinstance(self.smooth, str)
-            else f"a Gaussian of FWHM {angle_text(self.smooth)}"
-        )
-        return {"beam": "smoothed with the beam", "none": "not smoothed"}.get(
-            given, f"smoothed with {given}"
-        )
+        if isinstance(self.smooth, str):
+            return {"beam": "smoothed with the beam", "none": "not smoothed"}[self.smooth]
+        return f"smoothed with a Gaussian of FWHM {angle_text(self.smooth)}"
 
 
 class CentralRms(_OfSmoothMap):
@@ -127,18 +193,15 @@ class CentralRms(_OfSmoothMap):
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
         """Equation (1)."""
-        return central_rms(
-            self.smoothed(map_of(data, "central_rms", self.signal, self.map)), self.radius, self.of
-        )
+        product = map_of(data, "central_rms", self.signal, self.map)
+        return central_rms(self.smoothed(product), self.radius, self.of)
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """Describe the figure in words."""
         what = self.signal or "the map"
         if self.of == "half_difference":
-            what = (
-                "half the difference,"
-                f" {map_of(data, 'central_rms', self.signal, self.map).difference},"
-            )
+            product = map_of(data, "central_rms", self.signal, self.map)
+            what = f"half the difference, {product.difference},"
         return f"rms of {what} within {angle_text(self.radius)} of the centre, {self.how()}"
 
 
@@ -150,11 +213,10 @@ def central_rms(
     """
     value, near = product.rms(radius, of), product.distance() <= radius
     if not math.isfinite(value):
-        cure = "choose a larger radius"
         raise InputError(
             f"no pixel has a value within {angle_text(radius)} of the centre",
             place="central_rms",
-            cure=cure,
+            cure="choose a larger radius",
         )
     return value, value * relative_error_of_rms(product, near)
 
@@ -175,13 +237,7 @@ class PeakRatio(_OfSmoothMap):
 
     def needs(self) -> tuple[Signal, ...]:
         """The sky alone, with filters and without."""
-        kept = SKY_ALONE if self.modes == "sky" else Signal(only=["sky"], modes="full")
-        bare = (
-            UNFILTERED
-            if self.modes == "sky"
-            else Signal(only=["sky"], modes="full", filters="none")
-        )
-        return (kept, bare) if self.against == "unfiltered" else (kept,)
+        return sky_alone(self.modes)[: 2 if self.against == "unfiltered" else 1]
 
     def named_signals(self) -> tuple[str, ...]:
         """None but those of `needs`."""
@@ -199,15 +255,11 @@ class PeakRatio(_OfSmoothMap):
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """Describe the figure in words."""
-        other = (
-            "the map without filters"
-            if self.against == "unfiltered"
-            else "the input convolved with the beam"
-        )
-        return (
-            f"extreme value of the filtered sky / that of {other}, both {self.how()}, modes:"
-            f" {self.modes}"
-        )
+        other = "the input convolved with the beam"
+        if self.against == "unfiltered":
+            other = "the map without filters"
+        what = f"extreme value of the filtered sky / that of {other}"
+        return f"{what}, both {self.how()}, modes: {self.modes}"
 
 
 def without_filters(image: Image, product: MapProduct, smoothing: float) -> Floats:
@@ -215,9 +267,8 @@ def without_filters(image: Image, product: MapProduct, smoothing: float) -> Floa
     weights, as the map is.
     """
     plain = product if product.polarization is None else product.stokes("I")
-    seen = replace(plain, smoothed_by=0.0).with_planes(
-        signal=as_seen(image, plain), half_difference=None
-    )
+    signal = as_seen(image, plain)
+    seen = replace(plain, smoothed_by=0.0).with_planes(signal=signal, half_difference=None)
     return (seen.smoothed(smoothing) if smoothing > 0 else seen).signal
 
 
@@ -253,25 +304,25 @@ class PeakSnr(_OfSmoothMap):
         """Equation (3); the noise itself scatters the ratio by 1."""
         product = self.smoothed(map_of(data, "peak_snr", "", self.map))
         factor, error = 1.0, 0.0
-        radius = (
-            max(ARCMIN, central_diameter(product.fwhm, product.pixel) / 2)
-            if self.radius is None
-            else self.radius
-        )
+        radius = self.radius or central_diameter(product.fwhm, product.pixel) / 2
+        if self.radius is None:
+            radius = max(ARCMIN, radius)
         if self.noise != "white":
             of: Any = "half_difference" if self.noise == "half_difference" else "signal"
             free = self.smoothed(map_of(data, "peak_snr", names[0], self.map)) if names else product
             found, error = central_rms(free, radius, of)
             near = (product.distance() <= radius) & np.isfinite(product.noise)
             if not near.any():
-                cure = "add a WhiteNoise and leave BinMap.noise at its default"
                 raise InputError(
-                    "the white noise of the map is not known", place="peak_snr", cure=cure
+                    "the white noise of the map is not known",
+                    place="peak_snr",
+                    cure="add a WhiteNoise and leave BinMap.noise at its default",
                 )
             if not found > 0:
-                cure = "add a step that makes noise, or choose noise: white"
                 raise InputError(
-                    "the noise map is zero: the ratio is infinite", place="peak_snr", cure=cure
+                    "the noise map is zero: the ratio is infinite",
+                    place="peak_snr",
+                    cure="add a step that makes noise, or choose noise: white",
                 )
             w = product.weights[near]
             factor = found / math.sqrt(float((w * product.noise[near] ** 2).sum() / w.sum()))
@@ -286,10 +337,8 @@ class PeakSnr(_OfSmoothMap):
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """Describe the figure in words."""
-        return (
-            f"largest |map| / noise ({WHITE if self.noise == 'white' else self.noise}),"
-            f" {self.how()}"
-        )
+        noise = WHITE if self.noise == "white" else self.noise
+        return f"largest |map| / noise ({noise}), {self.how()}"
 
 
 class Coverage(_OfMap):
@@ -313,9 +362,7 @@ class Coverage(_OfMap):
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
         """Equation (4) or (5)."""
-        product = data.products.get(self.map)
-        if not isinstance(product, MapProduct):
-            product = map_of(data, "coverage", "", self.map)  # raises
+        product = product_of(data, self.map, MapProduct, "coverage", "map, BinMap")
         return coverage(product, self.radius, None if self.of == "time" else self.least), math.nan
 
     def describe(self, data: Data, names: Sequence[str]) -> str:

@@ -24,6 +24,8 @@ from zonda.core.figures import FigureMetric
 from zonda.core.types import Floats
 from zonda.operators.diagnostics.series import TimeStream
 
+from .common import product_of
+
 LEAST = 10
 """Samples that each half must have."""
 
@@ -47,17 +49,13 @@ class AndersonDarling(FigureMetric):
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
         """The p-value."""
-        found = data.products.get("time_streams")
-        if not isinstance(found, TimeStream) or self.stream not in found.streams:
-            there = (
-                ", ".join(found.streams)
-                if isinstance(found, TimeStream)
-                else "none; add a TimeStreams"
-            )
+        what = "product of streams, TimeStreams"
+        found = product_of(data, "time_streams", TimeStream, "anderson_darling", what)
+        if self.stream not in found.streams:
             raise InputError(
                 f"there is no stream {self.stream!r}",
                 place="anderson_darling",
-                cure=f"streams of this run: {there}",
+                cure=f"streams of this run: {', '.join(found.streams)}",
             )
         rate = (found.seconds.size - 1) / (found.seconds[-1] - found.seconds[0])
         return p_value(found.streams[self.stream][0], rate, self.above, self.every), math.nan

@@ -39,6 +39,8 @@ from zonda.core.figures import FigureMetric
 from zonda.core.types import Floats
 from zonda.operators.diagnostics.series import Modes, Spectrum, crossing, slope
 
+from .common import product_of
+
 
 class _OfSpectrum(FigureMetric):
     """A figure of a power spectrum."""
@@ -51,18 +53,7 @@ class _OfSpectrum(FigureMetric):
 
     def spectrum_of(self, data: Data, metric: str) -> Spectrum:
         """The product. Raises InputError where there is none."""
-        found = data.products.get(self.spectrum)
-        if not isinstance(found, Spectrum):
-            there = (
-                ", ".join(k for k, p in data.products.items() if isinstance(p, Spectrum))
-                or "none; add a PowerSpectrum"
-            )
-            raise InputError(
-                f"there is no spectrum {self.spectrum!r}",
-                place=metric,
-                cure=f"the spectra of this run: {there}",
-            )
-        return found
+        return product_of(data, self.spectrum, Spectrum, metric, "spectrum, PowerSpectrum")
 
 
 def stream_in(spectrum: Spectrum, stream: str, metric: str) -> Floats:
@@ -95,14 +86,11 @@ class PsdSlope(_OfSpectrum):
         psd = stream_in(spectrum, self.stream, "psd_slope")
         use = (spectrum.frequency >= self.low) & (spectrum.frequency <= self.high) & (psd > 0)
         if np.count_nonzero(use) < 3:
-            cure = (
-                "widen low and high, or lengthen PowerSpectrum.segment: its inverse is the distance"
-                " of frequencies"
-            )
+            resolution = "its inverse is the distance of frequencies"
             raise InputError(
                 f"fewer than 3 frequencies lie from {self.low:g} to {self.high:g} Hz",
                 place="psd_slope",
-                cure=cure,
+                cure=f"widen low and high, or lengthen PowerSpectrum.segment: {resolution}",
             )
         return slope(np.log(spectrum.frequency[use]), np.log(psd[use]))
 
@@ -132,11 +120,10 @@ class Crossing(_OfSpectrum):
         """Equation (2)."""
         spectrum = self.spectrum_of(data, "crossing")
         psd = stream_in(spectrum, self.stream, "crossing")
-        level = (
-            np.full(psd.shape, 2 * self.net**2)
-            if self.net
-            else stream_in(spectrum, self.other, "crossing")
-        )
+        if self.net:
+            level = np.full(psd.shape, 2 * self.net**2)
+        else:
+            level = stream_in(spectrum, self.other, "crossing")
         found = crossing(spectrum.frequency, psd, level)
         if isinstance(found, str):
             raise InputError(
@@ -172,24 +159,15 @@ class FirstComponent(FigureMetric):
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """Describe the figure in words."""
         found = self._product(data)
-        if found.delays == 0:
-            return (
-                f"share of the variance of {found.detectors} detectors in the first component,"
-                " instantaneous"
-            )
-        lags = f"with {found.delays} delays of {found.delay:g} s"
-        return (
-            f"share of the variance of {found.detectors} detectors in the first component, {lags}"
+        lags = (
+            f"with {found.delays} delays of {found.delay:g} s" if found.delays else "instantaneous"
         )
+        what = f"share of the variance of {found.detectors} detectors in the first component"
+        return f"{what}, {lags}"
 
     def _product(self, data: Data) -> Modes:
-        found = data.products.get(self.modes)
-        if not isinstance(found, Modes):
-            cure = "add a ModeSpectrum, or name the one that there is"
-            raise InputError(
-                f"there is no mode spectrum {self.modes!r}", place="first_component", cure=cure
-            )
-        return found
+        what = "mode spectrum, ModeSpectrum"
+        return product_of(data, self.modes, Modes, "first_component", what)
 
 
 class MeanTScan(FigureMetric):
@@ -215,14 +193,8 @@ class MeanTScan(FigureMetric):
         if not means or not all(means):
             text = "the levels of the atmosphere are not known here"
             raise InputError(text, place="mean_t_scan", cure="add AtmosphereLayers and Efficiency")
-        return (
-            float(
-                np.average(
-                    [m[self.of] for m in means], weights=[o.duration for o in data.observations]
-                )
-            ),
-            math.nan,
-        )
+        weights = [o.duration for o in data.observations]
+        return float(np.average([m[self.of] for m in means], weights=weights)), math.nan
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """Describe the figure in words."""

@@ -85,7 +85,7 @@ def test_map_power_weighs_rings_by_their_modes():
     [
         ({"of": "noise"}, "no spectrum and white level of the map 'noise'"),
         ({"of": "map", "smallest": "1 deg", "largest": "2 deg"}, "no ring lies"),
-        ({"spectra": "other"}, "there are no spectra 'other'"),
+        ({"spectra": "other"}, "there is no product of map spectra 'other'"),
     ],
 )
 def test_map_power_names_what_is_missing(parameters, message):

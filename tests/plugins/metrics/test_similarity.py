@@ -49,5 +49,5 @@ def test_a_run_without_streams():
     scene = zonda.Scene(
         site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d"
     )
-    with pytest.raises(InputError, match="there is no stream 'signal'"):
+    with pytest.raises(InputError, match="there is no product of streams"):
         AndersonDarling().find(zonda.Data(scene), [])
