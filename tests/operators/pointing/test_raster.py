@@ -89,7 +89,7 @@ def test_rows_are_straight_evenly_spaced_and_crossed_at_constant_speed_in_both_d
     one = replace(ROWS, n=1)
     assert one.turnaround == pytest.approx(2.0)  # 2 v / a
     assert replace(one, smooth=True).turnaround == pytest.approx(4.0)
-    assert not one.path(np.linspace(0, 50, 500))[1].any()
+    assert not one.offsets(np.linspace(0, 50, 500))[1].any()
 
 
 def offsets(o: Any) -> tuple[Any, Any]:
