@@ -31,6 +31,7 @@ beam has left the image.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,8 +76,31 @@ class Convolved:
     coefficients: dict[str, NDArray[np.floating]]
     to_grid: Floats
     bounds: Floats
-    steps: tuple[int, int]
-    coarse: bool
+    steps: tuple[int, int] = (1, 1)
+    coarse: bool = False
+
+    @classmethod
+    def of(cls, grid: Floats, *described: Any) -> Convolved:
+        """``grid``: the coefficients; ``described``: the other attributes."""
+        size = np.abs(grid)
+        grid[size < TINY * size.max(initial=0.0)] = 0.0
+        return cls({"float64": grid, "float32": grid.astype(np.float32)}, *described)
+
+    @property
+    def nbytes(self) -> int:
+        return sum(values.nbytes for values in self.coefficients.values())
+
+    def covered(self, mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """A mask of the input's pixels on the grid; (0, 0) where it is."""
+        if not mask.size:
+            return np.zeros((0, 0), np.uint8)
+        whole = np.zeros(self.coefficients["float64"].shape, np.uint8)
+        ny, nx = len(whole), len(whole.T)
+        y = np.floor((np.arange(ny) - self.bounds[2]) / self.steps[1]).astype(int)
+        x = np.floor((np.arange(nx) - self.bounds[0]) / self.steps[0]).astype(int)
+        in_y, in_x = (y >= 0) & (y < mask.shape[0]), (x >= 0) & (x < mask.shape[1])
+        whole[np.ix_(in_y, in_x)] = mask[np.ix_(y[in_y], x[in_x])]
+        return whole
 
 
 def convolve(
@@ -123,22 +147,13 @@ def convolve(
         grid = np.fft.irfft2(np.fft.rfft2(grid) * transfer, (ny, nx))
     elif not linear:
         grid = spline_filter(spline_filter(grid, 0), 1)
-    size = np.abs(grid)
-    grid[size < TINY * size.max(initial=0.0)] = 0.0
-    return Convolved(
-        coefficients={"float64": grid, "float32": grid.astype(np.float32)},
-        to_grid=np.array([[qx, 0.0, pad_x], [0.0, qy, pad_y], [0.0, 0.0, 1.0]]),
-        bounds=np.array(
-            [
-                pad_x - qx / 2,
-                pad_x + (columns - 0.5) * qx,
-                pad_y - qy / 2,
-                pad_y + (rows - 0.5) * qy,
-            ]
-        ),
-        steps=(qx, qy),
-        coarse=bool((across < SMOOTH_BELOW).any()),
+    to_grid = np.array([[qx, 0.0, pad_x], [0.0, qy, pad_y], [0.0, 0.0, 1.0]])
+    x, y = (
+        (pad_x - qx / 2, pad_x + (columns - 0.5) * qx),
+        (pad_y - qy / 2, pad_y + (rows - 0.5) * qy),
     )
+    coarse = bool((across < SMOOTH_BELOW).any())
+    return Convolved.of(grid, to_grid, np.array([*x, *y]), (qx, qy), coarse)
 
 
 def convolve_evenly(
@@ -157,15 +172,8 @@ def convolve_evenly(
     transfer = np.exp(-2 * np.pi**2 * variance / step**2 * (kx**2 + ky**2))
     transfer /= np.sinc(kx) ** (2 if linear else 4) * np.sinc(ky) ** (2 if linear else 4)
     grid = np.fft.irfft2(np.fft.rfft2(values - outside, (ny, nx)) * transfer, (ny, nx))
-    size = np.abs(grid)
-    grid[size < TINY * size.max(initial=0.0)] = 0.0
-    return Convolved(
-        coefficients={"float64": grid, "float32": grid.astype(np.float32)},
-        to_grid=np.eye(3),
-        bounds=np.array([-0.5, columns - 0.5, -0.5, rows - 0.5]),
-        steps=(1, 1),
-        coarse=False,
-    )
+    bounds = np.array([-0.5, columns - 0.5, -0.5, rows - 0.5])
+    return Convolved.of(grid, np.eye(3), bounds)
 
 
 def _check_size(
@@ -176,17 +184,12 @@ def _check_size(
     """
     from zonda.core.machine import available_memory
 
-    cells = float(
-        np.prod(
-            [n * q + 2 * REACH * w * q for n, w, q in zip(shape[::-1], width, steps, strict=True)]
-        )
-    )
-    free = available_memory()
-    if (
-        not 4 * 8 * cells <= free
-    ):  # the grid, its transform, the beam's transform, and one on the way
+    cells = np.prod((np.array(shape[::-1]) + 2 * REACH * width) * steps)
+    # the grid, its transform, the beam's transform, and one on the way
+    needed, free = 4 * 8 * float(cells), available_memory()
+    if not needed <= free:
         raise InputError(
-            f"convolving the map with the beam needs {4 * 8 * cells / 1e9:.3g} GB, {free / 1e9:.3g}"
+            f"convolving the map with the beam needs {needed / 1e9:.3g} GB, {free / 1e9:.3g}"
             f" GB are free: a beam is {np.max(across):.3g} of its pixels wide",
             place="sky map",
             cure="check the map's pixel size, or rebin it to some ten pixels per FWHM",

@@ -114,9 +114,7 @@ class ConvolvedSky(SkyInput):
             ):
                 self.warn(text)
             more = () if sky.polarization is None else sky.polarization
-            return Beam.of(
-                sky, fwhm, intensity, tuple(convolved(values, 0.0).coefficients for values in more)
-            )
+            return Beam.of(sky, fwhm, (intensity, *(convolved(plane, 0.0) for plane in more)))
 
         return cast(
             Beam,

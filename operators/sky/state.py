@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,8 +20,10 @@ from zonda.core.types import AnyFloats, Floats
 from .beam import Convolved
 from .brightness import Brightness
 from .grid import Grid
-from .linear import add_lines
-from .sampling import Chunks, Rows, add_splines, pointing, sample
+from .sampling import Chunks, Rows, pointing, sample
+
+if TYPE_CHECKING:
+    from zonda.core.data import Tally
 
 
 class Cache:
@@ -59,12 +62,6 @@ class Cache:
         return Cache, (self._limit,)
 
 
-Coefficients = dict[str, NDArray[np.floating[Any]]]
-
-if TYPE_CHECKING:
-    from zonda.core.data import Tally
-
-
 @dataclass(frozen=True)
 class Beam:
     """A map convolved with one beam.
@@ -73,78 +70,59 @@ class Beam:
     ----------
     fwhm
         rad; 0: no beam.
+    planes
+        I, or I, Q and U, on one grid.
     matrix
         (3, 3) from ICRS directions to the points of the convolved grid.
     covered
         `Brightness.covered` on those points.
-    polarization
-        Coefficients of Q and of U, as those of ``convolved``; none where there are no such.
     """
 
     fwhm: float
-    convolved: Convolved
+    planes: tuple[Convolved, ...]
     matrix: Floats
     covered: NDArray[np.uint8]
-    polarization: tuple[Coefficients, ...] = ()
 
     @classmethod
-    def of(
-        cls,
-        sky: Brightness,
-        fwhm: float,
-        convolved: Convolved,
-        polarization: tuple[Coefficients, ...] = (),
-    ) -> Beam:
-        """``convolved``: ``sky`` with the beam of ``fwhm`` [rad]."""
-        matrix = convolved.to_grid @ pixel_matrix(sky.wcs)
-        return cls(fwhm, convolved, matrix, _on_grid(sky.covered, convolved), polarization)
+    def of(cls, sky: Brightness, fwhm: float, planes: tuple[Convolved, ...]) -> Beam:
+        """``planes``: those of ``sky`` with the beam of ``fwhm`` [rad]."""
+        first = planes[0]
+        return cls(fwhm, planes, first.to_grid @ pixel_matrix(sky.wcs), first.covered(sky.covered))
 
     @property
     def nbytes(self) -> int:
-        kept = (self.convolved.coefficients, *self.polarization)
-        return self.covered.nbytes + sum(
-            c.nbytes for coefficients in kept for c in coefficients.values()
-        )
+        return self.covered.nbytes + sum(plane.nbytes for plane in self.planes)
 
     def tell(self, tally: Tally, label: str) -> None:
         """State its width and how finely it is sampled."""
         if self.fwhm == 0.0:
             tally.state(label, "beam", "none")
             return
-        text = (
-            f"Gaussian, {' x '.join(str(q) for q in self.convolved.steps)} grid steps per input"
-            " pixel"
-        )
-        if self.convolved.coarse:
+        first = self.planes[0]
+        text = f"Gaussian, {' x '.join(str(q) for q in first.steps)} grid steps per input pixel"
+        if first.coarse:
             text += (
                 "; the input has fewer than 2 pixels per FWHM: it is taken as smooth between its"
                 " pixels"
             )
         tally.state(label, f"beam of {np.degrees(self.fwhm) * 3600:.6g} arcsec", text)
 
+    def pointing(self, block: Block, kind: Any) -> Chunks:
+        """`sampling.pointing` of a block, for samples of the type ``kind``."""
+        boresight = block.observation.sky_boresight[block.samples]
+        quaternions = np.ascontiguousarray(boresight, np.float64)
+        first = self.planes[0]
+        shape = first.coefficients["float64"].shape
+        return pointing(quaternions, self.matrix, shape, first.bounds, kind)
 
-def _on_grid(covered: NDArray[np.bool_], convolved: Convolved) -> NDArray[np.uint8]:
-    if not covered.size:
-        return np.zeros((0, 0), np.uint8)
-    shape = convolved.coefficients["float64"].shape
-    whole = np.zeros(shape, np.uint8)
-    (qx, qy), (x0, _, y0, _) = convolved.steps, convolved.bounds
-    x, y = (
-        np.floor((np.arange(shape[1]) - x0) / qx).astype(int),
-        np.floor((np.arange(shape[0]) - y0) / qy).astype(int),
-    )
-    in_x, in_y = (x >= 0) & (x < covered.shape[1]), (y >= 0) & (y < covered.shape[0])
-    whole[np.ix_(in_y, in_x)] = covered[np.ix_(y[in_y], x[in_x])]
-    return whole
-
-
-@dataclass(frozen=True)
-class _Held:
-    chunks: Chunks
-
-    @property
-    def nbytes(self) -> int:
-        return sum(part.nbytes for part in self.chunks)
+    def add(
+        self, plane: int, chunks: Chunks, rows: Rows, out: AnyFloats, linear: bool, over: bool
+    ) -> tuple[int, int]:
+        """Add the plane of this number to ``out``, see `sampling.sample`; ``chunks`` by
+        `pointing`.
+        """
+        values = self.planes[plane].coefficients[out.dtype.name]
+        return sample(chunks, rows, values, self.covered, out, linear=linear, over=over)
 
 
 @dataclass
@@ -186,71 +164,34 @@ class SkyState:
         """
         plane, index = block.observation.focalplane, self.index[block.detectors]
         xi, eta = plane.xi[block.detectors], plane.eta[block.detectors]
+        efficiency = plane.polarization_efficiency[block.detectors]
         beyond = behind = 0
         if not self.beams:
-            beyond, behind = (
-                out.size,
-                self.grid.behind(block.observation.sky_boresight[block.samples], xi, eta),
-            )
-        kernel = add_lines if linear else add_splines
+            boresight = block.observation.sky_boresight[block.samples]
+            beyond, behind = out.size, self.grid.behind(boresight, xi, eta)
         for number, beam in enumerate(self.beams):
             rows = np.flatnonzero(index == number)
-            if rows.size:
-                coefficients = beam.convolved.coefficients[out.dtype.name]
-                chunks = self._pointing(block, number, out.dtype.type)
-                detectors = Rows(rows, xi[rows], eta[rows])
-                found = sample(kernel, chunks, detectors, coefficients, beam.covered, out, over)
-                beyond, behind = beyond + found[0], behind + found[1]
-                if self.angles is not None:
-                    self._polarize(block, kernel, chunks, beam, detectors, out)
+            if not rows.size:
+                continue
+            kind = out.dtype.type
+            key = block.samples.start, block.samples.stop, number, kind
+            chunks = self._chunks.get(
+                key, partial(beam.pointing, block, kind)
+            )  # detectors share it
+            found = beam.add(0, chunks, Rows(rows, xi[rows], eta[rows]), out, linear, over)
+            beyond, behind = beyond + found[0], behind + found[1]
+            rows = rows[efficiency[rows] > 0]
+            if self.angles is None or not rows.size:
+                continue
+            # p (Q cos 2 psi + U sin 2 psi), equation (1) of core.polarization
+            own = Rows(np.arange(rows.size), xi[rows], eta[rows])
+            q, u = (block.buffer(f"sky {name}", (rows.size, out.shape[1])) for name in "QU")
+            beam.add(1, chunks, own, q, linear, True)
+            beam.add(2, chunks, own, u, linear, True)
+            detectors, start = rows + block.detectors.start, block.samples.start
+            self.angles.add(detectors, start, efficiency[rows], (q, u), rows, out)
         if not block.again:  # a block that is made again is counted once
             self._counts[block.detectors.start, block.samples.start] = (beyond, behind)
-
-    def _polarize(
-        self, block: Block, kernel: Any, chunks: Chunks, beam: Beam, detectors: Rows, out: AnyFloats
-    ) -> None:
-        """Add p (Q cos 2 psi + U sin 2 psi) of the detectors that are polarized, equation (1) of
-        `core.polarization`.
-        """
-        efficiency = block.observation.focalplane.polarization_efficiency[block.detectors][
-            detectors.numbers
-        ]
-        seeing = efficiency > 0
-        rows = Rows(detectors.numbers[seeing], detectors.xi[seeing], detectors.eta[seeing])
-        if not rows.numbers.size or self.angles is None:
-            return
-        own = Rows(np.arange(rows.numbers.size), rows.xi, rows.eta)
-        planes = []
-        for name, coefficients in zip("QU", beam.polarization, strict=True):
-            planes.append(block.buffer(f"sky {name}", (rows.numbers.size, out.shape[1])))
-            sample(
-                kernel, chunks, own, coefficients[out.dtype.name], beam.covered, planes[-1], True
-            )
-        which = rows.numbers + block.detectors.start
-        self.angles.add(
-            which,
-            block.samples.start,
-            efficiency[seeing],
-            (planes[0], planes[1]),
-            rows.numbers,
-            out,
-        )
-
-    def _pointing(self, block: Block, number: int, kind: Any) -> Chunks:
-        """`pointing` of a block for a beam, which blocks of other detectors share."""
-
-        def make() -> _Held:
-            quaternions = np.ascontiguousarray(
-                block.observation.sky_boresight[block.samples], np.float64
-            )
-            beam = self.beams[number]
-            shape = beam.convolved.coefficients["float64"].shape
-            return _Held(pointing(quaternions, beam.matrix, shape, beam.convolved.bounds, kind))
-
-        held: _Held = self._chunks.get(
-            (block.samples.start, block.samples.stop, number, kind), make
-        )
-        return held.chunks
 
     def totals(self) -> tuple[int, int]:
         """Samples (outside the input map, more than 90 deg from its centre)."""
