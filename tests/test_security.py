@@ -62,7 +62,7 @@ CALLS = {
     "requests.get",
 }
 ALLOWED = {
-    ("core/cli/group.py", "import_module"): "names from the table in zonda/commands.py",
+    ("core/cli/entry.py", "import_module"): "names from the table in zonda/commands.py",
     ("core/discovery.py", "import_module"): "names from the metadata of installed packages",
     (
         "core/storage/packed.py",

@@ -8,7 +8,7 @@ COMMANDS = {
     "accuracy": "zonda.core.accuracy.command:accuracy",
     "check": "zonda.core.cli.check:check",
     "compile": "zonda.core.cli.compile:compile_kernels",
-    "completion": "zonda.plugins.commands.completion:completion",
+    "completion": "zonda.core.cli.complete:completion",
     "compare": "zonda.plugins.commands.compare:compare",
     "doctor": "zonda.plugins.commands.doctor:doctor",
     "new": "zonda.plugins.commands.new:new",

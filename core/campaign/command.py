@@ -14,7 +14,7 @@ import click
 from ..command_types import Bytes
 
 if TYPE_CHECKING:
-    from ..cli.request import RunRequest
+    from ..command_types import RunRequest
     from .campaign_file import Job, Task
     from .folder import TaskRow
     from .prepare import CampaignFile

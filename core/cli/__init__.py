@@ -1,4 +1,4 @@
 """The command ``zonda``. Each command imports what it needs: ``zonda --help`` must stay quick."""
 
 from .entry import main as main
-from .group import zonda as zonda
+from .entry import zonda as zonda

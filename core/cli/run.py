@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..command_types import Bytes, Share
+from ..command_types import Bytes, RunRequest, Share
 from . import complete
-from .request import RunRequest
 
 if TYPE_CHECKING:
     from ..configuration.loaded import Accuracy
