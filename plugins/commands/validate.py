@@ -63,12 +63,13 @@ def validate(
     one_blas_thread()
     from zonda.core.storage.files import check_output_folder
     from zonda.core.storage.lock import lock
-    from zonda.plugins.validation.engine import validate as measured
-    from zonda.plugins.validation.page import summary
+    from zonda.plugins.validation.page import summary, write
+    from zonda.plugins.validation.rows import measured
 
     check_output_folder(output)
     with lock(output):
-        rows = measured(file, chosen, output, path.parent, _say)
+        rows = measured(chosen, output, path.parent, _say)
+        write(file, rows, output)
     _clear()
     click.echo("\n".join(aligned(map(_cells, rows), align="<<><><")))
     click.echo(f"\n{summary(rows)}\n{output}/claims.html")

@@ -19,7 +19,6 @@ from zonda.core.configuration.units import (
     Angle,
     AngularSpeed,
     Fraction,
-    Hertz,
     Kelvin,
     KelvinRootSecond,
     Metres,
@@ -93,21 +92,9 @@ def ratio(of: str | float, to: str | float) -> float:
 
 
 @_register
-def product(factors: list[str | float]) -> float:
-    """Product of stated numbers."""
-    return math.prod(Amount.parse(f).value for f in factors)
-
-
-@_register
 def rayleigh_distance(aperture: Metres, frequency: RadioFrequency) -> float:
     """z_r = pi (D/2)^2 / lambda of the paper's beam, m."""
     return math.pi * (aperture / 2) ** 2 * frequency / LIGHT
-
-
-@_register
-def rayleigh_height(aperture: Metres, frequency: RadioFrequency, elevation: Angle) -> float:
-    """Height at which a line of sight at an elevation reaches the Rayleigh distance, m."""
-    return rayleigh_distance(aperture, frequency) * math.sin(elevation)
 
 
 @_register
@@ -201,12 +188,6 @@ def flux_per_beam(temperature: Kelvin, fwhm: Angle, frequency: RadioFrequency) -
 
 
 @_register
-def noise_of_detectors(noise: Kelvin, detectors: int, instead_of: int) -> float:
-    """Noise with another number of detectors, K."""
-    return noise * math.sqrt(instead_of / detectors)
-
-
-@_register
 def hexagonal_diameter(detectors: int, pitch: Angle) -> float:
     """Diameter of a disc that holds detectors on a hexagonal grid, pitch sqrt(2 sqrt(3) n / pi),
     rad.
@@ -292,19 +273,3 @@ def calculator_of_atlast(
 def total_time(scans: int, duration: Seconds, gap: Seconds = 0.0) -> float:
     """Length of an observation of several scans, s."""
     return scans * duration + (scans - 1) * gap
-
-
-@_register
-def spectral_slope(width: Metres, wind: float, low: Hertz, high: Hertz) -> float:
-    """Slope d log P / d log f, between two frequencies, of a Kolmogorov screen (f^-8/3) seen
-    through a Gaussian beam.
-
-    P = f^(-8/3) exp(-(2 pi f sigma / v)^2) along the wind: the integral over the other direction
-    smooths both and is left out. ``width``: FWHM in m; ``wind`` in m/s.
-    """
-    sigma = width / math.sqrt(8 * math.log(2))
-
-    def log_power(f: float) -> float:
-        return -8 / 3 * math.log(f) - (2 * math.pi * f * sigma / wind) ** 2
-
-    return (log_power(high) - log_power(low)) / math.log(high / low)

@@ -19,7 +19,7 @@ from zonda.core.configuration.yaml_places import Source, Span
 
 from .amount import Amount
 from .calculations import Calculation
-from .verdict import Of, Relation
+from .verdict import Of, Relation, Stated, Values, clears, compare
 
 FOLDER = Path(zonda.pipelines.__file__).parent / "validation"
 SHIPPED = FOLDER / "claims.yaml"
@@ -62,6 +62,25 @@ class Experiment(Parameters):
             raise ValueError("versus and statistic belong together")
         return self
 
+    @property
+    def kind(self) -> str:
+        """Kind of its values: of the metric itself (empty), ratios, differences, significances."""
+        paired = str(self.statistic).startswith("paired")
+        return "significance" if paired else self.statistic or ""
+
+    def __str__(self) -> str:
+        """Pipeline, changes, metric, seeds; or the calculation."""
+        if self.calculate is not None:
+            return str(self.calculate)
+        parts = [f"{self.pipeline}", *(f"{key}={value}" for key, value in self.change.items())]
+        if self.versus is not None:
+            other = ", ".join(f"{key}={value}" for key, value in self.versus.items())
+            parts.append(f"{self.statistic} to {other}")
+        metric, seeds = self.metric, self.seeds or 1
+        if not isinstance(metric, str):
+            metric = ", ".join(f"{name}({given or ''})" for name, given in metric.items())
+        return ", ".join([*parts, metric, f"{seeds} seed{'s' if seeds > 1 else ''}"])
+
     def differs_from(self, other: Experiment) -> bool:
         """True if it finds another value than ``other`` apart from random numbers: not if seeds
         alone differ.
@@ -92,6 +111,13 @@ class Expected(Parameters):
         if self.agrees == (self.above is not None or self.below is not None):
             raise ValueError("give either agrees: true, or above, below or both")
         return self
+
+    def is_met(self, found: Values, stated: Stated) -> bool:
+        """True if a counter-experiment's result is the expected one."""
+        if self.agrees:
+            return compare(stated, found).holds
+        above, below = (limit.value if limit else None for limit in (self.above, self.below))
+        return clears(found, above, below)
 
 
 class Counter(Experiment):
@@ -184,6 +210,12 @@ class Claim(Experiment):
             if name and not experiment.differs_from(self):
                 raise ValueError(f"the counter-experiment {name} is the claim's own experiment")
         return self
+
+    @property
+    def stated(self) -> Stated:
+        """The paper's numbers."""
+        numbers = (self.paper.value, self.error.value, self.rounding.value)
+        return Stated(*numbers, self.relation, self.of)
 
     @property
     def is_quick(self) -> bool:

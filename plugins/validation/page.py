@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter as Count
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from zonda.core.storage.files import atomic_path, write_text
 from .claims import ClaimsFile
 from .figure import draw
 from .rows import Row
-from .runs import described
 from .verdict import LIMIT, Values
 
 COLOURS = {"agrees": "#1a7f4b", "differs, explained": "#0b5c8f", "differs": "#b3261e"}
@@ -41,82 +40,116 @@ RULE = (
     " its criterion."
 )
 
+COLUMNS = {
+    "id": "name of the claim, and of its folder",
+    "section": "where it stands in the paper",
+    "claim": "what the paper states, in our words",
+    "unit": "of all numbers but distances; empty: a pure number",
+    "relation": "the value is equal to the paper's, or at least or at most it",
+    "paper": "the paper's value",
+    "paper_error": "its standard error",
+    "paper_rounding": "half width to which it is stated",
+    "zonda": "mean over realizations; nan: none was run",
+    "scatter": "standard deviation of one realization",
+    "standard_error": "of the mean",
+    "realizations": "number of realizations",
+    "distance_one": "in standard deviations of one realization",
+    "distance_mean": "in standard deviations of the mean",
+    "verdict": "computed from the numbers",
+    "remark": "why, and counter-experiments",
+}
+VALUES = {
+    "experiment": "name of the counter-experiment; empty: the claim itself",
+    "realization": "counted from 0",
+    "value": "in the unit of the next column",
+    "unit": "empty: a pure number",
+}
+
 
 def write(file: ClaimsFile, rows: Sequence[Row], folder: Path) -> None:
     """Write everything. Raises `OutputError`."""
+    records = [_record(row) for row in rows]
     for row in rows:
         if row.values.values:
-            own = folder / row.claim.id
-            _write_values(row, own / "values.ecsv")
-            with atomic_path(own / "values.png") as temporary:
+            found = [("", row.values, row.claim.paper)]
+            found += [(c.name, c.values, c.unit) for c in row.counters]
+            values = [
+                dict(zip(VALUES, (name, float(k), value / unit.factor, unit.unit), strict=True))
+                for name, several, unit in found
+                for k, value in enumerate(several.values)
+            ]
+            meta = {"claim": row.claim.id, "zonda": __version__}
+            _write_table(folder / row.claim.id / "values.ecsv", values, VALUES, meta)
+            with atomic_path(folder / row.claim.id / "values.png") as temporary:
                 draw(row).savefig(temporary)
     meta = {"paper": file.paper, "zonda": __version__, "verdicts": summary(rows)}
-    write_ecsv(folder / "claims.ecsv", list(_columns(rows)), meta)
-    write_text(folder / "claims.html", _html(file, rows, folder))
+    _write_table(folder / "claims.ecsv", records, COLUMNS, meta)
+    page = render(
+        __package__,
+        "claims.html",
+        title=file.paper,
+        version=__version__,
+        summary=summary(rows),
+        rule=RULE,
+        head=HEAD,
+        colours=COLOURS,
+        claims=[
+            {
+                **record,
+                "numbers": _cells(record),
+                "experiments": [(n or "the claim", str(e)) for n, e in row.claim.experiments()],
+                "pictures": sorted(
+                    (
+                        (image.name, image.stem.replace("_", " "))
+                        for image in (folder / row.claim.id).glob("*.png")
+                    ),
+                    key=lambda picture: (picture[0] != "values.png", picture),
+                ),
+            }
+            for row, record in zip(rows, records, strict=True)
+        ],
+    )
+    write_text(folder / "claims.html", page)
 
 
 def summary(rows: Sequence[Row]) -> str:
     """Numbers of claims by verdict: ``12 agree, 1 differs``."""
-    return ", ".join(
-        f"{verdict}: {number}"
-        for verdict, number in Count(row.verdict.value for row in rows).most_common()
-    )
+    found = Count(row.verdict.value for row in rows).most_common()
+    return ", ".join(f"{verdict}: {number}" for verdict, number in found)
 
 
-def _columns(rows: Sequence[Row]) -> Iterator[Column]:
-    """Numbers in the unit of the paper's value."""
-
-    def number(name: str, of: str, about: str) -> Column:
-        return Column(name, [_numbers(row)[of] for row in rows], "", about)
-
-    yield Column("id", [row.claim.id for row in rows], "", "name of the claim, and of its folder")
-    yield Column("section", [row.claim.section for row in rows], "", "where it stands in the paper")
-    yield Column(
-        "claim", [row.claim.claim for row in rows], "", "what the paper states, in our words"
-    )
-    yield Column(
-        "unit",
-        [row.claim.paper.unit for row in rows],
-        "",
-        "of all numbers but distances; empty: a pure number",
-    )
-    yield Column(
-        "relation",
-        [row.claim.relation for row in rows],
-        "",
-        "the value is equal to the paper's, or at least or at most it",
-    )
-    yield number("paper", "paper", "the paper's value")
-    yield number("paper_error", "paper_error", "its standard error")
-    yield number("paper_rounding", "paper_rounding", "half width to which it is stated")
-    yield number("zonda", "zonda", "mean over realizations; nan: none was run")
-    yield number("scatter", "scatter", "standard deviation of one realization")
-    yield number("standard_error", "standard_error", "of the mean")
-    yield Column(
-        "realizations", [len(row.values.values) for row in rows], "", "number of realizations"
-    )
-    yield number("distance_one", "distance_one", "in standard deviations of one realization")
-    yield number("distance_mean", "distance_mean", "in standard deviations of the mean")
-    yield Column("verdict", [row.verdict.value for row in rows], "", "computed from the numbers")
-    yield Column("remark", [remark(row) for row in rows], "", "why, and counter-experiments")
+def _write_table(
+    path: Path, records: Sequence[dict[str, Any]], about: dict[str, str], meta: dict[str, Any]
+) -> None:
+    columns = [Column(k, [one[k] for one in records], "", words) for k, words in about.items()]
+    write_ecsv(path, columns, meta)
 
 
-def _numbers(row: Row) -> dict[str, float]:
-    claim, values = row.claim, row.values
-    factor, nan = claim.paper.factor, float("nan")
+def _record(row: Row) -> dict[str, Any]:
+    """Values of `COLUMNS`; numbers in the unit of the paper's value."""
+    claim, values, comparison = row.claim, row.values, row.comparison
+    factor = claim.paper.factor
     return {
+        "id": claim.id,
+        "section": claim.section,
+        "claim": claim.claim,
+        "unit": claim.paper.unit,
+        "relation": claim.relation,
         "paper": claim.paper.value / factor,
         "paper_error": claim.error.value / factor,
         "paper_rounding": claim.rounding.value / factor,
         "zonda": values.mean / factor,
-        "scatter": values.scatter / factor if values.values else nan,
+        "scatter": values.scatter / factor if values.values else math.nan,
         "standard_error": values.standard_error / factor,
-        "distance_one": row.comparison.of_one if row.comparison else nan,
-        "distance_mean": row.comparison.of_mean if row.comparison else nan,
+        "realizations": len(values.values),
+        "distance_one": comparison.of_one if comparison else math.nan,
+        "distance_mean": comparison.of_mean if comparison else math.nan,
+        "verdict": row.verdict.value,
+        "remark": _remark(row),
     }
 
 
-def remark(row: Row) -> str:
+def _remark(row: Row) -> str:
     """Why, what data are missing or stand in, what contradicts, and what the counter-experiments
     found: sentences.
     """
@@ -132,10 +165,8 @@ def remark(row: Row) -> str:
     parts.append(claim.because)
     for counter in row.counters:
         found = stated(counter.values, counter.unit.factor, counter.unit.unit)
-        parts.append(
-            f"{counter.shows}"
-            f" ({found}{'' if counter.satisfied else ': its criterion is not satisfied'})."
-        )
+        fails = "" if counter.satisfied else ": its criterion is not satisfied"
+        parts.append(f"{counter.shows} ({found}{fails}).")
     return " ".join(filter(None, parts))
 
 
@@ -146,82 +177,21 @@ def stated(values: Values, factor: float, unit: str) -> str:
     return f"{text} {unit}".rstrip()
 
 
-def _write_values(row: Row, path: Path) -> None:
-    """Each value of the claim and of its counter-experiments."""
-    experiments = [
-        ("", row.values, row.claim.paper),
-        *((c.name, c.values, c.unit) for c in row.counters),
+def _cells(record: dict[str, Any]) -> list[str]:
+    """Cells of the numbers of one claim: the paper's, zonda's, and the distances between them, with
+    a dash where the values differ and nothing has an error.
+    """
+    sign = {"equal": "", "at_least": "≥ ", "at_most": "≤ "}[record["relation"]]
+    error = record["paper_error"] or record["paper_rounding"]
+    paper = f"{sign}{record['paper']:.4g}" + (f" ± {error:.2g}" if error else "")
+    cells = [f"{paper} {record['unit']}".rstrip()]
+    if not record["realizations"]:
+        return cells + [""] * 5
+    scatters = (record[key] for key in ("scatter", "standard_error"))
+    distances = (record[key] for key in ("distance_one", "distance_mean"))
+    return [
+        *cells,
+        f"{record['zonda']:.4g}",
+        *(f"{value:.2g}" if record["scatter"] else "" for value in scatters),
+        *(f"{value:.2g}" if math.isfinite(value) else "–" for value in distances),
     ]
-    names = [name for name, values, _ in experiments for _ in values.values]
-    numbers = [float(k) for _, values, _ in experiments for k in range(len(values.values))]
-    values = [v / unit.factor for _, found, unit in experiments for v in found.values]
-    units = [unit.unit for _, found, unit in experiments for _ in found.values]
-    columns = [
-        Column("experiment", names, "", "name of the counter-experiment; empty: the claim itself"),
-        Column("realization", numbers, "", "counted from 0"),
-        Column("value", values, "", "in the unit of the next column"),
-        Column("unit", units, "", "empty: a pure number"),
-    ]
-    write_ecsv(path, columns, {"claim": row.claim.id, "zonda": __version__})
-
-
-def _html(file: ClaimsFile, rows: Sequence[Row], folder: Path) -> str:
-    return render(
-        __package__,
-        "claims.html",
-        title=file.paper,
-        version=__version__,
-        summary=summary(rows),
-        rule=RULE,
-        head=HEAD,
-        colours=COLOURS,
-        claims=[_claim(row, folder) for row in rows],
-    )
-
-
-def _claim(row: Row, folder: Path) -> dict[str, Any]:
-    """Values of one claim for the page: sentences, numbers, experiments, pictures."""
-    claim = row.claim
-    images = sorted((folder / claim.id).glob("*.png"), key=lambda path: path.name != "values.png")
-    return {
-        "id": claim.id,
-        "states": claim.claim,
-        "section": claim.section,
-        "verdict": row.verdict.value,
-        "numbers": _cells(row),
-        "remark": remark(row),
-        "experiments": [
-            (name or "the claim", ", ".join(described(experiment)))
-            for name, experiment in claim.experiments()
-        ],
-        "pictures": [(image.name, image.stem.replace("_", " ")) for image in images],
-    }
-
-
-def _cells(row: Row) -> list[str]:
-    """Cells of the numbers of one claim: the paper's, zonda's, and the distances between them."""
-    claim, n = row.claim, _numbers(row)
-    sign = {"equal": "", "at_least": "≥ ", "at_most": "≤ "}[claim.relation]
-    error = n["paper_error"] or n["paper_rounding"]
-    paper = (
-        f"{sign}{n['paper']:.4g}"
-        + (f" ± {error:.2g}" if error else "")
-        + f" {claim.paper.unit}".rstrip()
-    )
-    found = [
-        f"{n[key]:.{digits}g}"
-        for key, digits in (("zonda", 4), ("scatter", 2), ("standard_error", 2))
-    ]
-    if not n["scatter"]:
-        found[1:] = ["", ""]
-    shown = (
-        [*found, *(distance_text(n[key]) for key in ("distance_one", "distance_mean"))]
-        if row.values.values
-        else [""] * 5
-    )
-    return [paper, *shown]
-
-
-def distance_text(distance: float) -> str:
-    """Standard deviations; a dash where the values differ and nothing has an error."""
-    return f"{distance:.2g}" if math.isfinite(distance) else "–"

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from zonda.core import experiment as core
 from zonda.core.campaign.entries import setting
+from zonda.core.configuration.locate import locate
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.figures import Choice
 from zonda.core.registry import operators
-from zonda.core.storage.files import write_text
+from zonda.core.storage.files import atomic_path, write_text
 from zonda.operators.atmosphere.weather.sources import profile_of
 from zonda.plugins.commands.weather_plots import plot_spectrum
 
@@ -81,10 +82,6 @@ class Runs:
             for variant in self._variants(experiment):
                 self.experiment.want(variant, choice, experiment.seeds or 1)
 
-    def execute(self) -> None:
-        """Run what is missing."""
-        self.experiment.run()
-
     def values(self, experiment: Experiment) -> Values:
         """Values of an experiment, whose runs have been executed."""
         if experiment.calculate is not None:
@@ -128,8 +125,6 @@ class Runs:
 
     def draw_atmosphere(self, experiment: Experiment, folder: Path) -> None:
         """The atmosphere above the site of an experiment's pipeline: ``atmosphere.png``."""
-        from zonda.core.storage.files import atomic_path
-
         folder.mkdir(parents=True, exist_ok=True)
         figure = atmosphere_figure(self._variants(experiment)[0].file.scene())
         with atomic_path(folder / "atmosphere.png") as temporary:
@@ -159,8 +154,6 @@ class Runs:
         ]
 
     def _path(self, name: str) -> Path:
-        from zonda.core.configuration.locate import locate
-
         for candidate in (self.base / name, self.base / f"{name}.yaml", FOLDER / f"{name}.yaml"):
             if candidate.is_file():
                 return candidate
@@ -169,11 +162,8 @@ class Runs:
 
 def _pictures(folder: Path) -> list[Path]:
     """The pictures of a run, without the claim's own."""
-    return [
-        path
-        for path in sorted(folder.glob("*.png"))
-        if path.name not in ("values.png", "atmosphere.png")
-    ]
+    own = ("values.png", "atmosphere.png")
+    return [path for path in sorted(folder.glob("*.png")) if path.name not in own]
 
 
 def _text_of(path: Path) -> str:
@@ -214,24 +204,3 @@ def combined(
     )
     root = math.sqrt(len(pairs)) if statistic == "paired_mean" else 1.0
     return (root * found,), root * error
-
-
-def described(experiment: Experiment) -> Iterator[str]:
-    """An experiment in words: pipeline, changes, metric, seeds; or the calculation."""
-    if experiment.calculate is not None:
-        yield str(experiment.calculate)
-        return
-    yield f"{experiment.pipeline}"
-    yield from (f"{key}={value}" for key, value in experiment.change.items())
-    if experiment.versus is not None:
-        yield (
-            f"{experiment.statistic} to"
-            f" {', '.join(f'{k}={v}' for k, v in experiment.versus.items())}"
-        )
-    metric = experiment.metric
-    yield (
-        metric
-        if isinstance(metric, str)
-        else ", ".join(f"{name}({given or ''})" for name, given in metric.items())
-    )
-    yield f"{experiment.seeds or 1} seed{'s' if (experiment.seeds or 1) > 1 else ''}"

@@ -16,7 +16,6 @@ from zonda.plugins.validation.calculations import (
     flux_per_beam,
     gaussian_overlap,
     rayleigh_distance,
-    spectral_slope,
     white_noise_of_daisy,
 )
 from zonda.plugins.validation.claims import SHIPPED, read
@@ -216,13 +215,6 @@ def test_the_daisy_of_the_pipelines_reaches_as_far():
     step = PointingDaisy(radius="4 arcmin", speed="50 arcsec/s", scan_duration="1 min")
     x, y = step.path(np.linspace(0, 30000, 200_001))
     assert np.hypot(x, y).max() == pytest.approx(daisy_reach(step.radius), rel=1e-4)
-
-
-def test_a_spectrum_without_a_beam_has_kolmogorov_s_slope():
-    assert spectral_slope(1e-6, 10.0, 0.01, 0.1) == pytest.approx(-8 / 3)
-    assert (
-        spectral_slope(100.0, 10.0, 0.016, 0.05) < -4
-    )  # the beam takes the more, the higher the frequency
 
 
 def test_every_calculation_says_what_it_is():

@@ -248,16 +248,16 @@ def test_the_quick_rows_are_decided(tmp_path):
 
 
 def test_a_counter_of_another_quantity_has_axes_of_its_own(claims, tmp_path):
-    from zonda.plugins.validation.engine import row
     from zonda.plugins.validation.figure import draw
+    from zonda.plugins.validation.rows import Row
     from zonda.plugins.validation.runs import Runs
 
     path = claims()
     claim, runs = read(path).claims[0], Runs(tmp_path / "out", path.parent)
     for _, experiment in claim.experiments():
         runs.want(experiment)
-    runs.execute()
-    own, other = draw(row(claim, runs)).axes
+    runs.experiment.run()
+    own, other = draw(Row.of(claim, runs)).axes
     assert (own.get_xlabel(), other.get_xlabel()) == ("uK", "ratio")
     assert other.get_xlim()[0] > 1.9
     assert other.get_xlim()[1] < 2.1
