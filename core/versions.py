@@ -1,5 +1,5 @@
-"""Versions on which results depend besides the pipeline: this program, down to its files, libraries
-and instruction sets of the CPU.
+"""Installed packages: the versions on which results depend besides the pipeline, and packages that
+come with an extra.
 """
 
 from __future__ import annotations
@@ -9,9 +9,25 @@ import os
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
 from .discovery import HOST
+from .errors import InputError
+
+
+def needed(module: str, extra: str, place: str = "") -> Any:
+    """A module of a package that the extra ``extra`` installs. Raises InputError at ``place`` where
+    it is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as err:
+        cure = f"pip install 'zonda[{extra}]'"
+        raise InputError(
+            f"cannot import {module}: {err}", place=place or f"zonda.interop.{extra}", cure=cure
+        ) from None
 
 
 def versions() -> dict[str, str]:

@@ -20,8 +20,8 @@ from zonda.core.flags import (
 )
 from zonda.core.intervals import samples_in
 from zonda.core.numerics.earth_orientation import orientation
-from zonda.core.packages import needed
 from zonda.core.types import Floats
+from zonda.core.versions import needed
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 
 from .scans import Scan, Source, scan_of

@@ -16,9 +16,9 @@ from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.flags import INVALID
 from zonda.core.operator import Operator
-from zonda.core.packages import needed
 from zonda.core.pipeline import Pipeline
 from zonda.core.types import AnyFloats, Floats
+from zonda.core.versions import needed
 from zonda.core.weather import GroundWeather
 from zonda.operators.io.load_tod import LoadTOD
 from zonda.operators.io.save_tod import save_tod

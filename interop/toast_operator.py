@@ -19,11 +19,11 @@ from zonda.core.flags import DETECTOR_MASK, PROCESSING
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
-from zonda.core.packages import needed
 from zonda.core.plan.planning import Planning
 from zonda.core.signal import MAIN
 from zonda.core.stream import Stream
 from zonda.core.types import AnyFloats
+from zonda.core.versions import needed
 from zonda.core.whole_stream import Changed
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 

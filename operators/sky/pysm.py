@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, PrivateAttr, ValidationInfo, model_v
 from zonda.core.configuration.files import find
 from zonda.core.data import Data
 from zonda.core.observation import Observation
-from zonda.core.packages import needed
+from zonda.core.versions import needed
 
 from .full_sky import FullSky, Nside
 from .pysm_emission import ALONE, EXTRA, check_templates, configuration, emission, is_file

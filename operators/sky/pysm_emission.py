@@ -29,8 +29,8 @@ import numpy as np
 from zonda.core.configuration.diagnostics import nearest
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band
-from zonda.core.packages import needed
 from zonda.core.types import Floats
+from zonda.core.versions import needed
 
 EXTRA = "pysm"
 STEP = 0.005
