@@ -81,16 +81,18 @@ class Registry:
         )
         self._found: dict[str, list[Found]] | None = None
         self._loaded: dict[Found, Any] = {}
-        self._registered: dict[str, Any] = {}
+        self._session: dict[str, Found] = {}
         self.hint: Callable[[str], tuple[str, str]] = lambda name: ("", "")
 
     @property
     def _index(self) -> dict[str, list[Found]]:
+        """Everything on offer, by name."""
         if self._found is None:
             self._found = {}
             points = (point for group in self.groups for point in discover(group))
-            for found in dict.fromkeys(found for point in points for found in point.described()):
-                self._found.setdefault(found.name, []).append(found)
+            found = (found for point in points for found in point.described())
+            for one in dict.fromkeys((*found, *self._session.values())):
+                self._found.setdefault(one.name, []).append(one)
         return self._found
 
     @property
@@ -123,39 +125,35 @@ class Registry:
         key = (
             name or (own if isinstance(own, str) else None) or getattr(component, "__name__", None)
         )
-        if self.classes and self.base:
-            self._check(
-                component, Found(key or repr(component), _reference(component), SESSION, "")
-            )
+        found = Found(key or repr(component), _reference(component), SESSION, "")
+        self._check(component, found)
         if not key:
             raise RegistryError(
                 f"this {self.kind} has no name", cure="give one: register(component, name='...')"
             )
-        if taken := self._index.get(key):
+        taken = self._index.get(key)
+        if taken and taken[0].distribution != SESSION:
             raise RegistryError(
                 f"{self.kind} '{key}' is already provided by {taken[0].origin}",
                 cure="choose another name",
             )
-        self._registered[key] = component
+        self._session[key], self._loaded[found], self._index[key] = found, component, [found]
         return component
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and (name in self._registered or bool(self._named(name)))
+        return isinstance(name, str) and bool(self._named(name))
 
     def __iter__(self) -> Iterator[str]:
-        return iter(sorted({*self._index, *self._registered}))
+        return iter(sorted(self._index))
 
     def __len__(self) -> int:
-        return len({*self._index, *self._registered})
+        return len(self._index)
 
     def candidates(self) -> list[Found]:
         """Everything on offer, by name; what was registered by hand comes from "this session".
         Imports nothing.
         """
-        local = [
-            Found(name, _reference(value), SESSION, "") for name, value in self._registered.items()
-        ]
-        return sorted([f for found in self._index.values() for f in found] + local)
+        return sorted(found for alike in self._index.values() for found in alike)
 
     def suggest(self, name: str) -> str | None:
         """The nearest name on offer."""
@@ -169,7 +167,7 @@ class Registry:
 
         Raises `RegistryError` where several do.
         """
-        if self.exact or not isinstance(name, str) or name in self._registered or self._named(name):
+        if self.exact or not isinstance(name, str) or self._named(name):
             return name
         distribution, colon, short = name.rpartition(":")
         alike = [known for known in self if fold(known) == fold(short)]
@@ -187,12 +185,11 @@ class Registry:
         Raises `RegistryError` for a name that is unknown, doubly provided, broken or written for
         another plugin API.
         """
-        name = self.registered(name)
-        if name in self._registered:
-            return self._check(
-                self._registered[name], Found(name, _reference(self._registered[name]), SESSION, "")
-            )
-        found = self._named(name)
+        return self.load(self._only(name))
+
+    def _only(self, name: str) -> Found:
+        """The one candidate of a name. Raises `RegistryError` if there is none, or several."""
+        found = self._named(self.registered(name))
         if not found:
             raise self._unknown(name)
         if len(found) > 1:
@@ -201,7 +198,7 @@ class Registry:
                 label="write " + " or ".join(f"'{f.qualified}'" for f in found),
                 cure="or uninstall one of them",
             )
-        return self.load(found[0])
+        return found[0]
 
     def create(self, name: str, folder: str | Path | None = None) -> Any:
         """The object called ``name``: what the entry point names, or what it returns when called
@@ -213,15 +210,10 @@ class Registry:
         """
         if is_file(name) and self.base and not self.classes:
             return self._of_file(name, folder)
-        name = self.registered(name)
-        component = self.get(name)
+        found = self._only(name)
+        component = self.load(found)
         if not callable(component):
             return component
-        found = (
-            Found(name, _reference(component), SESSION, "")
-            if name in self._registered
-            else self._named(name)[0]
-        )
         try:
             made = component()
         except RAISED as err:
@@ -256,8 +248,6 @@ class Registry:
         """Import one candidate. Raises `RegistryError` where that fails or it is written for
         another plugin API.
         """
-        if found.distribution == SESSION:
-            return self._check(self._registered[found.name], found)
         if found not in self._loaded:
             try:
                 component = self._described(found) if found.file else found.load()

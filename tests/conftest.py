@@ -35,7 +35,9 @@ def own_user_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def nothing_stays_registered() -> Iterator[None]:
-    before = [dict(each._registered) for each in registries]
+    before = [dict(each._session) for each in registries]
     yield
     for each, registered in zip(registries, before, strict=True):
-        each._registered = registered
+        if each._session != registered:
+            each._session = registered
+            each.refresh()

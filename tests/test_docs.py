@@ -450,7 +450,7 @@ def test_the_operators_of_the_page_for_authors_are_right(tmp_path, monkeypatch):
     zonda.testing.check_operator(page.Rms())
     zonda.testing.check_operator(page.AzimuthSlope())
     zonda.testing.check_operator(page.Peak())
-    monkeypatch.setitem(noise_models._registered, "my_rings", page.Rings)
+    noise_models.register(page.Rings, name="my_rings")
     noise = zonda.WhiteNoise(model={"name": "my_rings", "growth": "50 %"})
     assert noise.model.growth == page.noise.model.growth == 0.5
     zonda.testing.check_operator(noise)

@@ -25,7 +25,7 @@ def fresh_registries(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Registries without what was registered by hand, and read anew before and after."""
     monkeypatch.delenv("ZONDA_PLUGINS", raising=False)
     for each in registry.registries:
-        monkeypatch.setattr(each, "_registered", {})
+        monkeypatch.setattr(each, "_session", {})
     registry.refresh()
     hooks.manager.cache_clear()
     yield

@@ -463,6 +463,6 @@ def test_it_keeps_the_contract_and_a_plan_knows_its_brightness(made, tmp_path):
     o = a_scan(made)
     planning = planning_class(PySMSky)(step)
     assert planning.traits(o).peak == pytest.approx(
-        np.abs(step.sky(o).map.table.data["I"]).max(), rel=1e-6
+        np.abs(step.sky(o).map.hdu.data["I"]).max(), rel=1e-6
     )
     assert planning.memory(o) > 12 * 64**2 * 8 * 6

@@ -353,13 +353,13 @@ class Thin(AbsorptionTable):
         )
 
 
-def test_spectra_are_plugins(monkeypatch):
+def test_spectra_are_plugins():
     import zonda
     from zonda.core.errors import ZondaError
     from zonda.core.registry import instruments, sites, spectra
 
-    monkeypatch.setitem(spectra._registered, "thin", lambda: Thin(TABLE))
-    monkeypatch.setitem(spectra._registered, "wrong", lambda: "no table")
+    spectra.register(lambda: Thin(TABLE), name="thin")
+    spectra.register(lambda: "no table", name="wrong")
     observation = SimpleNamespace(
         site=sites.create("green_bank"),
         start=Instant.parse("2024-11-25T07:00:00Z"),
