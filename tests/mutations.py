@@ -18,7 +18,7 @@ from zonda.core.run import block_maker
 from zonda.operators.atmosphere.turbulence import covariance, lattice
 from zonda.operators.atmosphere.weather import bands
 from zonda.operators.filters import brick_wall, common_mode
-from zonda.operators.maps import bin_map
+from zonda.operators.maps import binning
 from zonda.operators.maps.sums import DATA
 from zonda.operators.noise import pink, white
 from zonda.operators.optics.efficiency import Efficiency
@@ -140,9 +140,9 @@ def nan_pixels_that_stay(patch: Patch) -> None:
 
 
 def nan_samples_that_count_as_zero(patch: Patch) -> None:
-    add = bin_map.add_image
+    add = binning.add_image
     patch.setattr(
-        bin_map,
+        binning,
         "add_image",
         lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest),
     )
@@ -150,14 +150,14 @@ def nan_samples_that_count_as_zero(patch: Patch) -> None:
 
 def sums_rounded_by_block(patch: Patch) -> None:
     """Each block adds float32 sums, as a naive accumulator would."""
-    add = bin_map.add_image
+    add = binning.add_image
 
     def rounded(*arguments: Any) -> None:
         add(*arguments)
         sums = arguments[-3]
         sums[:, DATA] = sums[:, DATA].astype(np.float32).astype(np.int64)
 
-    patch.setattr(bin_map, "add_image", rounded)
+    patch.setattr(binning, "add_image", rounded)
 
 
 def noise_that_starts_again_in_each_block(patch: Patch) -> None:

@@ -12,7 +12,7 @@ pixel. For samples of weight a with errors e_i, whose correlations add up to c a
     |sum g_i e_i|^2 <= c sum g_i^2 e^2 = (c / H) e^2 / s,   s = w_S / (a H),
     g = a (A^-1)_S r,   w_S = 1 / (A^-1)_SS                                   (1)
 
-(`operators.maps.stokes_sums`), so that it holds for the error of S times s^(1/2), which is what is
+(`operators.maps.binning`), so that it holds for the error of S times s^(1/2), which is what is
 reported.
 """
 

@@ -13,9 +13,9 @@ The sums are kept in fixed point (`sums`), so that they are exact; each sample i
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,29 +23,17 @@ from pydantic import PrivateAttr
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.numerics.chunks import TILE_SAMPLES
 
 from .angle_checks import check_polarized, warn_before
+from .binning import Binning, Part, add_blocks, binnings, detector_weights
 from .coverage import COUNTS, Coverage, Directions
-from .grid import Grid, TangentGrid
-from .halves import Split, halves_of
+from .grid import Grid
 from .map_from_sums import MapFromSums
 from .map_layout import MapLayout
 from .map_sums import MapSums
 from .parameters import MapParameters
 from .pixels import Cells, Looking
-from .stokes_sums import Part, StokesBinning, add_blocks, stokes_binnings
-from .sums import (
-    FLAGGED,
-    NOT_FINITE,
-    OUTSIDE,
-    TOO_LARGE,
-    WEIGHT,
-    Binning,
-    Sums,
-    add_image,
-    add_list,
-)
+from .sums import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, Sums
 
 NO_WHITE = "what the detectors' NET would make; this scene has no white noise"
 """Said of the noise that the map of such a scene states."""
@@ -121,20 +109,22 @@ class BinMap(MapParameters):
         changed.
         """
         levels, seen = self._levels(observation)
-        if self.stokes == "IQU":
+        polarized, hits = self.stokes == "IQU", self.contents == "hits"
+        if polarized:
             check_polarized(observation, self.label)
         looking = Looking.of(observation, self.grid)
-        hits, scatter = self.contents == "hits", self.noise == "scatter"
-        signals = 1 if hits else len(observation.signals)
-        how = self.split, looking, levels, seen, self._spare
-        made: list[Any] = (
-            stokes_binnings(*how)
-            if self.stokes == "IQU"
-            else binnings(*how, signals=signals, scatter=scatter)
+        made = binnings(
+            self.split,
+            looking,
+            levels,
+            seen,
+            self._spare,
+            signals=1 if hits else len(observation.signals),
+            polarized=polarized,
+            scatter=1 / self._layout["variance"] if self.noise == "scatter" else 0.0,
         )
         directions = Directions.of(looking, seen) if self.crosslinking else None
-        reference = self._layout["variance"]
-        return Prepared(looking, made, directions, reference, self.split != "scans", hits, scatter)
+        return Prepared(made, directions, hits)
 
     def exec(self, block: Block, state: Prepared) -> None:
         """Add one block to this thread's sums."""
@@ -142,18 +132,12 @@ class BinMap(MapParameters):
 
     def exec_bands(self, blocks: Sequence[Block], states: Sequence[Prepared]) -> None:
         """Add the blocks of several bands, each to its own sums; what is the same is found once."""
-        parts = [Blocks(s.signals(b), b, s) for b, s in zip(blocks, states, strict=True)]
+        parts = [Part(s.signals(b), b, s.halves) for b, s in zip(blocks, states, strict=True)]
         cells = Cells()
-        for signals, block, state in parts:
+        for part, state in zip(parts, states, strict=True):
             if state.directions is not None:
-                state.directions.add(signals, block, cells)
-        if self.stokes == "IQU":
-            add_blocks(
-                [Part(cast(Any, s.binnings), signals, block) for signals, block, s in parts], cells
-            )
-            return
-        for together in alike(parts):
-            add_together(together)
+                state.directions.add(part.signals, part.block, cells)
+        add_blocks(parts, cells)
 
     def collect(self, data: Data, observation: Observation, state: Prepared) -> None:
         """Add this observation to the even or the odd scans' sums; what is dropped is counted.
@@ -236,22 +220,16 @@ class BinMap(MapParameters):
 
 @dataclass
 class Prepared:
-    """An observation's pointing, weights and sums.
+    """An observation's binnings: of each half of its samples (`binnings`), or of all where the
+    halves are of scans.
 
-    ``looking``: the detectors' pixels. ``binnings``: of each half (`halves_of`), one for all
-    signals or one for each with noise of its own. ``directions``: those of the scans, where the map
-    tells how they cross. ``reference``: unit of the variance, K^2. ``apart``: the halves are of
-    samples, not of scans; ``hits``: only hits are wanted; ``scatter``: noise is that of the
-    samples' scatter.
+    ``directions``: those of the scans, where the map tells how they cross. ``hits``: only hits are
+    wanted.
     """
 
-    looking: Looking
-    binnings: list[Binning] | list[StokesBinning]
+    halves: list[list[Binning]]
     directions: Directions | None
-    reference: float
-    apart: bool
     hits: bool
-    scatter: bool
 
     def signals(self, block: Block) -> tuple[Any, ...]:
         """Signals of a block, (n_det, n) each; zeros where only the hits are wanted."""
@@ -259,7 +237,7 @@ class Prepared:
             nothing = block.buffer("nothing", block.shape)
             nothing.fill(0)
             return (nothing,)
-        window, unfiltered = self.binnings[0].window[block.samples], block.observation.unfiltered
+        window, unfiltered = self.halves[0][0].window[block.samples], block.observation.unfiltered
         whole = any(name in block.means for name in block.signals) or (window.size and unfiltered)
         signals = [block.total(name) if whole else block.detdata[name] for name in block.signals]
         if window.size:  # no filter, no window, acted on these
@@ -268,149 +246,3 @@ class Prepared:
                 for name, signal in zip(block.signals, signals, strict=True)
             ]
         return tuple(signals)
-
-    @property
-    def halves(self) -> list[list[Any]]:
-        """The binnings of either half; of scans, which are a half each, all together."""
-        middle = len(self.binnings) // 2
-        every: list[Any] = list(self.binnings)
-        return [every[:middle], every[middle:]] if self.apart else [every]
-
-    def counted(self, block: Block, binning: Binning) -> tuple[Any, ...]:
-        """Samples of a block that count, their weights, and this thread's sums."""
-        rows, samples = block.detectors, block.samples
-        return (
-            block.observation.good_detectors[rows] & binning.use[rows],
-            binning.good[samples],
-            binning.window[samples],
-            binning.weight[rows],
-            binning.noise[rows],
-            self.scatter,
-            1 / self.reference,
-            *binning.of_thread(),
-        )
-
-
-class Blocks(NamedTuple):
-    """A block of one band: its signals (n_det, n), and the state of its observation."""
-
-    signals: tuple[Any, ...]
-    block: Block
-    state: Prepared
-
-
-def alike(parts: Sequence[Blocks]) -> list[list[Blocks]]:
-    """The blocks of bands that look in the same pixels, together."""
-    found: dict[Hashable, list[Blocks]] = {}
-    for number, part in enumerate(parts):
-        looking = part.state.looking
-        image = looking.key is None or isinstance(looking.grid, TangentGrid)
-        found.setdefault(number if image else looking.key, []).append(part)
-    return list(found.values())
-
-
-def add_together(parts: Sequence[Blocks]) -> None:
-    """Add the signals of blocks, of bands that look in the same pixels, to this thread's sums."""
-    todo = []
-    for signals, block, state in parts:
-        for half in state.halves:
-            left = signals
-            for binning in half:
-                count = 1 + binning.n_others
-                todo.append((tuple(left[:count]), binning, *state.counted(block, binning)))
-                left = left[count:]
-    block, looking = parts[0].block, parts[0].state.looking
-    begin, end, rows = block.samples.start, block.samples.stop, block.detectors
-    if isinstance(looking.grid, TangentGrid):
-        plane = block.observation.focalplane
-        for signals, binning, *how in todo:
-            add_image(
-                signals,
-                binning.pointing,
-                begin,
-                plane.xi[rows],
-                plane.eta[rows],
-                *looking.grid.shape,
-                *how,
-            )
-        return
-    which = np.arange(rows.start, rows.stop)
-    for start in range(begin, end, TILE_SAMPLES):
-        stop, index = min(start + TILE_SAMPLES, end), None
-        for signals, binning, *how in todo:
-            if binning.good[start:stop].any():
-                index = looking.pixels(which, start, stop) if index is None else index
-                add_list(signals, start - begin, index, *how)
-            else:
-                how[-2][FLAGGED] += (stop - start) * which.size
-
-
-def detector_weights(
-    observation: Observation, reference: float, inverse: bool, place: str
-) -> tuple[Any, Any]:
-    """(w, w^2 times the variance of one sample) of each detector, in units of the variance
-    ``reference`` [K^2]; ``inverse``: w is the inverse variance, else 1.
-
-    Raises PipelineError where they differ by too much, or are not known.
-    """
-    usable, net = observation.good_detectors, observation.focalplane.net.copy()
-    if not usable.any():
-        return np.ones(len(net)), np.ones(len(net))
-    net[~usable] = net[usable][0]  # they weigh nothing, whatever their noise
-    variance = net**2 * observation.sample_rate / reference
-    weight = np.ones(len(net))
-    if inverse:
-        if (net > 0).all():
-            weight = 1 / variance
-        elif (net != net[0]).any():
-            bad = observation.focalplane.names[int(np.flatnonzero(net <= 0)[0])]
-            raise PipelineError(
-                f"detector {bad} has NET 0, which has no inverse variance",
-                place=place,
-                cure="set weights: uniform",
-            )
-    weight = np.rint(weight * WEIGHT) / WEIGHT  # so that the sums of w d and of w use the same w
-    if weight.max(initial=0.0) > 2.0**20 or weight.min(initial=1.0) < 2.0**-20:
-        spread = net.max() > 1000 * net.min()
-        much = "the detectors' NETs differ by more than a factor of 1000"
-        far = "the NET is more than 1000 times larger or smaller than that of the first scan"
-        raise PipelineError(much if spread else far, place=place, cure="set weights: uniform")
-    return weight, weight**2 * variance
-
-
-def binnings(
-    split: Split,
-    looking: Looking,
-    levels: tuple[Any, Any, Any],
-    good: NDArray[np.bool_],
-    spare: list[Sums],
-    *,
-    signals: int,
-    scatter: bool,
-) -> list[Binning]:
-    """Empty sums for one observation, for each half of its samples: one for all ``signals``, or one
-    for each if their noise is that of their ``scatter``. Arguments as of `stokes_binnings`.
-    """
-    observation, (weight, noise, window) = looking.observation, levels
-    alike = (
-        not scatter
-        and not window.size
-        and bool((weight == weight[0]).all() and (noise == noise[0]).all())
-    )
-    others, count = (0, signals) if scatter else (signals - 1, 1)
-    return [
-        Binning(
-            looking.grid,
-            looking.pointing,
-            use,
-            (good & samples).astype(np.uint8),
-            window,
-            weight,
-            noise,
-            alike,
-            others,
-            spare,
-        )
-        for use, samples in halves_of(split, observation)
-        for _ in range(count)
-    ]

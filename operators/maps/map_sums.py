@@ -5,7 +5,6 @@ every signal.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,45 +17,13 @@ from zonda.core.numerics.chunks import empty
 from zonda.core.product import Product
 from zonda.core.signal import MAIN
 
-from . import sums
+from .binning import Binning
 from .coverage import Coverage
-from .stokes_kernel import DATA, HIT
-from .stokes_sums import MATRIX, StokesBinning
-from .sums import FLAGGED, VALUE, Binning, Sums
+from .sums import FLAGGED, VALUE, Sums
 
 MOST = 2.0**62
 """Below what a sum must stay."""
 JOINED = "the sum of the maps of all tasks"
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Columns of the table of a map's pixels.
-
-    ``right``: right sides of a signal in each pixel; ``first``: where those of the first signal
-    are, None: they are not in the table.
-    """
-
-    count: int
-    hits: int
-    weights: slice
-    noise: slice
-    right: int
-    first: slice | None = None
-
-
-INTENSITY = Columns(
-    4,
-    sums.HITS,
-    slice(sums.WEIGHTS, sums.WEIGHTS + 1),
-    slice(sums.NOISE, sums.NOISE + 1),
-    1,
-    slice(sums.DATA, sums.DATA + 1),
-)
-"""One weight and one right side, in the order of `sums`."""
-POLARIZED = Columns(DATA, HIT, MATRIX, MATRIX, 3)
-"""Six weights and three right sides, in the order of `stokes_sums`; the noise is that of the
-weights."""
 
 
 class MapSums(Product):
@@ -79,12 +46,12 @@ class MapSums(Product):
     Attributes
     ----------
     table
-        (2, n_pixels, n) `columns`: hits and weights of all signals, noise.
+        (2, n_pixels, 2 or 7): hits, and the weights of all signals.
     right
-        (2, n_pixels, 1 or 3) sums of w d of each signal that has them outside the table.
+        (2, n_pixels, 1 or 3) sums of w d of each signal.
     noise
         (2, n_pixels, 1 or 6) by stream, of signals with noise of their own; under the name of the
-        first signal that of all, where it is not that of the table.
+        first signal that of all, where it is not that of the weights.
     scans, rates
         Names of the observations, and their sample rates, Hz.
     unknown_variance
@@ -104,25 +71,20 @@ class MapSums(Product):
         of_scans: bool = True,
     ) -> None:
         self.signals = tuple(signals)
-        self.columns = POLARIZED if polarized else INTENSITY
-        self.scatter, self.of_scans = scatter, of_scans
+        self.polarized, self.scatter, self.of_scans = polarized, scatter, of_scans
         self.scans: list[str] = []
         self.rates: set[float] = set()
         self.unknown_variance = False
         self.coverage = Coverage()
         self.beams = Beams()
-        own = self.signals if polarized else self.signals[1:]
-        self.table = zeros(n_pixels, self.columns.count)
-        self.right = {name: zeros(n_pixels, self.columns.right) for name in own}
-        self.noise = {name: zeros(n_pixels, 1) for name in own} if scatter else {}
+        own = self.signals or (MAIN,)
+        self.table = zeros(n_pixels, 7 if polarized else 2)
+        self.right = {name: zeros(n_pixels, 3 if polarized else 1) for name in own}
+        noisy = () if polarized else own if scatter else own[:1]
+        self.noise = {name: zeros(n_pixels, 1) for name in noisy}
         self._largest = 0.0
-        self._largest_of = dict.fromkeys((self.first, *own), 0.0)
+        self._largest_of = dict.fromkeys(own, 0.0)
         self._deepest = [0, 0]
-
-    @property
-    def polarized(self) -> bool:
-        """I, Q and U are wanted."""
-        return self.columns is POLARIZED
 
     @property
     def first(self) -> str:
@@ -132,7 +94,7 @@ class MapSums(Product):
     @property
     def hits(self) -> Sums:
         """(2, n_pixels) samples in each pixel."""
-        return self.table[:, :, self.columns.hits]
+        return self.table[:, :, 0]
 
     @property
     def halved(self) -> bool:
@@ -148,7 +110,7 @@ class MapSums(Product):
     def _tables(self) -> dict[str, Sums]:
         """Sums by their names in files, (2, n_pixels, columns) each."""
         found = {"table": self.table}
-        for k, name in enumerate(self.signals or (MAIN,)):
+        for k, name in enumerate(self.right):
             found |= {
                 f"{what}_{k}": tables[name]
                 for what, tables in (("right", self.right), ("noise", self.noise))
@@ -157,21 +119,31 @@ class MapSums(Product):
         return found
 
     def add(
-        self,
-        observation: Observation,
-        halves: Sequence[Sequence[Binning] | Sequence[StokesBinning]],
-        place: str,
+        self, observation: Observation, halves: Sequence[Sequence[Binning]], place: str
     ) -> tuple[int, Sums]:
-        """Add one observation: (samples binned, dropped (4,)). Raises PipelineError where a sum may
-        have overflowed.
-
-        ``halves``: the binnings of either half of its samples, or one list of all of them.
+        """Add one observation, the binnings of either half of its samples or of all of them:
+        (samples binned, dropped (4,)). Raises PipelineError where a sum may have overflowed.
         """
         inside, dropped = 0, np.zeros(4, np.int64)
-        for k, binnings in enumerate(halves, start=self._shift):
-            add: Any = self._add_polarized if self.polarized else self._add_intensity
-            binned, lost = add(k, binnings)
-            inside, dropped = inside + binned, dropped + lost
+        for k, half in enumerate(halves, start=self._shift):
+            names = list(self.right)
+            for n, binning in enumerate(half):
+                if self.polarized and binning.own:
+                    self._with_noise()
+                own, names = names[: binning.signals], names[binning.signals :]
+                for found in binning.folded():
+                    if not n:
+                        self.table[k, found.pixels, 0] += found.hits
+                        self.table[k, found.pixels, 1:] += found.weights
+                        inside, dropped = inside + int(found.hits.sum()), dropped + found.dropped
+                    for name, right in zip(own, found.right, strict=True):
+                        self.right[name][k][found.pixels] += right
+                    if own[0] in self.noise:
+                        noise = found.weights if found.noise is None else found.noise
+                        self.noise[own[0]][k][found.pixels] += noise
+                    deepest = 0 if n else self._deepest[k] + int(found.hits.max(initial=0))
+                    high, every = found.largest
+                    self._note(k, deepest, high, dict(zip(own, every, strict=True)))
         # what belongs to the other half counted as flagged
         dropped[FLAGGED] -= (len(halves) - 1) * observation.n_detectors * observation.n_samples
         self.scans.append(observation.name)
@@ -179,56 +151,10 @@ class MapSums(Product):
         self._check(f"{place}, {observation.name}")
         return inside, dropped
 
-    def _add_intensity(self, k: int, binnings: Sequence[Binning]) -> tuple[int, Sums]:
-        """Add binnings, one for all signals or one for each, to the half ``k``: (samples binned,
-        dropped (4,)).
-        """
-        names = list(self.right)
-        together = binnings[0].n_others == len(names)
-        others = (
-            np.concatenate([self.right[name][k] for name in names], axis=1)
-            if names and together
-            else _nothing(self.table[k])
-        )
-        inside, deepest, dropped, largest = binnings[0].fold(self.table[k], others)
-        high = {self.first: float(largest[sums.DATA])}
-        for n, name in enumerate(names):
-            if together:
-                self.right[name][k] = others[:, n : n + 1]
-                high[name] = float(largest[sums.NOISE + 1 + n])
-            else:
-                own = np.zeros_like(self.table[k])
-                _, _, _, found = binnings[1 + n].fold(own, _nothing(own))
-                self.right[name][k] += own[:, self.columns.first]
-                self.noise[name][k] += own[:, self.columns.noise]
-                high[name] = float(found[sums.DATA])
-                largest[sums.NOISE] = max(largest[sums.NOISE], found[sums.NOISE])
-        self._note(k, deepest, float(largest[sums.WEIGHTS : sums.NOISE + 1].max()), high)
-        return inside, dropped
-
-    def _add_polarized(self, k: int, binnings: Sequence[StokesBinning]) -> tuple[int, Sums]:
-        """Add a binning to the half ``k``: (samples binned, dropped (4,))."""
-        inside, dropped, end = 0, np.zeros(4, np.int64), DATA + 3 * len(self.signals)
-        for binning in binnings:
-            if binning.own_noise:
-                self._with_noise()
-            for pixels, found, lost, largest in binning.taken():
-                self.table[k][pixels] += found[:, :DATA]
-                for n, name in enumerate(self.signals):
-                    self.right[name][k][pixels] += found[:, DATA + 3 * n : DATA + 3 * n + 3]
-                if self.noise:
-                    own = found[:, end:] if found.shape[1] > end else found[:, MATRIX]
-                    self.noise[self.first][k][pixels] += own
-                deepest = self._deepest[k] + int(found[:, HIT].max(initial=0))
-                high = dict.fromkeys(self.signals, float(largest[1]))
-                self._note(k, deepest, float(largest[0]), high)
-                inside, dropped = inside + int(found[:, HIT].sum()), dropped + lost
-        return inside, dropped
-
     def _with_noise(self) -> None:
         """Keep the noise of polarized maps, which so far was that of the weights."""
         if not self.noise:
-            self.noise[self.first] = self.table[..., MATRIX].copy()
+            self.noise[self.first] = self.table[..., 1:].copy()
 
     def parts(
         self, stream: str, pixels: slice, half: int | None = None
@@ -242,15 +168,10 @@ class MapSums(Product):
                 return table[half or 0, pixels]
             return np.asarray(table[0, pixels] + table[1, pixels])
 
-        table, columns = of(self.table), self.columns
-        right = of(self.right[stream]) if stream in self.right else table[:, columns.first]
+        table = of(self.table)
         noise = self.noise.get(stream if self.scatter else self.first)
-        return (
-            table[:, columns.hits],
-            table[:, columns.weights],
-            right,
-            table[:, columns.noise] if noise is None else of(noise),
-        )
+        weights = table[:, 1:]
+        return table[:, 0], weights, of(self.right[stream]), weights if noise is None else of(noise)
 
     def __iadd__(self, other: MapSums) -> MapSums:
         """Add sums whose scans follow those that are here: exact, so that their order does not
@@ -323,8 +244,7 @@ class MapSums(Product):
         """The right sides are subtracted, exactly. The largest term is at most the sum of
         theirs.
         """
-        whole = self.right.get(self.first)
-        rest = (self.table[..., self.columns.first] if whole is None else whole).copy()
+        rest = self.right[self.first].copy()
         for part in parts:
             rest -= self.right[part]
         self.right[stream] = rest
@@ -361,7 +281,3 @@ class MapSums(Product):
 def zeros(n_pixels: int, columns: int) -> NDArray[np.int64]:
     """(2, n_pixels, columns) zeros that take no memory until they are written."""
     return empty((2 * n_pixels, columns), np.int64).reshape(2, n_pixels, columns)
-
-
-def _nothing(half: Sums) -> Sums:
-    return np.empty((len(half), 0), np.int64)

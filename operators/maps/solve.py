@@ -1,5 +1,5 @@
 """Brightness of pixels from the sums of a map: equation (1) of `bin_map`, and equations (1) and (2)
-of `stokes_sums`, solved in each pixel.
+of `binning`, solved in each pixel.
 """
 
 from __future__ import annotations
@@ -11,15 +11,13 @@ import numpy as np
 from zonda.core.types import AnyFloats, Floats
 
 from .map_sums import MapSums
-from .stokes_sums import PLACES
+from .stokes_kernel import PLACES
 from .sums import VALUE, WEIGHT, Sums
 
 TRIANGLE = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 """Rows and columns of the elements of a symmetric matrix: ii, iq, iu, qq, qu, uu."""
 SINGULAR = 1e-8
 """Of the smallest eigenvalue, as a share of the largest: below it is the rounding of the sums."""
-ELEMENTS = [place - 1 for place in PLACES]
-"""Columns of the six weights as a matrix, row by row."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +128,7 @@ class _Solved:
         values, spread = np.full((2, n, 3), np.nan)
         covariance, condition = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
         hit = np.flatnonzero(hits)
-        a = weights[hit][:, ELEMENTS].reshape(-1, 3, 3) / WEIGHT
+        a = weights[hit][:, PLACES].reshape(-1, 3, 3) / WEIGHT
         low, axes = np.linalg.eigh(a)
         with np.errstate(divide="ignore"):
             condition[hit] = np.where(
@@ -146,7 +144,7 @@ class _Solved:
         spread[pixels] = np.einsum("nii->ni", inverse)
         covariance[pixels] = inverse * variance
         if own_noise:
-            middle = noise[pixels][:, ELEMENTS].reshape(-1, 3, 3) / WEIGHT
+            middle = noise[pixels][:, PLACES].reshape(-1, 3, 3) / WEIGHT
             covariance[pixels] = inverse @ middle @ inverse * variance
         return cls(values, covariance, spread, condition)
 

@@ -1,4 +1,4 @@
-"""The loops behind `stokes_sums`: the sums of a tile's samples in their pixels.
+"""The loops behind `binning` for maps of I, Q and U: the sums of a tile's samples in their pixels.
 
 Successive samples of a detector often fall in the same pixel. Their terms are added up along the
 row, all columns side by side (`running_terms`), and each run of samples in one pixel goes to the
@@ -30,6 +30,11 @@ FIRST = 1
 """Column of the sum of w, from which on A follows: w, wc, ws, wcc, wcs, wss."""
 DATA = 7
 """First column of the data: wd, wdc, wds of each signal, then N."""
+
+MATRIX = slice(FIRST, DATA)
+"""Columns of A."""
+PLACES = (0, 1, 2, 1, 3, 4, 2, 4, 5)
+"""Columns of A as a matrix, row by row, counted from the first of them."""
 
 AT_ONCE = 512
 """Samples of a detector whose terms are in the first cache together."""

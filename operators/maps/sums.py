@@ -16,17 +16,12 @@ columns. What one of them lacks is dropped from all.
 from __future__ import annotations
 
 import math
-import threading
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.kernels import kernel
 from zonda.core.numerics.columns import prefetch
-from zonda.core.types import Floats
-
-from .grid import Grid, TangentGrid
 
 Sums = NDArray[np.int64]
 
@@ -57,84 +52,6 @@ together.
 
 DATA, HITS, WEIGHTS, NOISE = range(4)
 OUTSIDE, FLAGGED, NOT_FINITE, TOO_LARGE = range(4)
-
-
-@dataclass
-class Binning:
-    """One observation's pointing and weights, and the sums of each thread.
-
-    Attributes
-    ----------
-    pointing
-        What `Grid.pointing` gives.
-    use, good, window
-        (n_det,), (n_samp,) uint8: which detectors (of its half) and samples count; (n_samp,):
-        `Observation.window`, or (0,).
-    weight, noise
-        (n_det,): w, and w^2 times the variance of one sample, in units of the reference variance.
-    alike
-        All detectors weigh the same: the sums of weights and noise follow from the hits.
-    n_others
-        Number of signals beside the first: sums of w d of their own, after the columns of the
-        first.
-    spare
-        Arrays of zeros that served the scans before: touching fresh memory costs more than the
-        sums.
-    """
-
-    grid: Grid
-    pointing: Floats
-    use: NDArray[np.bool_]
-    good: NDArray[np.uint8]
-    window: Floats
-    weight: Floats
-    noise: Floats
-    alike: bool
-    n_others: int = 0
-    spare: list[Sums] = field(default_factory=list)
-    parts: dict[int, tuple[Sums, Sums, Floats]] = field(default_factory=dict)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def of_thread(self) -> tuple[Sums, Sums, Floats]:
-        """(sums with their border (n, 4 + n_others, or 2 + n_others where alike), dropped (4,),
-        largest (4 + n_others,)).
-        """
-        mine = threading.get_ident()
-        with self.lock:
-            if mine not in self.parts:
-                self.parts[mine] = self._zeros(), np.zeros(4, np.int64), np.zeros(4 + self.n_others)
-            return self.parts[mine]
-
-    def _zeros(self) -> Sums:
-        n = self.grid.n_pixels + 1
-        if isinstance(self.grid, TangentGrid):
-            n = (self.grid.shape[0] + 2) * (self.grid.shape[1] + 2)
-        shape = n, (2 if self.alike else 4) + self.n_others
-        try:
-            while (sums := self.spare.pop()).shape != shape:
-                pass
-        except IndexError:
-            return np.zeros(shape, np.int64)
-        return sums
-
-    def fold(self, half: Sums, others: Sums) -> tuple[int, int, Sums, Floats]:
-        """Add all threads' sums to ``half`` (n_pixels, 4) and ``others`` (n_pixels, n_others):
-        (samples binned, most in a pixel, dropped (4,), largest (4 + n_others,))."""
-        dropped, largest, inside, deepest = np.zeros(4, np.int64), np.zeros(4 + self.n_others), 0, 0
-        rows, columns = self.grid.shape if isinstance(self.grid, TangentGrid) else (0, 0)
-        weight, noise = (
-            np.int64(np.rint(x[0] * WEIGHT)) if x.size else np.int64(0)
-            for x in (self.weight, self.noise)
-        )
-        for sums, part_dropped, part_largest in self.parts.values():
-            binned, outside, most = _fold(sums, rows, columns, weight, noise, half, others)
-            inside, deepest = inside + binned, max(deepest, most)
-            dropped += part_dropped
-            dropped[OUTSIDE] += outside
-            largest = np.maximum(largest, part_largest)
-            self.spare.append(sums)
-        self.parts.clear()
-        return inside, deepest, dropped, largest
 
 
 @kernel
@@ -493,35 +410,3 @@ def _scatter_any(flat, columns, base, cells, rows, units):  # type: ignore[no-un
             flat[at + np.uintp(HITS)] += 1
             for s in range(1, units.shape[0]):
                 flat[at + base + np.uintp(s - 1)] += units[s, k, t]
-
-
-@kernel
-def _fold(sums, ny, nx, weight, noise, out, others):  # type: ignore[no-untyped-def]
-    """Move a thread's sums to ``out`` (n_pixels, 4), those of further signals to ``others``
-    (n_pixels, m - 1): hits inside, on the border, and the most in a pixel. ``ny``: 0 for a list.
-
-    ``weight``, ``noise``: of every sample, where ``sums`` has no columns for them.
-    """
-    inside, outside, most = np.int64(0), np.int64(0), np.int64(0)
-    width, base = nx + 2 if ny else sums.shape[0], sums.shape[1] - others.shape[1]
-    for y in range(sums.shape[0] // width):
-        for x in range(width):
-            at = y * width + x
-            hits = sums[at, HITS]
-            if not hits:
-                continue
-            to = (y - 1) * nx + x - 1 if ny else at - 1
-            if x == 0 or (ny and (x == nx + 1 or y == 0 or y == ny + 1)):
-                outside += hits
-                sums[at] = 0
-                continue
-            inside += hits
-            out[to, DATA] += sums[at, DATA]
-            out[to, HITS] += hits
-            most = max(most, out[to, HITS])
-            out[to, WEIGHTS] += sums[at, WEIGHTS] if base == 4 else hits * weight
-            out[to, NOISE] += sums[at, NOISE] if base == 4 else hits * noise
-            for s in range(others.shape[1]):
-                others[to, s] += sums[at, base + s]
-            sums[at] = 0
-    return inside, outside, most

@@ -2,7 +2,7 @@
 time streams.
 
 A sample i of weight a_i and noise of rms sigma_i sees r_i = (1, p cos 2 psi, p sin 2 psi) of (I, Q,
-U). The map solves in each pixel (`operators.maps.stokes_sums`) for what has the covariance
+U). The map solves in each pixel (`operators.maps.binning`) for what has the covariance
 
     C = A^-1 N A^-1,   A = sum_i a_i r_i r_i^T,
     N = sum_i a_i^2 sigma_i^2 r_i r_i^T.                              (1)
@@ -31,9 +31,10 @@ from zonda.core.block import Block
 from zonda.core.numerics.transforms import convolved, gaussian_taps
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
+from zonda.operators.maps.binning import Binning, Part, add_blocks
 from zonda.operators.maps.grid import TangentGrid
 from zonda.operators.maps.pixels import Cells, Looking
-from zonda.operators.maps.stokes_sums import MATRIX, PLACES, Part, StokesBinning, add_blocks
+from zonda.operators.maps.stokes_kernel import PLACES
 from zonda.operators.maps.sums import WEIGHT
 
 from .beams import Comb, combs
@@ -92,15 +93,11 @@ def variances(survey: Survey, radius: float) -> dict[str, dict[str, Floats]]:
 
 def inverse(a: Floats, limit: float) -> Floats:
     """(n, 3, 3) A^-1 of the sums (n, 6); NaN where the condition number is above the ``limit``."""
-    low, axes = np.linalg.eigh(a[:, PLACES_OF_SIX].reshape(-1, 3, 3))
+    low, axes = np.linalg.eigh(a[:, PLACES].reshape(-1, 3, 3))
     fine = (low[:, 2] > 0) & (low[:, 0] * limit >= low[:, 2])
     found = np.full((len(a), 3, 3), np.nan)
     found[fine] = (axes[fine] / low[fine, None, :]) @ axes[fine].transpose(0, 2, 1)
     return found
-
-
-PLACES_OF_SIX = [place - MATRIX.start for place in PLACES]
-"""Of `PLACES`, where the hits are left out."""
 
 
 def _window(survey: Survey, radius: float) -> TangentGrid:
@@ -124,17 +121,17 @@ def _scans(survey: Survey, grid: TangentGrid) -> Iterator[Floats]:
         looking = Looking(o, grid, np.ascontiguousarray(grid.pointing(o)[:, index]))
         angles: PolarizationAngles = polarization_angles(survey, o, index)
         ones, good = np.ones(len(plane)), np.ones(index.size, np.uint8)
-        binning = StokesBinning(looking, angles, ones > 0, good, np.zeros(0), ones, ones, 1, False)
+        binning = Binning(looking, ones > 0, good, np.zeros(0), ones, ones, angles=angles)
         for first in range(0, len(plane), DETECTORS):
             for start in range(0, index.size, INSTANTS):
                 detectors = slice(first, min(first + DETECTORS, len(plane)))
                 block = Block(o, detectors, slice(start, min(start + INSTANTS, index.size)))
                 n_det, n = block.shape
                 signals = (np.ascontiguousarray(signal[:n_det, :n]),)
-                add_blocks([Part([binning], signals, block)], Cells())
+                add_blocks([Part(signals, block, [[binning]])], Cells())
         total = np.zeros((grid.n_pixels, 6))
-        for pixels, found, *_ in binning.taken():
-            total[pixels] += found[:, MATRIX] * (o.n_samples / index.size / WEIGHT)
+        for found in binning.folded():
+            total[found.pixels] += found.weights * (o.n_samples / index.size / WEIGHT)
         yield total
 
 
@@ -154,9 +151,9 @@ def _smoothed(
         total = convolved(weight, taps)[near]
         row = np.nan_to_num(solved[:, s])
         for k, each in enumerate(noise):
-            own = np.einsum(
-                "ni,nij,nj->n", row, each[:, PLACES_OF_SIX].reshape(-1, 3, 3), row
-            ).reshape(grid.shape)
+            own = np.einsum("ni,nij,nj->n", row, each[:, PLACES].reshape(-1, 3, 3), row).reshape(
+                grid.shape
+            )
             squares = convolved(weight**2 * own, taps**2)[near]
             found[s, k] = np.average(squares / total**2, weights=weight[near])
     return found

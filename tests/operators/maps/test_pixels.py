@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zonda
-from zonda.operators.maps import stokes_sums
+from zonda.operators.maps import binning
 from zonda.operators.maps.grid import HealpixGrid
 from zonda.operators.maps.pixels import Looking
 from zonda.plugins.checks.scenes import scan
@@ -179,13 +179,13 @@ def test_samples_of_bands_go_to_their_maps_together(
     """Behind a step that needs whole scans, whose blocks stay. One of five tiles has the detector
     that is dead in one band.
     """
-    taken, add = [], stokes_sums.add_stokes
+    taken, add = [], binning.add_stokes
 
     def noted(signals: Any, *others: Any) -> None:
         taken.append(len(others[-1]))
         add(signals, *others)
 
-    monkeypatch.setattr(stokes_sums, "add_stokes", noted)
+    monkeypatch.setattr(binning, "add_stokes", noted)
     how, steps = (
         {"nside": 1024, "weights": weights},
         (Spoilt(what=spoilt), zonda.PolynomialFilter(order=1)),

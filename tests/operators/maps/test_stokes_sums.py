@@ -237,7 +237,7 @@ def test_nothing_counts_in_a_tile_without_good_samples():
 
 
 def test_a_window_enters_the_noise_squared() -> None:
-    """Equation (2) of `stokes_sums`: two samples of window 1/2 add 2 x 1/4 of their w^2 sigma^2 to
+    """Equation (2) of `binning`: two samples of window 1/2 add 2 x 1/4 of their w^2 sigma^2 to
     N, 2 x 1/2 of w to A.
     """
     sums, one, index = np.zeros((1, DATA + 3 + 6), np.int64), np.ones(1), np.zeros(1, np.int64)
