@@ -26,13 +26,13 @@ from zonda.operators.io.time_ordered_data import TimeOrderedData
 from zonda.operators.io.toast_hdf5 import (
     FLAGS_ARE,
     WEATHER,
+    columns_of,
     detectors_table,
     name_uid,
     nominal_noise,
+    offsets_of,
     session_of,
-    tod_azimuth_elevation,
 )
-from zonda.operators.io.toast_reading import columns_of, offsets_of
 
 from .scans import Source, scan_of
 
@@ -134,15 +134,7 @@ def _weather(weather: GroundWeather) -> Any:
 
 
 def _fill_shared(ob: Any, tod: TimeOrderedData) -> None:
-    shared: dict[str, Any] = {"times": tod.times, "seconds": tod.seconds, "flags": tod.flags}
-    for name in ("boresight_azel", "boresight_radec"):
-        if len(getattr(tod, name)):
-            shared[name] = getattr(tod, name)
-    if len(tod.boresight_azel):
-        shared["azimuth"], shared["elevation"] = tod_azimuth_elevation(tod)
-    if tod.hwp_angle is not None:
-        shared["hwp_angle"] = tod.hwp_angle
-    for name, values in shared.items():
+    for name, values in tod.of_samples().items():
         ob.shared.create_column(name, values.shape, dtype=values.dtype)
         ob.shared[name].set(np.ascontiguousarray(values), fromrank=0)
 

@@ -16,12 +16,21 @@ from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, OutputError
+from zonda.core.flags import DETECTOR_MASK
 from zonda.core.output import StreamOutput, output_folder
 from zonda.core.product import Record
-from zonda.core.storage.files import atomic_path, discard, product_path, publish, temporary_sibling
+from zonda.core.storage.files import (
+    atomic_path,
+    check_memory,
+    discard,
+    product_path,
+    publish,
+    temporary_sibling,
+)
 from zonda.core.stream_names import UNITS, StreamName, streams_asked, streams_needed
 
-from . import fits_table, toast_hdf5, toast_reading
+from . import fits_table, toast_hdf5
+from .recorded_stream import kelvin_per
 from .time_ordered_data import TimeOrderedData
 
 if TYPE_CHECKING:
@@ -193,14 +202,33 @@ def _provenance(data: Data) -> dict[str, str | int | float]:
 
 
 def load_tod(path: str | os.PathLike[str]) -> TimeOrderedData:
-    """Read a file that `SaveTOD` wrote, or another TOAST layout-2 HDF5 file.
+    """Read a file that `SaveTOD` wrote, or another TOAST layout-2 HDF5 file. Temperatures are
+    converted to K; single samples that it flags (`DETECTOR_MASK`) become NaN.
 
     Raises
     ------
     InputError
         When it cannot be read as such.
     """
-    return fits_table.read(path) if is_fits(path) else toast_reading.read(path)
+    opened = reader(path, whole=True)
+    tod, place = opened.tod, opened.place
+    every, samples = np.arange(tod.n_detectors), slice(0, tod.n_samples)
+    try:
+        spoilt: Any = opened.flags(every, samples)
+        if spoilt is not None:
+            spoilt = (spoilt & ~tod.detector_flags[:, None] & np.uint8(DETECTOR_MASK)) != 0
+        for name, unit in opened.streams.items():
+            check_memory(8 * len(every) * tod.n_samples, f"the stream {name}", place)
+            values = opened.read(name, every, samples)
+            if (factor := kelvin_per(unit) or 1.0) != 1.0:
+                values = values * factor
+            if spoilt is not None and spoilt.any():
+                values = np.where(spoilt, np.nan, values)
+            tod.streams[name] = values
+    finally:
+        opened.close()
+    tod.check(place)
+    return tod
 
 
 def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
@@ -227,11 +255,13 @@ def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
     return Path(path)
 
 
-def reader(path: str | os.PathLike[str]) -> fits_table.Reader | toast_reading.Reader:
-    """An open file, whose streams are read in rectangles. Raises InputError when it cannot be read
-    as such.
+def reader(
+    path: str | os.PathLike[str], *, whole: bool = False
+) -> fits_table.Reader | toast_hdf5.Reader:
+    """An open file, whose streams are read in rectangles; ``whole``: it may be compressed. Raises
+    InputError when it cannot be read as such.
     """
-    return fits_table.Reader(path) if is_fits(path) else toast_reading.Reader(path)
+    return fits_table.Reader(path, whole=whole) if is_fits(path) else toast_hdf5.Reader(path)
 
 
 def is_fits(path: str | os.PathLike[str]) -> bool:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +22,33 @@ from zonda.core.flags import (
     Flags,
     from_file,
     in_file,
+    of_before,
 )
 from zonda.core.intervals import Intervals, runs, samples_in
 from zonda.core.numerics.quaternions import detector_quaternions, directions
+from zonda.core.numerics.sphere import angles
+from zonda.core.storage.files import writing
 from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
 
+OF_SAMPLES = (
+    "times",
+    "seconds",
+    "azimuth",
+    "elevation",
+    "boresight_azel",
+    "boresight_radec",
+    "flags",
+    "hwp_angle",
+)
+"""What a scan may have of each sample, besides its streams."""
 
-@dataclass
+
+def _none() -> NDArray[np.float64]:
+    return np.zeros((0, 4))
+
+
+@dataclass(kw_only=True)
 class TimeOrderedData:
     """The content of a file of time-ordered data.
 
@@ -88,8 +110,8 @@ class TimeOrderedData:
     telescope: str
     field_of_view: float
     site: tuple[str, float, float, float]
-    boresight_azel: NDArray[np.float64]
-    boresight_radec: NDArray[np.float64]
+    boresight_azel: NDArray[np.float64] = field(default_factory=_none)
+    boresight_radec: NDArray[np.float64] = field(default_factory=_none)
     flags: NDArray[np.uint8]
     detector_flags: NDArray[np.uint8]
     names: list[str]
@@ -153,6 +175,25 @@ class TimeOrderedData:
                 place=place,
                 cure="save it again",
             )
+
+    def of_samples(self) -> dict[str, NDArray[Any]]:
+        """What it has of each sample, by name, with azimuth (as recorded, where it is) and
+        elevation of the boresight.
+        """
+        longitude, elevation = angles(directions(self.boresight_azel))
+        azimuth = -longitude % (2 * np.pi) if self.azimuth is None else self.azimuth
+        found = vars(self) | {"azimuth": azimuth, "elevation": elevation}
+        every = {name: found[name] for name in OF_SAMPLES}
+        return {name: v for name, v in every.items() if v is not None and len(v)}
+
+    def update_flags(self) -> None:
+        """Make flags of a file that an earlier zonda wrote TOAST's; its *processing* is
+        trimmed.
+        """
+        self.flags = of_before(self.flags, samples=True)
+        self.detector_flags = of_before(self.detector_flags, samples=False)
+        processed = (self.flags & np.uint8(PROCESSING)) != 0
+        self.intervals[TRIMMED_INTERVALS] = runs(processed, self.seconds)
 
     def take_flags(self, observation: Observation) -> None:
         """Take the flags that a scan has now, and its intervals."""
@@ -275,3 +316,31 @@ class TimeOrderedData:
         )
         found.take_flags(o)
         return found
+
+
+class TodWriter:
+    """Base of what writes a scan, rectangle by rectangle; a subclass has `write`, `_finish` and
+    `_close`.
+    """
+
+    def __init__(self, path: Path, tod: TimeOrderedData) -> None:
+        self.path, self.tod = path, tod
+
+    def finish(self) -> None:
+        """Write all but the streams, and close the file."""
+        with writing(self.path):
+            try:
+                self._finish()
+            finally:
+                self._close()
+
+    def close(self) -> None:
+        """Close an unfinished file."""
+        with suppress(OSError):  # nothing is lost: the caller removes the file
+            self._close()
+
+    def _finish(self) -> None:
+        raise NotImplementedError
+
+    def _close(self) -> None:
+        raise NotImplementedError

@@ -1,5 +1,5 @@
-"""TOAST 3's HDF5 observation file, layout version 2, written with h5py alone (`toast_reading` reads
-it).
+"""TOAST 3's HDF5 observation file, layout version 2, written and read with h5py alone: streams in
+rectangles, all else at once.
 
 What TOAST requires of a file is in its `toast.io.observation_hdf_utils`; sotodlib's
 ``load_toast_h5_file`` reads the same file. TOAST wants float64 signals, and an uncompressed
@@ -8,24 +8,27 @@ What TOAST requires of a file is in its `toast.io.observation_hdf_utils`; sotodl
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
+import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from zonda.core.flags import INVALID
-from zonda.core.numerics.quaternions import directions
-from zonda.core.numerics.sphere import angles
-from zonda.core.storage.files import writing
-from zonda.core.storage.hdf5_files import Disk
+from zonda.core.configuration.time import Instant
+from zonda.core.errors import InputError
+from zonda.core.flags import INVALID, Flags
+from zonda.core.storage.files import reading, writing
+from zonda.core.storage.hdf5_files import Disk, check_size, checked
 from zonda.core.stream_names import UNITS
-from zonda.core.types import AnyFloats
+from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
 
-from .time_ordered_data import TimeOrderedData
+from .time_ordered_data import OF_SAMPLES, TimeOrderedData, TodWriter
+from .toast_noise import DEFAULT_MODEL, columns_of_model, models
 
 SUFFIX = ".h5"
 
@@ -60,7 +63,7 @@ def name_uid(name: str) -> int:
     return int.from_bytes(hashlib.md5(name.encode()).digest(), "little") & 0x7FFFFFFF
 
 
-class Writer:
+class Writer(TodWriter):
     """Writes one observation, streams in rectangles and in any order. Not thread-safe: guard it.
 
     Parameters
@@ -78,7 +81,7 @@ class Writer:
     def __init__(self, path: Path, tod: TimeOrderedData, streams: list[str], dtype: str) -> None:
         import h5py
 
-        self.path, self._tod = path, tod
+        super().__init__(path, tod)
         with writing(path):
             self._disk = Disk(path)
             self._file = h5py.File(self._disk, "w")
@@ -103,43 +106,34 @@ class Writer:
         """The flags of the detectors' samples; made where they are not there yet."""
         group = self._file["detdata"]
         if "flags" not in group:
-            group.create_dataset("flags", (self._tod.n_detectors, self._tod.n_samples), "u1").attrs[
-                "units"
-            ] = ""
+            made = group.create_dataset("flags", (self.tod.n_detectors, self.tod.n_samples), "u1")
+            made.attrs["units"] = ""
         return group["flags"]
 
-    def finish(self) -> None:
-        """Write everything else and close the file."""
-        with writing(self.path):
-            try:
-                self._disk.check()
-                _write_root(self._file, self._tod)
-                _write_instrument(self._file.create_group("instrument"), self._tod)
-                _write_metadata(self._file, self._tod)
-                _write_shared(self._file, self._tod)
-                flags = self._flags()
-                for d in np.flatnonzero(
-                    self._tod.detector_flags
-                ):  # rows never written are zeros and take no room
-                    flags[int(d)] |= self._tod.detector_flags[d]
-            finally:
-                self._file.close()
-                self._disk.close()
+    def _finish(self) -> None:
+        self._disk.check()
+        _write_root(self._file, self.tod)
+        _write_instrument(self._file.create_group("instrument"), self.tod)
+        _write_metadata(self._file, self.tod)
+        _write_shared(self._file, self.tod)
+        flags = self._flags()
+        for d in np.flatnonzero(self.tod.detector_flags).tolist():
+            flags[d] |= self.tod.detector_flags[d]  # rows never written are zeros, without room
 
-    def close(self) -> None:
-        """Close an unfinished file."""
-        with contextlib.suppress(OSError):  # nothing is lost: the caller removes the file
-            self._file.close()
-            self._disk.close()
+    def _close(self) -> None:
+        self._file.close()
+        self._disk.close()
 
 
 def _write_root(file: Any, tod: TimeOrderedData) -> None:
-    file.attrs["toast_format_version"] = 2
-    file.attrs["observation_name"] = tod.name
-    file.attrs["observation_uid"] = name_uid(tod.name)
-    file.attrs["observation_samples"] = tod.n_samples
-    file.attrs["observation_detector_sets"] = "NONE"
-    file.attrs["observation_sample_sets"] = "NONE"
+    file.attrs.update(
+        toast_format_version=2,
+        observation_name=tod.name,
+        observation_uid=name_uid(tod.name),
+        observation_samples=tod.n_samples,
+        observation_detector_sets="NONE",
+        observation_sample_sets="NONE",
+    )
     _long_attribute(file, "observation_detectors", json.dumps(tod.names))
     flags = dict(zip(tod.names, tod.detector_flags.tolist(), strict=True))
     _long_attribute(file, "observation_detector_flags", json.dumps(flags))
@@ -282,19 +276,8 @@ def _write_noise(group: Any, tod: TimeOrderedData, frequency: AnyFloats, psd: An
 
 
 def _write_shared(file: Any, tod: TimeOrderedData) -> None:
-    azimuth, elevation = tod_azimuth_elevation(tod)
-    shared = {
-        "times": tod.times,
-        "seconds": tod.seconds,
-        "azimuth": azimuth,
-        "elevation": elevation,
-        "boresight_azel": tod.boresight_azel,
-        "boresight_radec": tod.boresight_radec,
-        "flags": tod.flags,
-        **({} if tod.hwp_angle is None else {"hwp_angle": tod.hwp_angle}),
-    }
     group = file.create_group("shared")
-    for name, values in shared.items():
+    for name, values in tod.of_samples().items():
         group.create_dataset(name, data=values).attrs["comm_type"] = "column"
     intervals = file.create_group("intervals")
     intervals.attrs["times"] = "times"
@@ -305,7 +288,282 @@ def _write_shared(file: Any, tod: TimeOrderedData) -> None:
         )  # to the last bit those of samples
 
 
-def tod_azimuth_elevation(tod: TimeOrderedData) -> tuple[AnyFloats, AnyFloats]:
-    """Azimuth, as recorded where it is, and elevation of a scan, rad."""
-    longitude, elevation = angles(directions(tod.boresight_azel))
-    return -longitude % (2 * np.pi) if tod.azimuth is None else tod.azimuth, elevation
+# --------------------------------------------------------------------------------------------------
+# reading
+
+KIND, CURE = (
+    "HDF5 in TOAST's layout",
+    "give an HDF5 file in TOAST's layout, whole, as SaveTOD writes it",
+)
+AGAIN = "save it again with TOAST 3.0 or later, or with SaveTOD"
+
+PARTS = {
+    "instrument": "no instrument",
+    "instrument/focalplane": "no focal plane",
+    "shared": "no pointing",
+    "shared/times": "no times of the samples",
+    "detdata": "no data of detectors",
+}
+"""What must be there, and what to say where it is not."""
+
+
+class Reader:
+    """An open file. `read` and `flags` may be called from several threads at once.
+
+    Attributes
+    ----------
+    tod
+        All but the streams.
+    streams
+        Names of the streams, with their units as the file has them.
+
+    Raises
+    ------
+    InputError
+        No such file, not HDF5, another layout, an item that TOAST requires is missing, or what is
+        in it does not fit together.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.place = f"time-ordered data {path}"
+        with reading(self.place, KIND, CURE):
+            self._file = checked(path, self.place, CURE)
+        try:
+            with reading(self.place, KIND, CURE):
+                _check_parts(self._file, self.place)
+                self.tod = _read(self._file, self.place)
+                self.streams = self._streams()
+            self.tod.check(self.place)
+        except BaseException:
+            self.close()
+            raise
+
+    def read(self, stream: str, detectors: NDArray[np.intp], samples: slice) -> AnyFloats:
+        """(n, m) values of a stream: rows ``detectors`` (n,) of the file, in its own units and
+        type.
+        """
+        with reading(self.place, KIND, CURE):
+            found: AnyFloats = _rectangle(self._file["detdata"][stream], detectors, samples)
+            return found
+
+    def flags(self, detectors: NDArray[np.intp], samples: slice) -> Flags | None:
+        """(n, m) uint8, flags of each sample of each detector; None: the file has none."""
+        found = self._file["detdata"].get("flags")
+        if found is None:
+            return None
+        with reading(self.place, KIND, CURE):
+            return np.asarray(_rectangle(found, detectors, samples), np.uint8)
+
+    def noise(self, model: str | None, mask: int) -> dict[str, Floats]:
+        """`TimeOrderedData.columns` of the noise of a model of the file; None: of `DEFAULT_MODEL`,
+        nothing where there is none.
+
+        ``mask``: detectors with one of these bits are not used. Raises InputError where there is no
+        model of this name, or it cannot be used.
+        """
+        have = models(self._file)
+        if model is None and DEFAULT_MODEL not in have:
+            return {}
+        if model is not None and model not in have:
+            cure = f"choose from: {', '.join(have)}" if have else "leave noise_model out"
+            raise InputError(
+                f"has no noise model {model!r} (/metadata)", place=self.place, cure=cure
+            )
+        with reading(self.place, KIND, CURE):
+            group, unused = (
+                self._file["metadata"][model or DEFAULT_MODEL],
+                (self.tod.detector_flags & np.uint8(mask)) != 0,
+            )
+            return columns_of_model(group, self.tod.names, unused, self.place)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _streams(self) -> dict[str, str]:
+        """Names and units; their shapes are checked."""
+        import h5py
+
+        shape, found = (self.tod.n_detectors, self.tod.n_samples), {}
+        for name, item in self._file["detdata"].items():
+            for dataset in [item] if isinstance(item, h5py.Dataset) else item.values():
+                if isinstance(dataset, h5py.Dataset):
+                    check_size(dataset, self.place, whole=False)
+            if isinstance(item, h5py.Dataset) and (
+                item.shape != shape or item.dtype.kind not in "fiu"
+            ):
+                what = f"detdata/{name} is {' x '.join(map(str, item.shape))} of {item.dtype}"
+                raise InputError(
+                    f"{what}, not {shape[0]} x {shape[1]} numbers", place=self.place, cure=AGAIN
+                )
+            if name != "flags":
+                found[name] = str(item.attrs.get("units", "K"))
+        return found
+
+
+def _check_parts(file: Any, place: str) -> None:
+    version = file.attrs.get("toast_format_version")
+    if version != 2:
+        raise InputError(f"toast_format_version is {version}, not 2", place=place, cure=AGAIN)
+    for part, what in PARTS.items():
+        if part not in file:
+            raise KeyError(f"there is {what} (/{part})")
+    for name, item in file["shared"].items():
+        if name in OF_SAMPLES and (not hasattr(item, "dtype") or item.dtype.kind not in "fiu"):
+            text = f"shared/{name} holds no numbers ({getattr(item, 'dtype', 'a group')})"
+            raise InputError(text, place=place, cure=AGAIN)
+    if not {"boresight_azel", "boresight_radec"} & set(file["shared"]):
+        raise KeyError("there is no pointing (shared/boresight_azel, shared/boresight_radec)")
+
+
+def _rectangle(item: Any, rows: NDArray[np.intp], samples: slice) -> Any:
+    """Rows and samples of a data set, or of a group that holds a FLAC-compressed one."""
+    import h5py
+
+    first, last = int(rows[0]), int(rows[-1]) + 1
+    wanted = (
+        slice(first, last)
+        if last - first == len(rows) and (np.diff(rows) == 1).all()
+        else rows.tolist()
+    )
+    if isinstance(item, h5py.Dataset):
+        return item[wanted, samples]
+    if "flacarray_format_version" not in item.attrs:
+        raise InputError(
+            f"{item.name} is a group, not a data set",
+            cure="save it again, uncompressed or with FLAC",
+        )
+    try:
+        from flacarray.hdf5 import read_array
+    except ImportError:
+        raise InputError(
+            f"{item.name} is compressed with FLAC", cure="pip install flacarray"
+        ) from None  # the extra flac
+    keep = np.zeros(int(item["stream_starts"].shape[0]), bool)
+    keep[rows] = True
+    found = np.asarray(read_array(item, keep=keep, stream_slice=samples)).reshape(len(rows), -1)
+    return found.astype(np.dtype(str(item.attrs["dtype"]))) if "dtype" in item.attrs else found
+
+
+def _read(file: Any, place: str) -> TimeOrderedData:
+    """Read everything but the streams."""
+    import astropy.units as u
+
+    instrument, shared = file["instrument"], file["shared"]
+    spans = file.get("intervals", {})
+    for dataset in (*shared.values(), *spans.values(), instrument["focalplane"]):
+        check_size(dataset, place)
+    names = [str(d) for d in json.loads(file.attrs["observation_detectors"])]
+    table, rows = _focalplane(instrument, names, place)
+    given = {name: shared[name][:] for name in OF_SAMPLES if name in shared}
+    given.pop("elevation", None)
+    times = given["times"]
+    seconds = given.setdefault("seconds", times - times[0])
+    given["flags"] = np.asarray(given.get("flags", np.zeros(len(times))), np.uint8)
+    other: Mapping[str, Any] = file["metadata/other"].attrs if "metadata/other" in file else {}
+    start = other.get("zonda_start_utc")
+    if start is None:
+        start = Instant(round(float(times[0]) * 1e9)).isoformat()
+    kept = (k for k in other if k.startswith("zonda_") and k not in ("zonda_start_utc", FLAGS_ARE))
+    own = {k.removeprefix("zonda_"): other[k] for k in kept}
+    of_detectors = json.loads(file.attrs["observation_detector_flags"])
+    a = instrument.attrs
+    tod = TimeOrderedData(
+        name=str(file.attrs["observation_name"]),
+        start=str(start),
+        sample_rate=float(table.meta["sample_rate"].to_value(u.Hz)),
+        telescope=str(a["telescope_name"]),
+        field_of_view=float(table.meta["field_of_view"].to_value(u.rad)),
+        site=(
+            str(a["site_name"]),
+            float(np.radians(a["site_lat_deg"])),
+            float(np.radians(a["site_lon_deg"])),
+            float(a["site_alt_m"]),
+        ),
+        detector_flags=np.array([of_detectors[d] for d in names], np.uint8),
+        names=names,
+        quats=np.asarray(table["quat"][rows], np.float64),
+        columns=columns_of(table, rows),
+        intervals={name: _in_seconds(found[:], times, seconds) for name, found in spans.items()},
+        weather=_weather(a),
+        metadata={k: v.item() if isinstance(v, np.generic) else v for k, v in own.items()},
+        offsets=offsets_of(table, rows),
+        **given,
+    )
+    if "zonda_start_utc" in other and FLAGS_ARE not in other:
+        tod.update_flags()
+    return tod
+
+
+def _in_seconds(spans: Any, times: AnyFloats, seconds: AnyFloats) -> list[tuple[float, float]]:
+    start, stop = np.interp(np.asarray(spans, np.float64), times, seconds)
+    return list(zip(start.tolist(), stop.tolist(), strict=True))
+
+
+def columns_of(table: Any, rows: NDArray[np.intp]) -> dict[str, Floats]:
+    """`TimeOrderedData.columns` of these rows of TOAST's table of detectors."""
+    import astropy.units as u
+
+    columns = {}
+    for ours, (theirs, unit, si) in COLUMNS.items():
+        if theirs in table.colnames:
+            values = table[theirs][rows]
+            columns[ours] = np.array(
+                u.Quantity(values, unit).to_value(si) if unit else values, np.float64
+            )
+    if "pol_leakage" in table.colnames:
+        epsilon = np.asarray(table["pol_leakage"][rows], np.float64)
+        columns.setdefault("polarization_efficiency", (1 - epsilon) / (1 + epsilon))
+    elif "polarization_angle" in columns:  # as TOAST's StokesWeights, whose epsilon is 0 then
+        columns.setdefault("polarization_efficiency", np.ones(len(rows)))
+    return columns
+
+
+def offsets_of(table: Any, rows: NDArray[np.intp]) -> Floats | None:
+    """`TimeOrderedData.offsets` of these rows of TOAST's table of detectors."""
+    return (
+        np.array([table[k][rows] for k in OFFSETS]).T if {*OFFSETS} <= set(table.colnames) else None
+    )
+
+
+def _focalplane(instrument: Any, names: list[str], place: str) -> tuple[Any, NDArray[np.intp]]:
+    """The table of detectors, and the rows of those that have data."""
+    from astropy.io.misc.hdf5 import read_table_hdf5
+    from astropy.table import QTable
+
+    table = QTable(read_table_hdf5(instrument, path="focalplane", character_as_bytes=False))
+    every = [str(name) for name in np.asarray(table["name"]).astype(str)]
+    order = {name: k for k, name in enumerate(every)}
+    for what, of in ((names, "observation_detectors"), (every, "the focal plane")):
+        if len(set(what)) < len(what):
+            twice = next(name for name in what if what.count(name) > 1)
+            cure = "give every detector a name of its own, and save it again"
+            raise InputError(f"detector {twice!r} is there twice in {of}", place=place, cure=cure)
+    if lacking := [name for name in names if name not in order]:
+        raise InputError(
+            f"detector {lacking[0]!r} has data, and no row in the focal plane",
+            place=place,
+            cure=AGAIN,
+        )
+    return table, np.array([order[name] for name in names], np.intp)
+
+
+def _weather(attributes: Any) -> GroundWeather | None:
+    """None where there is none, or one that states no numbers (TOAST's simulated weather names its
+    distribution alone).
+    """
+    import astropy.units as u
+
+    if not {"weather_time", *(f"weather_{theirs}" for theirs, _ in WEATHER.values())} <= set(
+        attributes
+    ):
+        return None
+    stated = {
+        ours: float(
+            u.Quantity(str(attributes[f"weather_{theirs}"])).to_value(
+                unit or u.dimensionless_unscaled
+            )
+        )
+        for ours, (theirs, unit) in WEATHER.items()
+    }
+    return GroundWeather(time=float(attributes["weather_time"]), **stated)

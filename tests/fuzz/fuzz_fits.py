@@ -24,8 +24,7 @@ with guided_by(
     from fuzz_hdf5 import tiny_scan, whole
 
     from zonda.core.errors import ZondaError
-    from zonda.operators.io import fits_table
-    from zonda.operators.io.save_tod import save_tod
+    from zonda.operators.io.save_tod import load_tod, save_tod
     from zonda.operators.sky.input_map import HealpixMap
     from zonda.operators.sky.read import read_map
 
@@ -38,7 +37,7 @@ def target(data: bytes) -> None:
     FILE.write_bytes(data)
     if data[-1:] == b"\1":
         try:
-            tod = fits_table.read(FILE)
+            tod = load_tod(FILE)
         except ZondaError as err:
             told(err)
             return

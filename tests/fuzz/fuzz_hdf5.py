@@ -20,8 +20,7 @@ with guided_by("zonda.operators.io", "zonda.operators.atmosphere.weather", "scip
     from zonda.core.errors import ZondaError
     from zonda.core.site import Site
     from zonda.operators.atmosphere.weather.era5 import read_era5
-    from zonda.operators.io import toast_reading
-    from zonda.operators.io.save_tod import save_tod
+    from zonda.operators.io.save_tod import load_tod, save_tod
     from zonda.operators.io.time_ordered_data import TimeOrderedData
 
 FILE = scratch(".h5")
@@ -57,7 +56,7 @@ def target(data: bytes) -> None:
     FILE.write_bytes(data[1:])
     try:
         if data[:1] == b"\1":
-            whole(toast_reading.read(FILE))
+            whole(load_tod(FILE))
         else:
             column = read_era5(FILE, SITE, TIME)
             assert all(

@@ -33,7 +33,7 @@ from zonda.core.numerics.quaternions import detector_quaternions
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
 from zonda.core.weather import GroundWeather
-from zonda.operators.io import fits_table, toast_reading
+from zonda.operators.io import fits_table, toast_hdf5
 from zonda.operators.io.save_tod import SaveTOD, load_tod, save_tod
 
 
@@ -480,13 +480,13 @@ def test_a_stream_that_is_not_there(make_observation, streams, mean):
     operator.discard(observation, state)
 
 
-@pytest.mark.parametrize("module", [toast_reading, fits_table])
+@pytest.mark.parametrize("module", [toast_hdf5, fits_table])
 def test_files_that_cannot_be_read(module, tmp_path):
     with pytest.raises(InputError, match="no such file"):
-        module.read(tmp_path / "absent")
+        module.Reader(tmp_path / "absent")
     (tmp_path / "text").write_text("this is neither HDF5 nor FITS\n" * 200)
     with pytest.raises(InputError, match="cannot be read as"):
-        module.read(tmp_path / "text")
+        module.Reader(tmp_path / "text")
 
 
 def test_an_incomplete_hdf5_file(tmp_path, make_observation, data, streams, mean):

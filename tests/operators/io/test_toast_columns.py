@@ -7,7 +7,7 @@ import pytest
 from astropy import units as u
 from astropy.table import QTable
 
-from zonda.operators.io.toast_reading import columns_of
+from zonda.operators.io.toast_hdf5 import columns_of
 
 
 @pytest.mark.parametrize(

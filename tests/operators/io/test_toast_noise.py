@@ -14,7 +14,7 @@ from zonda.core.errors import InputError
 from zonda.core.flags import INVALID
 from zonda.core.testing_scan import Given, Points, made_up_scene
 from zonda.operators.io.save_tod import load_tod, save_tod
-from zonda.operators.io.toast_reading import fit
+from zonda.operators.io.toast_noise import fit
 
 TRUTH = [
     (3e-4, 0.1, 1e-3, 1.0),
