@@ -126,7 +126,8 @@ class Registry:
             name or (own if isinstance(own, str) else None) or getattr(component, "__name__", None)
         )
         found = Found(key or repr(component), _reference(component), SESSION, "")
-        self._check(component, found)
+        if self.classes or key:
+            self._check(component, found)
         if not key:
             raise RegistryError(
                 f"this {self.kind} has no name", cure="give one: register(component, name='...')"
