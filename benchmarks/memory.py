@@ -102,7 +102,7 @@ def scene(instrument):
 
 def one(name, budget, threads):
     """Predicted and actual memory of one case, as JSON."""
-    import zonda.core.pipeline
+    import zonda.core.run.budget
     from zonda.core.errors import PipelineError
     from zonda.core.run.budget import divided
     from zonda.core.run.schedule import schedule
@@ -112,14 +112,14 @@ def one(name, budget, threads):
     pipeline = chain(**case)
     told = {}
 
-    def listen(steps, longest, settings, *more):
-        found = divided(steps, longest, settings, *more)
-        blocks = schedule(steps, longest, found)
+    def listen(views, settings, *more):
+        found = divided(views, settings, *more)
+        blocks = schedule(views, found)
         told["predicted"] = (settings.process - found.memory + blocks.bytes) / 1e9
         told["elsewhere"] = ", ".join(blocks.elsewhere)
         return found
 
-    zonda.core.pipeline.divided = listen
+    zonda.core.run.budget.divided = listen
     try:
         data = pipeline.run(where, threads=threads, ceiling=int(budget * 1e9))
     except PipelineError as error:

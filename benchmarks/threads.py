@@ -95,7 +95,7 @@ def profile(name: str) -> None:
         return plain, timed
 
     kept = {}
-    for method in ("prepare", "measure", "collect"):
+    for method in ("prepare", "_measure", "_act"):
         kept[method], timed = watched(method)
         setattr(Execution, method, timed)
     wall, cpu = time.perf_counter(), time.process_time()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -119,6 +119,80 @@ class Data:
         """
         bands = len(self.scene.instrument.bands) if not self.band else 0
         return self.pointed or self.observations[:: bands or 1]
+
+    def use_recorded(self, label: str, own: Mapping[str, Any]) -> None:
+        """Give the scene the instrument and the site of recorded data (`WithScene.own_scene`) that
+        the step of this label reads.
+        """
+        for what in ("instrument", "site"):
+            one, other = own[what].name, getattr(self.scene, what).name
+            text = f"{one}, the file's"
+            if one != other:
+                text += f"; the scene's {other} is not used"
+            self.tally.state(label, what, text)
+        self.scene = self.scene.model_copy(
+            update={what: own[what] for what in ("site", "instrument")}
+        )
+
+    def split(self) -> list[Data]:
+        """Make the data of each band (`bands`); none where the camera has one."""
+        instrument = self.scene.instrument
+        self.bands = {
+            name: Data(
+                self.scene.model_copy(update={"instrument": camera}),
+                provenance=dict(self.provenance),
+                output=self.output,
+                threads=self.threads,
+                laid_out=self.laid_out,
+                band=name,
+            )
+            for name, camera in (instrument.cameras.items() if instrument.bands else ())
+        }
+        return list(self.bands.values())
+
+    def hand_out(self, scans: Sequence[Observation] = ()) -> None:
+        """Give each band its views of the scans as they were pointed, or the ``scans`` that are
+        its views; and its part of what is laid out and added up (`gather`).
+        """
+        for scan in () if scans else self.observations:
+            common: dict[Hashable, Any] = {}
+            for own, view in zip(self.bands.values(), scan.of_each_band(), strict=True):
+                view.common = common
+                own.observations.append(view)
+        self.pointed = [] if scans else self.observations
+        for own in self.bands.values():
+            own.observations += [s for s in scans if s.instrument == own.scene.instrument]
+            both: Any = (self.partial, own.partial), (self.layouts, own.layouts)
+            for whole, part in both:
+                for label in [key for key in whole if key.endswith(f" {own.band}")]:
+                    part[label.removesuffix(f" {own.band}")] = whole.pop(label)
+
+    def gather(self) -> None:
+        """Put together what the bands made: products, labels and entries of the log bear the band's
+        name; nothing where there is one band.
+
+        What pointing counted in the scans is added once, not for each band.
+        """
+        for scan in self.pointed:
+            self.tally.update(scan.tally)
+        scans = zip(*(own.observations for own in self.bands.values()), strict=True)
+        self.observations = [s for views in scans for s in views] or self.observations
+        for band, own in self.bands.items():
+            for name, product in own.products.items():
+                if isinstance(product, list):  # of files
+                    self.products.setdefault(name, []).extend(product)
+                    continue
+                signal, slash, plain = name.rpartition("/")
+                key = f"{signal}{slash}{own.named(plain)}"
+                if key in self.products:
+                    cure = "rename the band, or give the step another product name"
+                    raise PipelineError(
+                        f"two steps make the product {key!r}", place=f"band {band}", cure=cure
+                    )
+                self.products[key] = product
+            self.partial |= {f"{label} {band}": part for label, part in own.partial.items()}
+            self.layouts |= {f"{label} {band}": part for label, part in own.layouts.items()}
+            self.tally.update(own.tally, suffix=f" {band}")
 
     def named(self, key: str) -> str:
         """The name of a product or file of these data, the band's behind it where the camera has

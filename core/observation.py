@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .emission import LoadSpectra, mean_emission
+from .errors import InputError
 from .flags import DEAD, EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, good
 from .focalplane import Focalplane
 from .intervals import Intervals, runs
@@ -220,17 +221,45 @@ class Observation:
         return self.seen_of or (self.n_samples, self.sample_rate)
 
     def of_each_band(self) -> list[Observation]:
-        """The scan as a camera with each of the instrument's bands alone sees it; itself where
-        there is one.
+        """The scan as a camera with each of the instrument's bands alone sees it: its detectors,
+        with flags and counts of its own; itself where there is one.
+
+        Raises InputError for a band that has no detector.
         """
         if not self.instrument.bands:
             return [self]
-        cameras = enumerate(self.instrument.cameras.values())
-        none = np.zeros(0, np.uint8)
-        return [
-            replace(self, instrument=c, focalplane=self.focalplane.of_band(k), detector_flags=none)
-            for k, c in cameras
-        ]
+        found = []
+        for number, (band, camera) in enumerate(self.instrument.cameras.items()):
+            rows = self.focalplane.band == number
+            if not rows.any():
+                raise InputError(
+                    f"the focal plane has no detector of the band {band}",
+                    place=f"instrument {camera.name}",
+                    cure=(
+                        "a class that lays out detectors of several bands joins them with"
+                        " Focalplane.of_bands"
+                    ),
+                )
+            view = replace(
+                self,
+                name=f"{self.name}-{band}",
+                instrument=camera,
+                focalplane=self.focalplane.of_band(number),
+                flags=self.flags.copy(),
+                detector_flags=self.detector_flags[rows],
+                intervals=dict(self.intervals),
+                smooth={},
+                detdata={},
+                noise_levels={},
+                closed_forms={},
+                windows={},
+                quoted_net=None,
+                expected_load=None,
+                load_spectra=None,
+                tally=Tally(),
+            )
+            found.append(view)
+        return found
 
     def looks_as(self, other: Observation) -> bool:
         """Tell whether the detectors are where those of another band of the scan are."""

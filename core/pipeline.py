@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,32 +12,21 @@ import numpy as np
 
 from .assembly import arguments
 from .assembly.order import check_order
-from .assembly.signals import Signals, note_signals, remainder
+from .assembly.signals import Signals, acting_steps, note_signals, remainder
 from .data import Data
 from .errors import PipelineError
 from .faults import faults_named
 from .hooks import manager
 from .machine import available_memory, available_threads
-from .mapmaker import joins
 from .observation import Observation
 from .operator import Operator, labels
-from .output import Output, Progress
+from .output import Output
 from .pages import html_table
-from .run.bands import (
-    Band,
-    data_of_bands,
-    distribute,
-    gather,
-    hand_over,
-    of_one_band,
-    points,
-    use_recorded,
-)
-from .run.budget import Budget, held_of, least_memory, longest_of
+from .run.budget import Budget, least_memory
 from .run.execute import execute
-from .run.schedule import Chain
 from .run.settings import Settings, Timer
-from .scene import Scene
+from .run.views import Band, Chain, View
+from .scene import Scene, WithScene
 from .signal import Signal, stream_of
 from .storage.files import check_output_folder
 from .versions import versions
@@ -61,10 +50,6 @@ class Part:
     scans: Sequence[int] | None = None
     layouts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     prefix: str = ""
-
-
-Bands = list[tuple["Pipeline", Data]]
-"""Steps and data that observe with each band of the camera."""
 
 
 class Pipeline:
@@ -116,7 +101,7 @@ class Pipeline:
             lines = [f"step {p.index + 1}: {p.message} ({p.label})" for p in problems]
             cures = dict.fromkeys(p.cure for p in problems if p.cure)
             raise PipelineError("\n".join(lines), place=self.name, cure="\n".join(cures))
-        self._pointed: Bands = []
+        self._pointed: list[Band] = []
         self._asked = arguments.runs(runs, name)
         self.signals = Signals(self.operators, self._asked, self.only, self.name)
 
@@ -128,7 +113,10 @@ class Pipeline:
     @property
     def chain(self) -> Chain:
         """The steps that act on every observation, with the signals that they make."""
-        return Chain(self.signals.steps, self.signals.formed, self.signals.components)
+        return self._chain(self.operators)
+
+    def _chain(self, operators: Sequence[Operator]) -> Chain:
+        return Chain(acting_steps(operators), self.signals.formed, self.signals.components)
 
     @faults_named(exceptions=False)
     def run(
@@ -179,62 +167,57 @@ class Pipeline:
         hooks.zonda_pipeline_start(pipeline=self, data=data)
         for operator in self.operators:
             timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
-        bands = self._of_bands(data)
+        bands = self._bands(data)
         self._observe(data, bands, timer)
-        self._execute(bands, settings, tuple(keep), timer, memory)
+        self._execute([band.keeping(keep) for band in bands], settings, timer, memory)
         self._finish(data, bands, timer)
         return data
 
-    def _of_bands(self, data: Data) -> Bands:
-        """The pipeline and the data of each band (`core.run.bands`): this one, and all data, where
-        there is one.
+    def _bands(self, data: Data) -> list[Band]:
+        """The steps and data of each band; all of them where the camera has one.
+
+        A step that acts on a band's data is a copy: it may keep what it lays out for them.
         """
-        use_recorded(data, self.operators)
-        found = data_of_bands(data)
-        if not found:
-            return [(self, data)]
-        made = []
-        for own in found.values():
-            pipeline = Pipeline(
-                self.operators,
-                runs=self._asked,
-                only=self.only,
-                name=self.name,
-                description=self.description,
-                precision=self.precision,
-            )
-            pipeline.operators = [
-                o
-                for o in pipeline.operators
-                if of_one_band(o) and (not isinstance(o, Output) or o.one_band)
+        for operator in self.operators:
+            if isinstance(operator, WithScene):
+                data.use_recorded(operator.label, operator.own_scene(data.scene.instrument))
+        bands = []
+        for own in data.split():
+            copies = [operator.model_copy() for operator in self.operators]
+            acting = [
+                o for o in copies if (o.one_band if isinstance(o, Output) else of_one_band(o))
             ]
-            made.append((pipeline, own))
-        return made
+            bands.append(Band(acting, self._chain(copies), own))
+        return bands or [Band(self.operators, self.chain, data)]
 
     def _observe(
-        self, data: Data, bands: Bands, timer: Timer, *, outputs: bool = True, prefix: str = ""
+        self,
+        data: Data,
+        bands: Sequence[Band],
+        timer: Timer,
+        *,
+        outputs: bool = True,
+        prefix: str = "",
     ) -> None:
         """Let all steps observe, outputs first: they may refuse at once. Bands share the pointing.
         ``prefix``: of scans.
         """
-        several = bands[0][1] is not data
-        for operator in sorted(self.operators, key=lambda o: not isinstance(o, Output)):
-            once = (
-                points(operator)
-                if not isinstance(operator, Output)
-                else outputs and not operator.one_band
-            )
-            if once or not (several or isinstance(operator, Output)) or (outputs and not several):
-                before = len(data.observations)
-                self._timed(timer, operator, "observe", data)
-                for observation in data.observations[
-                    before:
-                ]:  # unique names, before other steps see them
+        several = bool(data.bands)
+        whole = [
+            o
+            for o in self.operators
+            if not several or (not o.one_band if isinstance(o, Output) else points(o))
+        ]
+        for own, operators in ((data, whole), *((b.data, b.operators) for b in bands if several)):
+            for operator in sorted(operators, key=lambda o: not isinstance(o, Output)):
+                if isinstance(operator, Output) and not outputs:
+                    continue
+                before = len(own.observations)
+                self._timed(timer, operator, "observe", own)
+                for observation in own.observations[before:]:  # before other steps see them
                     observation.name = prefix + observation.name
-        if several:
-            distribute(data, [own for _, own in bands])
-            for pipeline, own in bands:
-                pipeline._observe(own, [(pipeline, own)], timer, outputs=outputs)
+            if several and own is data:
+                data.hand_out()
 
     @faults_named(exceptions=False)
     def run_part(
@@ -261,16 +244,16 @@ class Pipeline:
         timer = Timer()
         data.layouts, data.laid_out = dict(part.layouts), True
         manager().hook.zonda_pipeline_start(pipeline=self, data=data)
-        bands = self._of_bands(data)
+        bands = self._bands(data)
         self._observe(data, bands, timer, outputs=False, prefix=part.prefix)
         if part.scans is not None:
             data.pointed = (
                 [data.pointed[k] for k in part.scans] if data.pointed else []
             )  # the tally counts these alone
-            for _, own in bands:
-                own.observations = [own.observations[k] for k in part.scans]
-        self._execute(bands, settings, (), timer, memory, fresh=False)
-        gather(data, [own for _, own in bands])
+            for band in bands:
+                band.data.observations = [band.data.observations[k] for k in part.scans]
+        self._execute(bands, settings, timer, memory, fresh=False)
+        data.gather()
         data.provenance["timings"] = timer.rows()
         manager().hook.zonda_pipeline_end(pipeline=self, data=data)
         return data
@@ -280,12 +263,12 @@ class Pipeline:
         """Finish partial products that were combined, with the layouts that they have in common,
         and let the outputs act.
         """
-        bands = self._of_bands(data)
-        hand_over(data, [own for _, own in bands])
-        for pipeline, own in bands:
-            for operator in pipeline.operators:
-                if operator.label in own.layouts:
-                    operator.observe(own)
+        bands = self._bands(data)
+        data.hand_out(data.observations)
+        for band in bands:
+            for operator in band.operators:
+                if operator.label in band.data.layouts:
+                    operator.observe(band.data)
         manager().hook.zonda_pipeline_start(pipeline=self, data=data)
         self._finish(data, bands, Timer())
         return data
@@ -298,34 +281,23 @@ class Pipeline:
         all is ``laid_out``.
         """
         data = Data(scene, output=output, layouts=dict(layouts), laid_out=laid_out)
-        bands = self._of_bands(data)
-        self._observe(data, bands, Timer(), outputs=False)
-        gather(data, [own for _, own in bands])
-        self._pointed = bands
+        self._pointed = self._bands(data)
+        self._observe(data, self._pointed, Timer(), outputs=False)
+        data.gather()
         return data
 
     def least_memory(self, observations: Sequence[Observation]) -> int:
         """Bytes with which a process runs the pipeline over these observations on one thread,
         libraries included.
         """
-        if len(self._pointed) > 1:
-            shares = [
-                (p, [o for o in observations if o.instrument == own.scene.instrument])
-                for p, own in self._pointed
-            ]
-            in_step = any(map(joins, shares[0][0].chain.steps))
-            held = [held_of(p.chain, longest_of(scans), in_step) for p, scans in shares]
-            return max(
-                p._least_memory(scans, sum(held) - mine)
-                for (p, scans), mine in zip(shares, held, strict=True)
-            )
-        return self._least_memory(observations)
-
-    def _least_memory(self, observations: Sequence[Observation], others: int = 0) -> int:
-        """`least_memory` of one band; ``others``: bytes of the products of other bands."""
-        observation = longest_of(observations)
-        note_signals([observation], self.signals.components, self.signals.formed)
-        return least_memory(self.chain, observation, Settings(dtype=self._dtype), others)
+        views = []
+        for band in self._pointed:
+            camera = band.data.scene.instrument
+            scans = [o for o in observations if not band.data.band or o.instrument == camera]
+            longest = max(scans, key=lambda o: o.n_detectors * o.n_samples)
+            note_signals([longest], self.signals.components, self.signals.formed)
+            views.append(View(band.chain, longest))
+        return least_memory(views, Settings(dtype=self._dtype))
 
     @property
     def _dtype(self) -> type[np.floating[Any]]:
@@ -360,24 +332,20 @@ class Pipeline:
 
     def _execute(
         self,
-        bands: Bands,
+        bands: Sequence[Band],
         settings: Settings,
-        keep: tuple[str, ...],
         timer: Timer,
         memory: int | None,
         fresh: bool = True,
     ) -> None:
         """Run all observations with all bands."""
-        for pipeline, own in bands:
-            pipeline._make_ready(own)
-        parts = [
-            Band(replace(pipeline.chain, keep=keep), own, pipeline._watch)
-            for pipeline, own in bands
-        ]
-        execute(parts, settings, timer, Budget(memory, fresh, self.name))
+        for band in bands:
+            self._make_ready(band)
+        execute(bands, settings, timer, Budget(memory, fresh, self.name))
 
-    def _make_ready(self, data: Data) -> None:
+    def _make_ready(self, band: Band) -> None:
         """Note in the observations what is made of them, and let outputs see them."""
+        data = band.data
         if not data.observations:
             raise PipelineError(
                 "the pointing steps made no observation",
@@ -387,7 +355,7 @@ class Pipeline:
         for observation in data.observations:
             observation.output, observation.focalplane = data.output, observation.focalplane.copy()
         note_signals(data.observations, self.signals.components, self.signals.formed)
-        self._watch(data, "pointing")
+        band.watch("pointing")
         for name, signal in self.signals.runs.items():
             if self.signals.not_linear and signal.modes == "full":
                 text = (
@@ -396,39 +364,38 @@ class Pipeline:
                 )
                 data.tally.state(name, "modes", text)
 
-    def _finish(self, data: Data, bands: Bands, timer: Timer) -> None:
+    def _finish(self, data: Data, bands: Sequence[Band], timer: Timer) -> None:
         """Finish the products of all bands, and let the outputs act."""
-        for pipeline, own in bands:
-            pipeline._make_products(own, timer)
-            if own is not data:
-                pipeline._let_outputs_act(own, timer)
-        gather(data, [own for _, own in bands])
-        self._watch(data, "maps")
-        self._let_outputs_act(data, timer, every=bands[0][1] is data)
+        for band in bands:
+            self._make_products(band, timer)
+            if data.bands:
+                self._let_outputs_act(band.operators, band.data, timer)
+        data.gather()
+        Band(self.operators, bands[0].chain, data).watch("maps")
+        every = [
+            o for o in self.operators if not (data.bands and isinstance(o, Output) and o.one_band)
+        ]
+        self._let_outputs_act(every, data, timer)
         data.provenance["timings"] = timer.rows()
         manager().hook.zonda_pipeline_end(pipeline=self, data=data)
 
-    def _make_products(self, data: Data, timer: Timer) -> None:
+    def _make_products(self, band: Band, timer: Timer) -> None:
         """Subtract the remainders, and finish all products."""
+        data = band.data
         for name, parts in self.signals.remainders.items():
             for product in data.partial.values():
                 if product.signals and stream_of(name) not in product.signals:
                     product.subtract(stream_of(name), [stream_of(part) for part in parts])
             data.tally.state(name, "remainder", remainder(parts))
-        for operator in self.chain.steps:
+        for operator in band.chain.steps:
             self._timed(timer, operator, "finalize", data)
 
-    def _let_outputs_act(self, data: Data, timer: Timer, every: bool = True) -> None:
-        """Finish the outputs; not ``every``: those that act on all bands at once."""
-        for operator in self.operators:
-            if isinstance(operator, Output) and (every or not operator.one_band):
+    def _let_outputs_act(self, operators: Iterable[Operator], data: Data, timer: Timer) -> None:
+        """Finish the outputs."""
+        for operator in operators:
+            if isinstance(operator, Output):
                 data.provenance["timings"] = timer.rows()  # a report knows of the steps before it
                 self._timed(timer, operator, "finalize", data)
-
-    def _watch(self, data: Data, done: Progress) -> None:
-        for operator in self.operators:
-            if isinstance(operator, Output):
-                operator.watch(data, done)
 
     def _timed(
         self, timer: Timer, operator: Operator, stage: Literal["observe", "finalize"], data: Data
@@ -475,3 +442,19 @@ class Pipeline:
 
     def _repr_html_(self) -> str:
         return html_table(f"Pipeline {self.name}", [(o.label, repr(o)) for o in self.operators])
+
+
+def points(operator: Operator) -> bool:
+    """Tell whether a step points the telescope, which is done once for all bands."""
+    return "boresight" in operator.provides
+
+
+def of_one_band(operator: Operator) -> bool:
+    """Tell whether a step acts on each band's data: all do but those that only point, which is
+    done once for all bands.
+
+    A step that points and reads streams too observes the scans of all bands first, and then each
+    band's data (`Data.band`); so does one that reads recorded pointing, whose flags differ from
+    band to band.
+    """
+    return operator.provides != {"boresight"} or isinstance(operator, WithScene)

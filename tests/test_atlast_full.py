@@ -69,18 +69,19 @@ def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     from zonda.core.run.budget import divided
     from zonda.core.run.schedule import schedule
     from zonda.core.run.settings import Settings
+    from zonda.core.run.views import View
 
     file = load("atlast_full", ())
     pipeline, scene = file.pipeline(), file.scene()
     data = Data(scene, output=tmp_path)
     for operator in pipeline.operators:
         operator.observe(data)
-    longest, settings = data.observations[0], Settings(threads=2, process=8 * 10**9)
-    left = divided(pipeline.chain, longest, settings, "test")
-    found = schedule(pipeline.chain, longest, left)
+    longest = [View(pipeline.chain, data.observations[0])]
+    left = divided(longest, Settings(threads=2, process=8 * 10**9), "test")
+    found = schedule(longest, left)
     assert found.bytes < left.memory
     assert any("made again" in what for what in found.elsewhere)
     with pytest.raises(
         PipelineError, match=r"(?s)the run would hold .*BinMap .* GB.*budget is 1 GB.*larger pixel"
     ):
-        divided(pipeline.chain, longest, Settings(threads=2, process=10**9), "test")
+        divided(longest, Settings(threads=2, process=10**9), "test")

@@ -96,12 +96,6 @@ class Planning(Generic[O]):
         """
         return False
 
-    def shares_blocks(self, observation: Observation) -> bool:
-        """True if bands that look through the same pixels save time when each block is worked on
-        with one after the other.
-        """
-        return False
-
 
 def planning_of(operator: Operator) -> Planning[Any]:
     """The planning of an operator; of one that has none, `Planning` itself."""

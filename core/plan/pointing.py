@@ -18,8 +18,7 @@ from ..mapmaker import made_by
 from ..numerics.projection import rotation_matrices
 from ..operator import Operator
 from ..output import Output
-from ..pipeline import Pipeline
-from ..run.bands import data_of_bands, distribute, of_one_band, points
+from ..pipeline import Pipeline, of_one_band, points
 from ..scene import Scene
 from ..signal import MAIN, is_stream
 from ..types import Floats
@@ -68,11 +67,11 @@ def observed(operators: Sequence[Operator], scene: Scene, band: str = "") -> Dat
     if band:
         for operator in filter(points, operators):
             operator.observe(data)
-        bands = data_of_bands(data)
-        distribute(data, [*bands.values()])
-        for scan, whole in zip(bands[band].observations, data.observations, strict=True):
+        data.split()
+        data.hand_out()
+        for scan, whole in zip(data.bands[band].observations, data.observations, strict=True):
             scan.tally.update(whole.tally)
-        data, operators = bands[band], [o for o in operators if of_one_band(o)]
+        data, operators = data.bands[band], [o for o in operators if of_one_band(o)]
     for operator in operators:
         operator.observe(data)
     return data

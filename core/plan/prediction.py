@@ -19,9 +19,10 @@ from ..data import Data, Observation
 from ..mapmaker import joins, made_by, makes_products
 from ..operator import Operator
 from ..output import Output
-from ..run.budget import BASE, share_in_step
-from ..run.schedule import Chain, schedule
+from ..run.budget import BASE
+from ..run.schedule import does_the_same, schedule
 from ..run.settings import Settings
+from ..run.views import Chain, View
 from ..signal import Signal
 from ..types import Floats
 from .bounds import Context
@@ -70,20 +71,19 @@ def memory_of(context: Context, chain: Chain, settings: Settings) -> Memory:
 
     outputs = [o for o in context.operators if isinstance(o, Output)]
     during = [o for o in context.operators if not isinstance(o, Output)]
-    held, products = POINTED * context.times + hold(during), hold(filter(makes_products, during))
+    held = POINTED * context.times + hold(during)
+    products: float = hold(filter(makes_products, during))
     settings = replace(settings, memory=max(int(settings.memory - BASE - held), 1))
-    in_step, others = None, context.bands_alike - 1
-    if others:
-        alone = replace(settings, memory=max(settings.memory - others * products, 1))
-        more = others * (held - products)
-        in_step = share_in_step(chain, longest, alone, context.bands_alike, more)
-    found = schedule(chain, longest, in_step or settings).bytes
-    if in_step is not None:
-        products = held + found
-    if any(map(joins, chain.steps)):  # its part of the stream of all bands
-        size = np.dtype(settings.dtype).itemsize
-        products = held + found + size * longest.n_samples * longest.n_detectors
-    return Memory(BASE + max(held + found, hold(outputs)), products)
+    view, number = View(chain, longest), context.bands_alike
+    alone = schedule([view], settings)
+    size: float = alone.bytes
+    settings = replace(settings, memory=max(settings.memory - (number - 1) * int(held), 1))
+    together = number > 1 and does_the_same([view] * number, settings, [alone])
+    if together:
+        size = schedule([view] * number, settings).bytes / number
+    if together or any(map(joins, chain.steps)):
+        products = held + size
+    return Memory(BASE + max(held + size, hold(outputs)), products)
 
 
 @dataclass(frozen=True)

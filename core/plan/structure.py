@@ -21,7 +21,7 @@ from ..mapmaker import MapMaker, filters, forms, made_by, makes_products
 from ..operator import Operator
 from ..output import Output, changes_observations, is_output
 from ..pipeline import Pipeline
-from ..run.schedule import Chain
+from ..run.views import Chain
 from ..signal import MAIN, TRANSMISSION, Component, is_stream, stream_of
 
 

@@ -25,7 +25,6 @@ from ..mapmaker import MapMaker, filters, forms
 from ..numerics.chunks import TILE_SAMPLES
 from ..operator import Operator
 from ..signal import Formed, is_stream
-from ..stream import Stream
 from ..tally import Tally
 from ..types import AnyFloats
 from .means import exec_whole, knows_means, means_of, names_of
@@ -33,15 +32,13 @@ from .schedule import Schedule
 from .segments import pieces, trimmed, within
 from .settings import Timer
 from .streams import Ledger, Stage
-
-Measured = dict[tuple[str, str], Any]
-"""By label and signal: what `Operator.measure` found."""
+from .views import View
 
 
 class Due(NamedTuple):
     """A map maker that is to act on a block together with those of the other bands."""
 
-    step: MapMaker
+    step: Operator
     block: Block
     state: Any
 
@@ -56,33 +53,29 @@ class Window:
 
 
 class BlockMaker:
-    """Works on blocks, from several threads at once.
+    """Works on the blocks of one band, from several threads at once.
 
     Parameters
     ----------
-    states
-        By label: what `Operator.prepare` returned. It fills up before the first block.
-    measured
-        What steps that measure found; it fills up as they do.
     stopped
         True: what is made is of no use any more.
     """
 
     def __init__(
         self,
+        view: View,
         schedule: Schedule,
-        states: Mapping[str, Any],
-        measured: Measured,
         timer: Timer,
         ledger: Ledger,
         stopped: Callable[[], bool],
     ) -> None:
-        chain, settings = schedule.chain, schedule.settings
-        self._chain, self._observation, self._dtype = chain, schedule.observation, settings.dtype
-        self._states, self._measured, self._streams = states, measured, schedule.streams
+        self._chain = chain = schedule.chain
+        self._view, self._observation, self._dtype = view, view.observation, schedule.settings.dtype
+        self._streams, self._schedule = schedule.streams, schedule
         self._timer, self._ledger, self._stopped = timer, ledger, stopped
-        self._schedule = schedule
-        self._labels = {id(step): step.label for step in chain.steps}  # the property is slow
+        # a label is a property, which is slow
+        own = ((o, o.label) for o in view.chain.steps)
+        self._own = {id(o): mine for o, mine in zip(chain.steps, own, strict=True)}
         acting = [o for o in chain.steps if type(o).exec is not Operator.exec]
         self._declared = {
             o.label: names_of(o, self._observation.signals) for o in acting if not knows_means(o)
@@ -99,6 +92,10 @@ class BlockMaker:
             if o.couples == "all"
             for name in o.requires - {"boresight"}
         }
+        self._joining = {
+            id(o) for o in acting if isinstance(o, MapMaker) and o.all_bands and knows_means(o)
+        }
+        """Map makers that act on the blocks of all bands at once."""
         # an unfiltered signal may be finite where a filter has spoilt the others
         self._masks_maps = not all(signal.filtered for signal in chain.signals)
         self._local = threading.local()
@@ -118,7 +115,7 @@ class BlockMaker:
         stage: Stage,
         detectors: slice,
         samples: slice,
-        made: dict[str, Stream],
+        made: dict[str, AnyFloats],
         *,
         again: bool,
         signals: Sequence[Formed] | None = None,
@@ -135,7 +132,7 @@ class BlockMaker:
             act here. None: all steps act. The block is then one piece, or the segment has a step
             that needs more (`segments.Segment.split`).
         """
-        segment, again = stage.segment, again or stage.swept
+        segment, again = stage.segment, again or self._view.number in stage.swept
         if signals is None:
             signals = [s for s in self._chain.signals if s.stream not in self._apart]
         n_samples = self._observation.n_samples
@@ -169,7 +166,7 @@ class BlockMaker:
         held = self._local.__dict__
         buffers = [*held.get("blocks", {}).values(), held.get("pieces", {}), held.get("whole", {})]
         size = sum(array.nbytes for held in buffers for array in held.values())
-        self._ledger.note(("blocks", threading.get_ident()), size)
+        self._ledger.note(("blocks", threading.get_ident(), self._view.number), size)
         return block
 
     # ---- which steps act
@@ -201,18 +198,18 @@ class BlockMaker:
     ) -> None:
         """Let steps act on a block; ``due`` takes the last ones of them as in `make`."""
         start = time.thread_time()
-        last = next(
-            (k for k, o in enumerate(steps) if all(map(maps_all_bands, steps[k:]))), len(steps)
-        )
-        for number, step in enumerate(steps):
+        last = len(steps)
+        while due is not None and last and id(steps[last - 1]) in self._joining:
+            last -= 1
+        states, measured = self._view.states, self._view.measured
+        for number, first in enumerate(steps):
             if self._stopped():
                 return
-            label = self._labels[id(step)]
+            step, label = self._own[id(first)]
             if due is not None and number >= last:
-                assert isinstance(step, MapMaker)
                 if self._masks_maps:
                     share_mask(block, block.signals)
-                due.append(Due(step, block, self._states[label]))
+                due.append(Due(step, block, states[label]))
             elif forms(step):
                 self._form(step, label, block, signals)
             elif filters(step):
@@ -223,7 +220,7 @@ class BlockMaker:
                 self._act(
                     step,
                     block,
-                    self._measured.get(self._measures.get(label, ("", "")), self._states[label]),
+                    measured.get(self._measures.get(label, ("", "")), states[label]),
                 )
             now = time.thread_time()
             self._timer.add(label, "exec", now - start)
@@ -232,7 +229,7 @@ class BlockMaker:
     def _form(self, step: Operator, label: str, block: Block, signals: Sequence[Formed]) -> None:
         """Let a step form each signal of its components, and give all of them the same mask."""
         for signal in signals:
-            self._on_one(step, block, signal, self._states[label])
+            self._on_one(step, block, signal, self._view.states[label])
         if len(signals) > 1:
             share_mask(block, [s.stream for s in signals])
 
@@ -240,12 +237,9 @@ class BlockMaker:
         """Let a step filter each signal."""
         here = [s for s in self._chain.signals if s.stream in block.detdata and s.filtered]
         for signal in here:
-            found = (label, signal.stream)
+            state = self._view.states[label]
             self._on_one(
-                step,
-                block,
-                signal,
-                self._measured[found] if found in self._measured else self._states[label],
+                step, block, signal, self._view.measured.get((label, signal.stream), state)
             )
         if len(here) > 1 and not step.linear:
             share_mask(block, [s.stream for s in here])
@@ -264,7 +258,7 @@ class BlockMaker:
 
     def _act(self, step: Operator, block: Block, state: Any) -> None:
         """`Operator.exec`, and a look at what it left."""
-        label = self._labels[id(step)]
+        label = step.label
 
         def work(block: Block) -> None:
             before = dict(block.detdata)
@@ -278,7 +272,7 @@ class BlockMaker:
                     place=label,
                     cure='write block.detdata["signal"][...] = ..., and return nothing',
                 )
-            check_left(step, block, before, self._due[label])
+            self._check_left(step, block, before)
 
         fields = {}
         if names := self._declared.get(label, frozenset()) & block.detdata.keys():
@@ -288,13 +282,59 @@ class BlockMaker:
         else:
             work(block)
 
+    def _check_left(self, step: Operator, block: Block, before: Mapping[str, AnyFloats]) -> None:
+        """Refuse what `Operator.exec` must not leave: a stream that is missing, or is no
+        array of the block's shape and type.
+
+        Parameters
+        ----------
+        before
+            The block's streams before; an array that is still there is not looked at.
+
+        Raises
+        ------
+        PluginError
+            Names the step, its class and where that comes from.
+        """
+        for name, stream in block.detdata.items():
+            if stream is before.get(name):
+                continue
+            if not isinstance(stream, np.ndarray):
+                found = f"a {type(stream).__name__}"
+            elif stream.shape != block.shape or stream.dtype != block.dtype:
+                found = f"an array {stream.shape} of {stream.dtype}"
+            elif not stream.flags.c_contiguous:
+                found = "an array that is not in C order"
+            else:
+                continue
+            wanted = f"an array {block.shape} of {np.dtype(block.dtype)} in C order"
+            raise PluginError(
+                f"exec left the stream {name!r} as {found}; it must be {wanted}",
+                place=whose(step),
+                cure=f"fill it in place: block.new({name!r})[...] = values",
+            )
+        due = self._due[step.label]
+        gone = (due - block.detdata.keys()) | (before.keys() - step.provides - block.detdata.keys())
+        if gone:
+            name = min(gone)
+            raise PluginError(
+                f"exec left no stream {name!r}, which"
+                f" {'it provides' if name in step.provides else 'others read'}",
+                place=whose(step),
+                cure=(
+                    f"make it with block.new({name!r}), or leave it out of provides"
+                    if name in due
+                    else "leave it in block.detdata"
+                ),
+            )
+
     # ---- what is in a block
 
     def _block(
         self,
         stage: Stage,
         window: Window,
-        made: dict[str, Stream],
+        made: dict[str, AnyFloats],
         again: bool,
         copied: bool,
         signals: Sequence[Formed],
@@ -314,14 +354,16 @@ class BlockMaker:
         block = Block(
             observation, detectors, reach, dtype=self._dtype, buffers=buffers, again=again
         )
-        block.places = {name: stream.array[detectors, reach] for name, stream in made.items()}
-        for name, stream in source.streams.items():
+        rows = self._view.rows
+        block.places = {name: array[rows][detectors, reach] for name, array in made.items()}
+        for name, array in source.arrays.items():
+            here = array[rows][detectors, reach]
             if made or not copied:
-                block.detdata[name] = block.places.get(name, stream.array[detectors, reach])
+                block.detdata[name] = block.places.get(name, here)
             else:
                 block.detdata[name] = block.buffer(name, block.shape)
-                block.detdata[name][...] = stream.array[detectors, reach]
-            block.means.update(stream.means)
+                block.detdata[name][...] = here
+        block.means.update(source.means.get(self._view.number, {}))
         if source.stage is None:
             return block
         margins = slice(reach.start, samples.start), slice(samples.stop, reach.stop)
@@ -393,11 +435,6 @@ class BlockMaker:
         block.detdata = {**given, **made}
 
 
-def maps_all_bands(step: Operator) -> bool:
-    """Tell whether a step maps the blocks of all bands at once, and knows of means."""
-    return isinstance(step, MapMaker) and step.all_bands and knows_means(step)
-
-
 def share_mask(block: Block, streams: Sequence[str]) -> None:
     """Make samples NaN in all signals that are not finite in one: their maps have the same hits,
     and remainders hold.
@@ -417,53 +454,3 @@ def _finite(row):  # type: ignore[no-untyped-def]
     for t in range(row.size):
         total += row[t] * zero  # row[t] - row[t] would be cancelled where sums are reassociated
     return total == 0
-
-
-def check_left(
-    step: Operator, block: Block, before: Mapping[str, AnyFloats], due: frozenset[str]
-) -> None:
-    """Refuse what `Operator.exec` must not leave: a stream that is missing, or is no array of the
-    block's shape and type.
-
-    Parameters
-    ----------
-    before
-        The block's streams before; an array that is still there is not looked at.
-    due
-        Streams that it must have made.
-
-    Raises
-    ------
-    PluginError
-        Names the step, its class and where that comes from.
-    """
-    for name, stream in block.detdata.items():
-        if stream is before.get(name):
-            continue
-        if not isinstance(stream, np.ndarray):
-            found = f"a {type(stream).__name__}"
-        elif stream.shape != block.shape or stream.dtype != block.dtype:
-            found = f"an array {stream.shape} of {stream.dtype}"
-        elif not stream.flags.c_contiguous:
-            found = "an array that is not in C order"
-        else:
-            continue
-        wanted = f"an array {block.shape} of {np.dtype(block.dtype)} in C order"
-        raise PluginError(
-            f"exec left the stream {name!r} as {found}; it must be {wanted}",
-            place=whose(step),
-            cure=f"fill it in place: block.new({name!r})[...] = values",
-        )
-    gone = (due - block.detdata.keys()) | (before.keys() - step.provides - block.detdata.keys())
-    if gone:
-        name = min(gone)
-        raise PluginError(
-            f"exec left no stream {name!r}, which"
-            f" {'it provides' if name in step.provides else 'others read'}",
-            place=whose(step),
-            cure=(
-                f"make it with block.new({name!r}), or leave it out of provides"
-                if name in due
-                else "leave it in block.detdata"
-            ),
-        )

@@ -6,18 +6,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 from ..errors import PipelineError
 from ..machine import available_memory, resident_memory
 from ..mapmaker import joins, makes_products
-from ..observation import Observation
 from ..plan.planning import planning_of
-from .bands import Band, looks_alike
 from .prefetch import Ahead
-from .schedule import Chain, schedule, spares
+from .schedule import does_the_same, schedule, spares
 from .settings import Settings
+from .views import Band, Chain, View
 
 BASE = 230_000_000
 """Bytes of the interpreter, libraries and compiled code."""
@@ -47,98 +46,80 @@ class Budget:
     place: str
 
 
-class Division(NamedTuple):
-    """Settings of each band; whether all are executed ``together``, and ``blockwise``: there is
-    room for a block of each at a time.
-    """
-
-    settings: list[Settings]
-    together: bool = False
-    blockwise: bool = True
-
-
 def divide(
-    bands: Sequence[Band], settings: Settings, budget: Budget, ahead: Ahead, together: bool
-) -> Division:
-    """Divide the memory of a run among its bands.
+    bands: Sequence[Band], settings: Settings, budget: Budget, ahead: Ahead
+) -> list[tuple[Sequence[Band], Settings]]:
+    """Bands that are executed together, and the settings with their memory.
 
-    Each band has what the products of the others leave. Bands that a step joins hold their
-    streams side by side, and once more together. Others that look through the same pixels share
-    equally, if each does the same with its streams as it would alone.
+    All are executed together if a step joins them, or if their detectors look through the same
+    pixels and streams are kept where they would be kept for a band alone. Else each has what the
+    products of the others leave.
 
     Parameters
     ----------
     ahead
         Is turned off where there is no room for a scan that is prepared while another is executed.
-    together
-        False: bands follow each other, unless a step joins them.
     """
-    n, joined = len(bands), len(bands) > 1 and any(map(joins, bands[0].chain.steps))
+    groups = _groups(bands, settings, budget, ahead)
+    for these, own in groups:
+        for band in these:
+            threads, band.data.threads = band.data.threads, own.threads
+    if own.threads < threads and budget.fresh:
+        text = f"{own.threads} of {threads} threads work: more do not fit in the memory budget"
+        warnings.warn(f"{budget.place}: {text}", stacklevel=5)
+    return groups
+
+
+def _groups(
+    bands: Sequence[Band], settings: Settings, budget: Budget, ahead: Ahead
+) -> list[tuple[Sequence[Band], Settings]]:
+    """`divide`, without a word."""
+    views = [band.longest for band in bands]
     every = [o for band in bands for o in band.data.observations]
     kept = 8 * len(bands[0].chain.keep) * sum(o.n_detectors * o.n_samples for o in every)
-    held = [held_of(band.chain, band.longest, joined) for band in bands]
+    if len(bands) > 1 and any(map(joins, bands[0].chain.steps)):
+        return [(bands, _shared(bands, settings, budget, ahead, kept))]
+    held = [memory_of([view], products=True) for view in views]
     alone = [
-        _alone(band, settings, budget, ahead, (kept, sum(held) - mine))
+        _shared([band], settings, budget, ahead, kept, sum(held) - mine)
         for band, mine in zip(bands, held, strict=True)
     ]
-    if joined:
-        least = [
-            min(schedule(band.chain, band.longest, own).least, own.memory)
-            for band, own in zip(bands, alone, strict=True)
-        ]
-        shares = [max(own.memory // (2 * n), low) for own, low in zip(alone, least, strict=True)]
-    elif n > 1 and together and looks_alike(bands):
-        more = [
-            (2 if ahead.on else 1)
-            * (held_of(b.chain, b.longest, True) - held_of(b.chain, b.longest))
-            for b in bands
-        ]
-        found = [
-            share_in_step(band.chain, band.longest, own, n, sum(more) - mine)
-            for band, own, mine in zip(bands, alone, more, strict=True)
-        ]
-        shares = [one.memory for one in found if one is not None]
-    else:
-        shares = []
-    if len(shares) < n:
-        return Division(alone)
-    each = [replace(own, memory=share, spare=[]) for own, share in zip(alone, shares, strict=True)]
-    return Division(each, True, sum(shares) <= alone[0].memory)
+    first = views[0].observation
+    if len(bands) > 1 and all(view.observation.looks_as(first) for view in views):
+        with suppress(PipelineError):  # not all of them fit at once
+            together = _shared(bands, settings, budget, ahead, kept)
+            single = [schedule([view], own) for view, own in zip(views, alone, strict=True)]
+            if does_the_same(views, together, single):
+                return [(bands, together)]
+    return [([band], own) for band, own in zip(bands, alone, strict=True)]
 
 
-def _alone(
-    band: Band, settings: Settings, budget: Budget, ahead: Ahead, beside: tuple[int, int]
+def _shared(
+    bands: Sequence[Band],
+    settings: Settings,
+    budget: Budget,
+    ahead: Ahead,
+    kept: int,
+    others: int = 0,
 ) -> Settings:
-    """Divide the memory of one band; ``beside``: kept streams, and products of other bands."""
-    chain, data = band.chain, band.data
+    """Divide the memory of bands that are executed together; ``kept``, ``others``: as in
+    `divided`.
+    """
     if budget.memory is not None and settings.process is None:
-        check_kept_memory(beside[0], available_memory(), budget.place)
+        check_kept_memory(kept, available_memory(), budget.place)
         return settings
-    most = settings.memory
-    settings = divided(chain, band.longest, settings, budget.place, budget.fresh, *beside)
+    most, views = settings.memory, [band.longest for band in bands]
+    settings = divided(views, settings, budget.place, budget.fresh, kept, others)
     if budget.memory is not None:
         settings = replace(settings, memory=min(settings.memory, most))
     if ahead.on:
-        less = with_scan_ahead(chain, band.longest, settings)
+        less = with_scan_ahead(views, settings)
         ahead.on, settings = less is not None, less or settings
-    if settings.threads < data.threads and budget.fresh:
-        text = (
-            f"{settings.threads} of {data.threads} threads work: more do not fit in the memory"
-            " budget"
-        )
-        warnings.warn(f"{budget.place}: {text}", stacklevel=5)
-    data.threads = settings.threads
     return settings
 
 
-def longest_of(observations: Sequence[Observation]) -> Observation:
-    """The observation of most samples."""
-    return max(observations, key=lambda o: o.n_detectors * o.n_samples)
-
-
 def divided(
-    chain: Chain,
-    observation: Observation,
+    views: Sequence[View],
     settings: Settings,
     place: str,
     fresh: bool = True,
@@ -152,8 +133,8 @@ def divided(
 
     Parameters
     ----------
-    observation
-        The longest.
+    views
+        The longest scan, with the bands that are executed together.
     settings
         ``process``: bytes that the process may hold; None: what it holds and half of the free
         memory.
@@ -174,61 +155,41 @@ def divided(
     budget = settings.process or resident_memory() + available_memory() // 2
     parts = {"zonda and its libraries": max(resident_memory(), BASE) if fresh else BASE}
     parts |= {KEPT: kept, OTHERS: others}
-    parts.update((o.label, planning_of(o).memory(observation)) for o in chain.steps)
+    for view in views:
+        for o in view.chain.steps:
+            parts[o.label] = parts.get(o.label, 0) + planning_of(o).memory(view.observation)
     fixed = sum(parts.values())
     left = replace(settings, memory=max(budget - fixed, 1))
-    found = schedule(chain, observation, left)
+    found = schedule(views, left)
     if fixed + found.least > budget and left.threads > 1:
-        left = replace(
-            left,
-            threads=max(1, min(left.threads - 1, (budget - fixed) * left.threads // found.least)),
-        )
-        found = schedule(chain, observation, left)
+        threads = min(left.threads - 1, (budget - fixed) * left.threads // found.least)
+        left = replace(left, threads=max(1, threads))
+        found = schedule(views, left)
     if fixed + found.least > budget:
-        _refuse(chain, parts, found.least, budget, left.threads, place)
+        _refuse(views[0].chain, parts, found.least, budget, left.threads, place)
     return replace(left, process=budget)
 
 
-def products_of(chain: Chain, observation: Observation) -> int:
-    """Bytes of what steps add up over all scans."""
-    return sum(planning_of(o).memory(observation) for o in chain.steps if makes_products(o))
-
-
-def held_of(chain: Chain, observation: Observation, in_step: bool = False) -> int:
-    """Bytes that a band holds while another acts: `products_of`; ``in_step`` with that one,
-    whatever its steps hold.
+def memory_of(views: Sequence[View], products: bool = False) -> int:
+    """Bytes that the steps hold for a scan with some bands, besides streams and blocks;
+    ``products``: what they add up over all scans alone.
     """
-    return (
-        sum(planning_of(o).memory(observation) for o in chain.steps)
-        if in_step
-        else products_of(chain, observation)
+    return sum(
+        planning_of(o).memory(view.observation)
+        for view in views
+        for o in view.chain.steps
+        if makes_products(o) or not products
     )
 
 
-def with_scan_ahead(chain: Chain, observation: Observation, settings: Settings) -> Settings | None:
+def with_scan_ahead(views: Sequence[View], settings: Settings) -> Settings | None:
     """The settings without what a scan holds that is prepared while another is executed; None where
     there is no room for it.
     """
-    size = sum(planning_of(o).memory(observation) for o in chain.steps if not makes_products(o))
-    if not spares(chain, observation, settings, size):
+    size = memory_of(views) - memory_of(views, products=True)
+    if not spares(views, settings, size):
         return None
     return replace(settings, memory=settings.memory - size)
-
-
-def share_in_step(
-    chain: Chain, observation: Observation, settings: Settings, bands: int, beside: int
-) -> Settings | None:
-    """The settings of one of several ``bands`` that work on a scan at the same time (`scan`).
-
-    None where no step saves time so, or less would be kept in memory than where it works alone.
-    ``beside``: bytes that the steps of the others hold.
-    """
-    if not any(planning_of(o).shares_blocks(observation) for o in chain.steps):
-        return None
-    memory = (settings.memory - beside) // bands
-    if not spares(chain, observation, settings, settings.memory - memory):
-        return None
-    return replace(settings, memory=memory)
 
 
 def check_kept_memory(size: int, free: int, place: str) -> None:
@@ -243,16 +204,15 @@ def check_kept_memory(size: int, free: int, place: str) -> None:
         )
 
 
-def least_memory(
-    chain: Chain, observation: Observation, settings: Settings, others: int = 0
-) -> int:
-    """Bytes with which a process runs these steps over an observation on one thread, libraries
-    included; ``others``: of the products of other bands.
-    """
-    held = sum(planning_of(o).memory(observation) for o in chain.steps) + others
-    return _with_margin(
-        BASE + held + schedule(chain, observation, replace(settings, threads=1)).least
+def least_memory(views: Sequence[View], settings: Settings) -> int:
+    """Bytes with which a process runs a scan with these bands on one thread, libraries included."""
+    one, products = replace(settings, threads=1), memory_of(views, products=True)
+    joined = any(map(joins, views[0].chain.steps))
+    need = max(
+        memory_of(group) + products - memory_of(group, products=True) + schedule(group, one).least
+        for group in ([views] if joined else [[view] for view in views])
     )
+    return _with_margin(BASE + need)
 
 
 def _with_margin(size: int) -> int:

@@ -1,13 +1,19 @@
-"""Runs a chain of operators over one observation, in blocks of detectors x samples inside a memory
-budget.
+"""Runs the steps over one scan, with one band or with several together, in blocks of detectors x
+samples inside a memory budget.
 
-The chain is cut into segments where the coupling changes (see `Operator.couples`). A segment works
-through the observation in blocks; operators that couple nothing work through a block in pieces of
+The steps are cut into segments where the coupling changes (see `Operator.couples`). A segment works
+through the scan in blocks; operators that couple nothing work through a block in pieces of
 `TILE_DETECTORS` x `PIECE` samples, each of which passes through all of them while it is hot in the
 cache. All signals are in the same block. Between segments the streams that later operators need are
 kept in memory, spilled to a temporary file, or made again when they are read, as the `schedule`
 says. Blocks and pieces begin at multiples of `TILE_DETECTORS` and `TILE_SAMPLES`, so that no result
 depends on the budget or on the number of threads.
+
+Bands are rows: a stream has the detectors of all bands, one band after the other. A block has
+detectors of one band, counted from the band's first row, and a step is given that band's view of
+the scan. Where the detectors of all bands look through the same pixels, each block is worked on
+with all bands before those steps that map all bands act once. A step that measures all bands
+together is given the stream of all rows; a band does then not have the bits that it has alone.
 """
 
 from __future__ import annotations
@@ -15,21 +21,20 @@ from __future__ import annotations
 import copy
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Future, wait
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..block import Block
-from ..data import Data
 from ..discovery import RAISED
 from ..errors import PipelineError
+from ..focalplane import Focalplane
 from ..machine import resident_memory
-from ..mapmaker import filters
+from ..mapmaker import filters, joins
 from ..numerics.chunks import TILE_DETECTORS, empty
 from ..numerics.smooth import SmoothField
 from ..observation import Observation
@@ -38,21 +43,27 @@ from ..signal import MAIN, Formed, is_signal
 from ..stream import Stream, forget_pages, in_order
 from ..tally import Tally
 from ..types import AnyFloats
-from .block_maker import BlockMaker, Due, Measured
-from .budget import products_of
-from .means import WholeStream, knows_means, means_of
+from .block_maker import BlockMaker, Due
+from .budget import memory_of
+from .means import MeansOfBands, WholeStream, knows_means, means_of
 from .prefetch import Ahead
-from .schedule import Chain, Planned, Schedule, ordered_in, schedule
-from .segments import least_block
+from .schedule import Planned, Schedule, schedule
+from .segments import least_block, pieces
 from .settings import Settings, Timer
 from .streams import Ledger, Source, Stage, Store, StreamMadeAgain
+from .views import View
+
+ELSEWHERE = "samples flagged as those of another band are: nothing is measured there"
+"""A count of the log."""
 
 
 class Execution:
-    """One chain of steps over one observation.
+    """The steps at work on one scan.
 
     Parameters
     ----------
+    views
+        The bands that are executed together.
     before, after
         Called before and after each stage of a step, with ``operator``, ``observation``, ``stage``
         (and ``seconds``).
@@ -60,88 +71,74 @@ class Execution:
 
     def __init__(
         self,
-        chain: Chain,
-        observation: Observation,
+        views: Sequence[View],
         settings: Settings,
         timer: Timer,
         before: Callable[..., None] = lambda **what: None,
         after: Callable[..., None] = lambda **what: None,
     ) -> None:
-        self.chain, self.observation, self.settings, self.timer = (
-            chain,
-            observation,
-            settings,
-            timer,
-        )
+        self.views, self.settings, self.timer = views, settings, timer
         self._before, self._after = before, after
-        self.states: dict[str, Any] = {}
-        self.measured: Measured = {}
         self.beforehand: Future[None] | None = None
         self.schedule: Schedule
         self.ledger = Ledger()
+        self._makers: list[BlockMaker] = []
         self._ahead = Ahead(False)
         self._stop = threading.Event()
         self._store = Store(settings.memory, settings.dtype, settings.spare, self.ledger)
-        self._source, self._begun = Source(), list[Operator]()
+        self._source, self._begun = Source(), list[tuple[Operator, Observation]]()
+        self._first = views[0].observation
+        row = 0
+        for number, view in enumerate(views):
+            view.number, view.rows = number, slice(row, row + view.shape[0])
+            row = view.rows.stop
 
-    def begin(self, bands: int, ordered: Collection[str], halos: Mapping[str, int]) -> None:
-        """Make the schedule, with the memory that there is now: what operators hold is known.
+    def run(self, ahead: Ahead | None = None, following: Execution | None = None) -> None:
+        """Configure, prepare, execute and collect; on any failure operators discard what they
+        began.
 
-        Parameters
-        ----------
-        bands
-            Number of those that hold streams and blocks at the same time.
-        ordered, halos
-            See `segments.cut`.
+        ``following``: what ``ahead`` may prepare meanwhile.
         """
-        self.settings = self._within_process(bands)
-        self._store = Store(
-            self.settings.memory, self.settings.dtype, self.settings.spare, self.ledger
-        )
-        self.schedule = Schedule(self.chain, self.observation, self.settings)
-        stopped = self._stop.is_set
-        self.blocks = BlockMaker(
-            self.schedule, self.states, self.measured, self.timer, self.ledger, stopped
-        )
-        self.schedule.make(ordered, halos)
-
-    def collect(self, data: Data) -> None:
-        """Let all steps hand over what they added up."""
-        for operator in self.chain.steps:
-            start = time.thread_time()
-            operator.collect(data, self.observation, self.states[operator.label])
-            self.timer.add(operator.label, "collect", time.thread_time() - start)
-
-    def close(self) -> None:
-        """Release what the observation took."""
-        self.states.clear()
-        self.measured.clear()
-        self._store.close()
-        for smooth in self.observation.smooth.values():
-            if isinstance(smooth, SmoothField):
-                smooth.forget()
-
-    def ready(self, ahead: Ahead | None) -> None:
-        """Configure and prepare all steps, unless ``ahead`` did so beforehand."""
-        self._ahead = ahead or self._ahead
-        if self.beforehand is not None:
-            self.beforehand.result()
-        else:
-            self.prepare()
+        try:
+            self._ahead = ahead or self._ahead
+            if self.beforehand is not None:
+                self.beforehand.result()
+            else:
+                self.prepare()
+            self._begin()
+            self._ahead.start(following)
+            for planned in self.schedule.planned:
+                head = planned.segment.operators[0]
+                if head.couples == "all":
+                    joined = [self.views] if joins(head) else [[view] for view in self.views]
+                    for views in joined:
+                        self._measure(views, head.label)
+                self._act(planned)
+            self._keep()
+            for view in self.views:
+                for operator in view.chain.steps:
+                    start = time.thread_time()
+                    state = view.states[operator.label]
+                    operator.collect(view.data, view.observation, state)  # type: ignore[arg-type]
+                    self.timer.add(operator.label, "collect", time.thread_time() - start)
+        except BaseException:
+            self.abandon()
+            raise
+        finally:
+            self._close()
 
     def prepare(self) -> None:
-        """Configure and prepare all steps; perhaps while another observation is executed
-        (`prefetch`).
-        """
-        for operator in self.chain.steps:
-            operator.configure(self.observation)
-        for operator in self.chain.steps:
-            if self._stop.is_set():
-                return
-            self._before(operator=operator, observation=self.observation, stage="prepare")
-            start = time.thread_time()
-            self.states[operator.label] = operator.prepare(self.observation)
-            self.tell(operator, "prepare", time.thread_time() - start)
+        """Configure and prepare all steps; perhaps while another scan is executed (`prefetch`)."""
+        for view in self.views:
+            for operator in view.chain.steps:
+                operator.configure(view.observation)
+            for operator in view.chain.steps:
+                if self._stop.is_set():
+                    return
+                self._before(operator=operator, observation=view.observation, stage="prepare")
+                start = time.thread_time()
+                view.states[operator.label] = operator.prepare(view.observation)
+                self._tell(view, operator, "prepare", time.thread_time() - start)
 
     def abandon(self) -> None:
         """Stop; let operators discard what they began."""
@@ -149,25 +146,41 @@ class Execution:
         if self.beforehand is not None:
             self.beforehand.cancel()
             wait([self.beforehand])
-        for operator in self.chain.steps:
-            if operator.label in self.states:
-                with suppress(*RAISED):
-                    operator.discard(self.observation, self.states[operator.label])
-        self.states.clear()
+        for view in self.views:
+            for operator in view.chain.steps:
+                if operator.label in view.states:
+                    with suppress(*RAISED):
+                        operator.discard(view.observation, view.states[operator.label])
+            view.states.clear()
 
-    def tell(self, operator: Operator, stage: str, used: float) -> None:
+    def _close(self) -> None:
+        """Release what the scan took."""
+        self._store.close()
+        for view in self.views:
+            view.states.clear()
+            view.measured.clear()
+            for smooth in view.observation.smooth.values():
+                if isinstance(smooth, SmoothField):
+                    smooth.forget()
+
+    def _tell(self, view: View, operator: Operator, stage: str, used: float) -> None:
         """Note CPU seconds and call the hooks."""
         self.timer.add(operator.label, stage, used)
-        self._after(operator=operator, observation=self.observation, stage=stage, seconds=used)
+        self._after(operator=operator, observation=view.observation, stage=stage, seconds=used)
 
     # ---- the schedule
 
-    @property
-    def ordered(self) -> list[str]:
-        """Labels of the steps that are much cheaper in order of time."""
-        return ordered_in(self.chain.steps, self.observation)
+    def _begin(self) -> None:
+        """Make the schedule, with the memory that there is now: what operators hold is known."""
+        self.settings = settings = self._within_process()
+        self._store = Store(settings.memory, settings.dtype, settings.spare, self.ledger)
+        self.schedule = schedule(self.views, settings)
+        stopped = self._stop.is_set
+        self._makers = [
+            BlockMaker(view, self.schedule, self.timer, self.ledger, stopped) for view in self.views
+        ]
 
-    def _within_process(self, bands: int) -> Settings:
+    def _within_process(self) -> Settings:
         """Lessen the memory of streams and blocks where operators took more than they said, and
         the threads where the smallest blocks would not fit.
         """
@@ -175,265 +188,313 @@ class Execution:
         if settings.process is None:
             return settings
         taken = resident_memory() - sum(array.nbytes for array in settings.spare)
-        to_come = products_of(self.chain, self.observation)
-        room = max((settings.process - taken) // bands - to_come, 1)
+        room = max(settings.process - taken - memory_of(self.views, products=True), 1)
         threads = settings.threads
         if room >= settings.memory:
             return settings
-        least = schedule(self.chain, self.observation, settings).least
+        least = schedule(self.views, settings).least
         if room < least:
             threads = max(1, threads * room // least)
             room = max(room, least * threads // settings.threads)
         return replace(settings, memory=room, threads=threads)
 
-    def _probe(self, stage: Stage) -> Block:
-        """The smallest block, made before its time."""
-        rows, columns = least_block(stage.span, self.schedule.shape)
-        return self.blocks.make(stage, slice(0, rows), slice(0, columns), {}, again=True)
-
     # ---- segments
 
-    def start(self, number: int) -> Pass | None:
-        """Let a segment begin: its work on blocks, or None where its streams are made again when
-        they are read.
+    def _act(self, planned: Planned) -> None:
+        """Let a segment act on all blocks, or note that its streams are made again when they are
+        read.
         """
-        planned = self.schedule.planned[number]
         stage = Stage(planned.segment, self._source, planned.wanted)
-        for operator in planned.segment.operators:
-            self._before(operator=operator, observation=self.observation, stage="exec")
-        self._begun += planned.segment.operators
-        if planned.how != "again":
-            return Pass.of(self, planned, stage)
-        self._store.clear_spare()
-        found = self._probe(stage)
-        names = frozenset(stage.wanted & found.detdata.keys())
-        for name in sorted(names):
-            self.observation.tally.state(
-                "Execution", f"stream {name} made again when it is read", planned.why
-            )
-        self._source = Source({}, stage, names, dict(found.means))
-        return None
-
-    def passed(self, source: Source) -> None:
-        """Note the streams that a segment has left, and that its steps are through."""
-        self._source = source
-        for operator in self._begun:
+        steps = [(o, view.observation) for view in self.views for o in planned.segment.operators]
+        for operator, observation in steps:
+            self._before(operator=operator, observation=observation, stage="exec")
+        self._begun += steps
+        if planned.how == "again":
+            self._source = self._made_again(stage, planned.why)
+            return
+        self._source = self._worked_through(planned, stage)
+        for operator, observation in self._begun:
             used = self.timer.seconds.get((operator.label, "exec"), 0.0)
-            self._after(operator=operator, observation=self.observation, stage="exec", seconds=used)
+            self._after(operator=operator, observation=observation, stage="exec", seconds=used)
         self._begun.clear()
 
-    def stop(self) -> None:
-        """Let blocks that are being worked on end: they are of no use any more."""
-        self._stop.set()
+    def _made_again(self, stage: Stage, why: str) -> Source:
+        """The streams of a segment that is not carried out, with the means of its smallest
+        blocks.
+        """
+        self._store.clear_spare()
+        found = Source(stage=stage)
+        for view, maker in zip(self.views, self._makers, strict=True):
+            rows, columns = least_block(stage.span, view.shape)
+            block = maker.make(stage, slice(0, rows), slice(0, columns), {}, again=True)
+            found.names = frozenset(stage.wanted & block.detdata.keys())
+            found.means[view.number] = dict(block.means)
+            for name in sorted(found.names):
+                what = f"stream {name} made again when it is read"
+                view.observation.tally.state("Execution", what, why)
+        return found
 
-    def keep(self) -> None:
-        """Keep the streams that the user asked for."""
-        for name in self.chain.keep:
-            if name not in self._source.streams:
+    def _worked_through(self, planned: Planned, stage: Stage) -> Source:
+        """The streams that a segment passes on, once it has worked on all blocks."""
+        before, made, seen = stage.source.arrays, dict[str, AnyFloats](), set[str]()
+        means = {view.number: dict[str, SmoothField]() for view in self.views}
+        for name in sorted(stage.wanted):
+            if name in before and not stage.segment.halo:
+                made[name] = before[name]  # changed in place
+                continue
+            shape = self.views[-1].rows.stop, self._first.n_samples
+            made[name] = self._store.allocate(name, shape, planned.how == "kept")
+            if isinstance(made[name], np.memmap):
+                text = f"{made[name].nbytes / 1e9:.2f} GB"
+                for view in self.views:
+                    what = f"stream {name} spilled to disk"
+                    view.observation.tally.state("Execution", what, text)
+
+        def work(view: View, detectors: slice, samples: slice, due: list[Due] | None) -> None:
+            maker = self._makers[view.number]
+            block = maker.make(stage, detectors, samples, made, again=False, due=due)
+            for name in made.keys() & block.detdata.keys():
+                seen.add(name)
+                if block.detdata[name] is not block.places.get(name):
+                    made[name][view.rows][detectors, samples] = block.detdata[name]
+            means[view.number].update(block.means)  # the same fields in every block
+            for array in (*made.values(), *before.values()):
+                forget_pages(array)
+
+        working = (o for o in stage.segment.operators if type(o).exec is not Operator.exec)
+        labels = ", ".join(o.label for o in working)
+        blocks = {view.number: self.schedule.blocks(planned, view) for view in self.views}
+        if self.schedule.at_once > 1:
+            whole = bool(stage.segment.split()[1])
+            scan = name_of_all(self._first)
+            self._sweep(partial(self._on_all, work, whole), blocks[0], f"{scan}: {labels}")
+        else:
+            for view in self.views:
+                what = f"{view.observation.name}: {labels}"
+                self._sweep(partial(work, view, due=None), blocks[view.number], what)
+        stage.has_been_swept(self.views)
+        for maker in self._makers:
+            maker.release()
+        kept = {name: array for name, array in made.items() if name in seen}
+        held = set(map(id, kept.values()))
+        gone = [a for a in (*before.values(), *made.values()) if id(a) not in held]
+        self._store.release(gone)
+        return Source(kept, None, frozenset(kept), means)
+
+    def _on_all(
+        self, work: Callable[..., None], whole: bool, detectors: slice, samples: slice
+    ) -> None:
+        """Work on a block of every band, piece by piece unless a step needs it ``whole``; then let
+        the steps that map all bands act once.
+        """
+        for part in [(detectors, samples)] if whole else pieces(detectors, samples):
+            every: list[list[Due]] = [[] for _ in self.views]
+            for view, due in zip(self.views, every, strict=True):
+                work(view, *part, due=due)
+            for together in zip(*every, strict=True):
+                step, start = together[0].step, time.thread_time()
+                step.exec_bands([due.block for due in together], [due.state for due in together])
+                self.timer.add(step.label, "exec", time.thread_time() - start)
+
+    def _sweep(
+        self, work: Callable[[slice, slice], None], blocks: list[tuple[slice, slice]], what: str
+    ) -> None:
+        """Work on every block, on several threads; the first error stops all of them."""
+        settings, total = self.settings, len(blocks)
+        if settings.threads == 1 or total == 1:
+            for done, block in enumerate(blocks, 1):
+                work(*block)
+                settings.progress(done, total, what)
+            return
+        with ThreadPoolExecutor(settings.threads) as pool:
+            futures = [pool.submit(work, *block) for block in blocks]
+            try:
+                for done, future in enumerate(as_completed(futures), 1):
+                    future.result()
+                    settings.progress(done, total, what)
+            except BaseException:
+                self._stop.set()
+                for future in futures:
+                    future.cancel()
+                raise
+
+    def _keep(self) -> None:
+        """Keep the streams that the user asked for, whole, in float64."""
+        for name in self.views[0].chain.keep:
+            if name not in self._source.arrays:
                 raise PipelineError(
                     f"stream {name!r} was asked to be kept, but no operator makes it",
                     cure="keep a stream that a step provides",
                 )
-            self.observation.detdata[name] = self._whole(self._source.streams[name])
-
-    def _whole(self, stream: Stream) -> AnyFloats:
-        """A whole stream with its mean, float64; a few detectors at a time, so that nothing of its
-        size is made besides.
-        """
-        whole = empty(self.schedule.shape, np.float64)
-        for first in range(0, len(whole), TILE_DETECTORS):
-            rows = slice(first, min(first + TILE_DETECTORS, len(whole)))
-            whole[rows] = stream.array[rows]
-            if stream.name in stream.means:
-                whole[rows] += stream.means[stream.name].evaluate(rows, slice(0, whole.shape[1]))
-            forget_pages(stream.array)
-        return whole
+            for view in self.views:
+                array = self._source.arrays[name][view.rows]
+                mean = self._source.means[view.number].get(name)
+                whole = empty(view.shape, np.float64)
+                for first in range(0, len(whole), TILE_DETECTORS):  # no array of its size besides
+                    rows = slice(first, min(first + TILE_DETECTORS, len(whole)))
+                    whole[rows] = array[rows]
+                    if mean is not None:
+                        whole[rows] += mean.evaluate(rows, slice(0, whole.shape[1]))
+                    forget_pages(array)
+                view.observation.detdata[name] = whole
 
     # ---- steps that measure whole streams
 
-    def measure(self, operator: Operator) -> None:
+    def _measure(self, views: Sequence[View], label: str) -> None:
         """Let a filter measure each signal, the complete one first; let another step measure the
-        one stream that it requires.
+        one stream that it requires. Several bands are measured as one, of all their detectors.
         """
-        used = 0.0
-        for signal in self.measured_by(operator):
-            with self.stream(operator, signal) as stream:
-                start = self.without_blocks()
-                model = (
-                    self.measured.get((operator.label, MAIN))
-                    if signal.takes_model(operator.label)
-                    else None
-                )
-                self.measured[operator.label, signal.stream] = operator.measure(stream, model)
-                used += self.without_blocks() - start
-        self.tell(operator, "measure", used)
+        step = next(o for o in views[0].chain.steps if o.label == label)
+        for view in views:
+            self._before(operator=step, observation=view.observation, stage="measure")
+        used, model = 0.0, None
+        for signal in self._measured_by(step):
+            lent: list[AnyFloats] = []
+            stream = self._stream(views, step, signal, lent)
+            start = self._without_blocks()
+            found = step.measure(stream, model if signal.takes_model(label) else None)
+            used += self._without_blocks() - start
+            self._store.drop(lent)
+            model = found if signal.stream == MAIN else model
+            for view, rows in zip(views, _rows_of(views), strict=True):
+                own = step.of_rows(found, rows) if len(views) > 1 else found  # type: ignore[attr-defined]
+                view.measured[label, signal.stream] = own
+            if len(views) > 1 and signal.stream == stream.name:
+                self._note(views, label, stream.observation)
+        for view in views:
+            self._tell(view, step, "measure", used if view is views[0] else 0.0)
 
-    def measured_by(self, operator: Operator) -> list[Formed]:
+    def _measured_by(self, step: Operator) -> list[Formed]:
         """The signals, or the one stream, that a step measures."""
-        names = sorted(operator.requires & self._source.names)
+        here, signals = self._source.names, self.schedule.chain.signals
+        names = sorted(step.requires & here)
         if len(names) != 1:
             raise PipelineError(
-                f"{operator.label} measures a whole stream, but {len(names)} reach it",
+                f"{step.label} measures a whole stream, but {len(names)} reach it",
                 cure="it must require exactly one",
             )
-        self._before(operator=operator, observation=self.observation, stage="measure")
-        if filters(operator):
-            here = self._source.names
-            return [s for s in self.chain.signals if s.filtered and s.stream in here]
-        return [self.chain.signals[0] if names == [MAIN] else Formed(names[0], frozenset())]
+        if filters(step):
+            return [s for s in signals if s.filtered and s.stream in here]
+        return [signals[0] if names == [MAIN] else Formed(names[0], frozenset())]
 
-    @contextmanager
-    def stream(self, operator: Operator, signal: Formed) -> Iterator[Stream]:
+    def _stream(
+        self, views: Sequence[View], step: Operator, signal: Formed, lent: list[AnyFloats]
+    ) -> Stream:
         """A stream for a step that measures: under the name that it knows, with its own mean
-        alone.
+        alone. ``lent`` takes the arrays that are to be given back.
         """
-        lent: list[AnyFloats] = []
-        yield self._stream(operator, signal, lent)
-        self._store.drop(lent)
-
-    def _stream(self, operator: Operator, signal: Formed, lent: list[AnyFloats]) -> Stream:
-        source = self._source
-        held, name = signal.stream, MAIN if is_signal(signal.stream) else signal.stream
-        observation, threads, means = self.observation, self.settings.threads, dict(source.means)
+        source, settings, held = self._source, self.settings, signal.stream
+        name = MAIN if is_signal(held) else held
+        observation, means = views[0].observation, dict(source.means[views[0].number])
         if name == MAIN:
-            means = {MAIN: source.means[held]} if held in source.means else {}
-        if held != name:  # what is found out of it is not the scene's
+            means = {MAIN: means[held]} if held in means else {}
+        if len(views) > 1:
+            every = [source.means[view.number].get(held) for view in views]
+            observation = all_detectors([view.observation for view in views])
+            means = {}
+            if any(mean is not None for mean in every):
+                whole: Any = MeansOfBands(list(zip(every, _rows_of(views), strict=True)))
+                means[name] = whole
+        elif held != name:  # what is found out of it is not the scene's
             observation = copy.copy(observation)
             observation.tally = Tally()
-            observation.flags, observation.detector_flags = (
-                observation.flags.copy(),
-                observation.detector_flags.copy(),
-            )
+            observation.flags = observation.flags.copy()
+            observation.detector_flags = observation.detector_flags.copy()
         if source.stage is not None:
             sweeper = partial(
-                self._sweep, source.stage, signal, f"{operator.label} measures {name}"
+                self._make_again, views, source.stage, signal, f"{step.label} measures {name}"
             )
             stream: Stream = StreamMadeAgain(
-                name, observation, means, threads, self.settings.dtype, sweeper
+                name, observation, means, settings.threads, settings.dtype, sweeper
             )
         else:
-            room = max(self.settings.memory - self._store.held, 0)
-            stream = Stream(name, observation, source.streams[held].array, means, threads, room)
-        if not knows_means(operator) and (
-            fields := means_of(observation, means, frozenset({name}))
-        ):
-            stream = WholeStream(stream, fields[name], partial(self._lend, name, lent))
-        stream.signal, stream.components, stream.state = (
-            held,
-            signal.components,
-            self.states[operator.label],
-        )
+            room = max(settings.memory - self._store.held, 0)
+            array = source.arrays[held][views[0].rows.start : views[-1].rows.stop]
+            stream = Stream(name, observation, array, means, settings.threads, room)
+        if not knows_means(step) and (fields := means_of(observation, means, frozenset({name}))):
+
+            def lend(shape: tuple[int, int]) -> AnyFloats:
+                lent.append(self._store.allocate(name, shape, dtype=np.float64))
+                return lent[-1]
+
+            stream = WholeStream(stream, fields[name], lend)
+        stream.signal, stream.components = held, signal.components
+        stream.state = views[0].states[step.label]
         return stream
 
-    def _lend(self, name: str, lent: list[AnyFloats], shape: tuple[int, int]) -> AnyFloats:
-        """A float64 array, noted in ``lent``, for as long as a step measures."""
-        lent.append(self._store.allocate(name, shape, dtype=np.float64))
-        return lent[-1]
-
-    def without_blocks(self) -> float:
-        """CPU seconds of this process, without those of blocks (a stream made again is made of
-        them) and of the scan ahead.
-        """
-        return time.process_time() - self.timer.of_stage("exec") - self._ahead.seconds()
-
-    def _sweep(
+    def _make_again(
         self,
+        views: Sequence[View],
         stage: Stage,
         signal: Formed,
         what: str,
         work: Callable[[slice, slice, AnyFloats], Any],
     ) -> Iterator[tuple[slice, slice, Any]]:
         """`Stream.sweep` of a stream that ``stage`` makes."""
-        signals: Sequence[Formed] | None = (
-            [signal] if stage.swept and signal in self.chain.signals else None
-        )
+        swept = {view.number for view in views} <= stage.swept
+        signals = [signal] if swept and signal in self.schedule.chain.signals else None
 
-        def one(detectors: slice, samples: slice) -> tuple[slice, slice, Any]:
-            block = self.blocks.make(stage, detectors, samples, {}, again=False, signals=signals)
-            return detectors, samples, work(detectors, samples, block.detdata[signal.stream])
+        def one(
+            view: View, first: int, detectors: slice, samples: slice
+        ) -> tuple[slice, slice, Any]:
+            maker = self._makers[view.number]
+            block = maker.make(stage, detectors, samples, {}, again=False, signals=signals)
+            rows = slice(first + detectors.start, first + detectors.stop)
+            return rows, samples, work(rows, samples, block.detdata[signal.stream])
 
-        todo = self.schedule.blocks(Planned(stage))
+        todo = [
+            (view, rows.start, *block)
+            for view, rows in zip(views, _rows_of(views), strict=True)
+            for block in self.schedule.blocks(Planned(stage), view)
+        ]
+        scan = name_of_all(self._first) if len(views) > 1 else views[0].observation.name
         for done, result in enumerate(in_order(one, todo, self.settings.threads), 1):
-            self.settings.progress(done, len(todo), f"{self.observation.name}: {what}")
+            self.settings.progress(done, len(todo), f"{scan}: {what}")
             yield result
-        stage.has_been_swept()
-        self.blocks.release()
+        stage.has_been_swept(views)
+        for maker in self._makers:
+            maker.release()
+
+    def _without_blocks(self) -> float:
+        """CPU seconds of this process, without those of blocks (a stream made again is made of
+        them) and of the scan ahead.
+        """
+        return time.process_time() - self.timer.of_stage("exec") - self._ahead.seconds()
+
+    def _note(self, views: Sequence[View], label: str, whole: Observation) -> None:
+        """Note in each band's observation what was flagged and counted in that of all."""
+        views[0].observation.tally.update(whole.tally)
+        for view, rows in zip(views, _rows_of(views), strict=True):
+            own = view.observation
+            own.detector_flags |= whole.detector_flags[rows]
+            elsewhere = own.good_samples & ~whole.good_samples
+            own.tally.count(label, ELSEWHERE, int(elsewhere.sum()), elsewhere.size)
+            own.flags |= whole.flags
 
 
-@dataclass
-class Pass:
-    """Work of one observation's segment on all blocks.
+def _rows_of(views: Sequence[View]) -> list[slice]:
+    """Rows of bands in a stream of these bands alone."""
+    start = views[0].rows.start
+    return [slice(view.rows.start - start, view.rows.stop - start) for view in views]
 
-    Attributes
-    ----------
-    made
-        The streams that it holds, by name.
+
+def name_of_all(scan: Observation) -> str:
+    """The name of a scan without that of its band."""
+    return scan.name.removesuffix(f"-{scan.instrument.band.name}")
+
+
+def all_detectors(scans: Sequence[Observation]) -> Observation:
+    """A scan with the detectors of all bands. A sample that one band flags is flagged: the bands
+    have no common mode there.
     """
-
-    execution: Execution
-    planned: Planned
-    stage: Stage
-    made: dict[str, Stream]
-    seen: set[str] = field(default_factory=set)
-    means: dict[str, SmoothField] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, execution: Execution, planned: Planned, stage: Stage) -> Pass:
-        """Room for the streams that a segment passes on."""
-        made: dict[str, Stream] = {}
-        observation, settings = execution.observation, execution.settings
-        for name in sorted(stage.wanted):
-            if name in stage.source.streams and not stage.segment.halo:
-                made[name] = stage.source.streams[name]  # changed in place
-                continue
-            array = execution._store.allocate(name, execution.schedule.shape, planned.how == "kept")
-            made[name] = Stream(name, observation, array, {}, settings.threads)
-            if isinstance(array, np.memmap):
-                observation.tally.state(
-                    "Execution", f"stream {name} spilled to disk", f"{array.nbytes / 1e9:.2f} GB"
-                )
-        return cls(execution, planned, stage, made)
-
-    @cached_property
-    def blocks(self) -> list[tuple[slice, slice]]:
-        """Detectors and samples of the blocks."""
-        return self.execution.schedule.blocks(self.planned)
-
-    def shares_blocks(self, other: Pass) -> bool:
-        """Tell whether the blocks are those of another band that looks through the same pixels."""
-        one, two = self.execution.observation, other.execution.observation
-        return one is two or (one.looks_as(two) and self.blocks == other.blocks)
-
-    def work(self, detectors: slice, samples: slice, due: list[Due] | None = None) -> None:
-        """Work on a block; ``due`` as in `BlockMaker.make`."""
-        block = self.execution.blocks.make(
-            self.stage, detectors, samples, self.made, again=False, due=due
-        )
-        for name, stream in self.made.items():
-            if name in block.detdata:
-                self.seen.add(name)
-                if block.detdata[name] is not block.places.get(name):
-                    stream.array[block.detectors, block.samples] = block.detdata[name]
-        self.means.update(block.means)  # the same fields in every block
-        for stream in (*self.made.values(), *self.stage.source.streams.values()):
-            forget_pages(stream.array)
-
-    def end(self) -> None:
-        """Hold the streams that were made; release the others."""
-        execution, source = self.execution, self.stage.source
-        self.stage.has_been_swept()
-        execution.blocks.release()
-        kept = {
-            name: Stream(name, s.observation, s.array, self.means, execution.settings.threads)
-            for name, s in self.made.items()
-            if name in self.seen
-        }
-        held = {id(s.array) for s in kept.values()}
-        execution._store.release(
-            [
-                s.array
-                for s in [*source.streams.values(), *self.made.values()]
-                if id(s.array) not in held
-            ]
-        )
-        execution.passed(Source.of(kept, self.means))
+    first = scans[0]
+    return replace(
+        first,
+        name=f"{name_of_all(first)}, all bands",
+        focalplane=Focalplane.of_bands({str(k): scan.focalplane for k, scan in enumerate(scans)}),
+        flags=np.bitwise_or.reduce([scan.flags for scan in scans]),
+        detector_flags=np.concatenate([scan.detector_flags for scan in scans]),
+        smooth={},
+        detdata={},
+        tally=Tally(),
+    )

@@ -18,6 +18,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..data import Block, Observation, Stream
 from ..mapmaker import MapMaker
@@ -126,6 +127,31 @@ def exec_whole(
     block.means.update(whole.means)
 
 
+class MeansOfBands:
+    """Means of the bands of a stream, one band after the other; bands without a mean have zeros.
+
+    Parameters
+    ----------
+    fields
+        The mean of each band, or None, and its detectors' rows.
+    """
+
+    def __init__(self, fields: Sequence[tuple[SmoothField | None, slice]]) -> None:
+        self._fields = fields
+
+    def evaluate(self, detectors: slice, samples: slice) -> NDArray[np.float64]:
+        """As `SmoothField.evaluate`."""
+        shape = detectors.stop - detectors.start, samples.stop - samples.start
+        found = np.zeros(shape)
+        for mean, rows in self._fields:
+            first, stop = max(rows.start, detectors.start), min(rows.stop, detectors.stop)
+            if mean is not None and first < stop:
+                own = slice(first - rows.start, stop - rows.start)
+                into = slice(first - detectors.start, stop - detectors.start)
+                found[into] = mean.evaluate(own, samples)
+        return found
+
+
 class WholeStream(Stream):
     """A stream with its mean in it, float64, for `Operator.measure`.
 
@@ -138,7 +164,7 @@ class WholeStream(Stream):
     """
 
     def __init__(
-        self, stream: Stream, field: SmoothField, allocate: Callable[[tuple[int, ...]], AnyFloats]
+        self, stream: Stream, field: SmoothField, allocate: Callable[[tuple[int, int]], AnyFloats]
     ) -> None:
         self.name, self.observation, self.threads, self.room = (
             stream.name,

@@ -1,29 +1,30 @@
-"""The schedule of one observation: its segments, what becomes of the streams between them, and the
+"""The schedule of one scan: its segments, what becomes of the streams between them, and the
 blocks that are cut.
 
-It is made once for an observation, without running or allocating anything, and then followed; the
-forecast of a run is the schedule that would be followed with its budget.
+It is made once for a scan, without running or allocating anything, and then followed; the forecast
+of a run is the schedule that would be followed with its budget. A stream has the detectors of all
+bands that are executed together, one band after the other; a block has those of one.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ..errors import PipelineError
-from ..mapmaker import MapMaker, filters, forms, makes_products
+from ..mapmaker import MapMaker, forms
 from ..numerics.chunks import TILE_DETECTORS
-from ..observation import Observation
 from ..operator import Operator
 from ..plan.planning import planning_of
-from ..signal import MAIN, Formed
+from ..signal import Formed
 from .means import knows_means, may_have_means, names_of
 from .segments import PIECE, Segment, block_share, blocks, cut, least_block, whole_span
 from .settings import Held, Settings
 from .streams import Source, Stage, free_disk
+from .views import View
 
 SCRATCH_STREAMS = 2
 """Block-sized arrays assumed for operators' own scratch when the budget is divided."""
@@ -35,78 +36,6 @@ filters, not made again.
 
 AMPLE_BLOCK = 128 << 20
 """Bytes of a block's arrays on one thread beyond which larger ones gain nothing."""
-
-COMPLETE = (Formed(MAIN, frozenset()),)
-"""The complete signal alone."""
-
-
-@dataclass(frozen=True)
-class Chain:
-    """The steps that act on an observation, and the signals that they make.
-
-    Attributes
-    ----------
-    steps
-        In order.
-    signals
-        Those that are formed, the complete one first.
-    components
-        Names of all streams that become part of a signal.
-    keep
-        Streams that the user asked for.
-    """
-
-    steps: Sequence[Operator]
-    signals: tuple[Formed, ...] = COMPLETE
-    components: frozenset[str] = frozenset()
-    keep: tuple[str, ...] = ()
-
-    def expanded(self, names: Collection[str]) -> frozenset[str]:
-        """Names of streams, with those of all signals in place of ``signal``."""
-        return (
-            frozenset(names) | {s.stream for s in self.signals}
-            if MAIN in names
-            else frozenset(names)
-        )
-
-    @property
-    def read(self) -> frozenset[str]:
-        """Names of the streams that are needed: what `Operator.exec` or `Operator.measure` reads,
-        and what is kept.
-        """
-        names = frozenset(self.keep)
-        for step in self.steps:
-            if type(step).exec is not Operator.exec or type(step).measure is not Operator.measure:
-                names |= (
-                    self.of(step, self.signals) if forms(step) else step.requires | step.optional
-                )
-        return self.expanded(names - {"boresight"})
-
-    def of(self, step: Operator, signals: Collection[Formed]) -> frozenset[str]:
-        """Names of the streams that a step which forms signals reads for these."""
-        unknown = not self.components
-        parts = frozenset[str]().union(*(s.components for s in signals))
-        return frozenset(
-            n
-            for n in step.requires | step.optional | parts
-            if unknown or n in parts or n not in self.components
-        )
-
-    def needed_for(self, signals: Collection[Formed], *, filtered: bool) -> list[Operator]:
-        """The steps that form signals, those that filter them if so wanted, and those that make
-        what these read.
-        """
-        found: list[Operator] = []
-        names = frozenset[str]()
-        for step in reversed(self.steps):
-            if forms(step) or (filtered and filters(step)):
-                names |= self.of(step, signals)
-            elif step.provides & names:
-                names |= step.requires | step.optional
-            else:
-                continue
-            found.insert(0, step)
-        return found
 
 
 @dataclass
@@ -141,7 +70,7 @@ class Planned:
 
 @dataclass
 class Schedule:
-    """Work on one observation, and the memory that it takes.
+    """Work on one scan, and the memory that it takes.
 
     Attributes
     ----------
@@ -154,39 +83,40 @@ class Schedule:
         Bytes that streams and blocks take at once; the least budget that would do.
     elsewhere
         Streams that are kept nowhere or on disk, in words.
-    again
-        How many times more the operators, by label, act whose streams are made again when they are
-        read.
+    at_once
+        Bands whose blocks are worked on together: all, if their detectors look through the same
+        pixels and their smallest blocks fit in memory; else 1.
     """
 
-    chain: Chain
-    observation: Observation
+    views: Sequence[View]
     settings: Settings
     planned: list[Planned] = field(default_factory=list)
     made_again: tuple[Formed, ...] = ()
     bytes: int = 0
     least: int = 0
     elsewhere: tuple[str, ...] = ()
-    again: Mapping[str, int] = field(default_factory=dict)
+    at_once: int = 1
 
     def __post_init__(self) -> None:
-        self.streams, self.means = (
-            self.chain.read,
-            self.chain.expanded(may_have_means(self.chain.steps)),
-        )
+        self.chain, first = self.views[0].chain, self.views[0].observation
+        self.streams = self.chain.read
+        self.means = self.chain.expanded(may_have_means(self.chain.steps))
+        if all(view.observation.looks_as(first) for view in self.views):
+            self.at_once = len(self.views)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(detectors, samples) of the observation."""
-        return self.observation.n_detectors, self.observation.n_samples
+        """(detectors, samples) of the band of most detectors."""
+        return max(view.shape for view in self.views)
 
     @property
     def stream_size(self) -> int:
         """Bytes of a whole stream."""
-        return self.shape[0] * self.shape[1] * np.dtype(self.settings.dtype).itemsize
+        rows = sum(view.shape[0] for view in self.views)
+        return rows * self.shape[1] * np.dtype(self.settings.dtype).itemsize
 
-    def blocks(self, planned: Planned) -> list[tuple[slice, slice]]:
-        """The blocks in which a segment works.
+    def blocks(self, planned: Planned, view: View) -> list[tuple[slice, slice]]:
+        """The blocks in which a segment works on a band.
 
         Raises
         ------
@@ -202,28 +132,22 @@ class Schedule:
                 f"one block of {rows} detectors needs {need / settings.threads / 1e6:.1f} MB on"
                 f" each of {settings.threads} threads, the memory budget has"
                 f" {(settings.memory - held) / 1e6:.1f} MB for all of them",
-                place=self.observation.name,
+                place=view.observation.name,
                 cure=(
                     f"raise --memory to {self._ceiling_for(need + held)}, use fewer --threads, or"
                     " make the scan shorter"
                 ),
             )
-        return list(blocks(stage.span, stage.in_time_order, self.shape, share))
+        return list(blocks(stage.span, stage.in_time_order, view.shape, share))
 
     # ---- made once
 
-    def make(self, ordered: Collection[str] = (), halos: Mapping[str, int] | None = None) -> None:
-        """Walk through the segments.
-
-        ``ordered`` and ``halos``: of the other bands that are executed together with this one, see
-        `segments.cut`.
-        """
-        steps = self.chain.steps
-        every = {*ordered, *ordered_in(steps, self.observation)}
-        segments = cut(steps, self.observation, every, halos or {})
+    def make(self) -> None:
+        """Walk through the segments."""
+        segments = cut(self.views)
         self.made_again = self._made_again(segments)
         apart = {s.stream for s in self.made_again}
-        source, held, elsewhere, again = Source(), 0, list[str](), dict[str, int]()
+        source, held, elsewhere = Source(), 0, list[str]()
         for number, segment in enumerate(segments):
             later = segments[number + 1 :]
             wanted = frozenset(self.chain.keep).union(
@@ -233,43 +157,25 @@ class Schedule:
             stage = Stage(
                 segment, source, made & self.chain.expanded(wanted) & self.streams - apart
             )
-            new = (
-                stage.wanted
-                if segment.halo
-                else stage.wanted - (frozenset() if source.stage else source.names)
-            )
-            size, how, why = len(new) * self.stream_size, "kept", ""
-            planned = Planned(stage)
+            known = segment.halo or source.stage
+            new = stage.wanted if known else stage.wanted - source.names
+            size, planned = len(new) * self.stream_size, Planned(stage)
             if later and new and not self._keeps(stage, size, held, later):
-                how, why = self._where(stage, sorted(new), size, held, later)
-                elsewhere += [
-                    f"{name} {'spilled to disk' if how == 'spilled' else 'made again'}"
-                    for name in sorted(new)
-                ]
-            planned.how, planned.why = how, why  # type: ignore[assignment]
+                planned.how, planned.why = self._where(stage, sorted(new), size, held, later)
+                what = "spilled to disk" if planned.how == "spilled" else "made again"
+                elsewhere += [f"{name} {what}" for name in sorted(new)]
             self.planned.append(planned)
-            if how == "again":
-                times = self._readings(later)
-                again.update(
-                    {
-                        o.label: max(times, again.get(o.label, 0))
-                        for o in segment.operators
-                        if not makes_products(o)
-                    }
-                )
-                source = Source({}, stage, stage.wanted)
+            if planned.how == "again":
+                source = Source(stage=stage, names=stage.wanted)
                 continue
-            size = 0 if how == "spilled" else size
+            size = 0 if planned.how == "spilled" else size
             planned.held = held + (size if later else 0)
             smallest = self._least_blocks(stage)
             largest = max(self._largest_blocks(stage, planned.held), smallest)
-            self.bytes, self.least = (
-                max(self.bytes, held + size + largest),
-                max(self.least, smallest),
-            )
-            held = planned.held
-            source = Source(names=stage.wanted)
-        self.elsewhere, self.again = tuple(elsewhere), again
+            self.bytes = max(self.bytes, held + size + largest)
+            self.least = max(self.least, smallest)
+            held, source = planned.held, Source(names=stage.wanted)
+        self.elsewhere = tuple(elsewhere)
 
     def _made_again(self, segments: Sequence[Segment]) -> tuple[Formed, ...]:
         """Unfiltered signals, where streams are held on the way to the maps and memory is not ample
@@ -287,7 +193,7 @@ class Schedule:
             k for k, s in enumerate(segments) if any(isinstance(o, MapMaker) for o in s.operators)
         ]
         needed = self.chain.needed_for(unfiltered, filtered=False)
-        bound = any(o.couples != "sample" or o.halo(self.observation) for o in needed)
+        bound = any(o.couples != "sample" or o.halo(self.views[0].observation) for o in needed)
         return unfiltered if before and mapped and min(mapped) > before[0] and not bound else ()
 
     def _keeps(self, stage: Stage, size: int, held: int, later: list[Segment]) -> bool:
@@ -311,7 +217,7 @@ class Schedule:
         following, disk = later[0], free_disk()
         head, span = following.operators[0], stage.span
         hindrance = ""
-        if head.couples == "all" and not planning_of(head).sweeps(self.observation):
+        if head.couples == "all" and not planning_of(head).sweeps(self.views[0].observation):
             hindrance = f"{head.label} reads it as a whole"
         elif {span, following.span} == {"time", "detectors"}:
             hindrance = f"{head.label} needs the other direction whole"
@@ -321,7 +227,7 @@ class Schedule:
                 f"the stream{plural} {', '.join(new)} takes {size / 1e9:.3g} GB, which fit neither"
                 f" in memory nor on the disk ({disk / 1e9:.3g} GB free in"
                 f" {tempfile.gettempdir()}), and cannot be made again when it is read: {hindrance}",
-                place=self.observation.name,
+                place=self.views[0].observation.name,
                 cure=(
                     f"use --memory {self._ceiling_for(2 * (held + size))}, or point TMPDIR to a"
                     " larger disk, or split into shorter scans"
@@ -335,21 +241,11 @@ class Schedule:
             else ("again", f"{size / 1e9:.3g} GB; {head.label} reads it in blocks")
         )
 
-    def _readings(self, later: Sequence[Segment]) -> int:
-        """Number of readings, beyond one, of the streams that are passed on to the first of the
-        segments to come.
-        """
-        heads = [s.operators[0] for s in later]
-        swept = sum(planning_of(o).sweeps(self.observation) for o in heads if o.couples == "all")
-        swept *= sum(s.filtered for s in self.chain.signals)
-        return swept + round(2 * later[0].halo / PIECE + 0.4)
-
     # ---- sizes of blocks
 
     def _least_blocks(self, stage: Stage) -> int:
         """Bytes of the smallest blocks, on all threads."""
-        rows, columns = least_block(stage.span, self.shape)
-        return self._bytes(stage, rows * columns, min(rows, TILE_DETECTORS) * min(columns, PIECE))
+        return self._bytes(stage, *least_block(stage.span, self.shape))
 
     def _largest_blocks(self, stage: Stage, held: int) -> int:
         """Bytes of the blocks that would be cut beside ``held`` bytes of streams, on all
@@ -357,8 +253,12 @@ class Schedule:
         """
         share = max(self._share(stage, held), 1)
         first = next(iter(blocks(stage.span, stage.in_time_order, self.shape, share)))
-        rows, columns = (s.stop - s.start for s in first)
-        return self._bytes(stage, rows * columns, min(rows, TILE_DETECTORS) * min(columns, PIECE))
+        return self._bytes(stage, *(s.stop - s.start for s in first))
+
+    @property
+    def _item(self) -> int:
+        """Bytes of a sample in the blocks of all threads."""
+        return self.settings.threads * self.at_once * np.dtype(self.settings.dtype).itemsize
 
     def _share(self, stage: Stage, held: int) -> int:
         """Samples that a block may hold beside ``held`` bytes of streams: within half of the
@@ -366,23 +266,15 @@ class Schedule:
         """
         settings, (whole, part) = self.settings, self._streams_in_block(stage)
         rows, columns = least_block(stage.span, self.shape)
-        each = settings.threads * np.dtype(settings.dtype).itemsize
-        share = block_share(
-            min(settings.memory // 2, settings.threads * AMPLE_BLOCK) // each, whole, part
-        )
-        return (
-            share
-            if share >= rows * columns
-            else block_share((settings.memory - held) // each, whole, part)
-        )
+        most = min(settings.memory // 2, settings.threads * self.at_once * AMPLE_BLOCK)
+        share = block_share(most // self._item, whole, part)
+        left = block_share((settings.memory - held) // self._item, whole, part)
+        return share if share >= rows * columns else left
 
-    def _bytes(self, stage: Stage, block: int, piece: int) -> int:
+    def _bytes(self, stage: Stage, rows: int, columns: int) -> int:
         whole, part = self._streams_in_block(stage)
-        return (
-            self.settings.threads
-            * np.dtype(self.settings.dtype).itemsize
-            * (whole * block + part * piece)
-        )
+        piece = min(rows, TILE_DETECTORS) * min(columns, PIECE)
+        return self._item * (whole * rows * columns + part * piece)
 
     def _streams_in_block(self, stage: Stage | None) -> tuple[int, int]:
         """Numbers of block-sized and of piece-sized arrays that a stage and those before it
@@ -411,16 +303,13 @@ class Schedule:
         """Arrays of the run's precision that whole streams and one mean take, float64, where a step
         does not know of means.
         """
-        each = 8 // np.dtype(self.settings.dtype).itemsize
-        paying = [
-            o for o in operators if (o.requires | o.optional) & self.means and not knows_means(o)
+        signals = self.views[0].observation.signals
+        copied = [
+            1 + len(names_of(o, signals) & self.streams)
+            for o in operators
+            if (o.requires | o.optional) & self.means and not knows_means(o)
         ]
-        return (
-            each
-            * (1 + max(len(names_of(o, self.observation.signals) & self.streams) for o in paying))
-            if paying
-            else 0
-        )
+        return 8 // np.dtype(self.settings.dtype).itemsize * max(copied, default=0)
 
     def _ceiling_for(self, need: int) -> str:
         """``--memory`` with which streams and blocks may take ``need`` bytes."""
@@ -429,32 +318,38 @@ class Schedule:
         return f"{-(-(need + fixed) * 21 // 20_000_000)}MB"
 
 
-def ordered_in(steps: Sequence[Operator], observation: Observation) -> list[str]:
-    """Labels of the steps that are much cheaper in order of time."""
-    return [o.label for o in steps if planning_of(o).in_time_order(observation)]
-
-
-def schedule(chain: Chain, observation: Observation, settings: Settings) -> Schedule:
-    """Make the schedule of an observation.
+def schedule(views: Sequence[View], settings: Settings) -> Schedule:
+    """Make the schedule of a scan with some bands.
 
     Raises
     ------
     PipelineError
         Where a stream fits neither in memory nor on the disk and cannot be made again.
     """
-    made = Schedule(chain, observation, settings)
+    made = Schedule(views, settings)
     made.make()
+    if made.least > settings.memory and made.at_once > 1:
+        made = Schedule(views, settings)
+        made.at_once = 1
+        made.make()
     return made
 
 
-def spares(chain: Chain, observation: Observation, settings: Settings, size: int) -> bool:
+def spares(views: Sequence[View], settings: Settings, size: int) -> bool:
     """Tell whether streams and blocks do the same with ``size`` bytes less memory."""
     if settings.memory <= size:
         return False
     less = replace(settings, memory=settings.memory - size)
+    return does_the_same(views, less, [schedule(views, settings)])
+
+
+def does_the_same(views: Sequence[View], settings: Settings, others: Sequence[Schedule]) -> bool:
+    """Tell whether streams are kept where other schedules keep them, and blocks fit."""
     try:
-        with_all, with_less = (schedule(chain, observation, s) for s in (settings, less))
+        found = schedule(views, settings)
     except PipelineError:  # a stream would go to a disk that has no room for it
         return False
-    same = with_less.elsewhere == with_all.elsewhere and with_less.made_again == with_all.made_again
-    return same and with_less.least <= less.memory
+    same = all(
+        (found.elsewhere, found.made_again) == (one.elsewhere, one.made_again) for one in others
+    )
+    return same and found.least <= settings.memory

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..data import Block, Observation
+from ..data import Block
 from ..numerics.chunks import TILE_DETECTORS, TILE_SAMPLES
 from ..operator import Operator
+from ..plan.planning import planning_of
+from .views import View
 
 PIECE = 4 * TILE_SAMPLES
 """Samples that operators without coupling see at once: 0.5 MB per float32 stream, and little time
@@ -41,37 +43,23 @@ class Segment:
         return self.operators[:cut], self.operators[cut:]
 
 
-def cut(
-    operators: Sequence[Operator],
-    observation: Observation,
-    ordered: Collection[str] = (),
-    halos: Mapping[str, int] | None = None,
-) -> list[Segment]:
-    """Cut a chain into segments where the coupling changes.
+def cut(views: Sequence[View]) -> list[Segment]:
+    """Cut the steps of bands that are executed together into segments where the coupling changes.
 
-    Parameters
-    ----------
-    ordered
-        Labels of the operators that want their blocks in order of time.
-    halos
-        By label, least neighbours that are given on each side, whatever `Operator.halo` says.
+    A step is given as many neighbours as it needs in any of them, and blocks in order of time if
+    it asks for that in one.
     """
-    least = halos or {}
     segments = [Segment([])]
-    for operator in operators:
-        last = segments[-1]
-        couples, halo, in_order = (
-            operator.couples,
-            max(operator.halo(observation), least.get(operator.label, 0)),
-            operator.label in ordered,
-        )
+    for steps in zip(*(view.chain.steps for view in views), strict=True):
+        operator, last = steps[0], segments[-1]
+        each = [(o, view.observation) for o, view in zip(steps, views, strict=True)]
+        couples, halo = operator.couples, max(o.halo(seen) for o, seen in each)
+        in_order = any(planning_of(o).in_time_order(seen) for o, seen in each)
         if (in_order and last.span == "time") or (last.in_time_order and couples == "time"):
-            segments.append(Segment([operator], couples, in_time_order=in_order))
+            segments.append(Segment([operator], couples))
         elif couples == "all":
             segments.append(Segment([operator]))
-        elif (
-            halo > 0 and last.span != "time"
-        ):  # whole scans need no halo; otherwise read the stream with margins
+        elif halo > 0 and last.span != "time":  # whole scans need none: read it with margins
             segments.append(Segment([operator], halo=halo))
         elif couples in ("sample", last.span):
             last.operators.append(operator)

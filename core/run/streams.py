@@ -17,7 +17,7 @@ import os
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,6 +30,7 @@ from ..numerics.smooth import SmoothField
 from ..operator import Operator
 from ..types import AnyFloats
 from .segments import Segment
+from .views import View
 
 DISK_SHARE = 0.9
 """Of the free disk that streams may take."""
@@ -66,20 +67,21 @@ class Stage:
     wanted
         Names of the streams that it passes on.
     swept
-        It has worked on every sample once: what comes now comes again.
+        Numbers of the bands of which it has worked on every sample once: what comes now comes
+        again.
     """
 
     segment: Segment
     source: Source
     wanted: frozenset[str]
-    swept: bool = False
+    swept: set[int] = field(default_factory=set)
     apart: bool = False
     """It makes unfiltered signals again, beside the other streams of a block."""
 
     @classmethod
     def without_filters(cls, steps: list[Operator], wanted: frozenset[str]) -> Stage:
         """A stage of the steps up to the one that forms signals."""
-        return cls(Segment(steps), Source(), wanted, swept=True, apart=True)
+        return cls(Segment(steps), Source(), wanted, apart=True)
 
     @property
     def place(self) -> int:
@@ -103,33 +105,36 @@ class Stage:
             self.source.stage and self.source.stage.in_time_order
         )
 
-    def has_been_swept(self) -> None:
-        """Every sample was worked on."""
-        stage: Stage | None = self
-        while stage is not None:
-            stage.swept, stage = True, stage.source.stage
+    def has_been_swept(self, views: Sequence[View]) -> None:
+        """Note that every sample of some bands was worked on."""
+        self.swept.update(view.number for view in views)
+        if self.source.stage is not None:
+            self.source.stage.has_been_swept(views)
 
 
 @dataclass
 class Source:
-    """Streams that a segment reads, or a stage that makes them; the mean emission that belongs to
-    them.
+    """Streams that a segment reads.
+
+    Attributes
+    ----------
+    arrays
+        Those that are held, by name: the detectors of all bands, one band after the other.
+    stage
+        Makes them where none is held.
+    means
+        By number of the band, the mean emission that belongs to its rows.
     """
 
-    streams: dict[str, Stream] = field(default_factory=dict)
+    arrays: dict[str, AnyFloats] = field(default_factory=dict)
     stage: Stage | None = None
     names: frozenset[str] = frozenset()
-    means: dict[str, SmoothField] = field(default_factory=dict)
+    means: dict[int, dict[str, SmoothField]] = field(default_factory=dict)
 
     @property
     def span(self) -> str:
         """See `Stage.span`."""
         return self.stage.span if self.stage else "sample"
-
-    @classmethod
-    def of(cls, streams: dict[str, Stream], means: dict[str, SmoothField]) -> Source:
-        """A source of streams that are held."""
-        return cls(streams, None, frozenset(streams), means)
 
 
 class StreamMadeAgain(Stream):
@@ -301,10 +306,12 @@ def columns(array: AnyFloats, samples: slice) -> AnyFloats:
         return np.array(array[:, samples], order="C")
     found = np.empty((array.shape[0], samples.stop - samples.start), array.dtype)
     whole, size = found.data.cast("B"), found.strides[0]
+    mapped: Any = array._mmap  # type: ignore[attr-defined]
+    begin = array.ctypes.data - np.frombuffer(mapped, np.uint8).ctypes.data
     with open(str(array.filename), "rb", buffering=0) as file:
         for row in range(array.shape[0]):
             place, left = (
-                row * array.strides[0] + samples.start * array.itemsize,
+                begin + row * array.strides[0] + samples.start * array.itemsize,
                 whole[row * size : (row + 1) * size],
             )
             while left:

@@ -101,12 +101,6 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         """
         return in_time_order(self.operator.model(observation))
 
-    def shares_blocks(self, observation: Observation) -> bool:
-        """Lines of sight, and tiles of the turbulence, where each detector is evaluated by
-        itself.
-        """
-        return bytes_of_units(self.operator.model(observation)) > 0
-
     def traits(self, observation: Observation) -> Traits:
         """rms of the fluctuation, and of what of it is faster than a frequency."""
         a = calibrated(self.operator.model(observation))

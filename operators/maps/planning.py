@@ -10,7 +10,7 @@ from zonda.core.plan.planning import Planning
 
 from .bin_map import BinMap
 from .coverage import COUNTS
-from .grid import TangentGrid, in_frame
+from .grid import in_frame
 
 
 class BinMapPlanning(Planning[BinMap]):
@@ -33,13 +33,6 @@ class BinMapPlanning(Planning[BinMap]):
         return Traits(
             pixel=side, weighs=step.weights == "inverse_variance" and step.contents == "all"
         )
-
-    def shares_blocks(self, observation: Observation) -> bool:
-        """The pixels, which `pixels.Looking` finds once; those of an image of I are found where
-        they are used.
-        """
-        step = self.operator
-        return step.stokes == "IQU" or step.crosslinking or not isinstance(step.grid, TangentGrid)
 
     def memory(self, observation: Observation) -> int:
         """Sums of two threads, two halves, the products of all signals; and the pointing, twice

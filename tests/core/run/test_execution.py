@@ -16,11 +16,11 @@ from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
 from zonda.core.registry import planning
 from zonda.core.run.execution import Execution
-from zonda.core.run.scan import run as run_scan
-from zonda.core.run.schedule import Chain, Schedule
+from zonda.core.run.schedule import Schedule
 from zonda.core.run.segments import PIECE, cut
 from zonda.core.run.settings import Settings, Timer
 from zonda.core.run.streams import Store
+from zonda.core.run.views import Chain, View
 
 
 def observation(n_det=101, n_samp=9 * TILE_SAMPLES + 123):
@@ -177,7 +177,8 @@ def execute(operators, obs, room=None, how=None, **settings):
     for i, o in enumerate(operators):
         o._label = f"{type(o).__name__}.{i}"
     data = Data(scene=None)
-    execution = Execution(Chain(operators, keep=("signal",)), obs, Settings(**settings), Timer())
+    view = View(Chain(operators, keep=("signal",)), obs, data)
+    execution = Execution([view], Settings(**settings), Timer())
     with ExitStack() as stack:
         if room is not None:
             keeps = lambda self, stage, size, held, later: held + size <= room  # noqa: E731
@@ -187,7 +188,7 @@ def execute(operators, obs, room=None, how=None, **settings):
             )
         if how is not None:
             stack.enter_context(mock.patch.object(Schedule, "_where", return_value=(how, "")))
-        run_scan([execution], [data])
+        execution.run()
     return execution, obs.detdata["signal"], data
 
 
@@ -313,7 +314,7 @@ def test_pieces_of_a_block_change_no_bit(coupled):
     """
     chain = [Source(), Square(), coupled, Scale(), Square(), coupled, Sink()]
     assert observation().n_samples > 2 * PIECE
-    assert [len(s.split()[0]) for s in cut(chain, observation())] == [2, 2]
+    assert [len(s.split()[0]) for s in cut([View(Chain(chain), observation())])] == [2, 2]
     want = reference(observation(), chain)
     for memory, threads in ((1 << 30, 1), (16 * want.size, 2)):
         got, data = run(chain, observation(), memory=memory, threads=threads)
@@ -452,7 +453,7 @@ def test_one_detector_one_sample():
 
 
 def test_segments():
-    spans = [(len(s.operators), s.span, s.halo) for s in cut(CHAIN, observation())]
+    spans = [(len(s.operators), s.span, s.halo) for s in cut([View(Chain(CHAIN), observation())])]
     assert spans == [
         (1, "sample", 0),
         (1, "sample", 3),
@@ -462,10 +463,12 @@ def test_segments():
         (2, "sample", 0),
     ]
     assert [
-        s.operators[0].couples for s in cut([Source(), Demean(), Scale(), Sink()], observation())
+        s.operators[0].couples
+        for s in cut([View(Chain([Source(), Demean(), Scale(), Sink()]), observation())])
     ] == ["sample", "all"]
     assert [
-        len(s.operators) for s in cut([Source(), Demean(), Smooth(), Sink()], observation())
+        len(s.operators)
+        for s in cut([View(Chain([Source(), Demean(), Smooth(), Sink()]), observation())])
     ] == [4]  # whole scans need no halo
 
 

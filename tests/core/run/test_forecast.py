@@ -25,15 +25,16 @@ from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
 from zonda.core.registry import planning
 from zonda.core.run.budget import BASE, divided, least_memory, with_scan_ahead
-from zonda.core.run.schedule import Chain, schedule
+from zonda.core.run.schedule import schedule
 from zonda.core.run.settings import Settings
+from zonda.core.run.views import Chain, View
 
 
-def labelled(steps):
+def views(obs, steps):
     steps = [o.model_copy() for o in steps]
     for i, o in enumerate(steps):
         o._label = f"{type(o).__name__}.{i}"
-    return Chain(steps)
+    return [View(Chain(steps), obs)]
 
 
 @pytest.mark.parametrize(
@@ -50,13 +51,13 @@ def test_what_is_held_is_what_was_forecast(chain, threads, share):
         "memory": int(share * threads * 4 * obs.n_detectors * obs.n_samples),
         "threads": threads,
     }
-    found = schedule(labelled(chain), obs, Settings(**settings))
+    found = schedule(views(obs, chain), Settings(**settings))
     # the bench keeps the last stream besides
     kept = 4 * obs.n_detectors * obs.n_samples
     execution, want, _ = execute(chain, obs, **settings)
     assert execution.ledger.peak <= found.bytes + kept
     assert found.least <= found.bytes <= settings["memory"]
-    least = schedule(labelled(chain), obs, Settings(memory=1, threads=threads)).least
+    least = schedule(views(obs, chain), Settings(memory=1, threads=threads)).least
     _, got, _ = execute(chain, observation(), threads=threads, memory=least + 2 * kept)
     assert np.array_equal(got, want)
 
@@ -112,7 +113,7 @@ def libraries(monkeypatch, free=10**10):
 
 
 def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
-    chain = labelled([Source(), Heavy(size=3_000_000_000)])
+    chain = [Source(), Heavy(size=3_000_000_000)]
     obs, settings = observation(), Settings(threads=2, process=2 * 10**9)
     libraries(monkeypatch)
     with pytest.raises(
@@ -121,12 +122,12 @@ def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
             r"(?s)3\.23 GB: Heavy\.1 3 GB.*budget is 2 GB.*use --memory 33..MB.*Heavy.1: choose a l"
         ),
     ):
-        divided(chain, obs, settings, "test")
+        divided(views(obs, chain), settings, "test")
     libraries(monkeypatch, 10**9)
     with pytest.raises(PipelineError, match=r"more than this machine has \(1\.23 GB\)") as refused:
-        divided(chain, obs, settings, "test")
+        divided(views(obs, chain), settings, "test")
     assert "--memory" not in refused.value.cure
-    found = divided(chain, obs, replace(settings, process=4 * 10**9), "test")
+    found = divided(views(obs, chain), replace(settings, process=4 * 10**9), "test")
     assert found.process == 4 * 10**9
     assert found.memory == 10**9 - BASE
 
@@ -136,28 +137,32 @@ def test_blocks_that_are_too_large_are_worked_on_by_fewer_threads(monkeypatch):
     for two of them.
     """
     libraries(monkeypatch)
-    chain = labelled([Source(), Demean(), Sink()])
+    chain = [Source(), Demean(), Sink()]
     assert (
         divided(
-            chain, observation(16, 1_000_000), Settings(threads=4, process=630 * 10**6), "test"
+            views(observation(16, 1_000_000), chain),
+            Settings(threads=4, process=630 * 10**6),
+            "test",
         ).threads
         == 2
     )
 
 
 def test_the_figure_that_a_refusal_names_works(monkeypatch):
-    obs, chain = observation(16, 1_000_000), labelled([Source(), Demean(), Sink()])
+    obs, chain = observation(16, 1_000_000), [Source(), Demean(), Sink()]
     libraries(monkeypatch)
     with pytest.raises(PipelineError, match=r"blocks on 1 thread 19\d MB") as refused:
-        divided(chain, obs, Settings(threads=4, process=3 * 10**8), "test")
+        divided(views(obs, chain), Settings(threads=4, process=3 * 10**8), "test")
     found = re.search(
         r"use --memory (\d+)MB; or split the scan into shorter ones", refused.value.cure
     )
     assert found is not None
-    settings = divided(chain, obs, Settings(threads=4, process=int(found[1]) * 10**6), "test")
+    settings = divided(
+        views(obs, chain), Settings(threads=4, process=int(found[1]) * 10**6), "test"
+    )
     assert settings.threads == 1
-    assert settings.memory >= schedule(chain, obs, settings).least
-    assert int(found[1]) * 10**6 >= least_memory(chain, obs, Settings(threads=4))
+    assert settings.memory >= schedule(views(obs, chain), settings).least
+    assert int(found[1]) * 10**6 >= least_memory(views(obs, chain), Settings(threads=4))
 
 
 def test_no_cure_is_named_that_cannot_work(monkeypatch):
@@ -167,8 +172,7 @@ def test_no_cure_is_named_that_cannot_work(monkeypatch):
         libraries(monkeypatch, free)
         with pytest.raises(PipelineError) as refused:
             divided(
-                labelled([Source(), Demean(), Sink()]),
-                obs,
+                views(obs, [Source(), Demean(), Sink()]),
                 Settings(threads=4, process=BASE // 2),
                 "test",
             )
@@ -189,8 +193,8 @@ def test_memory_of_a_scan_that_is_prepared_ahead_is_counted():
 
     planning.register(HoldsPlanning, name="Holds")
     obs = observation(64, 1_000_000)  # one stream: 256 MB
-    chain = labelled([Holds(), Sink()])
-    ahead = with_scan_ahead(chain, obs, Settings(2, memory=4_000_000_000))
+    chain = [Holds(), Sink()]
+    ahead = with_scan_ahead(views(obs, chain), Settings(2, memory=4_000_000_000))
     assert ahead is not None
     assert ahead.memory == 3_000_000_000
-    assert with_scan_ahead(chain, obs, Settings(2, memory=1_000_000_000)) is None
+    assert with_scan_ahead(views(obs, chain), Settings(2, memory=1_000_000_000)) is None

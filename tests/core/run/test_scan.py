@@ -231,12 +231,6 @@ def test_bands_with_pixels_of_their_own_follow_each_other() -> None:
     assert names == sorted(names)
 
 
-def test_bands_that_would_save_nothing_follow_each_other() -> None:
-    """Pixels of an image of I are found where they are used."""
-    names = watched(scene(), nside=0, memory=16_000_000)
-    assert names == sorted(names)
-
-
 def test_bands_follow_each_other_where_their_streams_would_not_be_kept_side_by_side() -> None:
     """Both streams of a band, each 19 x 40000 x 4 bytes = 3 MB, are kept where half of the memory
     is 10 MB; beside 15 MB of blocks there is no room for them in a band's share of 10 MB."""

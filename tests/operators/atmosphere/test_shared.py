@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.core.run import execute
+from zonda.core.run.execution import Execution
 from zonda.operators.atmosphere.turbulence import lattice, tiles
 from zonda.operators.atmosphere.turbulence.tiles import Tiles
 
@@ -215,18 +215,19 @@ def test_tiles_are_released_with_the_last_band_that_needs_them(
     forecast counts.
     """
     alive: WeakSet[Tiles] = WeakSet()
-    begin, done, left = Tiles.__init__, execute._done, []
+    begin, execute, left = Tiles.__init__, Execution.run, []
 
     def born(self: Tiles) -> None:
         begin(self)
         alive.add(self)
 
-    def watched(execution: Any, band: Any, last: bool) -> None:
+    def watched(self: Execution, *arguments: Any) -> None:
+        execute(self, *arguments)
         gc.collect()
+        last = self.views[-1].observation.instrument.band.name == "f150"
         left.extend([len(alive)] if last else [])
-        done(execution, band, last)
 
     monkeypatch.setattr(Tiles, "__init__", born)
-    monkeypatch.setattr(execute, "_done", watched)
+    monkeypatch.setattr(Execution, "run", watched)
     run(scene(field, "f090", "f150", dish=dish, pixels=pixels), threads=1)
     assert left == [0, 0]
