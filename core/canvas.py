@@ -39,16 +39,45 @@ METADATA = {
 }
 
 
-def new_axes(ax: Any = None, size: tuple[float, float] = (7.2, 5.0), **grid: Any) -> Any:
+def new_axes(
+    ax: Any = None, size: tuple[float, float] = (7.2, 5.0), above: float = 0.45, **grid: Any
+) -> Any:
     """``ax``, or the Axes of a new figure of ``size`` [in] that is not pyplot's.
 
-    ``grid`` is passed to `Figure.subplots`, which returns an array of Axes for several of them.
+    Margins are fixed: matplotlib's own layout draws everything twice. ``above``: room for the
+    title, and for a second axis below it, in. ``grid`` is passed to `Figure.subplots`, which
+    returns an array of Axes for several of them.
     """
     if ax is not None:
         return ax
     from matplotlib.figure import Figure
 
-    return Figure(figsize=size, dpi=DPI).subplots(**grid)
+    width, height = size
+    figure = Figure(figsize=size, dpi=DPI)
+    figure.subplots_adjust(0.85 / width, 0.6 / height, 1 - 0.25 / width, 1 - above / height)
+    return figure.subplots(**grid)
+
+
+def finish(ax: Any, across: str, up: str, title: str = "", **legend: Any) -> None:
+    """Name the axes, draw a grid, label logarithmic axes, and add a legend where ``legend`` says
+    how.
+    """
+    ax.set_xlabel(across)
+    ax.set_ylabel(up)
+    ax.set_title(title, wrap=True)
+    ax.grid(which="major", color="0.9", linewidth=0.7)
+    for axis in (ax.xaxis, ax.yaxis):
+        if axis.get_scale() == "log":
+            log_labels(axis)
+    if legend:
+        ax.legend(**{"frameon": False, "fontsize": 8} | legend)
+
+
+def axis_above(ax: Any, inverse: Any, name: str) -> None:
+    """Add a second, logarithmic axis on top, by a function that is its own inverse."""
+    upper = ax.secondary_xaxis("top", functions=(inverse, inverse))
+    upper.set_xlabel(name)
+    log_labels(upper.xaxis)
 
 
 def file_of(figure: Any, kind: str, dpi: float = DPI) -> bytes:
@@ -57,15 +86,9 @@ def file_of(figure: Any, kind: str, dpi: float = DPI) -> bytes:
 
     out = io.BytesIO()
     fast = {"pil_kwargs": {"compress_level": 2}} if kind == "png" else {}
+    dpi = dpi if kind == "png" else max(dpi, LEAST_DPI)
     with rc_context(SETTINGS):  # type: ignore[arg-type]
-        figure.savefig(
-            out,
-            format=kind,
-            dpi=dpi if kind == "png" else max(dpi, LEAST_DPI),
-            metadata=METADATA[kind],
-            bbox_inches="tight",
-            **fast,
-        )
+        figure.savefig(out, format=kind, dpi=dpi, metadata=METADATA[kind], **fast)
     return out.getvalue()
 
 
@@ -86,12 +109,16 @@ def _power_of_ten(value: float) -> str:
     return f"{'' if mantissa == '1' else mantissa + ' · '}10{str(power).translate(_RAISED)}"
 
 
-def log_labels(axis: Any, low: float, high: float) -> None:
-    """Label the powers of ten between two limits, and 2 and 5 of each where there are few."""
-    few = 0 < low < high < 160 * low
-    text = (lambda value: f"{value:.6g}") if low > 1e-3 and high < 1e5 else _power_of_ten
-    axis.set_major_formatter(lambda value, _: text(value) if value > 0 else "")
+def log_labels(axis: Any) -> None:
+    """Label the powers of ten of an axis, and 2 and 5 of each where there are few."""
+
+    def text(value: float, minor: bool) -> str:
+        low, high = sorted(axis.get_view_interval())
+        few = 0 < low < high < 160 * low
+        if value <= 0 or (minor and not (few and f"{value:.0e}"[0] in "25")):
+            return ""
+        return f"{value:.6g}" if low > 1e-3 and high < 1e5 else _power_of_ten(value)
+
+    axis.set_major_formatter(lambda value, _: text(value, minor=False))
+    axis.set_minor_formatter(lambda value, _: text(value, minor=True))
     axis.set_tick_params(which="minor", pad=5)  # as far away as labels of the longer marks
-    axis.set_minor_formatter(
-        lambda value, _: text(value) if few and value > 0 and f"{value:.0e}"[0] in "25" else ""
-    )

@@ -292,7 +292,7 @@ def _count_samples(bar: Any, per_beam: float) -> None:
     axis.set_label_text("samples per pixel", fontsize=9)
     second.tick_params(labelsize=8)
     if bar.long_axis.get_scale() == "log":
-        log_labels(axis, bar.vmin / per_beam, bar.vmax / per_beam)
+        log_labels(axis)
 
 
 def _range_of(values: AnyFloats, limit: float | None) -> tuple[float, float, str]:
@@ -349,7 +349,7 @@ def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, 
         aspect=30,
     )
     if bar.long_axis.get_scale() == "log":
-        log_labels(bar.long_axis, low, high)
+        log_labels(bar.long_axis)
     bar.set_label(label)
     ax.set_title(title)
     return ax

@@ -39,7 +39,6 @@ from .drawing.pictures import (
     draw_streams,
     draw_transfer,
 )
-from .drawing.plots import ScanTrack
 from .map_spectra import MapSpectra
 from .series import Modes, Spectrum, TimeStream
 from .transfer_function import Transfer
@@ -172,7 +171,7 @@ def _of_maps(data: Data, style: Style) -> Iterator[Sketch]:
 def _of_series(data: Data, style: Style) -> Iterator[Sketch]:
     """Pictures of the scans, and of products that are no maps."""
     if data.observations:
-        yield from draw_scan([ScanTrack.of(o) for o in data.scans])
+        yield from draw_scan(data.scans)
     before = _steps_before(data)
     bands = [f"_{band.name}" for band in data.scene.instrument.bands]
     for name, product in data.products.items():

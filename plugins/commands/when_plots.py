@@ -158,4 +158,4 @@ def _plot_pwv(ax: Any, pwv: Floats) -> None:
     )
     bar = ax.figure.colorbar(image, ax=ax, pad=0.02)
     bar.set_label("median PWV [mm]")
-    log_labels(bar.ax.yaxis, float(pwv.min()), float(pwv.max()))
+    log_labels(bar.ax.yaxis)

@@ -32,9 +32,10 @@ from zonda.core.numerics.angles import angle_text, sides_text
 from zonda.core.types import AnyFloats
 
 from ..series import Modes, Spectrum, TimeStream, unit_of_stream
-from .plots import ScanTrack, plot_modes, plot_scan, plot_spectra, plot_tod, plot_transfer
+from .plots import plot_modes, plot_scan, plot_spectra, plot_tod, plot_transfer
 
 if TYPE_CHECKING:
+    from zonda.core.data import Observation
     from zonda.core.maps.image import Image
     from zonda.core.maps.map_product import MapProduct
 
@@ -115,27 +116,23 @@ class Flat:
         found, wcs = on_plane(product, found)
         hits, seen = found.pop("hits"), np.nan_to_num(found.pop("seen"))
         used = seen[hits > 0]
-        return cls(
-            found, hits, seen >= least * np.percentile(used, 99) if used.size else seen > 0, wcs
-        )
+        enough = seen >= least * np.percentile(used, 99) if used.size else seen > 0
+        return cls(found, hits, enough, wcs)
 
     def window(self) -> Window:
         """Rows and columns where there are samples, with a margin of a hundredth of the longer
         side; all, if they are most.
         """
-        ny, nx = self.hits.shape
-        edges = []
-        for axis, size in enumerate((ny, nx)):
-            used = np.flatnonzero((self.hits > 0).any(axis=1 - axis))
-            edges.append((int(used[0]), int(used[-1]) + 1) if used.size else (0, size))
-        spare = math.ceil(0.01 * max(high - low for low, high in edges))
-        (y0, y1), (x0, x1) = (
-            (max(0, low - spare), min(size, high + spare))
-            for (low, high), size in zip(edges, (ny, nx), strict=True)
-        )
-        if (y1 - y0) * (x1 - x0) >= 0.9 * ny * nx:
-            return slice(0, ny), slice(0, nx)
-        return slice(y0, y1), slice(x0, x1)
+        seen, size = self.hits > 0, np.array(self.hits.shape)
+        if not seen.any():
+            return slice(None), slice(None)
+        places = np.nonzero(seen)
+        low, high = (np.array([f(n) for n in places]) for f in (np.min, np.max))
+        spare = math.ceil(0.01 * (high + 1 - low).max())
+        low, high = np.maximum(low - spare, 0), np.minimum(high + 1 + spare, size)
+        if (high - low).prod() >= 0.9 * size.prod():
+            return slice(None), slice(None)
+        return slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
 
     def cropped(self, window: Window | None = None) -> Flat:
         """The rows and columns of a window; `window` by default."""
@@ -159,15 +156,14 @@ def draw_input(file: str, image: Image, signed: bool = False) -> list[Sketch]:
     step = -(-max(image.values.shape) // LARGEST)
     values, wcs = image.values[::step, ::step], wcs_of(image.header)[::step, ::step]
     what = _named("Input", file, "input")
-    title = f"{what}: the sky before the beam"
+    ax, title = map_axes(values.shape, wcs)[0], f"{what}: the sky before the beam"
     if signed:
         top = float(np.nanpercentile(np.abs(values), 99.7)) or 1.0
         factor, unit = unit_of(top)
-        limits = (-top * factor, top * factor)
-        label = f"Rayleigh–Jeans brightness [{unit}]"
-        ax = plot_plain(values * factor, wcs, limits, "RdBu_r", label, title=title)
+        limits, label = (-top * factor, top * factor), f"Rayleigh–Jeans brightness [{unit}]"
+        plot_plain(values * factor, wcs, limits, "RdBu_r", label, ax=ax, title=title)
     else:
-        ax = plot_map(values, wcs, title=title)
+        plot_map(values, wcs, ax=ax, title=title)
     text = "The input map, before beam, opacity and filters."
     if image.fwhm:
         width = angle_text(image.fwhm)
@@ -189,24 +185,23 @@ def draw_map(
     shown = style.smoothed(product)
     planes = {"signal": shown.signal} | ({} if snr is None else {"snr": snr[0]})
     flat = Flat.of(shown, planes, style.least_coverage).cropped()
-    title = {"": "Map", "noiseless": "Noiseless map"}.get(signal, f"Map of signal {signal}")
-    title = _named(title, key)
-    meaning = {
-        "": "Everything: sky, atmosphere and noise, filtered and binned.",
+    titles = {
+        "": ("Map", "Everything: sky, atmosphere and noise, filtered and binned."),
         "noiseless": (
+            "Noiseless map",
             "The sky alone through the same pointing, filters and binning: what the processing"
-            " leaves of it."
+            " leaves of it.",
         ),
-    }.get(signal, "A part of the components, filtered and binned.")
-    how = _how(product, shown)
+    }
+    other = f"Map of signal {signal}", "A part of the components, filtered and binned."
+    title, meaning = titles.get(signal, other)
+    title, how = _named(title, key), _how(product, shown)
     text = f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}"
     head = _titled(title, shown)
     if snr is not None:
         head += f"; contours: S/N, {noise_text(snr[1], short=True)}"
-        text += (
-            f" Contours of the signal-to-noise ratio: {contour_text(style.contours)} (negative ones"
-            f" dashed). Its noise: {noise_text(snr[1])}."
-        )
+        lines = f"Contours of the signal-to-noise ratio: {contour_text(style.contours)}"
+        text += f" {lines} (negative ones dashed). Its noise: {noise_text(snr[1])}."
     limit = flat.limit("signal", SHOWN if signal == "noiseless" else 99.7)
     ax = _panels([(flat, flat.planes["signal"], head)], shown.resolution, limit)[0]
     if snr is not None:
@@ -290,57 +285,50 @@ def draw_plane(file: str, product: MapProduct, name: str) -> list[Sketch]:
     return [Sketch(file, plane.title, plane.caption, ax)]
 
 
-def draw_scan(tracks: Sequence[ScanTrack]) -> list[Sketch]:
+def draw_scan(scans: Sequence[Observation]) -> list[Sketch]:
     """Track of the boresight."""
-    ax = plot_scan(tracks)
-    return [
-        Sketch("scan", "Boresight track", "The boresight about the target, one line per scan.", ax)
-    ]
+    text = "The boresight about the target, one line per scan."
+    return [Sketch("scan", "Boresight track", text, plot_scan(scans))]
 
 
 def draw_spectra(file: str, spectrum: Spectrum, before: str) -> list[Sketch]:
     """Power spectra, taken after the step ``before``."""
-    where = f"after {before}" if before else f"at step {spectrum.label}"
-    many = (
-        f"{spectrum.detectors} detectors and {spectrum.observations}"
-        f" scan{'s' if spectrum.observations > 1 else ''}"
-    )
-    made = []
+    where, made = _after(before, spectrum.label), []
+    many = f"{spectrum.detectors} detectors and {_scans(spectrum.observations)}"
     for kind in dict.fromkeys(map(unit_of_stream, spectrum.psd)):
-        part = replace(
-            spectrum,
-            psd={name: psd for name, psd in spectrum.psd.items() if unit_of_stream(name) == kind},
-        )
-        extra, caption = (
-            "" if kind == "K_RJ" else f"_{'_'.join(part.psd)}",
-            f"Mean of {many} {where}",
-        )
-        if kind == "K_RJ":
-            caption += (
-                ", referred to the calibrated sky: divided by ζ exp(−τ), the atmosphere multiplied"
-                " by ε"
-            )
+        psd = {name: psd for name, psd in spectrum.psd.items() if unit_of_stream(name) == kind}
+        caption, sky = f"Mean of {many} {where}", kind == "K_RJ"
+        if sky:
+            caption += ", referred to the calibrated sky: divided by ζ exp(−τ), the atmosphere"
+            caption += " multiplied by ε"
         caption += "."
-        if "signal" in part.psd:
-            caption += (
-                " The signal holds the mean emission too, which changes as the scan moves in"
-                " elevation."
-            )
-        ax = plot_spectra(part, title=f"Power spectra of the time streams {where}")
-        made.append(Sketch(f"{file}{extra}", "Power spectra", caption, ax))
+        if "signal" in psd:
+            caption += " The signal holds the mean emission too, which changes as the scan moves"
+            caption += " in elevation."
+        title = f"Power spectra of the time streams {where}"
+        ax = plot_spectra(replace(spectrum, psd=psd), title=title)
+        name = file if sky else f"{file}_{'_'.join(psd)}"
+        made.append(Sketch(name, "Power spectra", caption, ax))
     return made
+
+
+def _after(before: str, label: str) -> str:
+    """Place of a measurement among the steps, in words."""
+    return f"after {before}" if before else f"at step {label}"
+
+
+def _scans(number: int) -> str:
+    return f"{number} scan{'s' if number > 1 else ''}"
 
 
 def draw_modes(file: str, modes: Modes, before: str) -> list[Sketch]:
     """Shares of the variance and the leading modes in time, taken after the step ``before``."""
-    where = f"after {before}" if before else f"at step {modes.label}"
+    where = _after(before, modes.label)
     what = f"{modes.detectors} detectors"
     what += f" at {modes.delays + 1} delays of {modes.delay:.3g} s" if modes.delays else ""
-    caption = (
-        f"Principal components of {what} {where}: left, the share of the variance in each, mean of"
-        f" {len(modes.values)} scan{'s' if len(modes.values) > 1 else ''}; right, the first in"
-        f" time, of {modes.observation}."
-    )
+    shares = f"left, the share of the variance in each, mean of {_scans(len(modes.values))}"
+    streams = f"right, the first in time, of {modes.observation}"
+    caption = f"Principal components of {what} {where}: {shares}; {streams}."
     ax = plot_modes(modes, title=f"Modes {where}")
     return [Sketch(file, "Modes", caption, ax)]
 
@@ -361,26 +349,18 @@ def draw_transfer(file: str, transfer: Transfer) -> list[Sketch]:
 
 def draw_streams(file: str, stream: TimeStream, before: str) -> list[Sketch]:
     """A picture for each stream, taken after the step ``before``."""
-    where = f"after {before}" if before else f"at step {stream.label}"
-    made = []
+    where, made = _after(before, stream.label), []
     for which in stream.streams:
-        extra = "" if which == "signal" else f"_{which}"
-        meaning = (
-            "divided by ζ exp(−τ), with the mean emission that no filter has removed"
-            if which == "signal"
-            else "at the detector"
-        )
-        meaning = (
-            meaning
-            if unit_of_stream(which) == "K_RJ"
-            else "along the line of sight, without its mean"
-        )
-        caption = (
-            f"Stream {which} of {len(stream.names)} detectors {where}: {meaning}. Pale: samples;"
-            " dark: means over 1 s."
-        )
+        meaning = "at the detector"
+        if which == "signal":
+            meaning = "divided by ζ exp(−τ), with the mean emission that no filter has removed"
+        elif unit_of_stream(which) != "K_RJ":
+            meaning = "along the line of sight, without its mean"
+        what = f"Stream {which} of {len(stream.names)} detectors {where}: {meaning}"
+        caption = f"{what}. Pale: samples; dark: means over 1 s."
         ax = plot_tod(stream, name=which, title=f"Time streams of {stream.observation} {where}")
-        made.append(Sketch(f"{file}{extra}", "Time streams", caption, ax))
+        name = file if which == "signal" else f"{file}_{which}"
+        made.append(Sketch(name, "Time streams", caption, ax))
     return made
 
 

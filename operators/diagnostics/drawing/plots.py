@@ -5,14 +5,13 @@ returns its Axes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from zonda.core.canvas import COLOURS, OTHER, PALE, SEQUENCE, log_labels, new_axes, unit_of
+from zonda.core.canvas import COLOURS, OTHER, PALE, SEQUENCE, axis_above, finish, new_axes, unit_of
 from zonda.core.numerics.angles import ARCMIN, ARCSEC
+from zonda.core.numerics.projection import boresights
 from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import AnyFloats
 
@@ -28,29 +27,6 @@ if TYPE_CHECKING:
 
 MODES = 4
 """Modes whose streams are drawn."""
-MANY = 2000
-"""Points of a track that are drawn, however near to one another."""
-
-
-@dataclass(frozen=True)
-class ScanTrack:
-    """A scan for `plot_scan`: unit vectors (n, 3) of the boresight, ICRS; the scan's centre (RA,
-    Dec) [rad].
-    """
-
-    name: str
-    centre: tuple[float, float]
-    directions: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, observation: Observation, most: int = 20000) -> ScanTrack:
-        """The track of a scan, from at most ``most`` evenly spaced samples."""
-        from zonda.core.numerics.projection import boresights
-
-        step = -(-observation.n_samples // most)
-        return cls(
-            observation.name, observation.centre, boresights(observation.boresight_radec[::step]).T
-        )
 
 
 def _binned(
@@ -88,48 +64,30 @@ def plot_spectra(
         good = np.isfinite(psd) & (psd > 0)
         if not good.any():
             continue
-        frequency, power = spectrum.frequency[good], psd[good]
-        x, y = _binned(frequency, power)
-        ax.loglog(frequency, power, color=colours.get(name, OTHER), linewidth=0.5, alpha=0.25)
+        colour, x, y = colours.get(name, OTHER), spectrum.frequency[good], psd[good]
+        ax.loglog(x, y, color=colour, linewidth=0.5, alpha=0.25)
+        mean = _binned(x, y)
         width, order = (2.2, 3) if name == "signal" else (1.6, 2.5)
-        ax.loglog(
-            x,
-            y,
-            color=colours.get(name, OTHER),
-            linewidth=width,
-            label=names.get(name, name),
-            zorder=order,
-        )
+        label = names.get(name, name)
+        ax.loglog(*mean, color=colour, linewidth=width, label=label, zorder=order)
         if name != "sky" or len(spectrum.psd) == 1:
-            top, bottom = max(top, float(y.max())), min(bottom, float(np.percentile(y, 5)))
+            top = max(top, float(mean[1].max()))
+            bottom = min(bottom, float(np.percentile(mean[1], 5)))
     floor = spectrum.white_level if {"white", "signal"} & set(spectrum.psd) else 0.0
     if floor > 0:
         top, bottom = max(top, floor), min(bottom, floor)
     if 0 < bottom < top:
         ax.set_ylim(max(bottom * 1e-2, min(floor or bottom, top) * 1e-4), top * 5)
     ax.set_xlim(spectrum.frequency[0], spectrum.frequency[-1])
+    dashed: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.1, "zorder": 3.5}
     for name, law in spectrum.closed_forms.items():
-        ax.loglog(
-            spectrum.frequency,
-            law,
-            color=colours[name],
-            linestyle=(0, (4, 2)),
-            linewidth=1.1,
-            zorder=3.5,
-        )
+        ax.loglog(spectrum.frequency, law, color=colours[name], **dashed)
     _mark_regimes(ax, spectrum.regimes())
     _mark_levels(ax, floor, spectrum.knee())
-    log_labels(ax.xaxis, *ax.get_xlim())
-    log_labels(ax.yaxis, *ax.get_ylim())
-    kinds = {unit_of_stream(name) for name in spectrum.psd}
-    what = (
-        {"K_RJ": ", Rayleigh–Jeans [K²/Hz]", "m": " [m²/Hz]"}.get(next(iter(kinds)), " [1/Hz]")
-        if len(kinds) == 1
-        else ""
-    )
-    _name(ax, "frequency [Hz]", f"power spectral density{what}")
-    ax.legend(frameon=False, fontsize=9, loc="upper right")
-    ax.set_title(title)
+    kinds = list({unit_of_stream(name) for name in spectrum.psd})
+    what = {"K_RJ": ", Rayleigh–Jeans [K²/Hz]", "m": " [m²/Hz]"}.get(kinds[0], " [1/Hz]")
+    up = f"power spectral density{what if len(kinds) == 1 else ''}"
+    finish(ax, "frequency [Hz]", up, title, fontsize=9, loc="upper right")
     return ax  # type: ignore[no-any-return]
 
 
@@ -139,61 +97,27 @@ def _mark_regimes(ax: Any, regimes: Sequence[tuple[str, float, float]]) -> None:
     """
     words = {"atmosphere": "atmosphere", "pink": "1/f noise", "white": "white noise"}
     low, high = np.log10(ax.get_xlim())
+    style: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
     for name, start, stop in regimes:
-        ax.axvspan(start, stop, color=COLOURS[name], alpha=0.07, linewidth=0, zorder=0)
-        if (np.log10(stop / start)) / (high - low) > 0.015 * len(words[name]):
-            place: dict[str, Any] = {
-                "xycoords": ("data", "axes fraction"),
-                "ha": "center",
-                "va": "bottom",
-                "fontsize": 8.5,
-            }
-            ax.annotate(
-                words[name],
-                (np.sqrt(start * stop), 0.012),
-                color=COLOURS[name],
-                bbox=PALE,
-                zorder=4,
-                **place,
-            )
+        colour, at = COLOURS[name], (np.sqrt(start * stop), 0.012)
+        ax.axvspan(start, stop, color=colour, alpha=0.07, linewidth=0, zorder=0)
+        if np.log10(stop / start) / (high - low) > 0.015 * len(words[name]):
+            ax.annotate(words[name], at, color=colour, fontsize=8.5, bbox=PALE, zorder=4, **style)
 
 
 def _mark_levels(ax: Any, level: float, knee: float | None) -> None:
     """The level of white noise (0: none) and the knee [Hz] of a picture of spectra."""
+    small: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8}
     if level > 0:
         ax.axhline(level, color="black", linestyle="--", linewidth=1.0, zorder=2)
         text = f"2 NET² (NET = {np.sqrt(level / 2) * 1e3:.3g} mK√s)"
-        place: dict[str, Any] = {
-            "xycoords": ("axes fraction", "data"),
-            "xytext": (-4, -5),
-            "ha": "right",
-            "va": "top",
-        }
-        ax.annotate(text, (1, level), textcoords="offset points", fontsize=8, **place)
+        place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "top"}
+        ax.annotate(text, (1, level), xytext=(-4, -5), **place, **small)
     if knee is not None:
         ax.axvline(knee, color="black", linestyle=":", linewidth=1.0, zorder=2)
-        place = {
-            "xycoords": ("data", "axes fraction"),
-            "xytext": (4, 0),
-            "rotation": 90,
-            "va": "bottom",
-            "bbox": PALE,
-        }
-        ax.annotate(
-            f"measured knee {knee:.2g} Hz",
-            (knee, 0.06),
-            textcoords="offset points",
-            fontsize=8,
-            zorder=4,
-            **place,
-        )
-
-
-def _name(ax: Any, across: str, up: str, grey: str = "0.9") -> None:
-    """Names of the axes, and a grid."""
-    ax.set_xlabel(across)
-    ax.set_ylabel(up)
-    ax.grid(which="major", color=grey, linewidth=0.7)
+        place = {"xycoords": ("data", "axes fraction"), "xytext": (4, 0), "rotation": 90}
+        text = f"measured knee {knee:.2g} Hz"
+        ax.annotate(text, (knee, 0.06), va="bottom", bbox=PALE, zorder=4, **place, **small)
 
 
 def _legend(ax: Any, **style: Any) -> None:
@@ -210,39 +134,26 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     read; the legend says where. Horizontal bars are the rings. The dotted line is the beam's FWHM;
     the upper axis counts wavelengths.
     """
-    ax = new_axes(ax, (7.2, 4.8))
+    ax = new_axes(ax, (7.2, 5.0), above=0.9)
     r = transfer.rings
     scale, edges = transfer.scale / ARCSEC, 1 / transfer.edges / ARCSEC
     width = [np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)]
+    style: dict[str, Any] = {"fmt": "o", "markersize": 4, "label": "T: share in phase"}
     error = np.where(np.isfinite(r.error), r.error, 0.0)
-    ax.errorbar(
-        scale,
-        r.transfer,
-        yerr=error,
-        xerr=width,
-        fmt="o",
-        color=SEQUENCE[0],
-        markersize=4,
-        label="T: share in phase",
-    )
+    ax.errorbar(scale, r.transfer, yerr=error, xerr=width, color=SEQUENCE[0], **style)
     high = scale[r.amplitude > 2].max(initial=0.0)
     label = "S: ratio of amplitudes" + (f" (above 2 from {high:.2g} arcsec down)" if high else "")
     shown = np.where(r.amplitude > 2, np.nan, r.amplitude)
     ax.plot(scale, shown, "--", color=SEQUENCE[1], linewidth=1.2, label=label)
     ax.set_xscale("log")
     ax.set_xlim(edges[0], edges[-1])
-    log_labels(ax.xaxis, edges[-1], edges[0])
     top = float(np.nanmax(np.append(shown, r.transfer), initial=1.0))
     ax.set_ylim(min(0.0, float(np.nanmin(r.transfer, initial=0.0))) * 1.05, 1.15 * top)
     ax.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
     if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / ARCSEC <= edges[0]:
         ax.axvline(transfer.fwhm / ARCSEC, color="black", linestyle=":", linewidth=1.0)
-    upper = ax.secondary_xaxis("top", functions=(_to_kilolambda, _to_kilolambda))
-    upper.set_xlabel("baseline [1000 wavelengths]")
-    log_labels(upper.xaxis, _to_kilolambda(edges[0]), _to_kilolambda(edges[-1]))
-    _name(ax, "angular scale [arcsec]", "transfer function")
-    ax.legend(frameon=False, fontsize=9, loc="best")
-    ax.set_title(title)
+    axis_above(ax, _to_kilolambda, "baseline [1000 wavelengths]")
+    finish(ax, "angular scale [arcsec]", "transfer function", title, fontsize=9, loc="best")
     return ax  # type: ignore[no-any-return]
 
 
@@ -250,20 +161,6 @@ def _to_kilolambda(arcsec: Any) -> Any:
     """1000 wavelengths of a scale in arcsec, and back: the function is its own inverse."""
     with np.errstate(divide="ignore"):
         return 1e-3 / (np.asarray(arcsec, np.float64) * ARCSEC)
-
-
-def _envelope(x: AnyFloats, y: AnyFloats, columns: int = 1600) -> tuple[AnyFloats, AnyFloats]:
-    """Lowest and highest of y, in turn, in ``columns`` equal parts: what a line of many more points
-    looks like.
-    """
-    width = len(y) // columns
-    if width < 4:
-        return x, y
-    whole = width * columns
-    parts, ends = y[:whole].reshape(columns, width), y[whole:]
-    both = np.stack([parts.min(axis=1), parts.max(axis=1)], axis=1).ravel()
-    at = x[:whole].reshape(columns, width)[:, [width // 4, 3 * width // 4]].ravel()
-    return np.append(at, x[whole:]), np.append(both, ends)
 
 
 def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title: str = "") -> Axes:
@@ -280,137 +177,94 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
         words = {
             "transmission": "relative change of the transmission",
             "opacity": "change of the opacity",
+            "pwv": "change of the line-of-sight PWV",
+            "path_delay": "change of the path",
         }
-        words |= {"pwv": "change of the line-of-sight PWV", "path_delay": "change of the path"}
         factor, unit = (factor, f" [{unit.replace('K', 'm')}]") if kind == "m" else (1.0, "")
         label = words.get(name, name) + unit
-    step = (
-        float(np.median(np.diff(stream.seconds))) if len(stream.seconds) > 1 else 0.0
-    )  # samples need not be a comb
+    t = stream.seconds
+    step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0  # samples need not be a comb
     width = max(1, round(1.0 / step)) if step > 0 else 1
     whole = values.shape[1] // width * width
-    centres = stream.seconds[:whole].reshape(-1, width).mean(axis=1)
-    for k, detector in enumerate(stream.names):
+    centres = t[:whole].reshape(-1, width).mean(axis=1)
+    for k, (detector, row) in enumerate(zip(stream.names, values * factor, strict=True)):
         colour = SEQUENCE[k % len(SEQUENCE)]
-        ax.plot(
-            *_envelope(stream.seconds, values[k] * factor), linewidth=0.4, alpha=0.2, color=colour
-        )
-        ax.plot(
-            centres,
-            values[k, :whole].reshape(-1, width).mean(axis=1) * factor,
-            linewidth=0.9,
-            color=colour,
-            label=detector,
-        )
-    _name(ax, "time since the start of the scan [s]", label, "0.92")
+        ax.plot(t, row, linewidth=0.4, alpha=0.2, color=colour)
+        means = row[:whole].reshape(-1, width).mean(axis=1)
+        ax.plot(centres, means, linewidth=0.9, color=colour, label=detector)
     ax.margins(x=0)
-    if len(stream.seconds) > 1:
-        ax.set_xlim(stream.seconds[0], stream.seconds[-1])
-    if values.shape[0]:
+    if len(t) > 1:
+        ax.set_xlim(t[0], t[-1])
+    title = title or f"Time streams of {stream.observation}, after step {stream.label}"
+    finish(ax, "time since the start of the scan [s]", label, title)
+    if len(values):
         rows = -(-len(stream.names) // 6)
         if rows <= 3:  # above the lines
             low, high = ax.get_ylim()
             ax.set_ylim(low, high + (high - low) * 0.08 * rows)
         frame = {"frameon": rows > 3, "framealpha": 0.85, "edgecolor": "none"}
         _legend(ax, **frame, ncols=min(6, len(stream.names)), loc="upper right")
-    ax.set_title(title or f"Time streams of {stream.observation}, after step {stream.label}")
     return ax  # type: ignore[no-any-return]
 
 
-def plot_scan(
-    observations: Sequence[Observation | ScanTrack],
-    *,
-    ax: Any = None,
-    title: str = "Boresight track",
-) -> Axes:
-    """ScanTrack of the boresight about the centre of the first scan, tangent-plane offsets in
-    arcmin or deg, a line per scan.
+def plot_scan(observations: Sequence[Observation], *, ax: Any = None) -> Axes:
+    """Track of the boresight about the centre of the first scan, tangent-plane offsets in arcmin or
+    deg, a line per scan, from at most 20 000 samples each.
 
     Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
     """
-    tracks = [o if isinstance(o, ScanTrack) else ScanTrack.of(o) for o in observations]
-    named, own = len(tracks) <= 8, ax is None
-    ax = new_axes(ax, (5.7, 5.2))
-    offsets = [_offsets(track, tracks[0].centre) for track in tracks]
-    known = np.concatenate(offsets)
-    known = known[np.isfinite(known).all(axis=1)]
-    extent = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
-    scale, unit = (60, "deg") if extent > 120 else (1, "arcmin")
-    for k, (track, offset) in enumerate(zip(tracks, offsets, strict=True)):
+    ax = new_axes(ax, (5.7, 5.2 if len(observations) > 8 else 5.7))
+    tracks, axes = [], local_axes(*observations[0].centre)
+    for o in observations:
+        radec = o.boresight_radec[:: -(-o.n_samples // 20000)]
+        cosine, east, north = axes @ boresights(radec)
+        away = np.where(cosine > 0.1, cosine, np.nan)  # of the tangent plane
+        tracks.append(np.stack([east, north]) / away / ARCMIN)
+    known = np.concatenate(tracks, axis=1)
+    known = known[:, np.isfinite(known).all(axis=0)]
+    far = known.size > 0 and float(np.ptp(known, axis=1).max()) > 120
+    scale, unit = (60, "deg") if far else (1, "arcmin")
+    for k, (o, track) in enumerate(zip(observations, tracks, strict=True)):
         width = 0.6 + 1.2 * (1 - (k + 1) / len(tracks))
-        x, y = _apart(offset, extent / 1000).T / scale
-        ax.plot(x, y, linewidth=width, color=SEQUENCE[k % len(SEQUENCE)], label=track.name)
+        ax.plot(*track / scale, linewidth=width, color=SEQUENCE[k % len(SEQUENCE)], label=o.name)
     ax.set_aspect("equal", adjustable="datalim")
     if not ax.xaxis_inverted():
         ax.invert_xaxis()
-    _name(ax, f"RA offset [{unit}]", f"Dec offset [{unit}]", "0.92")
-    if named:
-        beside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "frameon": False}
-        within = {"loc": "upper right", "framealpha": 0.85, "edgecolor": "none"}
-        _legend(ax, **(beside if own else within))
-    ax.set_title(title)
+    finish(ax, f"RA offset [{unit}]", f"Dec offset [{unit}]", "Boresight track")
+    if len(tracks) <= 8:  # below the axes
+        ax.figure.subplots_adjust(bottom=0.2)
+        _legend(ax, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, frameon=False)
     return ax  # type: ignore[no-any-return]
-
-
-def _offsets(track: ScanTrack, centre: tuple[float, float]) -> NDArray[np.float64]:
-    """(n, 2) arcmin east and north of ``centre`` on its tangent plane; NaN far from it."""
-    cosine, east, north = local_axes(*centre) @ track.directions.T
-    plane = np.stack([east, north], axis=1) / np.where(cosine > 0.1, cosine, np.nan)[:, None]
-    return np.asarray(plane / ARCMIN, np.float64)
-
-
-def _apart(points: NDArray[np.float64], least: float) -> NDArray[np.float64]:
-    """The points of a track (n, 2), without those less than ``least`` along it from one that is
-    kept.
-    """
-    steps = np.nan_to_num(np.hypot(*np.diff(points, axis=0).T))
-    if least <= 0 or len(points) < MANY:
-        return points
-    part = np.floor(np.append(0.0, np.cumsum(steps)) / least)
-    keep = np.append(True, part[1:] != part[:-1]) | ~np.isfinite(points).all(axis=1)
-    keep[-1] = True
-    return points[keep]
 
 
 def plot_modes(modes: Modes, *, axes: Any = None, title: str = "Modes") -> Axes:
     """Share of the variance in each mode, and the leading modes in time, below one another;
     ``axes``: two Axes to draw into.
     """
-    left, right = new_axes(
-        axes, (9.6, 4.2), ncols=2, width_ratios=(0.30, 0.515), gridspec_kw={"wspace": 0.3}
-    )
+    widths: dict[str, Any] = {
+        "ncols": 2,
+        "width_ratios": (0.30, 0.515),
+        "gridspec_kw": {"wspace": 0.3},
+    }
+    left, right = new_axes(axes, (9.6, 4.2), **widths)
     share = modes.shares[modes.shares > 0]
-    left.loglog(
-        np.arange(1, share.size + 1), share, "o-", color=SEQUENCE[0], markersize=3.5, linewidth=0.9
-    )
-    for k, value in enumerate(share[:2]):
+    number = np.arange(1, share.size + 1)
+    left.loglog(number, share, "o-", color=SEQUENCE[0], markersize=3.5, linewidth=0.9)
+    for k, value in enumerate(share[:2], 1):
         place: dict[str, Any] = {"xytext": (5, 5), "textcoords": "offset points", "fontsize": 9}
-        left.annotate(f"{100 * value:.3g} %", (k + 1, value), **place)
-    left.set_xlabel("mode")
-    left.set_ylabel("share of the variance")
+        left.annotate(f"{100 * value:.3g} %", (k, value), **place)
     left.set_xlim(0.8, max(2.0, 1.2 * share.size))
-    left.grid(which="major", color="0.9", linewidth=0.7)
-    for axis, limits in ((left.xaxis, left.get_xlim()), (left.yaxis, left.get_ylim())):
-        log_labels(axis, *limits)
+    finish(left, "mode", "share of the variance", title)
     rows = modes.streams[:MODES] / np.sqrt(max(1, modes.vectors.shape[1]))
     peak = float(np.nanmax(abs(rows), initial=0.0)) or 1.0
     factor, unit = unit_of(peak) if modes.unit else (1.0, "")
-    step = max(1, rows.shape[1] // 4000)
     for k, row in enumerate(rows):
-        right.plot(
-            modes.seconds[::step],
-            row[::step] * factor,
-            linewidth=0.7,
-            color=SEQUENCE[k],
-            label=f"{k + 1}",
-            zorder=4 - k,
-        )
-    right.set_xlabel(f"time since the start of {modes.observation} [s]")
-    right.set_ylabel(f"mode / √rows [{unit}]" if unit else "mode / √rows")
+        style: dict[str, Any] = {"label": f"{k + 1}", "zorder": 4 - k, "linewidth": 0.7}
+        right.plot(modes.seconds, row * factor, color=SEQUENCE[k], **style)
     right.margins(x=0)
     low, high = right.get_ylim()
     right.set_ylim(low, high + 0.12 * (high - low))
-    right.grid(color="0.92", linewidth=0.7)
+    up = f"mode / √rows [{unit}]" if unit else "mode / √rows"
+    finish(right, f"time since the start of {modes.observation} [s]", up)
     _legend(right, frameon=False, ncols=MODES, loc="upper right")
-    left.set_title(title, fontsize=10)
     return left  # type: ignore[no-any-return]

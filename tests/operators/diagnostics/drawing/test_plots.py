@@ -492,19 +492,6 @@ def test_many_scans_take_few_points(make_observation):
     assert len(x) < 20001
 
 
-def test_the_pale_line_keeps_every_extreme():
-    from zonda.operators.diagnostics.drawing.plots import _envelope
-
-    seconds, values = np.arange(50000) / 100, np.random.default_rng(1).normal(size=50000)
-    values[[123, 31234, 49999]] = [9.0, -9.0, 12.0]
-    x, y = _envelope(seconds, values)
-    assert len(x) == len(y) < 4000
-    assert (np.diff(x) > 0).all()
-    for k in (123, 31234, 49999):
-        near = np.abs(x - seconds[k]) < 0.4
-        assert values[k] in y[near]
-
-
 def test_only_what_is_there_is_drawn(data):
     Plots().finalize(data)
     assert data.products["pictures"] == []
