@@ -72,7 +72,8 @@ class Choice:
         Seconds that it saves, stated by planning classes of before: above 0 it is tried after the
         forms that state what they `saves`.
     saves
-        Measured saving; None: it saves nothing in this scene, and is taken only if it is asked for.
+        Measured saving; None: it saves nothing in this scene, or no plan of a benchmark scene
+        affords it, and it is taken only if it is asked for (``--drop``).
     """
 
     decision: Decision

@@ -140,7 +140,7 @@ def decide(
         if not prune_all:
             return "--no-prune"
         if not any(choice.pays for choice in coarser):
-            return "coarser saves nothing" if coarser else ""
+            return "coarser only with --drop" if coarser else ""
         return "coarser exceeds the budget"
 
     return [replace(taken.get(d.name, d), reason=reason(d)) for d in effects]

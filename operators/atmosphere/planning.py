@@ -14,7 +14,7 @@ the mean leave of it (`nodes.differential_rms`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -29,7 +29,6 @@ from zonda.core.plan.bounds import (
     Context,
     Effect,
     Estimate,
-    Saving,
     Traits,
     add,
     exact,
@@ -38,7 +37,6 @@ from zonda.core.plan.bounds import (
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
-from .averaging import shares
 from .drawing import bytes_of_units, in_time_order
 from .layers import AtmosphereLayers
 from .model import AtmosphereModel, absorption_of
@@ -60,10 +58,6 @@ PASSAGES = 3.0
 """Factor on the rms of a layer's transmission: a source is seen through what it is in a few
 passages.
 """
-
-LAYER = Saving("wide_field", 0.07)
-"""Of one layer less, where `DENSE` points (nodes x times) are evaluated per sample, or more."""
-DENSE = 0.03
 
 
 class AtmospherePlanning(Planning[AtmosphereLayers]):
@@ -114,8 +108,7 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
 
     def estimate(self, context: Context) -> Estimate:
         """Bounds for the observation at the lowest elevation."""
-        first = self.operator.model(context.first)
-        bounds = AtmosphereBounds(context, calibrated(self.operator.model(context.lowest)), first)
+        bounds = AtmosphereBounds(context, calibrated(self.operator.model(context.lowest)))
         effects = (
             *bounds.layers(),
             bounds.nodes(),
@@ -132,7 +125,7 @@ class Calibrated:
 
     ``kelvin``: K of equation (1), of the detector that sees most. ``uneven``: rms of K over the
     detectors, of the largest. ``variances`` s_l^2. ``velocities`` of the boresight's ray relative
-    to the air of each layer. ``averages`` by coverage, see `averaging.shares`.
+    to the air of each layer.
     """
 
     layers: list[Layer]
@@ -142,7 +135,6 @@ class Calibrated:
     velocities: list[Floats]
     model: AtmosphereModel
     elevations: tuple[float, float]
-    averages: dict[str, list[float]] = field(default_factory=dict)
 
     @property
     def rms(self) -> float:
@@ -241,13 +233,11 @@ def _slope(transfer: BandTransfer, pwv: float, elevation: float) -> float:
 class AtmosphereBounds:
     """Bounds of the effects on the products.
 
-    ``calibrated``: of the observation at the lowest elevation. ``first``: the model of the first
-    observation.
+    ``calibrated``: of the observation at the lowest elevation.
     """
 
     context: Context
     calibrated: Calibrated
-    first: AtmosphereModel
 
     @cached_property
     def left(self) -> list[float]:
@@ -267,14 +257,6 @@ class AtmosphereBounds:
         left = differential_rms(*spread_evenly(plane.xi, plane.eta), layers, a.model.plane.stretch)
         return math.hypot(a.kelvin * left, gains * whole)
 
-    @cached_property
-    def averages(self) -> list[float]:
-        """Rms of each layer in a pixel over that in a sample."""
-        context, a = self.context, self.calibrated
-        if (key := str(context.coverage)) not in a.averages:
-            a.averages[key] = shares(context, a.layers, a.components, self.first.plane)
-        return a.averages[key]
-
     def _correlated(self, layer: Layer) -> float:
         """Integral of the correlation over time, s: the beam or what of the outer scale the filters
         pass, over the wind's speed.
@@ -288,12 +270,6 @@ class AtmosphereBounds:
         """Longest correlation time of the layers, s."""
         return max(map(self._correlated, self.calibrated.layers))
 
-    def _points(self, tolerance: float) -> float:
-        """Points (nodes x times) at which a layer is evaluated, per sample; of the first scan."""
-        chosen = self.first.resolution(tolerance)
-        share = sum(1 / s for s in chosen.steps) / len(chosen.steps)
-        return len(chosen.nodes.xi) * share / self.context.first.n_detectors
-
     def layers(self) -> list[Effect]:
         """Layers that may be omitted one by one."""
         context, a = self.context, self.calibrated
@@ -304,13 +280,12 @@ class AtmosphereBounds:
         )
         text += OTHER_MODES if context.turns else ""
         p, effects = a.model.parameters, []
-        saves = LAYER if self._points(p.tolerance) > DENSE else None
         for k, layer in enumerate(a.layers):
             bound, what = context.behind_modes(self.of_layers[k]), f"at {layer.height:.0f} m"
             choices = [full(what + (": left out by the pipeline" if k in p.omit else ""))]
             if k not in p.omit and not p.outputs:
                 choices.append(Choice("dropped", "left out", {"omit": [k]}, bound=bound,
-                                      formula=text, saves=saves))  # fmt: skip
+                                      formula=text))  # fmt: skip
             effects.append(Effect(f"layer {k}", tuple(choices), bound, text))
         return effects
 
@@ -319,9 +294,7 @@ class AtmosphereBounds:
         """Bound on each layer's part of the products."""
         context, a, bounds = self.context, self.calibrated, []
         for k, layer in enumerate(a.layers):
-            rms = SAFETY * self.left[k]
-            bound = context.bound(rms, self._correlated(layer), common=True)
-            bound["map_rms"] = min(bound["map_rms"], self.averages[k] * rms)
+            bound = context.bound(SAFETY * self.left[k], self._correlated(layer), common=True)
             if context.before_filters:
                 bound["tod"] = SAFETY * a.of_layer(k)
             share = abs(a.model.layers[k].amplitude * float(a.model.kappa["opacity"][k]))
@@ -360,10 +333,8 @@ class AtmosphereBounds:
 
     def _in_proportion(self, share: float) -> dict[str, float]:
         """Bound of an error that is ``share`` of the fluctuation."""
-        sample = math.hypot(*self.left)
-        pixel = math.hypot(*(x * y for x, y in zip(self.left, self.averages, strict=True)))
-        bound = self.context.bound(SAFETY * share * sample, self._longest, common=True)
-        bound["map_rms"] = min(bound["map_rms"], SAFETY * share * pixel)
+        rms = SAFETY * share * math.hypot(*self.left)
+        bound = self.context.bound(rms, self._longest, common=True)
         return bound | {"psd": 2 * share + share**2}
 
     def nodes(self) -> Effect:

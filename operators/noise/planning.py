@@ -17,7 +17,6 @@ from zonda.core.plan.bounds import (
     Context,
     Effect,
     Estimate,
-    Saving,
     Traits,
     full,
 )
@@ -28,9 +27,6 @@ from .one_over_f import PowerLawFilter
 from .pink import PinkNoise, PinkSpectrum, level_of
 from .streams import CHECKPOINT
 from .white import WhiteNoise
-
-NONE = Saving("deep_field", 0.16)
-"""Of no pink noise. Fewer poles save 1.2 % at most."""
 
 
 class WhitePlanning(Planning[WhiteNoise]):
@@ -116,9 +112,7 @@ class PinkPlanning(Planning[PinkNoise]):
         bound, choices = context.behind_modes(size), [full(f"{pink.poles} poles")]
         if pink.shared == 0 and not context.kept_streams & pink.provides:
             # a common part would be what a singular mode consists of: it is not dropped
-            choices.append(
-                Choice("dropped", "none", leave_out=True, bound=bound, formula=text, saves=NONE)
-            )
+            choices.append(Choice("dropped", "none", leave_out=True, bound=bound, formula=text))
         return Estimate((Effect("poles", tuple(choices), bound, text),), without=size)
 
     def _amplitude(self, spectrum: PinkSpectrum, observation: Observation) -> float:

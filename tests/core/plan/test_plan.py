@@ -86,7 +86,7 @@ def test_the_form_that_saves_most_of_those_that_fit():
 def test_no_saving_no_error():
     found = decide([effect("free", (0.1, 0))], {"map_rms": 1.0})["free"]
     assert found.chosen == 0
-    assert found.reason == "coarser saves nothing"
+    assert found.reason == "coarser only with --drop"
 
 
 def test_seconds_that_a_planning_class_states_are_tried_last():
