@@ -36,8 +36,8 @@ class Planning(Generic[O]):
     reads_streams
         It makes a product of the time streams themselves (spectra, files), in which errors of a
         sample count.
-    holds
-        Its `memory`, where that is the same for every observation.
+    holds, per_detector, per_sample
+        Bytes of its `memory`: for every observation, and for each detector and each sample of it.
     smaller
         Advice that lessens its `memory`, in a few words (``choose a larger pixel``), for a run that
         does not fit.
@@ -48,6 +48,8 @@ class Planning(Generic[O]):
     knobs: ClassVar[tuple[Knob, ...]] = ()
     reads_streams: ClassVar[bool] = False
     holds: ClassVar[int] = 0
+    per_detector: ClassVar[int] = 0
+    per_sample: ClassVar[int] = 0
     smaller: ClassVar[str] = ""
 
     def __init__(self, operator: O) -> None:
@@ -82,7 +84,8 @@ class Planning(Generic[O]):
         An upper bound, asked after `Operator.observe` and before `Operator.prepare`: a run that
         would not fit is refused before it starts.
         """
-        return self.holds
+        each = self.per_detector * observation.n_detectors + self.per_sample * observation.n_samples
+        return self.holds + each
 
     def sweeps(self, observation: Observation) -> int:
         """Number of times that `Operator.measure` goes through its stream with `Stream.sweep`; 0:

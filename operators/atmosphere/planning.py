@@ -31,6 +31,7 @@ from zonda.core.plan.bounds import (
     Estimate,
     Traits,
     add,
+    evenly,
     exact,
     full,
 )
@@ -40,10 +41,10 @@ from zonda.core.types import Floats
 from .drawing import bytes_of_units, in_time_order
 from .layers import AtmosphereLayers
 from .model import AtmosphereModel, absorption_of
-from .turbulence.geometry import ScanPlane, axes, crossing, rays
+from .turbulence.geometry import axes, crossing, rays
 from .turbulence.levels import FIDELITIES
 from .turbulence.nodes import Layer, differential_rms, spread_evenly
-from .weather.bands import BandAtmosphere, BandTransfer
+from .weather.bands import BandTransfer
 from .weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
 
 INSTANTS = 200
@@ -81,13 +82,13 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         ),
         Knob("layers", (5, 10, 20), "thin sheets for a continuous atmosphere", redraws=True),
     )
+    holds, per_detector, per_sample = 100_000_000, 700, 40
 
     def memory(self, observation: Observation) -> int:
         """Tables, tiles of the turbulence, weights of the nodes; where there are none, the series
         of detectors.
         """
-        size = 100_000_000 + 700 * observation.n_detectors + 40 * observation.n_samples
-        return size + bytes_of_units(self.operator.model(observation))
+        return super().memory(observation) + bytes_of_units(self.operator.model(observation))
 
     def in_time_order(self, observation: Observation) -> bool:
         """True if detectors are evaluated one by one in a long scan: all of them share the
@@ -100,9 +101,7 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         a = calibrated(self.operator.model(observation))
 
         def faster(frequency: float) -> float:
-            return min(
-                math.sqrt(sum(a.faster(k, frequency) ** 2 for k in range(len(a.layers)))), a.rms
-            )
+            return min(math.hypot(*(a.faster(k, frequency) for k in range(len(a.layers)))), a.rms)
 
         return Traits(rms=a.rms, faster=faster)
 
@@ -124,8 +123,8 @@ class Calibrated:
     """The fluctuation of an observation's atmosphere in calibrated samples.
 
     ``kelvin``: K of equation (1), of the detector that sees most. ``uneven``: rms of K over the
-    detectors, of the largest. ``variances`` s_l^2. ``velocities`` of the boresight's ray relative
-    to the air of each layer.
+    detectors, of the largest. ``variances`` s_l^2. ``velocities`` (2, n) [m/s] of the boresight's
+    ray relative to the air of each layer, at some instants of the scan.
     """
 
     layers: list[Layer]
@@ -139,9 +138,7 @@ class Calibrated:
     @property
     def rms(self) -> float:
         """Rms of one calibrated sample, K."""
-        return self.kelvin * math.sqrt(
-            sum(m.amplitude**2 * v for m, v in zip(self.layers, self.variances, strict=True))
-        )
+        return math.hypot(*map(self.of_layer, range(len(self.layers))))
 
     def of_layer(self, k: int) -> float:
         """rms of one layer, K."""
@@ -156,17 +153,10 @@ class Calibrated:
         from scipy.special import erfc
 
         e, w = self.components[layer]
-        argument = (
-            2
-            * math.pi
-            * frequency
-            * np.divide.outer(np.sqrt(e), np.maximum(np.hypot(*self.velocities[layer]), 1e-6))
-        )
-        return (
-            self.kelvin
-            * self.layers[layer].amplitude
-            * math.sqrt(max(float(w @ erfc(argument).mean(1)), 0.0))
-        )
+        speed = np.maximum(np.hypot(*self.velocities[layer]), 1e-6)
+        argument = 2 * math.pi * frequency * np.divide.outer(np.sqrt(e), speed)
+        share = max(float(w @ erfc(argument).mean(1)), 0.0)
+        return self.kelvin * self.layers[layer].amplitude * math.sqrt(share)
 
     @cached_property
     def components(self) -> list[tuple[Floats, Floats]]:
@@ -177,55 +167,39 @@ class Calibrated:
 @lru_cache(maxsize=2)
 def calibrated(model: AtmosphereModel) -> Calibrated:
     """See `Calibrated`."""
-    elevation = model.observation.elevation
-    low, high = float(elevation.min()), float(elevation.max())
-    gains = _gains(model.observation, model.band, model.pwv, low)
+    o, plane, step = model.observation, model.observation.focalplane, 1e-3
+    low, high = float(o.elevation.min()), float(o.elevation.max())
+    # K of each detector: effect of a relative change of the PWV at the lowest elevation
+    at = np.clip(low + plane.eta, ELEVATION_MIN, ELEVATION_MAX)
+    passed = np.maximum(model.band.transmission(model.pwv, at), 1e-6)
+    slope = abs(model.band.emission_difference(model.pwv, model.pwv * step, at)) / step
+    gains = slope * plane.illumination_efficiency / (plane.main_beam_efficiency * passed)
     largest, factors = float(gains.max()), model.strength(np.sin([low, high]))
     strongest = 1.0 if factors is None else max(1.0, float(factors.max()))
+    speed = np.zeros((2, 1))  # of the boresight's crossing, per metre of height
+    if o.n_samples > 1:
+        instants = evenly(o.n_samples - 1, INSTANTS)
+        both = np.stack([instants, instants + 1], axis=1).ravel()
+        ray = crossing(rays(axes(o.boresight_azel[both]), np.zeros(1), np.zeros(1)))[:, 0]
+        x = model.plane.unroll(ray).reshape(2, -1, 2)
+        speed = (x[:, :, 1] - x[:, :, 0]) * o.sample_rate
+    moving = o.n_samples > 1
     return Calibrated(
         layers=model.emitting,
         variances=[field.variance for field in model.turbulence],
         kelvin=model.fluctuation.scale * strongest * largest,
         uneven=float(gains.std()) / max(largest, 1e-30),
-        velocities=_velocities(model.observation, model.plane, model.layers),
+        velocities=[
+            m.height * speed - moving * (model.plane.drift @ m.wind)[:, None] for m in model.layers
+        ],
         model=model,
         elevations=(low, high),
     )
 
 
-def _gains(observation: Observation, band: BandAtmosphere, pwv: float, elevation: float) -> Floats:
-    """(n_det,) what a relative change of the PWV makes in a calibrated sample, K: dT/dlnPWV epsilon
-    / (zeta e^-tau), where the boresight has this elevation."""
-    plane, step = observation.focalplane, 1e-3
-    at = np.clip(elevation + plane.eta, ELEVATION_MIN, ELEVATION_MAX)
-    passed = np.maximum(np.asarray(band.transmission(pwv, at), np.float64), 1e-6)
-    slope = np.abs(np.asarray(band.emission_difference(pwv, pwv * step, at), np.float64)) / step
-    return np.asarray(
-        slope * plane.illumination_efficiency / (plane.main_beam_efficiency * passed), np.float64
-    )
-
-
-def _velocities(o: Observation, plane: ScanPlane, layers: list[Layer]) -> list[Floats]:
-    """Velocities (2, n) [m/s] of the boresight's ray relative to each layer, at some instants of
-    the scan.
-    """
-    if o.n_samples < 2:
-        return [np.zeros((2, 1))] * len(layers)
-    at = np.unique(np.linspace(0, o.n_samples - 2, INSTANTS).astype(int))
-    both = np.stack([at, at + 1], axis=1).ravel()
-    x = plane.unroll(
-        crossing(rays(axes(o.boresight_azel[both]), np.zeros(1), np.zeros(1)))[:, 0]
-    ).reshape(2, -1, 2)
-    velocity = (x[:, :, 1] - x[:, :, 0]) * o.sample_rate
-    return [layer.height * velocity - (plane.drift @ layer.wind)[:, None] for layer in layers]
-
-
 def _slope(transfer: BandTransfer, pwv: float, elevation: float) -> float:
     """dT/dPWV over <e^-tau>."""
-    (low, log_t, _), (high, _, _) = (
-        transfer(pwv * 0.99, [elevation])[0],
-        transfer(pwv * 1.01, [elevation])[0],
-    )
+    (low, log_t, _), (high, _, _) = (transfer(pwv * f, [elevation])[0] for f in (0.99, 1.01))
     return (high - low) / (0.02 * pwv) / math.exp(log_t)
 
 
@@ -245,10 +219,10 @@ class AtmosphereBounds:
         detectors see differently, and what they see with unequal gains.
         """
         a = self.calibrated
-        each = [a.of_layer(k) for k in range(len(a.layers))]
+        each = [(a.of_layer(k), layer) for k, layer in enumerate(a.layers)]
         if not self.context.removes_common:
-            return each
-        return [self._differences([m], whole) for m, whole in zip(a.layers, each, strict=True)]
+            return [whole for whole, _ in each]
+        return [self._differences([layer], whole) for whole, layer in each]
 
     def _differences(self, layers: list[Layer], whole: float) -> float:
         """Rms that is left of some layers, whose rms is ``whole``, without the common mode."""
@@ -261,31 +235,29 @@ class AtmosphereBounds:
         """Integral of the correlation over time, s: the beam or what of the outer scale the filters
         pass, over the wind's speed.
         """
-        speed = max(float(np.hypot(*layer.wind)), 0.1)
+        speed, cut = max(float(np.hypot(*layer.wind)), 0.1), self.context.cut
         slow = max(4 * layer.sigma, min(layer.outer_scale, 20 * layer.sigma)) / speed
-        return min(slow, 1 / self.context.cut) if self.context.cut > 0 else slow
+        return min(slow, 1 / cut) if cut > 0 else slow
 
-    @cached_property
-    def _longest(self) -> float:
-        """Longest correlation time of the layers, s."""
-        return max(map(self._correlated, self.calibrated.layers))
+    def _bound(self, rms: float) -> dict[str, float]:
+        """Bound of an error in the fluctuation, correlated as the slowest layer is."""
+        longest = max(map(self._correlated, self.calibrated.layers))
+        return self.context.bound(rms, longest, common=True)
 
     def layers(self) -> list[Effect]:
         """Layers that may be omitted one by one."""
         context, a = self.context, self.calibrated
-        text = "1.25 p PWV dT/dPWV epsilon / (zeta e^-tau) kappa_l a_l x " + (
-            "rms left of the layer after subtraction of the detectors' mean"
-            if context.removes_common
-            else "rms behind the beam"
-        )
+        p, what = a.model.parameters, "rms behind the beam"
+        if context.removes_common:
+            what = "rms left of the layer after subtraction of the detectors' mean"
+        text = f"1.25 p PWV dT/dPWV epsilon / (zeta e^-tau) kappa_l a_l x {what}"
         text += OTHER_MODES if context.turns else ""
-        p, effects = a.model.parameters, []
+        effects = []
         for k, layer in enumerate(a.layers):
             bound, what = context.behind_modes(self.of_layers[k]), f"at {layer.height:.0f} m"
             choices = [full(what + (": left out by the pipeline" if k in p.omit else ""))]
             if k not in p.omit and not p.outputs:
-                choices.append(Choice("dropped", "left out", {"omit": [k]}, bound=bound,
-                                      formula=text))  # fmt: skip
+                choices.append(Choice("dropped", "left out", {"omit": [k]}, False, bound, text))
             effects.append(Effect(f"layer {k}", tuple(choices), bound, text))
         return effects
 
@@ -293,36 +265,32 @@ class AtmosphereBounds:
     def of_layers(self) -> list[dict[str, float]]:
         """Bound on each layer's part of the products."""
         context, a, bounds = self.context, self.calibrated, []
+        model, low, step = a.model, a.elevations[0], 1e-3
+        change = model.band.log_transmission_difference(model.pwv, model.pwv * step, low)
+        slope = abs(float(change)) / step  # d ln <e^-tau> / d ln PWV
         for k, layer in enumerate(a.layers):
             bound = context.bound(SAFETY * self.left[k], self._correlated(layer), common=True)
             if context.before_filters:
                 bound["tod"] = SAFETY * a.of_layer(k)
-            share = abs(a.model.layers[k].amplitude * float(a.model.kappa["opacity"][k]))
-            share *= a.model.fluctuation.scale * math.sqrt(a.variances[k])
-            bound |= context.sky_error(PASSAGES * share * self._opacity_slope)
+            share = abs(model.layers[k].amplitude * float(model.kappa["opacity"][k]))
+            share *= model.fluctuation.scale * math.sqrt(a.variances[k])
+            bound |= context.sky_error(PASSAGES * share * slope)
             bound["psd"] = min(SAFETY**2 * self._spectral_shares[k], 1.0)
             bounds.append(bound)
         return bounds
 
     @cached_property
-    def _opacity_slope(self) -> float:
-        """d ln <e^-tau> / d ln PWV."""
-        model, step = self.calibrated.model, 1e-3
-        low = self.calibrated.elevations[0]
-        change = model.band.log_transmission_difference(model.pwv, model.pwv * step, low)
-        return abs(float(change)) / step
-
-    @cached_property
-    def _spectral_shares(self) -> list[float]:
-        """Largest share that each layer has of the stream's power in a range of frequency (20 from
-        1 / duration to Nyquist), white noise included."""
+    def _spectral_shares(self) -> Floats:
+        """(n_layer,) largest share that each layer has of the stream's power in a range of
+        frequency (20 from 1 / duration to Nyquist), white noise included.
+        """
         o, a, grid = self.context.first, self.calibrated, np.array([0.0, 1.0])
         if o.duration * o.sample_rate > 4:
             grid = np.geomspace(1 / o.duration, o.sample_rate / 2, 21)
         power = np.array([[a.faster(k, float(f)) ** 2 for f in grid] for k in range(len(a.layers))])
-        each = np.maximum(power[:, :-1] - power[:, 1:], 0.0)
+        each = np.maximum(-np.diff(power), 0.0)
         total = each.sum(axis=0) + self.context.noise**2 * 2 * np.diff(grid) / o.sample_rate
-        return [float(v) for v in (each / np.maximum(total, 1e-300)).max(axis=1)]
+        return np.asarray((each / np.maximum(total, 1e-300)).max(axis=1))
 
     def without(self) -> dict[str, float]:
         """Effect of dropping all layers; and the mean emission, if no filter takes it out."""
@@ -333,81 +301,84 @@ class AtmosphereBounds:
 
     def _in_proportion(self, share: float) -> dict[str, float]:
         """Bound of an error that is ``share`` of the fluctuation."""
-        rms = SAFETY * share * math.hypot(*self.left)
-        bound = self.context.bound(rms, self._longest, common=True)
+        bound = self._bound(SAFETY * share * math.hypot(*self.left))
         return bound | {"psd": 2 * share + share**2}
 
     def nodes(self) -> Effect:
         """Nodes of the field and steps in time."""
-        context, a = self.context, self.calibrated
-        p, one = a.model.parameters, context.first.n_detectors == 1
-        left = max(self._differences(a.layers, a.rms), 0.01 * a.rms if one else 0.0)
+        a = self.calibrated
+        left = self._differences(a.layers, a.rms)
+        if self.context.first.n_detectors == 1:
+            left = max(left, 0.01 * a.rms)
         return exact(
             "detector nodes and time steps",
-            context.bound(left, self._longest, True),
+            self._bound(left),
             "rms left after subtraction of the detectors' mean",
-            f"tolerance {p.tolerance:g}",
+            f"tolerance {a.model.parameters.tolerance:g}",
         )
 
     def lattice(self) -> Effect:
         """Lattice of the turbulence."""
         p = self.calibrated.model.parameters
         level = FIDELITIES[p.fidelity]
-        text = "half the covariance's relative error x rms: how much the ensemble's rms is off"
-        what = f"{p.fidelity}, {p.lattice or level.lattice:g} of the beam"
-        wrong = self._in_proportion(0.5 * level.structure_error)
-        return exact("turbulence lattice", wrong, text, what)
+        return exact(
+            "turbulence lattice",
+            self._in_proportion(0.5 * level.structure_error),
+            "half the covariance's relative error x rms: how much the ensemble's rms is off",
+            f"{p.fidelity}, {p.lattice or level.lattice:g} of the beam",
+        )
 
     def spectral(self) -> list[Effect]:
         """The band's spectrum and ozone: the fluctuation's error by radiative transfer at one
         frequency, and without O3.
         """
-        a, band = self.calibrated, self.context.first.instrument.band
-        layers = replace(a.model.profile.layers, spectra=absorption_of(a.model.parameters))
+        model, elevation = self.calibrated.model, self.calibrated.elevations[0]
+        band = self.context.first.instrument.band
+        layers = replace(model.profile.layers, spectra=absorption_of(model.parameters))
         low, high = (f"{band.centre + side!r} Hz" for side in (-0.25e9, 0.25e9))
-        bare = replace(layers, o3=np.zeros_like(layers.o3))
         middle = BandTransfer(Band(name="middle", low=low, high=high), layers)
-        right = _slope(BandTransfer(band, layers), a.model.pwv, a.elevations[0])
+        bare = BandTransfer(band, replace(layers, o3=np.zeros_like(layers.o3)))
+        right = _slope(BandTransfer(band, layers), model.pwv, elevation)
         cells, centre = "the band, in cells of 0.5 GHz", "at the band's centre alone"
-        effects = []
-        for name, what, without, other in (
-            ("spectral resolution", cells, centre, middle),
-            ("ozone", "the profile's", "without ozone", BandTransfer(band, bare)),
-        ):
-            text = (
+        return [
+            exact(
+                name,
+                self._in_proportion(abs(_slope(other, model.pwv, elevation) / right - 1)),
                 "|ratio of dT/dPWV / e^-tau - 1| x rms of the fluctuation, by radiative transfer"
-                f" {without}"
+                f" {without}",
+                what,
             )
-            share = abs(_slope(other, a.model.pwv, a.elevations[0]) / right - 1)
-            effects.append(exact(name, self._in_proportion(share), text, what))
-        return effects
+            for name, what, without, other in (
+                ("spectral resolution", cells, centre, middle),
+                ("ozone", "the profile's", "without ozone", bare),
+            )
+        ]
 
     def slopes(self) -> list[Effect]:
         """Emission and opacity over the elevations of the scan. The high-pass filter takes the mean
         emission out.
         """
         context, model = self.context, self.calibrated.model
+        band, plane = model.band, context.first.focalplane
+        every = [o.elevation for o in context.observations]
         low = max(self.calibrated.elevations[0], math.radians(4.5))
-        high = max(
-            self.calibrated.elevations[1], *(o.elevation.max() for o in context.observations)
+        low = min(low, *(float(e.min()) for e in every))
+        high = max(self.calibrated.elevations[1], *(float(e.max()) for e in every))
+        emission, opacity = (
+            abs(float(f(model.pwv, low) - f(model.pwv, high)))
+            for f in (band.emission, band.log_transmission)
         )
-        low = min(low, *(float(o.elevation.min()) for o in context.observations))
-        band, pwv, plane = model.band, model.pwv, context.first.focalplane
-        emission = abs(float(band.emission(pwv, low) - band.emission(pwv, high)))
-        opacity = abs(float(band.log_transmission(pwv, low) - band.log_transmission(pwv, high)))
         share = float((plane.illumination_efficiency / plane.main_beam_efficiency).max())
-        share /= float(band.transmission(pwv, low))
-        size = context.bound(emission * share, context.first.duration, True)
+        share /= float(band.transmission(model.pwv, low))
         filtered = context.cut > 0
-        gone = "removed by the high-pass filter" if filtered else "in float64 beside the stream"
         loudest = math.hypot(*(t.loudest for t in context.traits.values()))
         noise = context.bound(opacity / 2 * loudest) | {"psd": opacity}
         return [
             exact(
                 "mean emission with elevation",
-                size,
+                context.bound(emission * share, context.first.duration, True),
                 "difference of the band's emission over the elevations seen",
-                gone,
+                "removed by the high-pass filter" if filtered else "in float64 beside the stream",
             ),
             exact(
                 "opacity with elevation",
