@@ -207,6 +207,13 @@ def exact(name: str, size: Bound, formula: str, what: str = "exact") -> Effect:
     return Effect(name, (full(what),), size, formula)
 
 
+def single(
+    name: str, size: Bound, formula: str, what: str = "exact", *, without: Bound | None = None
+) -> Estimate:
+    """Estimate of an operator with one effect, which has no coarser form."""
+    return Estimate((exact(name, size, formula, what),), without=without)
+
+
 def not_simulated(name: str, what: str, bound: Bound, formula: str) -> Effect:
     """An effect that nature has and zonda leaves out, with a bound on what that costs."""
     choice = Choice("not simulated", what, bound=bound, formula=formula)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from zonda.core.observation import Observation
-from zonda.core.plan.bounds import Context, Estimate, Traits, calibration, exact
+from zonda.core.plan.bounds import Context, Estimate, Traits, calibration, single
 from zonda.core.plan.planning import Planning
 
 from .crosstalk import Crosstalk, Shares, neighbours, read_shares
@@ -34,14 +34,11 @@ class GainPlanning(Planning[GainDrift]):
         """Its size: all that is in the stream, the mean emission included, changes by the rms of
         the gains.
         """
-        rms, o = self.operator.rms, context.first
-        size = context.bound(
-            rms * (context.fluctuation + context.mean_emission), o.duration
-        ) | context.sky_error(rms)
-        text = (
-            "rms of the gains x (rms of the stream + mean emission); of the sky, rms of the gains"
+        return single(
+            "gain drift",
+            context.of_all(self.operator.rms, common=False),
+            "rms of the gains x (rms of the stream + mean emission); of the sky, rms of the gains",
         )
-        return Estimate((exact("gain drift", size, text),))
 
 
 class TimeConstantPlanning(Planning[TimeConstant]):
@@ -56,9 +53,12 @@ class TimeConstantPlanning(Planning[TimeConstant]):
         # a Gaussian of FWHM passes to 1 % of its power below 0.71 v / FWHM
         frequency = min(0.71 * speed / float(o.focalplane.fwhm.min()), o.sample_rate / 2)
         loss = 1 - 1 / math.hypot(1, 2 * math.pi * frequency * tau)
-        text = "1 - |1 / (1 + 2 pi i f tau)| at f = 0.71 v / FWHM"
-        what = "exact below 0.46 of the sample rate"
-        return Estimate((exact("time constant", context.sky_error(loss), text, what),))
+        return single(
+            "time constant",
+            context.sky_error(loss),
+            "1 - |1 / (1 + 2 pi i f tau)| at f = 0.71 v / FWHM",
+            "exact below 0.46 of the sample rate",
+        )
 
 
 class CrosstalkPlanning(Planning[Crosstalk]):
@@ -77,15 +77,12 @@ class CrosstalkPlanning(Planning[Crosstalk]):
         shares, o = self._shares(context.first), context.first
         rows = np.repeat(np.arange(o.n_detectors), np.diff(shares.first))
         largest = float(np.bincount(rows, np.abs(shares.share), o.n_detectors).max(initial=0.0))
-        size = context.bound(
-            largest * (context.fluctuation + context.mean_emission), o.duration, common=True
-        )
-        text = (
+        return single(
+            "crosstalk",
+            context.of_all(largest),
             "largest sum of a detector's shares x (rms of the stream + mean emission); of the sky,"
-            " that sum"
+            " that sum",
         )
-        size |= context.sky_error(largest)
-        return Estimate((exact("crosstalk", size, text),))
 
     def _shares(self, observation: Observation) -> Shares:
         step, plane = self.operator, observation.focalplane
@@ -110,7 +107,7 @@ class GlitchPlanning(Planning[Glitches]):
         """Its size."""
         size = context.bound(self._rms(context.first), self.operator.decay)
         text = "sqrt(rate decay) amplitude (Campbell), at the detector, over zeta e^-tau"
-        return Estimate((exact("glitches", size, text),), without=size)
+        return single("glitches", size, text, without=size)
 
     def _rms(self, observation: Observation) -> float:
         step = self.operator

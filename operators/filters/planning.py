@@ -18,8 +18,8 @@ from zonda.core.plan.bounds import (
     Estimate,
     Saving,
     Traits,
-    exact,
     full,
+    single,
 )
 from zonda.core.plan.planning import Planning
 
@@ -41,6 +41,8 @@ class HighpassPlanning(Planning[HighpassFilter]):
     """
 
     of = HighpassFilter
+    per_sample = 120
+    """Spline weights; where the full DCT is used, the polynomials and what they are made from."""
     knobs = (Knob("oversampling", (8, 12, 24, 48), "slow part formed on a coarse series in time"),)
 
     def traits(self, observation: Observation) -> Traits:
@@ -49,18 +51,10 @@ class HighpassPlanning(Planning[HighpassFilter]):
         frequency, rate = self.operator.frequency, observation.sample_rate
         if self.operator.response == "bessel" and frequency < rate / 2:
             tried = np.geomspace(1e-3, 1, 200) * frequency
-            lowest = float(
-                tried[np.argmax(amplitude(tried, frequency, rate) >= 0.01)]
-            )  # the last, 0.7, is
-            return Traits(response=lambda f: float(f >= lowest))
-        cut = frequency if observation.duration * frequency >= 1 else 0.0
+            cut = tried[np.argmax(amplitude(tried, frequency, rate) >= 0.01)]  # the last, 0.7, is
+        else:
+            cut = frequency if observation.duration * frequency >= 1 else 0.0
         return Traits(response=lambda f: float(f >= cut))
-
-    def memory(self, observation: Observation) -> int:
-        """Spline weights; where the full DCT is used, the polynomials and what they are made
-        from.
-        """
-        return 120 * observation.n_samples
 
     def estimate(self, context: Context) -> Estimate:
         """The error of fewer knots; the Bessel filter has none."""
@@ -134,7 +128,7 @@ def low_part(context: Context, cut: float) -> float:
 class DetrendPlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = "zonda.operators.filters.polynomial:Detrend"
+    of = "zonda.operators.filters.detrend:Detrend"
 
     def memory(self, observation: Observation) -> int:
         """Bytes: the polynomials, and a row in float64; with a mask, its pointing, and where some
@@ -151,8 +145,9 @@ class PolynomialPlanning(DetrendPlanning):
 
     def estimate(self, context: Context) -> Estimate:
         """Leaving it out leaves the mean and the slow part in."""
-        left, what = _left_in(context), f"exact, order {self.operator.order}"
-        return Estimate((exact("polynomials", left, LEFT_IN, what),), without=left)
+        left = _left_in(context)
+        what = f"exact, order {self.operator.order}"
+        return single("polynomials", left, LEFT_IN, what, without=left)
 
 
 class GroundPlanning(Planning[Any]):
@@ -168,7 +163,7 @@ class GroundPlanning(Planning[Any]):
     def estimate(self, context: Context) -> Estimate:
         """Leaving it out leaves the mean and the template in."""
         left = _left_in(context)
-        return Estimate((exact("template in azimuth", left, LEFT_IN),), without=left)
+        return single("template in azimuth", left, LEFT_IN, without=left)
 
 
 LEFT_IN = "rms of the stream + mean emission, which no filter before it takes; all of the sky"
@@ -183,21 +178,17 @@ def _left_in(context: Context) -> dict[str, float]:
 class DesplinePlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = "zonda.operators.filters.polynomial:Despline"
-
-    def memory(self, observation: Observation) -> int:
-        """The splines at each sample, and what they are made from; a row in float64."""
-        return 8 * 12 * observation.n_samples
+    of = "zonda.operators.filters.despline:Despline"
+    per_sample = 8 * 12
+    """The splines at each sample, and what they are made from; a row in float64."""
 
 
 class TaperPlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
     of = "zonda.operators.filters.taper:Taper"
-
-    def memory(self, observation: Observation) -> int:
-        """The window."""
-        return 8 * observation.n_samples
+    per_sample = 8
+    """The window."""
 
 
 class CommonModePlanning(Planning[CommonModeFilter]):
@@ -234,5 +225,5 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         if step.method != "svd":
             return Estimate(without=without)
         text = "rms of the stream: no common mode removed at all"
-        effect = exact("common-mode residual", size, text, f"residual {step.residual:g}")
-        return Estimate((effect,), without=without)
+        what = f"residual {step.residual:g}"
+        return single("common-mode residual", size, text, what, without=without)

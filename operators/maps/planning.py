@@ -38,18 +38,12 @@ class BinMapPlanning(Planning[BinMap]):
         """Sums of two threads, two halves, the products of all signals; and the pointing, twice
         while it is laid out.
         """
-        others = len(observation.signals) - 1
-        counts = (count.memory for name, count in COUNTS.items() if getattr(self.operator, name))
-        more = sum(counts) + (40 if self.operator.scan_hits else 0)
-        samples = 144 * observation.n_samples if self.operator.crosslinking else 0
-        return more * self.operator.grid.n_pixels + samples + self._sums(observation, others)
-
-    def _sums(self, observation: Observation, others: int) -> int:
-        """Bytes of the sums with ``others`` signals beside the first."""
-        if (
-            self.operator.stokes == "IQU"
-        ):  # hits, six sums and three for each signal, in two threads and two halves
-            return (
-                32 * (7 + 3 * (1 + others)) + 240 * (1 + others)
-            ) * self.operator.grid.n_pixels + 250 * observation.n_samples
-        return (128 + 72 * others) * self.operator.grid.n_pixels + 150 * observation.n_samples
+        step, signals = self.operator, len(observation.signals)
+        each, samples = 56 + 72 * signals, 150
+        if step.stokes == "IQU":
+            # hits, six sums and three for each signal, in two threads and two halves
+            each, samples = 32 * (7 + 3 * signals) + 240 * signals, 250
+        each += sum(count.memory for name, count in COUNTS.items() if getattr(step, name))
+        each += 40 if step.scan_hits else 0
+        samples += 144 if step.crosslinking else 0
+        return each * step.grid.n_pixels + samples * observation.n_samples

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from zonda.core.knobs import Knob
 from zonda.core.numerics.chunks import TILE_DETECTORS
@@ -33,6 +33,8 @@ class WhitePlanning(Planning[WhiteNoise]):
     """Planning of `WhiteNoise`, which has no coarser form."""
 
     of = WhiteNoise
+    per_detector = 200
+    """Amplitudes at the nodes of the mean emission."""
 
     def traits(self, observation: Observation) -> Traits:
         """rms of one calibrated sample of each detector, under the load of
@@ -40,10 +42,6 @@ class WhitePlanning(Planning[WhiteNoise]):
         """
         each = calibrated(observation.noise_levels[self.operator.label], observation)
         return Traits(noise=float(each.min(initial=np.inf)) if each.size else 0.0, each=each)
-
-    def memory(self, observation: Observation) -> int:
-        """Amplitudes at the nodes of the mean emission."""
-        return 200 * observation.n_detectors
 
 
 class PinkPlanning(Planning[PinkNoise]):
@@ -78,10 +76,8 @@ class PinkPlanning(Planning[PinkNoise]):
         amplitude = self._amplitude(spectrum, observation)
         rate, rms = observation.sample_rate, amplitude * math.sqrt(law.gain * law.variance)
         grid = np.geomspace(1e-9, 0.5, 600)
-        power = np.abs(_response(law, grid)) ** 2
-        above = np.append(
-            np.cumsum((np.diff(grid) * (power[1:] + power[:-1]))[::-1])[::-1], 0.0
-        )  # 2 int_f^(1/2) g |H|^2 df
+        # 2 int_f^(1/2) g |H|^2 df
+        above = -2 * cumulative_trapezoid(law.response(grid)[::-1], grid[::-1], initial=0)[::-1]
 
         def faster(frequency: float) -> float:
             share = float(np.interp(math.log(max(frequency / rate, 1e-9)), np.log(grid), above))
@@ -134,21 +130,8 @@ def filters_in_a_tile(slopes: Floats) -> float:
     """Different slopes (n_det,) in a tile of detectors, on average: each is a filter that is run
     for the whole tile.
     """
-    tiles = [
-        slopes[first : first + TILE_DETECTORS] for first in range(0, len(slopes), TILE_DETECTORS)
-    ]
-    return float(np.mean([len(np.unique(tile)) for tile in tiles])) if tiles else 1.0
-
-
-def _response(law: PowerLawFilter, f: Any) -> Any:
-    """sqrt(g) H, complex, of equation (1) of `one_over_f`."""
-    back = np.exp(-2j * np.pi * f)
-    zeros, poles = (
-        np.r_[single, pair, pair.conj()]
-        for single, pair in ((law.zeros, law.pair_zeros), (law.poles, law.pair_poles))
-    )
-    top = np.prod(1 - (1 - zeros[:, None]) * back, axis=0)
-    return math.sqrt(law.gain) * top / np.prod(1 - (1 - poles[:, None]) * back, axis=0)
+    tiles = np.split(slopes, range(TILE_DETECTORS, len(slopes), TILE_DETECTORS))
+    return max(float(np.mean([len(np.unique(tile)) for tile in tiles])), 1.0)
 
 
 def _correlated(law: PowerLawFilter, context: Context) -> float:

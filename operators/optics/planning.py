@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from zonda.core.observation import Observation
-from zonda.core.plan.bounds import Context, Estimate, Traits, calibration, exact
+from zonda.core.plan.bounds import Context, Estimate, Traits, calibration, single
 from zonda.core.plan.planning import Planning
 
 from .efficiency import Efficiency
@@ -33,14 +33,12 @@ class GroundPlanning(Planning[Any]):
     """It has no coarser form."""
 
     of = "zonda.operators.optics.ground_pickup:GroundPickup"
+    per_sample, per_detector = 64, 8
+    """The profile, and what it is made of."""
 
     def traits(self, observation: Observation) -> Traits:
         """Its rms."""
         return Traits(rms=self._rms(observation))
-
-    def memory(self, observation: Observation) -> int:
-        """The profile, and what it is made of."""
-        return 64 * observation.n_samples + 8 * observation.n_detectors
 
     def estimate(self, context: Context) -> Estimate:
         """Its size. A filter that removes what the detectors have in common removes most
@@ -49,7 +47,7 @@ class GroundPlanning(Planning[Any]):
         rms = max(self._rms(o) for o in context.observations)
         size = context.bound(rms, context.first.duration, common=True)
         text = "rms (e / 45 deg)^power at the lowest elevation, at the detector, over zeta e^-tau"
-        return Estimate((exact("ground pickup", size, text),), without=size)
+        return single("ground pickup", size, text, without=size)
 
     def _rms(self, observation: Observation) -> float:
         step = self.operator
@@ -64,28 +62,22 @@ class HalfWavePlatePlanning(Planning[Any]):
     """Angles of one plate; what they do is done where the sky is sampled and mapped."""
 
     of = "zonda.operators.optics.half_wave_plate:HalfWavePlate"
-
-    def memory(self, observation: Observation) -> int:
-        """The angles."""
-        return 8 * observation.n_samples
+    per_sample = 8
+    """The angles."""
 
     def estimate(self, context: Context) -> Estimate:
         """Its size: without it polarized detectors see Q and U at other angles, up to 2 (Q^2 +
         U^2)^(1/2) apart.
         """
-        most = (
-            2
-            * context.peak
-            * float(context.first.focalplane.polarization_efficiency.max(initial=0.0))
+        efficiency = context.first.focalplane.polarization_efficiency
+        most = 2 * context.peak * float(efficiency.max(initial=0.0))
+        size = {"tod": most, "map_rms": most}
+        return single(
+            "half-wave plate",
+            size | ({"peak": most, "transfer": 2.0} if most else {}),
+            "2 p x the sky's brightness, which its polarized one cannot exceed",
+            "exact: ideal, of one angle",
         )
-        size = (
-            {"tod": most, "map_rms": most, "peak": most, "transfer": 2.0}
-            if most
-            else {"tod": 0.0, "map_rms": 0.0}
-        )
-        text = "2 p x the sky's brightness, which its polarized one cannot exceed"
-        what = "exact: ideal, of one angle"
-        return Estimate((exact("half-wave plate", size, text, what),))
 
 
 class LeakagePlanning(Planning[Any]):
@@ -99,11 +91,7 @@ class LeakagePlanning(Planning[Any]):
 
     def estimate(self, context: Context) -> Estimate:
         """Its size."""
-        o = context.first
-        share = self.operator.share * float(o.focalplane.polarization_efficiency.max(initial=0.0))
-        size = context.bound(
-            share * (context.fluctuation + context.mean_emission), o.duration, common=True
-        )
+        efficiency = context.first.focalplane.polarization_efficiency
+        share = self.operator.share * float(efficiency.max(initial=0.0))
         text = "p l x (rms of the stream + mean emission); of the sky, p l"
-        size |= context.sky_error(share)
-        return Estimate((exact("leakage", size, text),))
+        return single("leakage", context.of_all(share), text)

@@ -14,8 +14,9 @@ import numpy as np
 from zonda.core.data import Observation
 from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
-from zonda.core.plan.bounds import Context, Estimate, exact, not_simulated
+from zonda.core.plan.bounds import Context, Estimate, evenly, exact, not_simulated, single
 from zonda.core.plan.planning import Planning
+from zonda.core.types import AnyFloats
 
 from .base import Pointing
 from .limits import LargestMotion
@@ -61,41 +62,38 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
         o, error = context.first, self.operator.interpolation_error
         fwhm, radius = float(o.focalplane.fwhm.min()), o.focalplane.radius
         speed = context.coverage.speed if context.coverage else _speed(o)
-
-        def shift(delta: float) -> dict[str, float]:
-            return context.sky_error(min(STEEPEST * delta / fwhm, 1.0))
-
-        rotation = max(_rotation(x) for x in context.observations) * radius
+        seen = [_thin(x) for x in context.observations]
+        turn = max(float(np.ptp(np.unwrap(x.derotate("boresight_radec")[2]))) for x in seen)
         smear = (speed / o.sample_rate) ** 2 / 24 * 8 * math.log(2) / fwhm**2
-        resolution = float(np.spacing(o.seconds[-1])) * speed
+        aberration, per_beam = ABERRATION * _extent(context, seen), "1.43 / FWHM x "
         effects = (
             not_simulated(
                 "refraction",
                 "the pointing model takes out its mean",
-                shift(_bend(context)),
-                "1.43 / FWHM x 1.33 N cosec^2(el) x throw in elevation: what a constant correction"
+                _shift(context, _bend(o, [x.elevation for x in seen])),
+                f"{per_beam}1.33 N cosec^2(el) x throw in elevation: what a constant correction"
                 " leaves",
             ),
             exact(
                 "aberration",
-                shift(ABERRATION * _extent(context)),
-                "1.43 / FWHM x v/c x reach of the scan; a shift common to all is in the target's"
+                _shift(context, aberration),
+                f"{per_beam}v/c x reach of the scan; a shift common to all is in the target's"
                 " coordinates",
             ),
             not_simulated(
                 "aberration across the field",
                 "scale of the focal plane",
-                shift(ABERRATION * radius),
-                "1.43 / FWHM x v/c x radius of the field",
+                _shift(context, ABERRATION * radius),
+                f"{per_beam}v/c x radius of the field",
             ),
             exact(
                 "sky rotation",
-                shift(rotation),
-                "1.43 / FWHM x rotation during a scan x radius of the field",
+                _shift(context, turn * radius),
+                f"{per_beam}rotation during a scan x radius of the field",
             ),
             exact(
                 "pointing interpolation",
-                shift(error * fwhm),
+                _shift(context, error * fwhm),
                 "1.43 x interpolation_error",
                 f"within {error:g} of a beam",
             ),
@@ -108,12 +106,18 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
             *(exact(what, {}, text, "checked") for what, text in _motion(context)),
             exact(
                 "time stamps",
-                shift(resolution),
-                "1.43 / FWHM x spacing of float64 at the scan's end x speed",
+                _shift(context, float(np.spacing(o.seconds[-1])) * speed),
+                f"{per_beam}spacing of float64 at the scan's end x speed",
                 "float64 seconds",
             ),
         )
         return Estimate(effects)
+
+
+def _shift(context: Context, delta: float) -> dict[str, float]:
+    """Bound on the error of a shift [rad] of the beam."""
+    fwhm = float(context.first.focalplane.fwhm.min())
+    return context.sky_error(min(STEEPEST * delta / fwhm, 1.0))
 
 
 def _motion(context: Context) -> list[tuple[str, str]]:
@@ -142,56 +146,41 @@ class MispointingPlanning(Planning[Mispointing]):
     """It has no coarser form."""
 
     of: ClassVar[type[Operator]] = Mispointing
-
-    def memory(self, observation: Observation) -> int:
-        """The true boresight, and what it is made from."""
-        return 100 * observation.n_samples
+    per_sample = 100
+    """The true boresight, and what it is made from."""
 
     def estimate(self, context: Context) -> Estimate:
         """Its size by the shift of the beam, three standard deviations."""
-        step, fwhm = self.operator, float(context.first.focalplane.fwhm.min())
-        delta = math.hypot(*(step.offset or (0.0, 0.0))) + 3 * math.hypot(
-            step.scan_rms, step.jitter_rms
-        )
-        size = context.sky_error(min(STEEPEST * delta / fwhm, 1.0))
-        text = "1.43 / FWHM x (offset + 3 rms)"
-        return Estimate((exact("mispointing", size, text),))
+        step = self.operator
+        rms = math.hypot(step.scan_rms, step.jitter_rms)
+        delta = math.hypot(*(step.offset or (0.0, 0.0))) + 3 * rms
+        return single("mispointing", _shift(context, delta), "1.43 / FWHM x (offset + 3 rms)")
 
 
-def _bend(context: Context) -> float:
+def _bend(o: Observation, elevations: list[AnyFloats]) -> float:
     """Differential refraction [rad] over the elevations of all scans and the field."""
-    o = context.first
-    reached = [_thin(x).elevation for x in context.observations]
-    throw = max(float(np.ptp(e)) for e in reached) + 2 * o.focalplane.radius
+    throw = max(float(np.ptp(e)) for e in elevations) + 2 * o.focalplane.radius
+    lowest = min(float(e.min()) for e in elevations)
     pressure = math.exp(-o.site.altitude / 8000)
-    return (
-        1.33 * REFRACTIVITY * pressure / math.sin(min(float(e.min()) for e in reached)) ** 2 * throw
-    )
+    return 1.33 * REFRACTIVITY * pressure / math.sin(lowest) ** 2 * throw
 
 
 def _thin(o: Observation) -> Observation:
     """At most `INSTANTS` of it, evenly taken: none of what is bounded changes between them by more
     than a part in 1000.
     """
-    at = np.unique(np.linspace(0, o.n_samples - 1, min(INSTANTS, o.n_samples)).astype(int))
-    return o.thinned(at)
+    return o.thinned(evenly(o.n_samples, INSTANTS))
 
 
-def _rotation(o: Observation) -> float:
-    """Turn of the focal plane on the sky during a scan, rad."""
-    psi = np.unwrap(_thin(o).derotate("boresight_radec")[2])
-    return float(np.ptp(psi))
-
-
-def _extent(context: Context) -> float:
+def _extent(context: Context, seen: list[Observation]) -> float:
     """Largest distance of the boresight from the first centre, and the field's radius, rad."""
     ra, dec = context.first.centre
-    worst = 0.0
-    for o in context.observations:
-        there, lat, _ = _thin(o).derotate("boresight_radec")
+    least = 1.0  # of its cosine
+    for o in seen:
+        there, lat, _ = o.derotate("boresight_radec")
         cosine = np.sin(dec) * np.sin(lat) + np.cos(dec) * np.cos(lat) * np.cos(there - ra)
-        worst = max(worst, float(np.arccos(np.clip(cosine, -1, 1)).max()))
-    return worst + context.first.focalplane.radius
+        least = min(least, float(cosine.min()))
+    return math.acos(max(least, -1.0)) + context.first.focalplane.radius
 
 
 def _speed(o: Observation) -> float:

@@ -21,6 +21,7 @@ from zonda.core.plan.bounds import (
     exact,
     full,
     not_simulated,
+    single,
 )
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
@@ -95,14 +96,14 @@ class SkyPlanning(Planning[SkyMap]):
     def estimate(self, context: Context) -> Estimate:
         """Each effect as a share of a point source's peak."""
         o, step, widest = context.first, self.operator, self._widest(context.first)
-        reached = any(step.grid_of(x).reached(x, widest) for x in context.observations)
-        fwhm = float(step.fwhm or o.focalplane.fwhm.max())
-        if step.beam != "gaussian" or not reached:
-            fwhm = 0.0
-        what = "none" if reached else "not convolved: no detector reaches the map"
-        choices = [full("Gaussian" if fwhm else what), *self._without_beam(context, fwhm)]
+        fwhm, what = 0.0, "not convolved: no detector reaches the map"
+        if any(step.grid_of(x).reached(x, widest) for x in context.observations):
+            fwhm, what = float(step.fwhm or o.focalplane.fwhm.max()), "Gaussian"
+            if step.beam != "gaussian":
+                fwhm, what = 0.0, "none"
+        choices = (full(what), *self._without_beam(context, fwhm))
         effects = (
-            Effect("beam convolution", tuple(choices), context.sky_error(1.0), "the sky's peak"),
+            Effect("beam convolution", choices, context.sky_error(1.0), "the sky's peak"),
             self._order(context, step.grid_of(o), fwhm),
             exact(
                 "coordinate precision",
@@ -126,13 +127,13 @@ class SkyPlanning(Planning[SkyMap]):
         bound["transfer"] = math.expm1(min(exponent, 700.0))  # of the waves under the beam
         settings = {"beam": "none", "fwhm": None}
         bound = context.behind_modes(bound)
-        return [Choice("dropped", "no beam", settings, bound=bound, formula=text, saves=PENCIL)]
+        return [Choice("dropped", "no beam", settings, False, bound, text, saves=PENCIL)]
 
     def _order(self, context: Context, grid: Grid, fwhm: float) -> Effect:
         """Linear sampling for cubic splines, on the grid there is."""
-        operator, name = self.operator, "sampling order"
+        operator, name, cubic = self.operator, "sampling order", "cubic B-spline"
         if operator.interpolation == "linear" or not fwhm:
-            what = "linear" if operator.interpolation == "linear" else "cubic B-spline"
+            what = "linear" if operator.interpolation == "linear" else cubic
             return exact(name, context.sky_error(CUBIC), "0.3 % of a point source's peak", what)
         scale = np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0)
         points = fwhm / float(np.radians(scale).max())
@@ -143,8 +144,8 @@ class SkyPlanning(Planning[SkyMap]):
             " n^2 of its peak"
         )
         bound, settings = context.sky_error(LINEAR / n**2), {"interpolation": "linear"}
-        linear = Choice("coarse", "linear", settings, bound=bound, formula=text, saves=STRAIGHT)
-        return Effect(name, (full("cubic B-spline"), linear), bound, text)
+        linear = Choice("coarse", "linear", settings, False, bound, text, saves=STRAIGHT)
+        return Effect(name, (full(cubic), linear), bound, text)
 
 
 def one_beam(context: Context) -> Effect:
@@ -176,19 +177,17 @@ class SourcesPlanning(Planning[Any]):
 
     def memory(self, observation: Observation) -> int:
         """The catalogue, and lists of what is in view."""
+        from .point_sources import Catalogue
+
         _, entries = self._seen(observation)
-        return 8 * entries + 200 * observation.n_detectors + 100 * self._catalogue_size()
+        sources = len(Catalogue.read(self.operator).flux)
+        return 8 * entries + 200 * observation.n_detectors + 100 * sources
 
     def estimate(self, context: Context) -> Estimate:
         """Its size: the brightest source."""
-        size, text = brightness(self.traits(context.first)), "the brightest source in its beam"
-        what = "exact: each through its beam"
+        text, what = "the brightest source in its beam", "exact: each through its beam"
+        size = brightness(self.traits(context.first))
         return Estimate((exact("point sources", size, text, what), one_beam(context)))
-
-    def _catalogue_size(self) -> int:
-        from .point_sources import Catalogue
-
-        return len(Catalogue.read(self.operator).flux)
 
     def _seen(self, observation: Observation) -> tuple[Floats, int]:
         """Power of the sources that come into view, K_RJ sr; and how long the lists of them are."""
@@ -209,26 +208,21 @@ class CMBPlanning(Planning[Any]):
         """Four and a half standard deviations of the sky, which is larger than 1 K_RJ per K_CMB
         nowhere.
         """
-        spectra = self.operator.read().values
-        ell = np.arange(spectra.shape[1])
-        return Traits(
-            peak=4.5 * math.sqrt(float(((2 * ell + 1) * spectra[0]).sum()) / (4 * math.pi))
-        )
+        spectrum = self.operator.read().values[0]
+        variance = (2 * np.arange(len(spectrum)) + 1) @ spectrum / (4 * math.pi)
+        return Traits(peak=4.5 * math.sqrt(float(variance)))
 
     def memory(self, observation: Observation) -> int:
         """Bytes while the maps become a table: more than drawing them takes. 47 and 110 were
         measured for each pixel.
         """
-        return int(12 * self.operator.nside**2 * (110 if self._polarized(observation) else 50))
+        polarized = observation.focalplane.polarized and self.operator.read().values[1:].any()
+        return int(12 * self.operator.nside**2 * (110 if polarized else 50))
 
     def estimate(self, context: Context) -> Estimate:
         """Its size."""
         size, what = brightness(self.traits(context.first)), f"drawn at nside {self.operator.nside}"
-        return Estimate((exact("CMB", size, "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB", what),))
-
-    def _polarized(self, observation: Observation) -> bool:
-        """True if I, Q and U are drawn."""
-        return observation.focalplane.polarized and bool(self.operator.read().values[1:].any())
+        return single("CMB", size, "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB", what)
 
 
 class PySMPlanning(Planning[Any]):
@@ -244,17 +238,14 @@ class PySMPlanning(Planning[Any]):
 
     def memory(self, observation: Observation) -> int:
         """Templates and maps, and what `SkyMap` keeps of them."""
-        own = int(12 * self.operator.nside**2 * 8 * (6 + 6 * self._number))
+        number = len(self.operator.models) + len(self.operator.components)
+        own = int(12 * self.operator.nside**2 * 8 * (6 + 6 * number))
         return own + self._sampled(observation).memory(observation)
 
     def estimate(self, context: Context) -> Estimate:
         """Its size."""
         size, what = brightness(self.traits(context.first)), f"at nside {self.operator.nside}"
-        return Estimate((exact("sky of PySM", size, "largest brightness in view", what),))
-
-    @property
-    def _number(self) -> int:
-        return len(self.operator.models) + len(self.operator.components)
+        return single("sky of PySM", size, "largest brightness in view", what)
 
     def _sampled(self, observation: Observation) -> SkyPlanning:
         return SkyPlanning(self.operator.sky(observation))
