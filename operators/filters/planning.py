@@ -128,7 +128,7 @@ def low_part(context: Context, cut: float) -> float:
 class DetrendPlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = "zonda.operators.filters.detrend:Detrend"
+    of = "zonda.operators.filters.polynomial:Detrend"
 
     def memory(self, observation: Observation) -> int:
         """Bytes: the polynomials, and a row in float64; with a mask, its pointing, and where some
@@ -178,7 +178,7 @@ def _left_in(context: Context) -> dict[str, float]:
 class DesplinePlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = "zonda.operators.filters.despline:Despline"
+    of = "zonda.operators.filters.polynomial:Despline"
     per_sample = 8 * 12
     """The splines at each sample, and what they are made from; a row in float64."""
 
