@@ -22,7 +22,7 @@ from .configuration.parameters import Parameters
 from .errors import InputError, PipelineError, ZondaError
 from .pages import html_table
 from .signal import Signal
-from .storage.ecsv import Column, write_ecsv
+from .tables import Table
 from .types import Floats
 
 if TYPE_CHECKING:
@@ -281,6 +281,15 @@ def measure(data: Data, metric: str | FigureMetric, **parameters: Any) -> Figure
     )
 
 
+COLUMNS = {
+    "name": "metric and parameters",
+    "value": "in `unit`",
+    "error": "standard error, in `unit`; nan: not known",
+    "unit": "empty: a pure number",
+    "description": "what was measured",
+}
+
+
 class Figures:
     """The figures of a run in their order: iterate over them, or take one by its name."""
 
@@ -307,16 +316,7 @@ class Figures:
         """An ECSV table that `astropy.table.Table.read` knows: name, value, error, unit,
         description.
         """
-        columns = [
-            Column("name", [f.name for f in self], "", "metric and parameters"),
-            Column("value", [f.value for f in self], "", "in `unit`"),
-            Column(
-                "error", [f.error for f in self], "", "standard error, in `unit`; nan: not known"
-            ),
-            Column("unit", [f.unit for f in self], "", "empty: a pure number"),
-            Column("description", [f.description for f in self], "", "what was measured"),
-        ]
-        return write_ecsv(path, columns, meta)
+        return Table.of([vars(figure) for figure in self], COLUMNS, meta).write(path)
 
     def _repr_html_(self) -> str:
         return html_table("Figures", [(f.name, str(f).partition(" = ")[2]) for f in self])

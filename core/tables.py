@@ -52,6 +52,14 @@ class Table:
     columns: Sequence[Column]
     meta: Mapping[str, Any] = field(default_factory=dict)
 
+    @classmethod
+    def of(
+        cls, records: Sequence[Mapping[str, Any]], about: Mapping[str, str], meta: Mapping[str, Any]
+    ) -> Table:
+        """A table of mappings that have the same keys; ``about``: descriptions of the columns."""
+        made = [Column(k, [one[k] for one in records], "", text) for k, text in about.items()]
+        return cls(made, meta)
+
     @property
     def head(self) -> list[str]:
         """Names of the columns."""

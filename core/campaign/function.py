@@ -150,7 +150,19 @@ def _keys(pipeline: Any) -> list[str]:
         raise PipelineError(
             f"a campaign is made of a Pipeline, not of {pipeline!r:.60}", place=PLACE, cure=cure
         )
-    keys = [_key(step) for step in pipeline.operators]
+    keys = []
+    for operator in pipeline.operators:
+        if (key := _registered(type(operator))) is None:
+            raise PipelineError(
+                f"{operator.label} is a function or a class of this session, which the campaign's"
+                " workers do not know",
+                place=PLACE,
+                cure=(
+                    "make it a plugin (zonda new plugin NAME, pip install -e NAME), or run(scene)"
+                    " once for each observation"
+                ),
+            )
+        keys.append(key)
     if not any(map(may_write, pipeline.operators)):
         writers = ", ".join(operators_that(lambda step: issubclass(step, Output)))
         raise PipelineError(
@@ -159,27 +171,14 @@ def _keys(pipeline: Any) -> list[str]:
     return keys
 
 
-def _key(step: Operator) -> str:
-    """The name by which workers know a step's class. Raises `PipelineError` for one that they
-    cannot know.
-    """
-    kind = type(step)
+def _registered(kind: type[Operator]) -> str | None:
+    """The name by which workers know a class; None where they do not."""
     reference = f"{kind.__module__}:{kind.__qualname__}"
     for found in operators.candidates():
-        named = found.distribution != SESSION and (
-            found.name == kind.__name__ or found.reference == reference
-        )
-        if named and operators.get(found.qualified) is kind:
+        named = found.name == kind.__name__ or found.reference == reference
+        if named and found.distribution != SESSION and operators.get(found.qualified) is kind:
             return found.name
-    raise PipelineError(
-        f"{step.label} is a function or a class of this session, which the campaign's workers do"
-        " not know",
-        place=PLACE,
-        cure=(
-            "make it a plugin (zonda new plugin NAME, pip install -e NAME), or run(scene) once for"
-            " each observation"
-        ),
-    )
+    return None
 
 
 @contextlib.contextmanager
@@ -207,7 +206,11 @@ def _source(
 
     Raises `PipelineError` for what no file can say.
     """
-    steps = [_in_files(step, folders[0]) for step in pipeline.operators]
+    steps = list(pipeline.operators)
+    for number, step in enumerate(pipeline.operators):
+        if isinstance(step, InMemory):
+            steps[number] = step.in_files(product_path(folders[0], step.label, ".fits"))
+            steps[number]._label = step.label
     header = CampaignHeader(
         name=pipeline.name,
         description=pipeline.description,
@@ -235,15 +238,6 @@ def _source(
                 f"{label} cannot be written in a pipeline file", place=PLACE, cure=cure
             )
     return CampaignFile(file, lambda more: parse(text, name=PLACE, overrides=more), "")
-
-
-def _in_files(step: Operator, inputs: Path) -> Operator:
-    """The step with its arrays in a file."""
-    if not isinstance(step, InMemory):
-        return step
-    found = step.in_files(product_path(inputs, step.label, ".fits"))
-    found._label = step.label
-    return found
 
 
 def _named(component: Any, names: Any) -> Any:

@@ -8,7 +8,6 @@ s / sqrt(n), the standard error of the mean.
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..canvas import SEQUENCE, new_axes
 from ..configuration.units import factor_to
-from ..figures import Figure
+from ..experiment import Values
 from ..pages import render
-from ..storage.ecsv import Column
 from ..storage.files import atomic_path, write_text
 from ..tables import Table
 
@@ -29,68 +28,47 @@ if TYPE_CHECKING:
 LOGARITHMIC = 8.0
 """Ratio of the largest to the smallest swept value from which the axis is logarithmic."""
 
+COLUMNS = {
+    "figure": "metric and parameters",
+    "unit": "of mean, scatter and standard_error; empty: a pure number",
+    "mean": "over realizations",
+    "scatter": "standard deviation of one realization; nan: not known",
+    "standard_error": "of the mean; nan: not known",
+    "realizations": "number of realizations",
+}
+
 
 @dataclass(frozen=True)
 class Point:
-    """A figure at one point of the axes: values and their errors over realizations, (n,)."""
+    """A figure at one point of the axes, whose values are texts as in YAML."""
 
-    axes: tuple[tuple[str, Any], ...]
+    axes: dict[str, str]
     name: str
     unit: str
-    values: tuple[float, ...]
-    errors: tuple[float, ...]
-
-    @property
-    def mean(self) -> float:
-        """Mean over the realizations."""
-        return float(np.mean(self.values))
-
-    @property
-    def scatter(self) -> float:
-        """Standard deviation of one realization; of a single one the error that its metric states,
-        NaN: not known.
-        """
-        return float(np.std(self.values, ddof=1)) if len(self.values) > 1 else self.errors[0]
-
-    @property
-    def standard_error(self) -> float:
-        """Standard error of the mean."""
-        return self.scatter / math.sqrt(len(self.values))
+    values: Values
 
 
 def write(record: Record) -> None:
     """Write the table of a campaign whose combinations are all finished."""
     job, folder, points = record.job, record.folder, collected(record)
-    axes = list(dict.fromkeys(key for point in points for key, _ in point.axes))
-    columns = [
-        Column(key, [_text(dict(p.axes).get(key)) for p in points], "", "value on this axis")
-        for key in axes
+    axes = list(dict.fromkeys(key for point in points for key in point.axes))
+    rows = [
+        {key: point.axes.get(key, "") for key in axes}
+        | {
+            "figure": point.name,
+            "unit": point.unit,
+            "mean": point.values.mean,
+            "scatter": point.values.scatter,
+            "standard_error": point.values.standard_error,
+            "realizations": len(point.values.values),
+        }
+        for point in points
     ]
-    columns += [
-        Column("figure", [p.name for p in points], "", "metric and parameters"),
-        Column(
-            "unit",
-            [p.unit for p in points],
-            "",
-            "of mean, scatter and standard_error; empty: a pure number",
-        ),
-        Column("mean", [p.mean for p in points], "", "over realizations"),
-        Column(
-            "scatter",
-            [p.scatter for p in points],
-            "",
-            "standard deviation of one realization; nan: not known",
-        ),
-        Column(
-            "standard_error", [p.standard_error for p in points], "", "of the mean; nan: not known"
-        ),
-        Column("realizations", [len(p.values) for p in points], "", "number of realizations"),
-    ]
-    about = {"PIPELINE": job.name, "ZONDA": job.version, "COMMAND": job.command}
-    table = Table(columns, about)
+    meta = {"PIPELINE": job.name, "ZONDA": job.version, "COMMAND": job.command}
+    table = Table.of(rows, dict.fromkeys(axes, "value on this axis") | COLUMNS, meta)
     table.write(folder / "sweep.ecsv")
     with atomic_path(folder / "sweep.png") as temporary:
-        draw(points).savefig(temporary)
+        draw(points).savefig(temporary, bbox_inches="tight")
     page = render("zonda.core", "sweep.html", title=job.name, head=table.head, rows=table.shown())
     write_text(folder / "sweep.html", page)
 
@@ -98,71 +76,57 @@ def write(record: Record) -> None:
 def collected(record: Record) -> list[Point]:
     """Figures at every point, figure by figure."""
     job = record.job
-    found: dict[tuple[str, str], tuple[tuple[tuple[str, Any], ...], list[Figure]]] = {}
+    found: dict[str, dict[tuple[Any, ...], list[tuple[str, float, float]]]] = {}
     for number, combination in enumerate(job.combinations):
-        axes = tuple(
-            (key, value)
-            for key, value in combination.axes
-            if key not in ("realization", "observation")
-        )
-        place = json.dumps(
-            [
-                [
-                    combination.folder.partition("/")[0] if len(job.source) > 1 else "",
-                    *map(list, axes),
-                ]
-            ]
-        )
-        for figure in (Figure(*row) for row in record.combined[number]):
-            found.setdefault((figure.name, place), (axes, []))[1].append(figure)
-    order = list(dict.fromkeys(name for name, _ in found))
-    points = [
+        own = [a for a in combination.axes if a[0] not in ("realization", "observation")]
+        source = combination.folder.partition("/")[0] if len(job.source) > 1 else ""
+        place = (source, *((key, _text(value)) for key, value in own))
+        for name, value, unit, error, _ in record.combined[number]:
+            found.setdefault(name, {}).setdefault(place, []).append((unit, value, error))
+    return [
         Point(
-            axes,
+            dict(place[1:]),
             name,
-            figures[0].unit,
-            tuple(f.value for f in figures),
-            tuple(f.error for f in figures),
+            rows[0][0],
+            Values(tuple(value for _, value, _ in rows), rows[0][2]),
         )
-        for (name, _), (axes, figures) in found.items()
+        for name, places in found.items()
+        for place, rows in places.items()
     ]
-    return sorted(points, key=lambda point: order.index(point.name))
 
 
 def draw(points: Sequence[Point]) -> Any:
     """A matplotlib figure with a panel for each figure: mean and standard error (scatter, thin)
     against the first axis that changes; one line for each combination of the others."""
-    from matplotlib.figure import Figure as Canvas
-
     names = list(dict.fromkeys(point.name for point in points))
-    canvas = Canvas(figsize=(6.4, 0.6 + 3.0 * len(names)), dpi=110, layout="constrained")
-    for ax, name in zip(canvas.subplots(len(names), 1, squeeze=False)[:, 0], names, strict=True):
+    size = (6.4, 0.6 + 3.0 * len(names))
+    axes = new_axes(None, size, nrows=len(names), squeeze=False, gridspec_kw={"hspace": 0.4})[:, 0]
+    for ax, name in zip(axes, names, strict=True):
         _panel(ax, [point for point in points if point.name == name])
-    return canvas
+    return axes[0].figure
 
 
 def _panel(ax: Any, points: Sequence[Point]) -> None:
-    keys = list(dict.fromkeys(key for point in points for key, _ in point.axes))
-    changing = [k for k in keys if len({_text(dict(p.axes).get(k)) for p in points}) > 1]
+    keys = list(dict.fromkeys(key for point in points for key in point.axes))
+    changing = [k for k in keys if len({point.axes.get(k) for point in points}) > 1]
     first, others = (changing[0], changing[1:]) if changing else ("", [])
-    places, label, ticks = _positions([dict(p.axes).get(first) for p in points])
-    lines: dict[str, list[tuple[float, Point]]] = {}
+    places, unit, ticks = _positions([point.axes.get(first, "") for point in points])
+    lines: dict[str, list[tuple[float, Values]]] = {}
     for place, point in zip(places, points, strict=True):
-        lines.setdefault(
-            ", ".join(f"{k}={_text(dict(point.axes).get(k))}" for k in others), []
-        ).append((place, point))
+        name = ", ".join(f"{key}={point.axes.get(key, '')}" for key in others)
+        lines.setdefault(name, []).append((place, point.values))
     for number, (name, line) in enumerate(lines.items()):
         line.sort(key=lambda item: item[0])
-        x, y = [x for x, _ in line], [p.mean for _, p in line]
-        colour = f"C{number % 10}"
-        _bars(ax, x, y, [p.scatter for _, p in line], colour, lw=0.7, alpha=0.6)
-        _bars(ax, x, y, [p.standard_error for _, p in line], colour, lw=2.2)
-        ax.plot(x, y, "o-", color=colour, ms=5, lw=1, label=name or None)
+        colour, x = SEQUENCE[number % len(SEQUENCE)], [place for place, _ in line]
+        mean, scatter, error = np.array([(v.mean, v.scatter, v.standard_error) for _, v in line]).T
+        for size, style in ((scatter, {"lw": 0.7, "alpha": 0.6}), (error, {"lw": 2.2})):
+            ax.vlines(x, mean - size, mean + size, colour, **style)
+        ax.plot(x, mean, "o-", color=colour, ms=5, lw=1, label=name or None)
     if ticks:
         ax.set_xticks(range(len(ticks)), ticks)
     elif min(places) > 0 and max(places) / min(places) >= LOGARITHMIC:
         ax.set_xscale("log")
-    ax.set_xlabel(f"{first} [{label}]" if label else first)
+    ax.set_xlabel(f"{first} [{unit}]" if unit else first)
     ax.set_title(points[0].name, fontsize=9, loc="left")
     ax.set_ylabel(points[0].unit)
     ax.grid(True, color="#dddddd", lw=0.6)
@@ -170,44 +134,20 @@ def _panel(ax: Any, points: Sequence[Point]) -> None:
         ax.legend(fontsize=7, frameon=False)
 
 
-def _bars(
-    ax: Any,
-    x: Sequence[float],
-    y: Sequence[float],
-    sizes: Sequence[float],
-    colour: str,
-    **style: Any,
-) -> None:
-    known = [k for k, size in enumerate(sizes) if math.isfinite(size)]
-    if known:
-        ax.vlines(
-            [x[k] for k in known],
-            [y[k] - sizes[k] for k in known],
-            [y[k] + sizes[k] for k in known],
-            colour,
-            **style,
-        )
-
-
 _QUANTITY = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
 
 
-def _positions(values: Sequence[Any]) -> tuple[list[float], str, list[str]]:
+def _positions(values: Sequence[str]) -> tuple[list[float], str, list[str]]:
     """Places of values on an axis, the unit (that of the first), and the ticks where they are
     names.
     """
-    matches = [_QUANTITY.match(_text(value)) for value in values]
-    units = [match[2] if match else None for match in matches]
-    factors = [None if unit is None else factor_to(units[0] or "", unit) for unit in units]
-    if matches and None not in factors:
-        numbers = [
-            float(match[1]) * factor
-            for match, factor in zip(matches, factors, strict=True)
-            if match and factor
-        ]
-        return numbers, units[0] or "", []
-    names = list(dict.fromkeys(map(_text, values)))
-    return [float(names.index(_text(value))) for value in values], "", names
+    found = [match.groups() for value in values if (match := _QUANTITY.match(value))]
+    unit = found[0][1] if found else ""
+    factors = [factor_to(unit, own) for _, own in found]
+    if len(found) == len(values) and None not in factors:
+        return [float(n) * (f or 0.0) for (n, _), f in zip(found, factors, strict=True)], unit, []
+    names = list(dict.fromkeys(values))
+    return [float(names.index(value)) for value in values], "", names
 
 
 def _text(value: Any) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import statistics
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -101,6 +103,35 @@ def measured(variant: Variant, number: int, choices: Mapping[str, Choice | None]
         figure = choice.figure(data)
         found[name] = (figure.value, figure.error)
     return {name: found[name] for name in choices}
+
+
+@dataclass(frozen=True)
+class Values:
+    """Values of a metric over realizations (n,); ``error``: standard error that the metric states
+    for a single one, 0 where it states none, NaN where it is not known.
+    """
+
+    values: tuple[float, ...]
+    error: float = 0.0
+
+    @property
+    def mean(self) -> float:
+        """Mean; NaN for none."""
+        return math.fsum(self.values) / len(self.values) if self.values else math.nan
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of one realization; of a single one the error that its metric
+        states.
+        """
+        if len(self.values) < 2:
+            return self.error
+        return statistics.stdev(self.values)
+
+    @property
+    def standard_error(self) -> float:
+        """Standard error of the mean."""
+        return self.scatter / math.sqrt(len(self.values)) if self.values else math.nan
 
 
 @dataclass

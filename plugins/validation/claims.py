@@ -16,10 +16,11 @@ from zonda.core.configuration.locate import read as read_text
 from zonda.core.configuration.parameters import Parameters
 from zonda.core.configuration.steps import Mistakes
 from zonda.core.configuration.yaml_places import Source, Span
+from zonda.core.experiment import Values
 
 from .amount import Amount
 from .calculations import Calculation
-from .verdict import Of, Relation, Stated, Values, clears, compare
+from .verdict import Of, Relation, Stated, clears, compare
 
 FOLDER = Path(zonda.pipelines.__file__).parent / "validation"
 SHIPPED = FOLDER / "claims.yaml"

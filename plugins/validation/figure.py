@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from zonda.core.experiment import Values
+
     from .rows import CounterResult, Row
-    from .verdict import Values
 
 LINE = 0.42
 """Height of a line, in."""

@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from zonda import __version__
+from zonda.core.experiment import Values
 from zonda.core.pages import render
-from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path, write_text
+from zonda.core.tables import Table
 
 from .claims import ClaimsFile
 from .figure import draw
 from .rows import Row
-from .verdict import LIMIT, Values
+from .verdict import LIMIT
 
 COLOURS = {"agrees": "#1a7f4b", "differs, explained": "#0b5c8f", "differs": "#b3261e"}
 
@@ -79,11 +80,11 @@ def write(file: ClaimsFile, rows: Sequence[Row], folder: Path) -> None:
                 for k, value in enumerate(several.values)
             ]
             meta = {"claim": row.claim.id, "zonda": __version__}
-            _write_table(folder / row.claim.id / "values.ecsv", values, VALUES, meta)
+            Table.of(values, VALUES, meta).write(folder / row.claim.id / "values.ecsv")
             with atomic_path(folder / row.claim.id / "values.png") as temporary:
                 draw(row).savefig(temporary)
     meta = {"paper": file.paper, "zonda": __version__, "verdicts": summary(rows)}
-    _write_table(folder / "claims.ecsv", records, COLUMNS, meta)
+    Table.of(records, COLUMNS, meta).write(folder / "claims.ecsv")
     page = render(
         __package__,
         "claims.html",
@@ -116,13 +117,6 @@ def summary(rows: Sequence[Row]) -> str:
     """Numbers of claims by verdict: ``12 agree, 1 differs``."""
     found = Count(row.verdict.value for row in rows).most_common()
     return ", ".join(f"{verdict}: {number}" for verdict, number in found)
-
-
-def _write_table(
-    path: Path, records: Sequence[dict[str, Any]], about: dict[str, str], meta: dict[str, Any]
-) -> None:
-    columns = [Column(k, [one[k] for one in records], "", words) for k, words in about.items()]
-    write_ecsv(path, columns, meta)
 
 
 def _record(row: Row) -> dict[str, Any]:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zonda.core.errors import within
+from zonda.core.experiment import Values
 from zonda.core.storage.files import check_output_folder
 
 from .amount import Amount
 from .claims import Claim, Experiment
 from .runs import Runs, Say
-from .verdict import Comparison, Values, Verdict, compare, contradicted, decide
+from .verdict import Comparison, Verdict, compare, contradicted, decide
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from zonda.core import experiment as core
 from zonda.core.campaign.entries import setting
 from zonda.core.configuration.locate import locate
 from zonda.core.errors import InputError, ZondaError
+from zonda.core.experiment import Values
 from zonda.core.figures import Choice
 from zonda.core.registry import operators
 from zonda.core.storage.files import atomic_path, write_text
@@ -21,7 +22,6 @@ from zonda.operators.atmosphere.weather.sources import profile_of
 from zonda.plugins.commands.weather_plots import plot_spectrum
 
 from .claims import FOLDER, Claim, Experiment
-from .verdict import Values
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

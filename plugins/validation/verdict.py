@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+from zonda.core.experiment import Values
+
 LIMIT = 2.0
 """Largest distance that counts as agreement, in standard deviations."""
 
@@ -41,37 +43,6 @@ class Verdict(StrEnum):
     def decided(self) -> bool:
         """True if nothing is left to explain."""
         return self is not Verdict.DIFFERS
-
-
-@dataclass(frozen=True)
-class Values:
-    """Values over seeds (n,), SI; ``error``: standard error that a metric states for a single one,
-    0 where it states none.
-    """
-
-    values: tuple[float, ...]
-    error: float = 0.0
-
-    @property
-    def mean(self) -> float:
-        """NaN for none."""
-        return math.fsum(self.values) / len(self.values) if self.values else math.nan
-
-    @property
-    def scatter(self) -> float:
-        """Standard deviation of one realization; of a single one the error that its metric
-        states.
-        """
-        if len(self.values) < 2:
-            return self.error
-        return math.sqrt(
-            math.fsum((v - self.mean) ** 2 for v in self.values) / (len(self.values) - 1)
-        )
-
-    @property
-    def standard_error(self) -> float:
-        """Standard error of the mean."""
-        return self.scatter / math.sqrt(len(self.values)) if self.values else math.nan
 
 
 @dataclass(frozen=True)

@@ -98,8 +98,7 @@ def test_products_say_what_the_array_was(with_array, module_bench, tmp_path):
     plain = pipeline.run(scene(camera(7)), output=tmp_path, threads=1)
     told = {what: value for who, what, value in plain.tally if who == "SkyMap"}["input"]
     assert (
-        told
-        == f"array of 64 x 48, float64, hash {pipeline.operators[1].map.record()['hash']}, in K_RJ,"
+        told == f"array of 64 x 48, float64, hash {pipeline.operators[1].map.digest}, in K_RJ,"
         " given in Python"
     )
     for folder in (ours, tmp_path):

@@ -9,6 +9,7 @@ from astropy.table import Table
 from zonda.core.campaign.table import Point, draw
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
+from zonda.core.experiment import Values
 from zonda.core.figures import measure
 
 from ...scenes import camera
@@ -119,7 +120,7 @@ def test_a_sweep_over_nothing():
 def test_points_are_drawn_in_the_unit_of_the_first():
     def points(values):
         return [
-            Point((("a", v), ("b", 1)), "m", "K", (float(k),), (math.nan,))
+            Point({"a": v, "b": "1"}, "m", "K", Values((float(k),), math.nan))
             for k, v in enumerate(values)
         ]
 
@@ -129,7 +130,7 @@ def test_points_are_drawn_in_the_unit_of_the_first():
     assert ax.get_xscale() == "log"
     [ax] = draw(points(["tapered", "gaussian"])).axes
     assert [t.get_text() for t in ax.get_xticklabels()] == ["tapered", "gaussian"]
-    [ax] = draw(points([1, 2, 3])).axes
+    [ax] = draw(points(["1", "2", "3"])).axes
     assert list(ax.lines[0].get_xdata()) == [1, 2, 3]
 
 
