@@ -100,6 +100,9 @@ class Disk:
         self._file = open(path, "w+b", buffering=0)  # noqa: SIM115
         self._error: OSError | None = None
 
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
     def write(self, data: Any) -> int:
         """Write all of it where the last `seek` led."""
         rest = memoryview(data).cast("B")
@@ -120,31 +123,13 @@ class Disk:
         view[have:] = bytes(len(view) - have)
         return len(view)
 
-    def read(self, size: int) -> bytes:
-        """Read ``size`` bytes; zeros beyond the end."""
-        found = bytearray(size)
-        self.readinto(found)
-        return bytes(found)
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """Move to an offset, as `io.IOBase.seek`."""
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        """The present offset."""
-        return self._file.tell()
-
-    def truncate(self, size: int | None = None) -> int:
+    def truncate(self, size: int) -> int:
         """Cut the file, or make it longer."""
         try:
-            if self._error is None:
-                return self._file.truncate(size)
+            self._file.truncate(size)
         except OSError as error:
-            self._error = error
-        return size or 0
-
-    def flush(self) -> None:
-        """Nothing is held back."""
+            self._error = self._error or error
+        return size
 
     def check(self) -> None:
         """Raise the first failure."""

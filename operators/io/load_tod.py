@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core import flags
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
-from zonda.core.numerics.quaternions import middle
+from zonda.core.numerics.celestial import CelestialTransform
+from zonda.core.numerics.quaternions import conjugate, directions, middle, multiply
 from zonda.core.observation import Observation
 from zonda.core.signal import Component
 from zonda.core.types import Floats
 
-from .recorded_files import File, RecordedFiles, RecordedScan, Scan
-from .recorded_pointing import boresights, state_celestial
-from .recorded_scan import RecordedInstrument, joined
+from .recorded_files import File, RecordedBand, RecordedFiles, Scan
+from .recorded_scan import joined
 from .recorded_stream import RecordedStream
 from .time_ordered_data import TimeOrderedData
 
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from zonda.core.block import Block
     from zonda.core.data import Data
     from zonda.core.instrument import Instrument
+    from zonda.core.site import Site
 
 RECORDED = Component("recorded", "calibrated")
 """The stream of a file: it enters the signal as it is, calibrated."""
@@ -46,17 +46,11 @@ SAME_AZIMUTH = np.radians(1.0)
 pointing model.
 """
 
+GAP = 1.5
+"""Sample intervals from which two samples are a gap apart."""
+
 SAME_NUMBER = 1e-6
 """Largest relative difference of the sites and sample rates of such files."""
-
-
-@dataclass(frozen=True)
-class _Band:
-    """A band of a scan: the file, the camera, the rows of its detectors."""
-
-    part: RecordedScan
-    camera: RecordedInstrument
-    rows: NDArray[np.intp]
 
 
 class LoadTOD(RecordedFiles):
@@ -102,7 +96,7 @@ class LoadTOD(RecordedFiles):
         weather and half-wave plate of their own files.
         """
         if not data.band:
-            self._scans.update(_Scans(self, data).append())
+            _Scans(self, data).append()
             return
         for observation in data.observations:
             if file := self.file_of(observation):
@@ -144,9 +138,9 @@ class _Scans:
     step: LoadTOD
     data: Data
 
-    def append(self) -> dict[int, list[File]]:
-        """Append the observations; the files of each by its number."""
-        step, given, found = self.step, self.data.scene, dict[int, list[File]]()
+    def append(self) -> None:
+        """Append the observations."""
+        step, given = self.step, self.data.scene
         if self.data.observations:
             cure = (
                 "give all files to one LoadTOD, file: [FILE, ...], and leave out other steps that"
@@ -165,34 +159,26 @@ class _Scans:
         self.data.scene = given.model_copy(
             update={"site": own["site"], "instrument": own["instrument"]}
         )
-        most, known = 0, dict[Any, RecordedScan]()
+        most, known = 0, dict[Any, RecordedBand]()
         for scan in step.scans(given.instrument):
-            for part in scan:
-                self._check_new(part, known)
-            number = sum(len(part.cameras) for part in scan)
-            most = most or number
+            for band in scan:
+                self._check_new(band, known)
+            most = most or len(scan)
             observation = self._observation(self._of_bands(scan, own["instrument"], most))
-            found[observation.index] = [File.of(part, step.flag_mask) for part in scan]
-            if not own["instrument"].bands:
-                file = next(
-                    file
-                    for file in found[observation.index]
-                    if observation.focalplane.names[0] in file.rows
-                )
+            step._scans[observation.index] = [File.of(band, step.flag_mask) for band in scan]
+            file = step.file_of(observation)
+            if file is not None and not own["instrument"].bands:
                 _tell(step.label, observation, file)
             self.data.observations.append(observation)
-        return found
 
-    def _check_new(self, part: RecordedScan, known: dict[Any, RecordedScan]) -> None:
-        """Note the used detectors of a file: start, name and direction.
+    def _check_new(self, part: RecordedBand, known: dict[Any, RecordedBand]) -> None:
+        """Note the used detectors of a band: start, name and direction.
 
         Raises InputError if a file before it has one of them.
         """
         tod, xi, eta = part.tod, part.tod.xi.tolist(), part.tod.eta.tolist()
-        rows = np.concatenate(part.rows)
-        for row in rows[
-            (tod.detector_flags[rows] & np.uint8(self.step.detector_mask)) == 0
-        ].tolist():
+        unused = (tod.detector_flags & np.uint8(self.step.detector_mask)) != 0
+        for row in part.rows[~unused[part.rows]].tolist():
             key = str(tod.start), tod.names[row], xi[row], eta[row]
             if (other := known.setdefault(key, part)) is not part:
                 what = (
@@ -205,18 +191,13 @@ class _Scans:
                     cure=cure,
                 )
 
-    def _of_bands(self, scan: Scan, instrument: Instrument, most: int) -> list[_Band]:
+    def _of_bands(self, scan: Scan, instrument: Instrument, most: int) -> Scan:
         """The parts of a scan for each of the camera's bands; ``most``: bands of the first scan.
 
         Raises InputError if it is of another camera, lacks a band, or has one more.
         """
         place = f"{self.step.label}, {scan[0].path.name}"
-        every = [
-            _Band(part, *each)
-            for part in scan
-            for each in zip(part.cameras, part.rows, strict=True)
-        ]
-        bands = {band.camera.band.name: band for band in every}
+        bands = {band.camera.band.name: band for band in scan}
         for name, camera in instrument.cameras.items():
             of = bands.get(name)
             if (
@@ -224,33 +205,30 @@ class _Scans:
                 or of.camera.name != camera.name
                 or not np.isclose(of.camera.band.centre, camera.band.centre, rtol=1e-3)
             ):
-                what = ", ".join(
-                    f"{b.camera.name} at {b.camera.band.centre / 1e9:.4g} GHz" for b in every
+                what, first = (
+                    ", ".join(f"{c.name} at {c.band.centre / 1e9:.4g} GHz" for c in cameras)
+                    for cameras in ([band.camera for band in scan], [camera])
                 )
-                first = f"{camera.name} at {camera.band.centre / 1e9:.4g} GHz"
                 cure = "load the files of one instrument, all bands of each scan; or choose a band"
                 raise InputError(
                     f"was recorded with {what}, the first scan with {first}", place=place, cure=cure
                 )
-        if len(every) > most:
+        if len(scan) > most:
             text = (
                 f"has the bands {', '.join(bands)}, the first scan {', '.join(instrument.cameras)}"
             )
             raise InputError(
                 text, place=place, cure="begin with a scan of all bands; or choose a band"
             )
-        for part in scan[1:]:
+        for part in (band for band in scan if band.path != scan[0].path):
             _check_same_scan(scan[0], part, f"{self.step.label}, {part.path.name}")
         return [bands[name] for name in instrument.cameras]
 
-    def _observation(self, bands: list[_Band]) -> Observation:
+    def _observation(self, bands: Scan) -> Observation:
         """A scan; where the camera has several bands, their detectors follow each other."""
-        part, scene = bands[0].part, self.data.scene
-        tod, place = part.tod, f"{self.step.label}, {part.path}"
-        start, plane = (
-            Instant.parse(tod.start),
-            joined([b.camera for b in bands], place).focalplane(),
-        )
+        tod, scene, place = bands[0].tod, self.data.scene, f"{self.step.label}, {bands[0].path}"
+        start = Instant.parse(tod.start)
+        plane = joined([b.camera for b in bands], place).focalplane()
         if (np.diff(tod.seconds) <= 0).any():
             row = int(np.flatnonzero(np.diff(tod.seconds) <= 0)[0]) + 1
             raise InputError(
@@ -262,11 +240,12 @@ class _Scans:
             "fwhm", plane.fwhm
         )  # of all bands of the file, whichever are used; these alone have been checked
         tolerance = self.step.interpolation_error * float(fwhm[fwhm > 0].min())
-        found = boresights(tod, start, scene.site, self.step.celestial, tolerance, place)
-        good = flags.good(
-            sample_flags := tod.sample_flags(self.step.flag_mask), flags.EXCLUDE_SAMPLE
+        azel, radec, source = boresights(
+            tod, start, scene.site, self.step.celestial, tolerance, place
         )
-        flagged = np.concatenate([b.part.tod.detector_flags[b.rows] for b in bands])
+        sample_flags = tod.sample_flags(self.step.flag_mask)
+        good = flags.good(sample_flags, flags.EXCLUDE_SAMPLE)
+        flagged = np.concatenate([b.tod.detector_flags[b.rows] for b in bands])
         dead = np.where(
             flagged & np.uint8(self.step.detector_mask), np.uint8(flags.INVALID), np.uint8(0)
         )
@@ -279,9 +258,9 @@ class _Scans:
             start=start,
             seconds=tod.seconds,
             sample_rate=tod.sample_rate,
-            boresight_azel=found.azel,
-            boresight_radec=found.radec,
-            centre=self._centre(tod, found.radec, good),
+            boresight_azel=azel,
+            boresight_radec=radec,
+            centre=self._centre(tod, radec, good),
             seed=scene.seed,
             flags=sample_flags,
             detector_flags=dead,
@@ -290,7 +269,7 @@ class _Scans:
             hwp_angle=tod.hwp_angle,
         )
         observation.recorded_azimuth = _recorded_azimuth(self.step.label, observation, tod)
-        state_celestial(self.step.label, observation, found, tod.sample_rate)
+        state_celestial(self.step.label, observation, source, tod.sample_rate)
         return observation
 
     def _centre(self, tod: TimeOrderedData, radec: Any, good: Any) -> tuple[float, float]:
@@ -303,7 +282,7 @@ class _Scans:
             return float(tod.metadata["centre_ra"]), float(tod.metadata["centre_dec"])
         return middle(radec, good)
 
-    def _unique(self, name: str, bands: list[_Band]) -> str:
+    def _unique(self, name: str, bands: Scan) -> str:
         """The scan's name, of several bands without the first band's, with a number if another scan
         has it.
         """
@@ -315,7 +294,63 @@ class _Scans:
         return found
 
 
-def _check_same_scan(first: RecordedScan, part: RecordedScan, place: str) -> None:
+def boresights(
+    tod: TimeOrderedData,
+    start: Instant,
+    site: Site,
+    celestial: Literal["recorded", "recomputed"] | None,
+    tolerance: float,
+    place: str,
+) -> tuple[Floats, Floats, str]:
+    """The boresights (n, 4) of a file above the horizon and on the sky, and in words where the
+    latter come from; the rotation of the focal plane about the boresight is kept.
+
+    Raises InputError where those that are asked for cannot be had.
+    """
+    azel, radec = tod.boresight_azel, tod.boresight_radec
+    for name, values in (("boresight_azel", azel), ("boresight_radec", radec)):
+        far = np.flatnonzero(np.abs(np.einsum("ij,ij->i", values, values) - 1) > 1e-6)
+        if far.size:
+            raise InputError(
+                f"{name} is no rotation at sample {far[0]}",
+                place=place,
+                cure="make quaternions of length 1",
+            )
+    if celestial == "recorded" and not len(radec):
+        cure = "set celestial: recomputed, or leave it out"
+        raise InputError("has no boresight_radec", place=place, cure=cure)
+    if celestial == "recomputed" and not len(azel):
+        raise InputError("has no boresight_azel", place=place, cure="leave celestial out")
+    if len(radec) and len(azel) and celestial != "recomputed":
+        return azel, radec, "as recorded"
+    transform = CelestialTransform(site, start, float(tod.seconds[-1]), tolerance)
+    known = azel if len(azel) else radec
+    looking = directions(known)
+    horizontal = looking if len(azel) else transform.horizontal(looking, tod.seconds)
+    _, upright_azel, upright_radec = transform.boresight(horizontal, tod.seconds)
+    # what the boresight is turned about itself: Rz(psi) of R = R_upright Rz(psi)
+    turn = multiply(conjugate(upright_azel if len(azel) else upright_radec), known)
+    if len(azel):
+        return azel, multiply(upright_radec, turn), "recomputed from azimuth, elevation and time"
+    return multiply(upright_azel, turn), radec, "as recorded; azimuth and elevation are computed"
+
+
+def state_celestial(label: str, observation: Observation, source: str, rate: float) -> None:
+    """State where directions come from, how even the times are, and how many gaps there are."""
+    observation.tally.state(label, f"{observation.name}: directions on the sky", source)
+    steps = np.diff(observation.seconds) * rate
+    if steps.size and (gaps := int(np.count_nonzero(steps > GAP))):
+        what = f"{observation.name}: gaps between samples, which filters and noise do not see"
+        observation.tally.count(label, what, gaps, steps.size)
+    if observation.jitter * rate > 1e-3:
+        text = (
+            f"depart from a comb of {rate:.6g} Hz by {observation.jitter * 1e3:.3g} ms rms; noise"
+            " and filters count samples"
+        )
+        observation.tally.state(label, f"{observation.name}: times of the samples", text)
+
+
+def _check_same_scan(first: RecordedBand, part: RecordedBand, place: str) -> None:
     """Raise InputError if a file has the times of another, and other directions, site or rate."""
     for name in ("boresight_azel", "boresight_radec"):
         one, other = getattr(first.tod, name), getattr(part.tod, name)

@@ -50,21 +50,21 @@ MOST_FILES = 4096
 
 
 @dataclass(frozen=True)
-class RecordedScan:
-    """A file, all but its streams: its cameras of one band each, and the rows of their
-    detectors.
+class RecordedBand:
+    """A band of a file, all but its streams: the camera, the rows of its detectors, and whose noise
+    they have in words.
     """
 
     path: Path
     tod: TimeOrderedData
-    cameras: tuple[RecordedInstrument, ...]
-    rows: tuple[NDArray[np.intp], ...]
+    camera: RecordedInstrument
+    rows: NDArray[np.intp]
     noise: str
 
 
 @dataclass(frozen=True)
 class File:
-    """A file of a scan that is read: the rows of its detectors, what it states of the scan, whose
+    """A file of a band that is read: the rows of its detectors, what it states of the scan, whose
     noise it has in words.
     """
 
@@ -77,15 +77,12 @@ class File:
     noise: str
 
     @classmethod
-    def of(cls, part: RecordedScan, mask: int) -> File:
+    def of(cls, band: RecordedBand, mask: int) -> File:
         """``mask``: bits of the flags that exclude a sample."""
-        tod, rows = part.tod, np.concatenate(part.rows).tolist()
-        intervals = tod.scan_intervals or {
-            "scanning": runs(np.ones(tod.n_samples, bool), tod.seconds)
-        }
-        of_samples = tod.sample_flags(mask)
-        names = {tod.names[row]: row for row in rows}
-        return cls(part.path, names, of_samples, intervals, tod.weather, tod.hwp_angle, part.noise)
+        tod, rows = band.tod, {band.tod.names[row]: row for row in band.rows.tolist()}
+        every = {"scanning": runs(np.ones(tod.n_samples, bool), tod.seconds)}
+        said = tod.sample_flags(mask), tod.scan_intervals or every, tod.weather, tod.hwp_angle
+        return cls(band.path, rows, *said, band.noise)
 
     def state(self, observation: Observation) -> None:
         """Give an observation of one band what its own file states of the scan."""
@@ -101,8 +98,8 @@ Files = Annotated[
 ]
 """A file, or several."""
 
-Scan = list[RecordedScan]
-"""The files of one scan: one, or several with different bands."""
+Scan = list[RecordedBand]
+"""The bands of one scan, of one file or several."""
 
 
 class RecordedFiles(Operator):
@@ -167,7 +164,7 @@ class RecordedFiles(Operator):
         The camera has all bands of that scan; only one where ``given`` is the camera of a band.
         """
         scan = next(self.scans(given))
-        cameras = [camera for part in scan for camera in part.cameras]
+        cameras = [band.camera for band in scan]
         chosen = next((camera for camera in cameras if camera.has_the_detectors_of(given)), None)
         instrument = chosen or joined(cameras, f"{self.label}, {scan[0].path}")
         return {
@@ -223,12 +220,11 @@ class RecordedFiles(Operator):
 
     def scans(self, given: Instrument | None) -> Iterator[Scan]:
         """The scans in the order of their first files."""
-        return ([self._part(path, given) for path in paths] for paths in self._by_scan())
+        for paths in self._by_scan():
+            yield [band for path in paths for band in self._bands(path, given)]
 
     def _by_scan(self) -> list[list[Path]]:
         """The files of each scan: those with the same times and other bands."""
-        found: list[list[Path]] = []
-        open_ones: dict[Any, list[tuple[set[int], list[Path]]]] = {}
         told = [(path, *_told(path, _stamp(path))) for path in self.files]
         if (wanted := self.band) is not None:  # where no file has it, the first is refused
             told = [
@@ -236,20 +232,16 @@ class RecordedFiles(Operator):
                 for one in told
                 if not one[2] or any(is_near(mhz * 1e6, wanted) for mhz in one[2])
             ] or told[:1]
+        found: list[tuple[Any, set[int], list[Path]]] = []
         for path, times, bands in told:
-            same = open_ones.setdefault(times, [])
-            beside = next(
-                ((known, paths) for known, paths in same if bands and not known & bands), None
-            )
+            beside = next((s for s in found if bands and s[0] == times and not s[1] & bands), None)
             if beside is None:
-                beside = set(), []
-                same.append(beside)
-                found.append(beside[1])
-            beside[0].update(bands)
-            beside[1].append(path)
-        return found
+                found.append(beside := (times, set(), []))
+            beside[1].update(bands)
+            beside[2].append(path)
+        return [paths for _, _, paths in found]
 
-    def _part(self, path: Path, given: Instrument | None) -> RecordedScan:
+    def _bands(self, path: Path, given: Instrument | None) -> Scan:
         """Everything but the stream of a file. Raises InputError for a file that cannot be used."""
         place = f"{self.label}, {path}"
         tod, streams = _head(path, _stamp(path))
@@ -257,13 +249,8 @@ class RecordedFiles(Operator):
         table = read_noise(self.noise) if self.noise is not None else None
         if self.noise_model is not None or not stated:
             try:
-                tod = replace(
-                    tod,
-                    columns={
-                        **tod.columns,
-                        **_fitted(path, _stamp(path), self.noise_model, self.detector_mask),
-                    },
-                )
+                fitted = _fitted(path, _stamp(path), self.noise_model, self.detector_mask)
+                tod = replace(tod, columns={**tod.columns, **fitted})
             except InputError:
                 if table is None or self.noise_model is not None:
                     raise
@@ -276,13 +263,10 @@ class RecordedFiles(Operator):
         tod, noise = _with_noise(tod, table, np.concatenate([r[used[r]] for r in rows]), place)
         if table is None and "net" in tod.columns and (self.noise_model is not None or not stated):
             noise = f"fitted to the file's {self.noise_model or 'noise_model'}"
-        return RecordedScan(
-            path,
-            tod,
-            tuple(instrument_of(tod, r, used[r], given, place) for r in rows),
-            tuple(rows),
-            noise,
-        )
+        return [
+            RecordedBand(path, tod, instrument_of(tod, r, used[r], given, place), r, noise)
+            for r in rows
+        ]
 
 
 def _stamp(path: Path) -> tuple[int, int]:

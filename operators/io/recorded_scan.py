@@ -28,6 +28,18 @@ SAME_BAND = 1e-2
 NEAR_BAND = 0.05
 """Relative difference of centres up to which a band is the one that was named."""
 
+DEFAULTS = {
+    "fwhm": 0.0,
+    "main_beam_efficiency": 1.0,
+    "illumination_efficiency": 1.0,
+    "net": 0.0,
+    "polarization_angle": 0.0,
+    "knee": 0.0,
+    "slope": 1.0,
+    "minimum_frequency": 1e-3,
+}
+"""Values of detectors for which neither the file nor the scene's instrument states one."""
+
 POSITIVE = ("fwhm", "slope")
 """What is above zero, of the columns."""
 
@@ -203,30 +215,30 @@ def instrument_of(
     columns = {name: _known(name, values[rows], used) for name, values in tod.columns.items()}
     given = band_of(given, float(np.median(columns.get("band_centre", np.zeros(1)))))
     plane = _focalplane(tod, columns, rows, given, place)
-    fwhm = float(np.median(plane.fwhm))
     band = _band(tod, columns, given, place)
-    diameter = tod.metadata.get("telescope_diameter")
-    if diameter is None:
-        diameter = 1.22 * LIGHT / band.centre / fwhm if given is None else given.telescope.diameter
-    net, knee = float(np.median(plane.net)), float(np.median(plane.knee))
+    usual = {key: float(np.median(getattr(plane, key))) for key in DEFAULTS}
+    diameter = 1.22 * LIGHT / band.centre / usual["fwhm"]
+    if given is not None:
+        diameter = given.telescope.diameter
+    name, about = tod.telescope or "recorded", tod.metadata
     made = RecordedInstrument(
-        name=tod.telescope or "recorded",
+        name=name,
         description=f"as {tod.name} was recorded",
         telescope=Telescope(
-            name=str(tod.metadata.get("telescope", tod.telescope or "recorded")),
-            diameter=f"{float(diameter)!r} m",
+            name=str(about.get("telescope", name)),
+            diameter=f"{float(about.get('telescope_diameter', diameter))!r} m",
             elevation_min="0 deg",
         ),
         band=band,
         detectors=len(plane),
         field_of_view=f"{2 * float(np.arctan(plane.radius))!r} rad",
-        fwhm=f"{fwhm!r} rad",
-        main_beam_efficiency=float(np.median(plane.main_beam_efficiency)),
-        illumination_efficiency=float(np.median(plane.illumination_efficiency)),
-        net=f"{net!r} K s(1/2)",
-        knee=f"{knee!r} Hz",
-        slope=min(float(np.median(plane.slope)), 3.0),
-        pink_minimum_frequency=f"{float(np.median(plane.minimum_frequency))!r} Hz",
+        fwhm=f"{usual['fwhm']!r} rad",
+        main_beam_efficiency=usual["main_beam_efficiency"],
+        illumination_efficiency=usual["illumination_efficiency"],
+        net=f"{usual['net']!r} K s(1/2)",
+        knee=f"{usual['knee']!r} Hz",
+        slope=min(usual["slope"], 3.0),
+        pink_minimum_frequency=f"{usual['minimum_frequency']!r} Hz",
         sample_rate=f"{tod.sample_rate!r} Hz",
         provenance="the file of time-ordered data",
     )
@@ -289,34 +301,17 @@ def _focalplane(
     given: Instrument | None,
     place: str,
 ) -> Focalplane:
-    n, found = len(rows), dict[str, Any]()
-    stated = {
-        "fwhm": None if given is None else given.beam_fwhm,
-        "main_beam_efficiency": 1.0,
-        "illumination_efficiency": 1.0,
-        "net": 0.0 if given is None else given.net,
-        "polarization_angle": 0.0,
-        "knee": 0.0,
-        "slope": 1.0,
-        "minimum_frequency": 1e-3,
-    }
-    for name, otherwise in stated.items():
-        if name in columns:
-            found[name] = columns[name]
-        elif otherwise is None:
-            raise InputError(
-                "states no beam (fwhm)",
-                place=place,
-                cure="give the scene an instrument with its fwhm",
-            )
-        else:
-            found[name] = np.full(n, otherwise)
-    if "polarization_efficiency" in columns:
-        found["polarization_efficiency"] = columns["polarization_efficiency"]
-    if "wafer" in columns:
-        found["wafer"] = columns["wafer"]
+    stated = {} if given is None else {"fwhm": given.beam_fwhm, "net": given.net}
+    otherwise = {**DEFAULTS, **stated}
+    if "fwhm" not in columns and given is None:
+        cure = "give the scene an instrument with its fwhm"
+        raise InputError("states no beam (fwhm)", place=place, cure=cure)
+    found = {name: np.full(len(rows), value) for name, value in otherwise.items()}
+    optional = ("polarization_efficiency", "wafer")
+    found |= {name: columns[name] for name in (*otherwise, *optional) if name in columns}
+    found |= {"xi": tod.xi[rows], "eta": tod.eta[rows]}
     names = [tod.names[row] for row in rows]
-    for name, values in {**found, "xi": tod.xi[rows], "eta": tod.eta[rows]}.items():
+    for name, values in found.items():
         bad = np.flatnonzero(~np.isfinite(values) | ((values <= 0) & (name in POSITIVE)))
         if bad.size:
             cure = (
@@ -327,4 +322,4 @@ def _focalplane(
                 f"{name} of detector {names[bad[0]]} is {values[bad[0]]:g}", place=place, cure=cure
             )
     found["minimum_frequency"] = np.maximum(found["minimum_frequency"], 1e-9)
-    return Focalplane(names=names, xi=tod.xi[rows], eta=tod.eta[rows], **found)
+    return Focalplane(names=names, **found)

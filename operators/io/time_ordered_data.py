@@ -42,6 +42,21 @@ OF_SAMPLES = (
     "hwp_angle",
 )
 """What a scan may have of each sample, besides its streams."""
+OF_DETECTORS = (
+    "fwhm",
+    "polarization_angle",
+    "polarization_efficiency",
+    "main_beam_efficiency",
+    "illumination_efficiency",
+    "band_centre",
+    "band_width",
+    "net",
+    "knee",
+    "minimum_frequency",
+    "slope",
+    "wafer",
+)
+"""Columns of the detectors in a file."""
 
 
 def _none() -> NDArray[np.float64]:
@@ -138,15 +153,14 @@ class TimeOrderedData:
         pointing are not finite.
         """
         n, d = np.shape(self.times)[:1], np.shape(self.names)
-        shapes = {"seconds": n, "times": n, "flags": n, "quats": (*d, 4), "detector_flags": d}
-        pointed = [
-            name for name in ("boresight_azel", "boresight_radec") if len(getattr(self, name))
-        ]
+        given = vars(self) | self.columns
+        pointed = [name for name in ("boresight_azel", "boresight_radec") if len(given[name])]
+        shapes = dict.fromkeys(("seconds", "times", "flags", "hwp_angle", "azimuth"), n)
+        shapes |= {"quats": (*d, 4), "detector_flags": d, "offsets": (*d, 2)}
         shapes |= dict.fromkeys(pointed or ("boresight_azel",), (*n, 4))
-        shapes |= {} if self.offsets is None else {"offsets": (*d, 2)}
-        shapes |= {name: n for name in ("hwp_angle", "azimuth") if getattr(self, name) is not None}
-        wrong = [name for name, shape in shapes.items() if np.shape(getattr(self, name)) != shape]
-        wrong += [name for name, column in self.columns.items() if np.shape(column) != d]
+        shapes |= dict.fromkeys(self.columns, d)
+        known = {name: given[name] for name in shapes if given[name] is not None}
+        wrong = [name for name, values in known.items() if np.shape(values) != shapes[name]]
         wrong += [
             name
             for name, stream in self.streams.items()
@@ -155,20 +169,12 @@ class TimeOrderedData:
         if wrong or not n or not d:
             message = f"does not fit together: {', '.join(wrong)} for {len(self.names)} detectors"
             raise InputError(message, place=place, cure="save it again")
-        shapes.pop("azimuth", None)  # where it is no number, that of the boresight is taken
-        numbers = [
-            name for name, shape in shapes.items() if not np.isfinite(getattr(self, name)).all()
-        ]
-        if (
-            not np.isfinite([self.sample_rate, self.field_of_view, *self.site[1:]]).all()
-            or not self.sample_rate > 0
-        ):
-            numbers.append("sample rate, field of view or site")
-        numbers += [
-            f"intervals {name}"
-            for name, spans in self.intervals.items()
-            if not np.isfinite(spans).all()
-        ]
+        for name in ("azimuth", *self.columns):  # where it is no number, another is taken
+            known.pop(name, None)
+        known |= {f"intervals {name}": spans for name, spans in self.intervals.items()}
+        stated = [self.sample_rate, self.field_of_view, *self.site[1:]]
+        known["sample rate, field of view or site"] = stated if self.sample_rate > 0 else np.nan
+        numbers = [name for name, values in known.items() if not np.isfinite(values).all()]
         if numbers:
             raise InputError(
                 f"has NaN or impossible values in {', '.join(numbers)}",
@@ -226,20 +232,18 @@ class TimeOrderedData:
         sotodlib's xi is a sine (`xieta_sotodlib`): the same to 3e-7 rad at 0.5 deg, 35 arcsec less
         at 4 deg, 46 arcmin at 17 deg.
         """
-        return (
-            np.asarray(-self._directions[1] / self._directions[2])
-            if self.offsets is None
-            else self.offsets[:, 0]
-        )
+        return self._offsets()[:, 0]
 
     @property
     def eta(self) -> NDArray[np.float64]:
         """(n_det,) offset towards increasing elevation, as `xi`."""
-        return (
-            np.asarray(-self._directions[0] / self._directions[2])
-            if self.offsets is None
-            else self.offsets[:, 1]
-        )
+        return self._offsets()[:, 1]
+
+    def _offsets(self) -> NDArray[np.float64]:
+        if self.offsets is not None:
+            return self.offsets
+        x, y, z = directions(self.quats).T
+        return np.stack([-y / z, -x / z], axis=1)
 
     def xieta_sotodlib(
         self,
@@ -247,17 +251,9 @@ class TimeOrderedData:
         """xi, eta, gamma (n_det,) [rad] as sotodlib and so3g define them: sines, of the same signs
         as ours; gamma is the angle of the polarization from increasing eta towards increasing xi.
         """
+        x, y, _ = directions(self.quats).T
         _, _, z, w = self.quats.T
-        return (
-            np.asarray(-self._directions[1]),
-            np.asarray(-self._directions[0]),
-            np.asarray(np.arctan2(2 * w * z, w * w - z * z)),
-        )
-
-    @property
-    def _directions(self) -> NDArray[np.float64]:
-        """Detector directions in the boresight's frame, (3, n_det)."""
-        return directions(self.quats).T
+        return -y, -x, np.asarray(np.arctan2(2 * w * z, w * w - z * z))
 
     @classmethod
     def of(
@@ -265,7 +261,12 @@ class TimeOrderedData:
     ) -> TimeOrderedData:
         """Everything but the streams of an observation."""
         o, f, instrument = observation, observation.focalplane, observation.instrument
-        n = len(f)
+        own = {
+            "band_centre": np.full(len(f), instrument.band.centre),
+            "band_width": np.full(len(f), instrument.band.width),
+        }
+        if "white" in o.components and "pink" not in o.components:
+            own["knee"] = np.zeros(len(f))
         found = cls(
             name=o.name,
             start=o.start.isoformat(),
@@ -282,20 +283,8 @@ class TimeOrderedData:
             names=list(f.names),
             quats=detector_quaternions(f.xi, f.eta, f.polarization_angle),
             columns={
-                "fwhm": f.fwhm,
-                "polarization_angle": f.polarization_angle,
-                "polarization_efficiency": f.polarization_efficiency,
-                "main_beam_efficiency": f.main_beam_efficiency,
-                "illumination_efficiency": f.illumination_efficiency,
-                "band_centre": np.full(n, instrument.band.centre),
-                "band_width": np.full(n, instrument.band.width),
-                "net": f.net,
-                "knee": np.zeros(n)
-                if "white" in o.components and "pink" not in o.components
-                else f.knee,
-                "minimum_frequency": f.minimum_frequency,
-                "slope": f.slope,
-                "wafer": f.wafer.astype(np.float64),
+                name: np.asarray(own[name] if name in own else getattr(f, name), np.float64)
+                for name in OF_DETECTORS
             },
             weather=o.weather,
             hwp_angle=o.hwp_angle,
