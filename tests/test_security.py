@@ -216,15 +216,17 @@ def test_a_soft_link_stays_in_the_file(tmp_path: Path) -> None:
 
 
 def test_a_table_of_air_is_numbers_only(tmp_path: Path) -> None:
+    from zonda.core.configuration.time import Instant
     from zonda.core.site import Site
-    from zonda.operators.atmosphere.weather.table import read_table
+    from zonda.operators.atmosphere.weather.table import Table
 
     (tmp_path / "air.csv").write_text(
         "height [m], pressure [hPa], temperature [K], relative humidity [%]\n__import__('os'), 1,"
         " 2, 3\n"
     )
-    with pytest.raises(InputError, match="is not a number"):
-        read_table(tmp_path / "air.csv", Site(name="s", latitude="0 deg", longitude="0 deg"))
+    site = Site(name="s", latitude="0 deg", longitude="0 deg")
+    with pytest.raises(InputError, match="not a finite number"):
+        Table(table=tmp_path / "air.csv").column(site, Instant.parse("2024-03-01"))
 
 
 # --------------------------------------------------------------------------------------------------

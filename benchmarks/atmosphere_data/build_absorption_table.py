@@ -123,7 +123,7 @@ def ozone_ratios(temperature: NDArray[np.float64]) -> NDArray[np.uint8]:
     The parts hold the same frequencies at all pressures: those sorted by the opacity of the
     standard atmosphere's ozone.
     """
-    from zonda.operators.atmosphere.weather.standard_atmosphere import ozone
+    from zonda.operators.atmosphere.weather.air import ozone
 
     column = f"column o3 hydrostatic {OZONE}"
     fine = np.array(

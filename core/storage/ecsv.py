@@ -34,6 +34,7 @@ SPELLED = {
     "sec": "s",
     "secs": "s",
     "seconds": "s",
+    "ppm": "1e-6",
 }
 """Units as headings write them, in small letters, that astropy does not know."""
 
@@ -99,10 +100,12 @@ class Table:
         """Note a mistake in a row; -1: in the heading, None: in the table as a whole."""
         self._mistakes.append((0 if row is None else self.lines[row], message, cure))
 
-    def note_rows(self, wrong: NDArray[np.bool_], message: Callable[[int], str], cure: str) -> None:
+    def note_rows(
+        self, wrong: NDArray[np.bool_], message: str | Callable[[int], str], cure: str
+    ) -> None:
         """Note a mistake in each ``wrong`` row (n,)."""
         for row in np.flatnonzero(wrong).tolist():
-            self.note(row, message(row), cure)
+            self.note(row, message if isinstance(message, str) else message(row), cure)
 
     def check(self) -> None:
         """Raise `InputError` about all mistakes at once, each with its line."""

@@ -19,7 +19,7 @@ from zonda.operators.atmosphere.weather.bands import BandAtmosphere
 from zonda.operators.atmosphere.weather.climatology import profile
 from zonda.operators.atmosphere.weather.profiles import Profile
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
-from zonda.operators.atmosphere.weather.table import read_table
+from zonda.operators.atmosphere.weather.table import Table
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.noise.white import WhiteNoise
@@ -221,7 +221,7 @@ def _read_humidity(percent: float) -> None:
             + "\n".join(rows)
             + "\n"
         )
-        read_table(path, SITE)
+        Table(table=path).column(SITE, START)
 
 
 @checks.add(EDGES, reference="NEP^2 summed over the cells of the spectrum", limit=0.01)

@@ -19,7 +19,7 @@ with guided_by("zonda.operators.io", "zonda.operators.atmosphere.weather", "scip
     from zonda.core.configuration.time import Instant
     from zonda.core.errors import ZondaError
     from zonda.core.site import Site
-    from zonda.operators.atmosphere.weather.era5 import read_era5
+    from zonda.operators.atmosphere.weather.era5 import Era5
     from zonda.operators.io.save_tod import load_tod, save_tod
     from zonda.operators.io.time_ordered_data import TimeOrderedData
 
@@ -58,7 +58,7 @@ def target(data: bytes) -> None:
         if data[:1] == b"\1":
             whole(load_tod(FILE))
         else:
-            column = read_era5(FILE, SITE, TIME)
+            column = Era5(file=FILE).column(SITE, TIME)
             assert all(
                 np.isfinite(values).all()
                 for values in (column.pressure, column.height, column.temperature, column.h2o)

@@ -20,10 +20,11 @@ with guided_by(
     import numpy as np
 
     from zonda.core.accuracy.fronts import read
+    from zonda.core.configuration.time import Instant
     from zonda.core.errors import ZondaError
     from zonda.core.instrument import Band
     from zonda.core.site import Site
-    from zonda.operators.atmosphere.weather.table import read_table
+    from zonda.operators.atmosphere.weather.table import Table
 
 FILE = scratch(".txt")
 SITE = Site(name="here", latitude="40.6 deg", longitude="10.1 deg", altitude="500 m")
@@ -33,7 +34,7 @@ def target(data: bytes) -> None:
     FILE.write_bytes(data[1:])
     try:
         if data[:1] == b"T":
-            column = read_table(FILE, SITE)
+            column = Table(table=FILE).column(SITE, Instant.parse("2024-03-01"))
             assert all(
                 np.isfinite(v).all()
                 for v in (column.pressure, column.height, column.temperature, column.h2o)

@@ -25,9 +25,9 @@ from zonda.core.storage.files import own_data
 from zonda.core.types import Floats
 from zonda.core.weather import Column
 
+from .air import standard_column
 from .profiles import Profile, check_pwv, on_heights
 from .radiative_transfer import VAPOUR_GAS_CONSTANT
-from .standard_atmosphere import standard_column
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant

@@ -18,9 +18,14 @@ from zonda.core.types import Floats
 from zonda.core.weather import PWV_MAX as PWV_MAX
 from zonda.core.weather import Column
 
-from .humidity import saturation_pressure
+from .air import (
+    DRY_AIR_GAS_CONSTANT,
+    STRATOSPHERIC_WATER,
+    ozone,
+    saturation_pressure,
+    upper_levels,
+)
 from .radiative_transfer import GRAVITY, VAPOUR_GAS_CONSTANT, Layers
-from .standard_atmosphere import DRY_AIR_GAS_CONSTANT, STRATOSPHERIC_WATER, ozone, upper_levels
 
 if TYPE_CHECKING:
     from zonda.core.site import Site

@@ -9,19 +9,15 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from zonda.core.configuration.files import InputPath
 from zonda.core.errors import InputError
 from zonda.core.numerics.random import normals, stream_key, uniforms
 from zonda.core.types import AnyFloats
 from zonda.core.weather import Column, GroundWeather, WeatherSource
 
+from .air import DRY_AIR_GAS_CONSTANT, saturation_pressure, standard_column
 from .climatology import climatology_column
-from .era5 import read_era5
-from .humidity import saturation_pressure
 from .profiles import Profile, check_pwv, on_heights
 from .radiative_transfer import VAPOUR_GAS_CONSTANT
-from .standard_atmosphere import DRY_AIR_GAS_CONSTANT, standard_column
-from .table import read_table
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
@@ -66,34 +62,6 @@ class Standard(WeatherSource):
                 cure="give pwv, e.g. 3 mm",
             )
         return standard_column(site)
-
-
-class Era5(WeatherSource):
-    """ERA5 on pressure levels from the user's NetCDF file, interpolated in space and time."""
-
-    source: Literal["era5"] = "era5"
-    """Registered name."""
-    file: InputPath
-    """NetCDF file of `reanalysis-era5-pressure-levels`: t, q (or r), u, v, z, and o3 where it has
-    it.
-    """
-
-    def column(self, site: Site, time: Instant) -> Column:
-        return read_era5(self.file, site, time)
-
-
-class Table(WeatherSource):
-    """The user's own profile in a text table, one row per height; the same at any time."""
-
-    source: Literal["table"] = "table"
-    """Registered name."""
-    table: InputPath
-    """CSV with a header, e.g. `height [m], pressure [hPa], temperature [K], relative humidity [%]`;
-    see docs/weather.md.
-    """
-
-    def column(self, site: Site, time: Instant) -> Column:
-        return read_table(self.table, site)
 
 
 DRY = 1e-12

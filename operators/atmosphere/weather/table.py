@@ -2,47 +2,35 @@
 
 from __future__ import annotations
 
-import csv
 import re
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from zonda.core.errors import InputError, placed
+from zonda.core.configuration.files import InputPath
+from zonda.core.storage import ecsv
 from zonda.core.types import Floats
-from zonda.core.weather import Column
+from zonda.core.weather import Column, WeatherSource
 
-from .humidity import from_density, from_relative, from_specific
-from .standard_atmosphere import misplaced, wind_speed
+from .air import from_density, from_relative, from_specific, impossible, wind_speed
 
 if TYPE_CHECKING:
+    from zonda.core.configuration.time import Instant
     from zonda.core.site import Site
-
 
 HIGHEST = 8e3
 """m above sea level that a table must reach: nearly all water lies below."""
-TEMPERATURES = (150.0, 340.0)
-"""K of any air below 50 km."""
-
-UNITS = {
-    "height": {"m": 1.0, "km": 1e3},
-    "pressure": {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1e3},
-    "temperature": {"K": 1.0, "degC": 1.0},
-    "relative humidity": {"%": 0.01, "1": 1.0},
-    "vapour density": {"kg/m3": 1.0, "g/m3": 1e-3},
-    "specific humidity": {"kg/kg": 1.0, "g/kg": 1e-3},
-    "mixing ratio": {"1": 1.0, "ppm": 1e-6},
-    "wind east": {"m/s": 1.0, "km/h": 1 / 3.6},
-    "wind north": {"m/s": 1.0, "km/h": 1 / 3.6},
-    "ozone": {"1": 1.0, "ppm": 1e-6},
+REQUIRED = {"height": "m", "pressure": "Pa", "temperature": "K"}
+HUMIDITIES = {
+    "relative humidity": "",
+    "vapour density": "kg / m3",
+    "specific humidity": "",
+    "mixing ratio": "",
 }
-"""Columns and the units each may have. Humidity is one of relative (mixed phase), density,
-specific, or mixing ratio (volume).
-"""
-HUMIDITY = ("relative humidity", "vapour density", "specific humidity", "mixing ratio")
+"""One of these: relative (mixed phase), density, specific, or mixing ratio (volume)."""
+UNITS = REQUIRED | HUMIDITIES | {"wind east": "m / s", "wind north": "m / s", "ozone": ""}
+"""Columns, and the units that they are converted to."""
+CELSIUS = ("degC", "deg_C", "Celsius")
 DRY_AIR = 0.011
 """Relative humidity that some level of any air has: less is a share that was called a percentage.
 """
@@ -50,197 +38,105 @@ PRESSURE_MIN = 1e-3
 """Pa: that of 95 km. Below, the share of water that a humidity gives is not a number one can work
 with.
 """
-
-EXAMPLE = (
-    "height [m], pressure [hPa], temperature [K], relative humidity [%], wind east [m/s], wind"
-    " north [m/s]"
-)
+CURE, SORT = "check the unit of the column", "sort the rows from the ground up"
 
 
-def read_table(path: Path, site: Site) -> Column:
-    """The column of a CSV table: a header of ``name [unit]``, then rows of increasing height; ``#``
-    begins a comment.
+class Table(WeatherSource):
+    """The user's own profile in a text table, one row per height; the same at any time."""
 
-    Heights are above sea level. Without winds there is a west wind of
-    `standard_atmosphere.wind_speed`.
-
-    Raises
-    ------
-    InputError
-        With the line: an unknown, missing or doubled column, text that is no number, NaN, heights
-        that do not increase, pressures that do not fall, what no air is, a table that ends below 8
-        km.
+    source: Literal["table"] = "table"
+    """Registered name."""
+    table: InputPath
+    """CSV with a header, e.g. `height [m], pressure [hPa], temperature [K], relative humidity [%]`;
+    see docs/weather.md.
     """
-    with placed(f"table {path}"):
-        lines = _lines(path)
-        values = _numbers(lines, _header(lines[0][1]))
-        height, pressure, temperature = (
-            values[name] for name in ("height", "pressure", "temperature")
+
+    def column(self, site: Site, time: Instant) -> Column:
+        """The column of a CSV table; ``#`` begins a comment.
+
+        Heights are above sea level. Without winds there is a west wind of `air.wind_speed`.
+
+        Raises
+        ------
+        InputError
+            With the lines of all mistakes: an unknown, missing or doubled column, text that is no
+            number, NaN, heights that do not increase, pressures that do not fall, what no air is, a
+            table that ends below 8 km.
+        """
+        place = f"table {self.table}"
+        text = ecsv.read_text(self.table, place)
+        if not text.startswith("# %ECSV"):
+            text = re.sub(r"[ \t]*#.*", "", text)
+        table = ecsv.read_table(self.table, place, text)
+        table.columns = {
+            " ".join(name.lower().replace("_", " ").split()): column
+            for name, column in table.columns.items()
+        }
+        for name in table.columns.keys() - UNITS.keys():
+            table.note(-1, f"the column {name!r} is not known", f"columns: {', '.join(UNITS)}")
+        kinds = [name for name in HUMIDITIES if name in table.columns]
+        if len(kinds) != 1:
+            table.note(-1, f"has {len(kinds)} humidities", f"give one: {', '.join(HUMIDITIES)}")
+        winds = {"wind east", "wind north"} & table.columns.keys()
+        if len(winds) == 1:
+            table.note(-1, "has one component of the wind only", "give both or none")
+        offset = 0.0
+        if table.columns.get("temperature", ("", ""))[1] in CELSIUS:
+            offset = 273.15
+            table.columns["temperature"] = (table.columns["temperature"][0], "K")
+        read = {
+            name: table.numbers(name, unit)
+            for name, unit in UNITS.items()
+            if name in REQUIRED or name in table.columns
+        }
+        height, pressure = read["height"], read["pressure"]
+        low = f"the pressure is below {PRESSURE_MIN:g} Pa"
+        table.note_rows(np.diff(height, prepend=-np.inf) <= 0, "the height does not increase", SORT)
+        table.note_rows(pressure < PRESSURE_MIN, low, "leave the row out: no air")
+        falls = "the pressure does not fall with height"
+        table.note_rows(np.diff(pressure, prepend=np.inf) >= 0, falls, CURE)
+        table.check()
+        temperature = read["temperature"] + offset
+        humidity, kind = read[kinds[0]], kinds[0]
+        calm = not winds
+        wind = wind_speed(np.maximum(height - site.altitude, 0.0)), np.zeros_like(height)
+        h2o = humidity
+        if kind == "relative humidity":
+            h2o = from_relative(humidity, pressure, temperature)
+        elif kind == "vapour density":
+            h2o = from_density(humidity, pressure, temperature)
+        elif kind == "specific humidity":
+            h2o = from_specific(humidity)
+        found = Column(
+            pressure=pressure,
+            height=height,
+            temperature=temperature,
+            h2o=h2o,
+            wind_east=wind[0] if calm else read["wind east"],
+            wind_north=wind[1] if calm else read["wind north"],
+            ozone_pressure=pressure if "ozone" in read else None,
+            ozone=read.get("ozone"),
+            stated=f"table {self.table.name}"
+            + (" (without winds: a west wind of 8 to 38 m/s)" if calm else ""),
         )
-        _limits(values, [number for number, _ in lines[1:]])
+        self._check(table, found, kind, humidity)
+        return found
+
+    @staticmethod
+    def _check(table: ecsv.Table, column: Column, kind: str, humidity: Floats) -> None:
+        """Note what no air is."""
+        height, faults = column.height, list(impossible(column))
+        if kind == "relative humidity":
+            faults.append((humidity > 1.2, f"the {kind} is above 120 %"))
+            if 0 < humidity.max() <= DRY_AIR:
+                text = f"the {kind} is {humidity.max():.2g} at most, which no air has"
+                table.note(-1, text, CURE)
+        if column.ozone is not None:
+            faults.append((column.ozone < 0, "the ozone is negative"))
+        for wrong, text in faults:
+            table.note_rows(wrong, f"{text}: no air has that", CURE)
         if len(height) < 5 or height[-1] < HIGHEST:
-            cause = f"has {len(height)} heights up to {height[-1]:g} m above sea level"
-            raise InputError(
-                cause,
-                cure=(
-                    f"give at least 5, up to {HIGHEST:g} m: vapour and most of the oxygen lie below"
-                ),
-            )
-    humidity: dict[str, Callable[[Floats], Floats]] = {
-        "relative humidity": lambda x: from_relative(x, pressure, temperature),
-        "vapour density": lambda x: from_density(x, pressure, temperature),
-        "specific humidity": from_specific,
-        "mixing ratio": lambda x: x,
-    }
-    h2o = next(function(values[name]) for name, function in humidity.items() if name in values)
-    calm = "wind east" not in values
-    return Column(
-        pressure=pressure,
-        height=height,
-        temperature=temperature,
-        h2o=h2o,
-        wind_east=(
-            wind_speed(np.maximum(height - site.altitude, 0.0)) if calm else values["wind east"]
-        ),
-        wind_north=np.zeros_like(height) if calm else values["wind north"],
-        ozone_pressure=pressure if "ozone" in values else None,
-        ozone=values.get("ozone"),
-        stated=f"table {path.name}"
-        + (" (without winds: a west wind of 8 to 38 m/s)" if calm else ""),
-    )
-
-
-def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """(line number, cells) of the header and every row."""
-    try:
-        text = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as err:
-        raise InputError(
-            f"cannot be read as text: {err}", cure=f"write a CSV file: {EXAMPLE}"
-        ) from None
-    found = [(n, line.partition("#")[0].strip()) for n, line in enumerate(text, 1)]
-    lines = [(n, [cell.strip() for cell in next(csv.reader([line]))]) for n, line in found if line]
-    if len(lines) < 2:
-        raise InputError("holds no rows", cure=f"write a header and one row per height: {EXAMPLE}")
-    return lines
-
-
-def _header(cells: list[str]) -> list[tuple[str, str]]:
-    """(name, unit) of each column."""
-    columns: list[tuple[str, str]] = []
-    for cell in cells:
-        match = re.fullmatch(r"([A-Za-z_ ]+?)\s*\[\s*(.*?)\s*\]", cell)
-        name = " ".join(match[1].lower().replace("_", " ").split()) if match else ""
-        if not match or name not in UNITS or match[2] not in UNITS[name]:
-            units = (
-                f"'{name}' comes in {', '.join(UNITS[name])}"
-                if name in UNITS
-                else f"columns: {', '.join(UNITS)}"
-            )
-            raise InputError(
-                f"the column '{cell}' is not known", cure=f"{units}; a header is e.g. {EXAMPLE}"
-            )
-        if name in (known for known, _ in columns):
-            raise InputError(f"the column '{name}' is there twice", cure="keep one")
-        columns.append((name, match[2]))
-    names = [name for name, _ in columns]
-    missing = [name for name in ("height", "pressure", "temperature") if name not in names]
-    if missing or not any(name in names for name in HUMIDITY):
-        lacks = ", ".join(
-            [
-                *missing,
-                *(
-                    []
-                    if any(n in names for n in HUMIDITY)
-                    else [f"a humidity ({', '.join(HUMIDITY)})"]
-                ),
-            ]
-        )
-        raise InputError(f"lacks {lacks}", cure=f"a header is e.g. {EXAMPLE}")
-    if sum(name in names for name in HUMIDITY) > 1 or ("wind east" in names) != (
-        "wind north" in names
-    ):
-        raise InputError(
-            "has two humidities, or one component of the wind only",
-            cure="one humidity, both or no winds",
-        )
-    return columns
-
-
-def _numbers(
-    lines: list[tuple[int, list[str]]], columns: list[tuple[str, str]]
-) -> dict[str, Floats]:
-    """SI values of each column."""
-    table = np.empty((len(lines) - 1, len(columns)))
-    for row, (number, cells) in enumerate(lines[1:]):
-        if len(cells) != len(columns):
-            raise InputError(
-                f"line {number} has {len(cells)} cells for {len(columns)} columns",
-                cure="mend that line",
-            )
-        for k, cell in enumerate(cells):
-            try:
-                table[row, k] = float(cell)
-            except ValueError:
-                raise InputError(
-                    f"line {number}: '{cell}' is not a number", cure=f"mend {columns[k][0]} there"
-                ) from None
-            if not np.isfinite(table[row, k]):
-                message = f"line {number}: {columns[k][0]} is {cell}"
-                raise InputError(message, cure="give every value, or leave the row out")
-    values = {name: table[:, k] * UNITS[name][unit] for k, (name, unit) in enumerate(columns)}
-    if ("temperature", "degC") in columns:
-        values["temperature"] = values["temperature"] + 273.15
-    return values
-
-
-def _limits(values: dict[str, Floats], rows: list[int]) -> None:
-    def refuse(bad: NDArray[np.bool_], message: str, cure: str) -> None:
-        if bad.any():
-            raise InputError(f"line {rows[int(np.argmax(bad))]}: {message}", cure=cure)
-
-    height, pressure, temperature = (values[name] for name in ("height", "pressure", "temperature"))
-    refuse(
-        np.append(False, np.diff(height) <= 0),
-        "the height does not increase",
-        "sort the rows from the ground up",
-    )
-    refuse(
-        pressure < PRESSURE_MIN,
-        f"the pressure is below {PRESSURE_MIN:g} Pa",
-        "check its unit, or leave the row out: no air",
-    )
-    falls = "the pressure does not fall with height"
-    refuse(np.append(False, np.diff(pressure) >= 0), falls, "check pressures and their unit")
-    if (k := misplaced(pressure, height)) is not None:
-        message = f"a pressure of {pressure[k] / 100:.4g} hPa at {height[k]:g} m: no air has that"
-        raise InputError(
-            f"line {rows[k]}: {message}", cure="check the units of height and pressure"
-        )
-    low, high = TEMPERATURES
-    refuse(
-        ~((temperature > low) & (temperature < high)),
-        f"the temperature is not between {low:g} and {high:g} K",
-        "check its unit",
-    )
-    for name in (*HUMIDITY, "ozone"):
-        if name in values:
-            refuse(values[name] < 0, f"the {name} is negative", "a humidity is at least 0")
-    if "relative humidity" in values:
-        refuse(
-            values["relative humidity"] > 1.2,
-            "the relative humidity is above 120 %",
-            "check its unit: [%] or [1]",
-        )
-        if 0 < values["relative humidity"].max() <= DRY_AIR:
-            message = (
-                f"the relative humidity is {values['relative humidity'].max():.2g} at most, which"
-                " no air has"
-            )
-            raise InputError(message, cure="check its unit: [%] or [1]")
-    for name in ("specific humidity", "mixing ratio"):
-        if name in values:
-            refuse(values[name] > 0.1, f"the {name} is above 0.1", "check its unit")
-    for name in ("wind east", "wind north"):
-        if name in values:
-            refuse(np.abs(values[name]) > 200, "the wind is above 200 m/s", "check its unit")
+            text = f"has {len(height)} heights up to {height[-1]:g} m above sea level"
+            cure = f"give at least 5, up to {HIGHEST:g} m: vapour and most of the oxygen lie below"
+            table.note(None, text, cure)
+        table.check()

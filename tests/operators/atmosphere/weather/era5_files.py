@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 from scipy.io import netcdf_file
 
-from zonda.operators.atmosphere.weather import standard_atmosphere as standard
+from zonda.operators.atmosphere.weather import air as standard
 
 LEVELS = np.array([1000, 925, 850, 700, 600, 500, 400, 300, 250, 200, 150, 100, 50, 20, 10.0])
 START = datetime(2024, 3, 1, tzinfo=UTC)

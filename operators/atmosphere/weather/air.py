@@ -1,20 +1,32 @@
-"""The US Standard Atmosphere 1976: used where nothing better is known, and above what a source
-reaches.
+"""Air: measures of humidity, the US Standard Atmosphere 1976, and levels that no air has.
+
+Pressures are in Pa, temperatures in K; mixing ratios are by volume unless said otherwise. The
+standard atmosphere is used where nothing better is known, and above what a source reaches.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from zonda.core.site import Site
 from zonda.core.types import Floats
 from zonda.core.weather import Column
 
-from .radiative_transfer import GRAVITY, VAPOUR_GAS_CONSTANT
+from .radiative_transfer import (
+    GRAVITY,
+    MOLAR_MASS_DRY_AIR,
+    MOLAR_MASS_WATER,
+    VAPOUR_GAS_CONSTANT,
+)
 
 DRY_AIR_GAS_CONSTANT = 287.05
 """J / (kg K)."""
+EPSILON = MOLAR_MASS_WATER / MOLAR_MASS_DRY_AIR
+MOLAR_MASS_OZONE = 47.998e-3
+"""kg / mol."""
 
 HEIGHT = np.array([-1e3, 0, 11e3, 20e3, 32e3, 47e3])
 """Geopotential metres above sea level of the corners of the temperature profile."""
@@ -58,10 +70,48 @@ VAPOUR_SCALE_HEIGHT = 2e3
 """m: vapour density falls as exp(-height / this), a round value for clear days."""
 STRATOSPHERIC_WATER = 5e-6
 """Volume mixing ratio above the tropopause."""
+LIMITS = {
+    "temperature": (150.0, 340.0, "K"),
+    "h2o": (0.0, 0.1, "of the air"),
+    "wind_east": (-200.0, 200.0, "m/s"),
+    "wind_north": (-200.0, 200.0, "m/s"),
+}
+"""Of any air below 50 km."""
 OFF = 2000.0, 0.1
 """m, and share of its height, that a pressure may lie off its height in the standard atmosphere."""
 EXTEND_BELOW = 1500.0
 """Pa: a source whose highest level has more than this is continued upwards."""
+
+
+def saturation_pressure(temperature: Floats) -> Floats:
+    """Saturation pressure [Pa] over water above 0 C, ice below -23 C, both between (IFS
+    documentation cy41r2, IV, eq. 7.93).
+    """
+    t = np.asarray(temperature, np.float64)
+    liquid = 611.21 * np.exp(17.502 * (t - 273.16) / (t - 32.19))
+    ice = 611.21 * np.exp(22.587 * (t - 273.16) / (t + 0.7))
+    share = np.clip((t - 250.16) / (273.16 - 250.16), 0, 1) ** 2
+    return np.asarray(share * liquid + (1 - share) * ice)
+
+
+def from_relative(relative: Floats, pressure: Floats, temperature: Floats) -> Floats:
+    """From relative humidity, 0 to 1, of the mixed-phase saturation pressure."""
+    return np.asarray(relative * saturation_pressure(temperature) / pressure)
+
+
+def from_specific(specific: Floats) -> Floats:
+    """From specific humidity, kg of vapour per kg of moist air."""
+    return np.asarray(specific / (EPSILON + (1 - EPSILON) * specific))
+
+
+def from_density(density: Floats, pressure: Floats, temperature: Floats) -> Floats:
+    """From the mass of vapour, kg/m3."""
+    return np.asarray(density * VAPOUR_GAS_CONSTANT * temperature / pressure)
+
+
+def ozone_from_mass(mass_mixing_ratio: Floats) -> Floats:
+    """From kg of ozone per kg of air."""
+    return np.asarray(mass_mixing_ratio * MOLAR_MASS_DRY_AIR / MOLAR_MASS_OZONE)
 
 
 def temperature(height: ArrayLike) -> Floats:
@@ -81,16 +131,19 @@ def pressure(height: ArrayLike) -> Floats:
     )
 
 
-def misplaced(pressures: Floats, height: Floats) -> int | None:
-    """The first level whose pressure [Pa] no air has at its height [m above sea level]: a unit is
-    wrong. None: there is none.
+def impossible(column: Column) -> Iterator[tuple[NDArray[np.bool_], str]]:
+    """Levels (n,) that no air has, and why: a unit is another one than stated, or there is none.
 
-    Off by more than `OFF`, where weather moves a level by less than half of that.
+    Weather moves a level by less than half of `OFF`.
     """
     heights = np.linspace(-2000.0, 80e3, 4001)
-    usual = np.interp(-pressures, -pressure(heights), heights)
-    bad = np.abs(height - usual) > OFF[0] + OFF[1] * np.abs(usual)
-    return int(np.argmax(bad)) if bad.any() else None
+    usual = np.interp(-column.pressure, -pressure(heights), heights)
+    off = np.abs(column.height - usual) > OFF[0] + OFF[1] * np.abs(usual)
+    yield off, "its pressure does not belong to its height"
+    for name, (low, high, unit) in LIMITS.items():
+        values = getattr(column, name)
+        limits = f"between {low:g} and {high:g} {unit}".rstrip()
+        yield ~((values >= low) & (values <= high)), f"the {name} is not {limits}".replace("_", " ")
 
 
 def wind_speed(above_ground: ArrayLike) -> Floats:
@@ -136,11 +189,9 @@ def upper_levels(
     """
     height = np.arange(top_height + 1e3, 31.5e3, 1e3)
     if top_pressure < EXTEND_BELOW or not height.size:
-        return np.zeros(0), np.zeros(0), np.zeros(0)
+        height = height[:0]
     t = top_temperature + temperature(height) - temperature(top_height)
-    edges_h, edges_t = (
-        np.concatenate([[top_height], height]),
-        np.concatenate([[top_temperature], t]),
-    )
-    step = np.diff(edges_h) * GRAVITY / DRY_AIR_GAS_CONSTANT / ((edges_t[1:] + edges_t[:-1]) / 2)
+    edges = np.append(top_temperature, t)
+    step = np.diff(height, prepend=top_height) * GRAVITY / DRY_AIR_GAS_CONSTANT
+    step /= (edges[1:] + edges[:-1]) / 2
     return height, top_pressure * np.exp(-np.cumsum(step)), t
