@@ -58,7 +58,7 @@ def weights_that_do_not_sum_to_one(patch: Patch) -> None:
 def transmission_of_the_mean_opacity(patch: Patch) -> None:
     def mean_first(self: Any, slant: Any) -> Any:
         opacity = float(np.average(slant.sum(axis=0), weights=self._weight))
-        return float(np.sum(self._weight * bands.emission(slant, self._source))), -opacity, -opacity
+        return float(np.sum(self._weight * bands.emission(slant, self._source))), -opacity
 
     patch.setattr(bands.BandTransfer, "_at", mean_first)
 
@@ -68,7 +68,7 @@ def exponentials_before_logarithms(patch: Patch) -> None:
         passed = self._weight * np.exp(-slant.sum(axis=0))
         emitted = float(np.sum(self._weight * bands.emission(slant, self._source)))
         with np.errstate(divide="ignore"):
-            return emitted, float(np.log(passed.sum())), float(np.log(np.sum(passed * self._cmb)))
+            return emitted, float(np.log(passed.sum()))
 
     patch.setattr(bands.BandTransfer, "_at", underflowing)
 

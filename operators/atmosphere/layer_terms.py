@@ -74,7 +74,7 @@ class LayerTerms:
         points = [np.cos(np.pi * (np.arange(n + 1) + 0.5) / (n + 1)) for n in DEGREES]
         places = np.concatenate([looked_at, *points])
         s = (low + high) / 2 + places * (high - low) / 2
-        water = band.of_water(pwv, np.arcsin(np.clip(s, low, high)).tolist())
+        water = band.transfer.of_water(pwv, np.arcsin(np.clip(s, low, high)).tolist())
         weights, degrees = [], []
         for name in NAMES:
             own = pwv * s[:, None] * water.at(name, heights)
@@ -117,7 +117,7 @@ def kappa(band: BandAtmosphere, pwv: float, elevation: float, heights: Floats) -
 
     Of the whole column, int kappa rho_v dh = PWV.
     """
-    water = band.of_water(pwv, [elevation])
+    water = band.transfer.of_water(pwv, [elevation])
     found = {}
     for name in NAMES:
         column = float(water.of_column(name)[0])

@@ -404,7 +404,7 @@ class ExpectedLoad:
         low, high = np.log(np.sin(ends))
         number = 2 + math.ceil((high - low) / AIRMASS_STEP)
         elevations = np.arcsin(np.minimum(np.exp(np.linspace(low, high, number)), 1.0))
-        return band.spectra(self.parameters.pwv or profile.pwv, elevations.tolist())
+        return band.transfer.spectra(self.parameters.pwv or profile.pwv, elevations.tolist())
 
     def model(self) -> AtmosphereModel:
         """The model that the observation was, or will be, drawn from."""

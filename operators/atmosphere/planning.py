@@ -199,7 +199,7 @@ def calibrated(model: AtmosphereModel) -> Calibrated:
 
 def _slope(transfer: BandTransfer, pwv: float, elevation: float) -> float:
     """dT/dPWV over <e^-tau>."""
-    (low, log_t, _), (high, _, _) = (transfer(pwv * f, [elevation])[0] for f in (0.99, 1.01))
+    (low, log_t), (high, _) = (transfer(pwv * x, [elevation])[0] for x in (0.99, 1.01))
     return (high - low) / (0.02 * pwv) / math.exp(log_t)
 
 

@@ -219,7 +219,9 @@ def test_the_load_is_resolved_over_the_passband(low, high, warm, flat):
     observation.instrument = SimpleNamespace(band=band)
     model = BackgroundLimited(telescope_temperature=f"{warm} K")
     today = model.net(observation)
-    observation.load_spectra = lambda: atmosphere.spectra(pwv, [elevation * 0.99, elevation * 1.01])
+    observation.load_spectra = lambda: atmosphere.transfer.spectra(
+        pwv, [elevation * 0.99, elevation * 1.01]
+    )
     net = model.net(observation)
     # The half-cells at the edges have the brightness of the whole cell here, 0.125 GHz beside their
     # middle in the product: at 66 GHz 15 % of their load, 1.4 % of the bunching.

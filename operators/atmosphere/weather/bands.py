@@ -2,11 +2,10 @@
 elevation, fast and smooth.
 
 The radiative transfer is run on Chebyshev nodes in u = ln(1 + pwv / p) and v = ln(1 /
-sin(elevation)); three functions,
+sin(elevation)); two functions,
 
     emission               T = integral t(nu) T_RJ(nu) dnu / integral t(nu) dnu                  (1)
     log transmission   ln <e^-tau> = ln [integral t(nu) e^-tau(nu) dnu / integral t(nu) dnu]  (2)
-    log background         ln <J(nu, 2.725 K) e^-tau>                                            (3)
 
 are then polynomials in u and v. The transmission is averaged over the band, never the opacity.
 """
@@ -19,17 +18,18 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.polynomial.chebyshev import chebvander
+from numpy.typing import ArrayLike
 
 from zonda.core.emission import LoadSpectra
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.radiation import T_CMB, rayleigh_jeans
-from zonda.core.types import Floats
+from zonda.core.numerics.radiation import rayleigh_jeans
+from zonda.core.types import AnyFloats, Floats
 
 from .absorption import AbsorptionTable, CrossSections
 from .profiles import PWV_MAX, check_pwv
-from .radiative_transfer import ELEVATION_MAX, ELEVATION_MIN, Layers, emission, emission_slopes
+from .radiative_transfer import ELEVATION_MIN, Layers, check_elevations, emission, emission_slopes
 
 if TYPE_CHECKING:
     from zonda.core.instrument import Band
@@ -64,6 +64,8 @@ class BandAtmosphere:
 
     Attributes
     ----------
+    transfer
+        The radiative transfer that is interpolated.
     error
         Largest interpolation error found against the radiative transfer, counted as `TOLERANCE` is.
 
@@ -88,7 +90,7 @@ class BandAtmosphere:
             raise InputError(
                 "the profile is dry, so there is no vapour to vary", cure="give a PWV above 0 mm"
             )
-        self._transfer = BandTransfer(band, replace(profile.layers, spectra=spectra))
+        self.transfer = BandTransfer(band, replace(profile.layers, spectra=spectra))
         self._v_max = -math.log(math.sin(ELEVATION_MIN))
         for n_u, n_v, ratio in GRIDS:
             self._scale, self._u_max = self.pwv_max / ratio, math.log1p(ratio)
@@ -103,22 +105,6 @@ class BandAtmosphere:
                 place=f"band '{band.name}'",
                 cure="choose a narrower band, or one off the saturated water lines",
             )
-
-    def direct(self, pwv: float, elevation: float) -> tuple[float, float, float]:
-        """Equations (1) to (3) by radiative transfer, without interpolation: K_RJ, neper, ln
-        K_RJ.
-        """
-        return self._transfer(pwv, [elevation])[0]
-
-    def spectra(self, pwv: float, elevations: Sequence[float]) -> LoadSpectra:
-        """Brightness and transmission over the passband by radiative transfer. PWV in m, elevations
-        in rad.
-        """
-        return self._transfer.spectra(pwv, elevations)
-
-    def of_water(self, pwv: float, elevations: Sequence[float]) -> WaterResponse:
-        """Response to water at each height, by radiative transfer. PWV in m, elevations in rad."""
-        return self._transfer.of_water(pwv, elevations)
 
     def emission(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """Equation (1): the atmosphere alone, background 0 K. PWV in m, elevation in rad ->
@@ -137,10 +123,6 @@ class BandAtmosphere:
     def opacity(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """-ln <e^-tau> along the line of sight, neper."""
         return -self.log_transmission(pwv, elevation)
-
-    def background(self, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
-        """<J(nu, 2.725 K) e^-tau>: the microwave background behind the atmosphere, K_RJ."""
-        return np.exp(self._evaluate(2, pwv, elevation))
 
     def emission_difference(self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike) -> Floats:
         """emission(pwv + dpwv) - emission(pwv), K_RJ, to float64 precision of the difference
@@ -163,23 +145,21 @@ class BandAtmosphere:
         )
 
     def _tabulate(self, n_u: int, n_v: int) -> Floats:
-        """Chebyshev coefficients (3, n_u, n_v) from values at the Chebyshev points."""
-        x_u, x_v = _chebyshev_points(n_u), _chebyshev_points(n_v)
+        """Chebyshev coefficients (2, n_u, n_v) from values at the Chebyshev points."""
+        x_u, x_v = _points(n_u), _points(n_v)
         values = np.array(
-            [self._transfer(self._pwv(x), [self._elevation(y) for y in x_v]) for x in x_u]
-        )  # (n_u, n_v, 3)
-        to_u, to_v = _chebyshev_transform(n_u), _chebyshev_transform(n_v)
+            [self.transfer(self._pwv(x), [self._elevation(y) for y in x_v]) for x in x_u]
+        )  # (n_u, n_v, 2)
+        to_u, to_v = _transform(n_u), _transform(n_v)
         return np.asarray(np.einsum("iu,uvf,jv->fij", to_u, values, to_v))
 
     def _check(self) -> float:
         """Largest error at 45 points: between the nodes, and the ends."""
-        points_u, points_v = (
-            np.array([-1.0, *_chebyshev_points(7), 1.0]),
-            [-1.0, -0.61, 0.13, 0.87, 1.0],
-        )
+        points_u = np.array([-1.0, *_points(7), 1.0])
+        points_v = [-1.0, -0.61, 0.13, 0.87, 1.0]
         pwv, elevations = [self._pwv(x) for x in points_u], [self._elevation(y) for y in points_v]
-        direct = np.moveaxis(np.array([self._transfer(each, elevations) for each in pwv]), 2, 0)
-        found = np.array([self._evaluate(k, np.array(pwv)[:, None], elevations) for k in range(3)])
+        direct = np.moveaxis(np.array([self.transfer(each, elevations) for each in pwv]), 2, 0)
+        found = np.array([self._evaluate(k, np.array(pwv)[:, None], elevations) for k in range(2)])
         scale = np.concatenate([direct[:1], 1 + np.abs(direct[1:])])
         return float(np.max(np.abs(found - direct) / scale))  # NaN where one is
 
@@ -202,24 +182,15 @@ class BandAtmosphere:
         return 2 * np.log1p(pwv / self._scale) / self._u_max - 1
 
     def _y(self, elevation: Floats) -> Floats:
-        low, high = (
-            (float(elevation.min()), float(elevation.max()))
-            if elevation.size
-            else (ELEVATION_MIN, ELEVATION_MAX)
-        )
-        if not ELEVATION_MIN * (1 - 1e-9) <= low <= high <= ELEVATION_MAX * (1 + 1e-9):
-            raise InputError(
-                f"elevations of {math.degrees(low):.2f} to {math.degrees(high):.2f} deg leave the"
-                " limits of the radiative transfer, 4.5 to 90 deg",
-                cure="choose a target or a time with a higher elevation",
-            )
+        if elevation.size:
+            check_elevations(float(elevation.min()), float(elevation.max()))
         return -2 * np.log(np.sin(elevation)) / self._v_max - 1
 
     def _evaluate(self, which: int, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
         pwv, elevation = np.asarray(pwv, np.float64), np.asarray(elevation, np.float64)
         if pwv.ndim:
             pwv, elevation = np.broadcast_arrays(pwv, elevation)
-        basis = _chebyshev(self._x(pwv).ravel(), self._coefficients.shape[1])
+        basis = chebvander(self._x(pwv).ravel(), self._coefficients.shape[1] - 1).T
         return self._contract(which, basis, elevation)
 
     def _difference(
@@ -230,23 +201,18 @@ class BandAtmosphere:
         )
         start, stop = self._x(pwv).ravel(), self._x(pwv + dpwv).ravel()
         step = (2 * np.log1p(dpwv / (self._scale + pwv)) / self._u_max).ravel()
-        basis = _chebyshev_difference(start, stop, step, self._coefficients.shape[1])
+        basis = _differences(start, stop, step, self._coefficients.shape[1])
         return self._contract(which, basis, elevation)
 
-    def _contract(self, which: int, basis: Floats, elevation: Floats) -> Floats:
+    def _contract(self, which: int, basis: AnyFloats, elevation: Floats) -> Floats:
         """sum_ij basis_i C_ij T_j(y) of one PWV or many, without BLAS: its sums may depend on the
         number of threads.
         """
-        y, found, along = (
-            self._y(elevation).ravel(),
-            np.empty(elevation.size),
-            self._coefficients[which],
-        )
+        y, found = self._y(elevation).ravel(), np.empty(elevation.size)
+        along = self._coefficients[which]
         for chunk in chunks(len(y)):
-            one, other = (
-                basis[:, chunk] if basis.shape[1] > 1 else basis,
-                _chebyshev(y[chunk], along.shape[1]),
-            )
+            one = basis[:, chunk] if basis.shape[1] > 1 else basis
+            other = chebvander(y[chunk], along.shape[1] - 1).T
             found[chunk] = np.sum(np.einsum("ij,in->jn", along, one) * other, axis=0)
         return found.reshape(elevation.shape)
 
@@ -283,27 +249,20 @@ class WaterResponse:
 
 
 class BandTransfer:
-    """Radiative transfer averaged over a band: pwv [m], elevations [rad] -> (emission, ln
-    transmission, ln background) each.
+    """Radiative transfer averaged over a band: pwv [m], elevations [rad] -> equations (1) and (2),
+    K_RJ and neper, each.
     """
 
     def __init__(self, band: Band, layers: Layers) -> None:
-        weight, frequency, cells = _cell_weights(band, layers.table)
+        weight, square, frequency, cells = _cells(band, layers.table)
         self._layers = layers
-        self._cross_sections, cell, share = layers.in_parts(
-            _at_frequencies(layers, frequency, cells)
-        )
-        frequency = frequency[cell]
-        self._weight = weight[cell] * share / weight.sum()
-        self._frequency, self._width, self._square = (
-            frequency,
-            weight[cell] * share,
-            _cell_squares(band, layers.table)[cell] * share,
-        )
-        self._source = rayleigh_jeans(frequency, layers.temperature[:, None])
-        self._cmb = rayleigh_jeans(frequency, T_CMB)
+        sections = _at_frequencies(layers, frequency, cells)
+        self._cross_sections, cell, share = layers.in_parts(sections)
+        self._frequency, self._width = frequency[cell], weight[cell] * share
+        self._weight, self._square = self._width / weight.sum(), square[cell] * share
+        self._source = rayleigh_jeans(self._frequency, layers.temperature[:, None])
 
-    def __call__(self, pwv: float, elevations: list[float]) -> list[tuple[float, float, float]]:
+    def __call__(self, pwv: float, elevations: list[float]) -> list[tuple[float, float]]:
         layers = self._layers.scaled(pwv)
         vertical = layers.opacity(self._cross_sections)
         return [self._at(vertical * layers.airmass(elevation)[:, None]) for elevation in elevations]
@@ -320,10 +279,8 @@ class BandTransfer:
     def of_water(self, pwv: float, elevations: Sequence[float]) -> WaterResponse:
         """Response to water at each height, if the column holds ``pwv`` [m]."""
         layers = self._layers.scaled(pwv)
-        vertical, per_water = (
-            layers.opacity(self._cross_sections),
-            layers.opacity_of_water(self._cross_sections),
-        )
+        vertical = layers.opacity(self._cross_sections)
+        per_water = layers.opacity_of_water(self._cross_sections)
         emitted, absorbed = [], []
         for elevation in elevations:
             airmass = layers.airmass(elevation)[:, None]
@@ -337,58 +294,37 @@ class BandTransfer:
             absorbed.append(gained @ (passed / passed.sum()))
         return WaterResponse(layers.middle, layers.water, np.array(emitted), np.array(absorbed))
 
-    def _at(self, slant: Floats) -> tuple[float, float, float]:
+    def _at(self, slant: Floats) -> tuple[float, float]:
         emitted = float(np.sum(self._weight * emission(slant, self._source)))
         opacity = slant.sum(axis=0)
         least = float(opacity.min())  # factored out, so that opaque bands do not underflow
         passed = self._weight * np.exp(least - opacity)
-        return emitted, math.log(passed.sum()) - least, math.log(np.sum(passed * self._cmb)) - least
+        return emitted, math.log(passed.sum()) - least
 
 
-def _cell_weights(band: Band, table: AbsorptionTable) -> tuple[Floats, Floats, slice]:
-    """Integral of the (piecewise linear) transmission over each cell of the absorption table that
-    it touches, and the mean frequency of that integral: not the cell's centre where the band ends
-    inside the cell.
+def _cells(band: Band, table: AbsorptionTable) -> tuple[Floats, Floats, Floats, slice]:
+    """Integrals of the (piecewise linear) transmission and of its square over each cell of the
+    absorption table that it touches, and the mean frequency of the first: not the cell's centre
+    where the band ends inside the cell.
     """
-    points, values, cell, cells = _divided(band, table)
-    edges, step = table.edges[cells.start : cells.stop + 1], np.diff(points)
-    offset = (
-        points - table.frequency[cells][np.append(cell, cell[-1])]
-    )  # from the centre of the cell that begins there
-    end = offset[:-1] + step
-    integral = np.bincount(cell, step * (values[1:] + values[:-1]) / 2, len(edges) - 1).astype(
-        np.float64
-    )
-    first = (
-        step
-        * (offset[:-1] * (2 * values[:-1] + values[1:]) + end * (values[:-1] + 2 * values[1:]))
-        / 6
-    )
-    moment = np.bincount(cell, first, len(edges) - 1)
-    shift = np.divide(moment, integral, out=np.zeros_like(moment), where=integral > 0)
-    return integral, table.frequency[cells] + shift, cells
-
-
-def _cell_squares(band: Band, table: AbsorptionTable) -> Floats:
-    """Integral of the square of the transmission over each of the cells of `_cell_weights`."""
-    points, values, cell, cells = _divided(band, table)
-    square = values[:-1] ** 2 + values[:-1] * values[1:] + values[1:] ** 2
-    return np.bincount(cell, np.diff(points) * square / 3, cells.stop - cells.start).astype(
-        np.float64
-    )
-
-
-def _divided(band: Band, table: AbsorptionTable) -> tuple[Floats, Floats, NDArray[np.intp], slice]:
-    """Frequencies at which the passband bends or a cell of the table begins, its transmission
-    there, and between each and the next the cell, of a slice of them."""
     open_ = np.flatnonzero(band.transmission)  # a table of a passband may have zeros far outside it
     support = slice(max(int(open_[0]) - 1, 0), int(open_[-1]) + 2)
     nu, transmission = band.frequency[support], band.transmission[support]
     cells = table.cells(float(nu[0]), float(nu[-1]), place=f"band '{band.name}'")
-    edges = table.edges[cells.start : cells.stop + 1]
+    edges, centre = table.edges[cells.start : cells.stop + 1], table.frequency[cells]
     points = np.union1d(np.clip(edges, nu[0], nu[-1]), nu)
-    cell = np.clip(np.searchsorted(edges, (points[1:] + points[:-1]) / 2) - 1, 0, len(edges) - 2)
-    return points, np.interp(points, nu, transmission), cell, cells
+    cell = np.clip(np.searchsorted(edges, (points[1:] + points[:-1]) / 2) - 1, 0, len(centre) - 1)
+    values, step = np.interp(points, nu, transmission), np.diff(points)
+    low, high = values[:-1], values[1:]
+    # from the centre of the cell that begins there
+    offset = (points - centre[np.append(cell, cell[-1])])[:-1]
+    first = step * (offset * (2 * low + high) + (offset + step) * (low + 2 * high)) / 6
+    integral, square, moment = (
+        np.bincount(cell, each, len(centre)).astype(np.float64)
+        for each in (step * (high + low) / 2, step * (low**2 + low * high + high**2) / 3, first)
+    )
+    shift = np.divide(moment, integral, out=np.zeros_like(moment), where=integral > 0)
+    return integral, square, centre + shift, cells
 
 
 def _at_frequencies(layers: Layers, frequency: Floats, cells: slice) -> CrossSections:
@@ -404,42 +340,30 @@ def _at_frequencies(layers: Layers, frequency: Floats, cells: slice) -> CrossSec
     def linear(sections: Floats) -> Floats:
         return np.asarray(sections[..., low] * (1 - upper) + sections[..., low + 1] * upper)
 
-    return CrossSections(
-        linear(known.dry_air),
-        linear(known.water),
-        linear(known.water_self),
-        linear(known.ozone),
-        known.ozone_ratio[..., nearest],
-    )
+    names = ("dry_air", "water", "water_self", "ozone")
+    mixed = {name: linear(getattr(known, name)) for name in names}
+    return CrossSections(**mixed, ozone_ratio=known.ozone_ratio[..., nearest])
 
 
-def _chebyshev_points(n: int) -> Floats:
+def _points(n: int) -> Floats:
+    """Chebyshev's points."""
     return np.cos(np.pi * (np.arange(n) + 0.5) / n)
 
 
-def _chebyshev_transform(n: int) -> Floats:
-    """(n, n) matrix from values at `_chebyshev_points` to coefficients."""
+def _transform(n: int) -> Floats:
+    """(n, n) matrix from values at `_points` to coefficients."""
     transform = np.cos(np.pi * np.outer(np.arange(n), np.arange(n) + 0.5) / n) * 2 / n
     transform[0] /= 2
     return transform
 
 
-def _chebyshev(x: Floats, n: int) -> Floats:
-    """(n, len(x)) T_0 .. T_n-1."""
-    out = np.ones((n, x.size))
-    out[1] = x
-    for k in range(2, n):
-        out[k] = 2 * x * out[k - 1] - out[k - 2]
-    return out
-
-
-def _chebyshev_difference(x: Floats, y: Floats, step: Floats, n: int) -> Floats:
+def _differences(x: Floats, y: Floats, step: Floats, n: int) -> Floats:
     """(n, len(x)) T_k(y) - T_k(x) for y - x = step, by the recurrence of the differences, so
     nothing cancels:
 
     D_k+1 = 2 y D_k + 2 step T_k(x) - D_k-1.
     """
-    start = _chebyshev(x, n)
+    start = chebvander(x, n - 1).T
     out = np.zeros((n, x.size))
     out[1] = step
     for k in range(2, n):

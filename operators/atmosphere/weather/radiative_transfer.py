@@ -35,6 +35,8 @@ WATER_DENSITY = 1000.0
 """kg / m3, of the liquid that precipitable water is measured in."""
 VAPOUR_GAS_CONSTANT = BOLTZMANN * AVOGADRO / MOLAR_MASS_WATER
 """J / (kg K), of water vapour."""
+PWV_OF_MOLECULE = MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY
+"""m of PWV per molecule of water per m2."""
 EARTH_RADIUS = 6.371e6
 """m, mean."""
 OZONE_SPREAD = 4e-4
@@ -44,6 +46,16 @@ ELEVATION_MIN, ELEVATION_MAX = math.radians(4.5), math.radians(90.0)
 """rad: limits of equation (1) without refraction; a telescope at 5 deg has detectors a little
 lower.
 """
+
+
+def check_elevations(low: float, high: float) -> None:
+    """Refuse elevations [rad] outside of 4.5 to 90 deg (`InputError`)."""
+    if not ELEVATION_MIN * (1 - 1e-9) <= low <= high <= ELEVATION_MAX * (1 + 1e-9):
+        raise InputError(
+            f"elevations of {math.degrees(low):.2f} to {math.degrees(high):.2f} deg leave the"
+            " limits of the radiative transfer, 4.5 to 90 deg",
+            cure="choose a target or a time with a higher elevation",
+        )
 
 
 @dataclass(frozen=True)
@@ -76,8 +88,12 @@ class Layers:
     @property
     def molecules(self) -> Floats:
         """(n,) molecules per m2 in hydrostatic balance."""
-        mass = MOLAR_MASS_DRY_AIR * (1 - self.h2o) + MOLAR_MASS_WATER * self.h2o
-        return -np.diff(self.pressure) / GRAVITY / mass * AVOGADRO
+        return -np.diff(self.pressure) / GRAVITY / self._mass * AVOGADRO
+
+    @property
+    def _mass(self) -> Floats:
+        """(n,) kg / mol of the air."""
+        return MOLAR_MASS_DRY_AIR * (1 - self.h2o) + MOLAR_MASS_WATER * self.h2o
 
     @property
     def pwv(self) -> float:
@@ -104,22 +120,21 @@ class Layers:
         """Cross-sections of each layer at its mean pressure and temperature (independent of the
         water vapour).
         """
-        pressure, temperature = (
-            (self.pressure[1:] + self.pressure[:-1]) / 2,
-            (self.temperature[1:] + self.temperature[:-1]) / 2,
-        )
+        pressure, temperature = ((x[1:] + x[:-1]) / 2 for x in (self.pressure, self.temperature))
         return self.table.cross_sections(pressure, temperature, cells)
 
     def opacity(self, cross_sections: CrossSections) -> Floats:
         """(n, n_frequency) vertical opacity of each layer, neper."""
-        k, water, ozone = cross_sections, self.h2o[:, None], self.o3[:, None]
+        return self.molecules[:, None] * self._each(cross_sections)
+
+    def _each(self, k: CrossSections) -> Floats:
+        """(n, n_frequency) cross-section of a molecule of the air."""
+        water, ozone = self.h2o[:, None], self.o3[:, None]
         # Linear in the mixing ratio, falling to 0.8 of its dry value at 0.05 at most: it is
         # positive up to 0.25, which no air holds (a source of more than 0.1 is refused), so nothing
         # is cut.
         water_section = np.maximum(k.water + water * k.water_self, 0.0)
-        return self.molecules[:, None] * (
-            (1 - water) * k.dry_air + water * water_section + ozone * k.ozone
-        )
+        return np.asarray((1 - water) * k.dry_air + water * water_section + ozone * k.ozone)
 
     def opacity_of_water(self, cross_sections: CrossSections) -> Floats:
         """(n, n_frequency) vertical opacity that each layer gains per metre of water [neper / m of
@@ -127,27 +142,18 @@ class Layers:
 
         The pressure stays: vapour takes the place of dry air, which is lighter by its mass.
         """
-        k, water, ozone = cross_sections, self.h2o[:, None], self.o3[:, None]
-        heavier = (MOLAR_MASS_WATER - MOLAR_MASS_DRY_AIR) / (
-            MOLAR_MASS_DRY_AIR * (1 - self.h2o) + MOLAR_MASS_WATER * self.h2o
-        )
-        each = (
-            (1 - water) * k.dry_air
-            + water * np.maximum(k.water + water * k.water_self, 0.0)
-            + ozone * k.ozone
-        )
+        k, water = cross_sections, self.h2o[:, None]
+        heavier = (MOLAR_MASS_WATER - MOLAR_MASS_DRY_AIR) / self._mass
         of_mixing = (
-            k.water + 2 * water * k.water_self - k.dry_air - heavier[:, None] * each
+            k.water + 2 * water * k.water_self - k.dry_air - heavier[:, None] * self._each(k)
         )  # per molecule of air
-        columns = (1 - self.h2o * heavier) * (
-            MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY
-        )  # d PWV / d mixing ratio, likewise
+        columns = (1 - self.h2o * heavier) * PWV_OF_MOLECULE  # d PWV / d mixing ratio, likewise
         return np.asarray(of_mixing / columns[:, None], np.float64)
 
     @property
     def water(self) -> Floats:
         """(n,) PWV that each layer holds, m."""
-        return np.asarray(self.molecules * self.h2o * (MOLAR_MASS_WATER / AVOGADRO / WATER_DENSITY))
+        return np.asarray(self.molecules * self.h2o * PWV_OF_MOLECULE)
 
     @property
     def middle(self) -> Floats:
@@ -161,27 +167,16 @@ class Layers:
         column = (self.molecules * self.o3)[:, None] * sections.ozone
         opacity = np.einsum("lf,glf->gf", column, sections.ozone_ratio)
         scatter = np.sqrt(OZONE_PARTS @ (opacity - column.sum(axis=0)) ** 2)
-        lines, smooth = (
-            np.flatnonzero(scatter > OZONE_SPREAD),
-            np.flatnonzero(scatter <= OZONE_SPREAD),
-        )
+        lines = np.flatnonzero(scatter > OZONE_SPREAD)
+        smooth = np.flatnonzero(scatter <= OZONE_SPREAD)
         cell = np.concatenate([smooth, np.repeat(lines, len(OZONE_PARTS))])
         share = np.concatenate([np.ones(len(smooth)), np.tile(OZONE_PARTS, len(lines))])
         ratio = sections.ozone_ratio[:, :, lines].transpose(1, 2, 0).reshape(len(self.o3), -1)
         ozone = sections.ozone[:, cell]
         ozone[:, len(smooth) :] *= ratio
-        k = sections
-        return (
-            replace(
-                k,
-                dry_air=k.dry_air[:, cell],
-                water=k.water[:, cell],
-                water_self=k.water_self[:, cell],
-                ozone=ozone,
-            ),
-            cell,
-            share,
-        )
+        names = ("dry_air", "water", "water_self")
+        others = {name: getattr(sections, name)[:, cell] for name in names}
+        return replace(sections, ozone=ozone, **others), cell, share
 
     def airmass(self, elevation: float) -> Floats:
         """(n,) slant over vertical path of each layer, equation (1).
@@ -191,12 +186,7 @@ class Layers:
         InputError
             Elevation outside 4.5 to 90 deg.
         """
-        if not ELEVATION_MIN * (1 - 1e-9) <= elevation <= ELEVATION_MAX * (1 + 1e-9):
-            raise InputError(
-                f"an elevation of {math.degrees(elevation):.2f} deg is outside the limits of the"
-                " radiative transfer, 4.5 to 90 deg",
-                cure="choose a target or a time with a higher elevation",
-            )
+        check_elevations(elevation, elevation)
         ratio = (
             math.cos(elevation)
             * (EARTH_RADIUS + self.height[0])

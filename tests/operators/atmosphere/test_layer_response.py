@@ -133,7 +133,7 @@ def test_kappa_over_the_whole_column_is_the_column(site, name):
         np.trapezoid(density, h) / 1000.0, rel=5e-3
     )  # kappa is linear between levels 170 m apart
     # And in the sum over the levels exactly.
-    water = atmosphere.of_water(pwv, [math.radians(60)])
+    water = atmosphere.transfer.of_water(pwv, [math.radians(60)])
     assert float(getattr(water, name)[0] @ water.water / water.of_column(name)[0]) == pytest.approx(
         pwv, rel=1e-12
     )
@@ -156,7 +156,7 @@ def test_terms_follow_the_elevation_of_a_dip(low, high, most):
     assert max(terms.degrees) <= most
     assert max(LayerTerms.of(atmosphere, pwv, HEIGHTS, 0.02, (0.7, 0.702)).degrees) <= 1
     s = np.linspace(*ends, 29)
-    water = atmosphere.of_water(pwv, np.arcsin(s).tolist())
+    water = atmosphere.transfer.of_water(pwv, np.arcsin(s).tolist())
     for name in ("emission", "opacity"):
         own, column = pwv * water.at(name, HEIGHTS), pwv * water.of_column(name)[:, None]
         largest = np.abs(own * s[:, None]).max()
