@@ -96,13 +96,12 @@ def closed_form(
     """
     if model.fluctuation.log_normal:
         return None
-    simulated = [k for k in range(len(model.layers)) if k not in model.parameters.omit]
 
     def spectrum(frequency: Floats) -> Floats:
         speeds = layer_speeds(observation, model.plane, model.layers)
         parts = (
             model.emitting[k].amplitude ** 2 * layer_spectrum(model.layers[k], frequency, speeds[k])
-            for k in simulated
+            for k in model.simulated
         )
         return np.asarray(
             _emission_per_fluctuation(model, observation) ** 2

@@ -102,14 +102,7 @@ class AtNodes:
         fields = {
             name: SmoothField(weights, c, step, n_samples) for name, c in coefficients.items()
         }
-        return cls(
-            fields,
-            (
-                sum(n for n, _, _ in sums),
-                math.fsum(t for _, t, _ in sums),
-                math.fsum(q for _, _, q in sums),
-            ),
-        )
+        return cls(fields, _added(sums))
 
     def drawn(self) -> tuple[int, float, float]:
         """Number of values of the PWV, their sum, and that of their squares."""
@@ -135,13 +128,8 @@ class OfDetectors:
         step: int,
         n_samples: int,
     ) -> None:
-        self._xi, self._eta, self._layers, self._to_pwv, self._response = (
-            nodes.xi,
-            nodes.eta,
-            layers,
-            to_pwv,
-            response,
-        )
+        self._xi, self._eta, self._layers = nodes.xi, nodes.eta, layers
+        self._to_pwv, self._response = to_pwv, response
         self.step, self._n_samples = step, n_samples
         self._units: OrderedDict[tuple[int, int], Future[dict[str, AnyFloats]]] = OrderedDict()
         self._sums: dict[tuple[int, int], tuple[int, float, float]] = {}
@@ -161,7 +149,7 @@ class OfDetectors:
         given.
         """
         if self._keeps_all:
-            others = [one for one in map(_held, bands) if one is not None]
+            others = [one for held in bands if (one := held()) is not None]
             unlike = {one._alike for one in others if not one._looks_as(self)}
             self._alike = next(
                 (one._alike for one in others if one._alike not in unlike), len(bands)
@@ -175,32 +163,16 @@ class OfDetectors:
 
     def drawn(self) -> tuple[int, float, float]:
         """See `AtNodes.drawn`, for the units made so far."""
-        parts = [self._sums[key] for key in sorted(self._sums)]
-        return (
-            sum(p[0] for p in parts),
-            math.fsum(p[1] for p in parts),
-            math.fsum(p[2] for p in parts),
-        )
+        return _added([self._sums[key] for key in sorted(self._sums)])
 
     def into(self, detectors: slice, samples: slice, out: dict[str, AnyFloats]) -> None:
         """See `AtNodes.into`."""
         for unit, of_detectors in _parts(detectors, UNIT_DETECTORS):
             for number, of_samples in _parts(samples, UNIT_SAMPLES):
                 coefficients = self._unit(unit, number)
-                rows = slice(
-                    of_detectors.start - unit * UNIT_DETECTORS,
-                    of_detectors.stop - unit * UNIT_DETECTORS,
-                )
-                at = slice(
-                    of_samples.start - number * UNIT_SAMPLES,
-                    of_samples.stop - number * UNIT_SAMPLES,
-                )
-                where = (
-                    slice(
-                        of_detectors.start - detectors.start, of_detectors.stop - detectors.start
-                    ),
-                    slice(of_samples.start - samples.start, of_samples.stop - samples.start),
-                )
+                rows = _from(of_detectors, unit * UNIT_DETECTORS)
+                at = _from(of_samples, number * UNIT_SAMPLES)
+                where = _from(of_detectors, detectors.start), _from(of_samples, samples.start)
                 for name, array in out.items():
                     field = DetectorField(coefficients[name], self.step, UNIT_SAMPLES)
                     part = array[where]
@@ -260,8 +232,8 @@ class OfDetectors:
         todo = [(self, mine)]
         todo += [
             (other, theirs)
-            for other in map(_held, self._beside)
-            if other and (theirs := other._also(key)) is not None
+            for held in self._beside
+            if (other := held()) and (theirs := other._also(key)) is not None
         ]
         try:
             for alike in sorted({band._alike for band, _ in todo}):
@@ -346,17 +318,22 @@ def _unit_size(n_detectors: int, step: int, streams: int) -> int:
     )
 
 
-def _held(band: weakref.ref[OfDetectors]) -> OfDetectors | None:
-    return band()
-
-
 def _sums(y: NDArray[np.float64]) -> tuple[int, float, float]:
     return y.size, float(y.sum()), float(np.einsum("ij,ij->", y, y))
+
+
+def _added(parts: list[tuple[int, float, float]]) -> tuple[int, float, float]:
+    number, total, squares = zip(*parts, strict=True) if parts else ((), (), ())
+    return sum(number), math.fsum(total), math.fsum(squares)
 
 
 def _own(count: int) -> slice:
     """Columns of `times` that are not margin."""
     return slice(PAD + SPLINE_MARGIN, count - 2 - SPLINE_MARGIN)
+
+
+def _from(part: slice, start: int) -> slice:
+    return slice(part.start - start, part.stop - start)
 
 
 def _parts(whole: slice, size: int) -> Iterator[tuple[int, slice]]:

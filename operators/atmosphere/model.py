@@ -90,35 +90,26 @@ class AtmosphereModel:
     @cached_property
     def layers(self) -> list[Layer]:
         """The layers, the lowest first."""
-        p, telescope, band = (
-            self.parameters,
-            self.observation.instrument.telescope,
-            self.observation.instrument.band,
-        )
+        p = self.parameters
         heights = np.linspace(p.lowest, p.highest, p.layers)
         shares, winds = _shares(p, self.profile, heights), _winds(p, self.profile, heights)
         layers = []
         for height, share, wind in zip(heights.tolist(), shares.tolist(), winds, strict=True):
             distance = self.plane.effective(height) / math.sin(self.plane.elevation)
-            aperture, sigma = None, beam_sigma(telescope, band, distance)
-            if p.beam != "gaussian":
-                taper = 0.0 if p.beam == "top_hat" else p.edge_taper or EDGE_TAPER
-                aperture = Aperture(
-                    widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance), taper
-                )
-                sigma = aperture.sigma
-            layers.append(
-                Layer(
-                    share,
-                    height,
-                    distance,
-                    p.outer_scale,
-                    sigma,
-                    aperture,
-                    np.asarray(wind, np.float64),
-                )
-            )
+            seen = self._footprint(distance)
+            layers.append(Layer(share, height, distance, p.outer_scale, *seen, np.asarray(wind)))
         return layers
+
+    def _footprint(self, distance: float) -> tuple[float, Aperture | None]:
+        """Sigma of the beam at a distance along the line of sight, and its aperture if it has a
+        rim.
+        """
+        p, instrument = self.parameters, self.observation.instrument
+        if p.beam == "gaussian":
+            return beam_sigma(instrument.telescope, instrument.band, distance), None
+        width = _width(instrument.telescope, instrument.band, distance)
+        aperture = Aperture(width, 0.0 if p.beam == "top_hat" else p.edge_taper or EDGE_TAPER)
+        return aperture.sigma, aperture
 
     @cached_property
     def turbulence(self) -> list[Turbulence]:
@@ -161,23 +152,17 @@ class AtmosphereModel:
         Where `pwv_rms` holds at the zenith, in scans whose elevation changes by so much that it
         varies by `ONE_VALUE`.
         """
-        if self._strength is None:
-            return None
-        sines, factors = self._strength
-        return np.interp(sine, sines, factors)
+        return None if self._strength is None else np.interp(sine, *self._strength)
 
     @cached_property
     def _strength(self) -> tuple[Floats, Floats] | None:
         if self.parameters.pwv_rms_at == "scan":
             return None
-        elevation, reach = self.observation.elevation, math.atan(self.observation.focalplane.radius)
-        ends = np.clip(
-            [float(elevation.min()), float(elevation.max())], ELEVATION_MIN, ELEVATION_MAX
-        )
+        ends, wider = (elevation_range(self.observation, wider) for wider in (False, True))
         mean = float(self.slab.share(math.sin(self.elevation)))
         if np.abs(self.slab.share(np.sin(ends)) / mean - 1).max() <= ONE_VALUE:
             return None
-        low, high = np.sin(np.clip(ends + np.array([-reach, reach]), ELEVATION_MIN, ELEVATION_MAX))
+        low, high = np.sin(wider)
         sines = np.linspace(low, high, 64)
         return sines, self.slab.share(sines) / mean
 
@@ -192,7 +177,7 @@ class AtmosphereModel:
     @property
     def elevation(self) -> float:
         """Mean elevation of the scan, rad, within the limits of the radiative transfer."""
-        return min(max(float(np.mean(self.observation.elevation)), ELEVATION_MIN), ELEVATION_MAX)
+        return _inside(float(np.mean(self.observation.elevation)))
 
     def _variance(self, layers: Sequence[Layer]) -> float:
         return sum(
@@ -202,21 +187,14 @@ class AtmosphereModel:
     @cached_property
     def _variance_at_zenith(self) -> float:
         """Variance of the sum of the layers behind the beam, for a telescope that looks up."""
-        telescope, band, total = (
-            self.observation.instrument.telescope,
-            self.observation.instrument.band,
-            0.0,
-        )
+        total = 0.0
         for layer in self.layers:
-            if layer.aperture is None:
-                one = float(
-                    beam_correlation(
-                        0.0, layer.outer_scale, beam_sigma(telescope, band, layer.height)
-                    )[0]
-                )
-            else:
-                width = widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, layer.height)
-                one = Aperture(width, layer.aperture.taper).variance(layer.outer_scale)
+            sigma, aperture = self._footprint(layer.height)
+            one = (
+                aperture.variance(layer.outer_scale)
+                if aperture
+                else float(beam_correlation(0.0, layer.outer_scale, sigma)[0])
+            )
             total += layer.amplitude**2 * one
         return total
 
@@ -254,10 +232,13 @@ class AtmosphereModel:
         """
         if self.parameters.layer_response == "column":
             return None
-        simulated = [k for k in range(len(self.layers)) if k not in self.parameters.omit]
-        return LayerTerms.of(
-            self.band, self.pwv, self.heights[simulated], self.fluctuation.scale, sines
-        )
+        heights = self.heights[self.simulated]
+        return LayerTerms.of(self.band, self.pwv, heights, self.fluctuation.scale, sines)
+
+    @property
+    def simulated(self) -> list[int]:
+        """Numbers of the layers that are not omitted."""
+        return [k for k in range(len(self.layers)) if k not in self.parameters.omit]
 
     def resolution(self, tolerance: float | None = None) -> Resolution:
         """Nodes and steps in time, for the parameters' tolerance or another."""
@@ -266,9 +247,8 @@ class AtmosphereModel:
             emission = partial(self.band.emission, self.pwv)
             layers, rms = self.emitting, self.fluctuation.rms
             variance = self._variance(layers)
-            if (
-                not variance > 1e-12 * self.fluctuation.variance
-            ):  # of a saturated line only the air below is seen
+            # Of a saturated line only the air below is seen.
+            if not variance > 1e-12 * self.fluctuation.variance:
                 layers, variance = self.layers, self.fluctuation.variance
             found = choose_resolution(
                 self.observation, self.plane, layers, variance, tolerance, emission, rms
@@ -372,7 +352,7 @@ class Models:
 
 @dataclass(frozen=True)
 class ExpectedLoad:
-    """Announcement of an `AtmosphereLayers` to other steps: `expected_load` as a call, and its
+    """Announcement of an `AtmosphereLayers` to other steps: the expected load as a call, and its
     model.
     """
 
@@ -381,7 +361,13 @@ class ExpectedLoad:
     observation: Observation
 
     def __call__(self) -> tuple[float, float]:
-        return expected_load(self.models, self.parameters, self.observation)
+        """Mean emission [K_RJ] and transmission in the middle of a scan, before its model is
+        built.
+        """
+        profile, band = self.models.weather(self.parameters, self.observation)
+        elevation = _inside(float(np.median(self.observation.elevation)))
+        pwv = self.parameters.pwv or profile.pwv
+        return float(band.emission(pwv, elevation)), float(band.transmission(pwv, elevation))
 
     def announce(self) -> None:
         """Let other steps know, and the other bands of the camera (`Observation.common`)."""
@@ -395,13 +381,7 @@ class ExpectedLoad:
         built.
         """
         profile, band = self.models.weather(self.parameters, self.observation)
-        elevation, reach = self.observation.elevation, math.atan(self.observation.focalplane.radius)
-        ends = np.clip(
-            [float(elevation.min()) - reach, float(elevation.max()) + reach],
-            ELEVATION_MIN,
-            ELEVATION_MAX,
-        )
-        low, high = np.log(np.sin(ends))
+        low, high = np.log(np.sin(elevation_range(self.observation, True)))
         number = 2 + math.ceil((high - low) / AIRMASS_STEP)
         elevations = np.arcsin(np.minimum(np.exp(np.linspace(low, high, number)), 1.0))
         return band.transfer.spectra(self.parameters.pwv or profile.pwv, elevations.tolist())
@@ -411,14 +391,17 @@ class ExpectedLoad:
         return self.models.of(self.parameters, self.observation)
 
 
-def expected_load(
-    models: Models, parameters: LayerParameters, observation: Observation
-) -> tuple[float, float]:
-    """Mean emission [K_RJ] and transmission in the middle of a scan, before its model is built."""
-    profile, band = models.weather(parameters, observation)
-    elevation = min(max(float(np.median(observation.elevation)), ELEVATION_MIN), ELEVATION_MAX)
-    pwv = parameters.pwv or profile.pwv
-    return float(band.emission(pwv, elevation)), float(band.transmission(pwv, elevation))
+def _inside(elevation: float) -> float:
+    """The elevation [rad], within the limits of the radiative transfer."""
+    return min(max(elevation, ELEVATION_MIN), ELEVATION_MAX)
+
+
+def elevation_range(observation: Observation, field: bool = False) -> Floats:
+    """Lowest and highest elevation [rad] of the boresight, or of the field, within these limits."""
+    elevation = observation.elevation
+    reach = math.atan(observation.focalplane.radius) if field else 0.0
+    ends = [float(elevation.min()) - reach, float(elevation.max()) + reach]
+    return np.clip(ends, ELEVATION_MIN, ELEVATION_MAX)
 
 
 def absorption_of(parameters: LayerParameters) -> AbsorptionTable:
@@ -440,7 +423,11 @@ def beam_sigma(telescope: Telescope, band: Band, distance: float) -> float:
     From the paper's near-field FWHM(z) = D sqrt(z^-2 + z_r^-2) rad, z_r = pi (D/2)^2 / lambda at
     the band centre.
     """
-    return widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance) / FWHM_PER_SIGMA
+    return _width(telescope, band, distance) / FWHM_PER_SIGMA
+
+
+def _width(telescope: Telescope, band: Band, distance: float) -> float:
+    return widened(telescope.diameter, SPEED_OF_LIGHT / band.centre, distance)
 
 
 def _shares(parameters: LayerParameters, profile: Profile, heights: Floats) -> Floats:
