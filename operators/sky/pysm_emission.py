@@ -60,15 +60,12 @@ def configuration(
 
 
 def check_templates(config: Mapping[str, Any], nside: int, place: str) -> None:
-    """Raises InputError where files that components name are not on this machine."""
-    lacking = [name for name in _templates(config, nside) if not _is_here(name)]
+    """Raises InputError where a component asks for a file that is not on this machine."""
     for item in _classes(config):
-        if not any(map(is_file, item.values())):
-            asked = [_of_nside(name, item, nside) for name in _asked_for(item, nside)]
-            lacking += asked[:1] if not any(map(_is_here, asked)) else []
-    if lacking:
-        more = f" and {len(lacking) - 3} more" if len(lacking) > 3 else ""
-        raise _lacks(", ".join(lacking[:3]) + more, place)
+        near = min(item.get("available_nside") or [nside], key=lambda n: abs(n - nside))
+        asked = [name.replace("{nside}", str(near)) for name in _asked_for(item, nside)]
+        if asked and not any(map(_is_here, asked)):
+            raise _lacks(asked[0], place)
 
 
 def band_weights(band: Band) -> tuple[Floats, Floats]:
@@ -165,13 +162,6 @@ def is_file(item: Any) -> bool:
     return isinstance(item, str) and item.endswith(FILES)
 
 
-def _templates(config: Mapping[str, Any], nside: int) -> Iterator[str]:
-    """Files that components name."""
-    for item in _classes(config):
-        names = (_of_nside(value, item, nside) for value in item.values() if is_file(value))
-        yield from (name for name in names if "{" not in name)
-
-
 def _classes(config: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     """The configuration of each class: components may be made up of several."""
     if "class" in config:
@@ -181,19 +171,12 @@ def _classes(config: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
             yield from _classes(item)
 
 
-def _of_nside(name: str, item: Mapping[str, Any], nside: int) -> str:
-    """A template's name for the resolution that PySM takes of those there are."""
-    nearest_nside = min(item.get("available_nside") or [nside], key=lambda n: abs(n - nside))
-    return name.replace("{nside}", str(nearest_nside))
-
-
 class _Asked(Exception):
     """A component asked for a file."""
 
 
 def _asked_for(item: Mapping[str, Any], nside: int) -> list[str]:
-    """Files whose names a class puts together: the first that it asks for when it is made, or its
-    maps of all frequencies.
+    """The first file that a class asks for when it is made, or its maps of all frequencies.
 
     Nothing is read. Empty where the class cannot be made, which `emission` tells.
     """

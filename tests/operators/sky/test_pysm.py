@@ -413,7 +413,12 @@ def test_templates_are_found_where_pysm_looks_for_them(tmp_path, monkeypatch):
         (
             {
                 "components": {
-                    "mine": {"class": "PowerLaw", "map_I": "absent.fits", "freq_ref_I": "1 GHz"}
+                    "mine": {
+                        "class": "PowerLaw",
+                        "map_I": "absent.fits",
+                        "freq_ref_I": "1 GHz",
+                        "map_pl_index": -3,
+                    }
                 }
             },
             "absent.fits.*correct the path",
