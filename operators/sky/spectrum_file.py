@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -85,81 +85,57 @@ def read(
         where no ``unit`` or ``scaling`` says so.
     """
     with reading(place, "a power spectrum", CURE):
-        state = Path(place).stat()
-    return _read(place, (state.st_mtime_ns, state.st_size), unit, scaling, tuple(columns))
-
-
-@lru_cache(maxsize=4)
-def _read(
-    place: str,
-    changed: tuple[int, int],
-    unit: Unit | None,
-    scaling: Scaling | None,
-    columns: tuple[str, ...],
-) -> Spectrum:
-    with reading(place, "a power spectrum", CURE):
-        check_memory(4 * changed[1], "the table", place)
+        check_memory(4 * Path(place).stat().st_size, "the table", place)
         try:
             table = np.loadtxt(place, ndmin=2)
         except ValueError as error:  # numpy's own cures are for those who call it
             raise ValueError(str(error).partition("; use `")[0]) from None
         with open(place, encoding="utf-8", errors="replace") as file:
-            comments = [
-                line.strip("#! \n\t")
-                for _, line in zip(range(100), file, strict=False)
-                if line.lstrip().startswith(("#", "!"))
-            ]
-    ell = table[:, 0]
+            lines = [line.strip() for line in islice(file, 100)]
+    comments = [line.strip("#! \t") for line in lines if line.startswith(("#", "!"))]
+    ell, stated = table[:, 0], " ".join(comments).lower()
     if not np.isfinite(table).all():
         row, column = np.argwhere(~np.isfinite(table))[0]
         text = f"row {row + 1} of the numbers has {table[row, column]} in column {column + 1}"
         raise InputError(text, place=place, cure="mend that row")
-    if table.shape[1] < 2:
-        raise InputError("has one column", place=place, cure=CURE)
-    if (ell != np.round(ell)).any() or (np.diff(ell) <= 0).any() or ell[0] < 0 or ell[-1] > HIGHEST:
-        raise InputError(
+    rising = (ell == np.round(ell)).all() and (np.diff(ell) > 0).all()
+    for wrong, text in (
+        (table.shape[1] < 2, "has one column"),
+        (
+            not (rising and ell[0] >= 0 and ell[-1] <= HIGHEST),
             f"the first column is no rising series of multipoles up to {HIGHEST}",
-            place=place,
-            cure=CURE,
-        )
-    if (ell[-1] - max(ell[0], 2)) + 1 != np.count_nonzero(ell >= 2):
-        raise InputError(
+        ),
+        (
+            ell[-1] - max(ell[0], 2) + 1 != np.count_nonzero(ell >= 2),
             "multipoles are missing between the first and the last",
-            place=place,
-            cure="give every l",
-        )
+        ),
+    ):
+        if wrong:
+            raise InputError(text, place=place, cure=CURE)
     names, named = _names(table.shape[1] - 1, comments, columns, place)
-    stated = " ".join(comments).lower()
-    said_unit, said_scaling = unit or _unit_of(stated), scaling or _scaling_of(stated)
-    chosen_unit: Unit = said_unit or "uK^2"
-    values, at = np.zeros((4, int(ell[-1]) + 1)), ell.astype(int)
-    flat = (
-        np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0.0)
-        if said_scaling != "none"
-        else np.ones(len(ell))
-    )
-    for name, column in zip(names, table.T[1:], strict=True):
+    found_unit: Unit = unit or _unit_of(stated) or "uK^2"
+    plain = (scaling or _scaling_of(stated)) == "none"
+    values = np.zeros((4, int(ell[-1]) + 1))
+    flat = np.ones(len(ell))
+    if not plain:
+        flat = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0.0)
+    for name, powers in zip(names, table.T[1:], strict=True):
         if name in READ:
-            values[READ.index(name), at] = column * flat * FACTORS[chosen_unit]
-    if said_scaling == "none":
+            values[READ.index(name), ell.astype(int)] = powers * flat * FACTORS[found_unit]
+    if plain:
         values[:, :2] = 0.0  # monopole and dipole
-    tt, ee, bb, te = values
-    if min(tt.min(), ee.min(), bb.min()) < 0 or (te**2 > tt * ee * (1 + 1e-6)).any():
-        raise InputError(
-            "no sky has this spectrum: TT, EE or BB is negative, or TE^2 exceeds TT EE",
-            place=place,
-            cure=CURE,
-        )
-    which = ("C_l" if said_scaling == "none" else "l (l + 1) C_l / 2 pi") + f" in {chosen_unit}"
-    unused = [name for name in names if name not in READ]
-    text = f"{', '.join(n for n in names if n in READ)} ({named}) as {which}" + (
-        f"; not used: {', '.join(unused)}" if unused else ""
-    )
+    tt, ee, _, te = values
+    if values[:3].min() < 0 or (te**2 > tt * ee * (1 + 1e-6)).any():
+        text = "no sky has this spectrum: TT, EE or BB is negative, or TE^2 exceeds TT EE"
+        raise InputError(text, place=place, cure=CURE)
+    used, unused = ([n for n in names if (n in READ) is read] for read in (True, False))
+    text = f"{', '.join(used)} ({named}) as {'C_l' if plain else 'l (l + 1) C_l / 2 pi'}"
+    text += f" in {found_unit}" + (f"; not used: {', '.join(unused)}" if unused else "")
     found = Spectrum(values, text)
     if unit is None:
-        _check_rms(found, chosen_unit, place)
+        _check_rms(found, found_unit, place)
     if scaling is None:
-        _check_shape(found, place)
+        _check_shape(tt, place)
     return found
 
 
@@ -169,14 +145,10 @@ def _names(
     """Names of the columns behind l, and who says so."""
     names, who = [_plain(name) for name in given], "as given"
     if not names:
-        headings = [
-            found for line in comments if (found := _heading(line)) and len(found) == number
-        ]
-        names, who = (
-            (headings[-1], "by the file's heading")
-            if headings
-            else (list(BY_NUMBER.get(number, ())), "by their number")
-        )
+        headings = [names for line in comments if len(names := _heading(line)) == number]
+        names, who = list(BY_NUMBER.get(number, ())), "by their number"
+        if headings:
+            names, who = headings[-1], "by the file's heading"
     if len(names) != number or "TT" not in names or len(set(names)) < number:
         cure = f"set columns to the names of those behind l, e.g. columns: TT, EE, TE, BB; {CURE}"
         told = f"columns names {', '.join(names)}" if given else "no heading names them"
@@ -186,10 +158,8 @@ def _names(
 
 def _heading(line: str) -> list[str]:
     """Names behind l of a line such as ``L TT EE`` or ``1:l 2:TT 3:EE``; empty where it is none."""
-    words = [re.sub(r"^\d+:", "", word) for word in re.split(r"[\s,]+", line.strip()) if word]
-    if len(words) < 2 or words[0].lower() not in ("l", "ell", "multipole"):
-        return []
-    return [_plain(word) for word in words[1:]]
+    words = [re.sub(r"^\d+:", "", word) for word in re.split(r"[\s,]+", line.strip())]
+    return [_plain(w) for w in words[1:]] if words[0].lower() in ("l", "ell", "multipole") else []
 
 
 def _plain(name: str) -> str:
@@ -211,37 +181,31 @@ def _scaling_of(stated: str) -> Scaling | None:
 
 
 def _check_rms(found: Spectrum, unit: Unit, place: str) -> None:
-    rms, (least, most) = 1e6 * found.rms, PLAUSIBLE
-    if rms == 0.0 or least <= rms <= most:
+    """Raise InputError if the rms is not plausible, and name units in which it is."""
+    least, most = PLAUSIBLE
+    rms = {name: 1e6 * found.rms * (f / FACTORS[unit]) ** 0.5 for name, f in FACTORS.items()}
+    if rms[unit] == 0.0 or least <= rms[unit] <= most:
         return
-    others = [
-        (name, rms * (FACTORS[name] / FACTORS[unit]) ** 0.5) for name in FACTORS if name != unit
-    ]
-    right = [f"{name} (rms {value:.3g} uK)" for name, value in others if least <= value <= most]
-    cure = (
-        f"set unit: {' or '.join(right)}"
-        if right
-        else "set unit to uK^2, K^2 or dimensionless, if that is what is meant"
-    )
-    raise InputError(
-        f"a sky of this spectrum, taken in {unit}, has an rms of {rms:.3g} uK, and the CMB about"
-        " 100 uK",
-        place=place,
-        cure=cure,
-    )
+    right = [f"{name} (rms {r:.3g} uK)" for name, r in rms.items() if least <= r <= most]
+    cure = f"set unit: {' or '.join(right)}"
+    if not right:
+        cure = "set unit to uK^2, K^2 or dimensionless, if that is what is meant"
+    text = f"a sky of this spectrum, taken in {unit}, has an rms of {rms[unit]:.3g} uK"
+    raise InputError(f"{text}, and the CMB about 100 uK", place=place, cure=cure)
 
 
-def _check_shape(found: Spectrum, place: str) -> None:
-    tt = found.values[0]
+def _check_shape(tt: Floats, place: str) -> None:
+    """Raise InputError if C_l itself stands in the column."""
     if len(tt) <= 300:
         return
     ell = np.arange(len(tt))
     power = ell * (ell + 1) * tt
     low, high = power[10:21].mean(), power[150:301].mean()
     if low > 0 and high < FALLS * low:
+        factor = f"{low / max(high, 1e-300):.3g}"
         raise InputError(
-            f"l (l + 1) C_l falls from l = 15 to 200 by a factor of {low / max(high, 1e-300):.3g},"
-            " where that of the CMB rises",
+            f"l (l + 1) C_l falls from l = 15 to 200 by a factor of {factor}, where that of the CMB"
+            " rises",
             place=place,
             cure=(
                 "set scaling: none where the columns are C_l, or scaling: l(l+1)/2pi where they are"

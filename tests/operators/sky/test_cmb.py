@@ -72,7 +72,7 @@ def test_the_stream_is_the_map_in_the_bands_kelvin(tmp_path):
     ell = np.arange(LMAX + 1)
     fwhm = float(observation.focalplane.fwhm[0])
     alm = healpy.map2alm(
-        step.sky(observation.seed, True)[0].map.table.data["I"].astype(np.float64),
+        step.sky(observation.seed, True)[0].map.hdu.data["I"].astype(np.float64),
         lmax=LMAX,
         iter=5,
     )
@@ -89,7 +89,7 @@ def test_the_stream_is_the_map_in_the_bands_kelvin(tmp_path):
 def test_without_polarized_detectors_the_intensity_alone_is_drawn(tmp_path):
     """The same bits of it; and the plan counts less memory."""
     step = CMBSky(spectrum=theory(tmp_path / "t.txt"), nside=64)
-    every, intensity = (step.sky(3, polarized)[0].map.table for polarized in (True, False))
+    every, intensity = (step.sky(3, polarized)[0].map.hdu for polarized in (True, False))
     assert (every.columns.names, intensity.columns.names) == (["I", "Q", "U"], ["I"])
     np.testing.assert_array_equal(intensity.data["I"], every.data["I"])
     sizes = []
@@ -114,12 +114,12 @@ def test_without_polarized_detectors_the_intensity_alone_is_drawn(tmp_path):
 def test_seeds_and_realizations(tmp_path):
     path = theory(tmp_path / "t.txt", polarized=False)
     seeded = [
-        CMBSky(spectrum=path, nside=16).sky(seed, True)[0].map.table.data["I"] for seed in (1, 2, 1)
+        CMBSky(spectrum=path, nside=16).sky(seed, True)[0].map.hdu.data["I"] for seed in (1, 2, 1)
     ]
     assert not np.array_equal(seeded[0], seeded[1])
     np.testing.assert_array_equal(seeded[0], seeded[2])
     fixed = [
-        CMBSky(spectrum=path, nside=16, realization=4).sky(seed, True)[0].map.table.data["I"]
+        CMBSky(spectrum=path, nside=16, realization=4).sky(seed, True)[0].map.hdu.data["I"]
         for seed in (1, 2)
     ]
     np.testing.assert_array_equal(*fixed)
