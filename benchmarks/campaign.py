@@ -12,10 +12,16 @@ largest worker is noted at every task.
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import sys
 import tempfile
 import time
 from pathlib import Path
+
+from zonda.core.campaign.campaign_file import Job
+from zonda.core.campaign.folder import Record
+from zonda.core.cli import main as zonda
+from zonda.core.hooks import hookimpl, manager
 
 YAML = """\
 site: green_bank
@@ -34,9 +40,25 @@ operators:
 """
 
 
-def resident():
-    """Resident memory of this process, bytes."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+def memory(process, key):
+    """Resident memory of a process, bytes: now (VmRSS), or at its peak (VmHWM)."""
+    status = Path(f"/proc/{process}/status").read_text().splitlines()
+    return 1024 * int(next(line for line in status if line.startswith(key)).split()[1])
+
+
+class Watch:
+    """Notes time and memory at every task: of the main process, and the peak of the largest worker
+    (of the main process where there is none).
+    """
+
+    def __init__(self):
+        self.rows = []
+
+    @hookimpl
+    def zonda_campaign_progress(self, done):
+        workers = [child.pid for child in multiprocessing.active_children()] or ["self"]
+        peaks = [memory(worker, "VmHWM") for worker in workers]
+        self.rows.append((time.monotonic(), memory("self", "VmRSS"), max(peaks)))
 
 
 def main(arguments):
@@ -46,57 +68,32 @@ def main(arguments):
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--plot", type=Path)
     given = parser.parse_args(arguments)
-
-    from zonda.core.campaign import calls
-    from zonda.core.campaign.tasks import Outcome
-    from zonda.core.cli import main as zonda
-
-    rows = []
-    usual = calls._result
-
-    def watched(future, folder):
-        outcome = usual(future, folder)
-        if isinstance(outcome, Outcome):
-            rows.append((time.monotonic(), resident(), outcome.peak, outcome.seconds))
-        return outcome
-
-    calls._result = watched
+    watch = Watch()
+    manager().register(watch)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "tiny.yaml"
+        path, out = Path(folder) / "tiny.yaml", Path(folder) / "out"
         path.write_text(YAML.format(tasks=given.tasks))
         options = ["--workers", str(given.workers)] if given.engine == "processes" else []
         begin, cpu = time.monotonic(), time.process_time()
-        status = zonda(
-            [
-                "run",
-                str(path),
-                "--output",
-                str(Path(folder) / "out"),
-                "--engine",
-                given.engine,
-                *options,
-            ]
-        )
+        status = zonda(["run", str(path), "--output", str(out), "--engine", given.engine, *options])
         wall, cpu = time.monotonic() - begin, time.process_time() - cpu
-    if status:
-        return status
+        if status:
+            return status
+        inside = [row.seconds for row in Record(Job.read(out), out).rows()]
+    rows = watch.rows
     skip = min(len(rows) // 10, 50)  # while workers start and compile
-    span = rows[-1][0] - rows[skip][0]
-    inside = sum(r[3] for r in rows[skip + 1 :])
-    n = len(rows) - skip - 1
+    n, span = len(rows) - skip - 1, rows[-1][0] - rows[skip][0]
     print(
         f"{len(rows)} tasks in {wall:.1f} s with planning and combining, {cpu:.1f} s of CPU time of"
         " the main process"
     )
     print(
-        f"{1e3 * span / n:.1f} ms a task, of which {1e3 * inside / n:.1f} ms in the task itself on"
-        " each worker"
+        f"{1e3 * span / n:.1f} ms a task, of which {1e3 * sum(inside[skip + 1 :]) / n:.1f} ms in"
+        " the task itself on each worker"
     )
     for k in [*range(skip, len(rows), max(1, len(rows) // 10)), len(rows) - 1]:
-        print(
-            f"{k + 1:>6} tasks  main {rows[k][1] / 1e6:6.1f} MB  worker at most"
-            f" {max(r[2] for r in rows[: k + 1]) / 1e6:6.1f} MB"
-        )
+        main_now, worker = rows[k][1] / 1e6, max(r[2] for r in rows[: k + 1]) / 1e6
+        print(f"{k + 1:>6} tasks  main {main_now:6.1f} MB  worker at most {worker:6.1f} MB")
     if given.plot:
         plot(rows, given.plot)
     return 0

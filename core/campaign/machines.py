@@ -5,6 +5,7 @@ machine.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
@@ -48,20 +49,18 @@ def differences(one: str, other: str) -> str:
     found = []
     for key in sorted((a.keys() | b.keys()) - WITHOUT_INFLUENCE):
         mine, theirs = a.get(key, "none"), b.get(key, "none")
-        if mine == theirs:
-            continue
-        if key.endswith("instructions"):
-            more, less = (
-                sorted(set(mine.split()) - set(theirs.split())),
-                sorted(set(theirs.split()) - set(mine.split())),
-            )
+        if mine != theirs and key.endswith("instructions"):
+            own, others = set(mine.split()), set(theirs.split())
             words = [
                 f"{sign} {' '.join(names[:3])}{' ...' * (len(names) > 3)}"
-                for sign, names in (("with", more), ("without", less))
+                for sign, names in (
+                    ("with", sorted(own - others)),
+                    ("without", sorted(others - own)),
+                )
                 if names
             ]
             found.append(f"{key} {', '.join(words)}")
-        else:
+        elif mine != theirs:
             found.append(f"{key} {mine} ({theirs} there)")
     return ", ".join(found)
 
@@ -87,28 +86,27 @@ class Watch:
     """
 
     def __init__(self, known: Mapping[int, str], strict: bool, folder: Path, say: Say) -> None:
-        self._strict, self._folder, self.say = strict, folder, say
+        self._strict, self._folder, self.say = False, folder, say
         self._first = ""
         self._told: set[frozenset[tuple[str, str]]] = set()
         for number in sorted(known):
-            self.meet(known[number], f"task {number}", strict=False)
+            self.meet(known[number], f"task {number}")
+        self._strict = strict
 
-    def meet(self, machine: str, who: str, strict: bool | None = None) -> str:
+    def meet(self, machine: str, who: str) -> str:
         """Why a task is refused; empty where it is not. ``who``: which task, where."""
-        if not kind(machine):
-            return ""
-        if not kind(self._first):
-            self._first = machine
-        if kind(machine) == kind(self._first):
+        this = kind(machine)
+        self._first = self._first or (machine if this else "")
+        if not this or this == kind(self._first):
             return ""
         what = (
             f"{who} ran on another kind of machine or with other libraries than the first:"
             f" {differences(machine, self._first)}"
         )
-        if self._strict if strict is None else strict:
+        if self._strict:
             return f"{what}; same_machine refuses it"
-        if kind(machine) not in self._told:
-            self._told.add(kind(machine))
+        if this not in self._told:
+            self._told.add(this)
             self.say(
                 f"{what}; {EFFECT} (zonda status {self._folder}; campaign.same_machine refuses it)"
             )
@@ -117,10 +115,6 @@ class Watch:
 
 def kinds(machines: Iterable[str]) -> list[tuple[str, int]]:
     """One machine of each kind, the commonest first, and how many tasks ran on that kind."""
-    first: dict[frozenset[tuple[str, str]], str] = {}
-    count: dict[frozenset[tuple[str, str]], int] = {}
-    for machine in machines:
-        if this := kind(machine):
-            first.setdefault(this, machine)
-            count[this] = count.get(this, 0) + 1
-    return [(first[this], count[this]) for this in sorted(count, key=lambda k: -count[k])]
+    known = [machine for machine in machines if kind(machine)]
+    first = {kind(machine): machine for machine in reversed(known)}
+    return [(first[this], count) for this, count in Counter(map(kind, known)).most_common()]
