@@ -26,7 +26,7 @@ class TextValue:
         raise NotImplementedError
 
     def dump(self) -> Any:
-        """What stands for it in files; as a default its text."""
+        """Value that stands for it in files; by default its text."""
         return str(self)
 
     @classmethod

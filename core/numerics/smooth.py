@@ -84,9 +84,9 @@ def spline_basis(u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=32)
-def _inside(step: int, dtype: str) -> AnyFloats:
-    """(step,) r / step."""
-    return (np.arange(step) / step).astype(dtype)
+def _inside(samples: int, dtype: str) -> AnyFloats:
+    """(samples,) places r / samples of the samples of a cell."""
+    return (np.arange(samples) / samples).astype(dtype)
 
 
 class Series(NamedTuple):
