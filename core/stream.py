@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .errors import OutputError
 from .numerics.chunks import TILE_DETECTORS, TILE_SAMPLES
 from .numerics.smooth import SmoothField
 from .observation import Observation
@@ -119,3 +121,40 @@ def forget_pages(array: AnyFloats) -> None:
     pages = getattr(array, "_mmap", None)
     if pages is not None and hasattr(mmap, "MADV_DONTNEED"):
         pages.madvise(mmap.MADV_DONTNEED)
+
+
+def columns(array: AnyFloats, samples: slice) -> AnyFloats:
+    """(n_det, n) samples of all detectors as an array of its own.
+
+    A spilled stream's are read from its file: around each page that is touched in a mapping the
+    system maps up to 64 kB, which is most of a stream whose rows are that short.
+    """
+    if not isinstance(array, np.memmap):
+        return np.array(array[:, samples], order="C")
+    found = np.empty((array.shape[0], samples.stop - samples.start), array.dtype)
+    whole, size = found.data.cast("B"), found.strides[0]
+    mapped: Any = array._mmap  # type: ignore[attr-defined]
+    begin = array.ctypes.data - np.frombuffer(mapped, np.uint8).ctypes.data
+    with open(str(array.filename), "rb", buffering=0) as file:
+        for row in range(array.shape[0]):
+            place, left = (
+                begin + row * array.strides[0] + samples.start * array.itemsize,
+                whole[row * size : (row + 1) * size],
+            )
+            while left:
+                read = _read_at(file, left, place)
+                if not read:
+                    cure = "do not change files in the temporary folder while zonda runs"
+                    raise OutputError(
+                        "the temporary file was truncated", place=str(array.filename), cure=cure
+                    )
+                place, left = place + read, left[read:]
+    return found
+
+
+def _read_at(file: Any, into: memoryview, place: int) -> int:
+    """Bytes read into ``into`` from ``place`` on, in one call of the system where there is one."""
+    if hasattr(os, "preadv"):
+        return os.preadv(file.fileno(), [into], place)
+    file.seek(place)
+    return int(file.readinto(into))

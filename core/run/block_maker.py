@@ -12,7 +12,6 @@ import copy
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,9 +28,8 @@ from ..tally import Tally
 from ..types import AnyFloats
 from .means import exec_whole, knows_means, means_of, names_of
 from .schedule import Schedule
-from .segments import pieces, trimmed, within
+from .segments import Segment, pieces, trimmed, within
 from .settings import Timer
-from .streams import Ledger, Stage
 from .views import View
 
 
@@ -41,15 +39,6 @@ class Due(NamedTuple):
     step: Operator
     block: Block
     state: Any
-
-
-@dataclass(frozen=True)
-class Window:
-    """Extent of a block: ``samples``, and with its margins ``reach``."""
-
-    detectors: slice
-    samples: slice
-    reach: slice
 
 
 class BlockMaker:
@@ -66,13 +55,12 @@ class BlockMaker:
         view: View,
         schedule: Schedule,
         timer: Timer,
-        ledger: Ledger,
         stopped: Callable[[], bool],
     ) -> None:
         self._chain = chain = schedule.chain
         self._view, self._observation, self._dtype = view, view.observation, schedule.settings.dtype
         self._streams, self._schedule = schedule.streams, schedule
-        self._timer, self._ledger, self._stopped = timer, ledger, stopped
+        self._timer, self._stopped = timer, stopped
         # a label is a property, which is slow
         own = ((o, o.label) for o in view.chain.steps)
         self._own = {id(o): mine for o, mine in zip(chain.steps, own, strict=True)}
@@ -99,20 +87,18 @@ class BlockMaker:
         # an unfiltered signal may be finite where a filter has spoilt the others
         self._masks_maps = not all(signal.filtered for signal in chain.signals)
         self._local = threading.local()
-
-    @property
-    def _apart(self) -> set[str]:
+        self._apart = frozenset(s.stream for s in schedule.made_again)
         """Streams of the signals that are made again where they are mapped."""
-        return {s.stream for s in self._schedule.made_again}
+        self._unfiltered = Segment(chain.needed_for(schedule.made_again, filtered=False))
+        self._unfiltered.wanted = self._apart
 
     def release(self) -> None:
         """Forget the blocks: their threads have ended."""
         self._local = threading.local()
-        self._ledger.drop("blocks")
 
     def make(
         self,
-        stage: Stage,
+        segment: Segment,
         detectors: slice,
         samples: slice,
         made: dict[str, AnyFloats],
@@ -121,7 +107,7 @@ class BlockMaker:
         signals: Sequence[Formed] | None = None,
         due: list[Due] | None = None,
     ) -> Block:
-        """A block with the segment's steps, and those of the stages before it, carried out.
+        """A block with the segment's steps, and those that make its streams again, carried out.
 
         Parameters
         ----------
@@ -132,7 +118,7 @@ class BlockMaker:
             act here. None: all steps act. The block is then one piece, or the segment has a step
             that needs more (`segments.Segment.split`).
         """
-        segment, again = stage.segment, again or self._view.number in stage.swept
+        again = again or self._view.number in segment.swept
         if signals is None:
             signals = [s for s in self._chain.signals if s.stream not in self._apart]
         n_samples = self._observation.n_samples
@@ -141,7 +127,7 @@ class BlockMaker:
         first, rest = segment.split()
         # whole scans, and what is only taken in pieces, are worked on where they are kept
         in_place = bool(made) and not segment.halo and (not rest or reach == slice(0, n_samples))
-        passed_on = set(stage.wanted).union(
+        passed_on = set(segment.wanted).union(
             *(self._chain.expanded(o.requires | o.optional) for o in rest)
         )
         if again:
@@ -151,10 +137,9 @@ class BlockMaker:
             first, rest = (
                 [o for o in part if not o.provides or self._is_read(o)] for part in (first, rest)
             )
-        window = Window(detectors, samples, reach)
-        block = self._block(
-            stage, window, made if in_place else {}, again, not first or bool(rest), signals
-        )
+        places = made if in_place else {}
+        copied = not first or bool(rest)
+        block = self._block(segment, detectors, samples, reach, places, again, copied, signals)
         if self._apart and any(isinstance(o, MapMaker) for o in segment.operators):
             self._add_unfiltered(block)
         if first:
@@ -163,10 +148,6 @@ class BlockMaker:
         if reach != samples:
             block = trimmed(block, samples)
         self._exec(rest[1:], block, signals, due)
-        held = self._local.__dict__
-        buffers = [*held.get("blocks", {}).values(), held.get("pieces", {}), held.get("whole", {})]
-        size = sum(array.nbytes for held in buffers for array in held.values())
-        self._ledger.note(("blocks", threading.get_ident(), self._view.number), size)
         return block
 
     # ---- which steps act
@@ -332,8 +313,10 @@ class BlockMaker:
 
     def _block(
         self,
-        stage: Stage,
-        window: Window,
+        segment: Segment,
+        detectors: slice,
+        samples: slice,
+        reach: slice,
         made: dict[str, AnyFloats],
         again: bool,
         copied: bool,
@@ -345,12 +328,11 @@ class BlockMaker:
         With margins never in place: others read them too. Not ``copied``: steps work on copies of
         parts of it alone.
         """
-        source, observation = stage.source, self._observation
-        detectors, samples, reach = window.detectors, window.samples, window.reach
+        source, observation = segment.source, self._observation
         if again:
             observation = copy.copy(observation)
             observation.tally = Tally()
-        buffers = self._local.__dict__.setdefault("blocks", {}).setdefault(stage.place, {})
+        buffers = self._local.__dict__.setdefault("blocks", {}).setdefault(id(segment), {})
         block = Block(
             observation, detectors, reach, dtype=self._dtype, buffers=buffers, again=again
         )
@@ -364,13 +346,13 @@ class BlockMaker:
                 block.detdata[name] = block.buffer(name, block.shape)
                 block.detdata[name][...] = here
         block.means.update(source.means.get(self._view.number, {}))
-        if source.stage is None:
+        if source.segment is None:
             return block
         margins = slice(reach.start, samples.start), slice(samples.stop, reach.stop)
         for part, known in ((margins[0], True), (samples, again), (margins[1], True)):
             if part.start == part.stop:
                 continue
-            before = self.make(source.stage, detectors, part, {}, again=known, signals=signals)
+            before = self.make(source.segment, detectors, part, {}, again=known, signals=signals)
             for name in source.names & before.detdata.keys():
                 if reach == samples:
                     block.detdata[name] = before.detdata[name]
@@ -385,11 +367,14 @@ class BlockMaker:
         """Put the signals that pass no filter into a block of a map maker, made again from their
         components.
         """
-        signals = [s for s in self._chain.signals if s.stream in self._apart]
-        stage = Stage.without_filters(
-            self._chain.needed_for(signals, filtered=False), frozenset(self._apart)
+        found = self.make(
+            self._unfiltered,
+            block.detectors,
+            block.samples,
+            {},
+            again=True,
+            signals=self._schedule.made_again,
         )
-        found = self.make(stage, block.detectors, block.samples, {}, again=True, signals=signals)
         for name in self._apart:
             block.detdata[name] = found.detdata[name]
             if name in found.means:

@@ -47,10 +47,10 @@ from .block_maker import BlockMaker, Due
 from .budget import memory_of
 from .means import MeansOfBands, WholeStream, knows_means, means_of
 from .prefetch import Ahead
-from .schedule import Planned, Schedule, schedule
-from .segments import least_block, pieces
+from .schedule import Schedule, schedule
+from .segments import Segment, Source, least_block, pieces
 from .settings import Settings, Timer
-from .streams import Ledger, Source, Stage, Store, StreamMadeAgain
+from .streams import Store, StreamMadeAgain
 from .views import View
 
 ELSEWHERE = "samples flagged as those of another band are: nothing is measured there"
@@ -81,11 +81,10 @@ class Execution:
         self._before, self._after = before, after
         self.beforehand: Future[None] | None = None
         self.schedule: Schedule
-        self.ledger = Ledger()
         self._makers: list[BlockMaker] = []
         self._ahead = Ahead(False)
         self._stop = threading.Event()
-        self._store = Store(settings.memory, settings.dtype, settings.spare, self.ledger)
+        self._store = Store(settings.memory, settings.dtype, settings.spare)
         self._source, self._begun = Source(), list[tuple[Operator, Observation]]()
         self._first = views[0].observation
         row = 0
@@ -107,13 +106,13 @@ class Execution:
                 self.prepare()
             self._begin()
             self._ahead.start(following)
-            for planned in self.schedule.planned:
-                head = planned.segment.operators[0]
+            for segment in self.schedule.segments:
+                head = segment.operators[0]
                 if head.couples == "all":
                     joined = [self.views] if joins(head) else [[view] for view in self.views]
                     for views in joined:
                         self._measure(views, head.label)
-                self._act(planned)
+                self._act(segment)
             self._keep()
             for view in self.views:
                 for operator in view.chain.steps:
@@ -173,12 +172,10 @@ class Execution:
     def _begin(self) -> None:
         """Make the schedule, with the memory that there is now: what operators hold is known."""
         self.settings = settings = self._within_process()
-        self._store = Store(settings.memory, settings.dtype, settings.spare, self.ledger)
+        self._store = Store(settings.memory, settings.dtype, settings.spare)
         self.schedule = schedule(self.views, settings)
         stopped = self._stop.is_set
-        self._makers = [
-            BlockMaker(view, self.schedule, self.timer, self.ledger, stopped) for view in self.views
-        ]
+        self._makers = [BlockMaker(view, self.schedule, self.timer, stopped) for view in self.views]
 
     def _within_process(self) -> Settings:
         """Lessen the memory of streams and blocks where operators took more than they said, and
@@ -200,50 +197,50 @@ class Execution:
 
     # ---- segments
 
-    def _act(self, planned: Planned) -> None:
+    def _act(self, segment: Segment) -> None:
         """Let a segment act on all blocks, or note that its streams are made again when they are
         read.
         """
-        stage = Stage(planned.segment, self._source, planned.wanted)
-        steps = [(o, view.observation) for view in self.views for o in planned.segment.operators]
+        segment.source = self._source
+        steps = [(o, view.observation) for view in self.views for o in segment.operators]
         for operator, observation in steps:
             self._before(operator=operator, observation=observation, stage="exec")
         self._begun += steps
-        if planned.how == "again":
-            self._source = self._made_again(stage, planned.why)
+        if segment.how == "again":
+            self._source = self._made_again(segment)
             return
-        self._source = self._worked_through(planned, stage)
+        self._source = self._worked_through(segment)
         for operator, observation in self._begun:
             used = self.timer.seconds.get((operator.label, "exec"), 0.0)
             self._after(operator=operator, observation=observation, stage="exec", seconds=used)
         self._begun.clear()
 
-    def _made_again(self, stage: Stage, why: str) -> Source:
+    def _made_again(self, segment: Segment) -> Source:
         """The streams of a segment that is not carried out, with the means of its smallest
         blocks.
         """
         self._store.clear_spare()
-        found = Source(stage=stage)
+        found = Source(segment=segment)
         for view, maker in zip(self.views, self._makers, strict=True):
-            rows, columns = least_block(stage.span, view.shape)
-            block = maker.make(stage, slice(0, rows), slice(0, columns), {}, again=True)
-            found.names = frozenset(stage.wanted & block.detdata.keys())
+            rows, columns = least_block(segment.whole, view.shape)
+            block = maker.make(segment, slice(0, rows), slice(0, columns), {}, again=True)
+            found.names = frozenset(segment.wanted & block.detdata.keys())
             found.means[view.number] = dict(block.means)
             for name in sorted(found.names):
                 what = f"stream {name} made again when it is read"
-                view.observation.tally.state("Execution", what, why)
+                view.observation.tally.state("Execution", what, segment.why)
         return found
 
-    def _worked_through(self, planned: Planned, stage: Stage) -> Source:
+    def _worked_through(self, segment: Segment) -> Source:
         """The streams that a segment passes on, once it has worked on all blocks."""
-        before, made, seen = stage.source.arrays, dict[str, AnyFloats](), set[str]()
+        before, made, seen = segment.source.arrays, dict[str, AnyFloats](), set[str]()
         means = {view.number: dict[str, SmoothField]() for view in self.views}
-        for name in sorted(stage.wanted):
-            if name in before and not stage.segment.halo:
+        for name in sorted(segment.wanted):
+            if name in before and not segment.halo:
                 made[name] = before[name]  # changed in place
                 continue
             shape = self.views[-1].rows.stop, self._first.n_samples
-            made[name] = self._store.allocate(name, shape, planned.how == "kept")
+            made[name] = self._store.allocate(name, shape, segment.how == "kept")
             if isinstance(made[name], np.memmap):
                 text = f"{made[name].nbytes / 1e9:.2f} GB"
                 for view in self.views:
@@ -252,7 +249,7 @@ class Execution:
 
         def work(view: View, detectors: slice, samples: slice, due: list[Due] | None) -> None:
             maker = self._makers[view.number]
-            block = maker.make(stage, detectors, samples, made, again=False, due=due)
+            block = maker.make(segment, detectors, samples, made, again=False, due=due)
             for name in made.keys() & block.detdata.keys():
                 seen.add(name)
                 if block.detdata[name] is not block.places.get(name):
@@ -261,18 +258,18 @@ class Execution:
             for array in (*made.values(), *before.values()):
                 forget_pages(array)
 
-        working = (o for o in stage.segment.operators if type(o).exec is not Operator.exec)
+        working = (o for o in segment.operators if type(o).exec is not Operator.exec)
         labels = ", ".join(o.label for o in working)
-        blocks = {view.number: self.schedule.blocks(planned, view) for view in self.views}
+        blocks = {view.number: self.schedule.blocks(segment, view) for view in self.views}
         if self.schedule.at_once > 1:
-            whole = bool(stage.segment.split()[1])
+            whole = bool(segment.split()[1])
             scan = name_of_all(self._first)
             self._sweep(partial(self._on_all, work, whole), blocks[0], f"{scan}: {labels}")
         else:
             for view in self.views:
                 what = f"{view.observation.name}: {labels}"
                 self._sweep(partial(work, view, due=None), blocks[view.number], what)
-        stage.has_been_swept(self.views)
+        segment.has_been_swept(self.views)
         for maker in self._makers:
             maker.release()
         kept = {name: array for name, array in made.items() if name in seen}
@@ -400,9 +397,9 @@ class Execution:
             observation.tally = Tally()
             observation.flags = observation.flags.copy()
             observation.detector_flags = observation.detector_flags.copy()
-        if source.stage is not None:
+        if source.segment is not None:
             sweeper = partial(
-                self._make_again, views, source.stage, signal, f"{step.label} measures {name}"
+                self._make_again, views, source.segment, signal, f"{step.label} measures {name}"
             )
             stream: Stream = StreamMadeAgain(
                 name, observation, means, settings.threads, settings.dtype, sweeper
@@ -425,33 +422,33 @@ class Execution:
     def _make_again(
         self,
         views: Sequence[View],
-        stage: Stage,
+        segment: Segment,
         signal: Formed,
         what: str,
         work: Callable[[slice, slice, AnyFloats], Any],
     ) -> Iterator[tuple[slice, slice, Any]]:
-        """`Stream.sweep` of a stream that ``stage`` makes."""
-        swept = {view.number for view in views} <= stage.swept
+        """`Stream.sweep` of a stream that ``segment`` makes."""
+        swept = {view.number for view in views} <= segment.swept
         signals = [signal] if swept and signal in self.schedule.chain.signals else None
 
         def one(
             view: View, first: int, detectors: slice, samples: slice
         ) -> tuple[slice, slice, Any]:
             maker = self._makers[view.number]
-            block = maker.make(stage, detectors, samples, {}, again=False, signals=signals)
+            block = maker.make(segment, detectors, samples, {}, again=False, signals=signals)
             rows = slice(first + detectors.start, first + detectors.stop)
             return rows, samples, work(rows, samples, block.detdata[signal.stream])
 
         todo = [
             (view, rows.start, *block)
             for view, rows in zip(views, _rows_of(views), strict=True)
-            for block in self.schedule.blocks(Planned(stage), view)
+            for block in self.schedule.blocks(segment, view)
         ]
         scan = name_of_all(self._first) if len(views) > 1 else views[0].observation.name
         for done, result in enumerate(in_order(one, todo, self.settings.threads), 1):
             self.settings.progress(done, len(todo), f"{scan}: {what}")
             yield result
-        stage.has_been_swept(views)
+        segment.has_been_swept(views)
         for maker in self._makers:
             maker.release()
 

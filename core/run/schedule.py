@@ -21,9 +21,9 @@ from ..operator import Operator
 from ..plan.planning import planning_of
 from ..signal import Formed
 from .means import knows_means, may_have_means, names_of
-from .segments import PIECE, Segment, block_share, blocks, cut, least_block, whole_span
+from .segments import PIECE, Segment, Source, block_share, blocks, cut, least_block
 from .settings import Held, Settings
-from .streams import Source, Stage, free_disk
+from .streams import free_disk
 from .views import View
 
 SCRATCH_STREAMS = 2
@@ -39,43 +39,13 @@ AMPLE_BLOCK = 128 << 20
 
 
 @dataclass
-class Planned:
-    """A segment as it will be carried out.
-
-    Attributes
-    ----------
-    stage
-        Names and sizes; its streams are empty.
-    how, why
-        What becomes of the streams that it makes new.
-    held
-        Bytes of streams that are held beside it.
-    """
-
-    stage: Stage
-    how: Held = "kept"
-    why: str = ""
-    held: int = 0
-
-    @property
-    def segment(self) -> Segment:
-        """The segment's steps."""
-        return self.stage.segment
-
-    @property
-    def wanted(self) -> frozenset[str]:
-        """Names of the streams that it passes on."""
-        return self.stage.wanted
-
-
-@dataclass
 class Schedule:
     """Work on one scan, and the memory that it takes.
 
     Attributes
     ----------
-    planned
-        The segments in order.
+    segments
+        In order.
     made_again
         Signals that are passed to map makers as they were formed, made again from their components
         where they are mapped.
@@ -90,7 +60,7 @@ class Schedule:
 
     views: Sequence[View]
     settings: Settings
-    planned: list[Planned] = field(default_factory=list)
+    segments: list[Segment] = field(default_factory=list)
     made_again: tuple[Formed, ...] = ()
     bytes: int = 0
     least: int = 0
@@ -115,7 +85,7 @@ class Schedule:
         rows = sum(view.shape[0] for view in self.views)
         return rows * self.shape[1] * np.dtype(self.settings.dtype).itemsize
 
-    def blocks(self, planned: Planned, view: View) -> list[tuple[slice, slice]]:
+    def blocks(self, segment: Segment, view: View) -> list[tuple[slice, slice]]:
         """The blocks in which a segment works on a band.
 
         Raises
@@ -123,11 +93,10 @@ class Schedule:
         PipelineError
             Where the least one does not fit.
         """
-        stage, held = planned.stage, planned.held
-        rows, columns = least_block(stage.span, self.shape)
-        share = self._share(stage, held)
+        rows, columns = least_block(segment.whole, self.shape)
+        share, held = self._share(segment, segment.held), segment.held
         if rows * columns > share:
-            settings, need = self.settings, self._least_blocks(stage)
+            settings, need = self.settings, self._least_blocks(segment)
             raise PipelineError(
                 f"one block of {rows} detectors needs {need / settings.threads / 1e6:.1f} MB on"
                 f" each of {settings.threads} threads, the memory budget has"
@@ -138,43 +107,40 @@ class Schedule:
                     " make the scan shorter"
                 ),
             )
-        return list(blocks(stage.span, stage.in_time_order, view.shape, share))
+        return list(blocks(segment.whole, segment.ordered, view.shape, share))
 
     # ---- made once
 
     def make(self) -> None:
         """Walk through the segments."""
-        segments = cut(self.views)
+        self.segments = segments = cut(self.views)
         self.made_again = self._made_again(segments)
         apart = {s.stream for s in self.made_again}
         source, held, elsewhere = Source(), 0, list[str]()
         for number, segment in enumerate(segments):
-            later = segments[number + 1 :]
+            later, segment.source = segments[number + 1 :], source
             wanted = frozenset(self.chain.keep).union(
                 *(o.requires | o.optional for s in later for o in s.operators)
             )
             made = source.names.union(*(self.chain.expanded(o.provides) for o in segment.operators))
-            stage = Stage(
-                segment, source, made & self.chain.expanded(wanted) & self.streams - apart
-            )
-            known = segment.halo or source.stage
-            new = stage.wanted if known else stage.wanted - source.names
-            size, planned = len(new) * self.stream_size, Planned(stage)
-            if later and new and not self._keeps(stage, size, held, later):
-                planned.how, planned.why = self._where(stage, sorted(new), size, held, later)
-                what = "spilled to disk" if planned.how == "spilled" else "made again"
+            segment.wanted = made & self.chain.expanded(wanted) & self.streams - apart
+            known = segment.halo or source.segment
+            new = segment.wanted if known else segment.wanted - source.names
+            size = len(new) * self.stream_size
+            if later and new and not self._keeps(segment, size, held, later):
+                segment.how, segment.why = self._where(segment, sorted(new), size, held, later)
+                what = "spilled to disk" if segment.how == "spilled" else "made again"
                 elsewhere += [f"{name} {what}" for name in sorted(new)]
-            self.planned.append(planned)
-            if planned.how == "again":
-                source = Source(stage=stage, names=stage.wanted)
+            if segment.how == "again":
+                source = Source(segment=segment, names=segment.wanted)
                 continue
-            size = 0 if planned.how == "spilled" else size
-            planned.held = held + (size if later else 0)
-            smallest = self._least_blocks(stage)
-            largest = max(self._largest_blocks(stage, planned.held), smallest)
+            size = 0 if segment.how == "spilled" else size
+            segment.held = held + (size if later else 0)
+            smallest = self._least_blocks(segment)
+            largest = max(self._largest_blocks(segment), smallest)
             self.bytes = max(self.bytes, held + size + largest)
             self.least = max(self.least, smallest)
-            held, source = planned.held, Source(names=stage.wanted)
+            held, source = segment.held, Source(names=segment.wanted)
         self.elsewhere = tuple(elsewhere)
 
     def _made_again(self, segments: Sequence[Segment]) -> tuple[Formed, ...]:
@@ -196,16 +162,16 @@ class Schedule:
         bound = any(o.couples != "sample" or o.halo(self.views[0].observation) for o in needed)
         return unfiltered if before and mapped and min(mapped) > before[0] and not bound else ()
 
-    def _keeps(self, stage: Stage, size: int, held: int, later: list[Segment]) -> bool:
+    def _keeps(self, segment: Segment, size: int, held: int, later: list[Segment]) -> bool:
         """Tell whether ``size`` bytes of streams beside those held stay in memory: in half of it,
         with room for blocks.
         """
-        following = Stage(later[0], Source(names=stage.wanted), frozenset())
-        least = max(self._least_blocks(stage), self._least_blocks(following))
+        later[0].source = Source(names=segment.wanted)
+        least = max(self._least_blocks(segment), self._least_blocks(later[0]))
         return held + size <= min(self.settings.memory // 2, self.settings.memory - least)
 
     def _where(
-        self, stage: Stage, new: list[str], size: int, held: int, later: list[Segment]
+        self, segment: Segment, new: list[str], size: int, held: int, later: list[Segment]
     ) -> tuple[Held, str]:
         """Decide about streams that do not fit in memory beside ``held`` bytes, and say why.
 
@@ -215,7 +181,7 @@ class Schedule:
             Where they can neither be made again nor fit on the disk.
         """
         following, disk = later[0], free_disk()
-        head, span = following.operators[0], stage.span
+        head, span = following.operators[0], segment.whole
         hindrance = ""
         if head.couples == "all" and not planning_of(head).sweeps(self.views[0].observation):
             hindrance = f"{head.label} reads it as a whole"
@@ -233,7 +199,8 @@ class Schedule:
                     " larger disk, or split into shorter scans"
                 ),
             )
-        if not hindrance and stage.in_time_order and whole_span(following.span, span) == "time":
+        following.source = Source(segment=segment)
+        if not hindrance and segment.ordered and following.whole == "time":
             hindrance = "" if size > disk else f"made in order of time, {head.label} needs scans"
         return (
             ("spilled", f"{size / 1e9:.2f} GB: {hindrance}")
@@ -243,48 +210,48 @@ class Schedule:
 
     # ---- sizes of blocks
 
-    def _least_blocks(self, stage: Stage) -> int:
+    def _least_blocks(self, segment: Segment) -> int:
         """Bytes of the smallest blocks, on all threads."""
-        return self._bytes(stage, *least_block(stage.span, self.shape))
+        return self._bytes(segment, *least_block(segment.whole, self.shape))
 
-    def _largest_blocks(self, stage: Stage, held: int) -> int:
-        """Bytes of the blocks that would be cut beside ``held`` bytes of streams, on all
+    def _largest_blocks(self, segment: Segment) -> int:
+        """Bytes of the blocks that would be cut beside the streams that are held, on all
         threads.
         """
-        share = max(self._share(stage, held), 1)
-        first = next(iter(blocks(stage.span, stage.in_time_order, self.shape, share)))
-        return self._bytes(stage, *(s.stop - s.start for s in first))
+        share = max(self._share(segment, segment.held), 1)
+        first = next(iter(blocks(segment.whole, segment.ordered, self.shape, share)))
+        return self._bytes(segment, *(s.stop - s.start for s in first))
 
     @property
     def _item(self) -> int:
         """Bytes of a sample in the blocks of all threads."""
         return self.settings.threads * self.at_once * np.dtype(self.settings.dtype).itemsize
 
-    def _share(self, stage: Stage, held: int) -> int:
+    def _share(self, segment: Segment, held: int) -> int:
         """Samples that a block may hold beside ``held`` bytes of streams: within half of the
         budget, or all that is left.
         """
-        settings, (whole, part) = self.settings, self._streams_in_block(stage)
-        rows, columns = least_block(stage.span, self.shape)
+        settings, (whole, part) = self.settings, self._streams_in_block(segment)
+        rows, columns = least_block(segment.whole, self.shape)
         most = min(settings.memory // 2, settings.threads * self.at_once * AMPLE_BLOCK)
         share = block_share(most // self._item, whole, part)
         left = block_share((settings.memory - held) // self._item, whole, part)
         return share if share >= rows * columns else left
 
-    def _bytes(self, stage: Stage, rows: int, columns: int) -> int:
-        whole, part = self._streams_in_block(stage)
+    def _bytes(self, segment: Segment, rows: int, columns: int) -> int:
+        whole, part = self._streams_in_block(segment)
         piece = min(rows, TILE_DETECTORS) * min(columns, PIECE)
         return self._item * (whole * rows * columns + part * piece)
 
-    def _streams_in_block(self, stage: Stage | None) -> tuple[int, int]:
-        """Numbers of block-sized and of piece-sized arrays that a stage and those before it
-        hold.
+    def _streams_in_block(self, segment: Segment | None) -> tuple[int, int]:
+        """Numbers of block-sized and of piece-sized arrays that are held for a segment and for
+        those that make its streams again.
         """
-        if stage is None:
+        if segment is None:
             return 0, 0
-        first, rest = stage.segment.split()
+        first, rest = segment.split()
         expanded = self.chain.expanded
-        names = set(stage.source.names | stage.wanted).union(
+        names = set(segment.source.names | segment.wanted).union(
             *(expanded(o.requires | o.optional | o.provides) for o in rest)
         )
         every = (
@@ -292,10 +259,10 @@ class Schedule:
             if first
             else set()
         )
-        before = self._streams_in_block(stage.source.stage)
+        before = self._streams_in_block(segment.source.segment)
         whole, part = len(names & self.streams), len(every & self.streams)
         scratch = SCRATCH_STREAMS if rest else 0
-        margins = 2 if stage.segment.halo else 1  # a block with margins is trimmed to a copy
+        margins = 2 if segment.halo else 1  # a block with margins is trimmed to a copy
         whole, part = margins * whole + scratch, part + (SCRATCH_STREAMS if first else 0)
         return before[0] + whole + self._copies(rest), max(before[1], part + self._copies(first))
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..data import Block
 from ..numerics.chunks import TILE_DETECTORS, TILE_SAMPLES
+from ..numerics.smooth import SmoothField
 from ..operator import Operator
 from ..plan.planning import planning_of
+from ..types import AnyFloats
+from .settings import Held
 from .views import View
 
 PIECE = 4 * TILE_SAMPLES
@@ -20,17 +23,76 @@ lost between calls.
 
 
 @dataclass
-class Segment:
-    """Operators that see the same blocks. ``span``: what a block must hold whole (sample: nothing).
+class Source:
+    """Streams that a segment reads.
 
-    ``in_time_order``: blocks hold all detectors and come in order of time
-    (`Operator.in_time_order`).
+    Attributes
+    ----------
+    arrays
+        Those that are held, by name: the detectors of all bands, one band after the other.
+    segment
+        Makes them where none is held.
+    means
+        By number of the band, the mean emission that belongs to its rows.
+    """
+
+    arrays: dict[str, AnyFloats] = field(default_factory=dict)
+    segment: Segment | None = None
+    names: frozenset[str] = frozenset()
+    means: dict[int, dict[str, SmoothField]] = field(default_factory=dict)
+
+
+@dataclass(eq=False)
+class Segment:
+    """Operators that see the same blocks.
+
+    Attributes
+    ----------
+    span
+        What a block must hold whole for them: ``time``, ``detectors``, or ``sample``, nothing.
+    halo
+        Neighbours that they need on each side.
+    in_time_order
+        Blocks hold all detectors and come in order of time (`Planning.in_time_order`).
+    wanted
+        Names of the streams that it passes on.
+    how, why
+        What becomes of the streams that it makes new.
+    held
+        Bytes of streams that are held beside its blocks.
+    swept
+        Numbers of the bands of which it has worked on every sample once: what comes now comes
+        again.
     """
 
     operators: list[Operator]
     span: str = "sample"
     halo: int = 0
     in_time_order: bool = False
+    source: Source = field(default_factory=Source)
+    wanted: frozenset[str] = frozenset()
+    how: Held = "kept"
+    why: str = ""
+    held: int = 0
+    swept: set[int] = field(default_factory=set)
+
+    @property
+    def whole(self) -> str:
+        """Span that its blocks must hold whole, for those that make its streams again too."""
+        before = self.source.segment
+        return before.whole if before and self.span == "sample" else self.span
+
+    @property
+    def ordered(self) -> bool:
+        """True if it, or what makes its streams again, is much cheaper in order of time."""
+        before = self.source.segment
+        return self.in_time_order or (before is not None and before.ordered)
+
+    def has_been_swept(self, views: Sequence[View]) -> None:
+        """Note that every sample of some bands was worked on."""
+        self.swept.update(view.number for view in views)
+        if self.source.segment is not None:
+            self.source.segment.has_been_swept(views)
 
     def split(self) -> tuple[list[Operator], list[Operator]]:
         """The first operators, which take a block in pieces, and those from the first coupled one
@@ -70,13 +132,6 @@ def cut(views: Sequence[View]) -> list[Segment]:
             segments.append(Segment([operator], couples))
         segments[-1].in_time_order |= in_order
     return [s for s in segments if s.operators]
-
-
-def whole_span(span: str, before: str) -> str:
-    """Span that blocks hold whole where a segment of ``span`` reads streams that are made with the
-    span ``before``.
-    """
-    return before if span == "sample" else span
 
 
 def least_block(span: str, shape: tuple[int, int]) -> tuple[int, int]:

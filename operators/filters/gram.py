@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
 from zonda.core.numerics.random import normals, stream_key
-from zonda.core.run.streams import columns
-from zonda.core.stream import Stream
+from zonda.core.stream import Stream, columns
 from zonda.core.types import Floats
 
 from .source_mask import Inside
