@@ -65,10 +65,6 @@ ALLOWED = {
     ("core/cli/entry.py", "import_module"): "names from the table in zonda/commands.py",
     ("core/discovery.py", "import_module"): "names from the metadata of installed packages",
     (
-        "core/storage/packed.py",
-        "import_module",
-    ): "gzip, bz2, lzma, uncompresspy, from tables in the same file",
-    (
         "core/storage/hdf5_files.py",
         "subprocess.run",
     ): "zonda itself, as a child; no shell; the file's path is one argument",

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from ..configuration.time import Instant
 from ..errors import InputError
+from . import packed
 from .files import atomic_path, reading
 
 LARGEST = 1 << 28
-"""Bytes of a table that is read."""
+"""Bytes of the text of a table that is read."""
 MOST_TOLD = 12
 """Mistakes that are told one by one; the others are counted."""
 BRACKETED = re.compile(r"(.*?)\s*(?:\[(.*)\]|\((degs?|degrees?|°|rad|radians?|s|secs?|seconds?)\))")
@@ -248,15 +249,12 @@ def read_table(path: Path, place: str = "", text: str | None = None) -> Table:
 
 
 def read_text(path: Path, place: str) -> str:
-    """The text of a table. Raises InputError for a file that is larger than `LARGEST`, or no
-    text.
+    """The text of a table, unpacked. Raises InputError for one that is larger than `LARGEST`, or
+    no text.
     """
     cure = "give ECSV, or text whose heading names the columns, with their units in brackets"
     with reading(place, "a table", cure):
-        if path.stat().st_size > LARGEST:
-            text = f"is larger than {LARGEST >> 20} MB"
-            raise InputError(text, place=place, cure="give a small table")
-        return path.read_text(encoding="utf-8-sig")
+        return packed.text(path, place, LARGEST)
 
 
 def _cells(lines: Sequence[tuple[int, str]], mark: str) -> tuple[list[int], list[list[str]]]:

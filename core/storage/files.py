@@ -91,28 +91,19 @@ def reading(place: str, kind: str, cure: str) -> Iterator[None]:
         yield
     except ZondaError:
         raise
-    except FileNotFoundError as error:
-        raise InputError(
-            "there is no such file", place=place, cure=_whereabouts(error.filename)
-        ) from error
-    except IsADirectoryError as error:
-        raise InputError(
-            "is a folder, not a file", place=place, cure="give the file's path"
-        ) from error
-    except PermissionError as error:
-        raise InputError("permission denied", place=place, cure="make the file readable") from error
-    except KeyError as error:
-        raise InputError(
-            f"is incomplete or corrupt: {error.args[0] if error.args else ''}",
-            place=place,
-            cure=cure,
-        ) from error
-    except MemoryError as error:
-        raise InputError("needs more memory than there is", place=place, cure=cure) from error
     except Exception as error:
-        raise InputError(
-            f"cannot be read as {kind}: {first_line(error)}", place=place, cure=cure
-        ) from error
+        message = f"cannot be read as {kind}: {first_line(error)}"
+        if isinstance(error, FileNotFoundError):
+            message, cure = "there is no such file", _whereabouts(error.filename)
+        elif isinstance(error, IsADirectoryError):
+            message, cure = "is a folder, not a file", "give the file's path"
+        elif isinstance(error, PermissionError):
+            message, cure = "permission denied", "make the file readable"
+        elif isinstance(error, KeyError):
+            message = f"is incomplete or corrupt: {error.args[0] if error.args else ''}"
+        elif isinstance(error, MemoryError):
+            message = "needs more memory than there is"
+        raise InputError(message, place=place, cure=cure) from error
 
 
 def _whereabouts(path: str | bytes | int | None) -> str:

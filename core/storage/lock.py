@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import inspect
 import os
 import socket
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -80,10 +78,7 @@ def _held(path: Path) -> Iterator[None]:
 
 def _take(path: Path) -> FileLock | None:
     """A lock on a file, None if another holds it."""
-    options: dict[str, Any] = {}
-    if "fallback_to_soft" in inspect.signature(FileLock.__init__).parameters:
-        options["fallback_to_soft"] = False
-    found = FileLock(path, thread_local=False, **options)
+    found = FileLock(path, thread_local=False, fallback_to_soft=False)
     try:
         found.acquire(blocking=False)
     except Timeout:

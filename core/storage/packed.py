@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import lzma
 import os
 import zipfile
 import zlib
-from importlib import import_module
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 from .. import machine
 from ..errors import InputError
@@ -18,8 +19,21 @@ UNPACKED_MAX = 4_000_000_000
 TEXT_MAX = 16_000_000
 """Bytes of a table of numbers as text, unpacked."""
 
-_PACKED = {b"\x1f\x8b\x08": "gzip", b"BZh": "bz2", b"\xfd7z": "lzma", b"PK\x03\x04": "zip"}
-_COMPRESS = b"\x1f\x9d\x90"
+
+def _only_member(path: str | os.PathLike[str], mode: Literal["rb"]) -> IO[bytes]:
+    archive = zipfile.ZipFile(path)
+    if len(members := archive.infolist()) != 1:
+        raise ValueError(f"a zip archive of {len(members)} files, not one")
+    return archive.open(members[0])
+
+
+OPENERS: dict[bytes, Any] = {
+    b"\x1f\x8b\x08": gzip.open,
+    b"BZh": bz2.open,
+    b"\xfd7z": lzma.open,
+    b"PK\x03\x04": _only_member,
+}
+"""By how a file begins: what opens it."""
 
 
 def too_large(message: str, place: str) -> InputError:
@@ -34,10 +48,15 @@ def too_large(message: str, place: str) -> InputError:
     )
 
 
-def is_packed(path: str | os.PathLike[str]) -> bool:
-    """True for a file that begins as gzip, bzip2, xz, zip or compress do."""
+def _opener(path: str | os.PathLike[str]) -> Any:
     with open(path, "rb") as file:
-        return file.read(4).startswith((*_PACKED, _COMPRESS))
+        magic = file.read(4)
+    return next((opener for begin, opener in OPENERS.items() if magic.startswith(begin)), open)
+
+
+def is_packed(path: str | os.PathLike[str]) -> bool:
+    """True for a file that begins as gzip, bzip2, xz or zip do."""
+    return _opener(path) is not open
 
 
 def unpacked(path: str | os.PathLike[str], place: str, most: int) -> bytes:
@@ -46,38 +65,24 @@ def unpacked(path: str | os.PathLike[str], place: str, most: int) -> bytes:
     Raises `InputError` for more than ``most`` bytes or than memory has free, ValueError for content
     that cannot be unpacked, and OSError.
     """
-    with open(path, "rb") as raw:
-        magic = raw.read(4)
-    if magic.startswith(_COMPRESS):
-        raise InputError("is packed with compress", place=place, cure="unpack it: uncompress FILE")
     most = min(most, machine.available_memory())
-    kind = next((kind for start, kind in _PACKED.items() if magic.startswith(start)), "")
+    opener = _opener(path)
     try:
-        with _opened(path, kind) as file:
-            content = file.read(most + 1)
+        with opener(path, "rb") as file:
+            content: bytes = file.read(most + 1)
     except (EOFError, OSError, zlib.error, lzma.LZMAError, zipfile.BadZipFile) as error:
         if isinstance(error, OSError) and error.errno is not None:  # the file, not its content
             raise
         raise ValueError(f"it cannot be unpacked ({error})") from error
     if len(content) > most:
-        what = "unpacks to" if kind else "has"
+        what = "has" if opener is open else "unpacks to"
         raise too_large(f"{what} more than {most / 1e6:g} MB, where reading stops", place)
     return content
 
 
-def _opened(path: str | os.PathLike[str], kind: str) -> IO[bytes]:
-    if kind != "zip":
-        file: Any = import_module(kind or "io").open(path, "rb")
-        return file  # type: ignore[no-any-return]
-    archive = zipfile.ZipFile(path)
-    if len(members := archive.infolist()) != 1:
-        raise ValueError(f"a zip archive of {len(members)} files, not one")
-    return archive.open(members[0])
-
-
-def text(path: Path, place: str) -> str:
+def text(path: Path, place: str, most: int | None = None) -> str:
     """The text of a table, unpacked.
 
-    Raises `InputError` for a text longer than `TEXT_MAX`, ValueError and OSError.
+    Raises `InputError` for a text longer than ``most`` (`TEXT_MAX`), ValueError and OSError.
     """
-    return unpacked(path, place, TEXT_MAX).decode("utf-8-sig")
+    return unpacked(path, place, most or TEXT_MAX).decode("utf-8-sig")

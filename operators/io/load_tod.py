@@ -352,23 +352,18 @@ def state_celestial(label: str, observation: Observation, source: str, rate: flo
 
 def _check_same_scan(first: RecordedBand, part: RecordedBand, place: str) -> None:
     """Raise InputError if a file has the times of another, and other directions, site or rate."""
-    for name in ("boresight_azel", "boresight_radec"):
-        one, other = getattr(first.tod, name), getattr(part.tod, name)
-        if one.shape != other.shape or not np.allclose(one, other, rtol=0, atol=SAME_DIRECTION):
-            text = f"looks elsewhere than {first.path.name}, which has the same times ({name})"
-            raise InputError(
-                text,
-                place=place,
-                cure="load them one after the other",
-            )
-    for what, stated in (("site", _place), ("sample rate", lambda tod: (tod.sample_rate,))):
-        wanted, own = stated(first.tod), stated(part.tod)
-        if not np.allclose(wanted, own, rtol=SAME_NUMBER, atol=SAME_DIRECTION):
-            both = ", not ".join(
-                " ".join(f"{number:.9g}" for number in numbers) for numbers in (own, wanted)
-            )
-            text = f"states another {what} than {first.path.name}, which has the same times: {both}"
-            cure = "correct the one that is wrong, or choose a band"
+    stated: tuple[tuple[str, Any, float], ...] = (
+        ("boresight_azel", lambda tod: tod.boresight_azel, 0.0),
+        ("boresight_radec", lambda tod: tod.boresight_radec, 0.0),
+        ("site", lambda tod: (*np.degrees(tod.site[1:3]), tod.site[3]), SAME_NUMBER),
+        ("sample rate", lambda tod: tod.sample_rate, SAME_NUMBER),
+    )
+    for what, of, tolerance in stated:
+        one, own = np.array(of(first.tod)), np.array(of(part.tod))
+        if one.shape != own.shape or not np.allclose(one, own, tolerance, SAME_DIRECTION):
+            text = f"states another {what} than {first.path.name}, which has the same times"
+            text += f": {own}, not {one}" if own.size <= 3 else ""
+            cure = "correct the one that is wrong, load them one after the other, or choose a band"
             raise InputError(text, place=place, cure=cure)
 
 
@@ -382,11 +377,6 @@ def _tell(label: str, observation: Observation, file: File) -> None:
     observation.tally.count(
         label, "detectors that the file's flags exclude", int(np.count_nonzero(dead)), len(dead)
     )
-
-
-def _place(tod: TimeOrderedData) -> tuple[float, float, float]:
-    """Latitude and longitude [deg], height [m]."""
-    return float(np.degrees(tod.site[1])), float(np.degrees(tod.site[2])), tod.site[3]
 
 
 def _recorded_azimuth(label: str, observation: Observation, tod: TimeOrderedData) -> Floats | None:
