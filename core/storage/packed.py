@@ -27,7 +27,12 @@ def _only_member(path: str | os.PathLike[str], mode: Literal["rb"]) -> IO[bytes]
     return archive.open(members[0])
 
 
+def _compress(path: str | os.PathLike[str], mode: str) -> IO[bytes]:
+    raise ValueError("it is packed with compress; unpack it first")
+
+
 OPENERS: dict[bytes, Any] = {
+    b"\x1f\x9d\x90": _compress,
     b"\x1f\x8b\x08": gzip.open,
     b"BZh": bz2.open,
     b"\xfd7z": lzma.open,

@@ -362,9 +362,7 @@ def test_what_does_not_fit_together(night: Any, tmp_path: Path) -> None:
     tod = load_tod(files[1])
     tod.boresight_radec = tod.boresight_radec[:, [1, 0, 3, 2]]
     elsewhere = save_tod(tmp_path / "elsewhere.h5", tod)
-    with pytest.raises(
-        InputError, match="states another boresight_radec than|states another boresight_azel than"
-    ):
+    with pytest.raises(InputError, match="states another boresight_radec than"):
         load([files[0], elsewhere])
     with pytest.raises(InputError, match="at 220 GHz") as caught:
         load(files, band="220 GHz")
