@@ -7,7 +7,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.configuration.target import Target
-from zonda.operators.sky.footprint import off_the_map
+from zonda.operators.sky.geometry import off_the_map
 from zonda.operators.sky.skymap import SkyMap
 
 
