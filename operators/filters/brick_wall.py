@@ -26,11 +26,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dct, next_fast_len
 
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import TILE_DETECTORS, chunks, empty
 from zonda.core.numerics.smooth import product, spline_basis
-from zonda.core.numerics.transforms import cosine_transform, fast_length
 from zonda.core.types import AnyFloats
 
 SHORTEST_STEP = 8
@@ -170,10 +170,10 @@ class HighpassPlan:
             folded[:, [0, -1]] *= 2
             folded[:, 1] += rest[:, 0]
             folded[:, -2] += rest[:, -1]
-            spectrum = cosine_transform(folded)
+            spectrum = dct(folded, 1)
             spectrum[:, self.cut :] = 0
             spectrum[:, : self.cut] *= self.response
-            low = cosine_transform(spectrum)
+            low = dct(spectrum, 1)
             c[:, 1:-1] += low
             c[:, 0] += low[:, 1]
             c[:, -1] += low[:, -2]
@@ -210,7 +210,7 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     degree = min(degree if cut else min(degree, 1), n - 1)
     if cut:
         degree = min(degree, cut - 1)
-    knots = fast_length(max(16, math.ceil(oversampling * cut / 2)), (2, 3, 5, 7, 11))
+    knots = next_fast_len(max(16, math.ceil(oversampling * cut / 2)))
     if not cut or n < SHORTEST_STEP * knots:
         knots = 0
     if not knots:

@@ -35,9 +35,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 
 from zonda.core.errors import InputError
-from zonda.core.numerics.transforms import fast_length, spline_filter, spline_response
 from zonda.core.types import Floats
 
 PIXELS_PER_FWHM = 4.0
@@ -115,7 +115,7 @@ def convolve(
     ``fwhm`` [rad]; 0: no beam.
 
     ``linear``: for linear interpolation, whose mean response sinc^2(k h) along each axis is divided
-    out (`linear`).
+    out (`sampling`).
     """
     covariance = (SIGMA * fwhm) ** 2 * np.linalg.inv(jacobian.T @ jacobian)  # pixel^2
     width = np.sqrt(np.diag(covariance))  # sigma in pixels along (x, y)
@@ -129,24 +129,22 @@ def convolve(
         int(np.ceil(REACH * width[k] * q)) + SPLINE_MARGIN + q for k, q in ((0, qx), (1, qy))
     )
     rows, columns = values.shape
-    ny, nx = fast_length(rows * qy + 2 * pad_y), fast_length(columns * qx + 2 * pad_x)
+    sides = rows * qy + 2 * pad_y, columns * qx + 2 * pad_x
+    ny, nx = (next_fast_len(n, True) for n in sides)
     grid = np.zeros((ny, nx))
     grid[pad_y : pad_y + rows * qy : qy, pad_x : pad_x + columns * qx : qx] = (values - outside) * (
         qx * qy
     )
     if fwhm > 0:
-        kx, ky = (
-            np.float64(qx) * np.fft.rfftfreq(nx),
-            np.float64(qy) * np.fft.fftfreq(ny)[:, None],
-        )  # cycles per input pixel
+        # cycles per input pixel
+        kx: Floats = qx * np.fft.rfftfreq(nx)
+        ky: Floats = qy * np.fft.fftfreq(ny)[:, None]
         transfer = _transfer(covariance, kx, ky, across < SMOOTH_BELOW)
-        if linear:
-            transfer /= np.sinc(kx / qx) ** 2 * np.sinc(ky / qy) ** 2
-        else:
-            transfer /= spline_response(kx / qx) * spline_response(ky / qy)
+        along = [np.sinc(k) ** 2 if linear else _at_knots(k) for k in (kx / qx, ky / qy)]
+        transfer /= along[0] * along[1]
         grid = np.fft.irfft2(np.fft.rfft2(grid) * transfer, (ny, nx))
     elif not linear:
-        grid = spline_filter(spline_filter(grid, 0), 1)
+        grid = _spline(_spline(grid, 0), 1)
     to_grid = np.array([[qx, 0.0, pad_x], [0.0, qy, pad_y], [0.0, 0.0, 1.0]])
     x, y = (
         (pad_x - qx / 2, pad_x + (columns - 0.5) * qx),
@@ -154,6 +152,22 @@ def convolve(
     )
     coarse = bool((across < SMOOTH_BELOW).any())
     return Convolved.of(grid, to_grid, np.array([*x, *y]), (qx, qy), coarse)
+
+
+def _at_knots(frequency: Floats) -> Floats:
+    """Fourier transform of (1, 4, 1) / 6, the cubic B-spline at its knots; cycles per knot."""
+    return np.asarray((2 + np.cos(2 * np.pi * frequency)) / 3)
+
+
+def _spline(values: Floats, axis: int) -> Floats:
+    """Cubic B-spline coefficients of values (ny, nx) along an axis, mirrored about both ends:
+    (c_(k-1) + 4 c_k + c_(k+1)) / 6 = v_k is a division in the transform.
+    """
+    rows = np.moveaxis(values, axis, -1)
+    n, period = rows.shape[-1], 2 * rows.shape[-1] - 2
+    transform = np.fft.rfft(np.concatenate([rows, rows[..., -2:0:-1]], axis=-1))
+    found = np.fft.irfft(transform / _at_knots(np.arange(n) / period), period)
+    return np.moveaxis(found[..., :n], -1, axis)
 
 
 def convolve_evenly(
@@ -167,7 +181,7 @@ def convolve_evenly(
     of which are at the points and half between them.
     """
     rows, columns = values.shape
-    ny, nx = fast_length(rows), fast_length(columns)
+    ny, nx = next_fast_len(rows, True), next_fast_len(columns, True)
     kx, ky = np.fft.rfftfreq(nx), np.fft.fftfreq(ny)[:, None]  # cycles per step
     transfer = np.exp(-2 * np.pi**2 * variance / step**2 * (kx**2 + ky**2))
     transfer /= np.sinc(kx) ** (2 if linear else 4) * np.sinc(ky) ** (2 if linear else 4)
