@@ -35,8 +35,7 @@ def test_the_planning_of_a_run_imports_no_operator_that_it_lacks():
     others = (
         "sky.cmb sky.pysm sky.point_sources atmosphere.screens optics.leakage"
         " optics.half_wave_plate optics.ground_pickup filters.ground filters.polynomial"
-        " diagnostics.compare_maps diagnostics.compare_streams"
-        " diagnostics.mode_spectrum"
+        " diagnostics.compare_maps diagnostics.mode_spectrum"
     )
     assert "zonda.operators.sky.skymap" in loaded
     assert not {f"zonda.operators.{name}" for name in others.split()} & set(loaded)
