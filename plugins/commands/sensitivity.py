@@ -118,7 +118,9 @@ def sensitivity(
 
     one_blas_thread()
     from zonda.core.storage.files import check_output_folder
-    from zonda.plugins.forecast import report
+    from zonda.plugins.forecast import default_pipeline
+    from zonda.plugins.forecast.lines import duration
+    from zonda.plugins.forecast.result import reached
     from zonda.plugins.forecast.sensitivity import SensitivityOfBands
     from zonda.plugins.forecast.sensitivity import sensitivity as forecast
 
@@ -143,11 +145,11 @@ def sensitivity(
         click.echo(json.dumps(text, indent=2))
         return
     if pipeline is None:
-        click.echo(report.made(asked, settings))
+        click.echo(default_pipeline.shown(asked, settings))
     click.echo(str(found))
     for one, seconds in zip(each, needed, strict=False):
-        click.echo(f"\n{report.reached(one, str(reach), seconds)}")
+        click.echo(f"\n{reached(one, str(reach), seconds)}")
     if len(needed) > 1:
-        click.echo(f"\n{report.reached_by_all(str(reach), max(needed))}")
+        click.echo(f"\n{reach} in all bands after {duration(max(needed))} of integration")
     for path in written:
         click.echo(f"{path}")

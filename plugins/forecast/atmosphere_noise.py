@@ -22,8 +22,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
 
-from zonda.core.types import Floats
+from zonda.core.types import AnyFloats, Floats
 from zonda.operators.atmosphere.planning import Calibrated, calibrated
 from zonda.operators.atmosphere.turbulence.geometry import (
     ScanPlane,
@@ -32,6 +33,7 @@ from zonda.operators.atmosphere.turbulence.geometry import (
     rays,
     scan_planes,
 )
+from zonda.operators.atmosphere.turbulence.nodes import Layer
 
 from .survey import Noise, Survey, Track
 
@@ -106,7 +108,18 @@ class _Scan:
     jacobian: Floats
     density: Floats
     offsets: Floats
-    weight: float
+
+    def waves(self, survey: Survey, model: Layer, waves: Floats) -> tuple[AnyFloats, Floats]:
+        """Filtered cosines and sines (2 n_wave, n) of waves along the boresight's path in a layer,
+        and the phases' slopes (n_wave, 2) over the focal plane.
+        """
+        matrix, start, velocity = self.plane.affine(model.height, model.wind)
+        seconds = self.track.observation.seconds[self.track.index]
+        path = matrix @ self.crossings + start[:, None] + velocity[:, None] * seconds
+        phase = waves @ path
+        series = np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
+        survey.filter(self.track, series)
+        return series, waves @ (matrix @ self.jacobian)
 
 
 def variance(survey: Survey, radius: float, waves: int = WAVES) -> Left:
@@ -119,33 +132,29 @@ def variance(survey: Survey, radius: float, waves: int = WAVES) -> Left:
     found = calibrated(step.model(survey.observations[survey.configured[0]]))
     scans = _scans(survey, radius)
     shares = _expected(survey, found)
-    total, spread = np.zeros(len(scans)), 0.0
-    some = _some(survey)
-    covariance, spectrum = (
-        np.zeros((len(some), len(some))),
-        np.zeros(len(scans[0].track.index) // 2 + 1),
-    )
     share = np.array([s.sum() for s in shares]) * [k not in step.omit for k in range(len(shares))]
+    some = survey.offsets[:: max(1, len(survey.offsets) // DETECTORS)]  # they stand for all
+    total, spread, modes = np.zeros(len(scans)), 0.0, []
     rng = np.random.default_rng(3)
     for k in np.flatnonzero(share > NEGLIGIBLE * share.sum()).tolist():
-        drawn, weights = _drawn(
-            found, k, shares[k], max(8, round(waves * share[k] / share.sum())), rng
-        )
-        weights = weights * (found.kelvin * found.layers[k].amplitude) ** 2
-        each = _of_waves(survey, scans, found, k, drawn) * weights
+        each = max(8, round(waves * share[k] / share.sum()))
+        drawn, weights = _drawn(found, k, shares[k], each, rng)
+        model = found.layers[k]
+        weights = weights * (found.kelvin * model.amplitude) ** 2
+        added = _of_waves(survey, scans, some, model, drawn) * weights
         if step_of_modes(survey):
-            part, power = _covariance(survey, scans[0], found, k, drawn, weights)
-            covariance, spectrum = covariance + part, spectrum + power
-        total += each.sum(axis=1)
-        spread += float(each[-1].size * each[-1].var())
+            modes.append(_covariance(survey, scans[0], some, model, drawn, weights))
+        total += added.sum(axis=1)
+        spread += float(added[-1].size * added[-1].var())
     last = np.arange(len(scans), number)
     total = np.r_[total, total[-1] * survey.seconds[len(scans) - 1] / survey.seconds[last]]
-    error = math.sqrt(spread) / total[-1] if total[-1] > 0 else 0.0
-    return Left(
-        total,
-        error,
-        _mode(survey, covariance, spectrum) if total[-1] > 0 and step_of_modes(survey) else None,
-    )
+    if not total[-1] > 0:
+        return Left(total, 0.0)
+    mode = None
+    if modes:
+        covariance, spectrum = (np.sum(each, axis=0) for each in zip(*modes, strict=True))
+        mode = _mode(survey, covariance, spectrum)
+    return Left(total, math.sqrt(spread) / total[-1], mode)
 
 
 def _scans(survey: Survey, radius: float) -> list[_Scan]:
@@ -156,29 +165,22 @@ def _scans(survey: Survey, radius: float) -> list[_Scan]:
     width = max(survey.sigma, 1.5 * survey.speed / rate / survey.fwhm * survey.sigma)
     density, reach, cell = _footprint(survey.offsets, width)
     angle = 2 * np.pi * (GOLDEN * np.arange(POINTS) % 1)
-    probes = (
-        radius
-        * np.sqrt((np.arange(POINTS) + 0.5) / POINTS)[:, None]
-        * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    )
-    planes = scan_planes(survey.observations[:MOST])
+    distance = radius * np.sqrt((np.arange(POINTS) + 0.5) / POINTS)[:, None]
+    probes = distance * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    little, zero = 1e-4 * np.eye(3)[1:], np.zeros(1)
     found = []
-    for k, plane in enumerate(planes):
+    for k, plane in enumerate(scan_planes(survey.observations[:MOST])):
         track = survey.track(k, rate)
-        offsets = np.einsum(
-            "tij,ptj->pti", np.linalg.inv(track.turn), probes[:, None] - track.centre[None]
-        )
-        seen = _interpolated(density, (offsets + reach) / cell - 0.5)
+        apart = probes[:, None] - track.centre[None]
+        offsets = np.einsum("tij,ptj->pti", np.linalg.inv(track.turn), apart)
+        at = ((offsets + reach) / cell - 0.5).reshape(-1, 2).T
+        seen = map_coordinates(density, at, order=1, mode="constant").reshape(apart.shape[:-1])
         frame = axes(track.observation.boresight_azel[track.index])
-        own = plane.unroll(crossing(rays(frame, np.zeros(1), np.zeros(1))))[:, 0]
-        middle, little = frame[len(frame) // 2 : len(frame) // 2 + 1], 1e-4
-        corners = plane.unroll(
-            crossing(rays(middle, np.array([0.0, little, 0.0]), np.array([0.0, 0.0, little])))
-        )[:, :, 0]
-        jacobian = (corners[:, 1:] - corners[:, :1]) / little
-        found.append(
-            _Scan(track, plane, own, jacobian, seen * track.step, offsets, float(survey.weights[k]))
-        )
+        own = plane.unroll(crossing(rays(frame, zero, zero)))[:, 0]
+        middle = len(frame) // 2
+        corners = plane.unroll(crossing(rays(frame[middle : middle + 1], *little)))[:, :, 0]
+        jacobian = (corners[:, 1:] - corners[:, :1]) / 1e-4
+        found.append(_Scan(track, plane, own, jacobian, seen * track.step, offsets))
     return found
 
 
@@ -194,23 +196,12 @@ def _footprint(offsets: Floats, sigma: float) -> tuple[Floats, float, float]:
     """(grid, reach, cell): detectors per solid angle of the focal plane, smoothed with a Gaussian
     of ``sigma`` [rad].
     """
-    from scipy.ndimage import gaussian_filter
-
     reach = float(np.abs(offsets).max()) + 4 * sigma
     cell = max(sigma / 1.5, reach / 250)
     number = int(2 * reach / cell) + 2
     half = number * cell / 2
-    counts, _, _ = np.histogram2d(
-        offsets[:, 0], offsets[:, 1], bins=number, range=[[-half, half]] * 2
-    )
+    counts, _, _ = np.histogram2d(offsets[:, 0], offsets[:, 1], number, [[-half, half]] * 2)
     return np.asarray(gaussian_filter(counts, sigma / cell)), half, cell
-
-
-def _interpolated(grid: Floats, where: Floats) -> Floats:
-    from scipy.ndimage import map_coordinates
-
-    found = map_coordinates(grid, where.reshape(-1, 2).T, order=1, mode="constant")
-    return np.asarray(found.reshape(where.shape[:-1]))
 
 
 def _spectrum(found: Calibrated, layer: int, number: Floats) -> Floats:
@@ -227,21 +218,13 @@ def _expected(survey: Survey, found: Calibrated) -> list[Floats]:
     shares = []
     for k, layer in enumerate(found.layers):
         speed = np.hypot(*found.velocities[k])
-        across = np.clip(number[:, None] * speed / (2 * np.pi * max(survey.cut, 1e-6)), 1e-9, None)
-        above = np.where(across > 1, 1 - 2 / np.pi * np.arcsin(1 / np.maximum(across, 1)), 0).mean(
-            axis=1
-        )
+        across = np.maximum(np.outer(number, speed) / (2 * np.pi * max(survey.cut, 1e-6)), 1e-9)
+        above = (1 - 2 / np.pi * np.arcsin(1 / np.maximum(across, 1))).mean(axis=1)
         above += ENDS * np.minimum(1, across.max(axis=1)) ** 2
         phase = number * field * layer.distance
-        form = phase**2 / (phase**2 + 4) if survey.common else np.ones_like(number)
-        each = (
-            (found.kelvin * layer.amplitude) ** 2
-            * number**2
-            * _spectrum(found, k, number)
-            / (2 * np.pi)
-            * above
-            * form
-        )
+        form = phase**2 / (phase**2 + 4) if survey.common else 1.0
+        power = (found.kelvin * layer.amplitude) ** 2 * number**2 * _spectrum(found, k, number)
+        each = power / (2 * np.pi) * above * form
         slow, fast = each / (1 + phase**2), each / (1 + phase)
         shares.append(slow / max(slow.sum(), 1e-300) * fast.sum() + fast)
     return shares
@@ -262,66 +245,43 @@ def _drawn(
 
 
 def _of_waves(
-    survey: Survey, scans: list[_Scan], found: Calibrated, layer: int, waves: Floats
+    survey: Survey, scans: list[_Scan], some: Floats, model: Layer, waves: Floats
 ) -> Floats:
     """(n_scan, n_wave) the square in equation (1) over (sum g)^2, after each scan, averaged over
     probes.
     """
-    model = found.layers[layer]
-    squares, amount = np.zeros((POINTS, len(waves))), np.zeros(POINTS)
-    some = _some(survey)
+    squares, amount, n = np.zeros((POINTS, len(waves))), np.zeros(POINTS), len(waves)
     rows = []
-    for scan in scans:
-        matrix, start, velocity = scan.plane.affine(model.height, model.wind)
-        seconds = scan.track.observation.seconds[scan.track.index]
-        path = matrix @ scan.crossings + start[:, None] + velocity[:, None] * seconds
-        phase = waves @ path
-        series = np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
-        survey.filter(scan.track, series)
-        series = series[: len(waves)] + 1j * series[len(waves) :]
-        across = waves @ (matrix @ scan.jacobian)
-        mean = (
-            np.exp(1j * (across @ some.T)).mean(axis=1) if survey.common else np.zeros(len(waves))
-        )
+    for scan, weight in zip(scans, survey.weights, strict=False):
+        both, across = scan.waves(survey, model, waves)
+        series, mean = both[:n] + 1j * both[n:], np.zeros(n)
+        if survey.common:
+            mean = np.exp(1j * (across @ some.T)).mean(axis=1)
         for i, seen in enumerate(scan.density):
             near = np.flatnonzero(seen > 1e-2 * seen.max(initial=0.0))
             if near.size:
                 angle = (across @ scan.offsets[i, near].T).astype(np.float32)
                 value = ((np.exp(1j * angle) - mean[:, None]) * series[:, near]) @ seen[near]
-                squares[i] += scan.weight**2 * abs(value) ** 2
-            amount[i] += scan.weight * seen.sum()
+                squares[i] += weight**2 * abs(value) ** 2
+            amount[i] += weight * seen.sum()
         weighted = np.where(amount > 0, amount, np.inf)
         rows.append((squares / weighted[:, None]).sum(axis=0) / max(amount.sum(), 1e-300))
     return np.array(rows)
 
 
-def _some(survey: Survey) -> Floats:
-    """(n, 2) offsets of some detectors, which stand for all."""
-    return survey.offsets[:: max(1, len(survey.offsets) // DETECTORS)]
-
-
 def _covariance(
-    survey: Survey, scan: _Scan, found: Calibrated, layer: int, waves: Floats, weights: Floats
+    survey: Survey, scan: _Scan, some: Floats, model: Layer, waves: Floats, weights: Floats
 ) -> tuple[Floats, Floats]:
     """(n, n) covariance [K^2] of a layer in the filtered samples of some detectors over a scan;
     spectrum of what they have in common."""
-    model = found.layers[layer]
-    matrix, start, velocity = scan.plane.affine(model.height, model.wind)
-    path = (
-        matrix @ scan.crossings
-        + start[:, None]
-        + velocity[:, None] * scan.track.observation.seconds[scan.track.index]
+    series, across = scan.waves(survey, model, waves)
+    energy, squares = (
+        each.reshape(2, len(waves), -1).sum(axis=0)
+        for each in (np.abs(np.fft.rfft(series)) ** 2, series.astype(np.float64) ** 2)
     )
-    phase = waves @ path
-    series = np.concatenate([np.cos(phase), np.sin(phase)]).astype(np.float32)
-    survey.filter(scan.track, series)
-    energy = (np.abs(np.fft.rfft(series)) ** 2).reshape(2, len(waves), -1).sum(axis=0)
-    power = (series.astype(np.float64) ** 2).reshape(2, len(waves), -1).sum(axis=0).mean(axis=1)
-    seen = np.exp(1j * ((waves @ (matrix @ scan.jacobian)) @ _some(survey).T))
+    seen = np.exp(1j * (across @ some.T))
     shared = weights * abs(seen.mean(axis=1)) ** 2
-    return np.asarray(((seen.conj().T * (power * weights)) @ seen).real), np.asarray(
-        shared @ energy
-    )
+    return ((seen.conj().T * (squares.mean(axis=1) * weights)) @ seen).real, shared @ energy
 
 
 def _mode(survey: Survey, covariance: Floats, spectrum: Floats) -> Mode:
@@ -341,11 +301,8 @@ def _mode(survey: Survey, covariance: Floats, spectrum: Floats) -> Mode:
     f = np.linspace(max(survey.cut, 1 / o.duration), o.sample_rate / 2, 4000)
     own, shared = np.zeros_like(f), 0.0
     for noise in survey.levels[0]:
-        each = (
-            noise.sample**2
-            / (o.sample_rate / 2)
-            * (np.ones_like(f) if noise.spectrum is None else noise.spectrum(f))
-        )
+        power = np.ones_like(f) if noise.spectrum is None else noise.spectrum(f)
+        each = noise.sample**2 / (o.sample_rate / 2) * power
         own += (1 - noise.shared) * each
         shared += noise.shared * float(np.trapezoid(each, f))
     variance = float(np.trapezoid(own, f))
@@ -356,21 +313,15 @@ def _mode(survey: Survey, covariance: Floats, spectrum: Floats) -> Mode:
     u, first = vectors[:, -1], max(float(eigenvalues[-1]), 1e-300) * number / few
     step, second = survey.steps.common, variance * (1 + math.sqrt(number / values)) ** 2
     if step is not None and step.on_undetermined == "mean" and second > first + variance:
-        return Mode(
-            independent, 0.0, Noise(0.0)
-        )  # it is lost in the noise, far from determined: the detectors' mean is removed
+        # it is lost in the noise, far from determined: the detectors' mean is removed
+        return Mode(independent, 0.0, Noise(0.0))
     track = survey.track(0, _rate(survey))
-    frequency = np.maximum(np.fft.rfftfreq(len(track.index), 1 / track.rate), f[0])
-    density = np.interp(frequency, f, own) * o.sample_rate / 2
-    along = float(spectrum @ density / spectrum.sum())
+    grid = np.fft.rfftfreq(len(track.index), 1 / track.rate)
+    frequency = np.maximum(grid, f[0])
+    along = float(spectrum @ (np.interp(frequency, f, own) * o.sample_rate / 2) / spectrum.sum())
     turned = (number - 1) * (first + variance) * along / first**2 / o.n_samples
     stays = turned * float(u @ covariance @ u) / few
-    power = (
-        stays
-        * spectrum
-        / spectrum.sum()
-        / (frequency[1] - np.fft.rfftfreq(len(track.index), 1 / track.rate)[0])
-    )
+    power = stays * spectrum / spectrum.sum() / (frequency[1] - grid[0])
     density = power * o.sample_rate / 2
     return Mode(
         independent, stays, Noise(1.0, lambda at: np.interp(at, frequency, density, right=0.0))

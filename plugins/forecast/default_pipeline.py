@@ -31,7 +31,7 @@ from zonda.core.site import Site
 from zonda.core.weather import Pwv
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from zonda.core.configuration.loaded import PipelineFile
     from zonda.core.types import Floats
@@ -136,6 +136,12 @@ def make(asked: Asked, settings: Sequence[str] = ()) -> PipelineFile:
     from zonda.core.configuration.pipeline_file import parse
 
     return parse(text(asked), name="the pipeline of zonda sensitivity", overrides=settings)
+
+
+def shown(asked: Mapping[str, Any], settings: Sequence[str]) -> str:
+    """The pipeline that is made for an observer's words, and the changes to it."""
+    made = text(Asked(**{k: v for k, v in asked.items() if v is not None}))
+    return "\n".join(["# the pipeline:", made.rstrip(), *(f"# --set {s}" for s in settings), ""])
 
 
 def text(asked: Asked) -> str:

@@ -77,6 +77,10 @@ class Depth:
         """The parts that are forecast."""
         return tuple(name for name in PARTS if not np.isnan(self.variance[name][-1]))
 
+    def followed(self, seconds: float) -> bool:
+        """True for an integration time within that of the scans."""
+        return bool(self.seconds[0] * (1 - 1e-9) <= seconds <= self.seconds[-1] * (1 + 1e-9))
+
     def part(self, name: str, seconds: Floats | float) -> Floats:
         """The rms of a part of the noise, K_RJ, after ``seconds``: as forecast up to the end of the
         scans, then as time^-1/2; before the end of the first scan likewise."""

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
 from zonda.core.numerics.angles import ARCMIN
-from zonda.core.pages import html_table
 from zonda.core.registry import instruments
 
-from . import calculator, default_pipeline, lines
+from . import calculator, default_pipeline
 from .depth import depths_of, factors
-from .result import Forecast
+from .result import Sensitivity, audited, write
 from .survey import survey_of
 
 if TYPE_CHECKING:
@@ -24,46 +23,6 @@ if TYPE_CHECKING:
 RADIUS, BEAMS = 0.5 * ARCMIN, 2.0
 """Radius of the circle that the depth is averaged over where none is given: the central arcmin, or
 this many FWHM if that is more."""
-
-
-class Sensitivity(Forecast):
-    """The depth of a map against time, as text, table and picture."""
-
-    def audited(self, seeds: int, threads: int | None = None) -> Sensitivity:
-        """With the depth that ``seeds`` simulations of the pipeline find, see `audit`."""
-        return next(iter(_audited({self.band: self}, self.file, seeds, threads).values()))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Everything as numbers and text, for JSON."""
-        from .report import as_dict
-
-        return as_dict(self)
-
-    def write(self, folder: str | Path) -> list[Path]:
-        """Write ``sensitivity.ecsv``, ``sensitivity.png`` and ``pipeline.yaml`` to a folder; their
-        paths.
-        """
-        from .report import write
-
-        return write(self, Path(folder))
-
-    def plot(self) -> Any:
-        """Depth against time, split into its parts: a matplotlib figure, not pyplot's."""
-        from .picture import figure
-
-        return figure(self)
-
-    def __str__(self) -> str:
-        from .report import text
-
-        return text(self)
-
-    def _repr_html_(self) -> str:
-        rows = [
-            (lines.duration(t), lines.in_unit(float(self.depth.total(t)), "K_RJ"))
-            for t in self.times.tolist()
-        ]
-        return html_table(f"Depth of {self.file.header.name}, behind the beam", rows)
 
 
 @dataclass(frozen=True)
@@ -87,13 +46,14 @@ class SensitivityOfBands:
 
     def reach(self, rms: str | float) -> float:
         """Integration time [s] after which the maps of all bands are as deep, see
-        `Forecast.reach`.
+        `Sensitivity.reach`.
         """
         return max(found.reach(rms) for found in self.bands.values())
 
     def audited(self, seeds: int, threads: int | None = None) -> SensitivityOfBands:
         """With the depths that ``seeds`` simulations of the pipeline find, see `audit`."""
-        return replace(self, bands=_audited(self.bands, self.file, seeds, threads))
+        found = audited([*self.bands.values()], seeds, threads)
+        return replace(self, bands=dict(zip(self.bands, found, strict=True)))
 
     def as_dict(self) -> dict[str, Any]:
         """Everything as numbers and text, for JSON."""
@@ -103,9 +63,7 @@ class SensitivityOfBands:
         """Write ``sensitivity_BAND.ecsv`` and ``sensitivity_BAND.png`` of all bands, and
         ``pipeline.yaml``; their paths.
         """
-        from .report import write_bands
-
-        return write_bands(self.file, self.bands, Path(folder))
+        return write([*self.bands.values()], Path(folder))
 
     def __str__(self) -> str:
         return "\n\n".join(map(str, self.bands.values()))
@@ -188,19 +146,6 @@ def _forecast(
         band,
         planes,
     )
-
-
-def _audited(
-    found: Mapping[str, Sensitivity], file: PipelineFile, seeds: int, threads: int | None
-) -> dict[str, Sensitivity]:
-    """The forecasts, by band, with what simulations find."""
-    from .audit import Forecasted, audit
-
-    forecasts = {
-        band: Forecasted(one.planes, one.radius, one.survey.fwhm) for band, one in found.items()
-    }
-    audits = audit(file, forecasts, seeds, threads)
-    return {band: replace(one, audit=audits[band]) for band, one in found.items()}
 
 
 def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> PipelineFile:
