@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..assembly.signals import note_signals
 from ..data import Data, Observation
 from ..mapmaker import made_by
-from ..numerics.projection import rotation_matrices
+from ..numerics.projection import boresights, rotation_matrices
 from ..operator import Operator
 from ..output import Output
 from ..pipeline import Pipeline, of_one_band, points
@@ -157,6 +157,13 @@ def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> froz
     return frozenset(found | {"tod", "psd"} if context.readers else found)
 
 
+def speeds(o: Observation, at: NDArray[np.intp]) -> Floats:
+    """Speed of the boresight on the sky from each of these samples to the next, rad/s."""
+    both = np.stack([at, at + 1], axis=1) if o.n_samples > 1 else np.zeros((0, 2), int)
+    ends = boresights(o.boresight_radec[both.ravel()]).reshape(3, -1, 2)
+    return np.asarray(np.linalg.norm(ends[..., 1] - ends[..., 0], axis=0) * o.sample_rate)
+
+
 def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
     """Hits per pixel of side ``pixel`` [rad] and scan speed, from a thinned set of instants and
     detectors.
@@ -167,7 +174,7 @@ def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
     if exact:
         instants = detectors = most
     centre = rotation_matrices(observations[0].boresight_radec[:1])[0]
-    points, speeds = [], [np.zeros(0)]
+    points, seen = [], []
     for o in observations:
         times, rows = evenly(o.n_samples, instants), evenly(o.n_detectors, detectors)
         plane = np.array([-o.focalplane.eta[rows], -o.focalplane.xi[rows], np.ones(len(rows))])
@@ -176,16 +183,15 @@ def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
         # samples that a detector takes to cross a pixel, at these instants
         passage = np.full(len(times), float(o.n_samples))
         if o.n_samples > 1:
-            both = o.boresight_radec[np.stack([times[:-1], times[:-1] + 1], 1).ravel()]
-            ends = rotation_matrices(both)[:, :, 2].reshape(-1, 2, 3)
-            speeds.append(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) * o.sample_rate)
-            speed = np.maximum(np.append(speeds[-1], speeds[-1][-1:]), 1e-12)
+            speed = speeds(o, times[:-1])
+            seen.append(speed)
+            speed = np.maximum(np.append(speed, speed[-1:]), 1e-12)
             passage = np.clip(o.sample_rate * pixel / speed, 1.0, passage)
         each = o.n_samples * o.n_detectors / (len(times) * len(rows))
         looked = 1 / np.maximum(passage * len(times) / o.n_samples, 1.0)
         found = (x / scale, y / scale, each, looked[:, None], (each / passage)[:, None])
         points.append(np.stack(np.broadcast_arrays(*found))[:, z > 0.1])
-    median = float(np.median(np.concatenate(speeds))) if len(speeds) > 1 else 0.0
+    median = float(np.median(np.concatenate(seen))) if seen else 0.0
     where, counted = np.split(np.concatenate(points, axis=1), [2])
     if exact:
         deep = np.quantile(np.unique(_numbers(where, pixel), return_counts=True)[1], DEEP)

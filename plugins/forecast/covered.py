@@ -53,7 +53,8 @@ COVERED: dict[type[Operator], frozenset[str] | None] = {
 }
 """Parameters that may have any value; the others must have their defaults. None: all may."""
 
-CURE = "remove it, or find the noise with `zonda run` and several seeds"
+BY_SEEDS = "find the noise with `zonda run` and several seeds"
+CURE = f"remove it, or {BY_SEEDS}"
 
 
 @dataclass(frozen=True)
@@ -103,14 +104,8 @@ def steps_of(file: PipelineFile) -> Steps:
         if "boresight" not in operator.provides:
             _check(operator, step.key)
         kept.append(operator)
-    maps, highpass, common = (
-        [o for o in kept if isinstance(o, kind)]
-        for kind in (BinMap, HighpassFilter, CommonModeFilter)
-    )
-    _check_numbers(file.header.name, maps, highpass, common)
-    found = Steps.among(kept)
-    _check_together(found, file.header.name)
-    return found
+    _check_together(kept, file.header.name)
+    return Steps.among(kept)
 
 
 def _check(operator: Operator, name: str) -> None:
@@ -124,57 +119,53 @@ def _check(operator: Operator, name: str) -> None:
     for parameter in type(operator).model_fields:
         value = getattr(operator, parameter)
         if parameter not in free | ANY and value != getattr(usual, parameter):
-            text = f"the forecast does not cover {parameter}: {value}"
             raise PipelineError(
-                text,
+                f"the forecast does not cover {parameter}: {value}",
                 place=name,
-                cure=f"leave {parameter} out, or find the noise with `zonda run` and several seeds",
+                cure=f"leave {parameter} out, or {BY_SEEDS}",
             )
 
 
-def _check_numbers(name: str, maps: Sequence[Operator], *filters: Sequence[Operator]) -> None:
-    if len(maps) != 1:
-        text = (
-            "there is no map" if not maps else f"there are {len(maps)} maps, the forecast is of one"
+def _check_together(steps: Sequence[Operator], name: str) -> None:
+    """Refuse what the forecast does not cover of several steps."""
+    maps, highpass, common, air, white, pink = (
+        [o for o in steps if isinstance(o, kind)]
+        for kind in (
+            BinMap,
+            HighpassFilter,
+            CommonModeFilter,
+            AtmosphereLayers,
+            WhiteNoise,
+            PinkNoise,
         )
-        raise PipelineError(text, place=name, cure="have one BinMap")
-    for each in filters:
-        if len(each) > 1:
-            raise PipelineError(
-                f"there are {len(each)} of them, the forecast covers one",
-                place=each[0].label,
-                cure=CURE,
-            )
-
-
-def _check_together(steps: Steps, name: str) -> None:
-    if not any(steps.of(kind) for kind in (WhiteNoise, PinkNoise, AtmosphereLayers)):
-        raise PipelineError(
-            "nothing in this pipeline makes noise", place=name, cure="add WhiteNoise"
-        )
-    order = [o for o in steps.operators if isinstance(o, HighpassFilter | CommonModeFilter)]
-    if len(order) == 2 and isinstance(order[0], CommonModeFilter):
-        raise PipelineError(
+    )
+    one = "have one BinMap"
+    for wrong, text, cure in (
+        (not maps, "there is no map", one),
+        (len(maps) > 1, f"there are {len(maps)} maps, the forecast is of one", one),
+        *(
+            (len(o) > 1, f"{o[0].label}: there are {len(o)} of them, the forecast covers one", CURE)
+            for o in (highpass, common, air)
+            if o
+        ),
+        (not (air or white or pink), "nothing in this pipeline makes noise", "add WhiteNoise"),
+        (
+            highpass and common and steps.index(common[0]) < steps.index(highpass[0]),
             "the forecast covers a CommonModeFilter only after the HighpassFilter",
-            place=name,
-            cure="exchange the two",
-        )
-    if steps.of(AtmosphereLayers) and steps.highpass is None:
-        text = (
+            "exchange the two",
+        ),
+        (
+            air and not highpass,
             "without a HighpassFilter the mean emission of the atmosphere, tens of kelvin, is in"
-            " the map"
-        )
-        raise PipelineError(
-            text, place=name, cure="add HighpassFilter, or leave AtmosphereLayers out"
-        )
-    if len(steps.of(AtmosphereLayers)) > 1:
-        raise PipelineError("the forecast covers one AtmosphereLayers", place=name, cure=CURE)
-    shared = any(o.shared > 0 for o in steps.of(PinkNoise))
-    if shared and steps.common is None:
-        text = (
+            " the map",
+            "add HighpassFilter, or leave AtmosphereLayers out",
+        ),
+        (
+            not common and any(o.shared > 0 for o in pink if isinstance(o, PinkNoise)),
             "noise that detectors share adds up coherently without a CommonModeFilter, which the"
-            " forecast does not cover"
-        )
-        raise PipelineError(
-            text, place=name, cure="add CommonModeFilter, or set PinkNoise.shared to 0"
-        )
+            " forecast does not cover",
+            "add CommonModeFilter, or set PinkNoise.shared to 0",
+        ),
+    ):
+        if wrong:
+            raise PipelineError(text, place=name, cure=cure)

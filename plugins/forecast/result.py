@@ -392,10 +392,10 @@ def figure(found: Sensitivity) -> Any:
             ax.plot(hours, values, lw=1.4, label=label, **style)
     total = depth.total(t) * factor
     inside = t <= end * (1 + 1e-9)
-    style: dict[str, Any] = {"color": "black", "lw": 2}
-    ax.plot(hours[inside], total[inside], label="together", **style)
+    black: dict[str, Any] = {"color": "black", "lw": 2}
+    ax.plot(hours[inside], total[inside], label="together", **black)
     later = "together, as time$^{-1/2}$"
-    ax.plot(hours[~inside], total[~inside], ls="--", label=later, **style)
+    ax.plot(hours[~inside], total[~inside], ls="--", label=later, **black)
     for line, (plane, other) in zip(("-.", ":"), found.polarization.items(), strict=False):
         values = other.total(t) * factor
         ax.plot(hours, values, color="black", lw=1.2, ls=line, label=f"{plane}, together")

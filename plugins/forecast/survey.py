@@ -20,11 +20,12 @@ from zonda.core.assembly.signals import note_signals
 from zonda.core.errors import PipelineError
 from zonda.core.focalplane import Focalplane
 from zonda.core.maps.beams import expected_fwhm
-from zonda.core.numerics.angles import FWHM_PER_SIGMA
-from zonda.core.numerics.projection import boresights, frame_rotation, homographies
-from zonda.core.observation import Observation
+from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
+from zonda.core.numerics.projection import frame_rotation, homographies
+from zonda.core.observation import Observation, WhiteLevel
 from zonda.core.pipeline import Pipeline
-from zonda.core.plan.pointing import observed
+from zonda.core.plan.bounds import evenly
+from zonda.core.plan.pointing import observed, speeds
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
@@ -36,7 +37,7 @@ from zonda.operators.noise.planning import calibrated as calibrated_level
 from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.half_wave_plate import HalfWavePlate
 
-from .covered import Steps, steps_of
+from .covered import BY_SEEDS, Steps, steps_of
 
 if TYPE_CHECKING:
     from zonda.core.configuration.loaded import PipelineFile
@@ -232,17 +233,9 @@ class Survey:
     @cached_property
     def speed(self) -> float:
         """Median speed of the boresight on the sky, rad/s."""
-        speeds = []
-        for o in self.observations[:3]:
-            at = np.unique(
-                np.linspace(0, o.n_samples - 2, min(2000, max(o.n_samples - 1, 1))).astype(int)
-            )
-            if o.n_samples > 1:
-                ends = boresights(o.boresight_radec[np.stack([at, at + 1], 1).ravel()]).reshape(
-                    3, -1, 2
-                )
-                speeds.append(np.linalg.norm(ends[..., 1] - ends[..., 0], axis=0) * o.sample_rate)
-        return float(np.median(np.concatenate(speeds))) if speeds else 0.0
+        each = [speeds(o, evenly(o.n_samples - 1, 2000)) for o in self.observations[:3]]
+        found = np.concatenate(each)
+        return float(np.median(found)) if found.size else 0.0
 
     @property
     def rate(self) -> float:
@@ -286,24 +279,23 @@ class Survey:
         """The map's pixels. Raises PipelineError where it is not a TAN map."""
         grid = self.steps.binning.grid
         if not isinstance(grid, TangentGrid):
-            text, cure = (
+            raise PipelineError(
                 "the forecast is made for TAN maps",
-                "leave nside and projection of BinMap out",
+                place="zonda sensitivity",
+                cure="leave nside and projection of BinMap out",
             )
-            raise PipelineError(text, place="zonda sensitivity", cure=cure)
         return grid
 
     def check_radius(self, radius: float) -> None:
         """Raise PipelineError where a circle [rad] about the map's centre is not on the map."""
-        grid = self.grid
-        half = min(grid.shape) * grid.pixel / 2
+        half = min(self.grid.shape) * self.grid.pixel / 2
         if radius > half:
-            wide, reach = (math.degrees(angle) * 60 for angle in (radius, half))
-            text = (
-                f"a circle of radius {wide:.3g} arcmin is not on the map, which reaches {reach:.3g}"
-                " arcmin from its centre"
+            raise PipelineError(
+                f"a circle of radius {radius / ARCMIN:.3g} arcmin is not on the map, which reaches"
+                f" {half / ARCMIN:.3g} arcmin from its centre",
+                place="zonda sensitivity",
+                cure="choose a smaller --radius",
             )
-            raise PipelineError(text, place="zonda sensitivity", cure="choose a smaller --radius")
 
 
 def survey_of(file: PipelineFile, band: str = "") -> Survey:
@@ -321,24 +313,23 @@ def survey_of(file: PipelineFile, band: str = "") -> Survey:
     if observations and steps.binning.stokes == "IQU":
         check_polarized(observations[0], steps.binning.label)
     note_signals(observations, pipeline.signals.components, pipeline.signals.formed)
-    chosen_scans = sorted(
-        {
-            round(k)
-            for k in np.linspace(0, len(observations) - 1, min(CONFIGURED, len(observations)))
-        }
-    )
-    for k in chosen_scans:
+    looked = sparse(len(observations), CONFIGURED)
+    for k in looked:
         for operator in pipeline.operators:
             operator.configure(observations[k])
-    levels = {k: _noises(steps, observations[k]) for k in chosen_scans}
-    distance = np.abs(np.subtract.outer(np.arange(len(observations)), chosen_scans))
-    nearest = [chosen_scans[k] for k in distance.argmin(axis=1)]
+    levels = {k: _noises(steps, observations[k]) for k in looked}
+    nearest = [min(looked, key=lambda n: abs(n - k)) for k in range(len(observations))]
     _check_scans(observations, header.name)
     weights = np.ones(len(observations))
     if steps.binning.weights == "inverse_variance":
         nets = np.array([_rms(observations[k].expected_net()) for k in nearest])
         weights = np.where(nets > 0, (nets[0] / np.where(nets > 0, nets, 1.0)) ** 2, 1.0)
     return Survey(data.scene, steps, observations, [levels[k] for k in nearest], weights, nearest)
+
+
+def sparse(number: int, most: int) -> list[int]:
+    """At most so many of the numbers below ``number``, evenly spaced."""
+    return sorted({round(k) for k in np.linspace(0, number - 1, min(most, number)).tolist()})
 
 
 def polarization_angles(survey: Survey, observation: Observation, index: Any) -> PolarizationAngles:
@@ -361,37 +352,25 @@ def _check_scans(observations: Sequence[Observation], name: str) -> None:
         )
     first = observations[0].focalplane.names
     for o in observations:
-        if o.focalplane.names != first:
-            raise PipelineError(
-                "scans with other detectors", place=o.name, cure="forecast them one by one"
-            )
+        text, cure = "", BY_SEEDS
         unused = 1 - o.good_samples.mean() * o.good_detectors.mean()
         if unused > FLAGGED:
-            text = (
-                f"{100 * unused:.3g} % of the samples are flagged, which the forecast does not"
-                " cover"
-            )
-            raise PipelineError(
-                text, place=o.name, cure="find the noise with `zonda run` and several seeds"
-            )
+            share = f"{100 * unused:.3g} % of the samples"
+            text = f"{share} are flagged, which the forecast does not cover"
+        if o.focalplane.names != first:
+            text, cure = "scans with other detectors", "forecast them one by one"
+        if text:
+            raise PipelineError(text, place=o.name, cure=cure)
 
 
 def _noises(steps: Steps, observation: Observation) -> tuple[Noise, ...]:
     """The noises of a configured scan's calibrated samples."""
     found = []
     for white in steps.of(WhiteNoise):
-        found.append(
-            Noise(
-                _even(
-                    calibrated_level(observation.noise_levels[white.label], observation),
-                    white.label,
-                )
-            )
-        )
+        found.append(Noise(_even(observation, observation.noise_levels[white.label], white.label)))
     for pink in steps.of(PinkNoise):
-        spectrum = PinkSpectrum.of(pink, observation)
-        if spectrum is not None:
-            level = _even(calibrated_level(level_of(pink, observation), observation), pink.label)
+        if spectrum := PinkSpectrum.of(pink, observation):
+            level = _even(observation, level_of(pink, observation), pink.label)
             found.append(Noise(level, _response(spectrum, pink.poles), pink.shared))
     return tuple(found)
 
@@ -405,15 +384,15 @@ def _response(spectrum: PinkSpectrum, poles: int) -> Callable[[Floats], Floats]:
     return lambda f: np.exp(np.interp(np.log(np.maximum(f, frequency[0])), at, table))
 
 
-def _even(samples: Floats, place: str) -> float:
-    """The rms of what all detectors have alike."""
+def _even(observation: Observation, noise: WhiteLevel, place: str) -> float:
+    """The rms of a calibrated sample's white noise, which all detectors have alike."""
+    samples = calibrated_level(noise, observation)
     level = _rms(samples)
     if level > 0 and float(np.std(samples)) > UNEVEN * level:
-        text = "the detectors' NETs differ, which the forecast does not cover"
         raise PipelineError(
-            text,
+            "the detectors' NETs differ, which the forecast does not cover",
             place=place,
-            cure="leave the scatter out, or find the noise with `zonda run` and several seeds",
+            cure=f"leave the scatter out, or {BY_SEEDS}",
         )
     return level
 
@@ -424,8 +403,5 @@ def _rms(values: Floats) -> float:
 
 def elevations(survey: Survey) -> tuple[float, float]:
     """Lowest and highest elevation of the boresight, rad."""
-    ends = [
-        (float(e.min()), float(e.max()))
-        for e in (o.elevation for o in (survey.observations[0], survey.observations[-1]))
-    ]
-    return min(np.array(ends)[:, 0]), max(np.array(ends)[:, 1])
+    ends = [survey.observations[k].elevation for k in (0, -1)]
+    return min(float(e.min()) for e in ends), max(float(e.max()) for e in ends)
