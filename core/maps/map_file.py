@@ -4,7 +4,7 @@ from.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -30,6 +30,10 @@ LONGEST = 66
 """Letters of a text in a card."""
 _SCALES = {"K_RJ": "Rayleigh-Jeans brightness", "K_CMB": "temperature of the CMB"}
 _COORDSYS = {"icrs": "C", "galactic": "G", "barycentricmeanecliptic": "E"}
+_NOISES = {"noise": "I", "cov_ii": "I", "cov_qq": "Q", "cov_uu": "U"}
+"""Stokes parameter whose noise a row holds."""
+
+Cards = list[tuple[Any, ...]]
 
 
 @dataclass(frozen=True)
@@ -38,34 +42,76 @@ class Provenance:
 
     Attributes
     ----------
-    cards
+    cards, history
         For the first header: who made it, with what; the resolved YAML as HISTORY.
     tables
         The resolved YAML (a row per line), the plan and the tally: binary tables of text, as they
         stand at a file's end.
     """
 
-    cards: Header
-    tables: bytes
+    cards: Cards
+    history: list[str] = field(default_factory=list)
+    tables: bytes = b""
 
     @classmethod
     def of_a_map(cls, product: MapArrays) -> Provenance:
         """Provenance of a map apart from its run."""
         from zonda import __version__
 
-        cards = header_of(
-            [
-                ("ORIGIN", "zonda", "simulated, not observed"),
-                ("CREATOR", f"zonda {__version__}", "software"),
-                ("NSCANS", len(product.scans), "scans"),
-            ]
-        )
-        return cls(cards, b"")
+        return cls([*_origin(__version__), ("NSCANS", len(product.scans), "scans")])
 
     @classmethod
     def of(cls, data: Data) -> Provenance:
-        """Provenance of a run that has ended."""
-        return cls(_origin(data), b"".join(_tables(data)))
+        """Provenance of a run that has ended: cards of its origin; the command and the resolved
+        YAML as history.
+        """
+        import zonda
+
+        scene, provenance = data.scene, data.provenance
+        version = provenance.get("versions", {}).get("zonda", zonda.__version__)
+        start = str(min((o.start for o in data.scans), default=scene.time))
+        cards = [
+            *_origin(version),
+            ("PIPELINE", ascii_text(str(provenance.get("name", ""))), "pipeline"),
+            ("SEED", int(scene.seed), "root of all random numbers"),
+            ("DATE-OBS", start, "start of the first scan, UTC"),
+            ("NSCANS", len(data.scans), "scans"),
+        ]
+        history: list[str] = []
+        camera = scene.instrument
+        origins = [o.origin for o in data.scans] or [
+            (camera.telescope.name, camera.name, scene.site.name)
+        ]
+        for key, every in zip(
+            ("TELESCOP", "INSTRUME", "SITE"), zip(*origins, strict=True), strict=True
+        ):
+            names = sorted({ascii_text(name) for name in every})
+            text = ", ".join(names)
+            if len(text) > LONGEST:
+                history += [f"{key}: {name}" for name in names]
+                text = f"{len(names)} of them, see HISTORY"
+            cards.append((key, text))
+        yaml = str(provenance.get("resolved_yaml", ""))
+        history += map(ascii_text, filter(None, (str(provenance.get("command", "")),)))
+        history += map(ascii_text, yaml.splitlines())
+        texts: list[tuple[str, tuple[str, ...], Any]] = [
+            ("RESOLVED_YAML", ("LINE",), [(line,) for line in yaml.splitlines()]),
+            ("PLAN", ("EFFECT", "DECISION", "BOUND", "FORMULA"), provenance.get("plan")),
+            ("TALLY", ("STEP", "WHAT", "VALUE"), list(data.tally)),
+        ]
+        written = (
+            _table(name, dict(zip(keys, map(_texts, zip(*rows, strict=True)), strict=False)))
+            for name, keys, rows in texts
+            if rows
+        )
+        return cls(cards, history, b"".join(written))
+
+
+def _origin(version: str) -> Cards:
+    return [
+        ("ORIGIN", "zonda", "simulated, not observed"),
+        ("CREATOR", f"zonda {version}", "software"),
+    ]
 
 
 @dataclass(frozen=True)
@@ -103,72 +149,64 @@ class MapFile:
         return cls(name, product, product.planes, noise=noise or {})
 
     @property
-    def rows(self) -> Iterator[tuple[str, str, Plane, Any]]:
+    def rows(self) -> list[tuple[str, str, Plane, Any]]:
         """Name, meaning, plane and values of each row of the planes."""
-        for plane in self.planes.values():
-            for name, meaning, values in plane.rows:
-                yield name, meaning, plane, values
+        return [
+            (name, meaning, plane, values)
+            for plane in self.planes.values()
+            for name, meaning, values in plane.rows
+        ]
 
     @property
-    def beam(self) -> Header:
+    def beam(self) -> Cards:
         """The resolution of the map."""
         product = self.product
-        degrees = float(np.degrees(product.resolution))
-        what = (
-            "[deg] FWHM: beam, smoothing in quadrature"
-            if product.smoothed_by
-            else "[deg] FWHM of the beam"
+        narrow, wide, degrees = (
+            float(np.degrees(fwhm)) for fwhm in (*product.beams, product.resolution)
         )
-        cards = [("BMAJ", degrees, what), ("BMIN", degrees, what), ("BPA", 0.0, "[deg]")]
-        narrow, wide = (float(np.degrees(fwhm)) for fwhm in product.beams)
+        if not degrees:
+            return []
+        more = ": beam, smoothing in quadrature" if product.smoothed_by else " of the beam"
+        cards: Cards = [(key, degrees, f"[deg] FWHM{more}") for key in ("BMAJ", "BMIN")]
+        cards.append(("BPA", 0.0, "[deg]"))
         if narrow < wide:
             cards += [
                 ("BEAMLOW", narrow, "[deg] narrowest FWHM of the beams in BMAJ"),
                 ("BEAMHIGH", wide, "[deg] widest; BMAJ: peak x beam is the flux"),
             ]
-        return header_of(cards if degrees else ())
+        return cards
 
-    @property
-    def convention(self) -> Header:
-        """In which Q and U are, where there are some."""
-        stated = ("POLCCONV", CONVENTION, "Q, U: angles from south to east")
-        return header_of([stated] if any(name in "qu" for name, *_ in self.rows) else ())
-
-    @property
-    def halves(self) -> Header:
-        """Card of the halves that were subtracted in `half_difference`."""
-        return header_of(
-            [("JACKKNIF", ascii_text(self.product.difference), "halves that were subtracted")]
-        )
-
-    def noise_cards(self, plane: str = "") -> Header:
-        """Cards on the origin of the noise, for the header of a ``plane`` of it; of a table, for
-        its columns together.
+    def about(self, rows: Sequence[tuple[str, str, Plane, Any]], one: bool) -> Cards:
+        """Cards about rows in one header: temperature scale, beam, halves, origin of the noise, and
+        in which convention Q and U of the file are. ``one``: the header is that of one row.
         """
-        cards: dict[str, tuple[Any, ...]] = {}
-        for key, (factor, words) in self.noise.items():
-            if (
-                plane
-                and plane not in {"I": ("noise", "cov_ii"), "Q": ("cov_qq",), "U": ("cov_uu",)}[key]
-            ):
-                continue
+        cards: Cards = []
+        if any(plane.scale > 0 for _, _, plane, _ in rows):
+            if scale := scale_of(self.product.unit)[1]:
+                cards.append(("TEMPSCAL", scale, f"temperature scale: {_SCALES[scale]}"))
+            cards += self.beam
+        names = [name for name, *_ in rows]
+        if any(name.startswith("half_difference") for name in names):
+            halves = ascii_text(self.product.difference)
+            cards.append(("JACKKNIF", halves, "halves that were subtracted"))
+        for key in filter(self.noise.__contains__, (_NOISES.get(name) for name in names)):
+            factor, words = self.noise[str(key)]
             if factor is not None:
-                name = "NOISEFAC" if plane else f"NOISFAC{key}"
-                cards[name] = factor, "measured noise / this white noise"
-            if plane or key == "I":
-                cards["NOISEOF"] = ascii_text(words), "what the noise was measured in"
-        return header_of((key, *card) for key, card in cards.items())
+                stated = "NOISEFAC" if one else f"NOISFAC{key}"
+                cards.append((stated, factor, "measured noise / this white noise"))
+            if one or key == "I":
+                cards.append(("NOISEOF", ascii_text(words), "what the noise was measured in"))
+        if any(name in "qu" for name, *_ in self.rows):
+            cards.append(("POLCCONV", CONVENTION, "Q, U: angles from south to east"))
+        return cards
 
     def first(self, about: Provenance) -> Header:
         """Cards of the first header: the name, its origin and its band."""
-        found = joined(
-            header_of([("PRODUCT", ascii_text(self.name), "product of the pipeline")]), about.cards
-        )
+        cards = [("PRODUCT", ascii_text(self.name), "product of the pipeline"), *about.cards]
         if (band := self.product.band) is not None:
-            named = ("BAND", ascii_text(band.name), "name of the band")
-            centre = ("RESTFRQ", float(f"{band.centre:.12g}"), "[Hz] centre of the band")
-            found = joined(found, header_of([centre, named]))
-        return found
+            cards.append(("RESTFRQ", float(f"{band.centre:.12g}"), "[Hz] centre of the band"))
+            cards.append(("BAND", ascii_text(band.name), "name of the band"))
+        return header_of(cards, about.history)
 
     def write(self, path: Path, about: Provenance) -> Path:
         """Write it atomically; its path. Raises `OutputError` where it cannot be written."""
@@ -178,9 +216,7 @@ class MapFile:
             with open(temporary, "ab") as file:
                 if self.product.header is not None:
                     self._write_images(file, about)
-                for table in self._scan_tables():
-                    file.write(table)
-                file.write(about.tables)
+                file.write(b"".join(self._scan_tables()) + about.tables)
         return path
 
     def _scan_tables(self) -> Iterator[bytes]:
@@ -192,60 +228,45 @@ class MapFile:
             if self.product.pixels is not None:
                 columns["PIXEL"] = self.product.pixels[columns["PIXEL"]]
             yield _table("SCAN_HITS", columns)
-            yield _text_table("SCANS", {"NAME": found.scans})
+            yield _table("SCANS", {"NAME": _texts(found.scans)})
 
     def _write_images(self, file: IO[bytes], about: Provenance) -> None:
         world = exact_header(self.product.wcs)
-        unit, scale = scale_of(self.product.unit)
-        for k, (name, meaning, plane, values) in enumerate(self.rows):
-            cards = [("EXTNAME", name.upper(), "extension name")]
+        unit, _ = scale_of(self.product.unit)
+        for k, row in enumerate(self.rows):
+            name, meaning, plane, values = row
+            cards: Cards = [("EXTNAME", name.upper(), "extension name")]
             if own := plane.fits_unit(unit):
                 cards.append(("BUNIT", own, meaning))
-            if plane.scale > 0 and scale:
-                cards.append(("TEMPSCAL", scale, f"temperature scale: {_SCALES[scale]}"))
-            parts = [world, header_of(cards)]
-            if plane.scale > 0:
-                parts.append(self.beam)
-            if name.startswith("half_difference"):
-                parts.append(self.halves)
-            if name == "noise" or name.startswith("cov_"):
-                parts.append(self.noise_cards(name))
-            parts.append(self.convention)
+            header = joined(world, header_of(cards + self.about([row], one=True)))
             if k == 0:
-                parts += [self.first(about), self.cards]
-            write_image(file, joined(*parts), values, _type(values))
+                header = joined(header, self.first(about), self.cards)
+            write_image(file, header, values, _type(values))
 
     def _write_table(self, path: Path, about: Provenance) -> None:
         """A partial map, pixel numbers explicit; the cards are those of Gorski et al. (2005) that
         healpy reads.
         """
-        product = self.product
+        product, (unit, _) = self.product, scale_of(self.product.unit)
         columns = [fits.Column("PIXEL", "K", array=product.pixels)]
-        unit, scale = scale_of(product.unit)
         for name, _, plane, row in self.rows:
             values: NDArray[Any] = np.asarray(row, _type(row))
-            code = "D" if values.dtype.kind == "f" else "K" if values.dtype.itemsize == 8 else "J"
-            columns.append(
-                fits.Column(name.upper(), code, unit=plane.fits_unit(unit) or None, array=values)
-            )
+            code = {"f8": "D", "i8": "K", "i4": "J"}[values.dtype.str[1:]]
+            own = plane.fits_unit(unit) or None
+            columns.append(fits.Column(name.upper(), code, unit=own, array=values))
         table = fits.BinTableHDU.from_columns(columns, name="MAP")
-        cards = [
+        cards: Cards = [
             ("PIXTYPE", "HEALPIX", "HEALPix pixelization"),
             ("ORDERING", "NESTED" if product.nest else "RING", "pixel ordering"),
             ("COORDSYS", _COORDSYS[product.frame], f"{product.frame}"),
             ("NSIDE", product.nside, "resolution"),
             ("INDXSCHM", "EXPLICIT", "pixel numbers are in the column PIXEL"),
             ("OBJECT", "PARTIAL", "not all of the sky"),
+            *self.about(self.rows, one=False),
         ]
-        if scale:
-            cards.append(("TEMPSCAL", scale, f"temperature scale: {_SCALES[scale]}"))
-        parts = [header_of(cards), self.beam]
-        if "half_difference" in self.planes:
-            parts.append(self.halves)
-        parts += [self.convention, self.noise_cards(), self.first(about), self.cards]
         primary = fits.PrimaryHDU()
         primary.header.extend(self.first(about))
-        table.header.extend(joined(*parts))
+        table.header.extend(joined(header_of(cards), self.first(about), self.cards))
         fits.HDUList([primary, table]).writeto(path, output_verify="exception")
 
 
@@ -274,45 +295,6 @@ def _type(values: NDArray[Any]) -> np.dtype[Any]:
     return np.dtype(np.float64)
 
 
-def _origin(data: Data) -> Header:
-    """Cards of the origin of the data; the command and the resolved YAML as history."""
-    import zonda
-
-    scene, provenance = data.scene, data.provenance
-    version = provenance.get("versions", {}).get("zonda", zonda.__version__)
-    start = str(min((o.start for o in data.scans), default=scene.time))
-    cards: list[tuple[Any, ...]] = [
-        ("ORIGIN", "zonda", "simulated, not observed"),
-        ("CREATOR", f"zonda {version}", "software"),
-        ("PIPELINE", ascii_text(str(provenance.get("name", ""))), "pipeline"),
-        ("SEED", int(scene.seed), "root of all random numbers"),
-        ("DATE-OBS", start, "start of the first scan, UTC"),
-        ("NSCANS", len(data.scans), "scans"),
-    ]
-    history: list[str] = []
-    names = (scene.instrument.telescope.name, scene.instrument.name, scene.site.name)
-    found = (
-        zip(*(o.origin for o in data.scans), strict=True)
-        if data.scans
-        else ((name,) for name in names)
-    )
-    for key, every in zip(("TELESCOP", "INSTRUME", "SITE"), found, strict=True):
-        name, more = _names(every)
-        cards.append((key, name))
-        history += [f"{key}: {name}" for name in more]
-    if command := str(provenance.get("command", "")):
-        history.append(ascii_text(command))
-    history += map(ascii_text, str(provenance.get("resolved_yaml", "")).splitlines())
-    return header_of(cards, history)
-
-
-def _names(every: Iterable[str]) -> tuple[str, list[str]]:
-    """The different names, and those that HISTORY tells where a card does not hold them."""
-    names = sorted({ascii_text(name) for name in every})
-    text = ", ".join(names)
-    return (text, []) if len(text) <= LONGEST else (f"{len(names)} of them, see HISTORY", names)
-
-
 def ascii_text(text: str) -> str:
     """FITS holds printable ASCII only: anything else becomes a Python escape (``\\xe9``)."""
     if text.isascii() and text.isprintable():
@@ -320,27 +302,8 @@ def ascii_text(text: str) -> str:
     return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in text)
 
 
-def _tables(data: Data) -> Iterable[bytes]:
-    if text := str(data.provenance.get("resolved_yaml", "")):
-        yield _text_table("RESOLVED_YAML", {"LINE": text.splitlines()})
-    if plan := data.provenance.get("plan"):
-        names = ("EFFECT", "DECISION", "BOUND", "FORMULA")
-        yield _text_table("PLAN", {n: [str(r[k]) for r in plan] for k, n in enumerate(names)})
-    if rows := list(data.tally):
-        who, what, value = ([str(r[k]) for r in rows] for k in range(3))
-        yield _text_table("TALLY", {"STEP": who, "WHAT": what, "VALUE": value})
-
-
-def _text_table(name: str, columns: dict[str, list[str]]) -> bytes:
-    plain = {title: [ascii_text(t) for t in texts] for title, texts in columns.items()}
-    widths = {title: max([1, *map(len, texts)]) for title, texts in plain.items()}
-    return _table(
-        name,
-        {
-            title: np.array([t.encode("ascii") for t in plain[title]], f"S{widths[title]}")
-            for title in plain
-        },
-    )
+def _texts(column: Sequence[Any]) -> NDArray[np.bytes_]:
+    return np.array([ascii_text(str(text)) for text in column] or [""], "S")[: len(column)]
 
 
 def _table(name: str, columns: Mapping[str, NDArray[Any]]) -> bytes:
