@@ -80,9 +80,10 @@ class BinMap(MapParameters):
         if self.stokes == "IQU":
             check_polarized(data.observations[0], self.label)
             warn_before(data.observations, self.frame, self.condition_limit, self.label)
-        if self.nside is None:
-            MapLayout(self).check_size(data.observations)
-        return [] if self.width is None else [MapLayout(self).outside(data.observations)]
+        if self.nside is not None:
+            return []
+        outside = MapLayout(self).outside(data.observations)
+        return [] if self.width is None else [outside]
 
     def observe(self, data: Data) -> None:
         """Lay out one grid for all observations."""

@@ -35,7 +35,7 @@ from zonda.core.kernels import kernel
 from zonda.core.maps.planes import Plane
 from zonda.core.types import Floats
 
-from .image_grid import rays
+from .grid import PixelGrid
 from .pixels import Cells, Looking, tiles
 from .sums import WEIGHT, Sums
 
@@ -70,7 +70,7 @@ class Directions:
     @classmethod
     def of(cls, looking: Looking, good: NDArray[np.bool_]) -> Directions:
         """``good`` (n_samp,): which samples count."""
-        towards = rays(looking.observation, looking.grid.frame)
+        towards = PixelGrid.pointing(looking.grid, looking.observation)
         motion = np.gradient(towards, axis=1) if towards.shape[1] > 1 else np.zeros_like(towards)
         return cls(looking, towards, motion, good.astype(np.uint8))
 

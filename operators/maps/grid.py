@@ -1,4 +1,4 @@
-"""Pixel grids: tangent-plane (TAN) images and HEALPix (CAR: `plate_carree`), and which of their
+"""Pixel grids: tangent-plane (TAN) and plate carrée (CAR) images and HEALPix, and which of their
 pixels a sample falls in.
 """
 
@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,12 @@ from zonda.core.numerics.projection import (
     frame_rotation,
     homographies,
     pixel_matrix,
+    ray_coefficients,
 )
 from zonda.core.types import Floats
 
 from .healpix import Lookup, healpix_pixels, lookup
-from .image_grid import ImageGrid, rays
-from .plate_carree import PlateCarreeGrid
+from .plate_carree import plate_carree_pixels, rows_of
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
@@ -39,6 +39,71 @@ if TYPE_CHECKING:
 
 MOST_PIXELS = 1 << 28
 """Largest grid that is made."""
+
+
+class PixelGrid:
+    """Pixels of a map in a celestial frame, and which of them a sample falls in."""
+
+    frame: str
+
+    @property
+    def kernel(self) -> tuple[Any, ...]:
+        """The compiled function that finds pixels, and what it is told of the grid."""
+        raise NotImplementedError
+
+    def pointing(self, observation: Observation) -> Floats:
+        """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame."""
+        turn = frame_rotation(self.frame)
+        return np.ascontiguousarray(ray_coefficients(observation.boresight_radec, turn).T)
+
+    def pixels(
+        self,
+        pointing: Floats,
+        first: int,
+        stop: int,
+        xi: Floats,
+        eta: Floats,
+        out: NDArray[np.int32],
+    ) -> None:
+        """Flat pixel indices (n_det, stop - first) of detectors at (xi, eta), -1 outside. Into
+        ``out``.
+        """
+        find, *where = self.kernel
+        find(pointing, first, stop, xi, eta, *where, out)
+
+
+@dataclass(frozen=True)
+class ImageGrid(PixelGrid):
+    """An image: ``shape`` (ny, nx), pixels of side ``pixel`` [rad] in ``frame``; its projection
+    says what ``origin`` is.
+    """
+
+    origin: tuple[float, float]
+    pixel: float
+    shape: tuple[int, int]
+    frame: str = "icrs"
+
+    @property
+    def n_pixels(self) -> int:
+        return self.shape[0] * self.shape[1]
+
+    @property
+    def wcs(self) -> WCS:
+        """World coordinates."""
+        raise NotImplementedError
+
+    @property
+    def header(self) -> Header:
+        """The FITS keywords of `wcs`."""
+        return exact_header(self.wcs)
+
+    def seen(self, hits: Any) -> Any:
+        """Places of the pixels that a map of ``hits`` (n_pixels,) has: all."""
+        return slice(None)
+
+    def described(self, seen: Any) -> dict[str, Any]:
+        """What a map states of its pixels."""
+        return {"header": self.header, "pixel": self.pixel}
 
 
 class TangentGrid(ImageGrid):
@@ -54,37 +119,66 @@ class TangentGrid(ImageGrid):
         return tangent_wcs(self.origin, self.pixel, self.shape, self.frame)
 
     @property
-    def header(self) -> Header:
-        """The FITS keywords of `wcs`."""
-        return exact_header(self.wcs)
+    def kernel(self) -> tuple[Any, ...]:
+        return tangent_pixels, *self.shape
 
     def pointing(self, observation: Observation) -> Floats:
         """Homographies (9, n_samp), see `core.numerics.projection`."""
         return np.ascontiguousarray(homographies(observation.boresight_radec, self.wcs).T)
 
-    def pixels(
-        self,
-        pointing: Floats,
-        first: int,
-        stop: int,
-        xi: Floats,
-        eta: Floats,
-        out: NDArray[np.int32],
-    ) -> None:
-        """Flat pixel indices (n_det, stop - first) of detectors at (xi, eta), -1 outside. Into
-        ``out``.
+
+@dataclass(frozen=True)
+class PlateCarreeGrid(ImageGrid):
+    """A CAR image: its origin is the (column, row) of its first pixel on the full sky."""
+
+    origin: tuple[int, int]
+
+    @property
+    def wcs(self) -> WCS:
+        """World coordinates whose reference point lies on the equator, at the longitude of the
+        image's middle column.
         """
-        tangent_pixels(pointing, first, stop, xi, eta, *self.shape, out)
+        from astropy.wcs import WCS
+
+        rows, middle = rows_of(self.pixel), self.shape[1] // 2
+        degrees = 180.0 / rows
+        wcs = WCS(naxis=2)
+        wcs.wcs.ctype = ("GLON-CAR", "GLAT-CAR")
+        if self.frame == "icrs":
+            wcs.wcs.ctype, wcs.wcs.radesys = ("RA---CAR", "DEC--CAR"), "ICRS"
+        wcs.wcs.crval = [(180.0 - (self.origin[0] + middle) * degrees) % 360.0, 0.0]
+        wcs.wcs.crpix = [middle + 1.0, rows / 2 + 0.5 - self.origin[1]]
+        wcs.wcs.cdelt = [-degrees, degrees]
+        wcs.wcs.set()
+        return wcs
+
+    @property
+    def header(self) -> Header:
+        """The FITS keywords of `wcs`, with 14 digits."""
+        return self.wcs.to_header(relax=True)
+
+    @property
+    def kernel(self) -> tuple[Any, ...]:
+        return plate_carree_pixels, rows_of(self.pixel), *self.origin, *self.shape
+
+    @classmethod
+    def of_box(cls, box: Sequence[int], pixel: float, frame: str) -> PlateCarreeGrid:
+        """The image of the full-sky pixels in a box."""
+        left, low, right, high = box
+        return cls((left, low), pixel, (high - low + 1, right - left + 1), frame)
 
 
 @dataclass(frozen=True)
-class HealpixGrid:
-    """The pixels ``pixels`` (sorted) of a HEALPix map; a sample's index is its place among them."""
+class HealpixGrid(PixelGrid):
+    """The pixels ``pixels_covered`` (sorted) of a HEALPix map; a sample's index is its place among
+    them.
+    """
 
     nside: int
     nest: bool
     pixels_covered: NDArray[np.int64]
     frame: str = "icrs"
+    shape: ClassVar[tuple[int]] = (-1,)
 
     @property
     def n_pixels(self) -> int:
@@ -95,23 +189,23 @@ class HealpixGrid:
         """Places of the covered pixels among them."""
         return lookup(self.pixels_covered)
 
-    def pointing(self, observation: Observation) -> Floats:
-        """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame."""
-        return rays(observation, self.frame)
+    @property
+    def kernel(self) -> tuple[Any, ...]:
+        return healpix_pixels, self.nside, self.nest, *self.lookup
 
-    def pixels(
-        self,
-        pointing: Floats,
-        first: int,
-        stop: int,
-        xi: Floats,
-        eta: Floats,
-        out: NDArray[np.int32],
-    ) -> None:
-        """Indices (n_det, stop - first) into ``pixels_covered`` of detectors at (xi, eta), -1
-        elsewhere. Into ``out``.
-        """
-        healpix_pixels(pointing, first, stop, xi, eta, self.nside, self.nest, *self.lookup, out)
+    def seen(self, hits: Any) -> Any:
+        """Places of the pixels that a map of ``hits`` (n_pixels,) has: those with some."""
+        return np.flatnonzero(hits)
+
+    def described(self, seen: Any) -> dict[str, Any]:
+        """What a map states of its pixels."""
+        return {
+            "header": None,
+            "pixel": math.sqrt(4 * math.pi / (12 * self.nside**2)),
+            "nside": self.nside,
+            "nest": self.nest,
+            "pixels": self.pixels_covered[seen],
+        }
 
 
 Grid = TangentGrid | PlateCarreeGrid | HealpixGrid

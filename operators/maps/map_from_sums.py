@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from zonda.core.signal import MAIN, product_name
 from zonda.core.tally import Tally
 
 from .angle_checks import warn_after
-from .grid import Grid, HealpixGrid
+from .grid import Grid
 from .halves import DIFFERENCES
 from .map_sums import MapSums
 from .parameters import MapParameters
@@ -92,13 +91,8 @@ class MapFromSums:
                 planes[name][:, part] = values
         if self.parameters.contents == "hits":
             planes["signal"][:] = planes["noise"][:] = np.nan
-        keep: Any = slice(None)
-        shape: tuple[int, ...] = (-1,)
-        if isinstance(self.grid, HealpixGrid):
-            keep = np.flatnonzero(planes["hits"][0])
-        else:
-            shape = self.grid.shape
-        planes = {name: rows[:, keep].reshape(len(rows), *shape) for name, rows in planes.items()}
+        seen, shape = self.grid.seen(planes["hits"][0]), self.grid.shape
+        planes = {name: rows[:, seen].reshape(len(rows), *shape) for name, rows in planes.items()}
         planes["hits"] = planes["hits"][0]
         return MapProduct(
             **planes,
@@ -112,25 +106,19 @@ class MapFromSums:
             difference=DIFFERENCES[self.parameters.split],
             contents=self.parameters.contents,
             sample_rate=min(self.sums.rates) if len(self.sums.rates) == 1 else 0.0,
-            **pixels_of(self.grid, keep),
+            **self.grid.described(seen),
         )
 
     def _add_coverage(self, product: MapProduct) -> None:
         """Add the planes that tell how scans cross, and the hits of each scan, if asked for."""
         coverage = self.sums.coverage
-        planes, pixels = coverage.planes(), coverage.pixels
-        if isinstance(self.grid, HealpixGrid):  # the product's pixels are those with hits
-            keep = np.flatnonzero(self.sums.hits.any(axis=0))
-            planes = {key: replace(p, values=p.values[:, keep]) for key, p in planes.items()}
-            pixels = (
-                None
-                if pixels is None
-                else [np.searchsorted(keep, some).astype(np.int32) for some in pixels]
-            )
-        for key, plane in planes.items():
-            values = plane.values.reshape(-1, *product.hits.shape)
+        seen = self.grid.seen(self.sums.hits.any(axis=0))
+        for key, plane in coverage.planes().items():
+            values = plane.values[:, seen].reshape(-1, *product.hits.shape)
             product.planes[key] = replace(plane, values=values)
-        if pixels is not None:
+        if (pixels := coverage.pixels) is not None:
+            if product.pixels is not None:  # those of the product are those with hits
+                pixels = [np.searchsorted(seen, some).astype(np.int32) for some in pixels]
             product.scan_hits = ScanHits(list(self.sums.scans), pixels, coverage.hits)
 
     def _state_beams(self, product: MapProduct, data: Data) -> None:
@@ -192,16 +180,3 @@ class MapFromSums:
             )
         if self.parameters.half_difference and not self.sums.halved:
             tally.state(self.parameters.label, "half-difference", "not made: it needs two scans")
-
-
-def pixels_of(grid: Grid, keep: Any) -> dict[str, Any]:
-    """Header or pixel numbers of a map; ``keep``: places of the HEALPix pixels that it has."""
-    if not isinstance(grid, HealpixGrid):
-        return {"header": grid.header, "pixel": grid.pixel}
-    return {
-        "header": None,
-        "pixel": math.sqrt(4 * math.pi / (12 * grid.nside**2)),
-        "nside": grid.nside,
-        "nest": grid.nest,
-        "pixels": grid.pixels_covered[keep],
-    }

@@ -13,28 +13,19 @@ import numpy as np
 
 from zonda.core.data import Observation, percent
 from zonda.core.errors import InputError, PipelineError
-from zonda.core.numerics.projection import pixel_matrix, share_outside
 
-from . import plate_carree
 from .grid import (
     MOST_PIXELS,
     Grid,
     HealpixGrid,
+    PlateCarreeGrid,
     TangentGrid,
     covered_healpix,
     covering_extent,
     in_frame,
 )
 from .mosaic import MOST_FIELDS, whole_of
-from .plate_carree import (
-    Box,
-    PlateCarreeGrid,
-    box_about,
-    box_of,
-    grid_of_box,
-    layout_about,
-    middle_of,
-)
+from .plate_carree import Box, box_about, box_of, centre_of, middle_of
 
 if TYPE_CHECKING:
     from .parameters import MapParameters
@@ -84,19 +75,28 @@ class MapLayout:
                     place=asked.label,
                     cure="leave the axis over which the band changes out of campaign.combine",
                 )
+        return found | self.place(observations, found)
+
+    def place(
+        self, observations: Sequence[Observation], before: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Fields of the targets, middle and extent of the map: ``half`` [rad] of a TAN image, the
+        ``box`` of a CAR one, or HEALPix ``pixels``. ``before``: the layout of those before.
+        """
+        asked = self.parameters
+        found: dict[str, Any] = {}
+        fields = found["fields"] = self.fields(observations, before.get("fields", []))
         if asked.nside:
-            pixels = covered_healpix(
-                observations, asked.nside, asked.ordering == "nested", asked.frame
-            )
-            found["pixels"] = np.union1d(found["pixels"], pixels) if "pixels" in found else pixels
-        found["fields"] = self.fields(observations, found.get("fields", []))
-        if asked.projection == "CAR" and not asked.nside:
-            found["pixel"] = asked.pixel
-            found["box"] = self.box(found["fields"], observations, found.get("box"))
-            found["middle"] = layout_about(found)
+            nest = asked.ordering == "nested"
+            pixels = covered_healpix(observations, asked.nside, nest, asked.frame)
+            found["pixels"] = np.union1d(before["pixels"], pixels) if "pixels" in before else pixels
+        elif asked.projection == "CAR":
+            box = found["box"] = self.box(fields, observations, before.get("box"))
+            one = len(fields) == 1
+            found["middle"] = tuple(fields[0][:2]) if one else centre_of(box, asked.pixel)
             return found
-        *found["middle"], half_width, half_height = whole_of(found["fields"], asked.label)
-        found["half"] = [half_width, half_height]
+        *found["middle"], width, height = whole_of(fields, asked.label)
+        found["half"] = [width, height]
         return found
 
     def fields(
@@ -145,61 +145,42 @@ class MapLayout:
         return box_about(middle_of(fields, asked.pixel), asked.width, height, asked.pixel)
 
     def grid(self, layout: Mapping[str, Any]) -> Grid:
-        """The grid of a layout."""
+        """The grid of a layout. InputError for an image that is too large."""
         asked = self.parameters
         if asked.nside:
-            return HealpixGrid(
-                asked.nside,
-                asked.ordering == "nested",
-                np.asarray(layout["pixels"], np.int64),
-                asked.frame,
-            )
+            pixels = np.asarray(layout["pixels"], np.int64)
+            return HealpixGrid(asked.nside, asked.ordering == "nested", pixels, asked.frame)
         if "box" in layout:
-            return checked(grid_of_box(layout["box"], asked.pixel, asked.frame), asked.label)
+            box = PlateCarreeGrid.of_box(layout["box"], asked.pixel, asked.frame)
+            return checked(box, asked.label)
+        height = asked.width if asked.height is None else asked.height
+        nx, ny = (
+            max(
+                1,
+                math.ceil(
+                    (2 * half / asked.pixel + 2 if side is None else side / asked.pixel) - 1e-6
+                ),
+            )
+            for side, half in zip((asked.width, height), layout["half"], strict=True)
+        )
         longitude, latitude = layout["middle"]
-        return self.image((longitude, latitude), layout.get("half", (0.0, 0.0)))
-
-    def image(self, middle: tuple[float, float], half: Sequence[float]) -> TangentGrid:
-        """The grid of an image about ``middle`` that reaches ``half`` [rad] far, where no width is
-        given.
-        """
-        asked = self.parameters
-        width, height = asked.width, asked.height if asked.height is not None else asked.width
-        width = width if width is not None else 2 * half[0] + 2 * asked.pixel
-        height = height if height is not None else 2 * half[1] + 2 * asked.pixel
-        nx, ny = (max(1, math.ceil(side / asked.pixel - 1e-6)) for side in (width, height))
-        return checked(TangentGrid(middle, asked.pixel, (ny, nx), asked.frame), asked.label)
-
-    def check_size(self, observations: Sequence[Observation]) -> None:
-        """Refuse an image that is too large for what is known of the scans: some instants of them
-        (InputError).
-        """
-        asked = self.parameters
-        fields = self.fields(observations, [])
-        if asked.projection == "CAR":
-            box = self.box(fields, observations)
-            checked(grid_of_box(box, asked.pixel, asked.frame), asked.label)
-        else:
-            *middle, half_width, half_height = whole_of(fields, asked.label)
-            self.image((middle[0], middle[1]), (half_width, half_height))
+        image = TangentGrid((longitude, latitude), asked.pixel, (ny, nx), asked.frame)
+        return checked(image, asked.label)
 
     def outside(self, observations: Sequence[Observation]) -> str:
-        """The share of the samples outside an image of a given width."""
-        asked = self.parameters
-        fields = self.fields(observations, [])
-        if asked.projection == "CAR":
-            car = grid_of_box(self.box(fields, observations), asked.pixel, asked.frame)
-            return (
-                "samples outside the map: about"
-                f" {percent(plate_carree.share_outside(car, observations), 2)}"
-            )
-        longitude, latitude, *_ = whole_of(fields, asked.label)
-        grid = self.image((longitude, latitude), (0.0, 0.0))
-        scans = ((o.boresight_radec, o.focalplane.xi, o.focalplane.eta) for o in observations)
-        return (
-            "samples outside the map: about"
-            f" {percent(share_outside(scans, pixel_matrix(grid.wcs), grid.shape), 2)}"
-        )
+        """The share of the samples outside an image of a given width; some hundred instants of each
+        scan are looked at. InputError for an image that is too large.
+        """
+        grid = self.grid(self.place(observations, {}))
+        beyond = looked = 0
+        for scan in observations if self.parameters.width is not None else ():
+            plane, at = scan.focalplane, slice(None, None, -(-scan.n_samples // 256))
+            some = slice(None, None, -(-len(plane) // 37))
+            h = np.ascontiguousarray(grid.pointing(scan)[:, at])
+            index = np.empty((len(plane.xi[some]), h.shape[1]), np.int32)
+            grid.pixels(h, 0, h.shape[1], plane.xi[some], plane.eta[some], index)
+            beyond, looked = beyond + int(np.count_nonzero(index < 0)), looked + index.size
+        return f"samples outside the map: about {percent(beyond / max(looked, 1), 2)}"
 
 
 def checked(grid: Image, place: str) -> Image:

@@ -14,23 +14,17 @@ interpolation.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.projection import boresights, frame_rotation, ray_coefficients
+from zonda.core.numerics.projection import boresights, frame_rotation
 from zonda.core.types import Floats
 
-from .image_grid import ImageGrid, rays
-
 if TYPE_CHECKING:
-    from astropy.io.fits import Header
-
     from zonda.core.data import Observation
 
 Box = tuple[int, int, int, int]
@@ -39,67 +33,9 @@ N - 1.
 """
 
 
-@dataclass(frozen=True)
-class PlateCarreeGrid(ImageGrid):
-    """A CAR image: its origin is the (column, row) of its first pixel on the full sky."""
-
-    origin: tuple[int, int]
-
-    @property
-    def wcs(self) -> Any:
-        """An `astropy.wcs.WCS` whose reference point lies on the equator, at the longitude of the
-        image's middle column.
-        """
-        from astropy.wcs import WCS
-
-        rows, degrees, middle = rows_of(self.pixel), 180.0 / rows_of(self.pixel), self.shape[1] // 2
-        wcs = WCS(naxis=2)
-        wcs.wcs.ctype = (
-            ["RA---CAR", "DEC--CAR"] if self.frame == "icrs" else ["GLON-CAR", "GLAT-CAR"]
-        )
-        wcs.wcs.crval = [(180.0 - (self.origin[0] + middle) * degrees) % 360.0, 0.0]
-        wcs.wcs.crpix = [middle + 1.0, rows / 2 + 0.5 - self.origin[1]]
-        wcs.wcs.cdelt = [-degrees, degrees]
-        if self.frame == "icrs":
-            wcs.wcs.radesys = "ICRS"
-        wcs.wcs.set()
-        return wcs
-
-    @property
-    def header(self) -> Header:
-        """The FITS keywords of `wcs`, with 14 digits."""
-        return self.wcs.to_header(relax=True)
-
-    def pointing(self, observation: Observation) -> Floats:
-        """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame."""
-        return rays(observation, self.frame)
-
-    def pixels(
-        self,
-        pointing: Floats,
-        first: int,
-        stop: int,
-        xi: Floats,
-        eta: Floats,
-        out: NDArray[np.int32],
-    ) -> None:
-        """Flat pixel indices (n_det, stop - first) of detectors at (xi, eta), -1 outside. Into
-        ``out``.
-        """
-        plate_carree_pixels(
-            pointing, first, stop, xi, eta, rows_of(self.pixel), *self.origin, *self.shape, out
-        )
-
-
 def rows_of(pixel: float) -> int:
     """N of equation (1)."""
     return round(math.pi / pixel)
-
-
-def grid_of_box(box: Sequence[int], pixel: float, frame: str) -> PlateCarreeGrid:
-    """The image of the full-sky pixels in a box."""
-    left, low, right, high = box
-    return PlateCarreeGrid((left, low), pixel, (high - low + 1, right - left + 1), frame)
 
 
 def centre_of(box: Sequence[int], pixel: float) -> tuple[float, float]:
@@ -140,24 +76,6 @@ def box_of(
     return found
 
 
-def share_outside(grid: PlateCarreeGrid, observations: Sequence[Observation]) -> float:
-    """About what share of all samples lies beyond the image; some hundred instants of each scan are
-    looked at.
-    """
-    beyond = looked = 0
-    for observation in observations:
-        at = slice(None, None, -(-observation.n_samples // 256))
-        plane = observation.focalplane
-        rows = slice(None, None, -(-len(plane) // 37))
-        h = np.ascontiguousarray(
-            ray_coefficients(observation.boresight_radec[at], frame_rotation(grid.frame)).T
-        )
-        index = np.empty((len(plane.xi[rows]), h.shape[1]), np.int32)
-        grid.pixels(h, 0, h.shape[1], plane.xi[rows], plane.eta[rows], index)
-        beyond, looked = beyond + int(np.count_nonzero(index < 0)), looked + index.size
-    return beyond / looked if looked else 0.0
-
-
 def middle_of(fields: Sequence[Sequence[float]], pixel: float) -> tuple[float, float]:
     """(longitude, latitude) [rad] of the only one of some fields (`MapLayout.fields`), else the
     middle of all of them.
@@ -169,12 +87,6 @@ def middle_of(fields: Sequence[Sequence[float]], pixel: float) -> tuple[float, f
         found = _joined(found, _box(longitude, 0.0, latitude, latitude, pixel), pixel)
     assert found is not None
     return centre_of(found, pixel)
-
-
-def layout_about(found: Mapping[str, Any]) -> tuple[float, float]:
-    """(longitude, latitude) [rad] of the map: its only target, else the middle of the box."""
-    fields, pixel = found["fields"], found["pixel"]
-    return middle_of(fields, pixel) if len(fields) == 1 else centre_of(found["box"], pixel)
 
 
 def _around(longitude: Floats, latitude: Floats, reach: float, pixel: float) -> Box:

@@ -12,8 +12,8 @@ from zonda.core.maps.map_plots import plot_map
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
 from zonda.operators.diagnostics.report_results import expected
-from zonda.operators.maps.grid import tangent_wcs
-from zonda.operators.maps.plate_carree import box_about, centre_of, grid_of_box
+from zonda.operators.maps.grid import PlateCarreeGrid, tangent_wcs
+from zonda.operators.maps.plate_carree import box_about, centre_of
 from zonda.plugins.metrics.common import relative_error_of_rms
 
 FWHM = 5 * ARCMIN
@@ -28,7 +28,7 @@ def product(
     if kind == "CAR":
         width = math.radians(side)
         box = box_about((1.0, math.radians(dec)), width, width, pixel)
-        grid = grid_of_box(box, pixel, "icrs")
+        grid = PlateCarreeGrid.of_box(box, pixel, "icrs")
         header, shape, centre = grid.wcs.to_header(), grid.shape, centre_of(box, pixel)
     else:
         n, centre = round(math.radians(side) / pixel), (1.0, math.radians(dec))

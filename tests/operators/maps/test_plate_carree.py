@@ -19,8 +19,9 @@ from zonda.core.numerics.angles import ARCMIN, ARCSEC
 from zonda.core.numerics.projection import directions
 from zonda.core.numerics.sphere import separation
 from zonda.operators.maps.bin_map import BinMap
+from zonda.operators.maps.grid import PlateCarreeGrid
 from zonda.operators.maps.map_layout import MapLayout, checked
-from zonda.operators.maps.plate_carree import Box, _box, _joined, centre_of, grid_of_box, rows_of
+from zonda.operators.maps.plate_carree import Box, _box, _joined, centre_of, rows_of
 from zonda.plugins.checks import scenes
 
 
@@ -48,7 +49,7 @@ def test_pixels_are_those_of_the_full_sky(
         *np.radians([latitude - half_height / 4, latitude + half_height / 4]),
         pixel,
     )
-    grid = grid_of_box(box, pixel, "icrs")
+    grid = PlateCarreeGrid.of_box(box, pixel, "icrs")
     y, x = np.indices(grid.shape)
     found = grid.wcs.wcs_pix2world(x.ravel(), y.ravel(), 0)
     there = full_sky(degrees).wcs_world2pix(*found, 0)
@@ -62,7 +63,7 @@ def test_pixell_calls_it_compatible() -> None:
     from pixell import enmap, wcsutils
 
     _, whole = enmap.fullsky_geometry(res=math.radians(0.5))
-    grid = grid_of_box((713, 30, 725, 44), math.radians(0.5), "icrs")
+    grid = PlateCarreeGrid.of_box((713, 30, 725, 44), math.radians(0.5), "icrs")
     assert wcsutils.is_compatible(grid.wcs, whole), pixell.__version__
     corners = enmap.pix2sky(grid.shape, grid.wcs, [[0, 14], [0, 12]])
     assert np.degrees(corners[0]) == pytest.approx([30.5 * 0.5 - 90, 44.5 * 0.5 - 90])
@@ -125,7 +126,7 @@ def test_a_map_of_given_size_and_one_across_the_meridian(bench: Any) -> None:
     assert nx * 5 == pytest.approx(360 / math.cos(observation.centre[1]), abs=4 * 5)
     assert ny * 5 == pytest.approx(240, abs=4 * 5)
     box = _box(0.0, 10 * ARCMIN, -0.1, 0.1, math.radians(0.05))
-    grid = grid_of_box(box, math.radians(0.05), "icrs")
+    grid = PlateCarreeGrid.of_box(box, math.radians(0.05), "icrs")
     where = np.empty((1, 1), np.int32)
     for angle in (-8 * ARCMIN, 8 * ARCMIN):
         direction = np.array([math.cos(angle), math.sin(angle), 0.0])
@@ -189,7 +190,7 @@ def test_smoothing_keeps_a_gaussian_round_at_high_latitude() -> None:
 
     pixel = math.radians(1 / 60)
     box = _box(1.0, math.radians(1.6), math.radians(59.3), math.radians(60.7), pixel)
-    grid = grid_of_box(box, pixel, "icrs")
+    grid = PlateCarreeGrid.of_box(box, pixel, "icrs")
     header = grid.wcs.to_header()
     ones = np.ones(grid.shape)
     product = MapProduct(
@@ -215,7 +216,7 @@ def test_a_pixel_that_does_not_divide_the_sky_is_refused() -> None:
         match=r"whole number of pixels; the nearest that fits is 7.0000",
     ):
         BinMap(projection="CAR", pixel="7 arcsec")
-    grid = grid_of_box((0, 0, 100_000, 100_000), math.radians(1 / 3600), "icrs")
+    grid = PlateCarreeGrid.of_box((0, 0, 100_000, 100_000), math.radians(1 / 3600), "icrs")
     with pytest.raises(InputError, match="too large"):
         checked(grid, "BinMap")
 
