@@ -1,4 +1,6 @@
-"""Map products from the sums of their samples."""
+"""Map products from the sums of their samples: equation (1) of `bin_map`, and equations (1) and (2)
+of `binning`, solved in each pixel.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +20,22 @@ from zonda.core.numerics.angles import angle_text
 from zonda.core.numerics.chunks import empty
 from zonda.core.signal import MAIN, product_name
 from zonda.core.tally import Tally
+from zonda.core.types import AnyFloats, Floats
 
 from .angle_checks import warn_after
 from .grid import Grid
 from .halves import DIFFERENCES
 from .map_sums import MapSums
 from .parameters import MapParameters
-from .solve import Solver
-from .sums import VALUE
+from .stokes_kernel import PLACES
+from .sums import VALUE, WEIGHT, Sums
 
 AT_ONCE = 1 << 14
 """Pixels whose maps are made at a time: intermediate arrays stay in the cache."""
+TRIANGLE = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+"""Rows and columns of the elements of a symmetric matrix: ii, iq, iu, qq, qu, uu."""
+SINGULAR = 1e-8
+"""Of the smallest eigenvalue, as a share of the largest: below it is the rounding of the sums."""
 UNSOLVED = "pixels whose samples do not determine I, Q and U: NaN"
 """A count of the log."""
 
@@ -71,21 +78,10 @@ class MapFromSums:
 
     def map_of(self, stream: str) -> MapProduct:
         """The map of the signal ``stream``."""
-        variance = self.layout["variance"]
-        solver = Solver(
-            self.sums,
-            variance,
-            variance if self.parameters.weights == "inverse_variance" else 1.0,
-            self.parameters.noise == "scatter",
-            self.parameters.condition_limit,
-            bool(self.parameters.half_difference)
-            and self.sums.halved
-            and self.parameters.contents == "all",
-        )
         planes: dict[str, Any] = {}
         for start in range(0, max(self.grid.n_pixels, 1), AT_ONCE):
             part = slice(start, start + AT_ONCE)
-            for name, values in solver.planes(stream, part).items():
+            for name, values in self.planes_of(stream, part).items():
                 if name not in planes:
                     planes[name] = empty((len(values), self.grid.n_pixels), values.dtype)
                 planes[name][:, part] = values
@@ -108,6 +104,60 @@ class MapFromSums:
             sample_rate=min(self.sums.rates) if len(self.sums.rates) == 1 else 0.0,
             **self.grid.described(seen),
         )
+
+    @property
+    def halves(self) -> bool:
+        """The difference of two halves is wanted."""
+        wanted = self.parameters.half_difference and self.parameters.contents == "all"
+        return bool(wanted) and self.sums.halved
+
+    def planes_of(self, stream: str, part: slice) -> dict[str, AnyFloats]:
+        """Planes by name, each (rows, n), of the signal ``stream`` in some pixels."""
+        unit = self.layout["variance"] if self.parameters.weights == "inverse_variance" else 1.0
+        make = self._polarized if self.sums.polarized else self._plain
+        found = make(stream, part, self.layout["variance"])
+        found["weights"] = found["weights"] / unit
+        return {name: np.atleast_2d(values) for name, values in found.items()}
+
+    def _plain(self, stream: str, part: slice, variance: float) -> dict[str, AnyFloats]:
+        hits, weights, data, noise = self.sums.parts(stream, part)
+        signal, weight = _mean(hits, weights, data)
+        term = noise[:, 0] / WEIGHT * variance
+        with np.errstate(invalid="ignore", divide="ignore"):
+            if self.sums.scatter:
+                # equal samples leave the rounding of their squares, of either sign: a scatter below
+                # it is counted, and 0
+                rest = np.maximum(term / weight - signal**2, 0.0)
+                error = np.where(hits > 1, np.sqrt(rest / (hits - 1)), np.nan)
+            else:
+                error = np.where(hits > 0, np.sqrt(term) / weight, np.nan)
+        found = {"signal": signal, "hits": hits, "weights": weight, "noise": error}
+        if self.halves:
+            (one, w), (two, v) = (
+                _mean(*self.sums.parts(stream, part, half)[:3]) for half in (0, 1)
+            )
+            with np.errstate(invalid="ignore", divide="ignore"):
+                found["half_difference"] = (one - two) * np.sqrt(w * v) / (w + v)
+        return found
+
+    def _polarized(self, stream: str, part: slice, variance: float) -> dict[str, AnyFloats]:
+        whole, limit = self.sums.parts(stream, part), self.parameters.condition_limit
+        values, spread, matrices, condition = _solved(whole, limit, bool(self.sums.noise))
+        covariance = matrices[:, TRIANGLE[0], TRIANGLE[1]].T * variance
+        found = {
+            "signal": values.T,
+            "hits": whole[0],
+            "weights": np.nan_to_num(1 / spread.T),
+            "noise": np.sqrt(covariance[[0, 3, 5]]),
+            "covariance": covariance,
+            "condition": condition,
+        }
+        if self.halves:
+            (one, a, *_), (two, b, *_) = (
+                _solved(self.sums.parts(stream, part, half), limit, False) for half in (0, 1)
+            )
+            found["half_difference"] = ((one - two) * np.sqrt(spread / (a + b))).T
+        return found
 
     def _add_coverage(self, product: MapProduct) -> None:
         """Add the planes that tell how scans cross, and the hits of each scan, if asked for."""
@@ -180,3 +230,40 @@ class MapFromSums:
             )
         if self.parameters.half_difference and not self.sums.halved:
             tally.state(self.parameters.label, "half-difference", "not made: it needs two scans")
+
+
+def _mean(hits: Sums, weights: Sums, data: Sums) -> tuple[Floats, Floats]:
+    """(signal, weight) of fixed-point sums; NaN where there are no hits."""
+    weight = weights[:, 0] / WEIGHT
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(hits > 0, data[:, 0] / VALUE / weight, np.nan), weight
+
+
+def _solved(
+    sums: tuple[Sums, Sums, Sums, Sums], limit: float, own_noise: bool
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """I, Q and U (n, 3) of some pixels [K], NaN where the condition number is above the ``limit``;
+    (n, 3) diagonal of A^-1; (n, 3, 3) covariance in units of the reference variance; (n,) condition
+    number, NaN without hits.
+    """
+    hits, weights, data, noise = sums
+    n = len(hits)
+    values, spread = np.full((2, n, 3), np.nan)
+    covariance, condition = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
+    hit = np.flatnonzero(hits)
+    a = weights[hit][:, PLACES].reshape(-1, 3, 3) / WEIGHT
+    low, axes = np.linalg.eigh(a)
+    with np.errstate(divide="ignore"):
+        condition[hit] = np.where(low[:, 0] > SINGULAR * low[:, 2], low[:, 2] / low[:, 0], np.inf)
+    fine = condition[hit] <= limit
+    pixels, axes, low = hit[fine], axes[fine], low[fine]
+    inverse, b = (axes / low[:, None, :]) @ axes.transpose(0, 2, 1), data[pixels] / VALUE
+    values[pixels] = np.einsum("nij,nj->ni", inverse, b)
+    rest = b - np.einsum("nij,nj->ni", a[fine], values[pixels])  # one step of refinement
+    values[pixels] += np.einsum("nij,nj->ni", inverse, rest)
+    spread[pixels] = np.einsum("nii->ni", inverse)
+    covariance[pixels] = inverse
+    if own_noise:
+        middle = noise[pixels][:, PLACES].reshape(-1, 3, 3) / WEIGHT
+        covariance[pixels] = inverse @ middle @ inverse
+    return values, spread, covariance, condition
