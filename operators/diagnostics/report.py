@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -16,15 +17,22 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.figures import Figures
 from zonda.core.maps.beams import expected_fwhm
-from zonda.core.numerics.angles import angle_text
+from zonda.core.numerics.angles import ARCSEC, angle_text
 from zonda.core.output import Output, output_folder
 from zonda.core.pages import render
 from zonda.core.storage.files import write_text
 from zonda.core.types import AnyFloats
 
 from .plot_operators import DRAWN, Picture, Plots, pictures
-from .report_results import class_of, flux_density, has_white_noise, results
-from .report_text import readable, sexagesimal, spread
+from .report_results import (
+    class_of,
+    flux_density,
+    has_white_noise,
+    readable,
+    results,
+    sexagesimal,
+    spread,
+)
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
@@ -124,11 +132,11 @@ def page(data: Data, shown: Sequence[Picture], central_diameter: float | None) -
 def _pictures(shown: Sequence[Picture], bands: Sequence[str]) -> list[dict[str, Any]]:
     found = []
     for picture in shown:
-        band = next((f" ({b})" for b in bands if picture.name.endswith(f"_{b}")), "")
-        title = picture.title if band and band[2:-1] in picture.title else picture.title + band
+        band = next((b for b in bands if picture.name.endswith(f"_{b}")), "")
+        named = band in picture.title
         found.append(
             {
-                "title": title,
+                "title": picture.title if named else f"{picture.title} ({band})",
                 "caption": picture.caption,
                 "image": base64.b64encode(picture.png).decode(),
                 "wide": int.from_bytes(picture.png[16:20], "big") > _WIDE,
@@ -139,6 +147,7 @@ def _pictures(shown: Sequence[Picture], bands: Sequence[str]) -> list[dict[str, 
 
 def _figures(data: Data) -> list[tuple[str, ...]]:
     """Name, value, standard error and meaning of each figure of `MeasureFigures`."""
+    every = (product for product in data.products.values() if isinstance(product, Figures))
     return [
         (
             f.name,
@@ -146,90 +155,61 @@ def _figures(data: Data) -> list[tuple[str, ...]]:
             f"{f.error:.2g}" if np.isfinite(f.error) else "",
             f.description,
         )
-        for product in data.products.values()
-        if isinstance(product, Figures)
-        for f in product
+        for figures in every
+        for f in figures
     ]
 
 
 def _scene(data: Data) -> list[tuple[str, Any]]:
     scene = data.scene
     instrument, site, telescope = scene.instrument, scene.site, scene.instrument.telescope
-    cameras = instrument.cameras
+    cameras, target = instrument.cameras, scene.target
     number = " + ".join(str(camera.detectors) for camera in cameras.values())
+    place = f"{np.degrees(site.latitude):.4f}°, {np.degrees(site.longitude):.4f}°"
+    field = f"detectors in a field of {angle_text(instrument.field_of_view)}"
+    campaign = data.provenance.get("campaign")
+    note = "this table and the plan are of its first entry, figures of its last, counts of all"
     rows: list[tuple[str, Any]] = [
-        (
-            "Site",
-            (
-                f"{site.name}: {np.degrees(site.latitude):.4f}°, {np.degrees(site.longitude):.4f}°,"
-                f" {site.altitude:.0f} m"
-            ),
-        ),
+        *([("Campaign", f"{campaign}; {note}")] if campaign else []),
+        ("Site", f"{site.name}: {place}, {site.altitude:.0f} m"),
         ("Telescope", f"{telescope.name}, {telescope.diameter:.4g} m"),
-        (
-            "Instrument",
-            (
-                f"{instrument.name}: {number} detectors in a field of"
-                f" {angle_text(instrument.field_of_view)}"
-            ),
-        ),
-        *(
-            row
-            for camera in cameras.values()
-            for row in _band(camera, data, several=len(cameras) > 1)
-        ),
-        (
-            "Target",
-            _target(scene.target) if scene.target is not None else "given by the pointing step",
-        ),
+        ("Instrument", f"{instrument.name}: {number} {field}"),
+    ]
+    for camera in cameras.values():
+        rows += _band(camera, data, several=len(cameras) > 1)
+    if data.observations:
+        rows.append(("Read-out", f"{data.observations[0].sample_rate:.6g} Hz"))
+    rows += [
+        ("Target", "given by the pointing step" if target is None else _target(target)),
         ("Start", scene.time),
         ("Seed", scene.seed),
     ]
-    if data.observations:
-        rows.insert(-3, ("Read-out", f"{data.observations[0].sample_rate:.6g} Hz"))
-    if campaign := data.provenance.get("campaign"):
-        rows.insert(
-            0,
-            (
-                "Campaign",
-                (
-                    f"{campaign}; this table and the plan are of its first entry, figures of its"
-                    " last, counts of all"
-                ),
-            ),
-        )
-    bands = [
-        (f"Band {c.band.name}" if len(cameras) > 1 else "Band", c.band.provenance)
-        for c in cameras.values()
-    ]
-    for kind, text in (("Site", site.provenance), ("Instrument", instrument.provenance), *bands):
-        if text:
-            rows.append((f"{kind}: source of the numbers", text))
+    sources = {"Site": site.provenance, "Instrument": instrument.provenance}
+    for camera in cameras.values():
+        name = f"Band {camera.band.name}" if len(cameras) > 1 else "Band"
+        sources[name] = camera.band.provenance
+    rows += [(f"{kind}: source of the numbers", text) for kind, text in sources.items() if text]
     return rows
 
 
 def _band(camera: Instrument, data: Data, *, several: bool) -> list[tuple[str, Any]]:
     """A band, with what its detectors are like in the first scan."""
     band, tell = camera.band, f" {camera.band.name}" if several else ""
-    edges = (
-        f"{band.frequency[0] / 1e9:.4g} to {band.frequency[-1] / 1e9:.4g} GHz about"
-        f" {band.centre / 1e9:.4g} GHz"
-    )
-    rows: list[tuple[str, Any]] = [(f"Band{tell}", f"{band.name}: {edges}")]
+    low, high, centre = (f / 1e9 for f in (band.frequency[0], band.frequency[-1], band.centre))
+    edges = f"{low:.4g} to {high:.4g} GHz about {centre:.4g} GHz"
+    rows: list[tuple[str, Any]] = [("Band", f"{band.name}: {edges}")]
     scans = [o for o in data.observations if o.instrument == camera]
     if scans:
         plane = scans[0].focalplane
+        jansky = flux_density(1.0, expected_fwhm(plane.fwhm, plane.net), band)
         rows += [
-            (f"Beam (FWHM){tell}", spread(plane.fwhm * 648000 / np.pi, "″")),
-            (
-                f"1 K_RJ at a point source's peak{tell}",
-                flux_density(1.0, expected_fwhm(plane.fwhm, plane.net), band),
-            ),
-            (f"Main-beam efficiency ζ{tell}", spread(plane.main_beam_efficiency)),
-            (f"Illumination efficiency ε{tell}", spread(plane.illumination_efficiency)),
-            (f"NET on the sky{tell}", _net(scans, data)),
+            ("Beam (FWHM)", spread(plane.fwhm / ARCSEC, "″")),
+            ("1 K_RJ at a point source's peak", jansky),
+            ("Main-beam efficiency ζ", spread(plane.main_beam_efficiency)),
+            ("Illumination efficiency ε", spread(plane.illumination_efficiency)),
+            ("NET on the sky", _net(scans, data)),
         ]
-    return rows
+    return [(f"{name}{tell}", text) for name, text in rows]
 
 
 def _net(scans: Sequence[Observation], data: Data) -> str:
@@ -247,10 +227,8 @@ def _target(target: Target) -> str:
     if target.frame == "icrs":
         return f"{sexagesimal(target.longitude, target.latitude)} (ICRS)"
     names = ("azimuth", "elevation") if target.frame == "horizontal" else ("galactic l", "b")
-    return (
-        f"{names[0]} {np.degrees(target.longitude):.6g}°, {names[1]}"
-        f" {np.degrees(target.latitude):.6g}°"
-    )
+    angles = np.degrees([target.longitude, target.latitude])
+    return ", ".join(f"{name} {angle:.6g}°" for name, angle in zip(names, angles, strict=True))
 
 
 def _scans(data: Data) -> list[tuple[str, ...]]:
@@ -279,11 +257,9 @@ def _steps(data: Data) -> list[dict[str, Any]]:
     for label, kind, parameters in data.provenance.get("operators", []):
         cls = class_of(kind)
         doc, fields = ("", {}) if cls is None else (own_doc(cls).split("\n\n")[0], described(cls))
+        meanings = {key: field.description or "" for key, field in fields.items()}
+        rows = [(k, t, readable(str(t)), meanings.get(k, "")) for k, t in parameters.items()]
         title = label if label == kind else f"{label} ({kind})"
-        rows = [
-            (key, text, readable(str(text)), fields[key].description or "" if key in fields else "")
-            for key, text in parameters.items()
-        ]
         found.append({"title": title, "doc": doc, "parameters": rows})
     return found
 
@@ -293,26 +269,20 @@ def _tally(data: Data) -> list[tuple[str, str, str]]:
     rows: list[tuple[str, str, str]] = []
     previous = ""
     order = {label: k for k, (label, *_) in enumerate(data.provenance.get("operators", []))}
-    for who, what, value in sorted(
-        data.tally.told(), key=lambda row: order.get(row[0], len(order))
-    ):
-        counted = re.fullmatch(r"(\d+)( \(.* %\))?", value)
-        number = (
-            f"{int(counted[1]):,}{counted[2] or ''}".replace(",", "\u202f") if counted else value
-        )
-        rows.append(
-            ("" if who == previous and len(rows) != LONG else who, what, number)
-        )  # a folded table begins with a name
+    told = sorted(data.tally.told(), key=lambda row: order.get(row[0], len(order)))
+    for who, what, value in told:
+        value = re.sub(r"^\d+(?=$| \()", lambda m: f"{int(m[0]):,}".replace(",", "\u202f"), value)
+        # a folded table begins with a name
+        rows.append(("" if who == previous and len(rows) != LONG else who, what, value))
         previous = who
     return rows
 
 
 def _timings(data: Data) -> list[dict[str, Any]]:
     """CPU seconds of each step, in all and by stage."""
-    by_step: dict[str, dict[str, float]] = {}
+    by_step: dict[str, Any] = {}
     for label, stage, seconds in data.provenance.get("timings", []):
-        stages = by_step.setdefault(str(label), {})
-        stages[str(stage)] = stages.get(str(stage), 0.0) + float(seconds)
+        by_step.setdefault(str(label), Counter())[str(stage)] += float(seconds)
     return [
         {
             "label": label,
@@ -325,16 +295,13 @@ def _timings(data: Data) -> list[dict[str, Any]]:
 
 def _provenance(data: Data) -> list[tuple[str, Any]]:
     provenance = data.provenance
-    rows: list[tuple[str, Any]] = [("seed", data.scene.seed)]
-    if provenance.get("command"):
-        rows.append(("command", provenance["command"]))
-    rows += provenance.get("versions", {}).items()
-    if provenance.get("precision"):
-        rows.append(("precision", provenance["precision"]))
+    rows = {"seed": data.scene.seed, "command": provenance.get("command")}
+    rows |= provenance.get("versions", {})
+    rows["precision"] = provenance.get("precision")
     for name, run in provenance.get("runs", {}).items():
-        parts = [
+        parts = (
             f"{how} {' and '.join(what) if isinstance(what, list) else what}"
             for how, what in run.items()
-        ]
-        rows.append((f"signal {name}", ", ".join(parts)))
-    return rows
+        )
+        rows[f"signal {name}"] = ", ".join(parts)
+    return [(name, value) for name, value in rows.items() if value not in ("", None)]

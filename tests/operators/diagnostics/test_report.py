@@ -15,8 +15,14 @@ from zonda.core.configuration.target import Target
 from zonda.core.errors import OutputError
 from zonda.operators.diagnostics.plot_operators import Picture
 from zonda.operators.diagnostics.report import Report, _target
-from zonda.operators.diagnostics.report_results import brightness, expected, flux_density, results
-from zonda.operators.diagnostics.report_text import readable, sexagesimal
+from zonda.operators.diagnostics.report_results import (
+    brightness,
+    expected,
+    flux_density,
+    readable,
+    results,
+    sexagesimal,
+)
 
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
 EVIL = "<script>alert('x')</script>&\"quoted\""
