@@ -39,17 +39,13 @@ METADATA = {
 }
 
 
-def new_axes(
-    ax: Any = None, size: tuple[float, float] = (7.2, 5.0), above: float = 0.45, **grid: Any
-) -> Any:
-    """``ax``, or the Axes of a new figure of ``size`` [in] that is not pyplot's.
+def new_axes(size: tuple[float, float] = (7.2, 5.0), above: float = 0.45, **grid: Any) -> Any:
+    """Axes of a new figure of ``size`` [in] that is not pyplot's.
 
     Margins are fixed: matplotlib's own layout draws everything twice. ``above``: room for the
     title, and for a second axis below it, in. ``grid`` is passed to `Figure.subplots`, which
     returns an array of Axes for several of them.
     """
-    if ax is not None:
-        return ax
     from matplotlib.figure import Figure
 
     width, height = size

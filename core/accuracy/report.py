@@ -230,7 +230,7 @@ def draw(study: Study, ax: Any = None) -> Any:
     A setting that gives the reference's bits has no place on a logarithmic axis: it stands on the
     lower edge, hollow.
     """
-    ax = new_axes(ax, (7.6, 5.4))
+    ax = ax or new_axes((7.6, 5.4))
     setup, chosen, front = study.setup, study.chosen, study.front
     alone = [a for a in study.sweep.alone if not a.knob.redraws]
     errors = [p.error for p in study.points] + [r.error or 0.0 for a in alone for r in a.rungs]

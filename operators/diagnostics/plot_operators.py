@@ -13,7 +13,7 @@ from pydantic import Field
 from zonda.core.canvas import DPI
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
-from zonda.core.drawable import Drawable, Sketch
+from zonda.core.drawable import Sketch
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_alone, noise_sources
@@ -21,27 +21,20 @@ from zonda.core.output import Output, output_folder
 from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.types import AnyFloats, Floats
 
-from .compare_streams import StreamComparison
 from .comparison.files import plane_of
 from .comparison.statistics import Comparison
-from .drawing.comparison_plots import draw_comparison, draw_map_spectra, draw_stream_comparison
+from .drawing.comparison_plots import draw_comparison
 from .drawing.pictures import (
     Picture,
     Style,
     draw_coverage,
     draw_input,
     draw_map,
-    draw_modes,
     draw_noise,
     draw_plane,
-    draw_scan,
-    draw_spectra,
-    draw_streams,
-    draw_transfer,
 )
-from .map_spectra import MapSpectra
-from .series import Modes, Spectrum, TimeStream
-from .transfer_function import Transfer
+from .drawing.plots import draw, draw_scan
+from .series import Spectrum, TimeStream
 
 __all__ = ["Picture", "Plots", "pictures"]
 
@@ -59,6 +52,11 @@ DRAWN = frozenset(
     ]
 )
 """Products with pictures."""
+FILES: dict[type, tuple[str, str]] = {
+    Spectrum: ("spectrum", "power_spectra"),
+    TimeStream: ("time_streams", "tod"),
+}
+"""Names of products and of their pictures, where these differ."""
 
 
 class Plots(Output):
@@ -175,26 +173,15 @@ def _of_series(data: Data, style: Style) -> Iterator[Sketch]:
     before = _steps_before(data)
     bands = [f"_{band.name}" for band in data.scene.instrument.bands]
     for name, product in data.products.items():
-        file, after = _file(name), before.get(getattr(product, "label", ""), "")
+        file, label = _file(name), getattr(product, "label", "")
         band = next((b for b in bands if name.endswith(b)), "")
-        if isinstance(product, Spectrum):
-            own = name == f"spectrum{band}"
-            yield from draw_spectra(f"power_spectra{band if own else f'_{file}'}", product, after)
-        elif isinstance(product, TimeStream):
-            own = name == f"time_streams{band}"
-            yield from draw_streams(f"tod{band if own else f'_{file}'}", product, after)
-        elif isinstance(product, Modes):
-            yield from draw_modes(file, product, after)
-        elif isinstance(product, Transfer):
-            yield from draw_transfer(file, product)
-        elif isinstance(product, Drawable):
-            yield from product.sketches(file)
-        elif isinstance(product, Comparison):
+        usual, stem = FILES.get(type(product), ("", ""))
+        if stem:
+            file = f"{stem}{band if name == f'{usual}{band}' else f'_{file}'}"
+        if isinstance(product, Comparison):
             yield from draw_comparison(file, product, style.contours)
-        elif isinstance(product, MapSpectra):
-            yield from draw_map_spectra(file, product)
-        elif isinstance(product, StreamComparison):
-            yield from draw_stream_comparison(file, product)
+        where = f"after {before[label]}" if before.get(label) else f"at step {label}"
+        yield from draw(product, file, where)
 
 
 def _file(name: str) -> str:

@@ -21,11 +21,13 @@ from zonda.core.maps.map_plots import (
 )
 from zonda.core.numerics.angles import ARCSEC, angle_text
 
+from ..compare_streams import StreamComparison
+from ..map_spectra import MapSpectra
+from .plots import draw, scans
+
 if TYPE_CHECKING:
-    from ..compare_streams import StreamComparison
     from ..comparison.radial import RadialSpectra
     from ..comparison.statistics import Comparison
-    from ..map_spectra import MapSpectra
 
 CONTOURS = (-8.0, -4.0, -2.0, 2.0, 4.0)
 """Default levels of the contours on SNR maps."""
@@ -84,7 +86,7 @@ def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
 
 
 def _curves(file: str, found: Comparison) -> Sketch:
-    left, right = new_axes(None, (10.6, 4.9), above=0.9, ncols=2, gridspec_kw={"wspace": 0.25})
+    left, right = new_axes((10.6, 4.9), above=0.9, ncols=2, gridspec_kw={"wspace": 0.25})
     plot_radial_spectra(left, found.spectra, found.unit, found.fwhm)
     p, names = found.profiles, dict(zip(("reference", "map"), found.names, strict=True))
     used = np.isfinite(p.mean["map"])
@@ -161,9 +163,10 @@ def _inverse(arcsec: Any) -> Any:
         return 60.0 / np.asarray(arcsec, np.float64)
 
 
-def draw_map_spectra(file: str, found: MapSpectra) -> list[Sketch]:
+@draw.register
+def draw_map_spectra(found: MapSpectra, file: str, where: str) -> list[Sketch]:
     """Radial spectra of maps, each with the white level that its noise promises."""
-    ax = new_axes(None, (7.2, 5.4), above=0.9)
+    ax = new_axes((7.2, 5.4), above=0.9)
     plot_radial_spectra(ax, found.spectra, "K_RJ", found.fwhm, found.names)
     ax.set_title("Radial power spectra of the maps")
     what = "Power spectral densities of the maps in rings of angular scale under a cosine window"
@@ -181,10 +184,11 @@ def _short(text: str, most: int = 46) -> str:
     return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"
 
 
-def draw_stream_comparison(file: str, found: StreamComparison) -> list[Sketch]:
+@draw.register
+def draw_stream_comparison(found: StreamComparison, file: str, where: str) -> list[Sketch]:
     """Spectra, their ratio and the coherence."""
     heights: dict[str, Any] = {"height_ratios": (0.43, 0.21, 0.20), "gridspec_kw": {"hspace": 0.06}}
-    axes = spectra, ratio, coherence = new_axes(None, (7.2, 7.2), nrows=3, sharex=True, **heights)
+    axes = spectra, ratio, coherence = new_axes((7.2, 7.2), nrows=3, sharex=True, **heights)
     f, (x, y, d) = found.frequency, found.power
     for row, label, colour in (
         (x, found.stream, "black"),
@@ -209,8 +213,7 @@ def draw_stream_comparison(file: str, found: StreamComparison) -> list[Sketch]:
         finish(ax, "frequency [Hz]" if ax is coherence else "", up)
     spectra.legend(frameon=False, fontsize=9)
     spectra.set_title(f"{found.stream} and {found.reference}")
-    number, scans = len(found.names), found.observations
-    many = f"{number} detectors and {scans} scan{'s' if scans > 1 else ''}"
+    many = f"{len(found.names)} detectors and {scans(found.observations)}"
     caption = (
         f"Streams {found.stream} and {found.reference} at step {found.label}, mean of {many}: power"
         f" spectra on the calibrated sky, their ratio (dashed: gain², {gain:.4g} ±"

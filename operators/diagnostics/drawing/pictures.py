@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,15 +31,10 @@ from zonda.core.maps.smoothing import smoother
 from zonda.core.numerics.angles import angle_text, sides_text
 from zonda.core.types import AnyFloats
 
-from ..series import Modes, Spectrum, TimeStream, unit_of_stream
-from .plots import plot_modes, plot_scan, plot_spectra, plot_tod, plot_transfer
-
 if TYPE_CHECKING:
-    from zonda.core.data import Observation
     from zonda.core.maps.image import Image
     from zonda.core.maps.map_product import MapProduct
 
-    from ..transfer_function import Transfer
 
 Window = tuple[slice, slice]
 LARGEST = 1500
@@ -283,85 +278,6 @@ def draw_plane(file: str, product: MapProduct, name: str) -> list[Sketch]:
     )
     ax = plot_plain(values, flat.wcs, limits, "cividis_r", plane.unit, title=plane.title)
     return [Sketch(file, plane.title, plane.caption, ax)]
-
-
-def draw_scan(scans: Sequence[Observation]) -> list[Sketch]:
-    """Track of the boresight."""
-    text = "The boresight about the target, one line per scan."
-    return [Sketch("scan", "Boresight track", text, plot_scan(scans))]
-
-
-def draw_spectra(file: str, spectrum: Spectrum, before: str) -> list[Sketch]:
-    """Power spectra, taken after the step ``before``."""
-    where, made = _after(before, spectrum.label), []
-    many = f"{spectrum.detectors} detectors and {_scans(spectrum.observations)}"
-    for kind in dict.fromkeys(map(unit_of_stream, spectrum.psd)):
-        psd = {name: psd for name, psd in spectrum.psd.items() if unit_of_stream(name) == kind}
-        caption, sky = f"Mean of {many} {where}", kind == "K_RJ"
-        if sky:
-            caption += ", referred to the calibrated sky: divided by ζ exp(−τ), the atmosphere"
-            caption += " multiplied by ε"
-        caption += "."
-        if "signal" in psd:
-            caption += " The signal holds the mean emission too, which changes as the scan moves"
-            caption += " in elevation."
-        title = f"Power spectra of the time streams {where}"
-        ax = plot_spectra(replace(spectrum, psd=psd), title=title)
-        name = file if sky else f"{file}_{'_'.join(psd)}"
-        made.append(Sketch(name, "Power spectra", caption, ax))
-    return made
-
-
-def _after(before: str, label: str) -> str:
-    """Place of a measurement among the steps, in words."""
-    return f"after {before}" if before else f"at step {label}"
-
-
-def _scans(number: int) -> str:
-    return f"{number} scan{'s' if number > 1 else ''}"
-
-
-def draw_modes(file: str, modes: Modes, before: str) -> list[Sketch]:
-    """Shares of the variance and the leading modes in time, taken after the step ``before``."""
-    where = _after(before, modes.label)
-    what = f"{modes.detectors} detectors"
-    what += f" at {modes.delays + 1} delays of {modes.delay:.3g} s" if modes.delays else ""
-    shares = f"left, the share of the variance in each, mean of {_scans(len(modes.values))}"
-    streams = f"right, the first in time, of {modes.observation}"
-    caption = f"Principal components of {what} {where}: {shares}; {streams}."
-    ax = plot_modes(modes, title=f"Modes {where}")
-    return [Sketch(file, "Modes", caption, ax)]
-
-
-def draw_transfer(file: str, transfer: Transfer) -> list[Sketch]:
-    """Transfer function of the filters."""
-    whose = "the sky alone" if transfer.modes == "sky" else "the complete data"
-    caption = (
-        "The map of the sky alone through all filters against the same map without filters, by"
-        " angular scale: the ratio of their cross spectrum to the spectrum of the latter, with the"
-        " standard error from the scatter of the modes (bars); dashed, the ratio of amplitudes."
-        f" Dotted, the beam. Singular modes of {whose}."
-    )
-    of = "" if file == "transfer_function" else f" ({file.removeprefix('transfer_function_')})"
-    ax = plot_transfer(transfer, title=f"Transfer function{of}, singular modes of {whose}")
-    return [Sketch(file, f"Transfer function{of}", caption, ax)]
-
-
-def draw_streams(file: str, stream: TimeStream, before: str) -> list[Sketch]:
-    """A picture for each stream, taken after the step ``before``."""
-    where, made = _after(before, stream.label), []
-    for which in stream.streams:
-        meaning = "at the detector"
-        if which == "signal":
-            meaning = "divided by ζ exp(−τ), with the mean emission that no filter has removed"
-        elif unit_of_stream(which) != "K_RJ":
-            meaning = "along the line of sight, without its mean"
-        what = f"Stream {which} of {len(stream.names)} detectors {where}: {meaning}"
-        caption = f"{what}. Pale: samples; dark: means over 1 s."
-        ax = plot_tod(stream, name=which, title=f"Time streams of {stream.observation} {where}")
-        name = file if which == "signal" else f"{file}_{which}"
-        made.append(Sketch(name, "Time streams", caption, ax))
-    return made
 
 
 def _how(product: MapProduct, shown: MapProduct) -> str:

@@ -1,29 +1,26 @@
-"""Pictures of spectra, modes, time streams and scans, drawn into ``ax`` or a new figure; each
-returns its Axes.
-"""
+"""Pictures of spectra, modes, time streams and scans."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import singledispatch
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from zonda.core.canvas import COLOURS, OTHER, PALE, SEQUENCE, axis_above, finish, new_axes, unit_of
+from zonda.core.drawable import Drawable, Sketch
 from zonda.core.numerics.angles import ARCMIN, ARCSEC
 from zonda.core.numerics.projection import boresights
 from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import AnyFloats
 
-from ..series import unit_of_stream
+from ..series import Modes, Spectrum, TimeStream, unit_of_stream
+from ..transfer_function import Transfer
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from zonda.core.data import Observation
-
-    from ..series import Modes, Spectrum, TimeStream
-    from ..transfer_function import Transfer
 
 MODES = 4
 """Modes whose streams are drawn."""
@@ -39,9 +36,46 @@ def _binned(
     return np.add.reduceat(frequency, first) / count, np.add.reduceat(psd, first) / count
 
 
-def plot_spectra(
-    spectrum: Spectrum, *, ax: Any = None, title: str = "Power spectra of the time streams"
-) -> Axes:
+@singledispatch
+def draw(product: Any, file: str, where: str) -> list[Sketch]:
+    """Pictures of a product whose names begin with ``file``; none of a product of another kind.
+    ``where``: the step it was measured at, in words.
+    """
+    return product.sketches(file) if isinstance(product, Drawable) else []
+
+
+def scans(number: int) -> str:
+    """A number of scans in words."""
+    return f"{number} scan{'s' if number > 1 else ''}"
+
+
+@draw.register
+def draw_spectra(spectrum: Spectrum, file: str, where: str) -> list[Sketch]:
+    """A picture for the streams of each unit."""
+    made = []
+    for kind in dict.fromkeys(map(unit_of_stream, spectrum.psd)):
+        psd = {name: psd for name, psd in spectrum.psd.items() if unit_of_stream(name) == kind}
+        sky = kind == "K_RJ"
+        caption = (
+            f"Mean of {spectrum.detectors} detectors and {scans(spectrum.observations)} {where}"
+        )
+        if sky:
+            caption += ", referred to the calibrated sky: divided by ζ exp(−τ), the atmosphere"
+            caption += " multiplied by ε"
+        caption += "."
+        if "signal" in psd:
+            caption += " The signal holds the mean emission too, which changes as the scan moves"
+            caption += " in elevation."
+        unit = {"K_RJ": ", Rayleigh–Jeans [K²/Hz]", "m": " [m²/Hz]"}.get(kind, " [1/Hz]")
+        ax = _spectra(replace(spectrum, psd=psd))
+        title, up = f"Power spectra of the time streams {where}", f"power spectral density{unit}"
+        finish(ax, "frequency [Hz]", up, title, fontsize=9, loc="upper right")
+        name = file if sky else f"{file}_{'_'.join(psd)}"
+        made.append(Sketch(name, "Power spectra", caption, ax))
+    return made
+
+
+def _spectra(spectrum: Spectrum) -> Any:
     """One-sided power spectra, log-log: thin lines as measured, thick ones averaged in logarithmic
     bins.
 
@@ -50,7 +84,7 @@ def plot_spectra(
     of white noise; it scatters about the knee of the law. Shades and names above tell which of the
     three laws dominates.
     """
-    ax = new_axes(ax)
+    ax = new_axes()
     names = {
         "signal": "signal (all)",
         "sky": "astronomical sky",
@@ -84,11 +118,7 @@ def plot_spectra(
         ax.loglog(spectrum.frequency, law, color=colours[name], **dashed)
     _mark_regimes(ax, spectrum.regimes())
     _mark_levels(ax, floor, spectrum.knee())
-    kinds = list({unit_of_stream(name) for name in spectrum.psd})
-    what = {"K_RJ": ", Rayleigh–Jeans [K²/Hz]", "m": " [m²/Hz]"}.get(kinds[0], " [1/Hz]")
-    up = f"power spectral density{what if len(kinds) == 1 else ''}"
-    finish(ax, "frequency [Hz]", up, title, fontsize=9, loc="upper right")
-    return ax  # type: ignore[no-any-return]
+    return ax
 
 
 def _mark_regimes(ax: Any, regimes: Sequence[tuple[str, float, float]]) -> None:
@@ -126,7 +156,8 @@ def _legend(ax: Any, **style: Any) -> None:
         line.set_linewidth(2)
 
 
-def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer function") -> Axes:
+@draw.register
+def draw_transfer(transfer: Transfer, file: str, where: str) -> list[Sketch]:
     """Share of each angular scale that the filters leave: T with its standard error, and S, the
     ratio of amplitudes.
 
@@ -134,7 +165,7 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     read; the legend says where. Horizontal bars are the rings. The dotted line is the beam's FWHM;
     the upper axis counts wavelengths.
     """
-    ax = new_axes(ax, (7.2, 5.0), above=0.9)
+    ax = new_axes(size=(7.2, 5.0), above=0.9)
     r = transfer.rings
     scale, edges = transfer.scale / ARCSEC, 1 / transfer.edges / ARCSEC
     width = [np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)]
@@ -153,8 +184,18 @@ def plot_transfer(transfer: Transfer, *, ax: Any = None, title: str = "Transfer 
     if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / ARCSEC <= edges[0]:
         ax.axvline(transfer.fwhm / ARCSEC, color="black", linestyle=":", linewidth=1.0)
     axis_above(ax, _to_kilolambda, "baseline [1000 wavelengths]")
+    whose = "the sky alone" if transfer.modes == "sky" else "the complete data"
+    more = file.removeprefix("transfer_function").removeprefix("_")
+    what = "Transfer function" + (f" ({more})" if more else "")
+    title = f"{what}, singular modes of {whose}"
     finish(ax, "angular scale [arcsec]", "transfer function", title, fontsize=9, loc="best")
-    return ax  # type: ignore[no-any-return]
+    caption = (
+        "The map of the sky alone through all filters against the same map without filters, by"
+        " angular scale: the ratio of their cross spectrum to the spectrum of the latter, with the"
+        " standard error from the scatter of the modes (bars); dashed, the ratio of amplitudes."
+        f" Dotted, the beam. Singular modes of {whose}."
+    )
+    return [Sketch(file, what, caption, ax)]
 
 
 def _to_kilolambda(arcsec: Any) -> Any:
@@ -163,11 +204,27 @@ def _to_kilolambda(arcsec: Any) -> Any:
         return 1e-3 / (np.asarray(arcsec, np.float64) * ARCSEC)
 
 
-def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title: str = "") -> Axes:
-    """Stream ``name`` of a few detectors against time, K_RJ: samples pale, means over one second
-    dark.
-    """
-    ax = new_axes(ax, (7.2, 3.6))
+@draw.register
+def draw_streams(stream: TimeStream, file: str, where: str) -> list[Sketch]:
+    """A picture for each stream."""
+    made = []
+    for name in stream.streams:
+        meaning = "at the detector"
+        if name == "signal":
+            meaning = "divided by ζ exp(−τ), with the mean emission that no filter has removed"
+        elif unit_of_stream(name) != "K_RJ":
+            meaning = "along the line of sight, without its mean"
+        what = f"Stream {name} of {len(stream.names)} detectors {where}: {meaning}"
+        caption = f"{what}. Pale: samples; dark: means over 1 s."
+        ax = _stream(stream, name, f"Time streams of {stream.observation} {where}")
+        own = file if name == "signal" else f"{file}_{name}"
+        made.append(Sketch(own, "Time streams", caption, ax))
+    return made
+
+
+def _stream(stream: TimeStream, name: str, title: str) -> Any:
+    """Stream ``name`` of a few detectors against time: samples pale, means over one second dark."""
+    ax = new_axes(size=(7.2, 3.6))
     values = stream.streams[name]
     finite = values[np.isfinite(values)]
     largest = float(np.abs(finite).max()) if finite.size else 1.0
@@ -195,7 +252,6 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
     ax.margins(x=0)
     if len(t) > 1:
         ax.set_xlim(t[0], t[-1])
-    title = title or f"Time streams of {stream.observation}, after step {stream.label}"
     finish(ax, "time since the start of the scan [s]", label, title)
     if len(values):
         rows = -(-len(stream.names) // 6)
@@ -204,16 +260,16 @@ def plot_tod(stream: TimeStream, *, ax: Any = None, name: str = "signal", title:
             ax.set_ylim(low, high + (high - low) * 0.08 * rows)
         frame = {"frameon": rows > 3, "framealpha": 0.85, "edgecolor": "none"}
         _legend(ax, **frame, ncols=min(6, len(stream.names)), loc="upper right")
-    return ax  # type: ignore[no-any-return]
+    return ax
 
 
-def plot_scan(observations: Sequence[Observation], *, ax: Any = None) -> Axes:
+def draw_scan(observations: Sequence[Observation]) -> list[Sketch]:
     """Track of the boresight about the centre of the first scan, tangent-plane offsets in arcmin or
     deg, a line per scan, from at most 20 000 samples each.
 
     Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
     """
-    ax = new_axes(ax, (5.7, 5.2 if len(observations) > 8 else 5.7))
+    ax = new_axes(size=(5.7, 5.2 if len(observations) > 8 else 5.7))
     tracks, axes = [], local_axes(*observations[0].centre)
     for o in observations:
         radec = o.boresight_radec[:: -(-o.n_samples // 20000)]
@@ -228,25 +284,20 @@ def plot_scan(observations: Sequence[Observation], *, ax: Any = None) -> Axes:
         width = 0.6 + 1.2 * (1 - (k + 1) / len(tracks))
         ax.plot(*track / scale, linewidth=width, color=SEQUENCE[k % len(SEQUENCE)], label=o.name)
     ax.set_aspect("equal", adjustable="datalim")
-    if not ax.xaxis_inverted():
-        ax.invert_xaxis()
+    ax.invert_xaxis()
     finish(ax, f"RA offset [{unit}]", f"Dec offset [{unit}]", "Boresight track")
     if len(tracks) <= 8:  # below the axes
         ax.figure.subplots_adjust(bottom=0.2)
         _legend(ax, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, frameon=False)
-    return ax  # type: ignore[no-any-return]
+    text = "The boresight about the target, one line per scan."
+    return [Sketch("scan", "Boresight track", text, ax)]
 
 
-def plot_modes(modes: Modes, *, axes: Any = None, title: str = "Modes") -> Axes:
-    """Share of the variance in each mode, and the leading modes in time, below one another;
-    ``axes``: two Axes to draw into.
-    """
-    widths: dict[str, Any] = {
-        "ncols": 2,
-        "width_ratios": (0.30, 0.515),
-        "gridspec_kw": {"wspace": 0.3},
-    }
-    left, right = new_axes(axes, (9.6, 4.2), **widths)
+@draw.register
+def draw_modes(modes: Modes, file: str, where: str) -> list[Sketch]:
+    """Share of the variance in each mode, and the leading modes in time, below one another."""
+    widths: dict[str, Any] = {"width_ratios": (0.30, 0.515), "gridspec_kw": {"wspace": 0.3}}
+    left, right = new_axes(size=(9.6, 4.2), ncols=2, **widths)
     share = modes.shares[modes.shares > 0]
     number = np.arange(1, share.size + 1)
     left.loglog(number, share, "o-", color=SEQUENCE[0], markersize=3.5, linewidth=0.9)
@@ -254,7 +305,7 @@ def plot_modes(modes: Modes, *, axes: Any = None, title: str = "Modes") -> Axes:
         place: dict[str, Any] = {"xytext": (5, 5), "textcoords": "offset points", "fontsize": 9}
         left.annotate(f"{100 * value:.3g} %", (k, value), **place)
     left.set_xlim(0.8, max(2.0, 1.2 * share.size))
-    finish(left, "mode", "share of the variance", title)
+    finish(left, "mode", "share of the variance", f"Modes {where}")
     rows = modes.streams[:MODES] / np.sqrt(max(1, modes.vectors.shape[1]))
     peak = float(np.nanmax(abs(rows), initial=0.0)) or 1.0
     factor, unit = unit_of(peak) if modes.unit else (1.0, "")
@@ -267,4 +318,9 @@ def plot_modes(modes: Modes, *, axes: Any = None, title: str = "Modes") -> Axes:
     up = f"mode / √rows [{unit}]" if unit else "mode / √rows"
     finish(right, f"time since the start of {modes.observation} [s]", up)
     _legend(right, frameon=False, ncols=MODES, loc="upper right")
-    return left  # type: ignore[no-any-return]
+    what = f"{modes.detectors} detectors"
+    what += f" at {modes.delays + 1} delays of {modes.delay:.3g} s" if modes.delays else ""
+    shares = f"left, the share of the variance in each, mean of {scans(len(modes.values))}"
+    streams = f"right, the first in time, of {modes.observation}"
+    caption = f"Principal components of {what} {where}: {shares}; {streams}."
+    return [Sketch(file, "Modes", caption, left)]

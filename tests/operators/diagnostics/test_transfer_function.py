@@ -12,7 +12,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCSEC
 from zonda.core.storage.ecsv import write_ecsv
-from zonda.operators.diagnostics.drawing.plots import plot_transfer
+from zonda.operators.diagnostics.drawing.plots import draw
 from zonda.operators.diagnostics.plot_operators import Plots, pictures
 from zonda.operators.diagnostics.transfer_function import (
     Transfer,
@@ -161,8 +161,8 @@ def test_the_table_is_read_by_astropy(transfer, tmp_path):
 
 
 def test_the_picture(transfer, data):
-    ax = plot_transfer(transfer, title="mine")
-    assert ax.get_title() == "mine"
+    ax = draw(transfer, "transfer_function", "")[0].ax
+    assert ax.get_title() == "Transfer function, singular modes of the sky alone"
     assert ax.get_xlabel() == "angular scale [arcsec]"
     low, high = ax.get_xlim()
     assert low == pytest.approx(1 / transfer.edges[0] / ARCSEC)
@@ -171,7 +171,7 @@ def test_the_picture(transfer, data):
         transfer,
         rings=replace(transfer.rings, amplitude=np.full_like(transfer.rings.amplitude, 50.0)),
     )
-    assert plot_transfer(wild).get_ylim()[1] <= 2.2  # T can still be read
+    assert draw(wild, "transfer_function", "")[0].ax.get_ylim()[1] <= 2.2  # T can still be read
     data.products["transfer_function"] = transfer
     made = {p.name: p for p in pictures(data, Plots().style())}
     assert made["transfer_function"].png.startswith(b"\x89PNG")

@@ -27,10 +27,8 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.on_plane import on_plane
 from zonda.operators.diagnostics.drawing.pictures import Flat
 from zonda.operators.diagnostics.drawing.plots import (
-    plot_scan,
-    plot_spectra,
-    plot_tod,
-    plot_transfer,
+    draw,
+    draw_scan,
 )
 from zonda.operators.diagnostics.plot_operators import Plots
 from zonda.operators.diagnostics.power_spectrum import Spectrum
@@ -233,7 +231,7 @@ def test_colours_diverge_only_about_zero(wcs):
 def test_a_repeated_track_does_not_hide_the_first(make_observation):
     widths = [
         line.get_linewidth()
-        for line in plot_scan([make_observation(500, k) for k in range(3)]).lines
+        for line in draw_scan([make_observation(500, k) for k in range(3)])[0].ax.lines
     ]
     assert widths == sorted(widths, reverse=True)
     assert widths[0] > 1.5 * widths[-1]
@@ -263,7 +261,7 @@ def test_coverage_leaves_unseen_pixels_out(wcs):
 
 
 def test_spectra_mark_the_white_level_and_the_knee(spectrum):
-    ax = drawn(plot_spectra(spectrum))
+    ax = drawn(draw(spectrum, "s", "")[0].ax)
     assert ax.get_xscale() == ax.get_yscale() == "log"
     assert any("2 NET²" in t and "1.73 mK" in t for t in texts(ax))  # sqrt(6e-6 / 2)
     assert any(t.startswith("measured knee 0.5") for t in texts(ax))
@@ -274,14 +272,14 @@ def test_spectra_mark_the_white_level_and_the_knee(spectrum):
 
 
 def test_time_streams(stream):
-    ax = drawn(plot_tod(stream))
+    ax = drawn(draw(stream, "tod", "")[0].ax)
     assert [t.get_text() for t in ax.get_legend().get_texts()] == ["d0", "d1"]
     assert "scan" in ax.get_title()
 
 
 def test_a_track_starts_at_its_offset(make_observation):
     observation = make_observation(500)
-    ax = drawn(plot_scan([observation]))
+    ax = drawn(draw_scan([observation])[0].ax)
     x, y = ax.lines[0].get_data()
     assert np.hypot(x[0], y[0]) < 1e-9  # the fixture's first sample looks at the centre
     offset = np.radians(0.05) * np.sin(observation.seconds)
@@ -371,14 +369,18 @@ def test_no_labels_overlap(picture, values, wcs, spectrum, stream, make_observat
     ring = np.linspace(0.1, 1, 12)
     rings = Found(np.sqrt(edges[1:] * edges[:-1]), ring, ring / 10, ring, ring, ring)
     ax = {
-        "spectra": lambda: plot_spectra(spectrum),
-        "streams": lambda: plot_tod(
-            replace(stream, streams={"signal": -1e3 + stream.streams["signal"]})
+        "spectra": lambda: draw(spectrum, "s", "")[0].ax,
+        "streams": lambda: (
+            draw(replace(stream, streams={"signal": -1e3 + stream.streams["signal"]}), "tod", "")[
+                0
+            ].ax
         ),
-        "transfer function": lambda: plot_transfer(
-            Transfer(rings, edges, "sky", 9 * ARCSEC, "T", "map"), title="T"
+        "transfer function": lambda: (
+            draw(Transfer(rings, edges, "sky", 9 * ARCSEC, "T", "map"), "transfer_function", "")[
+                0
+            ].ax
         ),
-        "scan": lambda: plot_scan([make_observation(500)]),
+        "scan": lambda: draw_scan([make_observation(500)])[0].ax,
         "coverage": lambda: plot_coverage(hits, wcs, per_beam=0.3),
     }.get(picture, lambda: plot_map(values, wcs, title="The map", fwhm=9 * ARCSEC))()
     canvas = FigureCanvasAgg(ax.figure)
@@ -483,7 +485,7 @@ def test_many_scans_take_few_points(make_observation):
     the samples were.
     """
     observation = make_observation(60000)
-    x, y = plot_scan([observation]).lines[0].get_data()
+    x, y = draw_scan([observation])[0].ax.lines[0].get_data()
     ra0, dec0 = observation.centre
     dx, dy = (observation.ra - ra0) * np.cos(dec0) / ARCMIN, (observation.dec - dec0) / ARCMIN
     extent = max(np.ptp(dx), np.ptp(dy))
@@ -628,7 +630,7 @@ def test_time_streams_are_kept_whole(make_observation, data):
 @pytest.mark.parametrize("picture", ["streams", "scans"])
 def test_the_legend_touches_no_line(picture, stream, make_observation):
     scans = [make_observation(500, index=k) for k in range(3)]
-    ax = plot_tod(stream) if picture == "streams" else plot_scan(scans)
+    ax = draw(stream, "tod", "")[0].ax if picture == "streams" else draw_scan(scans)[0].ax
     FigureCanvasAgg(ax.figure).draw()
     box = ax.get_legend().get_window_extent()
     for line in ax.get_lines():

@@ -19,7 +19,7 @@ from zonda.plugins.checks import scenes
 
 
 def drawn():
-    ax = new_axes(None, (3.0, 2.0))
+    ax = new_axes((3.0, 2.0))
     ax.plot([0, 1], [0, 1], label="a line")
     ax.imshow(np.arange(4.0).reshape(2, 2))
     ax.legend()
@@ -126,7 +126,7 @@ def test_contours_are_of_the_smoothed_map():
 
 
 def test_no_contours_where_no_level_is_reached():
-    ax = new_axes(None, (3.0, 2.0))
+    ax = new_axes((3.0, 2.0))
     plot_contours(ax, np.full((4, 4), np.nan), [2.0])
     plot_contours(ax, np.zeros((4, 4)), [2.0])
     assert not ax.collections
