@@ -54,6 +54,15 @@ def new_axes(size: tuple[float, float] = (7.2, 5.0), above: float = 0.45, **grid
     return figure.subplots(**grid)
 
 
+def new_figure(title: str, size: tuple[float, float]) -> Any:
+    """Figure of ``size`` [in] that matplotlib lays out, for axes of a known content."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    figure.suptitle(title)
+    return figure
+
+
 def finish(ax: Any, across: str, up: str, title: str = "", **legend: Any) -> None:
     """Name the axes, draw a grid, label logarithmic axes, and add a legend where ``legend`` says
     how.

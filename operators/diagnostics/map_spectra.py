@@ -105,97 +105,65 @@ class MapSpectrum(Output):
 
     def finalize(self, data: Data) -> None:
         """Raises PipelineError where there is no map, or none of which there is a spectrum."""
-        found = map_spectra(
-            data.products, Wanted(self.maps, self.bins, self.least_coverage, self.taper), self.label
-        )
+        found = self.spectra(data.products)
         publish(data, key_of(self, "map_spectra"), found, {"": found.spectra.columns("K")})
 
+    def spectra(self, products: Mapping[str, Any]) -> MapSpectra:
+        """Spectra of maps among the products of a run. Raises PipelineError."""
+        every = maps_of(products, split=False).items()
+        whole = {name: product for name, product in every if product.contents == "all"}
+        flat = {name: product for name, product in whole.items() if product.projection == "TAN"}
+        flat |= {name: product for name, product in maps_of(flat).items() if name not in whole}
+        usable = [name for name in whole if "/" not in name and whole[name].projection in USABLE]
+        names = self.maps or usable[:1]
+        spheres = [n for n in names if n in whole and whole[n].projection == "HEALPix"]
+        if spheres and len(names) > 1:
+            cure = "name one map in each MapSpectrum"
+            raise PipelineError(SEVERAL_HEALPIX, place=self.label, cure=cure)
+        if spheres:
+            product = whole[names[0]]
+            sphere = sphere_spectra(names[0], product, self.bins, self.least_coverage, self.label)
+            return MapSpectra(sphere, {name: name for name in sphere.power}, product.fwhm)
+        if missing := [name for name in names if name not in flat]:
+            cure = f"name some of these: {', '.join(flat)}" if flat else CURE
+            raise PipelineError(f"there is no TAN map {missing[0]!r}", place=self.label, cure=cure)
+        if not names:
+            raise PipelineError(NO_MAP, place=self.label, cure=CURE)
+        return self._of_planes(flat, names)
 
-@dataclass(frozen=True)
-class Wanted:
-    """Requested spectra: names of maps (empty: the map and what holds noise alone), rings, least
-    coverage, taper [rad].
-    """
-
-    maps: list[str]
-    bins: int
-    least: float
-    taper: float | None
-
-
-def map_spectra(products: Mapping[str, Any], wanted: Wanted, place: str) -> MapSpectra:
-    """Spectra of maps among the products of a run. Raises PipelineError about ``place``."""
-    whole = {
-        name: product
-        for name, product in maps_of(products, split=False).items()
-        if product.contents == "all"
-    }
-    flat = {name: product for name, product in whole.items() if product.projection == "TAN"}
-    flat |= {name: product for name, product in maps_of(flat).items() if name not in whole}
-    usable = [name for name in whole if "/" not in name and whole[name].projection in USABLE]
-    names = wanted.maps or usable[:1]
-    if len(names) == 1 and names[0] in whole and whole[names[0]].projection == "HEALPix":
-        product = whole[names[0]]
-        found = sphere_spectra(names[0], product, wanted.bins, wanted.least, place)
-        return MapSpectra(found, {name: name for name in found.power}, product.fwhm)
-    if len(names) > 1 and any(
-        name in whole and whole[name].projection == "HEALPix" for name in names
-    ):
-        raise PipelineError(SEVERAL_HEALPIX, place=place, cure="name one map in each MapSpectrum")
-    if missing := [name for name in names if name not in flat]:
-        cure = f"name some of these: {', '.join(flat)}" if flat else CURE
-        raise PipelineError(f"there is no TAN map {missing[0]!r}", place=place, cure=cure)
-    if not names:
-        raise PipelineError(NO_MAP, place=place, cure=CURE)
-    return _of_planes(flat, names, wanted, place)
-
-
-def _of_planes(
-    flat: Mapping[str, MapProduct], names: list[str], wanted: Wanted, place: str
-) -> MapSpectra:
-    """Spectra of TAN maps, of polarized ones those of I, E and B."""
-    first = flat[names[0]]
-    planes: dict[str, Floats] = {}
-    noise: dict[str, Floats] = {}
-    polarized: dict[str, tuple[str, str]] = {}
-
-    def add(name: str, product: MapProduct, plane: str = "signal") -> None:
-        planes[name] = getattr(product, plane)
-        if product.polarization is not None:
-            polarized[name] = f"{name}_Q", f"{name}_U"
-            q_and_u = np.stack([getattr(product.stokes(which), plane) for which in "QU"])
-            planes.update(zip(polarized[name], on_the_plane(product, q_and_u), strict=True))
-
-    def add_noise(name: str, product: MapProduct) -> None:
-        own = [product] if name not in polarized else list(product.by_stokes().values())
-        noise.update(
-            zip((name, *polarized.get(name, ())), (each.noise for each in own), strict=True)
-        )
-
-    for name in names:
-        add(name, flat[name])
-        if not name.startswith("noiseless/"):
-            add_noise(name, flat[name])
-    if not wanted.maps:
-        for of, (product, plane) in noise_sources(flat, names[0]).items():
-            name = "half_difference" if of == "half_difference" else f"source_free/{names[0]}"
-            add(name, product, plane)
-            if plane == "signal":
-                add_noise(name, product)
-    if any(values.shape != first.signal.shape for values in planes.values()):
-        raise PipelineError(
-            "the maps have different grids", place=place, cure="name maps of one step"
-        )
-    window = window_of(first, None, wanted.taper, wanted.least)
-    known = {name: np.where(window > 0, values, np.nan) for name, values in noise.items()}
-    sigma = first.smoothed_by / FWHM_PER_SIGMA
-    white = {
-        name: np.nan_to_num(values) for name, values in known.items() if np.isfinite(values).any()
-    }
-    edges = ring_edges(first.signal.shape, first.pixel, wanted.bins)
-    spectra = radial_spectra(planes, window, first.pixel, edges, white, sigma, polarized)
-    words = {
-        f"half_difference{end}": f"half the difference{more}, {first.difference}"
-        for end, more in HALVES.items()
-    }
-    return MapSpectra(spectra, {name: words.get(name, name) for name in spectra.power}, first.fwhm)
+    def _of_planes(self, flat: Mapping[str, MapProduct], names: list[str]) -> MapSpectra:
+        """Spectra of TAN maps, of polarized ones those of I, E and B."""
+        first = flat[names[0]]
+        planes: dict[str, Floats] = {}
+        noise: dict[str, Floats] = {}
+        polarized: dict[str, tuple[str, str]] = {}
+        shown: list[Any] = [(name, flat[name], "signal") for name in names]
+        if not self.maps:
+            for of, (product, plane) in noise_sources(flat, names[0]).items():
+                half = of == "half_difference"
+                shown.append((of if half else f"source_free/{names[0]}", product, plane))
+        for name, product, plane in shown:
+            planes[name], parts = getattr(product, plane), [product]
+            if product.polarization is not None:
+                parts = list(product.by_stokes().values())
+                polarized[name] = f"{name}_Q", f"{name}_U"
+                q_and_u = np.stack([getattr(part, plane) for part in parts[1:]])
+                planes.update(zip(polarized[name], on_the_plane(product, q_and_u), strict=True))
+            if plane == "signal" and not name.startswith("noiseless/"):
+                own = (name, *polarized.get(name, ()))
+                noise.update(zip(own, (part.noise for part in parts), strict=True))
+        if any(values.shape != first.signal.shape for values in planes.values()):
+            cure = "name maps of one step"
+            raise PipelineError("the maps have different grids", place=self.label, cure=cure)
+        window = window_of(first, None, self.taper, self.least_coverage)
+        known = {name: np.where(window > 0, values, np.nan) for name, values in noise.items()}
+        white = {name: np.nan_to_num(v) for name, v in known.items() if np.isfinite(v).any()}
+        sigma = first.smoothed_by / FWHM_PER_SIGMA
+        edges = ring_edges(first.signal.shape, first.pixel, self.bins)
+        spectra = radial_spectra(planes, window, first.pixel, edges, white, sigma, polarized)
+        words = {
+            f"half_difference{end}": f"half the difference{more}, {first.difference}"
+            for end, more in HALVES.items()
+        }
+        called = {name: words.get(name, name) for name in spectra.power}
+        return MapSpectra(spectra, called, first.fwhm)

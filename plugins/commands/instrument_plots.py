@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zonda.core.canvas import SEQUENCE
+from zonda.core.canvas import SEQUENCE, new_figure
 from zonda.core.focalplane import Focalplane
 from zonda.core.instrument import Instrument
 from zonda.core.types import Floats
@@ -27,30 +27,21 @@ def focal_plane_figure(instrument: Instrument, plane: Focalplane) -> Figure:
     """Draw all detectors on the left, the middle on the right: circles are the FWHM to scale, ticks
     the polarization angles.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.0, 6.4), dpi=110, layout="constrained")
-    title = instrument.name if len(instrument.name) < 60 else f"{instrument.name[:57]}..."
-    figure.suptitle(
-        f"{title}: {len(plane)} detectors on {instrument.telescope.name},"
-        f" {instrument.telescope.diameter:g} m"
-    )
+    name = instrument.name if len(instrument.name) < 60 else f"{instrument.name[:57]}..."
+    telescope = f"{instrument.telescope.name}, {instrument.telescope.diameter:g} m"
+    figure = new_figure(f"{name}: {len(plane)} detectors on {telescope}", (12.0, 6.4))
     whole, middle = figure.subplots(1, 2)
     largest = max(plane.radius + float(plane.fwhm.max()) / 2, 1e-9)
     _draw(whole, instrument, plane, largest, (0.0, 0.0))
     whole.legend(loc="upper right", frameon=True, fontsize=9, framealpha=0.8)
     centre, reach = _middle(plane)
     _draw(middle, instrument, plane, reach, centre, ticks=True)
-    whole.set_title(
-        "focal plane" + (", wafers outlined" if _outlines(whole, plane, largest) else ""),
-        fontsize=10,
-    )
+    outlined = ", wafers outlined" if _outlines(whole, plane, largest) else ""
+    whole.set_title(f"focal plane{outlined}", fontsize=10)
     inside = "inside a wafer" if len(np.unique(plane.wafer)) > 1 else "inside"
-    middle.set_title(
-        f"{inside}: beams (FWHM) to scale" + (", polarization angles" if plane.polarized else ""),
-        fontsize=10,
-    )
-    return figure
+    angles = ", polarization angles" if plane.polarized else ""
+    middle.set_title(f"{inside}: beams (FWHM) to scale{angles}", fontsize=10)
+    return figure  # type: ignore[no-any-return]
 
 
 def _middle(plane: Focalplane) -> tuple[tuple[float, float], float]:
@@ -79,19 +70,18 @@ def _draw(
     from matplotlib.collections import EllipseCollection
 
     unit, name = _unit(reach)
-    near = (np.abs(plane.xi - centre[0]) <= 1.5 * reach) & (
-        np.abs(plane.eta - centre[1]) <= 1.5 * reach
-    )
+    places = np.stack([plane.xi, plane.eta], axis=1)
+    near = (np.abs(places - centre) <= 1.5 * reach).all(axis=1)
     for k, band in enumerate(instrument.cameras):
-        rows = np.flatnonzero(near & ((plane.band == k) if instrument.bands else True))
+        own = plane.band == k if instrument.bands else np.ones(len(plane), bool)
+        rows = np.flatnonzero(near & own)
         colour, size = SEQUENCE[k % len(SEQUENCE)], plane.fwhm[rows] / unit
-        at = np.stack([plane.xi[rows], plane.eta[rows]], axis=1) / unit
         beams = EllipseCollection(
             size,
             size,
             np.zeros(len(rows)),
             units="xy",
-            offsets=at,
+            offsets=places[rows] / unit,
             offset_transform=ax.transData,
             facecolors="none",
             edgecolors=colour,
@@ -99,22 +89,15 @@ def _draw(
             rasterized=True,
         )
         ax.add_collection(beams)
-        count = int((plane.band == k).sum()) if instrument.bands else len(plane)
-        ax.plot([], [], "o", markerfacecolor="none", color=colour, label=f"{band}: {count}")
+        label = f"{band}: {int(own.sum())}"
+        ax.plot([], [], "o", markerfacecolor="none", color=colour, label=label)
         if ticks:
             _ticks(ax, plane, rows, unit, colour)
-    dead = np.flatnonzero(near & (plane.dead != 0))
-    if dead.size:
-        ax.plot(
-            plane.xi[dead] / unit,
-            plane.eta[dead] / unit,
-            "x",
-            color="0.4",
-            ms=5,
-            label=f"dead: {int(plane.dead.sum())}",
-        )
-    ax.set_xlim((centre[0] - 1.04 * reach) / unit, (centre[0] + 1.04 * reach) / unit)
-    ax.set_ylim((centre[1] - 1.04 * reach) / unit, (centre[1] + 1.04 * reach) / unit)
+    dead = places[near & (plane.dead != 0)] / unit
+    if len(dead):
+        ax.plot(*dead.T, "x", color="0.4", ms=5, label=f"dead: {int(plane.dead.sum())}")
+    for limits, at in ((ax.set_xlim, centre[0]), (ax.set_ylim, centre[1])):
+        limits((at - 1.04 * reach) / unit, (at + 1.04 * reach) / unit)
     ax.set_aspect("equal")
     ax.set_xlabel(f"xi [{name}], towards increasing azimuth")
     ax.set_ylabel(f"eta [{name}], towards increasing elevation")
@@ -132,11 +115,8 @@ def _ticks(ax: Any, plane: Focalplane, rows: Any, unit: float, colour: str) -> N
     angle, half = plane.polarization_angle[rows], 0.35 * plane.fwhm[rows] / unit
     axis = np.stack([np.sin(angle), np.cos(angle)], axis=1) * half[:, None]
     at = np.stack([plane.xi[rows], plane.eta[rows]], axis=1) / unit
-    ax.add_collection(
-        LineCollection(
-            list(np.stack([at - axis, at + axis], axis=1)), colors=colour, linewidths=1.2
-        )
-    )
+    lines = list(np.stack([at - axis, at + axis], axis=1))
+    ax.add_collection(LineCollection(lines, colors=colour, linewidths=1.2))
 
 
 def _outlines(ax: Any, plane: Focalplane, reach: float) -> bool:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zonda.core.canvas import SEQUENCE
+from zonda.core.canvas import PALE, SEQUENCE, log_labels, new_figure
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
 from zonda.operators.atmosphere.weather.summary import (
     HOURS,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 LOWEST, HIGHEST = 1e9, 1000e9
 """Hz: what the absorption table holds, and the spectra show."""
 LINES = {
-    "H₂O": (
+    "H₂O": [
         22.24,
         183.31,
         325.15,
@@ -42,14 +42,14 @@ LINES = {
         916.17,
         970.32,
         987.93,
-    ),
-    "O₂": (60.3, 118.75, 368.50, 424.76, 487.25, 715.39, 773.84, 834.15),
-    "O₃": (110.84, 249.96, 301.81, 358.85, 655.29, 843.0),
+    ],
+    "O₂": [60.3, 118.75, 368.50, 424.76, 487.25, 715.39, 773.84, 834.15],
+    "O₃": [110.84, 249.96, 301.81, 358.85, 655.29, 843.0],
 }
 """GHz: the strong lines of water and oxygen (of 60 GHz, the middle of many), and what stands out of
 ozone's hundreds.
 """
-LINE_COLOURS = {"H₂O": "#0072B2", "O₂": "#D55E00", "O₃": "#009E73"}
+LINE_COLOURS = dict(zip(LINES, SEQUENCE, strict=False))
 
 
 def plot_profile(ax: Any, air: Profile) -> None:
@@ -62,11 +62,8 @@ def plot_profile(ax: Any, air: Profile) -> None:
     ax.set_ylim(0, 20)
     other = ax.twiny()
     other.plot(np.hypot(air.wind_east, air.wind_north)[low], km, color=SEQUENCE[0], label="wind")
-    scale = (
-        10 ** math.floor(math.log10(20 / (air.vapour_density[0] * 1e3)))
-        if air.vapour_density[0] > 0
-        else 1.0
-    )
+    ground = float(air.vapour_density[0]) * 1e3
+    scale = 10 ** math.floor(math.log10(20 / ground)) if ground > 0 else 1.0
     label = "vapour [g/m³]" if scale == 1 else f"vapour × {scale:g} [g/m³]"
     other.plot(air.vapour_density[low] * 1e3 * scale, km, color=SEQUENCE[2], label="vapour")
     other.set_xlim(left=0)
@@ -78,45 +75,22 @@ def plot_pwv(ax: Any, water: PwvByMonth) -> None:
     """PWV over the year: the medians of eight hours of the day, and the quantiles of the months."""
     month = np.arange(12)
     low, lower, _, upper, high = water.quantiles.T * 1e3
-    ax.fill_between(
-        month,
-        low,
-        high,
-        color=SEQUENCE[5],
-        alpha=0.3,
-        lw=0,
-        label=f"{100 * QUANTILES[0]:g} to {100 * QUANTILES[-1]:g} %",
-    )
-    ax.fill_between(
-        month,
-        lower,
-        upper,
-        color=SEQUENCE[5],
-        alpha=0.6,
-        lw=0,
-        label=f"{100 * QUANTILES[1]:g} to {100 * QUANTILES[3]:g} %",
-    )
+    bands = ((low, high, 0.3, QUANTILES[::4]), (lower, upper, 0.6, QUANTILES[1::2]))
+    for first, last, alpha, (least, most) in bands:
+        label = f"{100 * least:g} to {100 * most:g} %"
+        ax.fill_between(month, first, last, color=SEQUENCE[5], alpha=alpha, lw=0, label=label)
     from matplotlib import colormaps
 
     for k, hour in enumerate(HOURS):
-        colour = colormaps["viridis"](hour / 24)
-        ax.plot(
-            month, water.median[:, k] * 1e3, color=colour, lw=1.2, label=f"median, {hour:02d} h UTC"
-        )
+        colour, label = colormaps["viridis"](hour / 24), f"median, {hour:02d} h UTC"
+        ax.plot(month, water.median[:, k] * 1e3, color=colour, lw=1.2, label=label)
     ax.set_yscale("log")
     ax.set_xticks(month, [name[0] for name in MONTHS])
     ax.set_ylabel("PWV [mm]")
-    ax.yaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_minor_formatter(_some_minor)
+    log_labels(ax.yaxis)
     ax.set_xlabel("month")
-    ax.legend(
-        fontsize=6.5,
-        ncols=4,
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.14),
-        frameon=False,
-        columnspacing=1.0,
-    )
+    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14), "frameon": False}
+    ax.legend(fontsize=6.5, ncols=4, columnspacing=1.0, **below)
 
 
 def plot_spectrum(
@@ -129,34 +103,18 @@ def plot_spectrum(
     for k, pwv in enumerate(pwv_steps(air)):
         seen = spectrum(air.scaled(pwv).layers, elevation, low=low, high=high)
         values = seen.brightness if which == "brightness" else np.exp(-seen.slant_opacity)
-        own = pwv == air.pwv
-        ax.plot(
-            seen.frequency / 1e9,
-            values,
-            color="black" if own else SEQUENCE[k % 6],
-            lw=1.4 if own else 0.9,
-            label=f"PWV {pwv * 1e3:.3g} mm",
-        )
+        own, label = pwv == air.pwv, f"PWV {pwv * 1e3:.3g} mm"
+        style = {"color": "black", "lw": 1.4} if own else {"color": SEQUENCE[k % 6], "lw": 0.9}
+        ax.plot(seen.frequency / 1e9, values, label=label, **style)
     place = ax.get_xaxis_transform()  # in the height of the picture, whatever its scale
     at, side = (0.98, "top") if which == "brightness" else (0.02, "bottom")
     named = sorted(enumerate(bands), key=lambda pair: pair[1].centre)
     centres = spread([band.centre / 1e9 for _, band in named], 1.4 * NAME, low / 1e9, high / 1e9)
     for (k, band), centre in zip(named, centres, strict=True):
         colour = SEQUENCE[(k + 3) % 7]
-        ax.fill_between(
-            band.frequency / 1e9, band.transmission, color=colour, alpha=0.2, lw=0, transform=place
-        )
-        box = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 0.5}
-        ax.annotate(
-            band.name,
-            (centre, at),
-            xycoords=place,
-            rotation=90,
-            ha="center",
-            va=side,
-            fontsize=7,
-            bbox=box,
-        )
+        ghz = band.frequency / 1e9
+        ax.fill_between(ghz, band.transmission, color=colour, alpha=0.2, lw=0, transform=place)
+        _upright(ax, band.name, (centre, at), va=side, fontsize=7, bbox=PALE)
     _name_lines(ax)
     ax.set_xlim(low / 1e9, high / 1e9)
     if which == "brightness":
@@ -184,25 +142,15 @@ def _name_lines(ax: Any) -> None:
         rows, spread([f for f, _ in rows], NAME, LOWEST / 1e9, HIGHEST / 1e9), strict=True
     ):
         colour = LINE_COLOURS[name]
-        ax.plot(
-            [frequency, frequency, at],
-            [1.0, 1.015, 1.05],
-            transform=place,
-            color=colour,
-            lw=0.6,
-            clip_on=False,
-        )
+        stroke = {"color": colour, "lw": 0.6, "clip_on": False, "transform": place}
+        ax.plot([frequency, frequency, at], [1.0, 1.015, 1.05], **stroke)
         text = f"{name} {frequency:.0f}"
-        ax.annotate(
-            text,
-            (at, 1.06),
-            xycoords=place,
-            rotation=90,
-            ha="center",
-            va="bottom",
-            fontsize=6.5,
-            color=colour,
-        )
+        _upright(ax, text, (at, 1.06), va="bottom", fontsize=6.5, color=colour)
+
+
+def _upright(ax: Any, text: str, at: tuple[float, float], **style: Any) -> None:
+    """Text across the axis, at a frequency and a height of the picture, whatever its scale."""
+    ax.annotate(text, at, xycoords=ax.get_xaxis_transform(), rotation=90, ha="center", **style)
 
 
 def spread(places: Sequence[float], least: float, low: float, high: float) -> list[float]:
@@ -233,10 +181,7 @@ def weather_figure(
     """Profile, PWV by month and hour (where it is known), emission and transmission: one figure,
     not pyplot's.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 9.5), dpi=110, layout="constrained")
-    figure.suptitle(title)
+    figure = new_figure(title, (11, 9.5))
     axes = figure.subplots(2, 2)
     plot_profile(axes[0, 0], air)
     if water is not None:
@@ -246,16 +191,6 @@ def weather_figure(
         axes[0, 1].text(0.5, 0.5, "no climatology here: no PWV by month", ha="center")
     plot_spectrum(axes[1, 0], air, elevation, bands, "brightness")
     plot_spectrum(axes[1, 1], air, elevation, bands, "transmission")
-    figure.legend(
-        *axes[1, 1].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=6,
-        fontsize=8,
-        frameon=False,
-    )
-    return figure
-
-
-def _some_minor(value: float, _: int) -> str:
-    """2 and 5 of every decade."""
-    return f"{value:g}" if f"{value:.0e}"[0] in "25" else ""
+    handles = axes[1, 1].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    return figure  # type: ignore[no-any-return]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zonda.core.canvas import SEQUENCE, log_labels
+from zonda.core.canvas import SEQUENCE, log_labels, new_figure
 from zonda.core.types import Floats
 from zonda.operators.atmosphere.weather.summary import MONTHS
 
@@ -26,14 +26,11 @@ TWILIGHT = (HORIZON, math.radians(-12), math.radians(-18))
 
 def when_figure(seen: Seen, year: Sequence[Month]) -> Figure:
     """Tonight above, the year below; one figure, not pyplot's."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.5, 8.5), dpi=110, layout="constrained")
-    figure.suptitle(f"{seen.name} from {seen.site.name}")
+    figure = new_figure(f"{seen.name} from {seen.site.name}", (8.5, 8.5))
     upper, lower = figure.subplots(2, 1)
     plot_night(upper, seen)
     plot_year(lower, seen, year)
-    return figure
+    return figure  # type: ignore[no-any-return]
 
 
 def plot_night(ax: Any, seen: Seen) -> None:
@@ -41,17 +38,9 @@ def plot_night(ax: Any, seen: Seen) -> None:
     night, offset = seen.night, solar_offset(seen.site)
     hours = (night.times - night.times[0]) / HOUR
     utc = (night.times[0] % 86400) / HOUR
+    shade: Any = {"color": "0.5", "alpha": 0.16, "lw": 0, "transform": ax.get_xaxis_transform()}
     for depth in TWILIGHT:
-        ax.fill_between(
-            hours,
-            0,
-            1,
-            where=night.sun.elevation < depth,
-            transform=ax.get_xaxis_transform(),
-            color="0.5",
-            alpha=0.16,
-            lw=0,
-        )
+        ax.fill_between(hours, 0, 1, where=night.sun.elevation < depth, **shade)
     own = seen.name.lower()
     for track, name, colour in (
         (night.sun, "Sun", SEQUENCE[4]),
@@ -59,34 +48,22 @@ def plot_night(ax: Any, seen: Seen) -> None:
     ):
         if not name.lower().startswith(own):
             ax.plot(hours, np.degrees(track.elevation), color=colour, lw=1.0, ls="--", label=name)
-    elevation = np.degrees(night.target.elevation)
+    elevation, limit = np.degrees(night.target.elevation), math.degrees(night.above)
+    up = np.where(elevation >= limit, elevation, np.nan)
     ax.plot(hours, elevation, color=SEQUENCE[0], lw=1.0)
-    ax.plot(
-        hours,
-        np.where(night.target.elevation >= night.above, elevation, np.nan),
-        color=SEQUENCE[0],
-        lw=2.8,
-        label=seen.name,
-    )
-    ax.axhline(
-        math.degrees(night.above),
-        color=SEQUENCE[1],
-        lw=0.8,
-        label=f"{math.degrees(night.above):.4g} deg",
-    )
+    ax.plot(hours, up, color=SEQUENCE[0], lw=2.8, label=seen.name)
+    ax.axhline(limit, color=SEQUENCE[1], lw=0.8, label=f"{limit:.4g} deg")
     ax.set_xlim(0, 24)
     ax.set_ylim(0, 90)
-    first = math.ceil(utc / 2) * 2
-    ticks = np.arange(first, utc + 24.01, 2)
-    ax.set_xticks(ticks - utc, [f"{t % 24:02.0f}" for t in ticks])
     ax.set_yticks(range(0, 91, 15))
     ax.set_ylabel("elevation [deg]")
     ax.set_xlabel(f"UTC [h], night of {seen.night_name}")
     solar = ax.secondary_xaxis("top", functions=(lambda x: x, lambda x: x))
-    begin = ((night.times[0] + offset) % 86400) / HOUR
-    every = np.arange(math.ceil(begin / 2) * 2, begin + 24.01, 2)
-    solar.set_xticks(every - begin, [f"{t % 24:02.0f}" for t in every])
     solar.set_xlabel("local mean solar time [h]")
+    begin = ((night.times[0] + offset) % 86400) / HOUR
+    for axis, start in ((ax, utc), (solar, begin)):
+        every = np.arange(math.ceil(start / 2) * 2, start + 24.01, 2)
+        axis.set_xticks(every - start, [f"{t % 24:02.0f}" for t in every])
     ax.grid(alpha=0.25, lw=0.5)
     ax.legend(loc="lower center", bbox_to_anchor=(0.5, -0.42), ncols=4, frameon=False, fontsize=9)
 
@@ -107,27 +84,16 @@ def plot_year(ax: Any, seen: Seen, year: Sequence[Month]) -> None:
     limit = math.degrees(seen.night.above)
     low, high = elevation.min(), elevation.max()
     monthly = seen.name.lower() == "moon"  # too many lines for names
-    levels = [
-        level
-        for level in (15.0, 30.0, 45.0, 60.0, 75.0)
-        if low < level < high and abs(level - limit) > 4
-    ]
+    steps = (15.0, 30.0, 45.0, 60.0, 75.0)
+    levels = [level for level in steps if low < level < high and abs(level - limit) > 4]
+    where = hours, place, elevation
     if levels and not monthly:
         colour = "white" if seen.known else "black"
-        ax.clabel(
-            ax.contour(hours, place, elevation, levels=levels, colors=colour, linewidths=0.7),
-            fmt="%g°",
-            fontsize=8,
-        )
+        thin = ax.contour(*where, levels=levels, colors=colour, linewidths=0.7)
+        ax.clabel(thin, fmt="%g°", fontsize=8)
     if low < limit < high:
-        thick = ax.contour(
-            hours,
-            place,
-            elevation,
-            levels=[limit],
-            colors=SEQUENCE[1],
-            linewidths=1.2 if monthly else 2.2,
-        )
+        width = 1.2 if monthly else 2.2
+        thick = ax.contour(*where, levels=[limit], colors=SEQUENCE[1], linewidths=width)
         if not monthly:
             ax.clabel(thick, fmt=f"{limit:.4g}°", fontsize=9)
     else:
@@ -147,15 +113,8 @@ def _plot_pwv(ax: Any, pwv: Floats) -> None:
     closed = np.concatenate([pwv, pwv[:, :1]], axis=1)
     closed = np.concatenate([closed[-1:], closed, closed[:1]])
     norm = LogNorm(pwv.min(), pwv.max())
-    image = ax.pcolormesh(
-        np.arange(25),
-        np.arange(14) - 0.5,
-        closed,
-        norm=norm,
-        cmap="viridis_r",
-        shading="gouraud",
-        rasterized=True,
-    )
+    style: Any = {"cmap": "viridis_r", "shading": "gouraud", "rasterized": True}
+    image = ax.pcolormesh(np.arange(25), np.arange(14) - 0.5, closed, norm=norm, **style)
     bar = ax.figure.colorbar(image, ax=ax, pad=0.02)
     bar.set_label("median PWV [mm]")
     log_labels(bar.ax.yaxis)

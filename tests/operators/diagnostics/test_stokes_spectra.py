@@ -10,7 +10,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.operators.diagnostics.comparison.files import read_planes
 from zonda.operators.diagnostics.comparison.stokes import on_meridians_of, planes_of
-from zonda.operators.diagnostics.map_spectra import Wanted, map_spectra
+from zonda.operators.diagnostics.map_spectra import MapSpectrum
 from zonda.operators.maps.grid import tangent_wcs
 
 NSIDE, LMAX = 512, 1000
@@ -90,9 +90,7 @@ def test_flat_spectra_of_a_sky_of_healpy(sky, declination):
     """17 deg across: at 55 deg south the meridians turn by 16 deg to the edge, which would put 7 %
     of E into B.
     """
-    found = map_spectra(
-        {"map": tan_map(sky, declination)}, Wanted([], 24, 0.1, None), "MapSpectrum"
-    ).spectra
+    found = MapSpectrum(maps=[], bins=24).spectra({"map": tan_map(sky, declination)}).spectra
     check(found)
 
 
@@ -106,7 +104,7 @@ def test_spectra_of_a_healpix_map(sky):
         "frame": "icrs",
     }
     product = polarized(*(plane[pixels] for plane in sky), nside=NSIDE, pixels=pixels, **how)
-    check(map_spectra({"map": product}, Wanted([], 24, 0.1, None), "MapSpectrum").spectra)
+    check(MapSpectrum(maps=[], bins=24).spectra({"map": product}).spectra)
 
 
 def test_white_levels_of_e_and_b():
@@ -134,7 +132,7 @@ def test_white_levels_of_e_and_b():
     ):
         planes = [level * random.standard_normal(shape) for level in noise]
         product = polarized(*planes, noise=noise, centre=(1.0, 0.2), frame="icrs", **how)
-        found = map_spectra({"map": product}, Wanted([], 8, 0.1, None), "MapSpectrum").spectra
+        found = MapSpectrum(maps=[], bins=8).spectra({"map": product}).spectra
         area = pixel**2 if len(shape) > 1 else healpy.nside2pixarea(64)
         assert found.white["map"] == pytest.approx(area, rel=1e-6)
         for key in ("map_E", "map_B"):
@@ -151,10 +149,10 @@ def test_a_map_without_a_spectrum_is_passed_over(sky):
     flat = tan_map(sky, 0.0, pixels=64)
     header = {**flat.header, "CTYPE1": "RA---CAR", "CTYPE2": "DEC--CAR"}
     strip = dataclasses.replace(flat, header=header)
-    found = map_spectra({"a": strip, "map": flat}, Wanted([], 8, 0.1, None), "MapSpectrum")
+    found = MapSpectrum(maps=[], bins=8).spectra({"a": strip, "map": flat})
     assert set(found.spectra.power) == {"map", "map_E", "map_B"}
     with pytest.raises(PipelineError, match="no TAN or HEALPix map"):
-        map_spectra({"a": strip}, Wanted([], 8, 0.1, None), "MapSpectrum")
+        MapSpectrum(maps=[], bins=8).spectra({"a": strip})
 
 
 def test_what_has_no_spectrum_is_refused():
@@ -162,12 +160,12 @@ def test_what_has_no_spectrum_is_refused():
     how = {"header": None, "centre": (0.0, 0.0), "pixel": 1e-4, "frame": "icrs"}
     product = polarized(*np.zeros((3, 100)), nside=8192, pixels=pixels, **how)
     with pytest.raises(PipelineError, match="nside 8192 would take gigabytes"):
-        map_spectra({"map": product}, Wanted([], 8, 0.1, None), "MapSpectrum")
+        MapSpectrum(maps=[], bins=8).spectra({"map": product})
     product = polarized(*np.zeros((3, 0)), nside=64, pixels=pixels[:0], **how)
     with pytest.raises(PipelineError, match="no pixel has enough samples"):
-        map_spectra({"map": product}, Wanted([], 8, 0.1, None), "MapSpectrum")
+        MapSpectrum(maps=[], bins=8).spectra({"map": product})
     with pytest.raises(PipelineError, match="there is no TAN map 'other'"):
-        map_spectra({"map": product}, Wanted(["other"], 8, 0.1, None), "MapSpectrum")
+        MapSpectrum(maps=["other"], bins=8).spectra({"map": product})
 
 
 def test_windows_on_the_sphere():
@@ -190,7 +188,7 @@ def test_windows_on_the_sphere():
         product = MapProduct(
             signal, hits, noise, noise, None, fwhm=1e-9, nside=nside, pixels=pixels, **how
         )
-        found = map_spectra({"map": product}, Wanted([], 8, 0.1, None), "MapSpectrum").spectra
+        found = MapSpectrum(maps=[], bins=8).spectra({"map": product}).spectra
         use = found.modes > 20
         scatter.append(
             (found.power["map"][use] / found.white["map"][use] - 1) * np.sqrt(found.modes[use])
