@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from zonda.core.drawable import Sketch
+from zonda.core.canvas import Sketch
 from zonda.core.types import Floats
 
 ACROSS = (4, 5, 3)

@@ -22,10 +22,17 @@ from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.output import Output
 from zonda.core.storage.files import product_path
 
-from .comparison.files import Wanted, plane_of, read_planes, write_comparison
+from .comparison.files import (
+    Wanted,
+    on_meridians_of,
+    plane_of,
+    planes_of,
+    products_of,
+    read_planes,
+    write_comparison,
+)
 from .comparison.planes import EMPTY, NOT_EMPTY, Plane
 from .comparison.statistics import THRESHOLD, Comparison, Settings, compare
-from .comparison.stokes import on_meridians_of, planes_of, products_of
 from .series import about, check_map, key_of, plane_key
 from .transfer_function import window_of
 

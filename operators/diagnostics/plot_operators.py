@@ -10,10 +10,9 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from zonda.core.canvas import DPI
+from zonda.core.canvas import DPI, Sketch
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
-from zonda.core.drawable import Sketch
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_alone, noise_sources

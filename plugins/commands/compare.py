@@ -212,9 +212,13 @@ def _compare(
     """One comparison, printed and written to ``folder``."""
     from zonda.core.storage.files import atomic_path
     from zonda.operators.diagnostics.comparison import statistics
-    from zonda.operators.diagnostics.comparison.files import Wanted, read_planes, write_comparison
+    from zonda.operators.diagnostics.comparison.files import (
+        Wanted,
+        on_meridians_of,
+        read_planes,
+        write_comparison,
+    )
     from zonda.operators.diagnostics.comparison.planes import common_beam
-    from zonda.operators.diagnostics.comparison.stokes import on_meridians_of
     from zonda.operators.diagnostics.drawing.comparison_plots import draw_comparison
     from zonda.operators.diagnostics.drawing.pictures import Style
     from zonda.operators.diagnostics.series import plane_key

@@ -1,4 +1,4 @@
-"""Figures of maps: equations (1) to (6).
+"""Figures of maps: equations (1) to (9).
 
 With the map m, its weights w and the angle r of a pixel from the map's centre, after smoothing with
 the beam:
@@ -22,6 +22,19 @@ With a the map of the sky alone without filters, b the same behind them, and the
 
     T = Re sum b a* / sum |a|^2,
     S = (sum |b|^2 / sum |a|^2)^(1/2).                                                           (6)
+
+With a reference A, a map B and the threshold t of `CompareMaps`,
+
+    fidelity    median of F = |A| / max(|B - A|, t rms(B - A)),
+    |A| >= least max |A|                        (7)
+
+With the power P_i of a map's rings i, their independent modes N_i, and the level W_i of white noise
+in independent pixels,
+
+    map_power   sum N_i P_i / sum N_i W_i,   smallest <= 1/k_i <= largest      (8)
+
+    relative error   (sum N_i W_i^2)^1/2 / sum N_i W_i,
+    of smoothed maps from draws of noise (radial)         (9)
 """
 
 from __future__ import annotations
@@ -29,10 +42,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, Fraction
@@ -46,6 +59,8 @@ from zonda.core.maps.measured_noise import WHITE
 from zonda.core.numerics.angles import ARCMIN, angle_text
 from zonda.core.signal import Signal
 from zonda.core.types import Floats
+from zonda.operators.diagnostics.comparison.statistics import Comparison
+from zonda.operators.diagnostics.map_spectra import MapSpectra
 from zonda.operators.diagnostics.transfer_function import compare, window_of
 
 from .common import (
@@ -61,6 +76,103 @@ from .common import (
     relative_error_of_rms,
     sky_alone,
 )
+
+
+class Fidelity(FigureMetric):
+    """Median fidelity of a map where its reference is bright, equation (7).
+
+    It is measured by a `CompareMaps`. Of a map that is g times its reference everywhere it is 1 /
+    |1 - g|, below the limit that the threshold sets.
+    """
+
+    reads: ClassVar[frozenset[str]] = frozenset({"comparison"})
+
+    comparison: str = Field("comparison", pattern=r"^[A-Za-z0-9_.]+$")
+    """Which one, by its name among the products: that of a `CompareMaps` with a name of its own."""
+    least: Fraction = quantity("10 %", gt=0, le=1)
+    """Share of the reference's peak from which a pixel counts; 100 %: the peak alone."""
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (7). Raises InputError where there is no comparison, or the reference is
+        empty.
+        """
+        found = product_of(data, self.comparison, Comparison, "fidelity", "comparison, CompareMaps")
+        size = np.abs(found.planes["reference"])
+        peak = float(np.nanmax(size, initial=0.0))
+        if peak == 0:
+            raise InputError(
+                "the reference is empty", place="fidelity", cure="compare with a sky with a source"
+            )
+        return float(np.median(found.planes["fidelity"][size >= self.least * peak])), math.nan
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """Describe the figure in words."""
+        where = f"where the reference has {100 * self.least:g} % of its peak"
+        if self.least == 1:
+            where = "at the reference's peak"
+        return f"median of |reference| / max(|difference|, threshold) {where}"
+
+
+class MapPower(FigureMetric):
+    """Power spectral density of a map over that of white noise in its pixels, in a range of angular
+    scales, equation (8).
+
+    It is measured by a `MapSpectrum`. White noise has 1 on all scales; 1/f noise and the atmosphere
+    add on large ones.
+    """
+
+    reads: ClassVar[frozenset[str]] = frozenset({"map_spectra"})
+
+    spectra: str = Field("map_spectra", pattern=r"^[A-Za-z0-9_.]+$")
+    """Which ones, by their name among the products: that of a `MapSpectrum` with a name of its own.
+    """
+    of: str = Field("source_free/map", pattern=r"^[A-Za-z0-9_/]+$")
+    """Which map."""
+    smallest: Angle = quantity("10 arcsec", gt=0)
+    """Smallest angular scale, 1/k."""
+    largest: Angle = quantity("20 arcsec", gt=0)
+    """Largest angular scale."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.largest <= self.smallest:
+            raise ValueError("largest must be larger than smallest")
+        return self
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (8). Raises InputError where the map, its white level or modes of these scales
+        are missing.
+        """
+        found = product_of(
+            data, self.spectra, MapSpectra, "map_power", "product of map spectra, MapSpectrum"
+        )
+        rings = found.spectra
+        if self.of not in rings.power or self.of not in rings.white:
+            there = ", ".join(sorted(rings.power.keys() & rings.white.keys())) or "none"
+            raise InputError(
+                f"no spectrum and white level of the map {self.of!r} are known",
+                place="map_power",
+                cure=f"maps with a known level: {there}; name others in MapSpectrum.maps",
+            )
+        power, level = rings.power[self.of], rings.white[self.of]
+        used = (rings.scale >= self.smallest) & (rings.scale <= self.largest) & np.isfinite(power)
+        number, power, level = rings.modes[used], power[used], level[used]
+        if not number.sum() > 0:
+            cure = "choose scales between two pixels and the map's size, or a wider range"
+            raise InputError(f"no ring lies {self._range()}", place="map_power", cure=cure)
+        value = float(number @ power) / float(number @ level)
+        if rings.draws is not None:
+            together = rings.draws[:, used] @ (number * level)
+            return value, value * float(together.std(ddof=1) / together.mean())
+        return value, value * math.sqrt(float(number @ level**2)) / float(number @ level)
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """Describe the figure in words."""
+        white = "that of white noise by NET and samples"
+        return f"power of {self.of} over {white}, scales {self._range()}"
+
+    def _range(self) -> str:
+        return f"from {angle_text(self.smallest)} to {angle_text(self.largest)}"
 
 
 class TransferAt(FigureMetric):
@@ -166,7 +278,7 @@ class _OfSmoothMap(_OfMap):
 
 
 class CentralRms(_OfSmoothMap):
-    """Weighted rms of the smoothed map about zero, near the map's centre, equation (1).
+    """Weighted rms of the smoothed map about zero, near the map's centre, equation (7).
 
     The standard error is that of white noise in the pixels, which the smoothing correlates.
     """
@@ -192,7 +304,7 @@ class CentralRms(_OfSmoothMap):
         return (self.signal,)
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
-        """Equation (1)."""
+        """Equation (7)."""
         product = map_of(data, "central_rms", self.signal, self.map)
         return central_rms(self.smoothed(product), self.radius, self.of)
 
@@ -208,7 +320,7 @@ class CentralRms(_OfSmoothMap):
 def central_rms(
     product: MapProduct, radius: float, of: Literal["signal", "half_difference"] = "signal"
 ) -> tuple[float, float]:
-    """Equation (1) of a map as it is, within ``radius`` [rad], and its standard error. InputError
+    """Equation (7) of a map as it is, within ``radius`` [rad], and its standard error. InputError
     where no pixel is there.
     """
     value, near = product.rms(radius, of), product.distance() <= radius
@@ -244,7 +356,7 @@ class PeakRatio(_OfSmoothMap):
         return ()
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
-        """Equation (2)."""
+        """Equation (8)."""
         after = map_of(data, "peak_ratio", names[0], self.map)
         seen = self.smoothed(after)
         if self.against == "unfiltered":
@@ -273,7 +385,7 @@ def without_filters(image: Image, product: MapProduct, smoothing: float) -> Floa
 
 
 def peak_ratio(before: Floats, after: MapProduct) -> float:
-    """Equation (2) of a brightness without filters, in the pixels of the map behind them."""
+    """Equation (8) of a brightness without filters, in the pixels of the map behind them."""
     good = covered(after) & np.isfinite(before)
     _, peak = extreme(before, good, "peak_ratio")
     if peak == 0:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zonda.core.canvas import OTHER, SEQUENCE, axis_above, finish, new_axes, unit_of
-from zonda.core.drawable import Sketch
+from zonda.core.canvas import OTHER, SEQUENCE, Sketch, axis_above, finish, new_axes, unit_of
 from zonda.core.maps.map_plots import (
     contour_text,
     map_axes,

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.canvas import DPI, file_of, unit_of
-from zonda.core.drawable import Sketch
+from zonda.core.canvas import DPI, Sketch, file_of, unit_of
 from zonda.core.maps.central import central_diameter, in_beams
 from zonda.core.maps.map_plots import (
     SHOWN,

@@ -9,8 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zonda.core.canvas import COLOURS, OTHER, PALE, SEQUENCE, axis_above, finish, new_axes, unit_of
-from zonda.core.drawable import Drawable, Sketch
+from zonda.core.canvas import (
+    COLOURS,
+    OTHER,
+    PALE,
+    SEQUENCE,
+    Drawable,
+    Sketch,
+    axis_above,
+    finish,
+    new_axes,
+    unit_of,
+)
 from zonda.core.numerics.angles import ARCMIN, ARCSEC
 from zonda.core.numerics.projection import boresights
 from zonda.core.numerics.sphere import local_axes

@@ -10,7 +10,7 @@ from astropy.table import Table
 import zonda
 import zonda.testing
 from zonda.core.assembly.checks import run_checks
-from zonda.core.drawable import Drawable
+from zonda.core.canvas import Drawable
 from zonda.core.errors import PipelineError
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.model import ExpectedLoad

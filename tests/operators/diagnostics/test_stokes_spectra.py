@@ -8,8 +8,7 @@ import pytest
 
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
-from zonda.operators.diagnostics.comparison.files import read_planes
-from zonda.operators.diagnostics.comparison.stokes import on_meridians_of, planes_of
+from zonda.operators.diagnostics.comparison.files import on_meridians_of, planes_of, read_planes
 from zonda.operators.diagnostics.map_spectra import MapSpectrum
 from zonda.operators.maps.grid import tangent_wcs
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from zonda.core.errors import InputError
-from zonda.plugins.metrics.similarity import AndersonDarling, p_value
+from zonda.plugins.metrics.streams import AndersonDarling, p_value
 
 RATE = 100.0
 
