@@ -196,19 +196,6 @@ def put(path: Path, content: bytes) -> None:
         raise
 
 
-def publish(temporary: Path, path: str | os.PathLike[str]) -> None:
-    """Move a finished temporary file to its name in one step. Raises `OutputError`; the temporary
-    file is gone either way.
-    """
-    try:
-        with writing(path):
-            _synchronize(temporary)
-            os.replace(temporary, path)
-    except BaseException:
-        discard(temporary)
-        raise
-
-
 def discard(temporary: Path) -> None:
     """Remove a temporary file; not an error where there is none."""
     with contextlib.suppress(OSError):
@@ -234,7 +221,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             if path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
             yield temporary
-        publish(temporary, path)
+            _synchronize(temporary)
+            os.replace(temporary, path)
     except BaseException:
         discard(temporary)
         raise

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -19,19 +19,12 @@ from zonda.core.errors import InputError, OutputError
 from zonda.core.flags import DETECTOR_MASK
 from zonda.core.output import StreamOutput, output_folder
 from zonda.core.product import Record
-from zonda.core.storage.files import (
-    atomic_path,
-    check_memory,
-    discard,
-    product_path,
-    publish,
-    temporary_sibling,
-)
+from zonda.core.storage.files import atomic_path, check_memory, product_path
 from zonda.core.stream_names import UNITS, StreamName, streams_asked, streams_needed
 
 from . import fits_table, toast_hdf5
 from .recorded_stream import kelvin_per
-from .time_ordered_data import TimeOrderedData
+from .time_ordered_data import TimeOrderedData, TodWriter
 
 if TYPE_CHECKING:
     from zonda.core.weather import GroundWeather
@@ -53,41 +46,15 @@ class Files(Record):
 
 @dataclass
 class _State:
-    """An open file. ``largest``: greatest magnitude written, K, for the statement about
-    rounding.
+    """An open file, which gets its name when ``whole`` is closed. ``largest``: greatest magnitude
+    written, K, for the statement about rounding.
     """
 
     path: Path
-    temporary: Path
-    tod: TimeOrderedData
-    writer: Any
+    writer: TodWriter
+    whole: ExitStack
     largest: float = 0.0
     lock: threading.Lock = field(default_factory=threading.Lock)
-
-    @classmethod
-    def begun(
-        cls, path: Path, module: Any, tod: TimeOrderedData, streams: list[str], dtype: str
-    ) -> _State:
-        """A file that gets its name when it is finished."""
-        if path.is_dir():
-            cure = "remove it or choose another output folder"
-            raise OutputError(
-                "cannot be written: there is a folder of that name", place=str(path), cure=cure
-            )
-        temporary = temporary_sibling(path)
-        try:
-            return cls(path, temporary, tod, module.Writer(temporary, tod, streams, dtype))
-        except BaseException:
-            discard(temporary)
-            raise
-
-    def finish(self, observation: Observation, provenance: Mapping[str, str | int | float]) -> None:
-        """Write what is known now that the scan is complete, and give the file its name."""
-        self.tod.take_flags(observation)
-        log = "\n".join(f"{who}: {what}: {value}" for who, what, value in observation.tally)
-        self.tod.metadata.update(provenance, tally=log)
-        self.writer.finish()
-        publish(self.temporary, self.path)
 
 
 class SaveTOD(StreamOutput):
@@ -134,13 +101,10 @@ class SaveTOD(StreamOutput):
             else f"tod_{self.label}_{observation.name}"
         )
         path = product_path(output_folder(observation, self.label), stem, module.SUFFIX)
-        return _State.begun(
-            path,
-            module,
-            TimeOrderedData.of(observation),
-            list(dict.fromkeys(self.streams)),
-            self.dtype,
-        )
+        tod, streams = TimeOrderedData.of(observation), list(dict.fromkeys(self.streams))
+        with ExitStack() as whole:
+            temporary = whole.enter_context(atomic_path(path))
+            return _State(path, module.Writer(temporary, tod, streams, self.dtype), whole.pop_all())
 
     def exec(self, block: Block, state: _State) -> None:
         for name in dict.fromkeys(self.streams):
@@ -158,7 +122,8 @@ class SaveTOD(StreamOutput):
                 state.writer.write(name, block.detectors, block.samples, values)
 
     def collect(self, data: Data, observation: Observation, state: _State) -> None:
-        state.tod.weather = observation.weather or _weather(data, observation, self.label)
+        tod = state.writer.tod
+        tod.weather = observation.weather or _weather(data, observation, self.label)
         if self.dtype == "float32":
             observation.tally.state(
                 self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}"
@@ -167,7 +132,11 @@ class SaveTOD(StreamOutput):
             observation.tally.state(
                 self.label, "NET of the detectors", "the instrument's; this run has no white noise"
             )
-        state.finish(observation, _provenance(data))
+        tod.take_flags(observation)
+        log = "\n".join(f"{who}: {what}: {value}" for who, what, value in observation.tally)
+        tod.metadata.update(_provenance(data), tally=log)
+        state.writer.finish()
+        state.whole.close()
         data.add(self.label, Files([str(state.path)]))
 
     def finalize(self, data: Data) -> None:
@@ -177,7 +146,8 @@ class SaveTOD(StreamOutput):
 
     def discard(self, observation: Observation, state: _State) -> None:
         state.writer.close()
-        discard(state.temporary)
+        with suppress(OutputError), state.whole:
+            raise OutputError("the scan is not complete", place=str(state.path))
 
 
 def _weather(data: Data, observation: Observation, place: str) -> GroundWeather | None:

@@ -315,6 +315,10 @@ class TodWriter:
     def __init__(self, path: Path, tod: TimeOrderedData) -> None:
         self.path, self.tod = path, tod
 
+    def write(self, stream: str, detectors: slice, samples: slice, values: AnyFloats) -> None:
+        """Write a rectangle of a stream."""
+        raise NotImplementedError
+
     def finish(self) -> None:
         """Write all but the streams, and close the file."""
         with writing(self.path):

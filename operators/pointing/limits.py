@@ -7,6 +7,7 @@ What would make a scan fit is found by trying values of its own parameters on th
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, TypeVar
@@ -139,6 +140,9 @@ LIMITS: dict[Quantity, str] = {
 SLOWER = "lower speed or acceleration, or set check_limits: warn"
 
 WORDS = {1: "speed", 2: "acceleration", 3: "jerk"}
+
+STEPS = 2048
+"""Of a factor of 1000, by which parameters are changed to find a scan that fits."""
 
 ROUNDING = 1e-6
 """Share by which a figure may exceed its limit: a scan that was laid out to reach it exactly is
@@ -285,36 +289,30 @@ def _slower(scan: Scan, slows: Mapping[str, tuple[int, int]], fits: Callable[[Sc
     empty where none does.
     """
 
-    def values(share: float) -> dict[str, float]:
+    def values(step: int) -> dict[str, float]:
         found = {}
         for name, (sign, _) in slows.items():
-            value = math.degrees(getattr(scan, name)) * 3600 * 10.0 ** (3 * share * sign)
+            factor = 10.0 ** (3 * sign * step / STEPS)
+            value = math.degrees(getattr(scan, name)) * 3600 * factor
             unit = 10.0 ** (math.floor(math.log10(value)) - 2)  # three digits, on the safe side
-            found[name] = math.radians(
-                (math.floor if sign < 0 else math.ceil)(value / unit) * unit / 3600
-            )
+            rounded = (math.floor if sign < 0 else math.ceil)(value / unit) * unit
+            found[name] = math.radians(rounded / 3600)
         return found
 
-    def allowed(name: str, value: float) -> bool:
-        return all(
-            value <= getattr(m, "le", math.inf) for m in type(scan).model_fields[name].metadata
-        )
-
-    def good(share: float) -> bool:
-        tried = values(share)
+    def good(step: int) -> bool | None:
+        """True if the scan fits, None for values that are too far to be allowed."""
+        tried = values(step)
+        for name, value in tried.items():
+            for limit in type(scan).model_fields[name].metadata:
+                if value > getattr(limit, "le", math.inf):
+                    return None
         with suppress(PointingError):  # e.g. turnarounds so long that they reach round the sky
-            return all(allowed(*item) for item in tried.items()) and fits(
-                scan.model_copy(update=tried)
-            )
-        return False
+            return fits(scan.model_copy(update=tried))
+        return None
 
-    enough = next((share for share in (1 / 8, 1 / 4, 1 / 2, 1.0) if slows and good(share)), None)
-    if enough is None:
+    enough = bisect_left(range(STEPS), True, 1, key=lambda step: good(step) is not False)
+    if not slows or not good(enough):
         return ""
-    too_little = 0.0
-    for _ in range(8):
-        middle = (enough + too_little) / 2
-        enough, too_little = (middle, too_little) if good(middle) else (enough, middle)
     return " with ".join(
         f"{name} {rate_text(value, slows[name][1])}" for name, value in values(enough).items()
     )
