@@ -16,7 +16,6 @@ from zonda.core.configuration.diagnostics import nearest, refusal
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.flags import DETECTOR_MASK, PROCESSING
-from zonda.core.numerics.smooth import SmoothField
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
@@ -24,7 +23,7 @@ from zonda.core.signal import MAIN
 from zonda.core.stream import Stream
 from zonda.core.types import AnyFloats
 from zonda.core.versions import needed
-from zonda.core.whole_stream import Changed
+from zonda.core.whole_stream import Changed, whole
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 
 EXTRA = "toast"
@@ -104,7 +103,7 @@ class ToastOperator(Operator):
 
     def _check_needs(self, observation: Observation) -> None:
         """Raises PipelineError where the scan lacks what the operator needs."""
-        ob = _unfilled(observation)
+        ob = _in_toast(observation, {})
         operator = made(self.operator, self.traits)
         try:
             wanted, makes = operator.requires(), operator.provides()
@@ -160,9 +159,12 @@ class ToastOperator(Operator):
 
     def _changed(self, stream: Stream) -> Changed:
         """See `ToastOperator.measure`."""
-        observation, mean = stream.observation, stream.means.get("signal")
+        observation = stream.observation
         with ALONE:
-            ob, spoilt = _filled(stream, mean)
+            values = whole(stream)
+            spoilt = ~np.isfinite(values)
+            ob = _in_toast(observation, {"signal": values})
+            ob.detdata["signal"].data[spoilt] = 0.0
             before, sums = ob.detdata["flags"].data.copy(), _sums(ob)
             self._apply(ob, observation)
             if np.array_equal(sums, _sums(ob)) and np.array_equal(before, ob.detdata["flags"].data):
@@ -234,33 +236,14 @@ def _value(trait: Any, value: Any, place: str) -> Any:
     return value
 
 
-def _unfilled(observation: Observation) -> Any:
-    """The scan in TOAST, on this process alone, without its signal."""
+def _in_toast(observation: Observation, streams: Mapping[str, AnyFloats]) -> Any:
+    """The scan in TOAST, on this process alone."""
     from . import toast as bridge
 
     mpi = needed("toast.mpi", EXTRA)
     comm = bridge.toast.Comm(world=mpi.MPI.COMM_SELF) if mpi.use_mpi else bridge.toast.Comm()
-    return bridge.unfilled(TimeOrderedData.of(observation), comm)
-
-
-def _filled(stream: Stream, mean: SmoothField | None) -> tuple[Any, Any]:
-    """The scan in TOAST with all of its signal, 0 where that is not finite; and where (n_det,
-    n_samp) it is not.
-    """
-    from . import toast as bridge
-
-    ob, spoilt = _unfilled(stream.observation), np.zeros(stream.shape, bool)
-
-    def row_of(row: int) -> tuple[AnyFloats, Any]:
-        values = stream.array[row].astype(np.float64)
-        if mean is not None:
-            values += mean.evaluate(slice(row, row + 1), slice(0, len(values)))[0]
-        spoilt[row] = ~np.isfinite(values)
-        values[spoilt[row]] = 0.0
-        return values, spoilt[row]
-
-    bridge.fill(ob, "signal", TimeOrderedData.of(stream.observation).detector_flags, row_of)
-    return ob, spoilt
+    tod = replace(TimeOrderedData.of(observation), streams=dict(streams))
+    return bridge.observation_of(tod, comm)
 
 
 def _sums(ob: Any) -> AnyFloats:
