@@ -93,27 +93,35 @@ class Asked:
 
     def check(self) -> None:
         """Raise InputError for what contradicts itself or is beyond limits."""
-        if self.pwv is not None and self.quantile is not None:
-            raise InputError(
+        month, quantile = self.month, self.quantile
+        for wrong, text, place, cure in (
+            (
+                self.pwv is not None and quantile is not None,
                 "the PWV is given twice, as a value and as a quantile",
-                place=PLACE,
-                cure="give --pwv or --quantile",
-            )
-        if self.elevation is not None and self.target is not None:
-            raise InputError(
+                PLACE,
+                "give --pwv or --quantile",
+            ),
+            (
+                self.elevation is not None and self.target is not None,
                 "a target has an elevation of its own",
-                place=PLACE,
-                cure="give --target or --elevation",
-            )
-        if self.month is not None and not 1 <= self.month <= 12:
-            raise InputError(
-                f"there is no month {self.month}", place="--month", cure="give 1 to 12"
-            )
-        if self.quantile is not None and not 0 < self.quantile < 1:
-            raise InputError(
-                f"a quantile of {self.quantile:g} is outside the limits, above 0 and below 1",
-                place="--quantile",
-            )
+                PLACE,
+                "give --target or --elevation",
+            ),
+            (
+                month is not None and not 1 <= month <= 12,
+                f"there is no month {month}",
+                "--month",
+                "give 1 to 12",
+            ),
+            (
+                quantile is not None and not 0 < quantile < 1,
+                f"a quantile of {quantile} is outside the limits, above 0 and below 1",
+                "--quantile",
+                "",
+            ),
+        ):
+            if wrong:
+                raise InputError(text, place=place, cure=cure)
 
 
 @dataclass(frozen=True)
@@ -147,10 +155,8 @@ def shown(asked: Mapping[str, Any], settings: Sequence[str]) -> str:
 def text(asked: Asked) -> str:
     """The pipeline as YAML. Raises as `make`."""
     asked.check()
-    instrument, site = (
-        registry.instruments.create(asked.instrument),
-        registry.sites.create(asked.site),
-    )
+    instrument = registry.instruments.create(asked.instrument)
+    site = registry.sites.create(asked.site)
     elevation = positive("--elevation", Unit("rad", "60 deg"), asked.elevation, ELEVATION)
     if elevation > math.pi / 2:
         raise InputError(
@@ -160,22 +166,40 @@ def text(asked: Asked) -> str:
     wanted = positive("--time", Unit("s", "3 h"), asked.time, 3600.0)
     usual = min(2 * max(instrument.field_of_view, 10 * instrument.beam_fwhm), WIDEST)
     scan = daisy(instrument, elevation, positive("--area", Unit("rad"), asked.area, usual), wanted)
-    span = scan.scans * (scan.duration + 30) - 30
     middle = _midnight(site, asked.month)
     if asked.target is None:
-        start, target = middle.shifted(-span / 2), _culminating(site, middle, elevation)
+        target = _culminating(site, middle, elevation)
     else:
         target = parsed("--target", Target.parse, asked.target)
-        start = _culmination(site, middle, target).shifted(-span / 2)
-    pwv = (
-        asked.pwv
-        if asked.pwv is not None
-        else None
-        if asked.quantile is None
-        else f"{100 * asked.quantile:.12g} %"
-    )
-    water = None if pwv is None else str(parsed("--pwv", Pwv.parse, pwv))
-    return _yaml(asked, instrument, scan, (str(start), str(target), water))
+        middle = _culmination(site, middle, target)
+    start = middle.shifted(-(scan.scans * (scan.duration + 30) - 30) / 2)
+    pwv = asked.pwv
+    if pwv is None and asked.quantile is not None:
+        pwv = f"{100 * asked.quantile:.12g} %"
+    angle, rate = Unit("rad"), Unit("rad / s")
+    lines = [
+        f"name: sensitivity_{asked.instrument}",
+        f"site: {asked.site}",
+        f"instrument: {asked.instrument}",
+        f"time: {start}",
+        f"target: {target}",
+        "" if pwv is None else f"weather: {{pwv: {parsed('--pwv', Pwv.parse, pwv)}}}",
+        "operators:",
+        "  - PointingDaisy:",
+        f"      radius: {_in(angle, scan.radius, 'arcmin', 'deg')}",
+        f"      speed: {_in(rate, scan.speed, 'arcsec/s', 'arcmin/s', 'deg/s')}",
+        f"      scan_duration: {scan.duration:.6g} s",
+        f"      scans: {scan.scans}",
+        "  - AtmosphereLayers",
+        "  - WhiteNoise",
+        "  - PinkNoise",
+        "  - Efficiency",
+        f"  - HighpassFilter: {{frequency: {scan.cut:.3g} Hz}}",
+        "  - CommonModeFilter" if instrument.detectors > 1 else "",
+        f"  - BinMap: {{pixel: {_in(angle, instrument.beam_fwhm / 4, 'arcsec', 'arcmin')}}}",
+        "  - SaveMap",
+    ]
+    return "".join(f"{line}\n" for line in lines if line)
 
 
 def daisy(instrument: Instrument, elevation: float, area: float, seconds: float) -> Daisy:
@@ -199,19 +223,15 @@ def _limits(telescope: Telescope, elevation: float) -> tuple[float, float]:
     """Largest acceleration and speed on the sky in any direction, rad/s2 and rad/s; infinite where
     none is known.
     """
-    across = math.cos(elevation)
-
-    def least(*values: float | None) -> float:
-        return min((v for v in values if v is not None), default=math.inf)
-
-    t = telescope
-    turned = [
-        None if v is None else v * across for v in (t.azimuth_acceleration_max, t.azimuth_speed_max)
-    ]
-    return (
-        least(t.acceleration_max, turned[0], t.elevation_acceleration_max),
-        least(t.speed_max, turned[1], t.elevation_speed_max),
+    t, across = telescope, math.cos(elevation)
+    acceleration, speed = (
+        min([azimuth * across if azimuth else math.inf, *filter(None, others)])
+        for azimuth, *others in (
+            (t.azimuth_acceleration_max, t.acceleration_max, t.elevation_acceleration_max),
+            (t.azimuth_speed_max, t.speed_max, t.elevation_speed_max),
+        )
     )
+    return acceleration, speed
 
 
 def _midnight(site: Site, month: int | None) -> Instant:
@@ -261,36 +281,6 @@ def _culmination(site: Site, middle: Instant, target: Target) -> Instant:
             f"{target} never rises at {site.name}", place="--target", cure="choose another site"
         )
     return start.shifted(float(seconds[best]))
-
-
-def _yaml(
-    asked: Asked, instrument: Instrument, scan: Daisy, scene: tuple[str, str, str | None]
-) -> str:
-    angle, rate = Unit("rad"), Unit("rad / s")
-    start, target, pwv = scene
-    lines = [
-        f"name: sensitivity_{asked.instrument}",
-        f"site: {asked.site}",
-        f"instrument: {asked.instrument}",
-        f"time: {start}",
-        f"target: {target}",
-        *([f"weather: {{pwv: {pwv}}}"] if pwv is not None else []),
-        "operators:",
-        "  - PointingDaisy:",
-        f"      radius: {_in(angle, scan.radius, 'arcmin', 'deg')}",
-        f"      speed: {_in(rate, scan.speed, 'arcsec/s', 'arcmin/s', 'deg/s')}",
-        f"      scan_duration: {scan.duration:.6g} s",
-        f"      scans: {scan.scans}",
-        "  - AtmosphereLayers",
-        "  - WhiteNoise",
-        "  - PinkNoise",
-        "  - Efficiency",
-        f"  - HighpassFilter: {{frequency: {scan.cut:.3g} Hz}}",
-        *(["  - CommonModeFilter"] if instrument.detectors > 1 else []),
-        f"  - BinMap: {{pixel: {_in(angle, instrument.beam_fwhm / 4, 'arcsec', 'arcmin')}}}",
-        "  - SaveMap",
-    ]
-    return "\n".join(lines) + "\n"
 
 
 def _in(unit: Unit, value: float, *names: str) -> str:

@@ -105,17 +105,12 @@ class Depth:
         Raises InputError for what is not positive.
         """
         if not rms > 0:
-            raise InputError(
-                f"no observation reaches a depth of {rms:g} K",
-                place="--reach",
-                cure="give a positive depth",
-            )
-        end = float(self.seconds[-1])
-        if float(self.total(end)) >= rms:
-            return end * (float(self.total(end)) / rms) ** 2
-        start = float(self.seconds[0])
-        if float(self.total(start)) <= rms:
-            return start * (float(self.total(start)) / rms) ** 2
+            text = f"no observation reaches a depth of {rms:g} K"
+            raise InputError(text, place="--reach", cure="give a positive depth")
+        start, end = (float(self.seconds[k]) for k in (0, -1))
+        for seconds, beyond in ((end, rms.__le__), (start, rms.__ge__)):
+            if beyond(total := float(self.total(seconds))):
+                return seconds * (total / rms) ** 2
         fine = np.geomspace(start, end, 2000)
         return float(fine[np.argmax(self.total(fine) <= rms)])
 
@@ -135,43 +130,39 @@ def depths_of(survey: Survey, radius: float) -> dict[str, Depth]:
         if survey.polarized
         else {"I": detector_noise.variances(survey, radius)}
     )
-    known = np.all(
-        [np.isfinite(each["white"] + each["1/f"]) for each in variances.values()], axis=0
-    )
+    known = np.isfinite(sum(each["white"] + each["1/f"] for each in variances.values()))
     if not known[-1]:
         text, cure = "nothing is observed in the circle", "choose a larger --radius"
         if survey.polarized:
-            text, cure = (
-                "the samples in the circle determine I, Q and U in no pixel",
-                f"{cure}, or larger pixels",
-            )
+            text = "the samples in the circle determine I, Q and U in no pixel"
+            cure += ", or larger pixels"
         raise InputError(text, place="zonda sensitivity", cure=cure)
     left = atmosphere_noise.variance(survey, radius)
     # an error of a variance is half as large of its root
     chance = left.mode.independent**-0.5 if left.mode else 0.0
     error = WITHIN | {"atmosphere": math.hypot(WITHIN["atmosphere"], left.error / 2, chance)}
-    nothing, reason = np.zeros_like(left.variance), ""
-    atmosphere = {"I": left.variance, "Q": nothing, "U": nothing}
-    if (
-        left.mode
-        and left.mode.turned
-        and _stays(survey, left.mode, radius) > TURNED * left.variance[-1]
-    ):
-        atmosphere = dict.fromkeys(atmosphere, np.full_like(left.variance, np.nan))
+    atmosphere = {"I": left.variance}  # it is not in Q and U
+    reason = ""
+    most = TURNED * left.variance[-1]
+    if left.mode and left.mode.turned and _stays(survey, left.mode, radius) > most:
         reason = "noise turns the singular mode, which then leaves some of what all detectors see"
     if survey.polarized and left.variance.any() and not survey.cancels:
-        atmosphere = dict.fromkeys(atmosphere, np.full_like(left.variance, np.nan))
         reason = "the detectors at one place do not keep it out of Q and U"
+    unknown = math.nan if reason else 0.0
     after = slice(int(known.argmax()), None)
-    parts = {plane: each | {"atmosphere": atmosphere[plane]} for plane, each in variances.items()}
     return {
         plane: Depth(
             survey.seconds[after],
-            {part: values[after] for part, values in each.items()},
+            {
+                part: values[after]
+                for part, values in (
+                    each | {"atmosphere": atmosphere.get(plane, 0 * left.variance) + unknown}
+                ).items()
+            },
             error,
             reason,
         )
-        for plane, each in parts.items()
+        for plane, each in variances.items()
     }
 
 
@@ -198,13 +189,8 @@ def times(depth: Depth, wanted: float | None) -> Floats:
     """Round times [s] about the length of the scans (or ``wanted``) for a table: 1, 2 and 5 of each
     decade of hours, and the length."""
     end = float(depth.seconds[-1])
-    chosen = {end, wanted or end}
-    low, high = min(chosen) / 5, max(chosen) * 20
-    decades = range(math.floor(math.log10(low / 3600)), math.ceil(math.log10(high / 3600)) + 1)
-    chosen |= {
-        3600 * step * 10.0**d
-        for d in decades
-        for step in PER_DECADE
-        if low <= 3600 * step * 10.0**d <= high
-    }
-    return np.array(sorted(chosen))
+    chosen = np.array([end, wanted or end])
+    low, high = chosen.min() / 5, chosen.max() * 20
+    ends = math.floor(math.log10(low / 3600)), math.ceil(math.log10(high / 3600))
+    round_ones = 3600 * np.multiply.outer(PER_DECADE, 10.0 ** np.arange(ends[0], ends[1] + 1))
+    return np.unique(np.r_[chosen, round_ones[(low <= round_ones) & (round_ones <= high)]])
