@@ -72,7 +72,7 @@ def doubts(instrument: Instrument) -> list[str]:
                 " lambda / D,"
             )
             found.append(doubt(text, fwhm / limit, WIDTHS, ""))
-        found += [doubt(f"{who}: NET", net, NET, "K s(1/2)") for net in nets]
+        found += [doubt(f"{who}: NET", net, NET, "K sqrt(s)") for net in nets]
         found.append(doubt(f"{who}: knee of the pink noise", camera.knee, KNEE, "Hz"))
         for key in ("main_beam_efficiency", "illumination_efficiency"):
             found.append(

@@ -61,7 +61,7 @@ _UNITS = {
     "Hz": ((1e-9, "GHz"), (1e-3, "kHz"), (1, "Hz")),
     "m": ((1e-3, "km"), (1, "m"), (1e3, "mm")),
     "K": tuple((factor, f"{prefix}K") for factor, prefix in _KELVIN),
-    "K s(1/2)": tuple((factor, f"{prefix}K s(1/2)") for factor, prefix in _KELVIN),
+    "K s(1/2)": tuple((factor, f"{prefix}K sqrt(s)") for factor, prefix in _KELVIN),
 }
 
 

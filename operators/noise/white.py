@@ -84,7 +84,7 @@ class WhiteNoise(Operator):
     def check(self, data: Data) -> list[str]:
         """Refuse a noise model that contradicts the detectors; warn of a NET that none has."""
         if self.net is not None and (
-            text := doubt(f"{self.label}: net", self.net, NET, "K s(1/2)")
+            text := doubt(f"{self.label}: net", self.net, NET, "K sqrt(s)")
         ):
             warnings.warn(text, stacklevel=2)
         for observation in data.observations:

@@ -16,7 +16,7 @@ STAND_IN = "stand-in: "
 """What begins a part of `provenance` (parts end with a semicolon) that says which number is not
 published.
 """
-HEAD = ("band", "GHz", "detectors", "FWHM", "NET [mK_RJ s(1/2)]", "knee [Hz]", "slope")
+HEAD = ("band", "GHz", "detectors", "FWHM", "NET [mK_RJ sqrt(s)]", "knee [Hz]", "slope")
 WIDTH = 100
 
 

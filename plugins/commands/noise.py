@@ -85,7 +85,7 @@ def noise(
     )
     click.echo(f"{len(made)} of {tod.n_detectors} detectors, {made[0].segments} segments or fewer")
     error = 1e2 * np.median([n.net_error / n.net for n in made])
-    click.echo(f"NET    {_span(net * 1e3)} mK_RJ s(1/2); standard error {error:.2g} %")
+    click.echo(f"NET    {_span(net * 1e3)} mK_RJ sqrt(s); standard error {error:.2g} %")
     with_knee = knee > 0
     if with_knee.any():
         error = np.median([n.knee_error for n in made if n.knee > 0])

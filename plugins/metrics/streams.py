@@ -200,7 +200,7 @@ class Crossing(_OfSpectrum):
 
     def describe(self, data: Data, names: Sequence[str]) -> str:
         """Describe the figure in words."""
-        other = f"2 NET^2 with {self.net:.4g} K s(1/2)" if self.net else self.other
+        other = f"2 NET^2 with {self.net:.4g} K sqrt(s)" if self.net else self.other
         return f"highest frequency at which {self.stream} exceeds {other}"
 
 
