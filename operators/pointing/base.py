@@ -27,9 +27,8 @@ from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
 from .limits import LargestMotion, check_elevation, excess, what_fits, when_up
-from .motion import POINTS, LargestDerivative, Quantity, motion
+from .motion import POINTS, LargestDerivative, Quantity, SamplesPerBeam, motion
 from .observed import centre_of, observed, report, state_times, transform_of
-from .samples_per_beam import SamplesPerBeam
 from .sun_and_moon import distances
 
 if TYPE_CHECKING:
@@ -48,14 +47,15 @@ _OFFSET_SIZE = math.radians(1 / 60)
 _BOX = ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))
 
 
-def _kind(value: Any) -> str:
+def kind(value: Any) -> str:
+    """Which of the two a parameter is: a name, or a list."""
     return "name" if isinstance(value, str) else "list"
 
 
 Offsets = Annotated[
     Annotated[Literal["none", "box"], Tag("name")]
     | Annotated[list[tuple[Angle, Angle]], Tag("list")],
-    Discriminator(_kind),
+    Discriminator(kind),
 ]
 """A named pattern of offsets, or the offsets themselves."""
 
@@ -220,11 +220,12 @@ class Pointing(Scans):
         return self
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
-        """Offsets (x, y) [rad] from the scan's centre on its tangent plane, each (n,).
+        """Offsets (x, y) [rad] from the scan's centre on its tangent plane, each (n,); by default
+        none.
 
         Each instant is independent of the others: a long scan is worked on in chunks.
         """
-        raise NotImplementedError
+        return np.zeros(len(seconds)), np.zeros(len(seconds))
 
     def directions(self, aim: Aim, seconds: Floats) -> Floats:
         """Horizontal unit vectors (n, 3) north, west, up at ``seconds`` (n,) since the start of the
@@ -452,3 +453,7 @@ def _on_tangent_plane(longitude: float, latitude: float, x: Floats, y: Floats) -
     for k in range(3):
         np.multiply(centre[k] + x * east[k] + y * north[k], scale, out=directions[:, k])
     return directions
+
+
+class PointingStare(Pointing):
+    """Boresight fixed on the target: tracking if it is ICRS or Galactic, at rest if it is az/el."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from zonda.core.scene import Scene
 
     from .limits import LargestMotion
-    from .samples_per_beam import SamplesPerBeam
+    from .motion import SamplesPerBeam
 
 
 def transform_of(

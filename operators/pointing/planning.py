@@ -21,8 +21,8 @@ from zonda.core.types import AnyFloats
 from .base import Pointing
 from .limits import LargestMotion
 from .mispointing import Mispointing
+from .motion import SamplesPerBeam
 from .recorded import PointingRecorded
-from .samples_per_beam import SamplesPerBeam
 from .schedule import PointingSchedule
 
 MOTION = LargestMotion.TOPICS + SamplesPerBeam.TOPICS

@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag
@@ -37,7 +37,7 @@ from zonda.core.numerics.quaternions import series
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
 
-from .base import Aim, Pointing
+from .base import Aim, Pointing, kind
 from .motion import rate_text
 from .observed import mark_turnarounds
 from .sweep import Sweep
@@ -58,14 +58,10 @@ ROW_TIME, TURN_TIME = 5.0, 2.0
 """Shortest time for a row and a turnaround whose speed and acceleration are not given, s."""
 
 
-def _kind(value: Any) -> str:
-    return "name" if isinstance(value, str) else "list"
-
-
 Angles = Annotated[
     Annotated[Literal["same", "cross_hatch"], Tag("name")]
     | Annotated[list[Angle], Tag("list"), Field(min_length=1)],
-    Discriminator(_kind),
+    Discriminator(kind),
 ]
 """By how much the raster is turned from scan to scan."""
 

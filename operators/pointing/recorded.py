@@ -23,10 +23,10 @@ from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
 from .limits import check_elevation
+from .motion import SamplesPerBeam
 from .observed import centre_of, observed, report, state_times, transform_of
 from .recording import OUT_OF_ORDER, Comb, Recording, Scan, comb
 from .recording_files import Clock, read_recording
-from .samples_per_beam import SamplesPerBeam
 
 if TYPE_CHECKING:
     from pathlib import Path

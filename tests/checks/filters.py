@@ -13,7 +13,7 @@ from zonda.operators.filters.common_mode import UNDETERMINED, CommonModeFilter
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.optics.efficiency import Efficiency
-from zonda.operators.pointing.stare import PointingStare
+from zonda.operators.pointing.base import PointingStare
 from zonda.operators.sky.skymap import SkyMap
 from zonda.plugins.checks.numerics import N_DET, WHITE, N, ten_million, without_modes
 from zonda.plugins.checks.scenes import differing, largest, run, scan, sky_file

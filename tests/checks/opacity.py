@@ -24,7 +24,7 @@ from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.efficiency import Efficiency
-from zonda.operators.pointing.stare import PointingStare
+from zonda.operators.pointing.base import PointingStare
 from zonda.plugins.checks.scenes import SITE, START, camera, largest, run, scan, scene
 
 from .cases import BAND, EDGES, OPAQUE, WATER

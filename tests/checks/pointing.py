@@ -19,8 +19,8 @@ from zonda.core.numerics.earth_orientation import orientation
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
+from zonda.operators.pointing.base import PointingStare
 from zonda.operators.pointing.daisy import PointingDaisy
-from zonda.operators.pointing.stare import PointingStare
 from zonda.plugins.checks.numerics import ERROR, SITES, angle, erfa_horizontal
 from zonda.plugins.checks.scenes import camera, differing, largest, scene
 

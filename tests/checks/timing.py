@@ -16,8 +16,8 @@ from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.efficiency import Efficiency
+from zonda.operators.pointing.base import PointingStare
 from zonda.operators.pointing.recorded import PointingRecorded
-from zonda.operators.pointing.stare import PointingStare
 from zonda.plugins.checks.numerics import ERROR, SITES, angle, erfa_horizontal
 from zonda.plugins.checks.scenes import TARGET, camera, scene
 

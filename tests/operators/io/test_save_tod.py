@@ -272,7 +272,7 @@ def test_weather_is_that_of_the_simulated_air(scene, tmp_path):
     from zonda.core.pipeline import Pipeline
     from zonda.operators.atmosphere.layers import AtmosphereLayers
     from zonda.operators.optics.efficiency import Efficiency
-    from zonda.operators.pointing.stare import PointingStare
+    from zonda.operators.pointing.base import PointingStare
 
     stare = PointingStare(target={"az": "120 deg", "el": "60 deg"}, scan_duration="2 s")
     air = AtmosphereLayers(pwv="1.5 mm", wind={"speed": "10 m/s", "direction": "270 deg"}, layers=1)
@@ -530,7 +530,7 @@ def test_a_pipeline_that_stops_leaves_whole_files_only(how, error, scene, tmp_pa
     from zonda.core.pipeline import Pipeline
     from zonda.operators.noise.white import WhiteNoise
     from zonda.operators.optics.efficiency import Efficiency
-    from zonda.operators.pointing.stare import PointingStare
+    from zonda.operators.pointing.base import PointingStare
 
     stare = PointingStare(target={"az": "120 deg", "el": "60 deg"}, scan_duration="20 s", scans=2)
     pipeline = Pipeline([stare, WhiteNoise(), Efficiency(), SaveTOD(), Fails(how=how)])

@@ -22,9 +22,8 @@ from zonda.core.numerics.quaternions import from_angles
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.site import Site
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
-from zonda.operators.pointing.base import Aim
+from zonda.operators.pointing.base import Aim, PointingStare
 from zonda.operators.pointing.daisy import PointingDaisy
-from zonda.operators.pointing.stare import PointingStare
 
 GREEN_BANK = Site(
     name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="818 m"

@@ -7,8 +7,8 @@ import pytest
 from zonda.core.configuration.target import Target
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
+from zonda.operators.pointing.base import PointingStare
 from zonda.operators.pointing.daisy import PointingDaisy
-from zonda.operators.pointing.stare import PointingStare
 
 ARCMIN = math.radians(1 / 60)
 ARCSEC = ARCMIN / 60

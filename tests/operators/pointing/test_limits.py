@@ -9,10 +9,10 @@ from zonda.core.configuration.time import Instant
 from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.instrument import Telescope
+from zonda.operators.pointing.base import PointingStare
 from zonda.operators.pointing.daisy import PointingDaisy
 from zonda.operators.pointing.limits import LargestMotion
 from zonda.operators.pointing.motion import LargestDerivative
-from zonda.operators.pointing.stare import PointingStare
 
 
 def test_target_below_the_horizon_says_when_it_is_up(observe: Callable[..., Data]) -> None:

@@ -18,11 +18,9 @@ from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
-from zonda.operators.pointing.base import Aim, Pointing
+from zonda.operators.pointing.base import Aim, Pointing, PointingStare
 from zonda.operators.pointing.daisy import PointingDaisy
-from zonda.operators.pointing.motion import motion
-from zonda.operators.pointing.samples_per_beam import peak_lost
-from zonda.operators.pointing.stare import PointingStare
+from zonda.operators.pointing.motion import motion, peak_lost
 
 ARCSEC = math.radians(1 / 3600)
 
