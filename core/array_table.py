@@ -23,7 +23,7 @@ from .focalplane import Focalplane
 from .types import Floats
 
 if TYPE_CHECKING:
-    from .storage.ecsv import Table
+    from .storage.table_files import Table
 
 QUANTITIES = {
     "xi": "rad",
@@ -204,7 +204,7 @@ def read_array(path: Path) -> ArrayTable:
 
 @lru_cache(maxsize=4)
 def _read(path: Path, changed: int, size: int) -> ArrayTable:
-    from .storage.ecsv import read_table  # most runs read no table
+    from .storage.table_files import read_table  # most runs read no table
 
     table = read_table(path)
     notes = _rename(table)

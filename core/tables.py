@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .storage.ecsv import Column, write_ecsv
+from .storage.table_files import Column, write_ecsv
 
 
 def aligned(

@@ -24,9 +24,9 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.output import Output, Progress
-from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.storage.fits_files import header_of, write_image
+from zonda.core.storage.table_files import Column, write_ecsv
 from zonda.core.types import Floats
 
 from .drawing import drifting_layers, height_of_vapour

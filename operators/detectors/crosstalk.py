@@ -26,7 +26,7 @@ from zonda.core.focalplane import Focalplane
 from zonda.core.kernels import kernel
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
-from zonda.core.storage.ecsv import read_table
+from zonda.core.storage.table_files import read_table
 from zonda.core.types import Floats
 
 NEXT = 1.2

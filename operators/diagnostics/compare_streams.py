@@ -47,7 +47,7 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.operator import Operator
 from zonda.core.pages import html_table
 from zonda.core.product import Record
-from zonda.core.storage.ecsv import Column
+from zonda.core.storage.table_files import Column
 from zonda.core.stream_names import AnyStream, check_signals, streams_asked, streams_needed
 from zonda.core.types import Floats
 

@@ -15,8 +15,8 @@ from zonda.core.errors import PipelineError
 from zonda.core.pages import html_table
 from zonda.core.product import Record
 from zonda.core.signal import is_stream
-from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import product_path
+from zonda.core.storage.table_files import Column, write_ecsv
 from zonda.core.stream_names import UNITS
 from zonda.core.types import Floats
 

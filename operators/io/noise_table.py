@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from zonda.core import flags
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import TILE_DETECTORS, chunks
-from zonda.core.storage.ecsv import Column, read_table, write_ecsv
+from zonda.core.storage.table_files import Column, read_table, write_ecsv
 from zonda.core.types import Floats
 
 from .recorded_scan import rows_of_bands

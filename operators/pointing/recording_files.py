@@ -25,8 +25,8 @@ from zonda.core.configuration.time import SECOND, Instant
 from zonda.core.errors import InputError
 from zonda.core.intervals import Intervals
 from zonda.core.storage import fits_files, hdf5_files
-from zonda.core.storage.ecsv import Table, read_table, read_text
 from zonda.core.storage.files import reading
+from zonda.core.storage.table_files import Table, read_table, read_text
 from zonda.core.types import Floats
 
 from .recording import Recording, longest_rising

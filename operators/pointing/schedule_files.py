@@ -12,7 +12,7 @@ import numpy as np
 
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
-from zonda.core.storage.ecsv import Table, read_table, read_text
+from zonda.core.storage.table_files import Table, read_table, read_text
 
 COLUMNS = (
     "start_time",

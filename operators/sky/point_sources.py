@@ -34,7 +34,7 @@ from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.plausible import FLUX, doubt
-from zonda.core.storage.ecsv import read_table
+from zonda.core.storage.table_files import read_table
 from zonda.core.types import Floats
 
 REACH = 6.0

@@ -16,8 +16,8 @@ from zonda.core.canvas import COLOURS, DPI
 from zonda.core.errors import InputError
 from zonda.core.numerics.angles import ARCMIN, ARCSEC
 from zonda.core.pages import html_table
-from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path, check_output_folder, write_text
+from zonda.core.storage.table_files import Column, write_ecsv
 from zonda.core.tables import aligned
 
 from .audit import Audited, Forecasted, audit

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from astropy.table import Table as AstropyTable
 
-from zonda.core.storage.ecsv import Column
+from zonda.core.storage.table_files import Column
 from zonda.core.tables import Table, aligned
 
 TABLE = Table(

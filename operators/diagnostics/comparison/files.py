@@ -46,9 +46,9 @@ from zonda.core.maps.units import KNOWN_UNITS, parse_unit, scale_of
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA, beam_area
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
 from zonda.core.polarization import between_meridians, turned_by
-from zonda.core.storage.ecsv import Column, write_ecsv
 from zonda.core.storage.files import atomic_path
 from zonda.core.storage.fits_files import check_size, header_of, joined, opened, write_image
+from zonda.core.storage.table_files import Column, write_ecsv
 from zonda.core.types import Floats
 
 from .planes import EMPTY, NOT_EMPTY, Plane

@@ -43,7 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.numerics.angles import ARCSEC
-from zonda.core.storage.ecsv import Column
+from zonda.core.storage.table_files import Column
 from zonda.core.types import AnyFloats, Floats
 
 DRAWS = 48

@@ -10,7 +10,7 @@ from astropy import units as u
 from astropy.table import Table as AstropyTable
 
 from zonda.core.errors import InputError
-from zonda.core.storage.ecsv import Column, read_table, write_ecsv
+from zonda.core.storage.table_files import Column, read_table, write_ecsv
 
 
 def test_what_is_written_is_read(tmp_path):
