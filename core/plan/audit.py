@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,6 +110,11 @@ class Checked:
         return "VIOLATED" if self.violated else "holds" if self.exercised else "not exercised"
 
     @property
+    def idle(self) -> bool:
+        """True if nothing is said of the bound."""
+        return not self.exercised
+
+    @property
     def violated(self) -> bool:
         """True if the bound, or the prediction, does not hold."""
         if self.within is not None:
@@ -130,31 +135,25 @@ class Audit:
         return any(r.violated for r in self.rows)
 
     def __str__(self) -> str:
-        table = [("effect", "decision", "metric", "bound", "actual", "standard error", "")]
-        for r in self.rows:
-            bound, actual, error = (figure(r.metric, v) for v in (r.bound, r.actual, r.error))
-            table.append((r.effect, r.what, r.metric, bound, actual, error, r.verdict))
-        lines = [f"audit of {self.slice}", *aligned(table)]
-        count = sum(r.violated for r in self.rows)
+        nothing = "nothing was coarsened, and no output depends on what was dropped"
         if not self.rows:
-            return f"{lines[0]}: nothing was coarsened, and no output depends on what was dropped"
+            return f"audit of {self.slice}: {nothing}"
+        table = []
+        for r in self.rows:
+            figures = (figure(r.metric, v) for v in (r.bound, r.actual, r.error))
+            table.append((r.effect, r.what, r.metric, *figures, r.verdict))
+        head = ("effect", "decision", "metric", "bound", "actual", "standard error", "")
+        lines = [f"audit of {self.slice}", *aligned(table, head)]
         if all(r.within is not None for r in self.rows):
-            lines.append("nothing was coarsened, and no output depends on what was dropped")
-        idle = sum(not r.exercised for r in self.rows)
-        lines.append(
-            f"{len(self.rows)} bounds, {count} violated"
-            + (f", {idle} not exercised" if idle else "")
-        )
-        return "\n".join(lines)
+            lines.append(nothing)
+        count, idle = (sum(getattr(r, k) for r in self.rows) for k in ("violated", "idle"))
+        words = f", {idle} not exercised" if idle else ""
+        return "\n".join([*lines, f"{len(self.rows)} bounds, {count} violated{words}"])
 
     def json(self) -> str:
         """The rows as JSON."""
-        return json.dumps(
-            {
-                "slice": self.slice,
-                "rows": [{**dataclasses.asdict(r), "violated": r.violated} for r in self.rows],
-            }
-        )
+        rows = [{**dataclasses.asdict(r), "violated": r.violated} for r in self.rows]
+        return json.dumps({"slice": self.slice, "rows": rows})
 
 
 @dataclass(frozen=True)
@@ -194,27 +193,22 @@ def audit_of_bands(
 
 
 def audit(
-    file: PipelineFile,
-    made: Plan,
-    *,
-    threads: int | None = None,
-    seconds: float | None = None,
-    observations: int = 1,
+    file: PipelineFile, made: Plan, *, threads: int | None = None, seconds: float | None = None
 ) -> Audit:
     """Compare every decision of ``made`` with the full simulation of a slice of ``file``, chosen by
     cost (`extent`) where no ``seconds`` are given."""
     chosen = [d for d in made.decided if d.chosen > 0]
     size = extent(made, len(chosen) + 2) if seconds is None else Extent(seconds)
-    seconds = size.seconds
     if made.structure.instead:  # nothing that is made of the complete signal is asked for
         file = dataclasses.replace(made, decided=()).apply(file)
-    part = sliced(file, seconds, observations, size.every)
-    whole = Structure(tuple(o.label for o in part.pipeline().operators), tuple(part.runs), ())
-    dropped = [
-        d.operator for d in chosen if d.effect.name == NAME and d.operator in whole.operators
-    ]
-    whole_plan = plan_band(part, Wishes(prune_all=False, drop=dropped))
-    words = f"the first {seconds:.3g} s of {observations} scan{'s' if observations > 1 else ''}"
+    part = sliced(file, size.seconds, 1, size.every)
+    labels = tuple(o.label for o in part.pipeline().operators)
+    whole = Structure(labels, tuple(part.runs), ())
+    kept = (*made.structure.operators, "Slice")
+    fewer = dataclasses.replace(whole, operators=tuple(label for label in labels if label in kept))
+    dropped = [d.operator for d in chosen if d.effect.name == NAME and d.operator in labels]
+    plan = plan_band(part, Wishes(prune_all=False, drop=dropped))
+    words = f"the first {size.seconds:.3g} s of 1 scan"
     if size.every > 1:
         words += f", every {size.every}th detector"
     if made.context.joined:
@@ -222,37 +216,31 @@ def audit(
             f", this band alone: with the others, which {made.context.joined} joins, the bounds"
             " need not hold"
         )
-    fewer = tuple(
-        label for label in whole.operators if label in made.structure.operators or label == "Slice"
-    )
-    rows = _noise(dataclasses.replace(whole_plan, structure=whole).apply(part), whole_plan, threads)
-    if not chosen and fewer == whole.operators:
+
+    def planned(*those: Decided, structure: Structure = whole) -> PipelineFile:
+        return dataclasses.replace(plan, structure=structure, decided=those).apply(part)
+
+    noise = dataclasses.replace(plan, structure=whole).apply(part)
+    rows = _noise(noise, plan, threads)
+    if not chosen and fewer == whole:
         return Audit(tuple(rows), words)
-    stated = {d.name: d for d in whole_plan.decided}
+    stated = {d.name: d for d in plan.decided}
     same = [s for d in chosen if (s := _on_slice(d, stated)) is not None]
-
-    def decided(*those: Decided, structure: Structure = whole) -> PipelineFile:
-        return dataclasses.replace(whole_plan, structure=structure, decided=those).apply(part)
-
-    reference = _run(_with_sky_given(decided()), threads)
+    reference = _run(_with_sky_given(planned()), threads)
     for d in same:
-        rows += _compare(d.name, d.choice, reference, _run(decided(d), threads), whole_plan.context)
-    if fewer != whole.operators and reference.map is not None:
-        bare = decided(structure=dataclasses.replace(whole, operators=fewer))
-        result = dataclasses.replace(_run(bare, threads), signal=[], sky=None, own=None)
+        rows += _compare(d.name, d.choice, reference, _run(planned(d), threads), plan.context)
+    if fewer != whole and reference.map is not None:
+        bare = _Result([], _run(planned(structure=fewer), threads).map)
         nothing = Choice("dropped", "what no output depends on", bound={"map_rms": 0.0})
-        rows += _compare("structure", nothing, reference, result, whole_plan.context)
+        rows += _compare("structure", nothing, reference, bare, plan.context)
     if len(same) > 1:
-        result = _run(decided(*same), threads)
         bound: dict[str, float] = {}
         for d in same:
-            sky = d.choice.bound.get(
-                "peak", 0.0
-            )  # what is bounded for the sky alone is in the stream and the map too
+            # what is bounded for the sky alone is in the stream and the map too
+            sky = d.choice.bound.get("peak", 0.0)
             bound = add(bound, {"tod": sky, "map_rms": sky, **d.choice.bound})
-        rows += _compare(
-            "all together", Choice("coarse", "", bound=bound), reference, result, whole_plan.context
-        )
+        result, together = _run(planned(*same), threads), Choice("coarse", "", bound=bound)
+        rows += _compare("all together", together, reference, result, plan.context)
     return Audit(tuple(rows), words)
 
 
@@ -278,80 +266,70 @@ def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]
         # an opaque atmosphere, calibrated and not filtered: the map's samples have no noise to
         # compare
         return []
-    maps: dict[str, Any] = {
-        run: v
-        for run in runs
-        for k, v in products.items()
-        if k.startswith(f"{run}/") and hasattr(v, "hits")
-    }
-    several = sum("map" in p for p in provided) > 1
-    if (
-        maps.keys() != runs.keys() or several or getattr(maps["white"], "smoothed_by", 0.0) > 0
-    ):  # the plan's pixel is none of these maps'
-        return []
-    first = maps["white"]
-    noise, hits = (
-        np.ravel(first.signal - (maps["air"].signal if air else 0.0)),
-        np.ravel(first.hits),
-    )
+    maps = {run: _map_of(products, f"{run}/") for run in runs}
+    first, several = maps["white"], sum("map" in p for p in provided) > 1
+    if None in maps.values() or several or getattr(first, "smoothed_by", 0.0) > 0:
+        return []  # the plan's pixel is none of these maps'
+    noise = np.ravel(first.signal - (maps["air"].signal if air else 0.0))
+    hits = np.ravel(first.hits)
     seen = (hits > 0) & np.isfinite(noise)
     if np.count_nonzero(seen) < 2 * PARTS:
         return []
     deep = float(np.quantile(hits[seen], DEEP))
-    squares = [float(p.mean()) for p in np.array_split(noise[seen] ** 2 * hits[seen] / deep, PARTS)]
+    actual, error = _rms(np.array_split(noise[seen] ** 2 * hits[seen] / deep, PARTS))
     within = HEADLINE if made.context.coverage and made.context.coverage.exact else ROUGH
-    return [
-        Checked(
-            "white noise",
-            "of the plan",
-            "map_rms",
-            made.noise[1],
-            _rms(squares),
-            _rms_error(squares),
-            within=within,
-        )
-    ]
+    about = ("white noise", "of the plan", "map_rms")
+    return [Checked(*about, made.noise[1], actual, error, within=within)]
 
 
-def _on_slice(d: Decided, stated: dict[str, Decided]) -> Decided | None:
+def _on_slice(d: Decided, stated: Mapping[str, Decided]) -> Decided | None:
     """The same choice with the bound that holds for the slice; None where the slice has no such
     choice.
     """
     mine = stated.get(d.name)
-    numbers = (
-        []
-        if mine is None
-        else [k for k, c in enumerate(mine.effect.choices) if c.what == d.choice.what]
-    )
-    return dataclasses.replace(mine, chosen=numbers[0]) if mine is not None and numbers else None
+    for number, choice in enumerate(mine.effect.choices if mine else ()):
+        if mine and choice.what == d.choice.what:
+            return dataclasses.replace(mine, chosen=number)
+    return None
 
 
 @dataclass(frozen=True)
 class _Result:
+    """Streams and maps of a run.
+
+    Attributes
+    ----------
+    sky, given, own
+        Maps of the sky alone: behind the filters; as it comes in, which a transfer function is
+        relative to; with modes of its own, where the pipeline asks for that.
+    """
+
     signal: list[NDArray[np.float64]]
     map: Any
-    sky: Any
+    sky: Any = None
     given: Any = None
-    """The sky alone as it comes in, not filtered, which a transfer function is relative to."""
     own: Any = None
-    """The sky alone with modes of its own, where the pipeline asks for that."""
 
 
 def _run(file: PipelineFile, threads: int | None) -> _Result:
     made = any("signal" in s.operator.provides for s in file.steps)
     data = file.pipeline().run(file.scene(), threads=threads, keep=["signal"] if made else ())
-    maps = [k for k, v in data.products.items() if hasattr(v, "hits") and hasattr(v, "signal")]
-    main = next((data.products[k] for k in maps if "/" not in k), None)
-    runs = ("sky_alone", GIVEN, "sky_with_own_modes")
-    sky, given, own = (
-        next((data.products[k] for k in maps if k.startswith(f"{run}/")), None) for run in runs
-    )
-    kept = [o for o in data.observations if "signal" in o.detdata]
     signal = [
         np.asarray(o.detdata["signal"][o.good_detectors][:, o.good_samples], np.float64)
-        for o in kept
+        for o in data.observations
+        if "signal" in o.detdata
     ]
-    return _Result(signal, main, sky, given, own)
+    runs = ("", "sky_alone/", f"{GIVEN}/", "sky_with_own_modes/")
+    return _Result(signal, *(_map_of(data.products, run) for run in runs))
+
+
+def _map_of(products: Mapping[str, Any], run: str) -> Any:
+    """The first map of a run (``name/``; empty: the complete signal); None where there is none."""
+    for name, product in products.items():
+        mine = name.startswith(run) if run else "/" not in name
+        if mine and hasattr(product, "hits") and hasattr(product, "signal"):
+            return product
+    return None
 
 
 def _with_sky_given(file: PipelineFile) -> PipelineFile:
@@ -369,51 +347,33 @@ def _compare(
 
     def add(metric: str, actual: float, error: float, rounding: float, plane: str = "") -> None:
         if metric in choice.bound and math.isfinite(actual):
-            bound = choice.bound[metric]
-            # where nothing may change, that nothing did is what is asked for, if there was
-            # something
+            bound, what = choice.bound[metric], f"{metric} {plane}".strip()
+            # a zero bound is tested only if there was something that could change
             exercised = actual > 0 or (bound == 0 and rounding > 0)
-            rows.append(
-                Checked(
-                    name,
-                    choice.what,
-                    f"{metric} {plane}".strip(),
-                    bound + rounding,
-                    actual,
-                    error,
-                    exercised,
-                )
-            )
+            about = (name, choice.what, what)
+            rows.append(Checked(*about, bound + rounding, actual, error, exercised))
 
-    scale = ROUNDING * _rms([float((s * s).mean()) for s in full.signal if s.size])
+    scale = ROUNDING * _rms(s * s for s in full.signal)[0]
     if [a.shape for a in full.signal] == [b.shape for b in other.signal]:
-        squares = [
-            float((p * p).mean())
+        parts = (
+            part**2
             for a, b in zip(full.signal, other.signal, strict=True)
-            for p in np.array_split(a - b, PARTS, axis=1)
-            if p.size
-        ]
-        add("tod", _rms(squares), _rms_error(squares), scale)
+            for part in np.array_split(a - b, PARTS, axis=1)
+        )
+        add("tod", *_rms(parts), scale)
     if full.map is not None and other.map is not None and context.coverage is not None:
-        hits = np.ravel(full.map.hits)
+        hits, usual = np.ravel(full.map.hits), context.coverage.hits
         for plane, share, one, two in _planes(full.map, other.map):
             difference = np.ravel((one.signal - two.signal) * share)
-            deep = (hits >= context.coverage.hits / 2) & np.isfinite(difference)
+            deep = (hits >= usual / 2) & np.isfinite(difference)
             if deep.any():
-                scaled = difference[deep] ** 2 * hits[deep] / context.coverage.hits
-                squares = [float(p.mean()) for p in np.array_split(scaled, PARTS) if p.size]
-                add("map_rms", _rms(squares), _rms_error(squares), scale, plane)
-    skies = [
-        (one, two)
-        for one, two in ((full.sky, other.sky), (full.own, other.own))
-        if one is not None and two is not None
-    ]
+                scaled = difference[deep] ** 2 * hits[deep] / usual
+                add("map_rms", *_rms(np.array_split(scaled, PARTS)), scale, plane)
+    both = [(full.sky, other.sky), (full.own, other.own)]
+    skies = [(one, two) for one, two in both if one is not None and two is not None]
     if skies:
-        strongest = float(
-            np.nanmax(
-                np.abs((skies[0][0] if full.given is None else full.given).signal), initial=0.0
-            )
-        )
+        given = skies[0][0] if full.given is None else full.given
+        strongest = float(np.nanmax(np.abs(given.signal), initial=0.0))
         largest: dict[str, float] = {}
         for one, two in skies:
             for plane, share, a, b in _planes(one, two):
@@ -439,15 +399,12 @@ def _planes(full: Any, other: Any) -> list[tuple[str, Any, Any, Any]]:
         ]
 
 
-def _rms(squares: Sequence[float]) -> float:
-    return math.sqrt(sum(squares) / max(len(squares), 1))
-
-
-def _rms_error(squares: Sequence[float]) -> float:
-    """Standard error of the rms from its scatter between the parts: sigma(s^2) / (2 rms
-    sqrt(n)).
+def _rms(parts: Iterable[NDArray[Any]]) -> tuple[float, float]:
+    """Rms of squares in several parts, and its standard error from the scatter between them,
+    sigma(s^2) / (2 rms sqrt(n)).
     """
-    rms = _rms(squares)
-    if len(squares) < 2 or rms == 0:
-        return 0.0
-    return float(np.std(squares, ddof=1) / math.sqrt(len(squares)) / (2 * rms))
+    means = [float(part.mean()) for part in parts if part.size]
+    rms = math.sqrt(sum(means) / max(len(means), 1))
+    if len(means) < 2 or rms == 0:
+        return rms, 0.0
+    return rms, float(np.std(means, ddof=1) / math.sqrt(len(means)) / (2 * rms))
