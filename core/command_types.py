@@ -6,6 +6,7 @@ Only click is imported with this module.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,3 +116,51 @@ class Share(_Anything):
                 ctx,
             )
         return int(first), int(second)
+
+
+_ON_ENGINE = (
+    click.option(
+        "--threads",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Threads (of each task); results do not depend on it.  [default: all]",
+    ),
+    click.option(
+        "--memory",
+        type=Bytes(),
+        metavar="SIZE",
+        help=(
+            "Most memory to hold, of a campaign all its workers' on this machine (with MPI and Dask"
+            " each process's), e.g. 4GB; results do not depend on it.  [default: half of the free]"
+        ),
+    ),
+    click.option(
+        "-v",
+        "--verbose",
+        is_flag=True,
+        help="Say all that was counted, chosen and approximated, not only what was lost.",
+    ),
+    click.option(
+        "--engine",
+        type=click.Choice(["serial", "processes", "mpi", "dask"]),
+        help="Run scans as tasks of a campaign.  [default: as in the file's campaign]",
+    ),
+    click.option(
+        "--workers",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Processes of --engine processes.",
+    ),
+    click.option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Of Dask, e.g. tcp://host:8786, or its scheduler file.",
+    ),
+)
+
+
+def on_engine(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator: options of the commands that run a pipeline, on an engine if asked."""
+    for option in reversed(_ON_ENGINE):
+        command = option(command)
+    return command

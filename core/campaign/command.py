@@ -7,15 +7,17 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..command_types import Bytes
+from ..command_types import on_engine
 
 if TYPE_CHECKING:
     from ..command_types import RunRequest
     from .campaign_file import Job, Task
+    from .engines import Pool
     from .folder import TaskRow
     from .prepare import CampaignFile
     from .settings import Campaign
@@ -26,10 +28,8 @@ if TYPE_CHECKING:
 
 def run(request: RunRequest) -> None:
     """``zonda run`` of pipeline files as a campaign."""
-    from ..storage.files import check_output_folder
     from ..storage.lock import lock
     from . import run as campaign
-    from .engines import engine
     from .prepare import Pruning
 
     sources = [source(p, request.settings, len(request.pipelines) > 1) for p in request.pipelines]
@@ -41,11 +41,7 @@ def run(request: RunRequest) -> None:
     folder = request.output or (
         sources[0].file.output if len(sources) == 1 else Path("out/campaign")
     )
-    options = _engine(sources[0].campaign, request.engine, request.workers, request.scheduler)
-    with engine(**options, threads=request.threads, memory=request.memory) as pool:
-        if pool.executor is None:
-            return
-        check_output_folder(folder)
+    with _working(sources[0].campaign, folder, request) as pool:
         pruning = Pruning(request.keep, request.drop, request.prune)
         if request.share is not None:
             k, n = request.share
@@ -54,11 +50,8 @@ def run(request: RunRequest) -> None:
             _say(f"share {k} of {n} is done; when all are: zonda resume {folder}")
         else:
             with lock(folder), _resumable(folder):
-                _show(
-                    campaign.begin(sources, folder, request.command, pool, _say, pruning),
-                    request.verbose,
-                )
-    click.echo(f"{folder}/")
+                found = campaign.begin(sources, folder, request.command, pool, _say, pruning)
+                _show(found, request.verbose)
 
 
 @click.command()
@@ -73,43 +66,8 @@ def run(request: RunRequest) -> None:
     default=None,
     help="Refuse tasks of another kind of machine than the first.  [default: as in the file]",
 )
-@click.option(
-    "--engine",
-    type=click.Choice(["serial", "processes", "mpi", "dask"]),
-    help="What works on the tasks.  [default: as in the file]",
-)
-@click.option(
-    "--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes."
-)
-@click.option(
-    "--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file."
-)
-@click.option(
-    "--threads",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Threads of each task.  [default: a worker's share]",
-)
-@click.option(
-    "--memory",
-    type=Bytes(),
-    metavar="SIZE",
-    help="As of `zonda run`, e.g. 4GB.  [default: half of the free]",
-)
-@click.option(
-    "-v", "--verbose", is_flag=True, help="Say all that was counted, chosen and approximated."
-)
-def resume(
-    folder: Path,
-    anyway: bool,
-    same_machine: bool | None,
-    engine: str | None,
-    workers: int | None,
-    scheduler: str | None,
-    threads: int | None,
-    memory: int | None,
-    verbose: bool,
-) -> None:
+@on_engine
+def resume(folder: Path, anyway: bool, same_machine: bool | None, **how: Any) -> None:
     """Go on with the campaign in DIR.
 
     The checksums of all partial products are verified, what is missing is run, failed tasks are
@@ -119,24 +77,18 @@ def resume(
     from ..machine import one_blas_thread
 
     one_blas_thread()
-    from ..storage.files import check_output_folder
     from ..storage.lock import lock
     from . import run as campaign
     from .campaign_file import Job
-    from .engines import engine as opened
 
-    job = Job.read(folder)
-    options = _engine(_campaign_of(job), engine, workers, scheduler)
-    with opened(**options, threads=threads, memory=memory) as pool:
-        if pool.executor is None:
-            return
-        check_output_folder(folder)
-        with lock(folder), _resumable(folder):
-            _show(
-                campaign.resume(folder, pool, _say, anyway=anyway, same_machine=same_machine),
-                verbose,
-            )
-    click.echo(f"{folder}/")
+    given, job = SimpleNamespace(**how), Job.read(folder)
+    with (
+        _working(_campaign_of(job), folder, given) as pool,
+        lock(folder),
+        _resumable(folder),
+    ):
+        found = campaign.resume(folder, pool, _say, anyway=anyway, same_machine=same_machine)
+        _show(found, given.verbose)
 
 
 @click.command()
@@ -176,17 +128,30 @@ def source(pipeline: str, settings: tuple[str, ...], several: bool) -> CampaignF
     )
 
 
-def _engine(
-    campaign: Campaign, engine: str | None, workers: int | None, scheduler: str | None
-) -> dict[str, Any]:
-    name = engine or ("dask" if scheduler else campaign.engine)
+@contextlib.contextmanager
+def _working(campaign: Campaign, folder: Path, given: Any) -> Iterator[Pool]:
+    """An engine as the options say (``given``, `on_engine`), else as the campaign does. A worker
+    of MPI ends here when it has done its part.
+    """
+    from ..storage.files import check_output_folder
+    from .engines import engine
+
+    name = given.engine or ("dask" if given.scheduler else campaign.engine)
     dask = name == "dask"
-    return {
-        "name": name,
-        "workers": workers or campaign.workers,
-        "scheduler": (scheduler or campaign.scheduler) if dask else None,
-        "tls": campaign.tls if dask else None,
-    }
+    with engine(
+        name,
+        workers=given.workers or campaign.workers,
+        threads=given.threads,
+        memory=given.memory,
+        scheduler=(given.scheduler or campaign.scheduler) if dask else None,
+        tls=campaign.tls if dask else None,
+    ) as pool:
+        if main := pool.executor is not None:
+            check_output_folder(folder)
+            yield pool
+    if not main:
+        raise click.exceptions.Exit
+    click.echo(f"{folder}/")
 
 
 def _campaign_of(job: Job) -> Campaign:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..command_types import Bytes, RunRequest, Share
+from ..command_types import RunRequest, Share, on_engine
 from . import complete
 
 if TYPE_CHECKING:
@@ -61,42 +61,11 @@ if TYPE_CHECKING:
     metavar="DIR",
     help="Folder for products.  [default: as in the file]",
 )
-@click.option(
-    "--threads",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Threads; results do not depend on it.  [default: all]",
-)
-@click.option(
-    "--memory",
-    type=Bytes(),
-    metavar="SIZE",
-    help=(
-        "Most memory to hold, of a campaign all its workers' on this machine (with MPI and Dask"
-        " each process's), e.g. 4GB; results do not depend on it.  [default: half of the free]"
-    ),
-)
-@click.option(
-    "-v",
-    "--verbose",
-    is_flag=True,
-    help="Say all that was counted, chosen and approximated, not only what was lost.",
-)
+@on_engine
 @click.option(
     "--verify",
     is_flag=True,
     help="Measure the error of this run's approximations: one more run, at their tightest.",
-)
-@click.option(
-    "--engine",
-    type=click.Choice(["serial", "processes", "mpi", "dask"]),
-    help="Run scans as tasks of a campaign.  [default: as in the file's campaign]",
-)
-@click.option(
-    "--workers", type=click.IntRange(min=1), metavar="N", help="Processes of --engine processes."
-)
-@click.option(
-    "--scheduler", metavar="ADDRESS", help="Of Dask, e.g. tcp://host:8786, or its scheduler file."
 )
 @click.option(
     "--task",
