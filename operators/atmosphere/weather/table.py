@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from zonda.core.configuration.files import InputPath
-from zonda.core.storage import ecsv
+from zonda.core.storage import table_files
 from zonda.core.types import Floats
 from zonda.core.weather import Column, WeatherSource
 
@@ -64,10 +64,10 @@ class Table(WeatherSource):
             table that ends below 8 km.
         """
         place = f"table {self.table}"
-        text = ecsv.read_text(self.table, place)
+        text = table_files.read_text(self.table, place)
         if not text.startswith("# %ECSV"):
             text = re.sub(r"[ \t]*#.*", "", text)
-        table = ecsv.read_table(self.table, place, text)
+        table = table_files.read_table(self.table, place, text)
         table.columns = {
             " ".join(name.lower().replace("_", " ").split()): column
             for name, column in table.columns.items()
@@ -123,7 +123,7 @@ class Table(WeatherSource):
         return found
 
     @staticmethod
-    def _check(table: ecsv.Table, column: Column, kind: str, humidity: Floats) -> None:
+    def _check(table: table_files.Table, column: Column, kind: str, humidity: Floats) -> None:
         """Note what no air is."""
         height, faults = column.height, list(impossible(column))
         if kind == "relative humidity":
