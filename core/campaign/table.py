@@ -100,7 +100,7 @@ def draw(points: Sequence[Point]) -> Any:
     against the first axis that changes; one line for each combination of the others."""
     names = list(dict.fromkeys(point.name for point in points))
     size = (6.4, 0.6 + 3.0 * len(names))
-    axes = new_axes(None, size, nrows=len(names), squeeze=False, gridspec_kw={"hspace": 0.4})[:, 0]
+    axes = new_axes(size, nrows=len(names), squeeze=False, gridspec_kw={"hspace": 0.4})[:, 0]
     for ax, name in zip(axes, names, strict=True):
         _panel(ax, [point for point in points if point.name == name])
     return axes[0].figure

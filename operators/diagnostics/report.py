@@ -43,7 +43,7 @@ LONG = 12
 """Rows of a table that are shown; the rest of a longer one is folded away. Half as many of files,
 in one cell.
 """
-_WIDE = 1000
+_WIDE = 1200
 """Pictures wider than this many pixels take a whole row."""
 
 
