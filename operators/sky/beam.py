@@ -137,8 +137,8 @@ def convolve(
     )
     if fwhm > 0:
         # cycles per input pixel
-        kx: Floats = qx * np.fft.rfftfreq(nx)
-        ky: Floats = qy * np.fft.fftfreq(ny)[:, None]
+        kx = np.float64(qx) * np.fft.rfftfreq(nx)
+        ky = np.float64(qy) * np.fft.fftfreq(ny)[:, None]
         transfer = _transfer(covariance, kx, ky, across < SMOOTH_BELOW)
         along = [np.sinc(k) ** 2 if linear else _at_knots(k) for k in (kx / qx, ky / qy)]
         transfer /= along[0] * along[1]

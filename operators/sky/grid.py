@@ -29,7 +29,7 @@ from zonda.core.types import Floats
 from .beam import REACH, SIGMA, SMOOTH_BELOW
 from .gridding import Gridding
 from .input_map import ImageMap, InputMap
-from .region import directions_on, region, tangent_wcs
+from .region import directions_on, region, tangent_grid_wcs
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
@@ -192,7 +192,7 @@ def tangent_grid(
     disc, whole = source.extent
     found = region(observation, step, REACH * SIGMA * wide, disc if whole else None, place)
     ra, dec = observation.centre
-    wcs = tangent_wcs(ra, dec, found.box, step)
+    wcs = tangent_grid_wcs(ra, dec, found.box, step)
     tiles = None if found.tiles is None else found.tiles.tobytes()
     pole = None if source.polarization is None else source.turn[2]
     made = *key, "grid", ra, dec, step, gridding, found.box, tiles

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.projection import boresights, pixel_matrix
+from zonda.core.numerics.projection import boresights, pixel_matrix, tangent_wcs
 from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import Floats
 
@@ -99,6 +99,8 @@ def region(
         The scan goes further from its centre than a gnomonic projection serves, or the box has too
         many points.
     """
+    from scipy.ndimage import maximum_filter
+
     around = float(np.arctan(observation.focalplane.radius)) + reach
     axes = local_axes(*observation.centre)
     boxes, furthest = [], 0.0
@@ -132,7 +134,7 @@ def region(
     tiles = np.zeros((ny // TILE, nx // TILE), bool)
     for x, y, _ in _on_plane(observation, axes, disc, around):
         tiles[((y / step - y0) // TILE).astype(int), ((x / step - x0) // TILE).astype(int)] = True
-    tiles = _grown(tiles, int(np.ceil(pad / TILE)))
+    tiles = maximum_filter(tiles, 2 * int(np.ceil(pad / TILE)) + 1, mode="constant")
     return Region((x0, x1, y0, y1), None if tiles.mean() > SPARSE else tiles)
 
 
@@ -164,34 +166,15 @@ def _snapped(low: Floats, high: Floats) -> tuple[int, int, int, int]:
     return int(x0), int(x1), int(y0), int(y1)
 
 
-def _grown(tiles: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """True also within ``by`` tiles along both axes."""
-    for axis in (0, 1):
-        total = np.cumsum(
-            np.pad(tiles, [(by + 1, by) if k == axis else (0, 0) for k in (0, 1)]), axis=axis
-        )
-        n, width = tiles.shape[axis], 2 * by + 1
-        tiles = np.take(total, np.arange(width, width + n), axis) > np.take(
-            total, np.arange(n), axis
-        )
-    return tiles
-
-
-def tangent_wcs(ra: float, dec: float, box: tuple[int, int, int, int], step: float) -> Any:
+def tangent_grid_wcs(ra: float, dec: float, box: tuple[int, int, int, int], step: float) -> Any:
     """A north-up TAN `WCS` (ICRS) about (ra, dec) of the points in ``box`` (`Region`);
     `pixel_shape` is set. All in rad.
     """
-    from astropy.wcs import WCS
-
     x0, x1, y0, y1 = box
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.crval = [np.degrees(ra), np.degrees(dec)]
-    wcs.wcs.crpix = [1 - x0, 1 - y0]
-    wcs.wcs.cdelt = [-np.degrees(step), np.degrees(step)]
-    wcs.wcs.radesys = "ICRS"
+    side = float(np.degrees(step))
+    crval = float(np.degrees(ra)), float(np.degrees(dec))
+    wcs: Any = tangent_wcs("icrs", crval, (1 - x0, 1 - y0), (-side, side))
     wcs.pixel_shape = (x1 - x0, y1 - y0)
-    wcs.wcs.set()
     return wcs
 
 

@@ -8,7 +8,7 @@ from zonda.core.errors import InputError
 from zonda.core.plan.planning import planning_of
 from zonda.operators.sky import region as regions
 from zonda.operators.sky.gridding import interpolated
-from zonda.operators.sky.region import TILE, Disc, region, tangent_wcs
+from zonda.operators.sky.region import TILE, Disc, region, tangent_grid_wcs
 from zonda.operators.sky.skymap import SkyMap
 
 ARCMIN = np.pi / 10800
@@ -48,7 +48,7 @@ def test_every_sample_and_its_beam_is_in_a_tile(made):
 
     p = (
         directions(scan.boresight_radec, xi, eta).reshape(-1, 3)
-        @ pixel_matrix(tangent_wcs(*CENTRE, found.box, step)).T
+        @ pixel_matrix(tangent_grid_wcs(*CENTRE, found.box, step)).T
     )
     x, y = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2]
     margin = reach / step + regions.MARGIN
@@ -112,7 +112,7 @@ def test_blocks_are_told(made, save, tmp_path, kind):
     from zonda.operators.sky.read import read_map
 
     told = []
-    target = tangent_wcs(*CENTRE, (-512, 512, -512, 512), ARCMIN)
+    target = tangent_grid_wcs(*CENTRE, (-512, 512, -512, 512), ARCMIN)
     if kind == "healpix":
         healpy.write_map(
             tmp_path / "h.fits",

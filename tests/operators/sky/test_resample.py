@@ -15,7 +15,7 @@ from zonda.operators.sky.brightness import tangent_areas
 from zonda.operators.sky.gridding import interpolated
 from zonda.operators.sky.input_map import ImageMap
 from zonda.operators.sky.read import read_map
-from zonda.operators.sky.region import tangent_wcs
+from zonda.operators.sky.region import tangent_grid_wcs
 from zonda.operators.sky.skymap import SkyMap
 
 ARCMIN = np.pi / 10800
@@ -249,7 +249,7 @@ def test_constant_healpix_is_constant(made, tmp_path):
     healpy.write_map(tmp_path / "c.fits", values, coord="C", column_units="K_RJ", dtype=np.float64)
     source = read_map(tmp_path / "c.fits")
     (got,), covered, poor = interpolated(
-        source, tangent_wcs(1.0, 0.4, (-14, 15, -14, 15), np.radians(0.3))
+        source, tangent_grid_wcs(1.0, 0.4, (-14, 15, -14, 15), np.radians(0.3))
     )
     assert 0.5 < covered.mean() < 0.9
     np.testing.assert_allclose(got[covered], 3.0, rtol=1e-9)
