@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -197,12 +198,9 @@ class Instrument(Parameters):
                 {k: v for k, v in value.items() if k != "band"}, context=info.context
             )
             if not isinstance(chosen, str) or chosen not in whole.cameras:
-                unknown = f"{whole.name} has no band '{chosen}'"
-                text = (
-                    unknown
-                    if isinstance(chosen, str)
-                    else "band beside bands is the name of one of them"
-                )
+                text = "band beside bands is the name of one of them"
+                if isinstance(chosen, str):
+                    text = f"{whole.name} has no band '{chosen}'"
                 cure = f"write one of {', '.join(whole.cameras)}, or leave band or bands out"
                 raise mistake(text, nearest(chosen, whole.cameras), cure, at=("band",))
             camera = whole.cameras[chosen]
@@ -210,106 +208,79 @@ class Instrument(Parameters):
                 "telescope": camera.telescope,
                 "band": camera.band,
             }
-        own = [
-            band.model_dump(mode="json") if isinstance(band, CameraBand) else band
-            for band in value["bands"]
-        ]
-        stated = [
-            key
-            for key in PER_BAND
-            if all(isinstance(band, dict) and band.get(key) is not None for band in own)
-        ]
+        own = [b.model_dump(mode="json") if isinstance(b, Band) else b for b in value["bands"]]
+        own = [band if isinstance(band, dict) else {} for band in own]
+        common = {
+            key: own[0][key] for key in PER_BAND if all(band.get(key) is not None for band in own)
+        }
         try:
-            CameraBand.model_validate(
-                {"name": "first", "low": "1 Hz", "high": "2 Hz"}
-                | {key: own[0][key] for key in stated}
-            )
+            CameraBand.model_validate({"name": "first", "low": "1 Hz", "high": "2 Hz"} | common)
         except ValidationError:  # which the band's own validation tells, at its place
-            return {key: STAND_INS[key] for key in stated if key in STAND_INS} | value
-        return {key: own[0][key] for key in stated} | value
+            common = {key: STAND_INS[key] for key in common if key in STAND_INS}
+        return common | value
 
     @model_validator(mode="after")
     def _bands_fit(self) -> Instrument:
-        names = [band.name for band in self.bands]
-        if twice := next((name for name in names if names.count(name) > 1), None):
-            second = len(names) - 1 - names[::-1].index(twice)
-            help = "give each a name of its own: products and files bear it"
-            raise mistake(f"two bands are called {twice}", "", help, at=("bands", second, "name"))
-        if self.band is None and not self.bands:
-            raise mistake(
-                "a camera needs a band",
-                "",
-                "name one with band, or several with bands",
-                at=("band",),
-            )
+        for wrong, text, cure, at in self._mistakes():
+            if wrong:
+                raise mistake(text, "", cure, at=at)
         if self.focalplane_table is not None:
-            return self._table_fits(self.focalplane_table)
-        counts = self._counts
-        if self.pixels == "shared" and len(set(counts.values())) > 1:
-            listed = ", ".join(f"{name} has {number}" for name, number in counts.items())
-            text = f"shared pixels need as many detectors in every band: {listed}"
-            raise mistake(
-                text,
-                "",
-                "give all bands the same number of detectors, or write pixels: separate",
-                at=("bands",),
-            )
-        if self.wafers > 1 and self.layout != "wafers":
-            help = "write layout: wafers, or leave out wafers"
-            raise mistake(
-                f"{self.wafers} wafers go with layout: wafers, not {self.layout}",
-                "",
-                help,
-                at=("wafers",),
-            )
-        for k, (name, number) in enumerate(counts.items()):
-            self._check_number(k, name if self.bands else "", number)
+            self._check_table(self.focalplane_table)
         return self
 
-    def _check_number(self, k: int, band: str, number: int) -> None:
-        """Raise what a validator does where the ``number`` of detectors of the ``k``-th band does
-        not suit pixels and wafers.
-        """
-        own = bool(self.bands) and self.bands[k].detectors is not None
-        at: tuple[str | int, ...] = ("bands", k, "detectors") if own else ("detectors",)
-        who = f"detectors of {band} is" if band else "detectors is"
-        number_of_wafers = self._wafers
-        share = self._pair * number_of_wafers
-        below = number // share * share
-        cure = f"write {below} or {below + share}" if below else f"write {share}"
-        if self.polarization == "pairs" and number % 2:
-            text = (
-                f"polarization: pairs needs an even number of detectors, two in each pixel; {who}"
-                f" {number}"
-            )
-            raise mistake(text, "", cure, at=at)
-        if number % share:
-            text = (
-                f"{number_of_wafers} wafers share their pixels equally; {who} {number}, no multiple"
-                f" of {share}"
-            )
-            raise mistake(text, "", f"{cure}, or layout: hexagon", at=at)
+    def _mistakes(self) -> Iterator[tuple[bool, str, str, tuple[str | int, ...]]]:
+        """What bands, pixels and wafers must not be: (whether it is, message, cure, place)."""
+        names = [band.name for band in self.bands]
+        for k, name in enumerate(names):
+            cure = "give each a name of its own: products and files bear it"
+            yield name in names[:k], f"two bands are called {name}", cure, ("bands", k, "name")
+        none, cure = self.band is None and not names, "name one with band, or several with bands"
+        yield none, "a camera needs a band", cure, ("band",)
+        if self.focalplane_table is not None:
+            return
+        counts, wafers, pairs = self._counts, self._wafers, self.polarization == "pairs"
+        listed = ", ".join(f"{name} has {number}" for name, number in counts.items())
+        yield (
+            self.pixels == "shared" and len(set(counts.values())) > 1,
+            f"shared pixels need as many detectors in every band: {listed}",
+            "give all bands the same number of detectors, or write pixels: separate",
+            ("bands",),
+        )
+        yield (
+            self.wafers > 1 and self.layout != "wafers",
+            f"{self.wafers} wafers go with layout: wafers, not {self.layout}",
+            "write layout: wafers, or leave out wafers",
+            ("wafers",),
+        )
+        share = self._pair * wafers
+        for k, (name, number) in enumerate(counts.items()):
+            own = bool(names) and self.bands[k].detectors is not None
+            at: tuple[str | int, ...] = ("bands", k, "detectors") if own else ("detectors",)
+            told = f"detectors{f' of {name}' if names else ''} is {number}"
+            below = number // share * share
+            cure = f"write {below} or {below + share}" if below else f"write {share}"
+            need = "polarization: pairs needs an even number of detectors, two in each pixel"
+            yield pairs and number % 2 > 0, f"{need}; {told}", cure, at
+            text = f"{wafers} wafers share their pixels equally; {told}, no multiple of {share}"
+            yield number % share > 0, text, f"{cure}, or layout: hexagon", at
 
-    def _table_fits(self, path: Path) -> Instrument:
+    def _check_table(self, path: Path) -> None:
+        """Raise what a validator does if the table of detectors does not suit the instrument."""
         try:
             table = read_array(path)
             table.check(self._counts, several=bool(self.bands))
+            message = ""
             if table.reach > math.tan(self.field_of_view / 2) * (1 + 1e-9):
                 field = f"{math.degrees(2 * math.atan(table.reach)):.6g} deg"
+                message = f"has detectors in a field of {field}, more than field_of_view"
                 cure = f"leave out field_of_view, or write at least {field}"
-                raise InputError(
-                    f"has detectors in a field of {field}, more than field_of_view",
-                    place=table.table.place,
-                    cure=cure,
-                )
-            if self.polarization == "pairs" and "polarization_angle" not in table.columns:
+            elif self.polarization == "pairs" and "polarization_angle" not in table.columns:
+                message = "has no column 'polarization_angle'"
                 cure = "add it, or leave out polarization: pairs, which belongs to layouts"
-                raise InputError(
-                    "has no column 'polarization_angle'", place=table.table.place, cure=cure
-                )
+            if message:
+                raise InputError(message, place=table.table.place, cure=cure)
         except ZondaError as err:
             raise refusal(err, at=("focalplane",)) from None
-        return self
 
     @model_serializer(mode="wrap")
     def _by_the_keys_of_files(self, handler: SerializerFunctionWrapHandler) -> Any:
@@ -329,13 +300,9 @@ class Instrument(Parameters):
     @property
     def _wafers(self) -> int:
         """Wafers that share the pixels of a band equally."""
-        if self.layout in LATTICES:
-            return 1
-        return (
-            self.wafers
-            if self.layout == "wafers"
-            else int(getattr(layouts.get(self.layout), "wafers", 1))
-        )
+        if self.layout in (*LATTICES, "wafers"):
+            return self.wafers
+        return int(getattr(layouts.get(self.layout), "wafers", 1))
 
     @property
     def _pair(self) -> int:
