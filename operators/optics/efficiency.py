@@ -36,7 +36,7 @@ from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.types import AnyFloats, Floats
 
-from .quotient import AT_ONCE, knots_of, quotient
+from .field_ratio import AT_ONCE, field_ratio, knots_of
 
 KNOWN = frozenset({"atmosphere", "transmission", "white", "pink"})
 """Components at the detector that equation (1) names."""
@@ -132,7 +132,7 @@ class Efficiency(Operator):
         if (ratio := observation.smooth.get("atmosphere")) is not None:
             share, error = gain * epsilon / zeta, 0.0
             if transmission is not None:
-                ratio, error = quotient(
+                ratio, error = field_ratio(
                     ratio, transmission, np.flatnonzero(observation.good_detectors)
                 )
             mean = ratio.scaled(share)

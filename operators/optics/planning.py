@@ -11,7 +11,7 @@ from zonda.core.plan.bounds import Context, Estimate, Traits, calibration, singl
 from zonda.core.plan.planning import Planning
 
 from .efficiency import Efficiency
-from .quotient import AT_ONCE
+from .field_ratio import AT_ONCE
 
 
 class EfficiencyPlanning(Planning[Efficiency]):
@@ -24,7 +24,7 @@ class EfficiencyPlanning(Planning[Efficiency]):
         return Traits(gain_error=self.operator.calibration_error)
 
     def memory(self, observation: Observation) -> int:
-        """Means at their nodes, and the parts that `quotient` works on at a time."""
+        """Means at their nodes, and the parts that `field_ratio` works on at a time."""
         at_once = min(AT_ONCE, observation.n_detectors)
         return 700 * observation.n_detectors + 64 * at_once * (observation.n_samples // 512 + 3)
 

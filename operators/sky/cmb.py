@@ -23,9 +23,9 @@ from zonda.core.observation import Observation
 from zonda.core.types import Floats
 
 from .full_sky import FullSky, Nside
+from .scan_sampler import ScanSampler
 from .skymap import SkyMap
 from .spectrum_file import Scaling, Spectrum, Unit, read
-from .state import SkyState
 
 
 class CMBSky(FullSky):
@@ -74,7 +74,7 @@ class CMBSky(FullSky):
         columns = [name for name in (self.columns or "").replace(",", " ").split() if name]
         return read(str(self.spectrum), self.unit, self.scaling, columns)
 
-    def prepare(self, observation: Observation) -> tuple[SkyMap, SkyState]:
+    def prepare(self, observation: Observation) -> tuple[SkyMap, ScanSampler]:
         """The step that samples the map, and what that one knows of the scan."""
         sky, rms = self.sky(observation.seed, observation.focalplane.polarized)
         observation.tally.state(self.label, "spectrum", self.read().text)

@@ -18,8 +18,8 @@ from .grid import Grid, is_resolved, own_pixels, tangent_grid
 from .gridding import Gridding
 from .input_map import ImageMap
 from .map_header import DOUBT, check_brightness, odd_pixels
+from .scan_sampler import Beam
 from .sky_input import SkyInput
-from .state import Beam
 
 if TYPE_CHECKING:
     from zonda.core.data import Data, Observation

@@ -12,8 +12,8 @@ from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
+from .scan_sampler import ScanSampler
 from .skymap import SkyMap, show_input
-from .state import SkyState
 
 
 def _power_of_two(value: int) -> int:
@@ -32,11 +32,13 @@ class FullSky(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"sky"})
 
-    def exec(self, block: Block, state: tuple[SkyMap, SkyState]) -> None:
+    def exec(self, block: Block, state: tuple[SkyMap, ScanSampler]) -> None:
         """See `SkyMap`."""
         state[0].exec(block, state[1])
 
-    def collect(self, data: Data, observation: Observation, state: tuple[SkyMap, SkyState]) -> None:
+    def collect(
+        self, data: Data, observation: Observation, state: tuple[SkyMap, ScanSampler]
+    ) -> None:
         """See `SkyMap`."""
         state[0].collect(data, observation, state[1])
 

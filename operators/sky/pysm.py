@@ -16,8 +16,8 @@ from zonda.core.versions import needed
 
 from .full_sky import FullSky, Nside
 from .pysm_emission import ALONE, EXTRA, check_templates, configuration, emission, is_file
+from .scan_sampler import ScanSampler
 from .skymap import SkyMap
-from .state import SkyState
 
 
 def _absolute(value: Any, info: ValidationInfo) -> Any:
@@ -82,7 +82,7 @@ class PySMSky(FullSky):
     def _what(self) -> str:
         return f"{', '.join([*self.models, *self.components])} at nside {self.nside}"
 
-    def prepare(self, observation: Observation) -> tuple[SkyMap, SkyState]:
+    def prepare(self, observation: Observation) -> tuple[SkyMap, ScanSampler]:
         """The step that samples the band's map, and what that one knows of the scan."""
         sky = self.sky(observation)
         observation.tally.state(self.label, "sky of PySM", self._what)

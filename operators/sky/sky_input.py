@@ -31,7 +31,7 @@ from .input_map import ImageMap, InputMap
 from .map_header import DOUBT, seen_twice
 from .read import read_map
 from .region import Progress, no_progress
-from .state import Cache
+from .scan_sampler import Cache
 
 
 class SkyParameters(Operator):

@@ -16,7 +16,7 @@ from zonda.core.storage.fits_files import header_of
 
 from .convolved import ConvolvedSky
 from .input_map import HealpixMap
-from .state import SkyState
+from .scan_sampler import ScanSampler
 
 POLARIZED = ("polarization", "axis")
 """Fields of an `Image` of I, Q and U."""
@@ -71,7 +71,7 @@ class SkyMap(ConvolvedSky):
         """See `SkyInput.check`; adds the lines about the map that reading it gives."""
         return [*super().check(data), *self._looked_at(data)]
 
-    def prepare(self, observation: Observation) -> SkyState:
+    def prepare(self, observation: Observation) -> ScanSampler:
         grid, (widths, index) = self.grid_of(observation), self.beam_widths(observation)
         if stated := self.warn_of_beams(grid.source, observation.focalplane.fwhm):
             observation.tally.state(self.label, "resolution", stated)
@@ -82,27 +82,27 @@ class SkyMap(ConvolvedSky):
                 f"{observation.name}: not convolved",
                 "no detector reaches the input map",
             )
-            return SkyState(grid, sky, [], index)
+            return ScanSampler(grid, sky, [], index)
         angles = (
             None
             if sky.polarization is None
             else PolarizationAngles.of(observation, observation.sky_boresight, grid.axis)
         )
         band = observation.instrument.band
-        state = SkyState(
+        state = ScanSampler(
             grid, sky, [self.with_beam(grid, band, float(fwhm)) for fwhm in widths], index, angles
         )
         state.tell(observation.tally, self.label)
         return state
 
-    def exec(self, block: Block, state: SkyState) -> None:
+    def exec(self, block: Block, state: ScanSampler) -> None:
         over = bool(state.beams) and "sky" not in block.detdata
         stream = block.new("sky", zero=not over)
         state.sample(block, stream, self.interpolation == "linear", over)
         if self.outside:
             stream += stream.dtype.type(self.outside)
 
-    def collect(self, data: Data, observation: Observation, state: SkyState) -> None:
+    def collect(self, data: Data, observation: Observation, state: ScanSampler) -> None:
         self._count(observation, state)
         if self.label not in data.partial:
             image = state.sky.image(self.label, state.grid.axis)
@@ -116,7 +116,7 @@ class SkyMap(ConvolvedSky):
         """
         show_input(self.label, data)
 
-    def _count(self, observation: Observation, state: SkyState) -> None:
+    def _count(self, observation: Observation, state: ScanSampler) -> None:
         """Count the samples that see no sky, and warn where all of them are."""
         beyond, behind = state.totals()
         total = observation.n_detectors * observation.n_samples

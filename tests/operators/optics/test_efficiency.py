@@ -9,7 +9,7 @@ import zonda
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.optics.efficiency import Efficiency
-from zonda.operators.optics.quotient import _spline, quotient
+from zonda.operators.optics.field_ratio import _spline, field_ratio
 
 from ...scenes import camera
 
@@ -186,18 +186,18 @@ def test_opaque_stretch_flags_samples(bench, streams):
 
 
 @pytest.mark.parametrize("steps", [(64, 64), (128, 32), (32, 128)])
-def test_quotient_of_smooth_fields(steps):
+def test_ratio_of_smooth_fields(steps):
     above, below = fields(step=steps[0])["atmosphere"], fields(step=steps[1])["transmission"]
-    ratio, error = quotient(above, below, np.arange(N_DET))
+    ratio, error = field_ratio(above, below, np.arange(N_DET))
     exact = everywhere(above) / everywhere(below)
     assert error < 1e-7 * exact.max()
     assert np.abs(everywhere(ratio) - exact).max() < 1e-7 * exact.max()
 
 
 @pytest.mark.parametrize("n", [1, 2, 63, 64, 65])
-def test_quotient_of_short_scans(n):
+def test_ratio_of_short_scans(n):
     above, below = fields(n)["atmosphere"], fields(n)["transmission"]
-    ratio, _ = quotient(above, below, np.arange(N_DET))
+    ratio, _ = field_ratio(above, below, np.arange(N_DET))
     exact = everywhere(above, n) / everywhere(below, n)
     assert np.abs(everywhere(ratio, n) - exact).max() < 1e-6 * exact.max()
 

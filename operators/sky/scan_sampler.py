@@ -1,4 +1,6 @@
-"""State of `SkyMap` for an observation: convolved maps, the boresight on them, counts."""
+"""Sampling of a scan, the state of `SkyMap` for an observation: convolved maps, the boresight on
+them, counts.
+"""
 
 from __future__ import annotations
 
@@ -126,8 +128,8 @@ class Beam:
 
 
 @dataclass
-class SkyState:
-    """State for `SkyMap.exec`.
+class ScanSampler:
+    """State for `SkyMap.exec`: samples the convolved maps in the blocks of a scan.
 
     Attributes
     ----------

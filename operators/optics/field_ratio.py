@@ -1,4 +1,4 @@
-"""The quotient of two smooth fields, as a smooth field: the mean emission over the transmission."""
+"""The ratio of two smooth fields, as a smooth field: the mean emission over the transmission."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ AT_ONCE = 4096
 """Detectors whose series of the smooth fields are worked on at a time."""
 
 TOLERANCE = 1e-7
-"""Largest error allowed in a quotient, relative to its largest value."""
+"""Largest error allowed in a ratio, relative to its largest value."""
 
 
-def quotient(
+def field_ratio(
     above: SmoothField, below: SmoothField, use: NDArray[np.intp]
 ) -> tuple[SmoothField, float]:
     """The smooth field above / max(below, `LEAST_TRANSMISSION`), and its largest error over the
@@ -79,7 +79,7 @@ def _representatives(weights: NDArray[np.floating], use: NDArray[np.intp]) -> ND
 
 
 def _ratio(above: SmoothField, below: SmoothField, step: int, rows: NDArray[np.intp]) -> Floats:
-    """The quotient for the detectors ``rows`` at the coarse times; in the first and last column,
+    """The ratio for the detectors ``rows`` at the coarse times; in the first and last column,
     its slopes at the ends.
     """
     one, other, high, low = (
