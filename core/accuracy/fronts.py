@@ -96,12 +96,9 @@ def as_json(study: Study, file: PipelineFile) -> dict[str, Any]:
         "fingerprint": fingerprint(file),
         "metric": setup.metric,
         "says": study.says,
-        "target": setup.target,
         "seed": file.scene().seed,
-        "shorter": setup.shorter,
-        "settings": list(setup.settings),
-        "repeats": setup.repeats,
-        "threads": setup.threads,
+        **{key: getattr(setup, key) for key in ("target", "shorter", "settings")},
+        **{key: getattr(setup, key) for key in ("repeats", "threads")},
         "versions": versions(),
         "noise_floor": study.floor,
         "realization_scatter": study.scatter,
@@ -112,12 +109,10 @@ def as_json(study: Study, file: PipelineFile) -> dict[str, Any]:
         "alone": [
             {
                 "knob": a.knob.key,
-                "approximates": a.knob.approximates,
-                "redraws": a.knob.redraws,
-                "left": a.left,
-                "how": a.how,
+                **{key: getattr(a.knob, key) for key in ("approximates", "redraws")},
+                **{key: getattr(a, key) for key in ("left", "how")},
+                "rungs": list(map(asdict, a.rungs)),
             }
-            | {"rungs": [asdict(r) for r in a.rungs]}
             for a in study.sweep.alone
         ],
         "points": [asdict(p) for p in study.points],
@@ -173,34 +168,32 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
     known = {k.key for k in knobs}
     given = [k.key for k in knobs if k.given]
     path = path_for(file, metric)
-    why, point = f"no stored Pareto front of {metric} for this pipeline ({path})", None
+    why, point, front = f"no stored Pareto front of {metric} for this pipeline ({path})", None, None
     if path.is_file():
         front = read(path)
-        if front.fingerprint != fingerprint(file) or not front.reference.keys() <= known:
-            why = f"the stored Pareto front of {metric} ({path}) is of other steps or another scene"
-        elif changed := [
+        changed = [
             f"{k.key}={front.staying[k.key]}"
             for k in knobs
             if front.staying.get(k.key, k.present) != k.present
-        ]:
-            why = f"the stored Pareto front of {metric} ({path}) was made with {' '.join(changed)}"
+        ]
+        of = f"the stored Pareto front of {metric}"
+        if front.fingerprint != fingerprint(file) or not front.reference.keys() <= known:
+            why = f"{of} ({path}) is of other steps or another scene"
+        elif changed:
+            why = f"{of} ({path}) was made with {' '.join(changed)}"
         elif (point := cheapest(front.points, target, front.reference_error)) is None:
-            why = f"no point of the stored Pareto front of {metric} meets {100 * target:g} %"
-    if point is not None:
-        setting = {k: v for k, v in point.setting.items() if k not in given}
+            why = f"no point of {of} meets {100 * target:g} %"
+    chosen = tightest(knobs) if point is None else point.setting
+    setting = {k: v for k, v in chosen.items() if k not in given}
+    error = None
+    if point is not None and front is not None:
         error = point.error + front.reference_error
-        reason = (
-            f"stored Pareto front of {metric}: {100 * error:.2g} % with"
-            f" {' '.join(overrides(setting)) or 'the knobs as they are'}"
-        )
+        knobs_then = " ".join(overrides(setting)) or "the knobs as they are"
+        reason = f"stored Pareto front of {metric}: {100 * error:.2g} % with {knobs_then}"
     else:
-        setting = {k: v for k, v in tightest(knobs).items() if k not in given}
-        error, reason = (
-            None,
-            (
-                f"{why}: the knobs are at their tightest; `zonda accuracy {file.header.name}"
-                " --store` makes one"
-            ),
+        reason = (
+            f"{why}: the knobs are at their tightest; `zonda accuracy {file.header.name} --store`"
+            " makes one"
         )
     if kept := [f"{k.key}={k.present}" for k in knobs if k.given and not k.redraws]:
         reason += f"; as the file states: {' '.join(kept)}"

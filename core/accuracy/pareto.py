@@ -13,8 +13,8 @@ ladders, not their product.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 from .bench import Bench
 from .settings import Setting
@@ -43,12 +43,15 @@ class Point:
 
 @dataclass(frozen=True)
 class _Step:
-    """A relaxation of one knob, as the knob alone predicts it."""
+    """Another value of one knob: CPU seconds that it saves, error that it adds, and the noise of
+    the saving, as the knob alone predicts them.
+    """
 
     key: str
     value: str
     saving: float
     error: float
+    noise: float
 
 
 def point(bench: Bench, setting: Setting, reference: Setting) -> Point:
@@ -118,58 +121,43 @@ def _exchange(turning: Sequence[Alone], here: Point, allowed: float) -> Setting 
     """The setting that saves most, as predicted: one knob relaxed, and others tightened until the
     error is allowed again.
     """
-    best, most = None, 0.0
+    best, most = None, here.spread
     for step in _steps(turning, here.setting):
-        setting, error, saving = (
-            here.setting | {step.key: step.value},
-            here.error + step.error,
-            step.saving,
-        )
-        while error > allowed:
+        setting, taken = here.setting | {step.key: step.value}, [step]
+        while here.error + sum(t.error for t in taken) > allowed:
             ways = [t for a in turning if a.knob.key != step.key for t in _tighter(a, setting)]
             if not ways:
                 break
             way = max(ways, key=lambda t: -t.error / max(-t.saving, 1e-12))
-            setting, error, saving = (
-                setting | {way.key: way.value},
-                error + way.error,
-                saving + way.saving,
-            )
-        if error <= allowed and saving > max(most, here.spread):
-            best, most = setting, saving
+            setting |= {way.key: way.value}
+            taken.append(way)
+        else:
+            saving = sum(t.saving for t in taken)
+            if saving > most:
+                best, most = setting, saving
     return best
 
 
 def _tighter(alone: Alone, here: Setting) -> list[_Step]:
     """Finer values of a knob than here that lower its error; savings and errors are negative."""
-    at = alone.rung(here[alone.knob.key])
-    finer = [
-        r
-        for r in alone.rungs[alone.rungs.index(at) + 1 :]
-        if r.error is not None and r.error < (at.error or 0.0)
-    ]
-    return [
-        _Step(alone.knob.key, r.value, at.own - r.own, (r.error or 0.0) - (at.error or 0.0))
-        for r in finer
-    ]
+    return [step for step in _moves(alone, here, finer=True) if step.error < 0]
 
 
 def _steps(turning: Sequence[Alone], here: Setting) -> list[_Step]:
     """Relaxations from here that save more than the noise of the measurement."""
-    steps = []
-    for alone in turning:
-        at = alone.rung(here[alone.knob.key])
-        for rung in alone.rungs:
-            if rung is at:
-                break
-            saving = at.own - rung.own
-            if rung.error is not None and saving > math.hypot(at.own_spread, rung.own_spread):
-                steps.append(
-                    _Step(
-                        alone.knob.key, rung.value, saving, max(0.0, rung.error - (at.error or 0.0))
-                    )
-                )
-    return steps
+    moves = (step for alone in turning for step in _moves(alone, here, finer=False))
+    return [replace(s, error=max(0.0, s.error)) for s in moves if s.saving > s.noise]
+
+
+def _moves(alone: Alone, here: Setting, finer: bool) -> Iterator[_Step]:
+    """Steps of one knob from its value here to the finer, or to the coarser ones."""
+    at = alone.rung(here[alone.knob.key])
+    place = alone.rungs.index(at)
+    for rung in alone.rungs[place + 1 :] if finer else alone.rungs[:place]:
+        if rung.error is not None:
+            error = rung.error - (at.error or 0.0)
+            noise = math.hypot(at.own_spread, rung.own_spread)
+            yield _Step(alone.knob.key, rung.value, at.own - rung.own, error, noise)
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
@@ -186,10 +174,8 @@ def cheapest(points: Sequence[Point], target: float, left: float = 0.0) -> Point
     best = least(points, target, left)
     if best is None:
         return None
-    good = [
-        p for p in points if p.error + left <= target and p.seconds <= best.seconds + best.spread
-    ]
-    return min(good, key=lambda p: (p.error, p.seconds))
+    alike = (p for p in points if p.seconds <= best.seconds + best.spread)
+    return min(alike, key=lambda p: (p.error, p.seconds))
 
 
 def least(points: Sequence[Point], target: float, left: float = 0.0) -> Point | None:
