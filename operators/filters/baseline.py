@@ -41,6 +41,11 @@ diagonals.
 """
 
 
+Bins = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""End of each run of samples in one bin (`runs`), and its bin."""
+NO_BINS: Bins = np.empty(0, np.int64), np.empty(0, np.int64)
+
+
 @dataclass(frozen=True)
 class Basis:
     """Functions of time of which the same few reach all samples of a run.
@@ -92,13 +97,26 @@ class Basis:
 
     def sums(self, rows: Rows, use: Mask) -> Floats:
         """(n_det, K): B_g x_g; not finite where a sample of the row is not, used or not."""
-        sums = np.zeros((len(rows.values), self.size))
-        _sums(*rows, use, self.functions, self.stops, self.firsts, sums)
-        return sums
+        return self.sums_of_bins(rows, use, NO_BINS, 0)[0]
 
-    def subtract(self, rows: Rows, coefficients: Floats) -> None:
-        """Subtract B^T ``coefficients`` (n_det, K)."""
-        _subtract(*rows, self.functions, self.stops, self.firsts, coefficients)
+    def sums_of_bins(self, rows: Rows, use: Mask, bins: Bins, number: int) -> tuple[Floats, Floats]:
+        """(n_det, K): `sums`, and (n_det, number) sums over bins, in one reading."""
+        n = len(rows.values)
+        sums, totals = np.zeros((n, self.size)), np.zeros((n, number))
+        _sums(*rows, use, self.functions, self.stops, self.firsts, *bins, sums, totals)
+        return sums, totals
+
+    def subtract(
+        self,
+        rows: Rows,
+        coefficients: Floats,
+        bins: Bins | None = None,
+        means: Floats | None = None,
+    ) -> None:
+        """Subtract B^T ``coefficients`` (n_det, K), and ``means`` (n_det, number) of bins."""
+        means = np.empty((0, 0)) if means is None else means
+        arrays = self.functions, self.stops, self.firsts, *(bins or NO_BINS)
+        _subtract(*rows, *arrays, coefficients, means)
 
 
 def runs(value: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -227,6 +245,14 @@ def dot(a, b):  # type: ignore[no-untyped-def]
     return total
 
 
+@kernel(fastmath={"contract", "nsz", "reassoc"})
+def _total(x):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for t in range(nb.uint64(x.size)):
+        total += x[t]
+    return total
+
+
 @kernel(fastmath={"contract", "nsz"})
 def lessen(x, c, f):  # type: ignore[no-untyped-def]
     """x -= c f, of two chunks."""
@@ -310,33 +336,76 @@ def _normal(use, functions, stops, firsts, normal):  # type: ignore[no-untyped-d
 
 @kernel
 def _sums(  # type: ignore[no-untyped-def]
-    values, lines, cell, inside, start, begin, use, functions, stops, firsts, sums
+    values,
+    lines,
+    cell,
+    inside,
+    start,
+    begin,
+    use,
+    functions,
+    stops,
+    firsts,
+    ends,
+    bins,
+    out,
+    totals,
 ):
-    """sums (n_row, K) += B_g x_g; the first arguments are those of `Rows`."""
-    low, chunk = 0, np.empty(AT_ONCE)
+    """out (n_row, K) += B_g x_g, and totals (n_row, n_bin) += the sums of x_g over ``bins``, of
+    samples up to ``ends``, which each lie in one run; the first arguments are those of `Rows`.
+    """
+    low, first, last, chunk = 0, 0, 0, np.empty(AT_ONCE)
     for r in range(stops.size):
         high = stops[r]
         x = chunk[: high - low]
+        while last < ends.size and ends[last] <= high:
+            last += 1
         for d in range(values.shape[0]):
             read(values, lines, cell, inside, start, d, begin + low, x)
             keep_used(x, use[low:high])
             for i in range(functions.shape[0]):
-                sums[d, firsts[r] + i] += dot(x, functions[i, low:high])
-        low = high
+                out[d, firsts[r] + i] += dot(x, functions[i, low:high])
+            at = 0
+            for k in range(first, last):
+                totals[d, bins[k]] += _total(x[at : ends[k] - low])
+                at = ends[k] - low
+        low, first = high, last
 
 
 @kernel
 def _subtract(  # type: ignore[no-untyped-def]
-    values, lines, cell, inside, start, begin, functions, stops, firsts, coefficients
+    values,
+    lines,
+    cell,
+    inside,
+    start,
+    begin,
+    functions,
+    stops,
+    firsts,
+    ends,
+    bins,
+    coefficients,
+    means,
 ):
-    """Subtract B^T ``coefficients`` (n_row, K)."""
-    low, chunk = 0, np.empty(AT_ONCE)
+    """Subtract B^T ``coefficients`` (n_row, K), and of each of the bins of `_sums` its ``means``
+    (n_row, n_bin).
+    """
+    low, first, last, chunk = 0, 0, 0, np.empty(AT_ONCE)
     for r in range(stops.size):
         high = stops[r]
         x = chunk[: high - low]
+        while last < ends.size and ends[last] <= high:
+            last += 1
         for d in range(values.shape[0]):
             read(values, lines, cell, inside, start, d, begin + low, x)
             for i in range(functions.shape[0]):
                 lessen(x, coefficients[d, firsts[r] + i], functions[i, low:high])
+            at = 0
+            for k in range(first, last):
+                mean = means[d, bins[k]]
+                for t in range(nb.uint64(at), nb.uint64(ends[k] - low)):
+                    x[t] -= mean
+                at = ends[k] - low
             write(values, d, begin + low, x)
-        low = high
+        low, first = high, last

@@ -27,7 +27,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -35,12 +34,11 @@ from pydantic import Field
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.flags import has_a_signal
-from zonda.core.kernels import kernel
 from zonda.core.observation import Observation
 from zonda.core.types import Floats
 
-from .baseline import Basis, Fit, dot, keep_used, lessen, polynomials, runs, solved
-from .rows import AT_ONCE, LinearFilter, Mask, Removal, Rows, read, write
+from .baseline import Basis, Bins, Fit, polynomials, runs, solved
+from .rows import LinearFilter, Mask, Removal, Rows
 
 
 class GroundFilter(LinearFilter):
@@ -111,8 +109,8 @@ class Template:
         (K, n): T of equation (1).
     use
         (n,) samples that are used.
-    stops
-        (n_run,): `baseline.runs` of ``bins``.
+    runs
+        Runs of samples in one bin, as `Basis.subtract` takes them.
     share
         (n_bin,) 1 / number of used samples, 0 where there are none.
     trend
@@ -122,7 +120,7 @@ class Template:
     bins: NDArray[np.int64]
     raw: Floats
     use: Mask
-    stops: NDArray[np.int64]
+    runs: Bins
     share: Floats
     trend: Fit
 
@@ -135,92 +133,28 @@ class Template:
         for row in within:
             row -= (np.bincount(bins[use], row[use], len(count)) * share)[bins]
         trend = Fit.of(Basis.of(within, np.zeros(len(bins), np.int64), len(raw)), use)
-        return cls(bins, raw, use, runs(bins), share, trend)
+        ends = runs(bins)
+        return cls(bins, raw, use, (ends, bins[ends - 1]), share, trend)
 
     def remove(self, rows: Rows, masked: Mask | None = None) -> int:
         """Equation (3) on rows in place. Returns how many samples were not finite; they stay as
         they were.
         """
-        sums, means = (
-            np.zeros((len(rows.values), len(self.raw))),
-            np.zeros((len(rows.values), len(self.share))),
-        )
-        functions, number = self.trend.basis.functions, self.bins[self.stops - 1]
-        _sums(*rows, self.use, functions, self.stops, number, sums, means)
+        sums, means = self.trend.basis.sums_of_bins(rows, self.use, self.runs, len(self.share))
         means *= self.share
-        trend = solved(self.trend.inverse, sums)
-        fine = np.isfinite(means).all(axis=1)
-        _subtract(*rows, fine, functions, self.stops, number, trend, means)
-        return sum(self._alone(rows, int(d)) for d in np.flatnonzero(~fine))
+        spoilt = np.flatnonzero(~np.isfinite(means).all(axis=1)).tolist()
+        alone = [self._alone(rows, d) for d in spoilt]
+        self.trend.basis.subtract(rows, solved(self.trend.inverse, sums), self.runs, means)
+        for d, (row, _) in zip(spoilt, alone, strict=True):
+            rows.values[d] = row
+        return sum(number for _, number in alone)
 
-    def _alone(self, rows: Rows, d: int) -> int:
-        """`remove` on the row ``d``, some of whose samples are not finite."""
+    def _alone(self, rows: Rows, d: int) -> tuple[Floats, int]:
+        """Row ``d`` without its template, and how many of its samples are not finite."""
         row = rows.double(slice(d, d + 1), len(self.use))
         finite = np.isfinite(row[0])
-        spoilt = row[0, ~finite]
+        kept = row[0, ~finite]
         row[0, ~finite] = 0.0
         Template.of(self.bins, self.raw, self.use & finite).remove(Rows.of(row))
-        row[0, ~finite] = spoilt
-        rows.values[d] = row[0]
-        return len(spoilt)
-
-
-@kernel(fastmath={"contract", "nsz", "reassoc"})
-def _total(x):  # type: ignore[no-untyped-def]
-    total = 0.0
-    for t in range(nb.uint64(x.size)):
-        total += x[t]
-    return total
-
-
-@kernel
-def _sums(  # type: ignore[no-untyped-def]
-    values, lines, cell, inside, start, begin, use, functions, stops, number, sums, totals
-):
-    """sums (n_row, K) += T'_g x_g, and totals (n_row, n_bin) += G_g x_g; the first arguments are
-    those of `Rows`.
-    """
-    chunk, first = np.empty(AT_ONCE), 0
-    for low in range(0, use.size, AT_ONCE):
-        high, last = min(low + AT_ONCE, use.size), first
-        x = chunk[: high - low]
-        while last < stops.size and stops[last] <= high:
-            last += 1
-        for d in range(values.shape[0]):
-            read(values, lines, cell, inside, start, d, begin + low, x)
-            keep_used(x, use[low:high])
-            for i in range(functions.shape[0]):
-                sums[d, i] += dot(x, functions[i, low:high])
-            at = 0
-            for r in range(first, last):
-                totals[d, number[r]] += _total(x[at : stops[r] - low])
-                at = stops[r] - low
-        first = last
-
-
-@kernel
-def _subtract(  # type: ignore[no-untyped-def]
-    values, lines, cell, inside, start, begin, which, functions, stops, number, trend, means
-):
-    """Subtract T'^T ``trend`` (n_row, K) and G^T ``means`` (n_row, n_bin) from the rows ``which``
-    (n_row,).
-    """
-    chunk, first, n = np.empty(AT_ONCE), 0, stops[-1]
-    for low in range(0, n, AT_ONCE):
-        high, last = min(low + AT_ONCE, n), first
-        x = chunk[: high - low]
-        while last < stops.size and stops[last] <= high:
-            last += 1
-        for d in range(values.shape[0]):
-            if which[d]:
-                read(values, lines, cell, inside, start, d, begin + low, x)
-                for i in range(functions.shape[0]):
-                    lessen(x, trend[d, i], functions[i, low:high])
-                at = 0
-                for r in range(first, last):
-                    mean = means[d, number[r]]
-                    for t in range(nb.uint64(at), nb.uint64(stops[r] - low)):
-                        x[t] -= mean
-                    at = stops[r] - low
-                write(values, d, begin + low, x)
-        first = last
+        row[0, ~finite] = kept
+        return row[0], len(kept)
