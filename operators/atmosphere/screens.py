@@ -12,6 +12,7 @@ lines of sight over the field of view,
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,6 +22,7 @@ from pydantic import Field
 
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Data
+from zonda.core.canvas import Sketch
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.output import Output, Progress
@@ -32,8 +34,147 @@ from zonda.core.types import Floats
 from .drawing import drifting_layers, height_of_vapour
 from .model import AtmosphereModel, ExpectedLoad
 from .response import airmass
-from .screen_plots import LayerScreen, Screens
 from .turbulence.lines_of_sight import LinesOfSight
+
+ACROSS = (4, 5, 3)
+"""Panels in a row: what leaves the fewest places empty."""
+SIDE = 3.6, 3.2
+"""Of a panel with its labels, in."""
+
+
+@dataclass(frozen=True)
+class LayerScreen:
+    """One layer about the point that the boresight looks through at a moment.
+
+    Attributes
+    ----------
+    height, distance
+        Of the layer, and along the line of sight, m.
+    wind
+        (east, north), m/s.
+    values
+        (n_along, n_across) fluctuation of the PWV at zenith in this layer, m: p a_l g_l PWV.
+    spacing
+        Between the values, m.
+    track
+        (n, 2) across and along the wind, m, where the boresight passes through the layer during the
+        scan; 0 at the moment.
+    fwhm, field
+        Width of the beam there, and diameter of the field of view, m.
+    """
+
+    height: float
+    distance: float
+    wind: tuple[float, float]
+    values: Floats
+    spacing: float
+    track: Floats
+    fwhm: float
+    field: float
+
+    def draw(self, ax: Any) -> None:
+        """Draw its values, the track, the beam, the field of view and the wind."""
+        from matplotlib.patches import Circle
+
+        half = self.values.shape[0] * self.spacing / 2
+        speed, azimuth = math.hypot(*self.wind), math.degrees(math.atan2(*self.wind)) % 360
+        wind = f"wind {speed:.3g} m/s towards {azimuth:.0f}°"
+        _image(ax, self.values, half, f"{self.height:.0f} m\n{wind}")
+        ax.plot(*self.track.T, color="black", linewidth=0.6)
+        here = tuple(self.track[np.abs(self.track).sum(axis=1).argmin()])
+        ax.plot(*here, "x", color="black", markersize=5)
+        for width, line in ((self.fwhm, "-"), (self.field, ":")):
+            ax.add_patch(Circle(here, width / 2, fill=False, edgecolor="black", linestyle=line))
+        arrow = {"arrowstyle": "-|>", "linewidth": 1.4}
+        ax.annotate("", (-0.86 * half, 0.9 * half), (-0.86 * half, 0.5 * half), arrowprops=arrow)
+        sides = (-half, half)
+        ax.set(xlim=sides, ylim=sides, xlabel="across the wind [m]", ylabel="along the wind [m]")
+
+
+@dataclass(frozen=True)
+class Screens:
+    """The layers at a moment, and the PWV over the field of view at several.
+
+    Attributes
+    ----------
+    layers
+        From the lowest up.
+    moment
+        Of ``layers``, s since the scan's start.
+    seconds
+        (k,) of ``pwv``, s since the scan's start.
+    pwv
+        (k, n, n) fluctuation of the PWV along the line of sight, m; rows eta, columns xi; NaN
+        beyond the field.
+    side
+        Of the field, rad.
+    mean_pwv
+        At zenith, m.
+    observation
+        Name of the scan.
+    """
+
+    layers: list[LayerScreen]
+    moment: float
+    seconds: Floats
+    pwv: Floats
+    side: float
+    mean_pwv: float
+    observation: str
+
+    def sketches(self, name: str) -> list[Sketch]:
+        """The layers, and the strip; see `core.canvas.Drawable`."""
+        layers = _panels(len(self.layers))
+        for ax, layer in zip(layers, self.layers, strict=True):
+            layer.draw(ax)
+        text = (
+            "PWV fluctuation (at zenith) in each simulated layer,"
+            f" {self.moment:.3g} s after the start of {self.observation}, in the frame that drifts"
+            " with the layer's wind (arrow). Line: where the boresight passes through the layer in"
+            " the scan; cross: at this moment; solid circle: the beam (FWHM); dotted: the field of"
+            " view."
+        )
+        strip = _panels(len(self.seconds))
+        half = math.degrees(self.side) * 30
+        for ax, second, pwv in zip(strip, self.seconds, self.pwv, strict=True):
+            mean = np.nanmean(pwv)
+            _image(ax, pwv - mean, half, f"{second:.3g} s\nmean {mean * 1e6:+.3g} µm")
+            ax.set(xlabel="xi [arcmin]", ylabel="eta [arcmin]")
+        caption = (
+            "Fluctuation of the PWV along the line of sight [µm] over the field of view of"
+            f" {self.observation}, minus its mean over the field, which each title states. Mean PWV"
+            f" {self.mean_pwv * 1e3:.3g} mm."
+        )
+        return [
+            Sketch(f"{name}_layers", "Turbulent layers", text, layers[0]),
+            Sketch(f"{name}_field", "PWV over the field", caption, strip[0]),
+        ]
+
+
+def _panels(count: int) -> list[Any]:
+    """``count`` axes in rows."""
+    from matplotlib.figure import Figure
+
+    columns = min(count, min(ACROSS, key=lambda n: -count % n))
+    rows = -(-count // columns)
+    size = columns * SIDE[0], rows * SIDE[1]
+    figure = Figure(figsize=size, dpi=110, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+    for ax in axes[count:]:
+        ax.remove()
+    return axes[:count]
+
+
+def _image(ax: Any, values: Floats, half: float, title: str) -> None:
+    """Values [m] in µm, with a colour bar of its own, zero in white."""
+    shown = np.ma.masked_invalid(values * 1e6)
+    top = float(np.abs(shown).max()) or 1.0
+    sides = (-half, half, -half, half)
+    picture = ax.imshow(shown, origin="lower", extent=sides, cmap="RdBu_r", vmin=-top, vmax=top)
+    ax.figure.colorbar(picture, ax=ax, shrink=0.8, label="change of the PWV [µm]")
+    ax.locator_params(nbins=5)
+    ax.set_title(title, fontsize=9)
+
 
 MOST_CELLS = 400
 """Lattice points along each side of a layer's picture."""
@@ -91,11 +232,8 @@ class AtmosphereScreens(Output):
         any more, say so instead.
         """
         if data.laid_out:
-            data.tally.state(
-                self.label,
-                "not drawn",
-                "the scans of a campaign are not here when it is combined; run one of them",
-            )
+            text = "the scans of a campaign are not here when it is combined; run one of them"
+            data.tally.state(self.label, "not drawn", text)
             return
         data.check_scan(self.observation, self.label)
         load = data.observations[self.observation].expected_load
@@ -200,21 +338,28 @@ def _layers(model: AtmosphereModel, at: int) -> list[LayerScreen]:
     return found
 
 
+COLUMNS = (
+    ("height", "m", "above the telescope"),
+    ("distance", "m", "along the line of sight"),
+    ("wind_east", "m / s", "towards the east"),
+    ("wind_north", "m / s", "towards the north"),
+    ("beam", "m", "FWHM of the beam in the layer"),
+    ("field", "m", "diameter of the field of view in the layer"),
+    ("pwv_rms", "m", "of the fluctuation within the picture"),
+)
+"""Of the table of layers: name, unit and description."""
+
+
 def write(found: Screens, stem: Path) -> list[Path]:
     """``STEM.fits`` (PWV over the field, then each layer) and ``STEM.ecsv`` (the layers); their
     paths. Raises OutputError.
     """
     images, table = stem.with_name(f"{stem.name}.fits"), stem.with_name(f"{stem.name}.ecsv")
+    step = math.degrees(found.side) / (found.pwv.shape[1] - 1)
     with atomic_path(images) as temporary, open(temporary, "wb") as file:
-        step = math.degrees(found.side) / (found.pwv.shape[1] - 1)
-        middle = (found.pwv.shape[1] + 1) / 2
-        cards: list[tuple[Any, ...]] = [
+        cards = [
             ("EXTNAME", "PWV", "fluctuation along the line of sight"),
-            ("BUNIT", "m"),
-            ("CTYPE1", "XI"),
-            ("CTYPE2", "ETA"),
-            *((f"CRPIX{k}", middle) for k in (1, 2)),
-            *((f"CDELT{k}", step) for k in (1, 2)),
+            *_axis_cards(("XI", "ETA"), found.pwv, step),
         ]
         for k, second in enumerate(found.seconds):
             cards.append((f"TIME{k + 1}", float(second), "[s] since the start of the scan"))
@@ -222,37 +367,27 @@ def write(found: Screens, stem: Path) -> list[Path]:
         for k, layer in enumerate(found.layers):
             cards = [
                 ("EXTNAME", f"LAYER{k}"),
-                ("BUNIT", "m"),
                 ("HEIGHT", layer.height, "[m]"),
                 ("TIME", found.moment, "[s]"),
+                *_axis_cards(("ACROSS", "ALONG"), layer.values, layer.spacing),
             ]
-            for axis, (name, n) in enumerate(
-                zip(("ACROSS", "ALONG"), layer.values.shape[::-1], strict=True), 1
-            ):
-                cards += [
-                    (f"CTYPE{axis}", name, "the wind"),
-                    (f"CDELT{axis}", layer.spacing, "[m]"),
-                    (f"CRPIX{axis}", (n + 1) / 2),
-                ]
             write_image(file, header_of(cards), layer.values, np.float64)
-    rows = found.layers
-    columns = [
-        Column("height", [r.height for r in rows], "m", "above the telescope"),
-        Column("distance", [r.distance for r in rows], "m", "along the line of sight"),
-        Column("wind_east", [r.wind[0] for r in rows], "m / s", "towards the east"),
-        Column("wind_north", [r.wind[1] for r in rows], "m / s", "towards the north"),
-        Column("beam", [r.fwhm for r in rows], "m", "FWHM of the beam in the layer"),
-        Column("field", [r.field for r in rows], "m", "diameter of the field of view in the layer"),
-        Column(
-            "pwv_rms",
-            [float(r.values.std()) for r in rows],
-            "m",
-            "of the fluctuation within the picture",
-        ),
+    rows = [
+        (r.height, r.distance, *r.wind, r.fwhm, r.field, float(r.values.std()))
+        for r in found.layers
     ]
-    write_ecsv(
-        table,
-        columns,
-        {"OBSERVATION": found.observation, "MOMENT": found.moment, "PWV": found.mean_pwv},
-    )
+    columns = [
+        Column(name, values, unit, text)
+        for (name, unit, text), values in zip(COLUMNS, zip(*rows, strict=True), strict=True)
+    ]
+    meta = {"OBSERVATION": found.observation, "MOMENT": found.moment, "PWV": found.mean_pwv}
+    write_ecsv(table, columns, meta)
     return [images, table]
+
+
+def _axis_cards(names: tuple[str, str], values: Floats, step: float) -> list[tuple[Any, ...]]:
+    """Unit of an image, and its axes: (along FITS axis 1, along 2), centred."""
+    cards: list[tuple[Any, ...]] = [("BUNIT", "m")]
+    for axis, (name, n) in enumerate(zip(names, values.shape[:-3:-1], strict=True), 1):
+        cards += [(f"CTYPE{axis}", name), (f"CDELT{axis}", step), (f"CRPIX{axis}", (n + 1) / 2)]
+    return cards

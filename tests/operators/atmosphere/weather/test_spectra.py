@@ -325,7 +325,7 @@ def test_water_scales_to_the_wanted_column(pwv):
 
 
 def test_limits_are_named():
-    with pytest.raises(InputError, match=r"4\.00 deg is outside .* 4.5 to 90 deg"):
+    with pytest.raises(InputError, match=r"4\.00 deg leave the limits .* 4.5 to 90 deg"):
         spectrum(simple(), math.radians(4))
     with pytest.raises(
         InputError, match=r"not inside the range of the absorption table, 0\.75 to 1000\.25 GHz"
