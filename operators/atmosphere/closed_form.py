@@ -16,7 +16,7 @@ spectrum P,
 
 The relative fluctuation of the PWV has p^2 sum_l a_l^2 <S_l>, the mean over the speeds of the scan:
 this holds above the frequencies of the scan itself. The emission on the calibrated sky has p^2
-sum_l kappa_l^2 a_l^2 <S_l> (`layer_terms`) times (epsilon dT / dy / (zeta e^-tau))^2, y small.
+sum_l kappa_l^2 a_l^2 <S_l> (`response`) times (epsilon dT / dy / (zeta e^-tau))^2, y small.
 """
 
 from __future__ import annotations

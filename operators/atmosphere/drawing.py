@@ -13,9 +13,8 @@ from zonda.core.instrument import SPEED_OF_LIGHT
 from zonda.core.types import Floats
 
 from .fluctuations import BYTES_KEPT, AtNodes, OfDetectors, keeps_all, times, units_bytes
-from .layer_terms import NAMES
 from .model import AtmosphereModel, ExpectedLoad
-from .response import Response, delay_per_vapour
+from .response import NAMES, Response, delay_per_vapour
 from .turbulence.beams import rayleigh_distance, widened
 from .turbulence.geometry import looking
 from .turbulence.lines_of_sight import LinesOfSight

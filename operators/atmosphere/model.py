@@ -23,11 +23,9 @@ from zonda.core.registry import spectra
 from zonda.core.types import Floats
 from zonda.core.weather import GroundWeather, WeatherSource
 
-from .distribution import Fluctuation, largest_pwv
-from .layer_terms import NAMES, LayerTerms, kappa
-from .parameters import LayerParameters, Wind
+from .distribution import Fluctuation, Slab, largest_pwv
 from .resolution import Resolution, choose_resolution
-from .slab import Slab
+from .response import NAMES, LayerTerms, kappa
 from .turbulence.beams import Aperture, widened
 from .turbulence.covariance import beam_correlation
 from .turbulence.geometry import ScanPlane, axes_at, rays, scan_planes
@@ -41,6 +39,8 @@ from .weather.sources import on_the_ground, profile_of
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
+
+    from .layers import LayerParameters
 
 EDGE_TAPER = 10.0
 """dB: power at the rim of a tapered aperture below that at its centre, where none is given."""
@@ -450,4 +450,4 @@ def _winds(parameters: LayerParameters, profile: Profile, heights: Floats) -> Se
     if isinstance(wind, str):
         found = profile.at(heights)
         return list(np.stack([found.wind_east, found.wind_north], axis=-1))
-    return [wind.vector] * len(heights) if isinstance(wind, Wind) else [one.vector for one in wind]
+    return [one.vector for one in wind] if isinstance(wind, list) else [wind.vector] * len(heights)

@@ -1,7 +1,7 @@
 """Bounds of the atmosphere's effects, see `core.plan`.
 
 Of a layer l with share a_l, variance s_l^2 behind the beam, the band's emission T(PWV), and its
-kappa_l for water at that height (`layer_terms`; 1 where layers respond as the column does), one
+kappa_l for water at that height (`response`; 1 where layers respond as the column does), one
 calibrated sample has the rms
 
     K kappa_l a_l s_l,

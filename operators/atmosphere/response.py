@@ -9,13 +9,27 @@ With y the relative fluctuation of the PWV and s the sine of the elevation,
 stands for the difference of the emission [K_RJ] and of the opacity from those at y = 0, fitted to
 `BandAtmosphere` at Chebyshev points; the relative transmission, which spans decades in opaque
 bands, is expm1 of minus the latter. The factor y makes it exact where nothing fluctuates. Where
-layers have a response of their own (`layer_terms`), its first order is added. Ranges too wide for
+layers have a response of their own (`LayerTerms`), its first order is added. Ranges too wide for
 polynomials of `_DEGREES` (strong log-normal fluctuations) are left to `BandAtmosphere` itself.
+
+A layer's water absorbs and emits as it does at its height, the column's as it does on average. With
+f'_l(s) the derivative of the band's emission (or opacity) with respect to a relative change of the
+PWV that is made at the height of layer l, f'(0, s) that of the column, kappa_l = f'_l / f', what
+(1) gives for the column gains
+
+    f'(0, s) sum_l (kappa_l - 1) p a_l g_l = (1 / s) sum_j S^j sum_l c_jl p a_l g_l,
+    S in [-1, 1] over the scan      (2)
+
+the first order of what each layer's water changes more than the column's. s (f'_l - f') is nearly
+constant where the air is clear; the c_jl are its polynomials in S, of the degree that the range of
+elevations needs. The quotient kappa_l is not formed: where a line is saturated f' vanishes.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numba as nb
@@ -24,7 +38,6 @@ import numpy as np
 from zonda.core.kernels import kernel
 from zonda.core.types import Floats
 
-from .layer_terms import LayerTerms
 from .weather.bands import BandAtmosphere
 from .weather.radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
 
@@ -39,6 +52,104 @@ LOOKED_AT = 13
 """Points along each axis at which a fit of low degree is judged; twice as many for others."""
 
 _DEGREES = ((2, 2), (3, 3), (4, 4), (5, 6), (7, 8), (10, 12), (14, 16))
+
+
+NAMES = ("emission", "opacity")
+"""Responses that depend on the height of the water."""
+TERM_ERROR = 5e-4
+"""Largest error of s (f'_l - f') in elevation, of the largest s f'_l."""
+TERM_DEGREES = (0, 1, 2, 4, 6, 8)
+"""Of the polynomials in S; the last one is taken where none meets `TERM_ERROR`."""
+
+
+@dataclass(frozen=True)
+class LayerTerms:
+    """Equation (2) for one band, mean PWV and scan.
+
+    Attributes
+    ----------
+    weights
+        (k, n_layer) c_jl times y / (a_l g_l): the weights of the sums over the layers' a_l g_l,
+        those of the emission first.
+    degrees
+        Highest power of S of each of `NAMES`.
+    sines
+        Least and largest sine of the elevation.
+    """
+
+    weights: Floats
+    degrees: tuple[int, ...]
+    sines: tuple[float, float]
+
+    @classmethod
+    def of(
+        cls,
+        band: BandAtmosphere,
+        pwv: float,
+        heights: Floats,
+        scale: float,
+        sines: tuple[float, float],
+    ) -> LayerTerms:
+        """Compute the terms of layers at ``heights`` (n_layer,) above the site [m]; ``scale``: y /
+        sum_l a_l g_l.
+        """
+        low, high = (
+            max(sines[0], math.sin(ELEVATION_MIN) * (1 + 1e-12)),
+            min(sines[1], math.sin(ELEVATION_MAX)),
+        )
+        looked_at = np.cos(np.linspace(0, math.pi, LOOKED_AT))
+        points = [np.cos(np.pi * (np.arange(n + 1) + 0.5) / (n + 1)) for n in TERM_DEGREES]
+        places = np.concatenate([looked_at, *points])
+        s = (low + high) / 2 + places * (high - low) / 2
+        water = band.transfer.of_water(pwv, np.arcsin(np.clip(s, low, high)).tolist())
+        weights, degrees = [], []
+        for name in NAMES:
+            own = pwv * s[:, None] * water.at(name, heights)
+            excess = own - pwv * s[:, None] * water.of_column(name)[:, None]
+            truth, first = excess[:LOOKED_AT], LOOKED_AT
+            for degree, known in zip(TERM_DEGREES, points, strict=True):
+                matrix = np.linalg.inv(np.vander(known, degree + 1, increasing=True))
+                found = matrix @ excess[first : first + degree + 1]
+                first += degree + 1
+                error = np.abs(
+                    np.vander(looked_at, degree + 1, increasing=True) @ found - truth
+                ).max()
+                if error <= TERM_ERROR * np.abs(own[:LOOKED_AT]).max():
+                    break
+            weights.append(scale * found)
+            degrees.append(degree)
+        return cls(np.concatenate(weights), tuple(degrees), (low, high))
+
+    def add(self, name: str, sums: Floats, s: Floats, out: Floats) -> None:
+        """Add equation (2) to the response called ``name``; ``sums`` (k, n, m) over all layers,
+        ``s`` and ``out`` (n, m).
+        """
+        if name not in NAMES:
+            return
+        which = NAMES.index(name)
+        first = sum(self.degrees[:which]) + which
+        low, high = self.sines
+        own = np.clip(s, low, high)  # beyond lies the margin of a spline
+        place = (2 * own - (low + high)) / max(high - low, 1e-9)
+        total = sums[first + self.degrees[which]].copy()
+        for j in range(self.degrees[which] - 1, -1, -1):
+            total *= place
+            total += sums[first + j]
+        out += total / own
+
+
+def kappa(band: BandAtmosphere, pwv: float, elevation: float, heights: Floats) -> dict[str, Floats]:
+    """kappa of the emission and of the opacity, (n,) each, at ``heights`` above the site [m]. PWV
+    in m, elevation in rad.
+
+    Of the whole column, int kappa rho_v dh = PWV.
+    """
+    water = band.transfer.of_water(pwv, [elevation])
+    found = {}
+    for name in NAMES:
+        column = float(water.of_column(name)[0])
+        found[name] = water.at(name, heights)[0] / (column if abs(column) > 1e-30 else 1e-30)
+    return found
 
 
 def delay_per_vapour(temperature: Floats, weights: Floats) -> float:

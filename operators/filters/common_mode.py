@@ -6,7 +6,7 @@ sigma_i^2,
     A <- A - sum_i u_i v_i^T,
     v_i = A^T u_i.                                                            (1)
 
-G is never formed (`gram`); the modes are iterated (`lanczos`) until
+G is never formed (`gram`); the modes are iterated (`gram.lanczos`) until
 
     |G u_i - sigma_i^2 u_i| <= residual * sigma_i^2   for every mode that is removed.            (2)
 
@@ -42,8 +42,7 @@ from zonda.core.signal import MAIN
 from zonda.core.types import Floats
 
 from . import focal_plane_mean
-from .gram import Gram, Usable
-from .lanczos import NOTHING, Ritz, lanczos
+from .gram import NOTHING, Gram, Ritz, Usable, lanczos
 from .rows import LinearFilter
 from .source_mask import MASKED, Inside, SourceMask, counts
 

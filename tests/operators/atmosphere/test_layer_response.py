@@ -14,9 +14,9 @@ from zonda.core.errors import ZondaError
 from zonda.core.instrument import Band
 from zonda.core.operator import Operator
 from zonda.core.registry import sites
-from zonda.operators.atmosphere.layer_terms import LayerTerms, kappa
+from zonda.operators.atmosphere.distribution import Slab, air_correlation
 from zonda.operators.atmosphere.planning import calibrated
-from zonda.operators.atmosphere.slab import Slab, air_correlation
+from zonda.operators.atmosphere.response import LayerTerms, kappa
 from zonda.operators.atmosphere.turbulence.covariance import correlation
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere
 from zonda.operators.atmosphere.weather.climatology import profile
