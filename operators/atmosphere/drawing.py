@@ -29,12 +29,8 @@ PLANES = {
 
 def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     """The fluctuations of an observation, stated in its log."""
-    parameters, observation, chosen, law = (
-        model.parameters,
-        model.observation,
-        model.resolution(),
-        model.fluctuation,
-    )
+    parameters, observation = model.parameters, model.observation
+    chosen, law = model.resolution(), model.fluctuation
     law.check(model.pwv, label)
     turbulence = _layers_of(model, label)
     path = turbulence.paths[chosen.step]
@@ -103,14 +99,10 @@ def _of_bands(models: Sequence[AtmosphereModel], label: str) -> dict[str, Drifti
     """Layers by name of the band's scan."""
     layers = [drifting_layers(model) for model in models]
     for model, others in zip(models, share_tiles(layers), strict=True):
-        whole = len(model.turbulence) - len(set(model.parameters.omit))
+        whole, text = len(model.simulated), "lattices of its own: other beams or directions"
         named = ((models[k].observation.instrument.band.name, n) for k, n in sorted(others.items()))
-        parts = ", ".join(f"{name} ({n} of {whole} layers)" for name, n in named)
-        text = (
-            f"lattices made once with those of {parts}"
-            if parts
-            else "lattices of its own: other beams or directions"
-        )
+        if parts := ", ".join(f"{name} ({n} of {whole} layers)" for name, n in named):
+            text = f"lattices made once with those of {parts}"
         model.observation.tally.state(label, "turbulence beside other bands", text)
     return {model.observation.name: one for model, one in zip(models, layers, strict=True)}
 
@@ -122,12 +114,11 @@ def drifting_layers(
     ``points``, by default the nodes.
     """
     chosen = model.resolution()
-    parts = zip(model.turbulence, model.layers, chosen.steps, strict=True)
-    every = [
+    parts = list(zip(model.turbulence, model.layers, chosen.steps, strict=True))
+    drifting = [
         Drifting(field, layer.height, layer.amplitude, layer.wind, step)
-        for field, layer, step in parts
+        for field, layer, step in (parts[k] for k in model.simulated)
     ]
-    drifting = [one for number, one in enumerate(every) if number not in model.parameters.omit]
     first, count = times(slice(0, model.observation.n_samples), chosen.step)
     kind = np.float64 if chosen.nodes.shape else np.float32
     points, span = points or (chosen.nodes.xi, chosen.nodes.eta), (first, first + count)
@@ -153,23 +144,21 @@ def in_time_order(model: AtmosphereModel) -> bool:
     """True if blocks should come in order of time: detectors are evaluated one by one, and share
     the turbulence of the moment.
     """
-    o, chosen = model.observation, model.resolution()
-    if chosen.nodes.shape:
-        return False
-    return not keeps_all(
-        o.n_detectors, o.n_samples, chosen.step, len(streams(model.parameters.outputs))
-    )
+    return model.resolution().nodes.shape is None and not keeps_all(*_units(model))
 
 
 def bytes_of_units(model: AtmosphereModel) -> int:
     """Bytes of the detectors' series that are kept; 0 where they are interpolated from nodes."""
-    o, chosen = model.observation, model.resolution()
-    if chosen.nodes.shape:
+    if model.resolution().nodes.shape:
         return 0
-    every = units_bytes(
-        o.n_detectors, o.n_samples, chosen.step, len(streams(model.parameters.outputs))
-    )
+    every = units_bytes(*_units(model))
     return min(every, BYTES_KEPT) if in_time_order(model) else every
+
+
+def _units(model: AtmosphereModel) -> tuple[int, int, int, int]:
+    """Detectors, samples, step and streams of the units."""
+    o, names = model.observation, streams(model.parameters.outputs)
+    return o.n_detectors, o.n_samples, model.resolution().step, len(names)
 
 
 def _statements(model: AtmosphereModel, path: LinesOfSight) -> Iterator[tuple[str, str]]:

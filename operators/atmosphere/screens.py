@@ -297,7 +297,7 @@ def pwv_at(model: AtmosphereModel, xi: Floats, eta: Floats, samples: NDArray[np.
 
 def _layers(model: AtmosphereModel, at: int) -> list[LayerScreen]:
     """Every layer that is simulated about the boresight's place at sample ``at``."""
-    o, plane, omit = model.observation, model.plane, model.parameters.omit
+    o, plane = model.observation, model.plane
     step = max(1, o.n_samples // 2000)
     samples = np.append(np.arange(0, o.n_samples, step), at)
     path = LinesOfSight(o, plane, 1, 0, o.n_samples)
@@ -306,9 +306,8 @@ def _layers(model: AtmosphereModel, at: int) -> list[LayerScreen]:
     crossing = np.stack([x[0], y[0]])[:, samples]
     angle = 2 * float(np.hypot(o.focalplane.xi, o.focalplane.eta).max())
     found = []
-    for number, (layer, field) in enumerate(zip(model.layers, model.turbulence, strict=True)):
-        if number in omit:
-            continue
+    for number in model.simulated:
+        layer, field = model.layers[number], model.turbulence[number]
         matrix, start, velocity = plane.affine(layer.height, layer.wind)
         place = (
             matrix @ crossing + start[:, None] + velocity[:, None] * path.seconds[samples]

@@ -1,5 +1,5 @@
-"""Leading eigenpairs of G = A A^T of a stream A (detectors x samples), which is never formed: Lanczos
-iteration (full reorthogonalization, float64).
+"""Leading eigenpairs of G = A A^T of a stream A (detectors x samples), which is never formed, by
+Lanczos iteration (full reorthogonalization, float64).
 
 One step reads the stream once and gives A^T q and A A^T q together. It starts near the detector
 mean and stops when

@@ -291,60 +291,28 @@ def scan_plane(observation: Observation) -> ScanPlane:
     level = float(np.hypot(n[0], n[1]))
     a = n[:2] / level if level > 0 else np.zeros(2)
     matrix = np.eye(2) - (1 - n[2]) * np.outer(a, a)
-    nothing, no_advection = np.zeros(2), np.zeros((2, 2))
     transverse, flat = _error(matrix @ matrix, u), _error(np.eye(2), u)
-    if transverse > FLAT and level > 0:
-        elevation = float(np.median(np.arcsin(boresight[2])))
-        cone = Cone(a, elevation)
-        highest = float(np.arcsin(boresight[2]).max()) + float(np.arctan(np.hypot(xi, eta).max()))
-        bound = (
-            cone.error(crossing(u)) if highest < np.pi / 2 else np.inf
-        )  # the tip of a cone is no place to be near
-        if bound < min(transverse, flat):
-            drift, drift_bound = _mean_drift(cone, crossing(boresight))
-            there = np.eye(2) - (1 - np.sin(elevation)) * np.outer(a, a)
-            return ScanPlane(
-                there,
-                a / np.tan(elevation),
-                nothing,
-                no_advection,
-                there,
-                elevation,
-                "cone",
-                bound,
-                drift,
-                drift_bound,
-                cone,
-            )
+    middle = float(np.median(np.arcsin(boresight[2])))
     elevation, centre = float(np.arcsin(n[2])), n[:2] / n[2]
-    if transverse > max(0.5 * flat, FLAT):
-        elevation = float(
-            np.median(np.arcsin(boresight[2]))
-        )  # the mean direction may be the zenith
-        return ScanPlane(
-            np.eye(2),
-            centre,
-            nothing,
-            no_advection,
-            np.eye(2),
-            elevation,
-            "horizontal",
-            flat,
-            np.eye(2),
-            flat,
-        )
-    return ScanPlane(
-        matrix,
-        centre,
-        nothing,
-        no_advection,
-        matrix,
-        elevation,
-        "transverse",
-        transverse,
-        matrix,
-        transverse,
-    )
+    kind: Literal["transverse", "cone", "horizontal"] = "transverse"
+    bound, cone = transverse, None
+    if transverse > FLAT and level > 0:
+        highest = float(np.arcsin(boresight[2]).max()) + float(np.arctan(np.hypot(xi, eta).max()))
+        unrolled = Cone(a, middle)
+        # The tip of a cone is no place to be near.
+        error = unrolled.error(crossing(u)) if highest < np.pi / 2 else np.inf
+        if error < min(transverse, flat):
+            kind, bound, cone = "cone", error, unrolled
+            matrix = np.eye(2) - (1 - np.sin(middle)) * np.outer(a, a)
+            elevation, centre = middle, a / np.tan(middle)
+    if cone is None and transverse > max(0.5 * flat, FLAT):
+        # The mean direction may be the zenith.
+        kind, bound, matrix, elevation = "horizontal", flat, np.eye(2), middle
+    drift: tuple[Floats, float] = (matrix, bound)
+    if cone:
+        drift = _mean_drift(cone, crossing(boresight))
+    still = np.zeros(2), np.zeros((2, 2))
+    return ScanPlane(matrix, centre, *still, matrix, elevation, kind, bound, *drift, cone)
 
 
 def _mean_drift(cone: Cone, crossings: Floats) -> tuple[Floats, float]:

@@ -123,25 +123,15 @@ class DriftingLayers:
         """The sum of the layers and the sine of the elevation, each (len(xi), count), from time
         ``first``.
         """
-        total, sine = self.with_others([], xi, eta, first, count)
-        return total[0], sine
-
-    def with_others(
-        self, others: Sequence[DriftingLayers], xi: Floats, eta: Floats, first: int, count: int
-    ) -> tuple[Floats, Floats]:
-        """Sum of the layers of this band and of ``others`` that look as it does: lines of sight are
-        found once.
-
-        The sum of the layers is (1 + len(others), len(xi), count).
-        """
-        total, _, sine = self.sums(others, xi, eta, first, count)
-        return total, sine
+        (total,), _, sine = self.sums([], xi, eta, first, count)
+        return np.asarray(total, np.float64), sine
 
     def sums(
         self, others: Sequence[DriftingLayers], xi: Floats, eta: Floats, first: int, count: int
     ) -> tuple[Floats, list[Floats], Floats]:
-        """Sums as `with_others`, and for each band its weighted sums, (k, len(xi), count) in the
-        order of its ``weights``.
+        """Sums (1 + len(others), len(xi), count) of the layers of this band and of ``others`` that
+        look as it does, whose lines of sight are found once; for each band its weighted sums, (k,
+        len(xi), count) in the order of its ``weights``; sines of the elevation.
 
         The plain sums have the same bits with such weights and without.
         """

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from statistics import NormalDist
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,6 +38,8 @@ TOP = 46e3
 EXTRAPOLATION_MAX = 500.0
 """m that a site may lie below the lowest level of its climatology."""
 
+HELD = ("wind_east", "wind_north", "log_vapour_spread", "wind_east_spread", "wind_north_spread")
+"""Quantities of a `Column` that are what they are at its top above it."""
 STACKING = 0.77
 """Levels do not vary together: the column's ln(PWV) scatters this much of what the levels'
 quantiles, stacked, would give. This is the mean of the sites where ERA5's own columns tell (0.6 to
@@ -359,23 +361,15 @@ def _continued(column: Column) -> Column:
     if not height.size:
         return column
 
-    def held(values: Floats | None) -> Floats | None:
-        return None if values is None else np.append(values, np.full(height.size, values[-1]))
-
-    return replace(
-        column,
-        pressure=np.append(column.pressure, pressure),
-        height=np.append(column.height, height),
-        temperature=np.append(column.temperature, temperature),
-        h2o=np.append(
-            column.h2o, np.full(height.size, min(float(column.h2o[-1]), STRATOSPHERIC_WATER))
-        ),
-        wind_east=np.append(column.wind_east, np.full(height.size, column.wind_east[-1])),
-        wind_north=np.append(column.wind_north, np.full(height.size, column.wind_north[-1])),
-        log_vapour_spread=held(column.log_vapour_spread),
-        wind_east_spread=held(column.wind_east_spread),
-        wind_north_spread=held(column.wind_north_spread),
-    )
+    levels = {"pressure": pressure, "height": height, "temperature": temperature}
+    levels["h2o"] = np.full(height.size, min(float(column.h2o[-1]), STRATOSPHERIC_WATER))
+    for name in HELD:
+        if getattr(column, name) is not None:
+            levels[name] = np.full(height.size, getattr(column, name)[-1])
+    more: dict[str, Any] = {
+        name: np.append(getattr(column, name), values) for name, values in levels.items()
+    }
+    return replace(column, **more)
 
 
 def _layer_mean(pressure: Floats, mixing_ratio: Floats) -> Floats:

@@ -12,7 +12,7 @@ import numpy as np
 from zonda.core.errors import InputError
 from zonda.core.numerics.random import normals, stream_key, uniforms
 from zonda.core.types import AnyFloats
-from zonda.core.weather import Column, GroundWeather, WeatherSource
+from zonda.core.weather import Column, GroundWeather, Pwv, WeatherSource
 
 from .air import DRY_AIR_GAS_CONSTANT, saturation_pressure, standard_column
 from .climatology import climatology_column
@@ -100,13 +100,8 @@ def profile_of(
                 place="weather",
                 cure="remove pwv from AtmosphereLayers or from weather",
             )
-    without_climatology = (
-        isinstance(weather, Climatology) and site.climatology is None and pwv is not None
-    )
-    profile = on_heights(
-        standard_column(site) if without_climatology else weather.column(site, time), site
-    )
-    profile, how = _scaled(profile, weather, seed, pwv)
+        weather = weather.model_copy(update={"pwv": Pwv(metres=pwv)})
+    profile, how = _scaled(on_heights(weather.column(site, time), site), weather, seed)
     profile, wind = _blown(profile, weather, seed)
     return replace(
         profile, stated=(*profile.stated, ("PWV", how), *_supersaturated(profile), ("wind", wind))
@@ -150,16 +145,12 @@ def _supersaturated(profile: Profile) -> tuple[tuple[str, str], ...]:
     return (("relative humidity above 100 %", f"{text}; taken as it is"),)
 
 
-def _scaled(
-    profile: Profile, weather: WeatherSource, seed: int, pwv: float | None
-) -> tuple[Profile, str]:
+def _scaled(profile: Profile, weather: WeatherSource, seed: int) -> tuple[Profile, str]:
     given = weather.pwv
-    if pwv is not None or (given is not None and given.metres is not None):
-        wanted = pwv if pwv is not None else given.metres if given is not None else None
-        assert wanted is not None
-        return profile.scaled(max(wanted, DRY)), f"{wanted * 1e3:.4g} mm, as given"
     if given is None:
         return profile, f"{profile.pwv * 1e3:.4g} mm, as the source has it"
+    if given.metres is not None:
+        return profile.scaled(max(given.metres, DRY)), f"{given.metres * 1e3:.4g} mm, as given"
     law = profile.distribution
     if law is None:
         raise InputError(
@@ -168,17 +159,13 @@ def _scaled(
             place="weather",
             cure="give the PWV in mm, or leave it away to take the source's own",
         )
-    quantile = (
-        given.quantile
-        if given.quantile is not None
-        else float(uniforms(stream_key(seed, "weather", "pwv"), 0, 1)[0])
-    )
+    quantile, drawn = given.quantile, ""
+    if quantile is None:
+        quantile = float(uniforms(stream_key(seed, "weather", "pwv"), 0, 1)[0])
+        drawn = " (drawn)"
     wanted = law.at(quantile)
     low, high = law.at(0.25) * 1e3, law.at(0.75) * 1e3
-    text = (
-        f"{wanted * 1e3:.4g} mm, the {100 * quantile:.4g} %"
-        f" quantile{'' if given.quantile is not None else ' (drawn)'}"
-    )
+    text = f"{wanted * 1e3:.4g} mm, the {100 * quantile:.4g} % quantile{drawn}"
     season = (
         f"of that season and hour: median {law.median * 1e3:.4g} mm, half the days between"
         f" {low:.3g} and {high:.3g} mm"
