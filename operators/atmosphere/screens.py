@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from zonda.core.canvas import Sketch
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Data
-from zonda.core.canvas import Sketch
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.output import Output, Progress
