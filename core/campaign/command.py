@@ -112,20 +112,17 @@ def status(folder: Path, listed: bool, as_json: bool) -> None:
 
 def source(pipeline: str, settings: tuple[str, ...], several: bool) -> CampaignFile:
     """A pipeline file as part of a campaign, with the knobs that its ``accuracy`` asks for."""
-    from ..configuration.pipeline_file import load
+    from ..experiment import Variant
     from .prepare import CampaignFile
 
-    file = load(pipeline, settings)
-    if (target := file.header.accuracy) is not None:
+    variant = Variant(pipeline, settings)
+    if (target := variant.file.header.accuracy) is not None:
         from ..accuracy.fronts import settings_for
 
-        choice = settings_for(file, target.target, target.metric)
+        choice = settings_for(variant.file, target.target, target.metric)
         _say(f"accuracy: {choice.reason}")
-        settings = (*settings, *choice.overrides)
-        file = load(pipeline, settings)
-    return CampaignFile(
-        file, lambda more: load(pipeline, (*settings, *more)), file.header.name if several else ""
-    )
+        variant = variant.changed(choice.overrides)
+    return CampaignFile(variant, variant.file.header.name if several else "")
 
 
 @contextlib.contextmanager

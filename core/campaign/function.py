@@ -23,8 +23,8 @@ from ..components import SESSION
 from ..configuration.files import InMemory
 from ..configuration.loaded import PipelineFile, Step
 from ..configuration.parameters import Parameters
-from ..configuration.pipeline_file import parse
 from ..errors import PipelineError, ZondaError
+from ..experiment import Variant
 from ..operator import Operator
 from ..output import Output, may_write
 from ..pipeline import Pipeline
@@ -224,7 +224,8 @@ def _source(
     )
     named = {"site": _named(scene.site, sites), "instrument": _named(scene.instrument, instruments)}
     text = PipelineFile(header, named, tuple(map(Step, keys, steps)), PLACE, scene).resolved_yaml()
-    file = parse(text, name=PLACE)
+    variant = Variant(PLACE, text=text)
+    file = variant.file
     pairs = [
         ("the scene", scene, file.scene()),
         *((s.label, s, o) for s, o in zip(steps, file.operators, strict=True)),
@@ -237,7 +238,7 @@ def _source(
             raise PipelineError(
                 f"{label} cannot be written in a pipeline file", place=PLACE, cure=cure
             )
-    return CampaignFile(file, lambda more: parse(text, name=PLACE, overrides=more), "")
+    return CampaignFile(variant)
 
 
 def _named(component: Any, names: Any) -> Any:

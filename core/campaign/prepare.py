@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..configuration.files import paths_in
 from ..errors import InputError, within
+from ..experiment import Variant
 from ..scene import WithScene
 from ..storage.files import product_path
 from . import parts
@@ -38,14 +39,18 @@ MEASURED = 8
 
 @dataclass(frozen=True)
 class CampaignFile:
-    """A pipeline file and the settings from the command line. ``load(settings)`` reads it with
-    further ones.
+    """A pipeline file of a campaign, with the settings from the command line; its entries are
+    further variants.
     """
 
-    file: PipelineFile
-    load: Callable[[tuple[str, ...]], PipelineFile]
-    name: str
+    variant: Variant
+    name: str = ""
     """Folder of its products where there are several files, else ''."""
+
+    @property
+    def file(self) -> PipelineFile:
+        """The file itself."""
+        return self.variant.file
 
     @property
     def campaign(self) -> Campaign:
@@ -150,7 +155,7 @@ class _Draft:
         from ..plan.bands import for_run
 
         with within(f"entry {about(entry) or source.file.header.name}"):
-            file = _with_budget(source.load(entry.settings), share)
+            file = _with_budget(source.variant.changed(entry.settings).file, share)
             scene = file.scene().model_copy(update={"seed": entry.seed, "time": entry.time})
             if entry.settings:  # the error names the entry, not a line of the file
                 run_checks(file.pipeline(), scene)
@@ -223,7 +228,7 @@ def _entries(source: CampaignFile) -> list[Entry]:
     return entries(
         source.campaign,
         source.file.scene().seed,
-        lambda settings: source.load(settings).scene().time,
+        lambda settings: source.variant.changed(settings).file.scene().time,
     )
 
 
@@ -258,7 +263,7 @@ def outline(source: CampaignFile) -> tuple[str, PipelineFile]:
     sets = len({repr(e.combination) for e in found})
     number = "1 entry" if len(found) == 1 else f"{len(found)} entries"
     text = f"campaign of {number}, combined into {plural(sets, 'set')} of products"
-    return text, _with_budget(source.load(first.settings), 1 / math.sqrt(together))
+    return text, _with_budget(source.variant.changed(first.settings).file, 1 / math.sqrt(together))
 
 
 def about(entry: Entry) -> str:

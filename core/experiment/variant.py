@@ -8,7 +8,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,14 +32,21 @@ class Variant:
         Path, or a shipped pipeline's name.
     overrides
         Changes as ``--set`` takes them.
+    text
+        YAML in place of a file's, whose name in messages is then ``pipeline``.
     """
 
     pipeline: str | Path
     overrides: tuple[str, ...] = ()
+    text: str | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave the file that was read out of the pickle."""
-        return Variant, (self.pipeline, self.overrides)
+        return Variant, (self.pipeline, self.overrides, self.text)
+
+    def changed(self, overrides: Sequence[str]) -> Variant:
+        """The variant with further changes."""
+        return replace(self, overrides=(*self.overrides, *overrides))
 
     def __str__(self) -> str:
         return " ".join([Path(self.pipeline).stem, *self.overrides])
@@ -47,9 +54,11 @@ class Variant:
     @cached_property
     def file(self) -> PipelineFile:
         """The checked pipeline file. Raises `ConfigurationError`."""
-        from ..configuration.pipeline_file import load
+        from ..configuration.pipeline_file import load, parse
 
-        return load(self.pipeline, self.overrides)
+        if self.text is None:
+            return load(self.pipeline, self.overrides)
+        return parse(self.text, name=str(self.pipeline), overrides=self.overrides)
 
     @cached_property
     def key(self) -> str:

@@ -132,7 +132,7 @@ def _campaign(
     from zonda.core.campaign.engines import Pool
     from zonda.core.campaign.prepare import CampaignFile
     from zonda.core.campaign.run import begin, resume
-    from zonda.core.configuration.pipeline_file import load
+    from zonda.core.experiment import Variant
 
     path = folder.parent / "campaign.yaml"
     path.write_text(CAMPAIGN)
@@ -140,8 +140,13 @@ def _campaign(
     if again:
         resume(folder, pool, lambda text: None)
     else:
-        source = CampaignFile(load(path), lambda settings: load(path, settings), "")
-        begin([source], folder, "zonda run campaign.yaml", pool, lambda text: None)
+        begin(
+            [CampaignFile(Variant(path))],
+            folder,
+            "zonda run campaign.yaml",
+            pool,
+            lambda text: None,
+        )
     return {p.name: p.read_bytes() for p in sorted(folder.glob("*.fits"))}
 
 
