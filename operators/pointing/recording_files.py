@@ -100,6 +100,22 @@ class RecordedTable:
     intervals: dict[str, Any] = field(default_factory=dict)
     in_seconds: bool = False
 
+    @classmethod
+    def of(cls, columns: Mapping[str, tuple[NDArray[Any], str]], place: str) -> RecordedTable:
+        """Of arrays and their units: columns are those that have one number per row."""
+        plain = {
+            name: (values, unit)
+            for name, (values, unit) in columns.items()
+            if values.ndim == 1 and values.dtype.kind in "fiub"
+        }
+        lines = [0] * (1 + max([len(values) for values, _ in plain.values()] or [0]))
+        found = cls(Table(place, plain, lines))
+        if "boresight_azel" in columns:
+            _check_rotation(columns["boresight_azel"][0], place)
+        if "boresight_radec" in columns:
+            found.radec = np.asarray(columns["boresight_radec"][0], np.float64)
+        return found
+
 
 def read_recording(path: Path, clock: Clock, mask: int | None = None) -> Recording:
     """Read a recording.
@@ -132,16 +148,12 @@ def _text(path: Path, place: str) -> RecordedTable:
     table = read_table(path, place)
     known = {name for names in ALIASES.values() for name in names}
     columns: dict[str, tuple[Any, str]] = {}
-    for heading, (texts, unit) in table.columns.items():
-        name, (short, _, behind) = (
-            heading.lower().replace(" ", "_"),
-            heading.lower().rpartition("_"),
-        )
-        columns |= (
-            {short: (texts, behind)}
-            if short in known and name not in known
-            else {name: (texts, unit)}
-        )
+    for heading, column in table.columns.items():
+        name = heading.lower().replace(" ", "_")
+        short, _, unit = name.rpartition("_")
+        if short in known and name not in known:
+            name, column = short, (column[0], unit)
+        columns[name] = column
     table.columns = columns
     return _dated(RecordedTable(table))
 
@@ -206,18 +218,17 @@ def _fits(path: Path, place: str) -> RecordedTable:
             if not azel and not names >= {"ra", "dec"}:
                 continue
             given = {c.name.lower(): (np.asarray(hdu.data[c.name]), c.unit or "") for c in columns}
-            found = RecordedTable(_of_numbers(given, place), in_seconds=True)
+            found = RecordedTable.of(given, place)
+            found.in_seconds = True
             start = file[0].header.get("DATE-OBS")
             if "seconds" in names and start:
                 found.start = Instant.parse(start)
-            if names >= {"boresight_azel", "boresight_radec"}:  # SaveTOD's
+            if found.radec is not None:  # SaveTOD's
                 found.bits = "toast" if "FLAGBITS" in hdu.header else "before"
-                _check_rotation(given["boresight_azel"][0], place)
-                found.radec = np.asarray(given["boresight_radec"][0], np.float64)
+                spans: dict[str, list[Any]] = {}
                 for row in file["INTERVALS"].data if "INTERVALS" in file else ():
-                    spans = found.intervals.setdefault(str(row["NAME"]), [])
-                    spans.append([row["START"], row["STOP"]])
-                found.intervals = {k: np.array(v, np.float64).T for k, v in found.intervals.items()}
+                    spans.setdefault(str(row["NAME"]), []).append([row["START"], row["STOP"]])
+                found.intervals = {name: np.array(rows).T for name, rows in spans.items()}
             return found
     raise InputError(
         "has no table with az and el, or ra and dec",
@@ -226,20 +237,12 @@ def _fits(path: Path, place: str) -> RecordedTable:
     )
 
 
-def _of_numbers(columns: Mapping[str, tuple[NDArray[Any], str]], place: str) -> Table:
-    """The table of those columns that have one number per row."""
-    plain = {
-        n: (v, unit) for n, (v, unit) in columns.items() if v.ndim == 1 and v.dtype.kind in "fiub"
-    }
-    return Table(place, plain, [0] * (1 + max([len(v) for v, _ in plain.values()] or [0])))
-
-
 def _hdf5(path: Path, place: str) -> RecordedTable:
     import h5py
 
-    def read(item: Any, kinds: str = "fiub") -> Any:
+    def read(item: Any) -> Any:
         """The numbers of a data set; None for something else."""
-        if not isinstance(item, h5py.Dataset) or item.dtype.kind not in kinds:
+        if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "fiub":
             return None
         hdf5_files.check_size(item, place)
         return item[()]
@@ -254,21 +257,14 @@ def _hdf5(path: Path, place: str) -> RecordedTable:
                 si = TOAST_UNITS.get(ours.get(name.lower(), ""), "") if toast else ""
                 unit = item.attrs.get("units", item.attrs.get("unit", si))
                 columns[name.lower()] = (np.asarray(values), str(unit))
-        found = RecordedTable(_of_numbers(columns, place))
+        found = RecordedTable.of(columns, place)
         if toast:
             other = file["metadata/other"].attrs if "metadata/other" in file else {}
             start = other.get("zonda_start_utc")
             found.start = Instant.parse(str(start)) if start is not None else None
             found.bits = "before" if start is not None and "zonda_flags" not in other else "toast"
-            if (azel := read(group.get("boresight_azel"))) is not None:
-                _check_rotation(azel, place)
-            if (radec := read(group.get("boresight_radec"), "f")) is not None:
-                found.radec = np.asarray(radec, np.float64)
-            parts = file.get("intervals")
-            spans = {n: read(i, "fiu") for n, i in parts.items()} if hasattr(parts, "items") else {}
-            found.intervals = {
-                n: np.asarray(v, np.float64) for n, v in spans.items() if v is not None
-            }
+            spans = {name: read(item) for name, item in file.get("intervals", {}).items()}
+            found.intervals = {name: v for name, v in spans.items() if v is not None}
         return found
 
 
@@ -276,7 +272,7 @@ def _check_rotation(quaternions: Any, place: str) -> None:
     """Raise InputError for a boresight that is rotated about itself: azimuth and elevation alone do
     not follow it.
     """
-    x, y, z, w = np.asarray(quaternions[:], np.float64).T
+    x, y, z, w = np.asarray(quaternions, np.float64).T
     psi = np.arctan2(y * z + w * x, -(x * z - w * y))
     turned = float(np.abs(psi[np.isfinite(psi)]).max(initial=0.0))
     if turned > 1e-6:
@@ -358,13 +354,9 @@ def _within(spans: list[tuple[float, float]], seconds: Floats) -> NDArray[np.boo
 
 
 def _flags(
-    values: Any,
-    bits: Literal["toast", "before", "any"],
-    mask: int | None,
-    trimmed: NDArray[np.bool_] | None = None,
+    number: Floats, bits: str, mask: int | None, trimmed: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     """Flags in bits of `core.flags`. A value that is not a number excludes the sample."""
-    number = np.asarray(values, np.float64)
     whole = np.where(np.isfinite(number), number, 255).astype(np.int64)
     if bits == "any":
         excluded = number != 0 if mask is None else (whole & mask) != 0
