@@ -144,7 +144,7 @@ def _table(name: str, columns: Iterable[tuple[str, str, str, Any]], comment: str
 
 
 def _tables(tod: TimeOrderedData) -> Iterator[Any]:
-    """All tables but that of the streams."""
+    """Tables beside that of the streams."""
     known = tod.of_samples()
     samples = _table(
         "SAMPLES", [(name, form, unit, known[k]) for name, form, unit, k in SAMPLES if k in known]

@@ -48,7 +48,7 @@ class NoiseTable:
                 " noise of"
             )
             raise InputError(text, place=place, cure=cure)
-        rows = np.array([self.names[name] for name in detectors])
+        rows = np.array([self.names[name] for name in detectors], np.intp)
         return {name: values[rows] for name, values in self.columns.items()}
 
 

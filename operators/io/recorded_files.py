@@ -24,7 +24,7 @@ from zonda.core.intervals import Intervals, runs
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .noise_table import NoiseTable, read_noise
+from .noise_table import read_noise
 from .recorded_scan import (
     RecordedInstrument,
     instrument_of,
@@ -36,6 +36,7 @@ from .recorded_scan import (
 from .recorded_stream import RecordedStream
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
+from .toast_noise import DEFAULT_MODEL
 
 if TYPE_CHECKING:
     from zonda.core.instrument import Instrument
@@ -245,28 +246,46 @@ class RecordedFiles(Operator):
         """Everything but the stream of a file. Raises InputError for a file that cannot be used."""
         place = f"{self.label}, {path}"
         tod, streams = _head(path, _stamp(path))
-        stated = "net" in tod.columns
-        table = read_noise(self.noise) if self.noise is not None else None
-        if self.noise_model is not None or not stated:
-            try:
-                fitted = _fitted(path, _stamp(path), self.noise_model, self.detector_mask)
-                tod = replace(tod, columns={**tod.columns, **fitted})
-            except InputError:
-                if table is None or self.noise_model is not None:
-                    raise
         if self.signal is not None and self.signal not in streams:
             have = ", ".join(sorted(streams)) or "none"
             cure = f"set signal to one of: {have}; or signal: none for the pointing alone"
             raise InputError(f"has no stream {self.signal!r}", place=place, cure=cure)
         rows = rows_of_bands(tod, self.band, place)
         used = (tod.detector_flags & np.uint8(self.detector_mask)) == 0
-        tod, noise = _with_noise(tod, table, np.concatenate([r[used[r]] for r in rows]), place)
-        if table is None and "net" in tod.columns and (self.noise_model is not None or not stated):
-            noise = f"fitted to the file's {self.noise_model or 'noise_model'}"
+        use = np.concatenate([r[used[r]] for r in rows])
+        columns, noise = self._noise(tod, path, use)
+        tod = replace(tod, columns=columns)
         return [
             RecordedBand(path, tod, instrument_of(tod, r, used[r], given, place), r, noise)
             for r in rows
         ]
+
+    def _noise(
+        self, tod: TimeOrderedData, path: Path, rows: NDArray[np.intp]
+    ) -> tuple[dict[str, Floats], str]:
+        """Columns with the noise of the table, for the detectors ``rows``, of a model of the file
+        or the file's own, and which of these it is in words.
+        """
+        columns, said = dict(tod.columns), "the file's"
+        if self.noise_model is not None or "net" not in columns:
+            said = "the scene's instrument's, or none: the file states none"
+            try:
+                fitted = _fitted(path, _stamp(path), self.noise_model, self.detector_mask)
+            except InputError:
+                if self.noise is None or self.noise_model is not None:
+                    raise
+                fitted = {}
+            if fitted:
+                columns |= fitted
+                said = f"fitted to the file's {self.noise_model or DEFAULT_MODEL}"
+        if self.noise is None:
+            return columns, said
+        names = [tod.names[row] for row in rows]
+        for name, values in read_noise(self.noise).of(names, f"{self.label}, {path}").items():
+            column = columns.get(name, np.full(tod.n_detectors, np.append(values, 0.0)[0]))
+            columns[name] = np.array(column, np.float64)
+            columns[name][rows] = values
+        return columns, str(self.noise)
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -306,25 +325,3 @@ def _fitted(
         return opened.noise(model, mask)
     finally:
         opened.close()
-
-
-def _with_noise(
-    tod: TimeOrderedData, table: NoiseTable | None, rows: NDArray[np.intp], place: str
-) -> tuple[TimeOrderedData, str]:
-    """The file's data with the noise of a table for the detectors ``rows``, and where its noise
-    comes from.
-    """
-    if table is None:
-        what = (
-            "the file's"
-            if "net" in tod.columns
-            else "the scene's instrument's, or none: the file states none"
-        )
-        return tod, what
-    columns = dict(tod.columns)
-    if not rows.size:
-        return tod, str(table.path)
-    for name, values in table.of([tod.names[row] for row in rows], place).items():
-        columns[name] = np.array(columns.get(name, np.full(tod.n_detectors, values[0])), np.float64)
-        columns[name][rows] = values
-    return replace(tod, columns=columns), str(table.path)

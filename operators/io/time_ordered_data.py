@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -183,8 +182,8 @@ class TimeOrderedData:
             )
 
     def of_samples(self) -> dict[str, NDArray[Any]]:
-        """What it has of each sample, by name, with azimuth (as recorded, where it is) and
-        elevation of the boresight.
+        """Arrays of the samples, by name: those that it has, with azimuth (as recorded, where it
+        is) and elevation of the boresight.
         """
         longitude, elevation = angles(directions(self.boresight_azel))
         azimuth = -longitude % (2 * np.pi) if self.azimuth is None else self.azimuth
@@ -256,9 +255,7 @@ class TimeOrderedData:
         return -y, -x, np.asarray(np.arctan2(2 * w * z, w * w - z * z))
 
     @classmethod
-    def of(
-        cls, observation: Observation, metadata: Mapping[str, str | int | float] | None = None
-    ) -> TimeOrderedData:
+    def of(cls, observation: Observation) -> TimeOrderedData:
         """Everything but the streams of an observation."""
         o, f, instrument = observation, observation.focalplane, observation.instrument
         own = {
@@ -299,7 +296,6 @@ class TimeOrderedData:
                 "band": instrument.band.name,
                 "telescope": instrument.telescope.name,
                 "telescope_diameter": instrument.telescope.diameter,
-                **(metadata or {}),
             },
             offsets=np.stack([f.xi, f.eta], axis=1),
         )

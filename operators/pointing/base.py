@@ -48,7 +48,7 @@ _BOX = ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))
 
 
 def kind(value: Any) -> str:
-    """Which of the two a parameter is: a name, or a list."""
+    """Kind of a parameter that is a name or a list."""
     return "name" if isinstance(value, str) else "list"
 
 
@@ -80,11 +80,11 @@ class Scans(Operator):
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
 
     def every(self) -> Sequence[Any]:
-        """All scans, in their order."""
+        """Scans of the step, in their order."""
         raise NotImplementedError
 
     def some(self, scans: Sequence[Any]) -> list[Any]:
-        """Those scans that `check` looks at."""
+        """Scans that `check` looks at."""
         raise NotImplementedError
 
     def length(self, scan: Any) -> float:

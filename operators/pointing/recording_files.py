@@ -102,7 +102,7 @@ class RecordedTable:
 
     @classmethod
     def of(cls, columns: Mapping[str, tuple[NDArray[Any], str]], place: str) -> RecordedTable:
-        """Of arrays and their units: columns are those that have one number per row."""
+        """Table of arrays with units: its columns are those that have one number per row."""
         plain = {
             name: (values, unit)
             for name, (values, unit) in columns.items()
