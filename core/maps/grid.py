@@ -25,15 +25,12 @@ from numpy.typing import NDArray
 from ..numerics.projection import (
     central,
     frame_rotation,
-    tangent_coordinates,
     wcs_frame_rotation,
 )
 from ..numerics.sphere import angles, separation, unit_vectors
-from ..storage.fits_files import header_of
+from ..storage.fits_files import COMMENTARY, header_of
 from ..types import Floats
 
-SMALL = 1 << 20
-"""Pixels of a grid whose solid angles and distances are kept."""
 CYLINDERS = ("CAR", "CEA", "MER", "CYP")
 ROWS = 256
 """Of an image that are worked on at a time."""
@@ -94,11 +91,14 @@ class MapGrid:
         """Side of the square of the middle pixel's solid angle [rad]."""
         return math.sqrt(math.prod(self.sides))
 
+    @lru_cache(maxsize=2)  # noqa: B019  (every figure of a map's noise asks for it)
     def distance(self, centre: tuple[float, float]) -> Floats:
         """Angles [rad] of the pixels from ``centre`` (longitude, latitude) [rad] in the grid's
-        frame, of `shape`.
+        frame, of `shape`. Read only.
         """
-        return separation(*angles(self.directions()), centre)
+        found = separation(*angles(self.directions()), centre)
+        found.flags.writeable = False
+        return found
 
     def solid_angle(self, where: NDArray[np.bool_]) -> float:
         """Solid angle of the pixels ``where`` [sr], each piece of the sky counted once."""
@@ -228,12 +228,8 @@ class ImagePixels(MapGrid):
         xx, xy, yy = self.middle
         return math.sqrt(math.sqrt(xx * yy - xy**2))
 
-    @property
-    def areas(self) -> Floats:
-        return self._areas if math.prod(self.shape) <= SMALL else self._solid_angles()
-
     @cached_property
-    def _areas(self) -> Floats:
+    def areas(self) -> Floats:
         found = self._solid_angles()
         found.flags.writeable = False
         return found
@@ -252,19 +248,11 @@ class ImagePixels(MapGrid):
             )
             return np.asarray(flat / (secant * np.sqrt(secant)))
         if self.kind == "CAR" and self.cylinder:
-            step = abs(float(self.matrix[1, 1]))
-            edges = np.clip(
-                self.latitudes[:, None] + [[-step / 2, step / 2]], -math.pi / 2, math.pi / 2
-            )
-            found = (
-                abs(float(self.matrix[0, 0]))
-                * 2
-                * np.sin(np.diff(edges) / 2)
-                * np.cos(edges.mean(axis=1, keepdims=True))
-            )
-            return np.where(
-                abs(self.latitudes[:, None]) <= math.pi / 2 * (1 + 1e-12), found, np.nan
-            )
+            dx, dy = abs(float(self.matrix[0, 0])), abs(float(self.matrix[1, 1]))
+            rows, pole = self.latitudes[:, None], math.pi / 2
+            low, high = (np.clip(rows + side, -pole, pole) for side in (-dy / 2, dy / 2))
+            found = dx * 2 * np.sin((high - low) / 2) * np.cos((low + high) / 2)
+            return np.where(abs(rows) <= pole * (1 + 1e-12), found, np.nan)
         columns = np.arange(1 if self.cylinder else nx) + (
             float(self.wcs.wcs.crpix[0]) - 1.0 if self.cylinder else 0.0
         )
@@ -288,23 +276,6 @@ class ImagePixels(MapGrid):
         for first in range(0, ny, ROWS):
             rows = np.arange(first, min(first + ROWS, ny), dtype=np.float64)
             found[first : first + ROWS] = self.at(np.arange(nx, dtype=np.float64), rows[:, None])
-        return found
-
-    def distance(self, centre: tuple[float, float]) -> Floats:
-        kept = self.__dict__.setdefault("_distances", {})
-        if centre in kept:
-            return kept[centre]  # type: ignore[no-any-return]
-        if self.kind == "TAN":
-            y, x = np.indices(self.shape, np.float64)
-            world = tangent_coordinates(self.wcs, x.ravel(), y.ravel())
-            longitude, latitude = np.radians(np.array(world)).reshape(2, *self.shape)
-        else:
-            longitude, latitude = angles(self.directions())
-        found = separation(longitude, latitude, centre)
-        found.flags.writeable = False
-        if found.size <= SMALL:
-            kept.clear()
-            kept[centre] = found
         return found
 
     def coordinates(self, directions: Floats) -> tuple[Floats, Floats]:
@@ -406,12 +377,6 @@ class HealpixPixels(MapGrid):
 
         return np.stack(healpy.pix2vec(self.nside, self.pixels, nest=self.nest), axis=-1)
 
-    def distance(self, centre: tuple[float, float]) -> Floats:
-        import healpy
-
-        colatitude, phi = healpy.pix2ang(self.nside, self.pixels, nest=self.nest)
-        return separation(phi, np.pi / 2 - colatitude, centre)
-
     def pixels_at(self, directions: Floats) -> NDArray[np.int64]:
         import healpy
 
@@ -423,39 +388,28 @@ class HealpixPixels(MapGrid):
         return np.where(pixels[place] == wanted, place, -1)
 
 
-def image_grid(header: Any, shape: tuple[int, int], nominal: float | None = None) -> ImagePixels:
+def image_grid(header: Any, shape: tuple[int, ...], nominal: float | None = None) -> ImagePixels:
     """The grid of an image by its FITS header, or any mapping of its keywords.
 
     ``nominal``: side of a pixel at the reference point [rad], where it is known better than by the
     header's degrees.
     """
-    known = ((key, header[key]) for key in header if key not in ("", "COMMENT", "HISTORY"))
+    known = ((key, header[key]) for key in header if key not in COMMENTARY)
     cards = tuple(
         (key, value) for key, value in known if isinstance(value, bool | int | float | str)
     )
-    return _image(cards, (int(shape[0]), int(shape[1])), nominal)
+    return _image(cards, shape, nominal)
 
 
-def wcs_grid(wcs: Any, shape: tuple[int, int]) -> ImagePixels:
-    """The grid of an image by its `astropy.wcs.WCS`."""
+def wcs_grid(wcs: Any, shape: tuple[int, ...], nominal: float | None = None) -> ImagePixels:
+    """The grid of an image by its `astropy.wcs.WCS`; ``nominal`` as of `image_grid`."""
     wcs = wcs.celestial
     if str(wcs.wcs.ctype[0])[-3:] in CYLINDERS:
         wcs = wcs.deepcopy()  # `_unbounded` changes it
-    return ImagePixels(wcs, (int(shape[0]), int(shape[1])))
+    ny, nx = (int(n) for n in shape)
+    return ImagePixels(wcs, (ny, nx), None if nominal is None else (nominal, nominal))
 
 
-def healpix_grid(
-    nside: int, nest: bool, pixels: NDArray[np.int64], frame: str = "icrs"
-) -> HealpixPixels:
-    """The grid of some HEALPix pixels (sorted)."""
-    return HealpixPixels(nside, nest, pixels, frame)
-
-
-@lru_cache(
-    maxsize=4
-)  # the maps of all signals of a run share one, with its solid angles and distances
-def _image(
-    cards: tuple[tuple[str, Any], ...], shape: tuple[int, int], nominal: float | None
-) -> ImagePixels:
-    found = wcs_grid(WCS(header_of(cards), naxis=2), shape)
-    return found if nominal is None else ImagePixels(found.wcs, found.shape, (nominal, nominal))
+@lru_cache(maxsize=4)  # the maps of all signals of a run share one
+def _image(cards: Any, shape: tuple[int, ...], nominal: float | None) -> ImagePixels:
+    return wcs_grid(WCS(header_of(cards), naxis=2), shape, nominal)

@@ -127,14 +127,7 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
         del made[key]
     if not written or written in FRAMES:
         return made, ""
-    plain = (
-        written.upper()
-        .replace(" ", "")
-        .replace("(", "")
-        .replace(")", "")
-        .replace("_", "")
-        .replace("/", "")
-    )
+    plain = re.sub(r"[ ()_/]", "", written.upper())
     frame, equinox = _SAME.get(plain, (written.upper(), None))
     if frame not in FRAMES:
         raise InputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,35 +13,14 @@ from numpy.typing import NDArray
 from ..configuration.diagnostics import nearest
 from ..errors import InputError
 from ..types import Floats
-from .grid import HealpixPixels, ImagePixels, healpix_grid, image_grid
-from .planes import IQU, KNOWN, Plane, Polarization
+from .grid import HealpixPixels, ImagePixels, image_grid
+from .planes import IQU, KNOWN, Plane, Polarization, Rows
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
     from ..instrument import Band
     from .scan_hits import ScanHits
-
-
-T = TypeVar("T")
-
-
-class _Row(Generic[T]):
-    """An attribute of a map that is the first row of a plane (of a polarized map: of I); None
-    without the plane.
-    """
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
-    def __get__(self, product: MapArrays | None, owner: type) -> T:
-        if product is None:
-            return self  # type: ignore[return-value]  # of the class, for documentation
-        plane = product.planes.get(self.name)
-        return None if plane is None else plane.values[0]  # type: ignore[return-value]
-
-    def __set__(self, product: MapArrays, values: T) -> None:
-        product.hold(self.name, values)
 
 
 @dataclass(init=False)
@@ -72,6 +51,9 @@ class MapArrays:
         How one-sided the scan directions in each pixel are: 0 where they cross evenly, 1 where all
         are along one line; NaN where no detector moved. None: not kept (`BinMap: {crosslinking:
         true}`).
+    directions
+        (2, ...) mean cosine and sine of twice the angle, from east to north, in which detectors
+        moved through each pixel; NaN where none did. None: not kept.
     header
         Keywords of the WCS (images), else None.
     centre
@@ -120,12 +102,13 @@ class MapArrays:
     band: Band | None = None
     beams: tuple[float, float] = (0.0, 0.0)
 
-    signal = _Row[Floats]()
-    hits = _Row[NDArray[np.int64]]()
-    weights = _Row[Floats]()
-    noise = _Row[Floats]()
-    half_difference = _Row["Floats | None"]()
-    crosslinking = _Row["Floats | None"]()
+    signal = Rows[Floats]("signal")
+    hits = Rows[NDArray[np.int64]]("hits")
+    weights = Rows[Floats]("weights")
+    noise = Rows[Floats]("noise")
+    half_difference = Rows["Floats | None"]("half_difference")
+    crosslinking = Rows["Floats | None"]("crosslinking")
+    directions = Rows["Floats | None"]("directions", slice(None))
 
     def __init__(
         self,
@@ -257,13 +240,6 @@ class MapArrays:
         return {which: self.stokes(which) for which in IQU}
 
     @property
-    def directions(self) -> Floats | None:
-        """(2, ...) mean cosine and sine of twice the angle, from east to north, in which detectors
-        moved through each pixel; NaN where none did. None: not kept.
-        """
-        return self.planes["directions"].values if "directions" in self.planes else None
-
-    @property
     def wcs(self) -> Any:
         """The `astropy.wcs.WCS` of an image."""
         from astropy.wcs import WCS
@@ -310,16 +286,9 @@ class MapArrays:
     def grid(self) -> ImagePixels | HealpixPixels:
         """Positions and sizes of the pixels on the sky."""
         if self.header is not None:
-            return image_grid(self.header, (self.signal.shape[0], self.signal.shape[1]), self.pixel)
+            return image_grid(self.header, self.signal.shape, self.pixel)
         assert self.pixels is not None  # of HEALPix
-        return healpix_grid(self.nside, self.nest, self.pixels, self.frame)
-
-    @property
-    def latitudes(self) -> Floats:
-        """(ny,) latitudes of the rows of a CAR map [rad]."""
-        return image_grid(
-            self.header, (self.signal.shape[0], self.signal.shape[1]), self.pixel
-        ).latitudes
+        return HealpixPixels(self.nside, self.nest, self.pixels, self.frame)
 
     @property
     def sides(self) -> tuple[float, float]:

@@ -63,7 +63,7 @@ def _proportions(wcs: WCS, shape: tuple[int, ...]) -> tuple[float, float, float]
     """Width and height of an image on the sky, in pixels' heights, and by how much it is stretched
     across: a strip is at least as wide or high as `TALL` and `STRIP` say.
     """
-    xx, _, yy = wcs_grid(wcs, (shape[0], shape[1])).middle
+    xx, _, yy = wcs_grid(wcs, shape).middle
     across = shape[1] * math.sqrt(xx / yy)
     ratio = across / shape[0]
     stretched = min(max(ratio, 1 / TALL), STRIP) / ratio
@@ -243,7 +243,7 @@ def plot_coverage(
 def plot_circle(ax: Any, shape: tuple[int, ...], place: Sequence[float], diameter: float) -> None:
     """Draw a dotted circle of ``diameter`` [rad] about a pixel (x, y) of a map (ny, nx)."""
     style = {"fill": False, "edgecolor": "black", "linestyle": ":", "linewidth": 1.2}
-    ax.add_patch(circle_on_sky(wcs_grid(ax.wcs, (shape[0], shape[1])), place, diameter, **style))
+    ax.add_patch(circle_on_sky(wcs_grid(ax.wcs, shape), place, diameter, **style))
 
 
 def plot_contours(ax: Any, snr: AnyFloats, levels: Sequence[float]) -> None:
@@ -360,7 +360,7 @@ def draw_beam(ax: Any, wcs: WCS, shape: tuple[int, ...], fwhm: float) -> None:
 
     A map that is hardly larger than the beam has the width alone.
     """
-    grid, (ny, nx) = wcs_grid(wcs, (shape[0], shape[1])), shape
+    grid, (ny, nx) = wcs_grid(wcs, shape), shape
     place, half = np.array([0.05 * nx, 0.05 * ny]), np.zeros(2)
     for _ in range(2):  # its own size says where it lies
         beam = circle_on_sky(grid, place + half, fwhm, facecolor="white", edgecolor="black")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,50 +129,56 @@ KNOWN = {
 """Planes of every map, of polarized ones, and of maps of two halves, without values."""
 
 
+T = TypeVar("T")
+
+
+class Rows(Generic[T]):
+    """An attribute that is one row, or some, of a plane of the object; None without the plane. Of a
+    map one may be set: arrays as `MapArrays.hold` takes them.
+    """
+
+    def __init__(self, plane: str, rows: Any = 0) -> None:
+        self._plane, self._rows = plane, rows
+
+    def __get__(self, owner: Any, kind: type) -> T:
+        if owner is None:
+            return self  # type: ignore[return-value]  # of the class, for documentation
+        plane = owner.planes.get(self._plane)
+        return None if plane is None else np.asarray(plane.values)[self._rows]  # type: ignore
+
+    def __set__(self, owner: Any, values: Any) -> None:
+        owner.hold(self._plane, values)
+
+
+@dataclass(frozen=True)
 class Polarization:
-    """Q and U beside the I of a map: rows of its ``planes``, as arrays of the shape of the map."""
+    """Q and U beside the I of a map: rows of its ``planes``, as arrays of the shape of the map.
 
-    def __init__(self, planes: Mapping[str, Plane]) -> None:
-        self._planes = planes
+    Attributes
+    ----------
+    q, u
+        COSMO, from the meridians of the map's frame, in the unit of the map; NaN where the angles
+        of the samples do not determine I, Q and U.
+    covariance
+        (6, ...) of (I, Q, U), `COVARIANCES`, unit^2. After smoothing, which takes I, Q and U one by
+        one, only the variances are known, and the others NaN.
+    weights
+        (2, ...) of Q and of U: 1 / (A^-1)_QQ and 1 / (A^-1)_UU; those of the map are of I.
+    condition
+        Condition number of the samples' angles in each pixel, largest over smallest eigenvalue: 2
+        at best, infinite where they do not determine I, Q and U; NaN where there are no samples.
+    hits
+        Samples in each pixel, also in those that are not solved.
+    half_difference
+        (2, ...) of Q and U, each with the variance of the map there; None: not made.
+    """
 
-    @property
-    def q(self) -> Floats:
-        """Q, COSMO, from the meridians of the map's frame, in the unit of the map; NaN where the
-        angles of the samples do not determine I, Q and U.
-        """
-        return np.asarray(self._planes["signal"].values[1])
+    planes: Mapping[str, Plane]
 
-    @property
-    def u(self) -> Floats:
-        """U, as Q."""
-        return np.asarray(self._planes["signal"].values[2])
-
-    @property
-    def covariance(self) -> Floats:
-        """(6, ...) of (I, Q, U), `COVARIANCES`, unit^2. After smoothing, which takes I, Q and U one
-        by one, only the variances are known, and the others NaN.
-        """
-        return np.asarray(self._planes["covariance"].values)
-
-    @property
-    def weights(self) -> Floats:
-        """(2, ...) of Q and of U: 1 / (A^-1)_QQ and 1 / (A^-1)_UU; those of the map are of I."""
-        return np.asarray(self._planes["weights"].values[1:])
-
-    @property
-    def condition(self) -> Floats:
-        """Condition number of the samples' angles in each pixel, largest over smallest eigenvalue:
-        2 at best, infinite where they do not determine I, Q and U; NaN where there are no samples.
-        """
-        return np.asarray(self._planes["condition"].values[0])
-
-    @property
-    def hits(self) -> NDArray[np.int64]:
-        """Samples in each pixel, also in those that are not solved."""
-        return np.asarray(self._planes["hits"].values[0])
-
-    @property
-    def half_difference(self) -> Floats | None:
-        """(2, ...) of Q and U, each with the variance of the map there; None: not made."""
-        plane = self._planes.get("half_difference")
-        return None if plane is None else np.asarray(plane.values[1:])
+    q = Rows[Floats]("signal", 1)
+    u = Rows[Floats]("signal", 2)
+    covariance = Rows[Floats]("covariance", slice(None))
+    weights = Rows[Floats]("weights", slice(1, None))
+    condition = Rows[Floats]("condition")
+    hits = Rows[NDArray[np.int64]]("hits")
+    half_difference = Rows["Floats | None"]("half_difference", slice(1, None))

@@ -177,12 +177,6 @@ def tangent_wcs(
     return wcs
 
 
-def tangent_coordinates(wcs: WCS, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Longitudes in [0, 360) and latitudes [deg] of 0-based pixels of a TAN image, in its frame."""
-    a, b, c = np.tensordot(np.linalg.inv(central(wcs)), np.stack([x, y, np.ones_like(x)]), 1)
-    return np.degrees(np.arctan2(b, a)) % 360.0, np.degrees(np.arctan2(c, np.hypot(a, b)))
-
-
 LOOKED_AT = 256, 37
 """Instants of a scan and detectors that `share_outside` takes, at most."""
 

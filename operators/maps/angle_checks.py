@@ -98,17 +98,15 @@ def _weights(frame: str, observation: Observation, rows: NDArray[np.intp], numbe
         np.intp
     )  # in step with no plate
     plate = None if observation.hwp_angle is None else observation.hwp_angle[at]
-    pole = frame_rotation(frame)[2]
     angles = PolarizationAngles.of(
-        replace(observation, hwp_angle=plate), observation.boresight_radec[at], pole
+        replace(observation, hwp_angle=plate),
+        observation.boresight_radec[at],
+        frame_rotation(frame)[2],
     )
-    x, y = np.moveaxis(angles.axes[rows] @ angles.poles, 1, 0)
-    turned = (x - 1j * y) ** 2
-    turned /= np.maximum(abs(turned), 1e-30)
-    if plate is not None:
-        turned *= (angles.gamma[rows] @ [1, 1j])[:, None] * (angles.plate[0] + 1j * angles.plate[1])
-    turned *= observation.focalplane.polarization_efficiency[rows, None]
-    terms = np.stack([np.ones(turned.size), turned.real.ravel(), turned.imag.ravel()])
+    both = np.empty((2, rows.size, number))
+    angles.fill(rows, 0, *both)
+    both *= observation.focalplane.polarization_efficiency[rows, None]
+    terms = np.stack([np.ones(rows.size * number), *both.reshape(2, -1)])
     return np.asarray(terms @ terms.T)
 
 

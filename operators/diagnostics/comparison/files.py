@@ -23,7 +23,7 @@ import numpy as np
 
 from zonda.core.errors import InputError
 from zonda.core.maps.beams import check_width
-from zonda.core.maps.grid import HealpixPixels, healpix_grid
+from zonda.core.maps.grid import HealpixPixels
 from zonda.core.maps.header import marked_bad, number, text, with_known_frame
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_file import ascii_text
@@ -419,7 +419,7 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
     if not seen.any():
         raise InputError(EMPTY, place=place, cure=NOT_EMPTY)
     order = np.flatnonzero(seen)[np.argsort(pixels[seen])]
-    where = healpix_grid(nside, table.nest, pixels[order], frame)
+    where = HealpixPixels(nside, table.nest, pixels[order], frame)
     stated: dict[str, tuple[float, str]] = {}
     for key in IQU if "Q" in columns else "I":
         cards = {"NOISEFAC": header.get(f"NOISFAC{key}"), "NOISEOF": header.get("NOISEOF")}
@@ -449,7 +449,7 @@ def plane_of(
         noise = None if alone is None else shape
     pixels = None
     if product.pixels is not None:
-        pixels = healpix_grid(product.nside, product.nest, product.pixels, product.frame)
+        pixels = HealpixPixels(product.nside, product.nest, product.pixels, product.frame)
     return Plane(
         name,
         np.where(product.known, product.signal, np.nan),

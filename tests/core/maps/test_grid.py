@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from zonda.core.errors import InputError
-from zonda.core.maps.grid import healpix_grid, image_grid, wcs_grid
+from zonda.core.maps.grid import HealpixPixels, image_grid, wcs_grid
 from zonda.core.maps.smoothing import smoothed, smoother
 from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
 from zonda.core.numerics.sphere import separation, unit_vectors
@@ -241,7 +241,7 @@ def test_healpix(nest):
     nside, fwhm = 256, math.radians(1.0)
     middle = (0.7, 1.0)
     pixels = np.sort(healpy.query_disc(nside, unit_vectors(*middle), math.radians(6.0), nest=nest))
-    grid = healpix_grid(nside, nest, pixels)
+    grid = HealpixPixels(nside, nest, pixels)
     assert grid.areas == pytest.approx(healpy.nside2pixarea(nside))
     assert (grid.pixels_at(grid.directions()) == np.arange(len(pixels))).all()
     at = int(grid.distance(middle).argmin())

@@ -103,13 +103,13 @@ def test_areas_are_those_of_the_sphere(bench: Any) -> None:
         {"signal": np.ones((7, 300))},
     ).map
     edges = np.append(
-        product.latitudes - product.pixel / 2, product.latitudes[-1] + product.pixel / 2
+        product.grid.latitudes - product.pixel / 2, product.grid.latitudes[-1] + product.pixel / 2
     )
     # the exact area between two latitudes; cancellation leaves 1e-16 / pixel
     assert product.areas().ravel() == pytest.approx(
         np.diff(np.sin(edges)) * product.pixel, rel=1e-10
     )
-    assert product.latitudes.mean() == pytest.approx(product.centre[1], abs=20 * ARCSEC)
+    assert product.grid.latitudes.mean() == pytest.approx(product.centre[1], abs=20 * ARCSEC)
     jansky = product.to("Jy/pixel").signal / product.to("MJy/sr").signal * 1e-6
     hit = product.hits > 0
     assert jansky[hit] == pytest.approx(np.broadcast_to(product.areas(), hit.shape)[hit], rel=1e-12)
