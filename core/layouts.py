@@ -56,7 +56,7 @@ def hexagonal_packing(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     nearest first.
     """
     x, y = _lattice(n)
-    order = np.lexsort((np.round(np.arctan2(y, x), 9), np.round(np.hypot(x, y), 9)))[:n]
+    order = _order(n, x, y, np.hypot(x, y))
     return x[order], y[order]
 
 
@@ -84,7 +84,7 @@ def hexagon(n: int) -> tuple[Floats, Floats]:
     shell = np.max(
         np.abs([x - y / math.sqrt(3), 2 * y / math.sqrt(3), x + y / math.sqrt(3)]), axis=0
     )
-    order = np.lexsort((np.round(np.arctan2(y, x), 9), np.round(shell, 9)))[:n]
+    order = _order(n, x, y, shell)
     return x[order], y[order]
 
 
@@ -114,9 +114,14 @@ def _compact(n: int) -> tuple[Floats, Floats]:
     found = []
     for a, b in ((0.0, 0.0), (0.5, 0.0), (0.5, math.sqrt(3) / 6)):
         away = np.hypot(x - a, y - b)
-        order = np.lexsort((np.round(np.arctan2(y - b, x - a), 9), np.round(away, 9)))[:n]
+        order = _order(n, x - a, y - b, away)
         found.append((float(away[order[-1]]), x[order], y[order]))
     return min(found, key=lambda one: round(one[0], 9))[1:]
+
+
+def _order(n: int, x: Floats, y: Floats, distance: Floats) -> NDArray[np.intp]:
+    """The ``n`` points of the least ``distance``, of equal ones those of the least angle first."""
+    return np.lexsort((np.round(np.arctan2(y, x), 9), np.round(distance, 9)))[:n]
 
 
 def _lattice(n: int) -> tuple[Floats, Floats]:

@@ -178,7 +178,16 @@ def tangent_wcs(
 
 
 LOOKED_AT = 256, 37
-"""Instants of a scan and detectors that `share_outside` takes, at most."""
+"""Instants of a scan and detectors that `some_directions` takes, at most."""
+
+
+def some_directions(quaternions: Floats, xi: Floats, eta: Floats) -> Floats:
+    """`directions` (n_det, n, 3) of some detectors at some instants of a scan."""
+    at, of = (
+        slice(None, None, -(-n // most))
+        for n, most in zip((len(quaternions), len(xi)), LOOKED_AT, strict=True)
+    )
+    return directions(quaternions[at], xi[of], eta[of])
 
 
 def share_outside(
@@ -193,11 +202,7 @@ def share_outside(
     ny, nx = shape
     beyond = looked = 0
     for quaternions, xi, eta in scans:
-        at, of = (
-            slice(None, None, -(-n // most))
-            for n, most in zip((len(quaternions), len(xi)), LOOKED_AT, strict=True)
-        )
-        x, y, depth = np.moveaxis(directions(quaternions[at], xi[of], eta[of]) @ matrix.T, -1, 0)
+        x, y, depth = np.moveaxis(some_directions(quaternions, xi, eta) @ matrix.T, -1, 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             inside = (
                 (depth > 0)

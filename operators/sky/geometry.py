@@ -4,7 +4,6 @@ user places them.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -227,19 +226,14 @@ class ImageHeader(MapHeader):
         """(2,) sides [deg] of the pixels of a map without celestial axes."""
         if self.wanted.pixel_size is not None:
             return np.asarray(np.degrees(np.full(2, self.wanted.pixel_size)))
-        sizes, cure = [], "check CDELT1 and CDELT2"
-        for k in (1, 2):
-            written = str(header.get(f"CUNIT{k}") or header.get("CUNIT1")).strip()
+        units = [str(header.get(f"CUNIT{k}") or header.get("CUNIT1")).strip() for k in (1, 2)]
+        for k, written in enumerate(units, 1):
             if written not in ANGLES:
                 raise self._no_angle(f"CUNIT{k}", written)
-            step = self.number(f"CDELT{k}")
-            if step is None:
-                step = math.hypot(*(self.number(f"CD{i}_{k}") or 0.0 for i in (1, 2)))
-            sizes.append(abs(step) * ANGLES[written].to("rad"))
-        if not all(np.isfinite(s) and s > 0 for s in sizes):
-            raise self.error("the pixel size is zero or not finite", cure)
-        self.check_sides(np.degrees(sizes), cure)
-        return np.asarray(np.degrees(sizes))
+        sides = np.linalg.norm(self._wcs(header)[1], axis=0)
+        sides = np.degrees(sides * [ANGLES[written].to("rad") for written in units])
+        self.check_sides(sides, "check CDELT1 and CDELT2")
+        return np.asarray(sides)
 
 
 def rescaled(wcs: Any, matrix: Floats) -> Any:

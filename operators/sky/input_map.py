@@ -16,7 +16,7 @@ from zonda.core.errors import InputError
 from zonda.core.maps.grid import ImagePixels, wcs_grid
 from zonda.core.maps.map_reading import Frame
 from zonda.core.numerics.chunks import chunks
-from zonda.core.numerics.projection import directions, frame_rotation, wcs_frame_rotation
+from zonda.core.numerics.projection import frame_rotation, some_directions, wcs_frame_rotation
 from zonda.core.numerics.sphere import angle_between, angles, local_axes
 from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.types import Floats
@@ -41,8 +41,6 @@ of CAR have none.)
 """
 ALIKE = 1.01
 """Ratio of sides up to which these count as the nominal ones."""
-LOOKED_AT = 256, 37
-"""Instants of a scan and detectors of which it is looked up where they are on a map, at most."""
 NORTH = np.array([0.0, 0.0, 1.0])
 
 Pixels = tuple[NDArray[Any], ...]
@@ -391,12 +389,7 @@ class ImageMap(InputMap):
         """
         least, most = super().sides_seen(observation)
         plane = observation.focalplane
-        instants, detectors = (
-            slice(None, None, -(-n // limit))
-            for n, limit in zip((observation.n_samples, len(plane)), LOOKED_AT, strict=True)
-        )
-        offsets = plane.xi[detectors], plane.eta[detectors]
-        d = directions(observation.sky_boresight[instants], *offsets).reshape(-1, 3)
+        d = some_directions(observation.sky_boresight, plane.xi, plane.eta).reshape(-1, 3)
         x, y, inside = self.at(d)
         if not inside.any():
             return least, most

@@ -178,16 +178,9 @@ class Catalogue:
         at_centre = (
             np.where(np.isnan(self.frequency), 1.0, band.centre / self.frequency) ** self.index
         )
-        factors = {
-            alpha: to_kelvin_rj("Jy/beam", band, None, alpha, 1.0)
-            for alpha in np.unique(self.index).tolist()
-        }
-        return np.asarray(
-            scale
-            * self.flux
-            * at_centre
-            * np.array([factors[alpha] for alpha in self.index.tolist()])
-        )
+        indices, which = np.unique(self.index, return_inverse=True)
+        factors = [to_kelvin_rj("Jy/beam", band, None, alpha, 1.0) for alpha in indices.tolist()]
+        return np.asarray(scale * self.flux * at_centre * np.array(factors)[which])
 
 
 @dataclass(frozen=True)
