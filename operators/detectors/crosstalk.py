@@ -123,24 +123,18 @@ def neighbours(plane: Focalplane, level: float) -> Shares:
     """
     from scipy.spatial import cKDTree
 
-    at, bands = np.stack([plane.xi, plane.eta], axis=1), np.asarray(plane.band)
-    pairs = []
+    at, bands = np.stack([plane.xi, plane.eta], axis=1).round(12), np.asarray(plane.band)
+    pairs = [np.zeros((0, 2), np.int64)]
     for band in np.unique(bands):
         of_band = np.flatnonzero(bands == band)
-        places, where = np.unique(at[of_band].round(12), axis=0, return_inverse=True)
+        places = np.unique(at[of_band], axis=0)
         if len(places) > 1:
-            tree = cKDTree(places)
-            reach = NEXT * float(np.min(tree.query(places, k=[2])[0]))
-            near = tree.sparse_distance_matrix(tree, reach, output_type="coo_matrix")
-            held = [of_band[where.ravel() == k] for k in range(len(places))]
-            pairs += [
-                (d, e)
-                for i, j in zip(near.row, near.col, strict=True)
-                if i != j
-                for d in held[i]
-                for e in held[j]
-            ]
-    found = np.array(pairs, np.int64).reshape(-1, 2)
+            nearest, _ = cKDTree(places).query(places, k=[2])
+            reach = NEXT * float(np.min(nearest))
+            near = of_band[cKDTree(at[of_band]).query_pairs(reach, output_type="ndarray")]
+            pairs += [near, near[:, ::-1]]
+    found = np.concatenate(pairs)
+    found = found[(at[found[:, 0]] != at[found[:, 1]]).any(axis=1)]
     return Shares.of(len(plane), found[:, 0], found[:, 1], np.full(len(found), level))
 
 
