@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -33,7 +33,6 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.planes import IQU
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.output import Output
 from zonda.core.pages import html_table
@@ -113,76 +112,48 @@ class TransferFunction(Output):
         """Compare the two maps. Raises PipelineError where there is none, or none that can be
         compared.
         """
-        after, before = (_map(data, name, self.map, self.label) for name in self.shown)
+        after, before = (self._map(data, signal) for signal in self.shown)
         window = window_of(before, self.radius, self.taper, self.least_coverage)
         edges = self._edges(before, window)
         data.tally.state(self.label, "window", f"{np.count_nonzero(window)} pixels")
         if self.modes == "full":
-            what = (
-                "of the complete data"
-                if self.shown[0]
-                else "of the complete data, which are the sky alone"
-            )
-            data.tally.state(self.label, "singular modes", what)
-        for plane in ("I",) if before.polarization is None else IQU:
-            self._add(data, plane, (before, after), (window, edges))
+            alone = "" if self.shown[0] else ", which are the sky alone"
+            data.tally.state(self.label, "singular modes", f"of the complete data{alone}")
+        both = zip(before.by_stokes().items(), after.by_stokes().values(), strict=True)
+        for (plane, a), b in both:
+            rings = compare(a.signal, b.signal, window, a.pixel, edges)
+            empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
+            what = "" if plane == "I" else f"{plane}: "
+            data.tally.count(self.label, f"{what}rings without modes or power: NaN", empty)
+            key = plane_key(key_of(self, "transfer_function"), plane)
+            of = plane_key(self.map, plane)
+            found = Transfer(rings, edges, self.modes, before.fwhm, self.label, of)
+            command = data.provenance.get("command")
+            publish(data, key, found, {"": found.columns()}, COMMAND=command, **found.meta)
 
-    def _add(
-        self,
-        data: Data,
-        plane: str,
-        maps: tuple[MapProduct, MapProduct],
-        where: tuple[Floats, Floats],
-    ) -> None:
-        """Make the product of one of I, Q and U. ``maps``: before and after the filters; ``where``:
-        window and edges of the rings.
-        """
-        (window, edges), (a, b) = (
-            where,
-            (m if m.polarization is None else m.stokes(plane) for m in maps),
-        )
-        rings = compare(a.signal, b.signal, window, a.pixel, edges)
-        empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
-        data.tally.count(
-            self.label,
-            f"{'' if plane == 'I' else f'{plane}: '}rings without modes or power: NaN",
-            empty,
-        )
-        key, of = (plane_key(name, plane) for name in (key_of(self, "transfer_function"), self.map))
-        found = Transfer(rings, edges, self.modes, maps[0].fwhm, self.label, of)
-        command = data.provenance.get("command")
-        publish(data, key, found, {"": found.columns()}, COMMAND=command, **found.meta)
+    def _map(self, data: Data, signal: str) -> MapProduct:
+        product: Any = data.products.get(product_name(stream_of(signal), self.map))
+        if self.map not in data.products:
+            cure = "set map to the product of the step that makes it, or that step's product to map"
+            raise PipelineError(f"there is no map {self.map!r}", place=self.label, cure=cure)
+        of_signal = isinstance(product, MapProduct) and product.contents != "hits"
+        if not of_signal or product.projection != "TAN":
+            raise PipelineError(NOT_TAN, place=self.label, cure=CURE)
+        return product  # type: ignore[no-any-return]
 
     def _edges(self, before: MapProduct, window: Floats) -> Floats:
         """(bins + 1,) wavenumbers between the rings, rad^-1."""
         if not window.any():
-            raise PipelineError(
-                "no pixel is left in the window", place=self.label, cure="choose a larger radius"
-            )
+            what, cure = "no pixel is left in the window", "choose a larger radius"
+            raise PipelineError(what, place=self.label, cure=cure)
         smallest = self.smallest or max(before.fwhm, 2 * before.pixel)
         largest = self.largest or 2 * before.pixel * math.sqrt(np.count_nonzero(window) / math.pi)
         if largest <= smallest:
-            scales = (
-                f"scales from {largest / ARCSEC:.3g} to {smallest / ARCSEC:.3g} arcsec are none"
-            )
-            raise PipelineError(
-                scales, place=self.label, cure="set largest and smallest, or map a larger field"
-            )
+            low, high = smallest / ARCSEC, largest / ARCSEC
+            what = f"scales from {high:.3g} to {low:.3g} arcsec are none"
+            cure = "set largest and smallest, or map a larger field"
+            raise PipelineError(what, place=self.label, cure=cure)
         return np.geomspace(1 / largest, 1 / smallest, self.bins + 1)
-
-
-def _map(data: Data, signal: str, name: str, place: str) -> MapProduct:
-    """The map ``name`` of a signal, which can be compared; else a PipelineError about ``place``."""
-    product = data.products.get(product_name(stream_of(signal), name))
-    any_map = product or data.products.get(name)
-    if isinstance(any_map, MapProduct) and (
-        any_map.projection != "TAN" or any_map.contents == "hits"
-    ):
-        raise PipelineError(NOT_TAN, place=place, cure=CURE)
-    if not isinstance(product, MapProduct):
-        cure = "set map to the product of the step that makes it, or that step's product to map"
-        raise PipelineError(f"there is no map {name!r}", place=place, cure=cure)
-    return product
 
 
 @dataclass(frozen=True)
@@ -247,17 +218,10 @@ def window_of(
     """
     from scipy.ndimage import binary_fill_holes, gaussian_filter
 
-    hits = gaussian_filter(
-        product.known_hits.astype(np.float64),
-        product.fwhm / FWHM_PER_SIGMA / product.pixel,
-        mode="constant",
-    )
-    seen = hits[product.known]
-    inside = (
-        hits >= max(least * float(np.percentile(seen, 99)), 1e-9)
-        if seen.size
-        else np.zeros(hits.shape, bool)
-    )
+    seen, sigma = product.known, product.fwhm / FWHM_PER_SIGMA / product.pixel
+    hits = gaussian_filter(product.known_hits.astype(np.float64), sigma, mode="constant")
+    usual = float(np.percentile(hits[seen], 99)) if seen.any() else np.inf
+    inside = hits >= max(least * usual, 1e-9)
     inside = binary_fill_holes(inside)
     if radius is not None:
         inside &= product.distance() <= radius
@@ -306,24 +270,15 @@ class Transfer:
 
     def columns(self) -> list[Column]:
         """The table, largest scale first."""
-        r = self.rings
+        r, share = self.rings, "Re sum b a* / sum |a|^2: share that the filters leave, in phase"
+        error = "standard error of transfer from the scatter of the ring's modes"
         return [
             Column("scale", self.scale / ARCSEC, "arcsec", "1 / mean wavenumber of the ring"),
             Column("scale_largest", 1 / self.edges[:-1] / ARCSEC, "arcsec", "edge of the ring"),
             Column("scale_smallest", 1 / self.edges[1:] / ARCSEC, "arcsec", "edge of the ring"),
             Column("kilolambda", self.kilolambda, "", "wavenumber, 1000 wavelengths"),
-            Column(
-                "transfer",
-                r.transfer,
-                "",
-                "Re sum b a* / sum |a|^2: share that the filters leave, in phase",
-            ),
-            Column(
-                "error",
-                r.error,
-                "",
-                "standard error of transfer from the scatter of the ring's modes",
-            ),
+            Column("transfer", r.transfer, "", share),
+            Column("error", r.error, "", error),
             Column("amplitude", r.amplitude, "", "sqrt(sum |b|^2 / sum |a|^2)"),
             Column("modes", r.modes, "", "independent modes"),
         ]

@@ -41,7 +41,7 @@ def _levels(_context: Any, _option: Any, text: str) -> tuple[float, ...]:
 
 
 def _of_both(_context: Any, option: Any, given: tuple[str, ...]) -> Any:
-    """What an option says of the reference and of the map, and whether it said it twice."""
+    """Values of an option for the reference and for the map; True where it is given twice."""
     if len(given) > 2:
         raise click.BadParameter("is given more than twice: there are two maps")
     read = tuple(map(_numbers if option.name == "planes" else str, given))

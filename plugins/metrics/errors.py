@@ -347,8 +347,8 @@ class Structure(_Binned):
         )
 
     def steps(self, operators: list[Operator]) -> list[Operator]:
-        """With a `TimeStreams` of the atmosphere, and of the noise, behind the step that forms the
-        signal.
+        """The steps with a `TimeStreams` of the atmosphere, and of the noise, behind the one that
+        forms the signal.
         """
         at = next(k for k, o in enumerate(operators) if "signal" in o.provides) + 1
         noisy = any("white" in o.provides for o in operators[:at])

@@ -206,7 +206,7 @@ class TransferAt(FigureMetric):
         return sky_alone(self.modes)
 
     def named_signals(self) -> tuple[str, ...]:
-        """None but those of `needs`."""
+        """No signals but those of `needs`."""
         return ()
 
     def look(self, kinds: Mapping[str, str]) -> None:
@@ -352,7 +352,7 @@ class PeakRatio(_OfSmoothMap):
         return sky_alone(self.modes)[: 2 if self.against == "unfiltered" else 1]
 
     def named_signals(self) -> tuple[str, ...]:
-        """None but those of `needs`."""
+        """No signals but those of `needs`."""
         return ()
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:

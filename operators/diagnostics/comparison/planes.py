@@ -143,8 +143,8 @@ class Plane:
         )
 
     def smoothed(self, fwhm: float) -> Plane:
-        """With a resolution of ``fwhm`` [rad], equations (1) and (2); as it is where its own is
-        unknown or equal.
+        """The map with a resolution of ``fwhm`` [rad], equations (1) and (2); as it is where its
+        own is unknown or equal.
         """
         if self.fwhm is None or self.fwhm >= fwhm * (1 - EQUAL_BEAMS):
             return self
@@ -160,8 +160,8 @@ class Plane:
         return replace(self, values=values, noise=noise, fwhm=fwhm, blurred=blurred, alone=alone)
 
     def measured(self) -> Plane:
-        """With the noise times what ``alone`` is of it (`noise_factor`); as it is where there is no
-        ``alone``.
+        """The map with the noise times what ``alone`` is of it (`noise_factor`); as it is where
+        there is no ``alone``.
         """
         if self.alone is None or self.noise is None:
             return self
@@ -435,7 +435,7 @@ def _is_the_grid(second: Plane, first: Plane) -> bool:
 
 
 def _how(grid: Plane, own: Plane) -> str:
-    """How a map comes to a grid, in words."""
+    """The way in which a map comes to a grid, in words."""
     if own.pixels is not None:
         same, how = _same_pixels(grid.pixels, own.pixels), "interpolated between four neighbours"
     else:

@@ -301,15 +301,15 @@ def _resolution(shown: MapProduct) -> str:
 
 
 def _named(title: str, key: str, shows: str = "") -> str:
-    """With the product's name; of ``map`` only what is behind it (band, Stokes parameter): ``f150
-    Q``. ``shows``: before it.
+    """The title with the product's name; of ``map`` only what is behind it (band, Stokes
+    parameter): ``f150 Q``. ``shows``: before it.
     """
     more = key.removeprefix(shows).lstrip("_").removeprefix("map").lstrip("_").replace("_", " ")
     return f"{title} ({more})" if more else title
 
 
 def _titled(title: str, shown: MapProduct) -> str:
-    """With the resolution, which the circle in the map's corner shows: beam and smoothing
+    """The title with the resolution, which the circle in the map's corner shows: beam and smoothing
     together.
     """
     if not shown.smoothed_by:
