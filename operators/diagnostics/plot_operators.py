@@ -10,14 +10,14 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from zonda.core.canvas import DPI, Sketch
+from zonda.core.canvas import DPI, Sketch, file_of
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_alone, noise_sources
 from zonda.core.output import Output, output_folder
-from zonda.core.storage.files import atomic_path, product_path
+from zonda.core.storage.files import product_path
 from zonda.core.types import AnyFloats, Floats
 
 from .comparison.files import plane_of
@@ -25,7 +25,6 @@ from .comparison.statistics import Comparison
 from .drawing.comparison_plots import draw_comparison
 from .drawing.pictures import (
     Picture,
-    Style,
     draw_coverage,
     draw_input,
     draw_map,
@@ -98,28 +97,32 @@ class Plots(Output):
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
-        made = []
-        for picture in pictures(data, self.style()):
-            for kind, content in picture.files.items():
-                with atomic_path(product_path(folder, picture.name, f".{kind}")) as temporary:
-                    temporary.write_bytes(content)
-            made.append(picture)
-        data.products["pictures"] = made
+        data.products["pictures"] = made = list(pictures(data, self))
+        for picture in made:
+            picture.write(folder)
 
-    def style(self) -> Style:
-        """Its parameters as the pictures need them."""
-        smooth: Any = {"beam": None, "none": 0.0}.get(str(self.smooth), self.smooth)
-        return Style(
-            smooth,
-            self.central_diameter,
-            self.least_coverage,
-            tuple(self.contours),
-            tuple(dict.fromkeys(self.formats)),
-            self.dpi,
-        )
+    def smoothing(self, product: MapProduct) -> float:
+        """Gaussian [rad] by which a map is smoothed for its picture; 0 for none."""
+        if product.projection == "HEALPix" or product.smoothed_by:
+            return 0.0
+        width: Any = {"beam": product.fwhm, "none": 0.0}.get(str(self.smooth), self.smooth)
+        return float(width)
+
+    def smoothed(self, product: MapProduct) -> MapProduct:
+        """The map as its picture shows it."""
+        fwhm = self.smoothing(product)
+        return product.smoothed(fwhm) if fwhm > 0 else product
+
+    def printed(self, sketch: Sketch) -> Picture:
+        """A sketch in all formats; PNG always, since reports show it."""
+        figure = sketch.ax.figure
+        png = file_of(figure, "png", self.dpi)
+        kinds = dict.fromkeys(map(str, self.formats))
+        files = {k: png if k == "png" else file_of(figure, k, self.dpi) for k in kinds}
+        return Picture(sketch.name, sketch.title, sketch.caption, png, files)
 
 
-def pictures(data: Data, style: Style) -> Iterator[Picture]:
+def pictures(data: Data, style: Plots) -> Iterator[Picture]:
     """Every picture that the products allow, in reading order; each is drawn when it is asked
     for.
     """
@@ -137,7 +140,7 @@ def _of_inputs(data: Data) -> Iterator[Sketch]:
                 yield from draw_input(_file(f"{name}_{plane}"), image.stokes(plane), signed=True)
 
 
-def _of_maps(data: Data, style: Style) -> Iterator[Sketch]:
+def _of_maps(data: Data, style: Plots) -> Iterator[Sketch]:
     """Pictures of maps, their coverage and their noise."""
     maps = maps_of(data.products)
     shown = {
@@ -165,7 +168,7 @@ def _of_maps(data: Data, style: Style) -> Iterator[Sketch]:
             yield from draw_noise(_file(f"noise_{name}"), sources, style)
 
 
-def _of_series(data: Data, style: Style) -> Iterator[Sketch]:
+def _of_series(data: Data, style: Plots) -> Iterator[Sketch]:
     """Pictures of the scans, and of products that are no maps."""
     if data.observations:
         yield from draw_scan(data.scans)
@@ -213,7 +216,7 @@ def _noise_of(maps: Mapping[str, MapProduct], name: str) -> tuple[Floats, str] |
 
 
 def _snr(
-    product: MapProduct, style: Style, maps: Mapping[str, MapProduct], name: str
+    product: MapProduct, style: Plots, maps: Mapping[str, MapProduct], name: str
 ) -> tuple[AnyFloats, str] | None:
     """SNR of a map as it is shown, on its own grid, and what its noise is, in words; None where it
     is not known.

@@ -6,7 +6,6 @@ import base64
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -72,8 +71,7 @@ class Report(Output):
         folder = output_folder(data, self.label)
         shown = data.products.get("pictures")
         if shown is None:
-            style = replace(Plots().style(), central_diameter=self.central_diameter)
-            shown = list(pictures(data, style))
+            shown = list(pictures(data, Plots(central_diameter=self.central_diameter)))
         data.products["report"] = write_text(
             folder / "report.html", page(data, shown, self.central_diameter)
         )

@@ -210,7 +210,6 @@ def _compare(
     formats: tuple[str, ...],
 ) -> None:
     """One comparison, printed and written to ``folder``."""
-    from zonda.core.storage.files import atomic_path
     from zonda.operators.diagnostics.comparison import statistics
     from zonda.operators.diagnostics.comparison.files import (
         Wanted,
@@ -220,7 +219,7 @@ def _compare(
     )
     from zonda.operators.diagnostics.comparison.planes import common_beam
     from zonda.operators.diagnostics.drawing.comparison_plots import draw_comparison
-    from zonda.operators.diagnostics.drawing.pictures import Style
+    from zonda.operators.diagnostics.plot_operators import Plots
     from zonda.operators.diagnostics.series import plane_key
 
     shared = not (planes[2] or systems[2])
@@ -250,13 +249,9 @@ def _compare(
         click.echo(f"Stokes {plane}\n{text}\n" if len(both) > 1 else text)
         name = plane_key("comparison", plane)
         written += write_comparison(found, folder / name, {})
+        plots = Plots(formats=list(formats))
         for sketch in draw_comparison(name, found, contours):
-            picture = Style(formats=formats).printed(sketch)
-            for kind, content in picture.files.items():
-                path = folder / f"{picture.name}.{kind}"
-                with atomic_path(path) as temporary:
-                    temporary.write_bytes(content)
-                written.append(path)
+            written += plots.printed(sketch).write(folder)
     notes = [f"{path}: {note}" for path, one in zip(paths, read, strict=True) for note in one.notes]
     if references.keys() != maps.keys() and not any("Q and U" in note for note in notes):
         notes.append(f"Q and U: not compared: {names['Q' in references]} has none")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.canvas import DPI, Sketch, file_of, unit_of
+from zonda.core.canvas import Sketch, unit_of
 from zonda.core.maps.central import central_diameter, in_beams
 from zonda.core.maps.map_plots import (
     SHOWN,
@@ -28,11 +29,14 @@ from zonda.core.maps.noise_figures import Noise
 from zonda.core.maps.on_plane import on_plane
 from zonda.core.maps.smoothing import smoother
 from zonda.core.numerics.angles import angle_text, sides_text
+from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.types import AnyFloats
 
 if TYPE_CHECKING:
     from zonda.core.maps.image import Image
     from zonda.core.maps.map_product import MapProduct
+
+    from ..plot_operators import Plots
 
 
 Window = tuple[slice, slice]
@@ -52,37 +56,13 @@ class Picture:
     png: bytes
     files: dict[str, bytes] = field(default_factory=dict)
 
-
-@dataclass(frozen=True)
-class Style:
-    """Parameters of `Plots`; angles in rad, ``smooth`` None: with the beam, 0: not;
-    ``central_diameter`` None: as the map.
-    """
-
-    smooth: float | None = None
-    central_diameter: float | None = None
-    least_coverage: float = 0.0
-    contours: tuple[float, ...] = ()
-    formats: tuple[str, ...] = ("png",)
-    dpi: float = DPI
-
-    def smoothing(self, product: MapProduct) -> float:
-        """Gaussian [rad] by which a map is smoothed for its picture; 0 for none."""
-        if product.projection == "HEALPix" or product.smoothed_by:
-            return 0.0
-        return product.fwhm if self.smooth is None else self.smooth
-
-    def smoothed(self, product: MapProduct) -> MapProduct:
-        """The map as its picture shows it."""
-        fwhm = self.smoothing(product)
-        return product.smoothed(fwhm) if fwhm > 0 else product
-
-    def printed(self, sketch: Sketch) -> Picture:
-        """A sketch in the formats of the style; PNG always, since reports show it."""
-        figure = sketch.ax.figure
-        png = file_of(figure, "png", self.dpi)
-        files = {k: png if k == "png" else file_of(figure, k, self.dpi) for k in self.formats}
-        return Picture(sketch.name, sketch.title, sketch.caption, png, files)
+    def write(self, folder: Path) -> list[Path]:
+        """Write its files; their paths. Raises `OutputError`."""
+        paths = [product_path(folder, self.name, f".{kind}") for kind in self.files]
+        for path, content in zip(paths, self.files.values(), strict=True):
+            with atomic_path(path) as temporary:
+                temporary.write_bytes(content)
+        return paths
 
 
 @dataclass(frozen=True)
@@ -170,7 +150,7 @@ def draw_map(
     signal: str,
     key: str,
     product: MapProduct,
-    style: Style,
+    style: Plots,
     snr: tuple[AnyFloats, str] | None = None,
 ) -> list[Sketch]:
     """Map of a signal, called ``key``; ``snr``: contours of it on the map's grid, and what its
@@ -204,7 +184,7 @@ def draw_map(
 
 
 def draw_noise(
-    file: str, sources: Mapping[Noise, tuple[MapProduct, str]], style: Style
+    file: str, sources: Mapping[Noise, tuple[MapProduct, str]], style: Plots
 ) -> list[Sketch]:
     """Maps of noise alone, with the plane that holds it: ``half_difference`` of the map, which
     comes first, and ``source_free``.

@@ -162,7 +162,7 @@ def test_a_run_and_its_files(tmp_path):
         emission.over_detectors("correlation")[0] > 0.999
     )  # linear in the PWV but for the change of elevation
     assert np.isnan(emission.over_detectors("rms_difference")[0])
-    assert {"stream_comparison", "emission"} <= {p.name for p in pictures(data, Plots().style())}
+    assert {"stream_comparison", "emission"} <= {p.name for p in pictures(data, Plots())}
     assert (tmp_path / "stream_comparison.png").exists()
     page = (tmp_path / "report.html").read_text()
     assert "Streams compared" in page

@@ -5,7 +5,6 @@ and that it says which.
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -157,7 +156,7 @@ def test_titles_headers_and_the_report_state_the_factor(tmp_path):
     half = noise_stated({"map": data["map"]}, "map")["I"]
     assert half[1] == "half the difference, even - odd scans"
     assert half[0] == pytest.approx(stated[0], rel=0.1)  # the noise of two scans, independent
-    style = Plots(contours=[-2, 2]).style()
+    style = Plots(contours=[-2, 2])
     sketch = next(s for s in _of_maps(data, style) if s.name == "map")
     assert sketch.ax.get_title().endswith("× white noise")
     assert f"as in {FREE}." in sketch.caption
@@ -205,7 +204,7 @@ def test_healpix_files_state_their_noise(tmp_path):
 
 def test_noise_of_p_is_that_of_q_and_u(tmp_path):
     data = run(None, polarization="pairs", stokes="IQU")
-    style = replace(Plots(contours=[-3, 3]).style(), smooth=0.0)
+    style = Plots(contours=[-3, 3], smooth="none")
     snr, words = _snr(data["map"].stokes("P"), style, maps_of(data.products), "map_P")
     assert f"as in {FREE}" in words
     assert np.nanmean(snr**2) == pytest.approx(2.0, rel=0.2)  # Rayleigh: Q and U of unit variance

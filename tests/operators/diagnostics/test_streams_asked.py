@@ -113,7 +113,7 @@ def test_spectra_keep_the_unit_of_the_stream():
     psd, streams = data.products["spectrum"].psd, data.products["time_streams"].streams
     ratio = float((streams["path_delay"] / streams["pwv"]).mean())
     assert psd["path_delay"] / psd["pwv"] == pytest.approx(ratio**2, rel=1e-3)
-    names = [p.name for p in pictures(data, Plots().style())]
+    names = [p.name for p in pictures(data, Plots())]
     assert {
         "power_spectra",
         "power_spectra_path_delay_pwv",

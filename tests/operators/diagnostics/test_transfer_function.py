@@ -173,7 +173,7 @@ def test_the_picture(transfer, data):
     )
     assert draw(wild, "transfer_function", "")[0].ax.get_ylim()[1] <= 2.2  # T can still be read
     data.products["transfer_function"] = transfer
-    made = {p.name: p for p in pictures(data, Plots().style())}
+    made = {p.name: p for p in pictures(data, Plots())}
     assert made["transfer_function"].png.startswith(b"\x89PNG")
     assert "sky alone" in made["transfer_function"].caption
 

@@ -13,12 +13,12 @@ from zonda.core.canvas import file_of
 from zonda.core.maps.map_product import MapProduct
 from zonda.operators.diagnostics.drawing.pictures import (
     Flat,
-    Style,
     draw_coverage,
     draw_input,
     draw_map,
     draw_noise,
 )
+from zonda.operators.diagnostics.plot_operators import Plots
 from zonda.operators.maps.grid import tangent_wcs
 
 ARCSEC = np.pi / 648000
@@ -49,7 +49,7 @@ def product():
     ],
 )
 def test_titles_say_of_which_band_and_stokes_parameter_a_picture_is(product, key, behind):
-    style = Style(0.0, 60 * ARCSEC, 0.0)
+    style = Plots(smooth="none", central_diameter="60 arcsec", least_coverage=0.0)
     noise = draw_noise(f"noise_{key}", {"half_difference": (product, "half_difference")}, style)
     coverage = draw_coverage(f"coverage_{key}", product)
     titles = [
@@ -84,7 +84,7 @@ def test_an_input_with_a_pole_in_it_is_drawn():
 
 
 def test_the_stated_noise_is_that_of_the_smoothed_map(product):
-    style = Style(None, 60 * ARCSEC, 0.0)
+    style = Plots(central_diameter="60 arcsec", least_coverage=0.0)
     [sketch] = draw_noise("noise_map", {"half_difference": (product, "half_difference")}, style)
     there = product.smoothed(9 * ARCSEC).rms(30 * ARCSEC, of="half_difference")
     assert f"{there * 1e6:.4g} µK_RJ" in sketch.caption
@@ -109,6 +109,6 @@ def test_a_healpix_map_is_not_smoothed():
         pixels=np.sort(pixels),
         fwhm=9 * ARCSEC,
     )
-    assert Style(None, None, 0.1).smoothed(product) is product
+    assert Plots().smoothed(product) is product
     flat = Flat.of(product, {"signal": signal}, 0.1)
     assert set(flat.planes["signal"][flat.covered]) == set(signal)

@@ -113,7 +113,7 @@ def test_resolution_of_png_files(tmp_path):
 def test_contours_are_of_the_smoothed_map():
     """White noise smoothed with a beam of 4.5 pixels has an SNR of unit rms (some 80 independent
     patches: 8 %), the source about 3 (4 pi sigma^2 / A)^(1/2) 20^2 / (20^2 + 9^2) = 17."""
-    style = Plots(contours=[4.0]).style()
+    style = Plots(contours=[4.0])
     found = product()
     snr, words = _snr(found, style, {"map": found}, "map")
     edge = np.ones((48, 48), bool)
