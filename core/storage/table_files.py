@@ -24,6 +24,8 @@ from .files import atomic_path, reading
 
 LARGEST = 1 << 28
 """Bytes of the text of a table that is read."""
+MOST_COLUMNS = 999
+"""Columns of a table, as of one in FITS."""
 MOST_TOLD = 12
 """Mistakes that are told one by one; the others are counted."""
 BRACKETED = re.compile(r"(.*?)\s*(?:\[(.*)\]|\((degs?|degrees?|°|rad|radians?|s|secs?|seconds?)\))")
@@ -234,6 +236,9 @@ def read_table(path: Path, place: str = "", text: str | None = None) -> Table:
         named = [(m[1], m[2] or m[3] or "") if m else (word, "") for word, m in found]
     names = [name for name, _ in named]
     table = Table(place, {}, [*numbers[1:], *(numbers[:1] or [1])], meta)
+    if len(names) > MOST_COLUMNS:
+        text = f"has {len(names)} columns, more than the {MOST_COLUMNS} that are read"
+        raise InputError(text, place=place, cure="leave out columns")
     for name in sorted({n for n in names if names.count(n) > 1}):
         table.note(-1, f"has two columns {name!r}", "rename one of them")
     for k, row in enumerate(rows[1:]):

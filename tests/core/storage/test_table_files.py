@@ -126,3 +126,10 @@ def test_other_files(tmp_path, content):
         read_table(path)
     with pytest.raises(InputError, match="no such file"):
         read_table(tmp_path / "none")
+
+
+def test_more_columns_than_are_read(tmp_path):
+    path = tmp_path / "wide.csv"
+    path.write_text(",".join(f"c{k}" for k in range(60_000)) + "\n" + ",".join("1" * 60_000))
+    with pytest.raises(InputError, match="has 60000 columns, more than the 999"):
+        read_table(path)
