@@ -155,7 +155,7 @@ def accuracy(
             f" {most_runs(setup, turned)} runs (--budget {budget}) after a first one that compiles"
         )
         found = study(file, setup, turned, pool, say=_say)
-        if found.interrupted and pool.stop is not None:
+        if found.interrupted:
             pool.stop()
 
     from . import fronts as stored

@@ -70,8 +70,7 @@ def run_in(pool: Pool, variant: Variant, *how: Any) -> TimedRun:
     try:
         return pool.executor.submit(timed_run, variant, *how).result()
     except BrokenExecutor:
-        assert pool.remake is not None
-        pool.executor = pool.remake()
+        pool.start()
         raise ZondaError(
             "the measuring process was killed",
             place=str(variant),

@@ -95,14 +95,12 @@ class Work(ABC, Generic[T, R]):
                     isinstance(f.exception(), BrokenExecutor) for f in ended if not f.cancelled()
                 ):
                     ended, _ = wait(at_work)
-                    if pool.remake is None:
+                    if not pool.start():
                         raise self._gone()
-                    pool.executor = pool.remake()
         except BaseException:
             for future in at_work:
                 future.cancel()
-            if pool.stop is not None:
-                pool.stop()
+            pool.stop()
             raise
 
     def _result(self, future: Future[tuple[R, list[Warned]]]) -> R | Lost:

@@ -18,8 +18,15 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from concurrent.futures import (
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+)
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -34,7 +41,7 @@ SCHEDULER_FILE_WAIT = 20.0
 
 @dataclass
 class Pool:
-    """An executor at work.
+    """An executor at work, whose workers were started by others.
 
     Attributes
     ----------
@@ -50,14 +57,6 @@ class Pool:
         process.
     asked
         Memory that the user asked for; None: nothing.
-    fixed
-        Whether the user asked for this number of workers.
-    resize
-        Go on with another number of workers; None: they were started by others.
-    remake
-        A new executor in place of a broken one; None where there is no such thing.
-    stop
-        End the workers at once; None where that is not ours to do.
     """
 
     executor: Executor | None
@@ -65,11 +64,61 @@ class Pool:
     ahead: int = 0
     threads: int | None = None
     memory: int | None = None
-    remake: Callable[[], Executor] | None = None
-    stop: Callable[[], None] | None = None
     asked: int | None = None
-    fixed: bool = False
-    resize: Callable[[int], None] | None = None
+
+    def start(self, workers: int | None = None) -> bool:
+        """Start other workers in place of these; False where that is not ours to do."""
+        return False
+
+    def stop(self) -> bool:
+        """End the workers at once; False where that is not ours to do."""
+        return False
+
+
+class ProcessPool(Pool):
+    """Worker processes of this one.
+
+    ``fixed``: the user asked for this number of workers.
+    """
+
+    def __init__(self, workers: int | None, threads: int | None, memory: int | None) -> None:
+        count = workers or available_threads()
+        share = (memory or available_memory() // 2) // count
+        super().__init__(None, count, 1, threads, share, memory)
+        self.fixed, self._asked_threads = workers is not None, threads
+        self.start()
+
+    def start(self, workers: int | None = None) -> bool:
+        """Start the workers, as many as before or another number of them."""
+        self.stop()
+        self.workers = workers or self.workers
+        self.threads = self._asked_threads or max(1, available_threads() // self.workers)
+        safe = os.environ.get(children.SAFE)
+        with children.safe_path():  # its queues start a process that counts them
+            self.executor = _Workers(
+                self.workers,
+                mp_context=get_context("spawn"),
+                initializer=begin_worker,
+                initargs=(safe,),
+            )
+        return True
+
+    def stop(self) -> bool:
+        """End the processes, at work or not."""
+        if self.executor is not None:
+            for process in list((getattr(self.executor, "_processes", None) or {}).values()):
+                process.terminate()
+            self.executor.shutdown(wait=True, cancel_futures=True)
+        return True
+
+
+class _Workers(ProcessPoolExecutor):
+    """Processes that never see Ctrl-C, not while they import either."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """See `Executor.submit`."""
+        with children.safe_path(), children.without_script(), _ctrl_c_held_back():
+            return super().submit(fn, *args, **kwargs)
 
 
 class SerialExecutor(Executor):
@@ -130,53 +179,14 @@ def engine(
 
 @contextlib.contextmanager
 def _processes(workers: int | None, threads: int | None, memory: int | None) -> Iterator[Pool]:
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
-
-    class Workers(ProcessPoolExecutor):
-        """Pool of processes that never see Ctrl-C, not while they import either."""
-
-        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-            """See `Executor.submit`."""
-            with children.safe_path(), children.without_script(), _ctrl_c_held_back():
-                return super().submit(fn, *args, **kwargs)
-
-    count = workers or available_threads()
-    share = (memory or available_memory() // 2) // count
-
-    def make() -> Executor:
-        stop()
-        safe = os.environ.get(children.SAFE)
-        with children.safe_path():  # its queues start a process that counts them
-            return Workers(
-                opened.workers,
-                mp_context=get_context("spawn"),
-                initializer=begin_worker,
-                initargs=(safe,),
-            )
-
-    def stop() -> None:
-        """End the processes, at work or not."""
-        if opened.executor is None:
-            return
-        for process in list((getattr(opened.executor, "_processes", None) or {}).values()):
-            process.terminate()
-        opened.executor.shutdown(wait=True, cancel_futures=True)
-
-    def resize(number: int) -> None:
-        opened.workers = number
-        opened.threads = threads or max(1, available_threads() // number)
-        opened.executor = make()
-
-    opened = Pool(None, count, 1, threads, share, make, stop, memory, workers is not None, resize)
-    resize(count)
+    pool = ProcessPool(workers, threads, memory)
     try:
-        yield opened
+        yield pool
     except BaseException:
-        stop()
+        pool.stop()
         raise
-    if opened.executor is not None:
-        opened.executor.shutdown()
+    if pool.executor is not None:
+        pool.executor.shutdown()
 
 
 @contextlib.contextmanager
@@ -486,7 +496,7 @@ def share_out(pool: Pool, need: int, place: str) -> None:
     """
     if not need:
         return
-    if pool.resize is None:
+    if not isinstance(pool, ProcessPool):
         _each(pool, need, place)
         return
     main, free = max(resident_memory() + GROWTH, MAIN), available_memory()
@@ -497,7 +507,7 @@ def share_out(pool: Pool, need: int, place: str) -> None:
             _refuse(pool, need, main, place)
         budget, fitting = pool.workers * need, pool.workers
     if fitting < pool.workers:
-        pool.resize(fitting)
+        pool.start(fitting)
     pool.memory = budget // pool.workers
 
 
@@ -514,7 +524,7 @@ def _each(pool: Pool, need: int, place: str) -> None:
         )
 
 
-def _refuse(pool: Pool, need: int, main: int, place: str) -> None:
+def _refuse(pool: ProcessPool, need: int, main: int, place: str) -> None:
     workers = pool.workers if pool.fixed else 1
     has = (
         f"the memory budget is {_megabytes(pool.asked)}"

@@ -271,7 +271,7 @@ class Tasks(Work[Task, Outcome]):
         except BaseException:
             with contextlib.suppress(Exception):
                 self.record.put_off()
-            if self.pool.stop is not None:
+            if self.pool.stop():
                 clean(self.folder)
             raise
         finally:
