@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import PluginError
 from .numerics.smooth import SmoothField
 from .observation import Observation
 from .signal import MAIN, Component, Entrance
@@ -154,3 +155,55 @@ class Block:
         if name in self.means:
             whole += self.means[name].evaluate(self.detectors, self.samples)
         return whole
+
+    def check(
+        self,
+        before: Mapping[str, AnyFloats],
+        provides: frozenset[str],
+        due: frozenset[str],
+        who: str,
+    ) -> None:
+        """Refuse what `Operator.exec` must not leave: a stream that is missing, or is no array of
+        the block's shape and type.
+
+        Parameters
+        ----------
+        before
+            The streams before; an array that is still there is not looked at.
+        provides, due
+            Streams that the step may take away, and those that it must have made.
+        who
+            The step, its class and where that comes from.
+
+        Raises
+        ------
+        PluginError
+            Names ``who``.
+        """
+        for name, stream in self.detdata.items():
+            if stream is before.get(name):
+                continue
+            if not isinstance(stream, np.ndarray):
+                found = f"a {type(stream).__name__}"
+            elif stream.shape != self.shape or stream.dtype != self.dtype:
+                found = f"an array {stream.shape} of {stream.dtype}"
+            elif not stream.flags.c_contiguous:
+                found = "an array that is not in C order"
+            else:
+                continue
+            wanted = f"an array {self.shape} of {np.dtype(self.dtype)} in C order"
+            raise PluginError(
+                f"exec left the stream {name!r} as {found}; it must be {wanted}",
+                place=who,
+                cure=f"fill it in place: block.new({name!r})[...] = values",
+            )
+        gone = (due - self.detdata.keys()) | (before.keys() - provides - self.detdata.keys())
+        if gone:
+            name = min(gone)
+            what = "it provides" if name in provides else "others read"
+            cure = f"make it with block.new({name!r}), or leave it out of provides"
+            raise PluginError(
+                f"exec left no stream {name!r}, which {what}",
+                place=who,
+                cure=cure if name in due else "leave it in block.detdata",
+            )

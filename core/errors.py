@@ -71,3 +71,7 @@ def placed(place: str) -> Iterator[None]:
     except ZondaError as err:
         err.place = err.place or place
         raise
+
+
+class PluginError(ZondaError):
+    """A fault in a plugin, not in the pipeline that uses it."""

@@ -17,14 +17,10 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from .discovery import HOST, plugin_of
-from .errors import ZondaError
+from .errors import PluginError, ZondaError
 
 if TYPE_CHECKING:
     from .operator import Operator
-
-
-class PluginError(ZondaError):
-    """A fault in a plugin, not in the pipeline that uses it."""
 
 
 def whose(operator: Operator) -> str:

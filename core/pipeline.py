@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from .assembly import arguments
+from .assembly.chain import Chain
 from .assembly.order import check_order
 from .assembly.signals import Signals, acting_steps, note_signals, remainder
 from .data import Data
@@ -22,10 +23,10 @@ from .observation import Observation
 from .operator import Operator, labels
 from .output import Output
 from .pages import html_table
-from .run.budget import Budget, least_memory
+from .run.budget import least_memory
 from .run.execute import execute
 from .run.settings import Settings, Timer
-from .run.views import Band, Chain, View
+from .run.views import Band, View
 from .scene import Scene, WithScene
 from .signal import Signal, stream_of
 from .storage.files import check_output_folder
@@ -169,7 +170,7 @@ class Pipeline:
             timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
         bands = self._bands(data)
         self._observe(data, bands, timer)
-        self._execute([band.keeping(keep) for band in bands], settings, timer, memory)
+        self._execute([band.keeping(keep) for band in bands], settings, timer)
         self._finish(data, bands, timer)
         return data
 
@@ -252,7 +253,7 @@ class Pipeline:
             )  # the tally counts these alone
             for band in bands:
                 band.data.observations = [band.data.observations[k] for k in part.scans]
-        self._execute(bands, settings, timer, memory, fresh=False)
+        self._execute(bands, replace(settings, fresh=False), timer)
         data.gather()
         data.provenance["timings"] = timer.rows()
         manager().hook.zonda_pipeline_end(pipeline=self, data=data)
@@ -326,22 +327,17 @@ class Pipeline:
                 done=done, total=total, what=what
             ),
             process=ceiling,
+            asked=memory is not None,
+            place=self.name,
         )
         data.threads = settings.threads
         return data, settings
 
-    def _execute(
-        self,
-        bands: Sequence[Band],
-        settings: Settings,
-        timer: Timer,
-        memory: int | None,
-        fresh: bool = True,
-    ) -> None:
+    def _execute(self, bands: Sequence[Band], settings: Settings, timer: Timer) -> None:
         """Run all observations with all bands."""
         for band in bands:
             self._make_ready(band)
-        execute(bands, settings, timer, Budget(memory, fresh, self.name))
+        execute(bands, settings, timer)
 
     def _make_ready(self, band: Band) -> None:
         """Note in the observations what is made of them, and let outputs see them."""

@@ -55,8 +55,8 @@ class Stream:
 
     @property
     def shape(self) -> tuple[int, int]:
-        n_det, n_samp = self.array.shape
-        return n_det, n_samp
+        """(n_det, n_samp)."""
+        return self.observation.n_detectors, self.observation.n_samples
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -94,10 +94,13 @@ SWEEP_DETECTORS, SWEEP_SAMPLES = 4 * TILE_DETECTORS, 32 * TILE_SAMPLES
 
 
 def in_order(
-    work: Callable[..., Any], items: Iterable[tuple[Any, ...]], threads: int
+    work: Callable[..., Any],
+    items: Iterable[tuple[Any, ...]],
+    threads: int,
+    stop: Callable[[], object] = lambda: None,
 ) -> Iterator[Any]:
     """Results of ``work(*item)``, in order, made on several threads that run ahead by at most two
-    items each.
+    items each. ``stop`` is called on an error, before the items that are worked on are waited for.
     """
     if threads == 1:
         yield from (work(*item) for item in items)
@@ -111,6 +114,9 @@ def in_order(
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()
+        except BaseException:
+            stop()
+            raise
         finally:
             for future in pending:
                 future.cancel()

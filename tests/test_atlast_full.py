@@ -77,11 +77,11 @@ def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     for operator in pipeline.operators:
         operator.observe(data)
     longest = [View(pipeline.chain, data.observations[0])]
-    left = divided(longest, Settings(threads=2, process=8 * 10**9), "test")
+    left = divided(longest, Settings(threads=2, process=8 * 10**9))
     found = schedule(longest, left)
     assert found.bytes < left.memory
     assert any("made again" in what for what in found.elsewhere)
     with pytest.raises(
         PipelineError, match=r"(?s)the run would hold .*BinMap .* GB.*budget is 1 GB.*larger pixel"
     ):
-        divided(longest, Settings(threads=2, process=10**9), "test")
+        divided(longest, Settings(threads=2, process=10**9))

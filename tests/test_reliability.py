@@ -201,6 +201,7 @@ def test_streams_that_do_not_fit_the_folder_for_temporary_files(
     """
     import errno
 
+    from zonda.core.run.settings import Settings
     from zonda.core.run.streams import Store
 
     def full(*_: object) -> None:
@@ -208,7 +209,7 @@ def test_streams_that_do_not_fit_the_folder_for_temporary_files(
 
     monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    store = Store(1000, np.float32, [])
+    store = Store(Settings(memory=1000))
     with pytest.raises(OutputError, match="No space left") as caught:
         store.allocate("signal", (217, 1000))
     assert str(tmp_path) in str(caught.value)
@@ -223,10 +224,11 @@ def test_streams_that_do_not_fit_the_folder_for_temporary_files(
 def test_spilled_streams_have_their_blocks_from_the_start(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    from zonda.core.run.settings import Settings
     from zonda.core.run.streams import Store
 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    store = Store(1000, np.float32, [])
+    store = Store(Settings(memory=1000))
     array = store.allocate("signal", (217, 1000))
     assert isinstance(array, np.memmap)
     assert array.shape == (217, 1000)
@@ -242,6 +244,7 @@ def test_a_part_of_a_spilled_stream_is_read_without_mapping_its_neighbours(
     """A system maps 64 kB around every page that is touched: short pieces of many rows would map
     the whole stream.
     """
+    from zonda.core.run.settings import Settings
     from zonda.core.run.streams import Store
     from zonda.core.stream import columns, forget_pages
 
@@ -249,7 +252,7 @@ def test_a_part_of_a_spilled_stream_is_read_without_mapping_its_neighbours(
         return int(Path("/proc/self/statm").read_text().split()[2]) * os.sysconf("SC_PAGE_SIZE")
 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    store = Store(1000, np.float32, [])
+    store = Store(Settings(memory=1000))
     array = store.allocate("signal", (1000, 16384))  # 66 MB
     array[:] = np.arange(16384, dtype=np.float32) + np.arange(1000, dtype=np.float32)[:, None]
     forget_pages(array)

@@ -14,6 +14,7 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
+from ..assembly.chain import Chain
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..data import Data, Observation
 from ..mapmaker import joins, made_by, makes_products
@@ -22,7 +23,7 @@ from ..output import Output
 from ..run.budget import BASE
 from ..run.schedule import does_the_same, schedule
 from ..run.settings import Settings
-from ..run.views import Chain, View
+from ..run.views import View
 from ..signal import Signal
 from ..types import Floats
 from .bounds import Context

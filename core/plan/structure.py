@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from ..assembly.chain import Chain
 from ..assembly.signals import Signals, acting_steps, remainder
 from ..configuration.diagnostics import nearest
 from ..configuration.loaded import PipelineFile
@@ -21,7 +22,6 @@ from ..mapmaker import MapMaker, filters, forms, made_by, makes_products
 from ..operator import Operator
 from ..output import Output, changes_observations, is_output
 from ..pipeline import Pipeline
-from ..run.views import Chain
 from ..signal import MAIN, TRANSMISSION, Component, is_stream, stream_of
 
 

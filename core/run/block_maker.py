@@ -11,14 +11,14 @@ from __future__ import annotations
 import copy
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..block import Block
 from ..errors import PipelineError
-from ..faults import PluginError, whose
+from ..faults import whose
 from ..kernels import kernel
 from ..mapmaker import MapMaker, filters, forms
 from ..numerics.chunks import TILE_SAMPLES
@@ -74,12 +74,6 @@ class BlockMaker:
         for step in reversed(chain.steps):
             self._due[step.label] = frozenset(n for n in step.provides & required if is_stream(n))
             required |= step.requires if step in acting else frozenset()
-        self._measures = {
-            o.label: (o.label, name)
-            for o in acting
-            if o.couples == "all"
-            for name in o.requires - {"boresight"}
-        }
         self._joining = {
             id(o) for o in acting if isinstance(o, MapMaker) and o.all_bands and knows_means(o)
         }
@@ -201,7 +195,7 @@ class BlockMaker:
                 self._act(
                     step,
                     block,
-                    measured.get(self._measures.get(label, ("", "")), states[label]),
+                    next((f for (who, _), f in measured.items() if who == label), states[label]),
                 )
             now = time.thread_time()
             self._timer.add(label, "exec", now - start)
@@ -253,7 +247,7 @@ class BlockMaker:
                     place=label,
                     cure='write block.detdata["signal"][...] = ..., and return nothing',
                 )
-            self._check_left(step, block, before)
+            block.check(before, step.provides, self._due[label], whose(step))
 
         fields = {}
         if names := self._declared.get(label, frozenset()) & block.detdata.keys():
@@ -262,52 +256,6 @@ class BlockMaker:
             exec_whole(block, step, fields, self._local.__dict__.setdefault("whole", {}), work)
         else:
             work(block)
-
-    def _check_left(self, step: Operator, block: Block, before: Mapping[str, AnyFloats]) -> None:
-        """Refuse what `Operator.exec` must not leave: a stream that is missing, or is no
-        array of the block's shape and type.
-
-        Parameters
-        ----------
-        before
-            The block's streams before; an array that is still there is not looked at.
-
-        Raises
-        ------
-        PluginError
-            Names the step, its class and where that comes from.
-        """
-        for name, stream in block.detdata.items():
-            if stream is before.get(name):
-                continue
-            if not isinstance(stream, np.ndarray):
-                found = f"a {type(stream).__name__}"
-            elif stream.shape != block.shape or stream.dtype != block.dtype:
-                found = f"an array {stream.shape} of {stream.dtype}"
-            elif not stream.flags.c_contiguous:
-                found = "an array that is not in C order"
-            else:
-                continue
-            wanted = f"an array {block.shape} of {np.dtype(block.dtype)} in C order"
-            raise PluginError(
-                f"exec left the stream {name!r} as {found}; it must be {wanted}",
-                place=whose(step),
-                cure=f"fill it in place: block.new({name!r})[...] = values",
-            )
-        due = self._due[step.label]
-        gone = (due - block.detdata.keys()) | (before.keys() - step.provides - block.detdata.keys())
-        if gone:
-            name = min(gone)
-            raise PluginError(
-                f"exec left no stream {name!r}, which"
-                f" {'it provides' if name in step.provides else 'others read'}",
-                place=whose(step),
-                cure=(
-                    f"make it with block.new({name!r}), or leave it out of provides"
-                    if name in due
-                    else "leave it in block.detdata"
-                ),
-            )
 
     # ---- what is in a block
 

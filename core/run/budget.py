@@ -7,16 +7,17 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+from ..assembly.chain import Chain
 from ..errors import PipelineError
 from ..machine import available_memory, resident_memory
 from ..mapmaker import joins, makes_products
 from ..plan.planning import planning_of
 from .prefetch import Ahead
 from .schedule import does_the_same, schedule, spares
-from .settings import Settings
-from .views import Band, Chain, View
+from .settings import Settings, megabytes
+from .views import Band, View
 
 BASE = 230_000_000
 """Bytes of the interpreter, libraries and compiled code."""
@@ -27,27 +28,8 @@ OTHERS = "maps of other bands"
 FEWER = "keep fewer streams, of fewer or shorter scans"
 
 
-@dataclass(frozen=True)
-class Budget:
-    """The memory that a run was given, to be divided.
-
-    Attributes
-    ----------
-    memory
-        Bytes for streams and blocks that were asked for; None: what the ceiling leaves.
-    fresh
-        False in a worker (`divided`).
-    place
-        The pipeline's name, for errors.
-    """
-
-    memory: int | None
-    fresh: bool
-    place: str
-
-
 def divide(
-    bands: Sequence[Band], settings: Settings, budget: Budget, ahead: Ahead
+    bands: Sequence[Band], settings: Settings, ahead: Ahead
 ) -> list[tuple[Sequence[Band], Settings]]:
     """Bands that are executed together, and the settings with their memory.
 
@@ -60,34 +42,35 @@ def divide(
     ahead
         Is turned off where there is no room for a scan that is prepared while another is executed.
     """
-    groups = _groups(bands, settings, budget, ahead)
+    groups = _groups(bands, settings, ahead)
+    least, threads = min(own.threads for _, own in groups), settings.threads
     for these, own in groups:
         for band in these:
-            threads, band.data.threads = band.data.threads, own.threads
-    if own.threads < threads and budget.fresh:
-        text = f"{own.threads} of {threads} threads work: more do not fit in the memory budget"
-        warnings.warn(f"{budget.place}: {text}", stacklevel=5)
+            band.data.threads = own.threads
+    if least < threads and settings.fresh:
+        text = f"{least} of {threads} threads work: more do not fit in the memory budget"
+        warnings.warn(f"{settings.place}: {text}", stacklevel=5)
     return groups
 
 
 def _groups(
-    bands: Sequence[Band], settings: Settings, budget: Budget, ahead: Ahead
+    bands: Sequence[Band], settings: Settings, ahead: Ahead
 ) -> list[tuple[Sequence[Band], Settings]]:
     """`divide`, without a word."""
     views = [band.longest for band in bands]
     every = [o for band in bands for o in band.data.observations]
     kept = 8 * len(bands[0].chain.keep) * sum(o.n_detectors * o.n_samples for o in every)
     if len(bands) > 1 and any(map(joins, bands[0].chain.steps)):
-        return [(bands, _shared(bands, settings, budget, ahead, kept))]
+        return [(bands, _shared(views, settings, ahead, kept))]
     held = [memory_of([view], products=True) for view in views]
     alone = [
-        _shared([band], settings, budget, ahead, kept, sum(held) - mine)
-        for band, mine in zip(bands, held, strict=True)
+        _shared([view], settings, ahead, kept, sum(held) - mine)
+        for view, mine in zip(views, held, strict=True)
     ]
     first = views[0].observation
     if len(bands) > 1 and all(view.observation.looks_as(first) for view in views):
         with suppress(PipelineError):  # not all of them fit at once
-            together = _shared(bands, settings, budget, ahead, kept)
+            together = _shared(views, settings, ahead, kept)
             single = [schedule([view], own) for view, own in zip(views, alone, strict=True)]
             if does_the_same(views, together, single):
                 return [(bands, together)]
@@ -95,37 +78,27 @@ def _groups(
 
 
 def _shared(
-    bands: Sequence[Band],
-    settings: Settings,
-    budget: Budget,
-    ahead: Ahead,
-    kept: int,
-    others: int = 0,
+    views: Sequence[View], settings: Settings, ahead: Ahead, kept: int, others: int = 0
 ) -> Settings:
     """Divide the memory of bands that are executed together; ``kept``, ``others``: as in
     `divided`.
     """
-    if budget.memory is not None and settings.process is None:
-        check_kept_memory(kept, available_memory(), budget.place)
+    if settings.asked and settings.process is None:
+        free = available_memory()
+        if kept > free:
+            text = f"the kept streams would take {_size(kept)}, {_size(free)} are free"
+            raise PipelineError(text, place=settings.place, cure=FEWER)
         return settings
-    most, views = settings.memory, [band.longest for band in bands]
-    settings = divided(views, settings, budget.place, budget.fresh, kept, others)
-    if budget.memory is not None:
-        settings = replace(settings, memory=min(settings.memory, most))
+    found = divided(views, settings, kept, others)
+    if settings.asked:
+        found = replace(found, memory=min(settings.memory, found.memory))
     if ahead.on:
-        less = with_scan_ahead(views, settings)
-        ahead.on, settings = less is not None, less or settings
-    return settings
+        less = with_scan_ahead(views, found)
+        ahead.on, found = less is not None, less or found
+    return found
 
 
-def divided(
-    views: Sequence[View],
-    settings: Settings,
-    place: str,
-    fresh: bool = True,
-    kept: int = 0,
-    others: int = 0,
-) -> Settings:
+def divided(views: Sequence[View], settings: Settings, kept: int = 0, others: int = 0) -> Settings:
     """Divide the memory of a process: the settings with that of streams and blocks, and with fewer
     threads where the blocks of all do not fit.
 
@@ -138,11 +111,6 @@ def divided(
     settings
         ``process``: bytes that the process may hold; None: what it holds and half of the free
         memory.
-    place
-        The pipeline's name, for errors.
-    fresh
-        False in a worker, which still holds what tasks before this one have left: that is no part
-        of the forecast.
     kept, others
         Bytes of streams that the user keeps, and of the products of other bands.
 
@@ -153,7 +121,7 @@ def divided(
         needs it, and what would make it fit.
     """
     budget = settings.process or resident_memory() + available_memory() // 2
-    parts = {"zonda and its libraries": max(resident_memory(), BASE) if fresh else BASE}
+    parts = {"zonda and its libraries": max(resident_memory(), BASE) if settings.fresh else BASE}
     parts |= {KEPT: kept, OTHERS: others}
     for view in views:
         for o in view.chain.steps:
@@ -166,7 +134,7 @@ def divided(
         left = replace(left, threads=max(1, threads))
         found = schedule(views, left)
     if fixed + found.least > budget:
-        _refuse(views[0].chain, parts, found.least, budget, left.threads, place)
+        _refuse(views[0].chain, parts, found.least, budget, left)
     return replace(left, process=budget)
 
 
@@ -192,18 +160,6 @@ def with_scan_ahead(views: Sequence[View], settings: Settings) -> Settings | Non
     return replace(settings, memory=settings.memory - size)
 
 
-def check_kept_memory(size: int, free: int, place: str) -> None:
-    """Refuse to keep streams of ``size`` bytes where less memory is ``free``. Raises
-    PipelineError.
-    """
-    if size > free:
-        raise PipelineError(
-            f"the kept streams would take {_size(size)}, {_size(free)} are free",
-            place=place,
-            cure=FEWER,
-        )
-
-
 def least_memory(views: Sequence[View], settings: Settings) -> int:
     """Bytes with which a process runs a scan with these bands on one thread, libraries included."""
     one, products = replace(settings, threads=1), memory_of(views, products=True)
@@ -212,24 +168,20 @@ def least_memory(views: Sequence[View], settings: Settings) -> int:
         memory_of(group) + products - memory_of(group, products=True) + schedule(group, one).least
         for group in ([views] if joined else [[view] for view in views])
     )
-    return _with_margin(BASE + need)
-
-
-def _with_margin(size: int) -> int:
-    """A size that is to be asked for: what the libraries take differs a little from run to run."""
-    return -(-size * 21 // 20_000_000) * 1_000_000
+    return megabytes(BASE + need) * 1_000_000
 
 
 def _refuse(
-    chain: Chain, parts: Mapping[str, int], blocks: int, budget: int, threads: int, place: str
+    chain: Chain, parts: Mapping[str, int], blocks: int, budget: int, settings: Settings
 ) -> None:
+    threads = settings.threads
     need, free = sum(parts.values()) + blocks, available_memory() + resident_memory()
     rows = sorted(
         [*parts.items(), (f"blocks on {threads} thread{'s' if threads > 1 else ''}", blocks)],
         key=lambda row: -row[1],
     )
     largest = ", ".join(f"{who} {_size(size)}" for who, size in rows[:4] if size > 0.01 * need)
-    cures = [f"use --memory {_with_margin(need) // 1_000_000}MB"] if need * 1.05 <= free else []
+    cures = [f"use --memory {megabytes(need)}MB"] if need * 1.05 <= free else []
     smaller = {KEPT: FEWER} | {o.label: planning_of(o).smaller for o in chain.steps}
     own = need - parts["zonda and its libraries"]  # the process may hold more of other work
     cures += [
@@ -241,7 +193,7 @@ def _refuse(
     raise PipelineError(
         f"the run would hold {_size(need)}{beyond}: {largest}; its memory budget is"
         f" {_size(budget)}",
-        place=place,
+        place=settings.place,
         cure="; or ".join(cures or ["use a machine with more memory"]),
     )
 

@@ -7,14 +7,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..hooks import manager
-from .budget import Budget, divide
+from .budget import divide
 from .execution import Execution
 from .prefetch import Ahead
 from .settings import Settings, Timer
 from .views import Band, View
 
 
-def execute(bands: Sequence[Band], settings: Settings, timer: Timer, budget: Budget) -> None:
+def execute(bands: Sequence[Band], settings: Settings, timer: Timer) -> None:
     """Run all scans in order; the next one is prepared while one is executed."""
     hooks = manager().hook.zonda_before_operator, manager().hook.zonda_after_operator
     heard = any(
@@ -22,7 +22,7 @@ def execute(bands: Sequence[Band], settings: Settings, timer: Timer, budget: Bud
     )  # who listens hears of one observation after the other
     several = sum(len(band.data.observations) for band in bands) > 1
     ahead = Ahead(settings.threads > 1 and several and not heard)
-    groups = divide(bands, settings, budget, ahead)
+    groups = divide(bands, settings, ahead)
     turns = [
         (these, Execution([View(b.chain, b.data.observations[k], b.data) for b in these], own,
                           timer, *hooks))

@@ -22,7 +22,7 @@ import copy
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -35,7 +35,6 @@ from ..errors import PipelineError
 from ..focalplane import Focalplane
 from ..machine import resident_memory
 from ..mapmaker import filters, joins
-from ..numerics.chunks import TILE_DETECTORS, empty
 from ..numerics.smooth import SmoothField
 from ..observation import Observation
 from ..operator import Operator
@@ -43,6 +42,7 @@ from ..signal import MAIN, Formed, is_signal
 from ..stream import Stream, forget_pages, in_order
 from ..tally import Tally
 from ..types import AnyFloats
+from ..whole_stream import whole
 from .block_maker import BlockMaker, Due
 from .budget import memory_of
 from .means import MeansOfBands, WholeStream, knows_means, means_of
@@ -84,7 +84,7 @@ class Execution:
         self._makers: list[BlockMaker] = []
         self._ahead = Ahead(False)
         self._stop = threading.Event()
-        self._store = Store(settings.memory, settings.dtype, settings.spare)
+        self._store = Store(settings)
         self._source, self._begun = Source(), list[tuple[Operator, Observation]]()
         self._first = views[0].observation
         row = 0
@@ -172,7 +172,7 @@ class Execution:
     def _begin(self) -> None:
         """Make the schedule, with the memory that there is now: what operators hold is known."""
         self.settings = settings = self._within_process()
-        self._store = Store(settings.memory, settings.dtype, settings.spare)
+        self._store = Store(settings)
         self.schedule = schedule(self.views, settings)
         stopped = self._stop.is_set
         self._makers = [BlockMaker(view, self.schedule, self.timer, stopped) for view in self.views]
@@ -260,15 +260,11 @@ class Execution:
 
         working = (o for o in segment.operators if type(o).exec is not Operator.exec)
         labels = ", ".join(o.label for o in working)
-        blocks = {view.number: self.schedule.blocks(segment, view) for view in self.views}
-        if self.schedule.at_once > 1:
-            whole = bool(segment.split()[1])
-            scan = name_of_all(self._first)
-            self._sweep(partial(self._on_all, work, whole), blocks[0], f"{scan}: {labels}")
-        else:
-            for view in self.views:
-                what = f"{view.observation.name}: {labels}"
-                self._sweep(partial(work, view, due=None), blocks[view.number], what)
+        together = self.schedule.at_once > 1
+        for views in [self.views] if together else [[view] for view in self.views]:
+            scan = name_of_all(self._first) if together else views[0].observation.name
+            sweep = partial(self._on_block, views, work, bool(segment.split()[1]))
+            self._sweep(sweep, self.schedule.blocks(segment, views[0]), f"{scan}: {labels}")
         segment.has_been_swept(self.views)
         for maker in self._makers:
             maker.release()
@@ -278,16 +274,24 @@ class Execution:
         self._store.release(gone)
         return Source(kept, None, frozenset(kept), means)
 
-    def _on_all(
-        self, work: Callable[..., None], whole: bool, detectors: slice, samples: slice
+    def _on_block(
+        self,
+        views: Sequence[View],
+        work: Callable[..., None],
+        whole: bool,
+        detectors: slice,
+        samples: slice,
     ) -> None:
-        """Work on a block of every band, piece by piece unless a step needs it ``whole``; then let
-        the steps that map all bands act once.
+        """Work on a block of a band; or on one of several, piece by piece unless a step needs the
+        ``whole``, and let the steps that map all bands act once.
         """
+        if len(views) == 1:
+            work(views[0], detectors, samples, None)
+            return
         for part in [(detectors, samples)] if whole else pieces(detectors, samples):
-            every: list[list[Due]] = [[] for _ in self.views]
-            for view, due in zip(self.views, every, strict=True):
-                work(view, *part, due=due)
+            every: list[list[Due]] = [[] for _ in views]
+            for view, due in zip(views, every, strict=True):
+                work(view, *part, due)
             for together in zip(*every, strict=True):
                 step, start = together[0].step, time.thread_time()
                 step.exec_bands([due.block for due in together], [due.state for due in together])
@@ -297,23 +301,19 @@ class Execution:
         self, work: Callable[[slice, slice], None], blocks: list[tuple[slice, slice]], what: str
     ) -> None:
         """Work on every block, on several threads; the first error stops all of them."""
-        settings, total = self.settings, len(blocks)
-        if settings.threads == 1 or total == 1:
-            for done, block in enumerate(blocks, 1):
-                work(*block)
-                settings.progress(done, total, what)
-            return
-        with ThreadPoolExecutor(settings.threads) as pool:
-            futures = [pool.submit(work, *block) for block in blocks]
+        settings, stop, failed = self.settings, self._stop.set, list[BaseException]()
+
+        def one(detectors: slice, samples: slice) -> None:
             try:
-                for done, future in enumerate(as_completed(futures), 1):
-                    future.result()
-                    settings.progress(done, total, what)
-            except BaseException:
-                self._stop.set()
-                for future in futures:
-                    future.cancel()
-                raise
+                work(detectors, samples)
+            except BaseException as error:  # also one that a generator would turn (StopIteration)
+                failed.append(error)
+                stop()
+
+        for done, _ in enumerate(in_order(one, blocks, settings.threads, stop), 1):
+            if failed:
+                raise failed[0]
+            settings.progress(done, len(blocks), what)
 
     def _keep(self) -> None:
         """Keep the streams that the user asked for, whole, in float64."""
@@ -324,16 +324,10 @@ class Execution:
                     cure="keep a stream that a step provides",
                 )
             for view in self.views:
-                array = self._source.arrays[name][view.rows]
-                mean = self._source.means[view.number].get(name)
-                whole = empty(view.shape, np.float64)
-                for first in range(0, len(whole), TILE_DETECTORS):  # no array of its size besides
-                    rows = slice(first, min(first + TILE_DETECTORS, len(whole)))
-                    whole[rows] = array[rows]
-                    if mean is not None:
-                        whole[rows] += mean.evaluate(rows, slice(0, whole.shape[1]))
-                    forget_pages(array)
-                view.observation.detdata[name] = whole
+                array, means = self._source.arrays[name][view.rows], self._source.means[view.number]
+                stream = Stream(name, view.observation, array, means, 1)
+                view.observation.detdata[name] = whole(stream)
+                forget_pages(array)
 
     # ---- steps that measure whole streams
 
@@ -390,8 +384,8 @@ class Execution:
             observation = all_detectors([view.observation for view in views])
             means = {}
             if any(mean is not None for mean in every):
-                whole: Any = MeansOfBands(list(zip(every, _rows_of(views), strict=True)))
-                means[name] = whole
+                joined: Any = MeansOfBands(list(zip(every, _rows_of(views), strict=True)))
+                means[name] = joined
         elif held != name:  # what is found out of it is not the scene's
             observation = copy.copy(observation)
             observation.tally = Tally()

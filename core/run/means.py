@@ -166,12 +166,7 @@ class WholeStream(Stream):
     def __init__(
         self, stream: Stream, field: SmoothField, allocate: Callable[[tuple[int, int]], AnyFloats]
     ) -> None:
-        self.name, self.observation, self.threads, self.room = (
-            stream.name,
-            stream.observation,
-            stream.threads,
-            stream.room,
-        )
+        vars(self).update((name, v) for name, v in vars(stream).items() if name != "array")
         self.means = {name: other for name, other in stream.means.items() if name != stream.name}
         self._stream, self._field, self._allocate = stream, field, allocate
 
@@ -184,11 +179,6 @@ class WholeStream(Stream):
         for detectors, samples, part in self.sweep(lambda detectors, samples, part: part):
             whole[detectors, samples] = part
         return whole
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(n_det, n_samp)."""
-        return self._stream.shape
 
     @property
     def dtype(self) -> np.dtype[Any]:

@@ -9,20 +9,8 @@ from __future__ import annotations
 
 import threading
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Protocol
-
-
-class Preparable(Protocol):
-    """An execution, which can be prepared."""
-
-    beforehand: Future[None] | None
-
-    def prepare(self) -> None:
-        """Configure and prepare all steps."""
-
-    def abandon(self) -> None:
-        """Discard what was begun."""
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 
 class Ahead:
@@ -38,9 +26,9 @@ class Ahead:
         self.on = on
         self._pool: ThreadPoolExecutor | None = None
         self._clock: int | None = None
-        self._begun: list[Preparable] = []
+        self._begun: list[Any] = []
 
-    def start(self, execution: Preparable | None) -> None:
+    def start(self, execution: Any) -> None:
         """Begin with the preparation of an observation, whose execution will wait for it."""
         if execution is None or not self.on:
             return

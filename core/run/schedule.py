@@ -22,7 +22,7 @@ from ..plan.planning import planning_of
 from ..signal import Formed
 from .means import knows_means, may_have_means, names_of
 from .segments import PIECE, Segment, Source, block_share, blocks, cut, least_block
-from .settings import Held, Settings
+from .settings import Held, Settings, megabytes
 from .streams import free_disk
 from .views import View
 
@@ -282,7 +282,7 @@ class Schedule:
         """``--memory`` with which streams and blocks may take ``need`` bytes."""
         settings = self.settings
         fixed = max(settings.process - settings.memory, 0) if settings.process else 0
-        return f"{-(-(need + fixed) * 21 // 20_000_000)}MB"
+        return f"{megabytes(need + fixed)}MB"
 
 
 def schedule(views: Sequence[View], settings: Settings) -> Schedule:

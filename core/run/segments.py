@@ -117,19 +117,17 @@ def cut(views: Sequence[View]) -> list[Segment]:
         each = [(o, view.observation) for o, view in zip(steps, views, strict=True)]
         couples, halo = operator.couples, max(o.halo(seen) for o, seen in each)
         in_order = any(planning_of(o).in_time_order(seen) for o, seen in each)
-        if (in_order and last.span == "time") or (last.in_time_order and couples == "time"):
-            segments.append(Segment([operator], couples))
-        elif couples == "all":
-            segments.append(Segment([operator]))
-        elif halo > 0 and last.span != "time":  # whole scans need none: read it with margins
-            segments.append(Segment([operator], halo=halo))
-        elif couples in ("sample", last.span):
+        apart = (in_order and last.span == "time") or (last.in_time_order and couples == "time")
+        apart |= couples == "all"
+        margins = 0 if apart or last.span == "time" else halo  # whole scans need none
+        if not apart and not margins and couples in ("sample", last.span):
             last.operators.append(operator)
-        elif last.span == "sample" and not last.halo:
+        elif not apart and not margins and last.span == "sample" and not last.halo:
             last.operators.append(operator)
             last.span = couples
         else:
-            segments.append(Segment([operator], couples))
+            span = "sample" if couples == "all" or margins else couples
+            segments.append(Segment([operator], span, margins))
         segments[-1].in_time_order |= in_order
     return [s for s in segments if s.operators]
 

@@ -36,6 +36,13 @@ class Settings:
         Progress callback.
     spare
         Memory to use again.
+    asked
+        The user asked for so much ``memory``.
+    fresh
+        False in a worker, which still holds what tasks before this one have left: that is no part
+        of the forecast.
+    place
+        The pipeline's name, for errors.
     """
 
     threads: int = 1
@@ -44,6 +51,14 @@ class Settings:
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
     spare: list[AnyFloats] = field(default_factory=list)
     process: int | None = None
+    asked: bool = False
+    fresh: bool = True
+    place: str = ""
+
+
+def megabytes(size: int) -> int:
+    """MB to ask for with ``--memory``: what the libraries take differs a little from run to run."""
+    return -(-size * 21 // 20_000_000)
 
 
 @dataclass

@@ -26,6 +26,7 @@ from ..errors import OutputError, PipelineError
 from ..numerics.chunks import empty
 from ..numerics.smooth import SmoothField
 from ..types import AnyFloats
+from .settings import Settings
 
 DISK_SHARE = 0.9
 """Of the free disk that streams may take."""
@@ -60,11 +61,6 @@ class StreamMadeAgain(Stream):
         )
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """(n_det, n_samp)."""
-        return self.observation.n_detectors, self.observation.n_samples
-
-    @property
     def dtype(self) -> np.dtype[Any]:
         """Type of its values."""
         return self._dtype
@@ -81,8 +77,9 @@ class Store:
     removed at the end.
     """
 
-    def __init__(self, memory: int, dtype: type[np.floating[Any]], spare: list[AnyFloats]) -> None:
-        self._room, self._dtype, self._spare = memory // 2, np.dtype(dtype), spare
+    def __init__(self, settings: Settings) -> None:
+        self._room, self._spare = settings.memory // 2, settings.spare
+        self._dtype: np.dtype[Any] = np.dtype(settings.dtype)
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._live: dict[int, AnyFloats] = {}
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from zonda.core import cli, registry
-from zonda.core.errors import ZondaError
-from zonda.core.faults import PluginError, fault, faults_named
+from zonda.core.errors import PluginError, ZondaError
+from zonda.core.faults import fault, faults_named
 
 Plugin = Callable[..., Path]
 

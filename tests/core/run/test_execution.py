@@ -8,6 +8,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from zonda.core.assembly.chain import Chain
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.instrument import Band, Instrument, Telescope
@@ -22,7 +23,7 @@ from zonda.core.run.schedule import Schedule
 from zonda.core.run.segments import PIECE, cut
 from zonda.core.run.settings import Settings, Timer
 from zonda.core.run.streams import Store
-from zonda.core.run.views import Chain, View
+from zonda.core.run.views import View
 
 
 def observation(n_det=101, n_samp=9 * TILE_SAMPLES + 123):

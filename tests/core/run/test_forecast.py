@@ -21,6 +21,7 @@ from tests.core.run.test_execution import (
     observation,
     peak_of_streams_and_blocks,
 )
+from zonda.core.assembly.chain import Chain
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
@@ -28,7 +29,7 @@ from zonda.core.registry import planning
 from zonda.core.run.budget import BASE, divided, least_memory, with_scan_ahead
 from zonda.core.run.schedule import schedule
 from zonda.core.run.settings import Settings
-from zonda.core.run.views import Chain, View
+from zonda.core.run.views import View
 
 
 def views(obs, steps):
@@ -124,12 +125,12 @@ def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
             r"(?s)3\.23 GB: Heavy\.1 3 GB.*budget is 2 GB.*use --memory 33..MB.*Heavy.1: choose a l"
         ),
     ):
-        divided(views(obs, chain), settings, "test")
+        divided(views(obs, chain), settings)
     libraries(monkeypatch, 10**9)
     with pytest.raises(PipelineError, match=r"more than this machine has \(1\.23 GB\)") as refused:
-        divided(views(obs, chain), settings, "test")
+        divided(views(obs, chain), settings)
     assert "--memory" not in refused.value.cure
-    found = divided(views(obs, chain), replace(settings, process=4 * 10**9), "test")
+    found = divided(views(obs, chain), replace(settings, process=4 * 10**9))
     assert found.process == 4 * 10**9
     assert found.memory == 10**9 - BASE
 
@@ -142,9 +143,7 @@ def test_blocks_that_are_too_large_are_worked_on_by_fewer_threads(monkeypatch):
     chain = [Source(), Demean(), Sink()]
     assert (
         divided(
-            views(observation(16, 1_000_000), chain),
-            Settings(threads=4, process=630 * 10**6),
-            "test",
+            views(observation(16, 1_000_000), chain), Settings(threads=4, process=630 * 10**6)
         ).threads
         == 2
     )
@@ -154,14 +153,12 @@ def test_the_figure_that_a_refusal_names_works(monkeypatch):
     obs, chain = observation(16, 1_000_000), [Source(), Demean(), Sink()]
     libraries(monkeypatch)
     with pytest.raises(PipelineError, match=r"blocks on 1 thread 19\d MB") as refused:
-        divided(views(obs, chain), Settings(threads=4, process=3 * 10**8), "test")
+        divided(views(obs, chain), Settings(threads=4, process=3 * 10**8))
     found = re.search(
         r"use --memory (\d+)MB; or split the scan into shorter ones", refused.value.cure
     )
     assert found is not None
-    settings = divided(
-        views(obs, chain), Settings(threads=4, process=int(found[1]) * 10**6), "test"
-    )
+    settings = divided(views(obs, chain), Settings(threads=4, process=int(found[1]) * 10**6))
     assert settings.threads == 1
     assert settings.memory >= schedule(views(obs, chain), settings).least
     assert int(found[1]) * 10**6 >= least_memory(views(obs, chain), Settings(threads=4))
@@ -174,9 +171,7 @@ def test_no_cure_is_named_that_cannot_work(monkeypatch):
         libraries(monkeypatch, free)
         with pytest.raises(PipelineError) as refused:
             divided(
-                views(obs, [Source(), Demean(), Sink()]),
-                Settings(threads=4, process=BASE // 2),
-                "test",
+                views(obs, [Source(), Demean(), Sink()]), Settings(threads=4, process=BASE // 2)
             )
         assert re.fullmatch(cure, refused.value.cure)
 

@@ -8,7 +8,7 @@ from pydantic import PrivateAttr
 
 from tests.core.run.test_execution import execute, observation
 from zonda.core.data import Block
-from zonda.core.faults import PluginError
+from zonda.core.errors import PluginError
 from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator

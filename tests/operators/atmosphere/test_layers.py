@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from zonda.core.assembly.chain import Chain
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import ZondaError
@@ -21,7 +22,7 @@ from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.plan.planning import planning_of
 from zonda.core.registry import declared
 from zonda.core.run.segments import cut
-from zonda.core.run.views import Chain, View
+from zonda.core.run.views import View
 from zonda.core.scene import Scene
 from zonda.core.site import Site
 from zonda.operators.atmosphere import fluctuations, resolution
