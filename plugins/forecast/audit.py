@@ -19,8 +19,7 @@ from zonda.core.tables import aligned
 from zonda.operators.maps.bin_map import BinMap
 
 from .covered import steps_of
-from .depth import PARTS, Depth, scatter
-from .lines import prefixed
+from .depth import PARTS, Depth, prefixed, scatter
 
 if TYPE_CHECKING:
     from zonda.core.configuration.loaded import PipelineFile

@@ -22,8 +22,19 @@ from zonda.core.tables import aligned
 
 from .audit import Audited, Forecasted, audit
 from .calculator import Calculated
-from .depth import PARTS, UNITS, WITHIN, Depth, scatter, times
-from .lines import duration, in_unit, number, prefixed, read_depth
+from .depth import (
+    PARTS,
+    UNITS,
+    WITHIN,
+    Depth,
+    duration,
+    in_unit,
+    number,
+    prefixed,
+    read_depth,
+    scatter,
+    times,
+)
 from .survey import Survey, elevations
 
 if TYPE_CHECKING:

@@ -37,8 +37,7 @@ from zonda.operators.maps.pixels import Cells, Looking
 from zonda.operators.maps.stokes_kernel import PLACES
 from zonda.operators.maps.sums import WEIGHT
 
-from .beams import Comb, combs
-from .detector_noise import SIGNS, Filtered, Series
+from .detector_noise import SIGNS, Comb, Filtered, Series, combs
 from .survey import Survey, Track, polarization_angles
 
 PLANES = "IQU"

@@ -7,7 +7,7 @@ import pytest
 import zonda
 from zonda.core import cli
 from zonda.core.errors import InputError
-from zonda.plugins.forecast.lines import duration, in_unit, read_depth
+from zonda.plugins.forecast.depth import duration, in_unit, read_depth
 
 MEAN = (
     "--set",
