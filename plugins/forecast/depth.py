@@ -37,51 +37,40 @@ def read_depth(text: str, factors: Mapping[str, float]) -> float:
 
     Raises InputError.
     """
-    cure = (
-        "write e.g. '10 uK', '10 uK_CMB', '0.2 mJy/beam', '0.01 MJy/sr', or '0.1 mJy' of a point"
-        " source"
-    )
-    match = _DEPTH.fullmatch(text)
-    if match is None:
-        raise InputError(f"cannot read '{text}' as a depth", place="--reach", cure=cure)
-    if match["unit"] is None:
-        raise InputError(f"{text.strip()} has no unit", place="--reach", cure=cure)
+    examples = "'10 uK', '10 uK_CMB', '0.2 mJy/beam', '0.01 MJy/sr', or '0.1 mJy' of a point source"
+    wrong, cure = "", f"write e.g. {examples}"
     units = {**ALIASES, **{unit: unit for unit in factors}}
     known = {
-        prefix + name: (size, units[name])
-        for name in units
+        prefix + name: (size, unit)
+        for name, unit in units.items()
         for prefix, size in PREFIXES.items()
         if "MJy" not in name
     }
     known |= {"MJy/sr": (1.0, "MJy/sr"), "kJy/sr": (1e-3, "MJy/sr"), "Jy/sr": (1e-6, "MJy/sr")}
-    if match["unit"] not in known:
-        raise InputError(f"'{match['unit']}' is no unit of a depth", place="--reach", cure=cure)
-    size, unit = known[match["unit"]]
-    value = float(match["number"]) * size / factors[unit]
-    if not (math.isfinite(value) and value > 0):
-        raise InputError(
-            f"no observation reaches a depth of {text}",
-            place="--reach",
-            cure="give a positive depth",
-        )
-    return value
+    match = _DEPTH.fullmatch(text)
+    if match is None:
+        wrong = f"cannot read '{text}' as a depth"
+    elif match["unit"] is None:
+        wrong = f"{text.strip()} has no unit"
+    elif match["unit"] not in known:
+        wrong = f"'{match['unit']}' is no unit of a depth"
+    else:
+        size, unit = known[match["unit"]]
+        value = float(match["number"]) * size / factors[unit]
+        if math.isfinite(value) and value > 0:
+            return value
+        wrong, cure = f"no observation reaches a depth of {text}", "give a positive depth"
+    raise InputError(wrong, place="--reach", cure=cure)
 
 
 def prefixed(value: float, unit: str) -> tuple[float, str]:
     """Factor and name of the unit in which a value reads well: 1e6, ``uK_RJ``."""
+    scales = [(1.0, 1.0, unit), (1e-3, 1e3, f"m{unit}"), (1e-8, 1e6, f"u{unit}")]
+    last = (1e9, f"n{unit}")
     if unit == "MJy/sr":
-        return next(
-            (
-                (f, n)
-                for least, f, n in ((0.1, 1.0, "MJy/sr"), (1e-4, 1e3, "kJy/sr"))
-                if abs(value) >= least
-            ),
-            (1e6, "Jy/sr"),
-        )
-    for factor, prefix in ((1.0, ""), (1e3, "m"), (1e6, "u")):
-        if abs(value) * factor >= 1:
-            return factor, prefix + unit
-    return (1e6, f"u{unit}") if abs(value) >= 1e-8 or value == 0 else (1e9, f"n{unit}")
+        scales, last = [(0.1, 1.0, unit), (1e-4, 1e3, "kJy/sr")], (1e6, "Jy/sr")
+    size = abs(value) or 1e-8
+    return next(((factor, name) for least, factor, name in scales if size >= least), last)
 
 
 def number(value: float) -> str:

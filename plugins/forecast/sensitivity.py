@@ -129,54 +129,37 @@ def _forecast(
         size = float(radius)
     planes = depths_of(survey, size)
     depth = planes.pop("I")
-    seconds = default_pipeline.positive(
-        "--time", Unit("s", "3 h"), asked.get("time"), float(depth.seconds[-1])
-    )
-    instrument = survey.scene.instrument
-    units = factors(instrument.band, survey.fwhm)
+    end = float(depth.seconds[-1])
+    seconds = default_pipeline.positive("--time", Unit("s", "3 h"), asked.get("time"), end)
+    units = factors(survey.scene.instrument.band, survey.fwhm)
+    formula = calculator.of_survey(survey, seconds)
     return Sensitivity(
-        file,
-        survey,
-        depth,
-        size,
-        seconds,
-        units,
-        calculator.of_survey(survey, seconds),
-        None,
-        band,
-        planes,
+        file, survey, depth, size, seconds, units, formula, band=band, polarization=planes
     )
 
 
 def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> PipelineFile:
+    """The pipeline that is named, or one that is made for an instrument and a site."""
     from zonda.core.configuration.pipeline_file import PipelineFile, load
 
     unknown = sorted(asked.keys() - default_pipeline.Asked.__dataclass_fields__.keys())
     if unknown:
         raise TypeError(f"sensitivity() got an unexpected keyword argument {unknown[0]!r}")
     given = {key: value for key, value in asked.items() if value is not None}
+    text = cure = ""
     if pipeline is None:
         if missing := [key for key in ("instrument", "site") if key not in given]:
+            text = f"neither a pipeline nor --{missing[0]} is given"
             cure = "name a pipeline, or --instrument and --site (`zonda plugins` lists them)"
-            raise InputError(
-                f"neither a pipeline nor --{missing[0]} is given",
-                place=default_pipeline.PLACE,
-                cure=cure,
-            )
-        return default_pipeline.make(default_pipeline.Asked(**given), settings)
-    if beside := sorted(given.keys() - {"time"}):
+    elif beside := sorted(given.keys() - {"time"}):
+        text = f"--{beside[0]} is part of a pipeline, and cannot be given beside one"
         cure = f"change the pipeline with --set, or leave it or --{beside[0]} out"
         if pipeline in {found.name for found in instruments.candidates()}:
             cure = f"{pipeline} is an instrument: write --instrument {pipeline}"
-        text = f"--{beside[0]} is part of a pipeline, and cannot be given beside one"
+    elif isinstance(pipeline, PipelineFile) and settings:
+        text, cure = "settings change a pipeline when it is loaded", "give them to zonda.load"
+    if text:
         raise InputError(text, place=default_pipeline.PLACE, cure=cure)
-    if isinstance(pipeline, PipelineFile):
-        if settings:
-            cure = "give them to zonda.load"
-            raise InputError(
-                "settings change a pipeline when it is loaded",
-                place=default_pipeline.PLACE,
-                cure=cure,
-            )
-        return pipeline
-    return load(pipeline, settings)
+    if pipeline is None:
+        return default_pipeline.make(default_pipeline.Asked(**given), settings)
+    return pipeline if isinstance(pipeline, PipelineFile) else load(pipeline, settings)
