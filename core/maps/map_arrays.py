@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from astropy.io.fits import Header
 
     from ..instrument import Band
-    from .scan_hits import ScanHits
+    from .planes import ScanHits
 
 
 @dataclass(init=False)

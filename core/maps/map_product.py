@@ -13,8 +13,8 @@ from ..errors import InputError
 from ..numerics.angles import FWHM_PER_SIGMA, angle_text, sides_text
 from ..pages import html_table
 from ..types import Floats
-from .central import central_diameter
 from .map_arrays import MapArrays
+from .measured_noise import central_diameter
 from .smoothing import CUT, error_of_mean, smoother, weighted_mean
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class MapProduct(MapArrays):
         inverse variance are divided by the square of the factor. Raises InputError for a unit that
         is not known, and where the map has no band or beam.
         """
-        from .convert import converted
+        from .units import converted
 
         return converted(self, unit, spectral_index)
 
@@ -43,7 +43,7 @@ class MapProduct(MapArrays):
         """`smoothed` with a Gaussian of ``fwhm``: ``"9 arcsec"``, an astropy quantity; None: the
         telescope's beam.
         """
-        from .convert import smoothing_width
+        from .units import smoothing_width
 
         return self.smoothed(smoothing_width(fwhm, self.fwhm))
 
@@ -81,7 +81,7 @@ class MapProduct(MapArrays):
 
     @property
     def central_radius(self) -> float:
-        """Radius of the circle in which `rms` is taken, rad: `central.central_diameter`."""
+        """Radius of the circle in which `rms` is taken, rad: `central_diameter`."""
         return central_diameter(self.fwhm, self.pixel) / 2
 
     def rms(self, radius: float | None = None, of: str = "signal") -> float:

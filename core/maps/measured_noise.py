@@ -1,10 +1,31 @@
-"""Noise of a map in units of its white noise, and the words for it."""
+"""Noise of a map: the circle in which it is stated, its size in units of the white noise, and the
+words for it.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
+from ..numerics.angles import ARCMIN
 from ..types import Floats
+
+ACROSS = 5.0
+"""Beams and pixels across the circle, at least: an rms of fewer beams is known to no better than a
+quarter.
+"""
+
+
+def central_diameter(fwhm: float, pixel: float, given: float | None = None) -> float:
+    """``given``; where that is None 1 arcmin, or `ACROSS` beams or pixels where these are wider.
+    All in rad.
+    """
+    return max(ARCMIN, ACROSS * fwhm, ACROSS * pixel) if given is None else given
+
+
+def in_beams(diameter: float, fwhm: float) -> str:
+    """`` (6.7 beams)``, what a circle is wide; empty where the beam is not known."""
+    return f" ({diameter / fwhm:.2g} beams)" if fwhm > 0 else ""
+
 
 LEAST = 0.1
 """Share of the 99th percentile of the weight (1 / noise^2) that a pixel needs for its noise to be

@@ -13,7 +13,7 @@ import numpy as np
 from zonda.core.band import Band
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
-from zonda.core.maps.central import central_diameter, in_beams
+from zonda.core.maps.measured_noise import central_diameter, in_beams
 from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures
 from zonda.core.numerics.angles import angle_text, beam_area, sides_text
 from zonda.core.numerics.radiation import to_kelvin_rj

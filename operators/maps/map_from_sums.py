@@ -15,7 +15,7 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.beams import SPREAD
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.scan_hits import ScanHits
+from zonda.core.maps.planes import ScanHits
 from zonda.core.numerics.angles import angle_text
 from zonda.core.numerics.chunks import empty
 from zonda.core.signal import MAIN, product_name

@@ -52,10 +52,9 @@ from zonda.core.configuration.units import Angle, Fraction
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.figures import FigureMetric
-from zonda.core.maps.central import central_diameter
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.measured_noise import WHITE
+from zonda.core.maps.measured_noise import WHITE, central_diameter
 from zonda.core.numerics.angles import ARCMIN, angle_text
 from zonda.core.signal import Signal
 from zonda.core.types import Floats

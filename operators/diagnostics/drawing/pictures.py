@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.canvas import Sketch, unit_of
-from zonda.core.maps.central import central_diameter, in_beams
 from zonda.core.maps.map_plots import (
     SHOWN,
     contour_text,
@@ -25,6 +24,7 @@ from zonda.core.maps.map_plots import (
     plot_plain,
     wcs_of,
 )
+from zonda.core.maps.measured_noise import central_diameter, in_beams
 from zonda.core.maps.noise_figures import Noise
 from zonda.core.maps.on_plane import on_plane
 from zonda.core.maps.smoothing import smoother
