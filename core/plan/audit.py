@@ -201,7 +201,7 @@ def audit(
     size = extent(made, len(chosen) + 2) if seconds is None else Extent(seconds)
     if made.structure.instead:  # nothing that is made of the complete signal is asked for
         file = dataclasses.replace(made, decided=()).apply(file)
-    part = sliced(file, size.seconds, 1, size.every)
+    part = sliced(file, size.seconds, size.every)
     labels = tuple(o.label for o in part.pipeline().operators)
     whole = Structure(labels, tuple(part.runs), ())
     kept = (*made.structure.operators, "Slice")

@@ -55,10 +55,10 @@ def plan(
     """Show what of a scene is worth simulating, the error of leaving out the rest, and the time and
     memory of the run.
 
-    Each effect has a bound on the error that its coarser form adds to the products, with its
-    formula. They are dropped or coarsened, what saves most first, while the bounds add up to no
-    more than the budget: a tenth of the noise, or the file's `budget:`. Slices of a few seconds are
-    run to predict the time. `zonda run` plans scenes of 2e8 samples and more, and with --prune.
+    Each effect has an upper bound on the error that its coarser form adds to the products. Coarser
+    forms are taken, what saves most first, while the bounds add up to no more than the budget: a
+    tenth of the noise, or the file's `budget:`. Slices of a few seconds are run to predict the
+    time. `zonda run` plans scenes of 2e8 samples and more, and with --prune.
     """
     from ..machine import one_blas_thread
 

@@ -163,30 +163,25 @@ def _least(file: PipelineFile, cut: Slice, outputs: bool) -> tuple[int, dict[str
 
 
 class Slice(Operator):
-    """Keep the first samples of the first observations, and every so many detectors: random numbers
+    """Keep the first samples of the first observation, and every so many detectors: random numbers
     are addressed, not drawn in order, so that all runs over a slice see the same."""
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    observations: int = Field(1, ge=1)
-    """Number of observations that are kept."""
     seconds: float = Field(SECONDS, gt=0)
-    """Length of each observation, s."""
+    """Length of the observation, s."""
     every: int = Field(1, ge=1)
     """One detector of so many is kept, and the outermost four."""
 
     def observe(self, data: Data) -> None:
-        """Cut every scan to the slice."""
-        data.observations[:] = [self._of(o) for o in data.observations[: self.observations]]
-
-    def _of(self, o: Observation) -> Observation:
-        n = min(o.n_samples, max(1, round(self.seconds * o.sample_rate)))
-        o = o.thinned(slice(0, n))
-        if self.every == 1:
-            return o
-        plane = o.focalplane
-        outer = [int(f(v)) for v in (plane.xi, plane.eta) for f in (np.argmin, np.argmax)]
-        kept = np.unique(np.r_[np.arange(0, len(plane), self.every), outer])
-        return replace(o, focalplane=plane.rows(kept), detector_flags=o.detector_flags[kept])
+        """Cut the first scan to the slice; leave the others out."""
+        o = data.observations[0]
+        o = o.thinned(slice(0, max(1, round(self.seconds * o.sample_rate))))
+        if self.every > 1:
+            plane = o.focalplane
+            outer = [int(f(v)) for v in (plane.xi, plane.eta) for f in (np.argmin, np.argmax)]
+            kept = np.unique(np.r_[np.arange(0, len(plane), self.every), outer])
+            o = replace(o, focalplane=plane.rows(kept), detector_flags=o.detector_flags[kept])
+        data.observations[:] = [o]
 
 
 def _cut(steps: Sequence[Step], step: Slice) -> tuple[Step, ...]:
@@ -195,9 +190,7 @@ def _cut(steps: Sequence[Step], step: Slice) -> tuple[Step, ...]:
     return (*steps[: last + 1], Step("Slice", step), *steps[last + 1 :])
 
 
-def sliced(
-    file: PipelineFile, seconds: float = SECONDS, observations: int = 1, every: int = 1
-) -> PipelineFile:
+def sliced(file: PipelineFile, seconds: float = SECONDS, every: int = 1) -> PipelineFile:
     """The same pipeline over a slice, without what writes or draws, with a run of the sky as it is
     in the complete map, and one of the sky with modes of its own where the pipeline has such a
     signal."""
@@ -206,7 +199,7 @@ def sliced(
         for s in file.steps
         if not (isinstance(s.operator, Output) or planning_of(s.operator).reads_streams)
     ]
-    cut = Slice(seconds=seconds, observations=observations, every=every)
+    cut = Slice(seconds=seconds, every=every)
     made = frozenset[str]().union(*(made_by(s.operator) for s in steps))
     runs = {}
     if "sky" in made and made & {"atmosphere", "white", "pink"}:

@@ -193,7 +193,7 @@ def test_the_slice_is_chosen_by_its_samples(file, made):
 
 def test_a_slice_of_detectors(file):
     """Every fourth, and the outermost: the field keeps its extent."""
-    part = sliced(file, 2.0, 1, every=4)
+    part = sliced(file, 2.0, every=4)
     data = part.pipeline().run(part.scene(), threads=1)
     whole = zonda.load("mustang2_cluster").scene().instrument.focalplane()
     plane = data.observations[0].focalplane
