@@ -223,14 +223,16 @@ def _cost(measured: Any) -> str:
     return f"{measured.seconds:.3g} ± {measured.spread:.2g}"
 
 
-def draw(study: Study, ax: Any = None) -> Any:
+def draw(study: Study) -> Any:
     """Each knob alone, the Pareto front, the file's own and the chosen setting, floor and scatter;
-    returns the Axes.
+    returns the figure.
 
     A setting that gives the reference's bits has no place on a logarithmic axis: it stands on the
     lower edge, hollow.
     """
-    ax = ax or new_axes((7.6, 5.4))
+    from matplotlib.ticker import LogLocator
+
+    ax = new_axes((7.6, 5.4))
     setup, chosen, front = study.setup, study.chosen, study.front
     alone = [a for a in study.sweep.alone if not a.knob.redraws]
     errors = [p.error for p in study.points] + [r.error or 0.0 for a in alone for r in a.rungs]
@@ -268,11 +270,13 @@ def draw(study: Study, ax: Any = None) -> Any:
     ax.set_xlabel(f"CPU seconds (median of {setup.repeats} runs, bars: half their range)")
     ax.set_title(f"{setup.pipeline}: {study.says}", fontsize=9, wrap=True)
     ax.yaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
+    ax.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
     ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    ax.tick_params(axis="x", which="minor", labelbottom=False)
     ax.text(0.01, 0.01, "hollow: the reference's bits", transform=ax.transAxes, fontsize=7)
     ax.grid(color="#dddddd", lw=0.6)
     ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
-    return ax
+    return ax.figure
 
 
 def save(study: Study, path: Any) -> None:
@@ -280,4 +284,4 @@ def save(study: Study, path: Any) -> None:
     from ..storage.files import atomic_path
 
     with atomic_path(path) as temporary:
-        draw(study).figure.savefig(temporary, bbox_inches="tight")
+        draw(study).savefig(temporary, bbox_inches="tight")
