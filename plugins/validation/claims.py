@@ -18,8 +18,7 @@ from zonda.core.configuration.steps import Mistakes
 from zonda.core.configuration.yaml_places import Source, Span
 from zonda.core.experiment import Values
 
-from .amount import Amount
-from .calculations import Calculation
+from .calculations import Amount, Calculation
 from .verdict import Of, Relation, Stated, clears, compare
 
 FOLDER = Path(zonda.pipelines.__file__).parent / "validation"

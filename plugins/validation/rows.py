@@ -10,7 +10,7 @@ from zonda.core.errors import within
 from zonda.core.experiment import Values
 from zonda.core.storage.files import check_output_folder
 
-from .amount import Amount
+from .calculations import Amount
 from .claims import Claim, Experiment
 from .runs import Runs, Say
 from .verdict import Comparison, Verdict, compare, contradicted, decide
