@@ -30,8 +30,6 @@ LONGEST = 66
 """Letters of a text in a card."""
 _SCALES = {"K_RJ": "Rayleigh-Jeans brightness", "K_CMB": "temperature of the CMB"}
 _COORDSYS = {"icrs": "C", "galactic": "G", "barycentricmeanecliptic": "E"}
-_NOISES = {"noise": "I", "cov_ii": "I", "cov_qq": "Q", "cov_uu": "U"}
-"""Stokes parameter whose noise a row holds."""
 
 Cards = list[tuple[Any, ...]]
 
@@ -185,11 +183,11 @@ class MapFile:
             if scale := scale_of(self.product.unit)[1]:
                 cards.append(("TEMPSCAL", scale, f"temperature scale: {_SCALES[scale]}"))
             cards += self.beam
-        names = [name for name, *_ in rows]
-        if any(name.startswith("half_difference") for name in names):
+        if any(plane.of_halves for _, _, plane, _ in rows):
             halves = ascii_text(self.product.difference)
             cards.append(("JACKKNIF", halves, "halves that were subtracted"))
-        for key in filter(self.noise.__contains__, (_NOISES.get(name) for name in names)):
+        noisy = (plane.noise_of.get(name) for name, _, plane, _ in rows)
+        for key in filter(self.noise.__contains__, noisy):
             factor, words = self.noise[str(key)]
             if factor is not None:
                 stated = "NOISEFAC" if one else f"NOISFAC{key}"

@@ -97,6 +97,11 @@ class Plane:
     smoothing
         Smoothed maps hold the weighted ``mean``, or the standard ``error`` of it; or the plane is
         ``kept``.
+    noise_of
+        Stokes parameter whose noise a row holds, by the row's name: its header says what the noise
+        was measured in.
+    of_halves
+        The plane is a difference of two halves of the samples, which its header names.
     colours
         Lowest and highest value of the picture that `Plots` makes of the plane (None: those of the
         plane); None: no picture.
@@ -111,6 +116,8 @@ class Plane:
     stokes: Mapping[str, str] | None = None
     joint: bool = False
     smoothing: Literal["mean", "error", "kept"] = "kept"
+    noise_of: Mapping[str, str] = field(default_factory=dict)
+    of_halves: bool = False
     colours: tuple[float | None, float | None] | None = None
     title: str = ""
     caption: str = ""
@@ -155,12 +162,20 @@ KNOWN = {
         unit="weight",
         stokes={"weights": "sum of weights"},
     ),
-    "noise": Plane(NOTHING, {"noise": "standard error per pixel"}, 1, stokes={}, smoothing="error"),
+    "noise": Plane(
+        NOTHING,
+        {"noise": "standard error per pixel"},
+        1,
+        stokes={},
+        smoothing="error",
+        noise_of={"noise": "I"},
+    ),
     "covariance": Plane(
         NOTHING,
         {f"cov_{ab}": f"covariance of {ab[0].upper()} and {ab[1].upper()}" for ab in COVARIANCES},
         2,
         joint=True,
+        noise_of={"cov_ii": "I", "cov_qq": "Q", "cov_uu": "U"},
     ),
     "condition": Plane(
         NOTHING,
@@ -178,6 +193,7 @@ KNOWN = {
             "half_difference_u": "U of the difference of two halves",
         },
         smoothing="mean",
+        of_halves=True,
     ),
 }
 """Planes of every map, of polarized ones, and of maps of two halves, without values."""
