@@ -38,7 +38,7 @@ import numpy as np
 from zonda.core.kernels import kernel
 from zonda.core.types import Floats
 
-from .weather.bands import BandAtmosphere
+from .weather.bands import BandAtmosphere, chebyshev_points
 from .weather.radiative_transfer import EARTH_RADIUS, ELEVATION_MAX, ELEVATION_MIN
 
 WATER_DENSITY = 1000.0  # kg / m3
@@ -98,7 +98,7 @@ class LayerTerms:
             min(sines[1], math.sin(ELEVATION_MAX)),
         )
         looked_at = np.cos(np.linspace(0, math.pi, LOOKED_AT))
-        points = [np.cos(np.pi * (np.arange(n + 1) + 0.5) / (n + 1)) for n in TERM_DEGREES]
+        points = [chebyshev_points(n + 1) for n in TERM_DEGREES]
         places = np.concatenate([looked_at, *points])
         s = (low + high) / 2 + places * (high - low) / 2
         water = band.transfer.of_water(pwv, np.arcsin(np.clip(s, low, high)).tolist())
@@ -269,7 +269,7 @@ class Response:
                 known[looked_at] = over_y(
                     *self._unscaled(*np.meshgrid(*_ends(looked_at), indexing="ij"))
                 )
-            truth, (a, b) = known[looked_at], (_points(n) for n in (n_y, n_s))
+            truth, (a, b) = known[looked_at], (chebyshev_points(n) for n in (n_y, n_s))
             values = over_y(*self._unscaled(*np.meshgrid(a, b, indexing="ij")))
             series = np.einsum("iu,uv,jv->ij", _to_series(n_y), values, _to_series(n_s))
             found = np.einsum(
@@ -297,15 +297,11 @@ def _ends(number: int) -> tuple[Floats, Floats]:
     return np.cos(np.linspace(0.1, 3.1, number)), np.cos(np.linspace(0, 3.14, number))
 
 
-def _points(n: int) -> Floats:
-    return np.asarray(np.cos(np.pi * (np.arange(n) + 0.5) / n), np.float64)
-
-
 @lru_cache
 def _to_series(n: int) -> Floats:
-    """Matrix (n, n) from values at `_points` to Chebyshev coefficients."""
+    """Matrix (n, n) from values at `chebyshev_points` to Chebyshev coefficients."""
     return np.asarray(
-        np.linalg.inv(np.polynomial.chebyshev.chebvander(_points(n), n - 1)), np.float64
+        np.linalg.inv(np.polynomial.chebyshev.chebvander(chebyshev_points(n), n - 1)), np.float64
     )
 
 

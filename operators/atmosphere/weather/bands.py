@@ -146,7 +146,7 @@ class BandAtmosphere:
 
     def _tabulate(self, n_u: int, n_v: int) -> Floats:
         """Chebyshev coefficients (2, n_u, n_v) from values at the Chebyshev points."""
-        x_u, x_v = _points(n_u), _points(n_v)
+        x_u, x_v = chebyshev_points(n_u), chebyshev_points(n_v)
         values = np.array(
             [self.transfer(self._pwv(x), [self._elevation(y) for y in x_v]) for x in x_u]
         )  # (n_u, n_v, 2)
@@ -155,7 +155,7 @@ class BandAtmosphere:
 
     def _check(self) -> float:
         """Largest error at 45 points: between the nodes, and the ends."""
-        points_u = np.array([-1.0, *_points(7), 1.0])
+        points_u = np.array([-1.0, *chebyshev_points(7), 1.0])
         points_v = [-1.0, -0.61, 0.13, 0.87, 1.0]
         pwv, elevations = [self._pwv(x) for x in points_u], [self._elevation(y) for y in points_v]
         direct = np.moveaxis(np.array([self.transfer(each, elevations) for each in pwv]), 2, 0)
@@ -345,13 +345,13 @@ def _at_frequencies(layers: Layers, frequency: Floats, cells: slice) -> CrossSec
     return CrossSections(**mixed, ozone_ratio=known.ozone_ratio[..., nearest])
 
 
-def _points(n: int) -> Floats:
+def chebyshev_points(n: int) -> Floats:
     """Chebyshev's points."""
     return np.cos(np.pi * (np.arange(n) + 0.5) / n)
 
 
 def _transform(n: int) -> Floats:
-    """(n, n) matrix from values at `_points` to coefficients."""
+    """(n, n) matrix from values at `chebyshev_points` to coefficients."""
     transform = np.cos(np.pi * np.outer(np.arange(n), np.arange(n) + 0.5) / n) * 2 / n
     transform[0] /= 2
     return transform

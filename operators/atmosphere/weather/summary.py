@@ -60,19 +60,13 @@ def pwv_steps(profile: Profile) -> list[float]:
     to very wet there.
     """
     law = profile.distribution
-    low, high = (
-        (law.at(0.05), law.at(0.95))
-        if law is not None
-        else (profile.pwv / 3, min(3 * profile.pwv, PWV_MAX))
-    )
+    if not profile.pwv > 0:
+        return [0.0, 1e-3]
+    low, high = profile.pwv / 3, min(3 * profile.pwv, PWV_MAX)
+    if law is not None:
+        low, high = law.at(0.05), law.at(0.95)
     rounded = {float(f"{low * (high / low) ** (k / 3):.1g}") for k in range(4)}
-    return (
-        sorted(
-            p for p in {*rounded, profile.pwv} if p == profile.pwv or abs(p / profile.pwv - 1) > 0.2
-        )
-        if profile.pwv > 0
-        else [0.0, 1e-3]
-    )
+    return sorted({profile.pwv, *(p for p in rounded if abs(p / profile.pwv - 1) > 0.2)})
 
 
 def place_lines(site: Site, time: Instant, profile: Profile) -> list[str]:
@@ -87,23 +81,21 @@ def place_lines(site: Site, time: Instant, profile: Profile) -> list[str]:
 
 def profile_lines(profile: Profile) -> list[str]:
     """A table of the profile; the wind is that which blows, coming from a direction."""
-    rows = [("m", "hPa", "K", "g/m3", "m/s", "deg")]
-    for h in HEIGHTS:
-        a = profile.at(h)
-        east, north = float(a.wind_east), float(a.wind_north)
-        direction = math.degrees(math.atan2(-east, -north)) % 360
-        rows.append(
-            (
-                f"{h:.0f}",
-                f"{float(a.pressure) / 100:.1f}",
-                f"{float(a.temperature):.1f}",
-                f"{float(a.vapour_density) * 1e3:.3g}",
-                f"{math.hypot(east, north):.1f}",
-                f"{direction:.0f}",
-            )
-        )
-    head = ("above site", "pressure", "temperature", "vapour", "wind", "from")
-    return aligned(rows, head, ">", indent="  ")
+    air = profile.at(HEIGHTS)
+    columns = (
+        ("above site", "m", ".0f", air.height),
+        ("pressure", "hPa", ".1f", air.pressure / 100),
+        ("temperature", "K", ".1f", air.temperature),
+        ("vapour", "g/m3", ".3g", air.vapour_density * 1e3),
+        ("wind", "m/s", ".1f", np.hypot(air.wind_east, air.wind_north)),
+        ("from", "deg", ".0f", np.degrees(np.arctan2(-air.wind_east, -air.wind_north)) % 360),
+    )
+    heads, units, forms, values = zip(*columns, strict=True)
+    rows = [
+        [f"{x:{form}}" for x, form in zip(row, forms, strict=True)]
+        for row in zip(*values, strict=True)
+    ]
+    return aligned([units, *rows], heads, ">", indent="  ")
 
 
 def pwv_lines(water: PwvByMonth) -> list[str]:
@@ -129,27 +121,18 @@ def band_lines(profile: Profile, bands: Iterable[Band], elevation: float) -> lis
         )
         rows = []
         for pwv in steps:
-            mark = "<" if pwv == profile.pwv else ""
-            kelvin, passed = (
-                float(seen.emission(pwv, elevation)),
-                float(seen.transmission(pwv, elevation)),
-            )
-            opacity = float(seen.opacity(pwv, elevation))
+            passed = float(seen.transmission(pwv, elevation))
             rows.append(
                 (
                     f"PWV {_short(pwv)} mm:",
-                    f"{kelvin:.2f} K_RJ,",
-                    f"{_fraction(passed)},",
-                    f"{opacity:.4g}",
-                    mark,
+                    f"{float(seen.emission(pwv, elevation)):.2f} K_RJ,",
+                    f"{passed:{'.4f' if passed >= 1e-3 else '.1e'}},",
+                    f"{float(seen.opacity(pwv, elevation)):.4g}",
+                    "<" if pwv == profile.pwv else "",
                 )
             )
         lines += aligned(rows, align=">", indent="    ")
     return lines
-
-
-def _fraction(passed: float) -> str:
-    return f"{passed:.4f}" if passed >= 1e-3 else f"{passed:.1e}"
 
 
 def _short(pwv: float) -> str:
