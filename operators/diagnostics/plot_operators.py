@@ -3,36 +3,316 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from zonda.core.canvas import DPI, Sketch, file_of
+from zonda.core.canvas import DPI, Sketch, file_of, unit_of
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.maps.image import Image
+from zonda.core.maps.map_plots import (
+    SHOWN,
+    contour_text,
+    map_axes,
+    noise_text,
+    plot_circle,
+    plot_contours,
+    plot_coverage,
+    plot_map,
+    plot_plain,
+    wcs_of,
+)
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.noise_figures import maps_of, noise_alone, noise_sources
+from zonda.core.maps.measured_noise import central_diameter, in_beams
+from zonda.core.maps.noise_figures import Noise, maps_of, noise_alone, noise_sources
+from zonda.core.maps.on_plane import on_plane
+from zonda.core.maps.smoothing import smoother
+from zonda.core.numerics.angles import angle_text, sides_text
 from zonda.core.output import Output, output_folder
-from zonda.core.storage.files import product_path
+from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.types import AnyFloats, Floats
 
 from .comparison.files import plane_of
 from .comparison.statistics import Comparison
 from .drawing.comparison_plots import draw_comparison
-from .drawing.pictures import (
-    Picture,
-    draw_coverage,
-    draw_input,
-    draw_map,
-    draw_noise,
-    draw_plane,
-)
 from .drawing.plots import draw, draw_scan
 from .series import Spectrum, TimeStream
+
+Window = tuple[slice, slice]
+LARGEST = 1500
+"""Pixels of an image's longer side in a picture; larger images are thinned out."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Picture of a product: ``name`` without suffix, a title, what it shows, its bytes as PNG and,
+    by format, as further files.
+    """
+
+    name: str
+    title: str
+    caption: str
+    png: bytes
+    files: dict[str, bytes] = field(default_factory=dict)
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write its files; their paths. Raises `OutputError`."""
+        paths = [product_path(folder, self.name, f".{kind}") for kind in self.files]
+        for path, content in zip(paths, self.files.values(), strict=True):
+            with atomic_path(path) as temporary:
+                temporary.write_bytes(content)
+        return paths
+
+
+@dataclass(frozen=True)
+class Flat:
+    """Planes (ny, nx) of a map as its picture shows them; ``covered``: pixels with enough samples.
+
+    HEALPix and CAR maps are on a plane about their centre.
+    """
+
+    planes: dict[str, AnyFloats]
+    hits: AnyFloats
+    covered: NDArray[np.bool_]
+    wcs: Any
+
+    @classmethod
+    def of(cls, product: MapProduct, planes: Mapping[str, AnyFloats], least: float = 0.0) -> Flat:
+        """From planes on the grid of a map; ``least``: share of the 99th percentile of the samples.
+
+        Samples are smoothed as the map is: the edge of what is covered is not ragged then.
+        """
+        seen = product.known_hits.astype(np.float64)
+        if product.smoothed_by and product.projection != "HEALPix":
+            seen = smoother(product.grid, product.smoothed_by)(seen)
+        found: dict[str, Any] = {**planes, "hits": product.known_hits, "seen": seen}
+        found, wcs = on_plane(product, found)
+        hits, seen = found.pop("hits"), np.nan_to_num(found.pop("seen"))
+        used = seen[hits > 0]
+        enough = seen >= least * np.percentile(used, 99) if used.size else seen > 0
+        return cls(found, hits, enough, wcs)
+
+    def window(self) -> Window:
+        """Rows and columns where there are samples, with a margin of a hundredth of the longer
+        side; all, if they are most.
+        """
+        seen, size = self.hits > 0, np.array(self.hits.shape)
+        if not seen.any():
+            return slice(None), slice(None)
+        places = np.nonzero(seen)
+        low, high = (np.array([f(n) for n in places]) for f in (np.min, np.max))
+        spare = math.ceil(0.01 * (high + 1 - low).max())
+        low, high = np.maximum(low - spare, 0), np.minimum(high + 1 + spare, size)
+        if (high - low).prod() >= 0.9 * size.prod():
+            return slice(None), slice(None)
+        return slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
+
+    def cropped(self, window: Window | None = None) -> Flat:
+        """The rows and columns of a window; `window` by default."""
+        part = window or self.window()
+        planes = {name: values[part] for name, values in self.planes.items()}
+        return Flat(planes, self.hits[part], self.covered[part], self.wcs[part])
+
+    def limit(self, plane: str, share: float) -> float | None:
+        """Brightness scale that covers ``share`` per cent of well covered pixels: the noisy rim
+        must not set it.
+        """
+        if not self.hits.any():
+            return None
+        well = self.hits > 0.25 * np.percentile(self.hits[self.hits > 0], 99)
+        good = np.abs(self.planes[plane][well & np.isfinite(self.planes[plane])])
+        return float(np.percentile(good, share)) if good.size else None
+
+
+def draw_input(file: str, image: Image, signed: bool = False) -> list[Sketch]:
+    """Input map (ny, nx), K_RJ; ``signed``: Q or U, with zero in the middle of the colours."""
+    step = -(-max(image.values.shape) // LARGEST)
+    values, wcs = image.values[::step, ::step], wcs_of(image.header)[::step, ::step]
+    what = _named("Input", file, "input")
+    ax, title = map_axes(values.shape, wcs)[0], f"{what}: the sky before the beam"
+    if signed:
+        top = float(np.nanpercentile(np.abs(values), 99.7)) or 1.0
+        factor, unit = unit_of(top)
+        limits, label = (-top * factor, top * factor), f"Rayleigh–Jeans brightness [{unit}]"
+        plot_plain(values * factor, wcs, limits, "RdBu_r", label, ax=ax, title=title)
+    else:
+        plot_map(values, wcs, ax=ax, title=title)
+    text = "The input map, before beam, opacity and filters."
+    if image.fwhm:
+        width = angle_text(image.fwhm)
+        text += f" Its pixels are spread over a grid with Gaussians of {width} (FWHM)."
+    return [Sketch(file, what, text, ax)]
+
+
+def draw_map(
+    file: str,
+    signal: str,
+    key: str,
+    product: MapProduct,
+    style: Plots,
+    snr: tuple[AnyFloats, str] | None = None,
+) -> list[Sketch]:
+    """Map of a signal, called ``key``; ``snr``: contours of it on the map's grid, and what its
+    noise is.
+    """
+    shown = style.smoothed(product)
+    planes = {"signal": shown.signal} | ({} if snr is None else {"snr": snr[0]})
+    flat = Flat.of(shown, planes, style.least_coverage).cropped()
+    titles = {
+        "": ("Map", "Everything: sky, atmosphere and noise, filtered and binned."),
+        "noiseless": (
+            "Noiseless map",
+            "The sky alone through the same pointing, filters and binning: what the processing"
+            " leaves of it.",
+        ),
+    }
+    other = f"Map of signal {signal}", "A part of the components, filtered and binned."
+    title, meaning = titles.get(signal, other)
+    title, how = _named(title, key), _how(product, shown)
+    text = f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}"
+    head = _titled(title, shown)
+    if snr is not None:
+        head += f"; contours: S/N, {noise_text(snr[1], short=True)}"
+        lines = f"Contours of the signal-to-noise ratio: {contour_text(style.contours)}"
+        text += f" {lines} (negative ones dashed). Its noise: {noise_text(snr[1])}."
+    limit = flat.limit("signal", SHOWN if signal == "noiseless" else 99.7)
+    ax = _panels([(flat, flat.planes["signal"], head)], shown.resolution, limit)[0]
+    if snr is not None:
+        plot_contours(ax, np.where(flat.covered, flat.planes["snr"], np.nan), style.contours)
+    return [Sketch(file, title, text, ax)]
+
+
+def draw_noise(
+    file: str, sources: Mapping[Noise, tuple[MapProduct, str]], style: Plots
+) -> list[Sketch]:
+    """Maps of noise alone, with the plane that holds it: ``half_difference`` of the map, which
+    comes first, and ``source_free``.
+    """
+    panels: list[tuple[Flat, AnyFloats, str]] = []
+    figures, limits, how, window = [], [], "", None
+    first = next(iter(sources.values()))[0]
+    diameter = central_diameter(first.fwhm, first.pixel, style.central_diameter)
+    for of, (product, plane) in sources.items():
+        half = product.difference.replace(" - ", " minus ")
+        words = half if of == "half_difference" else "all but the sky"
+        shown = style.smoothed(product)
+        how = _how(product, shown)
+        flat = Flat.of(shown, {plane: getattr(shown, plane)}, style.least_coverage)
+        window = flat.window() if window is None else window
+        flat = flat.cropped(window)
+        head = _titled(_named(f"Noise: {words}", file, "noise"), shown)
+        panels.append((flat, flat.planes[plane], head))
+        limits.append(flat.limit(plane, 99.7))
+        rms = shown.rms(diameter / 2, of=plane)
+        if math.isfinite(rms):
+            figures.append(f"{words} {rms * 1e6:.4g} µK_RJ")
+    axes = _panels(panels, shown.resolution, max((x for x in limits if x), default=None))
+    place = axes[0].wcs.wcs_world2pix([np.degrees(first.centre)], 0)[0]
+    for ax in axes:
+        plot_circle(ax, panels[0][1].shape, place, diameter)
+    text = f"Noise maps on one scale, {how}.{_resolution(shown)}"
+    if figures:
+        wide = f"{np.degrees(diameter) * 60:.3g}′{in_beams(diameter, first.fwhm)}"
+        text += f" Weighted rms within the dotted circle of {wide}: {', '.join(figures)}."
+    return [Sketch(file, _named("Noise", file, "noise"), text, axes[0])]
+
+
+def draw_coverage(file: str, product: MapProduct) -> list[Sketch]:
+    """Samples per pixel and seconds per beam."""
+    per_beam: Any = product.seconds_per_beam()
+    each = isinstance(per_beam, np.ndarray) and per_beam.ndim > 0
+    flat = Flat.of(product, {"per_beam": per_beam} if each else {}).cropped()
+    if each:
+        found = flat.planes["per_beam"]
+        per_beam = np.where(np.isfinite(found), found, np.nanmean(found))
+    what = "Samples per pixel" if per_beam is None else "Integration time per beam"
+    title = _named(what, file, "coverage")
+    ax = plot_coverage(flat.hits, flat.wcs, per_beam=per_beam, title=title)
+    samples, pixels = int(product.hits.sum()), int((product.hits > 0).sum())
+    text = f"{samples:,} samples in {pixels:,} pixels of {sides_text(*product.sides)}.".replace(
+        ",", "\u202f"
+    )
+    if per_beam is not None:
+        beam = f"of {angle_text(product.fwhm)} FWHM (area π FWHM² / (4 ln 2))"
+        text += (
+            " Integration time: of all detectors together, in the area of the telescope's beam"
+            f" {beam}."
+        )
+    return [Sketch(file, "Coverage", text, ax)]
+
+
+def draw_plane(file: str, product: MapProduct, name: str) -> list[Sketch]:
+    """Plane of numbers, whose colours, title and caption it states itself; grey without samples."""
+    plane = product.planes[name]
+    seen = np.where(product.hits > 0, plane.values[0], np.nan)
+    flat = Flat.of(product, {name: seen}).cropped()
+    values = flat.planes[name]
+    assert plane.colours is not None
+    known = values[np.isfinite(values)]
+    low, high = plane.colours
+    limits = (
+        float(known.min(initial=0.0)) if low is None else low,
+        float(known.max(initial=0.0)) if high is None else high,
+    )
+    ax = plot_plain(values, flat.wcs, limits, "cividis_r", plane.unit, title=plane.title)
+    return [Sketch(file, plane.title, plane.caption, ax)]
+
+
+def _how(product: MapProduct, shown: MapProduct) -> str:
+    """Smoothing of a map for its picture, in words."""
+    if not shown.smoothed_by:
+        return "not smoothed"
+    text = f"smoothed by {angle_text(shown.smoothed_by)}"
+    return text if product.smoothed_by else f"{text} for this picture"
+
+
+def _resolution(shown: MapProduct) -> str:
+    """Meaning of the circle in a map's corner."""
+    if not shown.fwhm:
+        return ""
+    beam, smoothing = angle_text(shown.fwhm), angle_text(shown.smoothed_by)
+    if not shown.smoothed_by:
+        return f" Resolution {beam} FWHM, the beam's."
+    return (
+        f" Resolution {angle_text(shown.resolution)} FWHM: the beam's {beam} and the smoothing's"
+        f" {smoothing}, added in quadrature."
+    )
+
+
+def _named(title: str, key: str, shows: str = "") -> str:
+    """The title with the product's name; of ``map`` only what is behind it (band, Stokes
+    parameter): ``f150 Q``. ``shows``: before it.
+    """
+    more = key.removeprefix(shows).lstrip("_").removeprefix("map").lstrip("_").replace("_", " ")
+    return f"{title} ({more})" if more else title
+
+
+def _titled(title: str, shown: MapProduct) -> str:
+    """The title with the resolution, which the circle in the map's corner shows: beam and smoothing
+    together.
+    """
+    if not shown.smoothed_by:
+        return f"{title}, not smoothed"
+    return f"{title}, smoothed to {angle_text(shown.resolution)}"
+
+
+def _panels(
+    panels: Sequence[tuple[Flat, AnyFloats, str]], fwhm: float, limit: float | None
+) -> list[Any]:
+    """Axes of maps side by side with their titles, where the first map is well covered."""
+    first = panels[0][0]
+    axes = map_axes(first.covered.shape, first.wcs, len(panels))
+    for ax, (_, values, title) in zip(axes, panels, strict=True):
+        shown = np.where(first.covered, values, np.nan)
+        plot_map(shown, first.wcs, ax=ax, title=title, fwhm=fwhm or None, limit=limit)
+    return axes
+
 
 __all__ = ["Picture", "Plots", "pictures"]
 

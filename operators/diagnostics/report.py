@@ -71,7 +71,8 @@ class Report(Output):
         folder = output_folder(data, self.label)
         shown = data.products.get("pictures")
         if shown is None:
-            shown = list(pictures(data, Plots(central_diameter=self.central_diameter)))
+            style = Plots().model_copy(update={"central_diameter": self.central_diameter})
+            shown = list(pictures(data, style))
         data.products["report"] = write_text(
             folder / "report.html", page(data, shown, self.central_diameter)
         )

@@ -1,3 +1,1 @@
-"""Pictures of maps, spectra, streams and scans from plain values: figures, axes on the sky, PNG
-files, the process that draws.
-"""
+"""Pictures of comparisons, spectra, streams and scans from plain values."""

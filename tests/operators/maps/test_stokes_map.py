@@ -17,7 +17,7 @@ from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.map_file import MapFile, Provenance
 from zonda.core.numerics.projection import frame_rotation
 from zonda.core.polarization import PolarizationAngles
-from zonda.operators.diagnostics.drawing.pictures import Flat
+from zonda.operators.diagnostics.plot_operators import Flat
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.grid import TangentGrid
 from zonda.operators.maps.map_sums import MapSums

@@ -11,14 +11,14 @@ import pytest
 
 from zonda.core.canvas import file_of
 from zonda.core.maps.map_product import MapProduct
-from zonda.operators.diagnostics.drawing.pictures import (
+from zonda.operators.diagnostics.plot_operators import (
     Flat,
+    Plots,
     draw_coverage,
     draw_input,
     draw_map,
     draw_noise,
 )
-from zonda.operators.diagnostics.plot_operators import Plots
 from zonda.operators.maps.grid import tangent_wcs
 
 ARCSEC = np.pi / 648000

@@ -25,12 +25,11 @@ from zonda.core.maps.map_plots import (
 )
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.on_plane import on_plane
-from zonda.operators.diagnostics.drawing.pictures import Flat
 from zonda.operators.diagnostics.drawing.plots import (
     draw,
     draw_scan,
 )
-from zonda.operators.diagnostics.plot_operators import Plots
+from zonda.operators.diagnostics.plot_operators import Flat, Plots
 from zonda.operators.diagnostics.power_spectrum import Spectrum
 from zonda.operators.diagnostics.time_streams import TimeStream, TimeStreams
 
