@@ -229,7 +229,7 @@ class Instrument(Parameters):
         return self
 
     def _mistakes(self) -> Iterator[tuple[bool, str, str, tuple[str | int, ...]]]:
-        """What bands, pixels and wafers must not be: (whether it is, message, cure, place)."""
+        """Mistakes of bands, pixels and wafers: (whether it is made, message, cure, place)."""
         names = [band.name for band in self.bands]
         for k, name in enumerate(names):
             cure = "give each a name of its own: products and files bear it"

@@ -57,8 +57,8 @@ class Footprint:
 
     @classmethod
     def of(cls, image: InputMap, centre: Target | None, place: str) -> Footprint | None:
-        """Of a map that is put at ``centre``; None where it has no place of its own: HEALPix, or an
-        image without a WCS. Raises InputError as `moved`.
+        """The footprint of a map that is put at ``centre``; None where it has no place of its own:
+        HEALPix, or an image without a WCS. Raises InputError as `moved`.
         """
         if not isinstance(image, ImageMap) or (image.placeless and centre is None):
             return None

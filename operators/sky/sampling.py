@@ -39,7 +39,7 @@ CONSTANTS = np.array([1 / 6, 2 / 3, 0.5, 1.0, 2.0, 1e6, 0.0])
 
 
 class Chunks(NamedTuple):
-    """What `pointing` returns."""
+    """Boresight on a grid, in chunks of `CHUNK` samples: made by `pointing`."""
 
     h: AnyFloats
     """(m, 9, CHUNK) H row by row for (xi, eta, 1); the last chunk is filled up with its last

@@ -33,11 +33,8 @@ class InputImage(Product):
 
     def arrays(self) -> Mapping[str, Any]:
         """See `Product.arrays`."""
-        polarized = (
-            {}
-            if self.image.polarization is None
-            else {key: getattr(self.image, key) for key in POLARIZED}
-        )
+        known = POLARIZED if self.image.polarization is not None else ()
+        polarized = {key: getattr(self.image, key) for key in known}
         return {"values": self.image.values, "header": dict(self.image.header.items()), **polarized}
 
     @classmethod
@@ -76,22 +73,15 @@ class SkyMap(ConvolvedSky):
         if stated := self.warn_of_beams(grid.source, observation.focalplane.fwhm):
             observation.tally.state(self.label, "resolution", stated)
         sky = self.brightness_on(grid, observation.instrument.band)
+        state = ScanSampler(grid, sky, [], index)
         if not grid.reached(observation, float(widths.max(initial=0.0))):
-            observation.tally.state(
-                self.label,
-                f"{observation.name}: not convolved",
-                "no detector reaches the input map",
-            )
-            return ScanSampler(grid, sky, [], index)
-        angles = (
-            None
-            if sky.polarization is None
-            else PolarizationAngles.of(observation, observation.sky_boresight, grid.axis)
-        )
+            what = f"{observation.name}: not convolved"
+            observation.tally.state(self.label, what, "no detector reaches the input map")
+            return state
         band = observation.instrument.band
-        state = ScanSampler(
-            grid, sky, [self.with_beam(grid, band, float(fwhm)) for fwhm in widths], index, angles
-        )
+        state.beams = [self.with_beam(grid, band, float(fwhm)) for fwhm in widths]
+        if sky.polarization is not None:
+            state.angles = PolarizationAngles.of(observation, observation.sky_boresight, grid.axis)
         state.tell(observation.tally, self.label)
         return state
 
