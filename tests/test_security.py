@@ -77,7 +77,7 @@ ALLOWED = {
         "plugins/checks/dispatch.py",
         "subprocess.run",
     ): "zonda itself, as a child; no shell; the folder's path is one argument",
-    ("core/packages.py", "import_module"): "names that bridges and steps state",
+    ("core/versions.py", "import_module"): "names that bridges and steps state",
     ("zonda/__init__.py", "import_module"): "names from a table in the same file",
 }
 """Calls that could run what a file says, and why these do not."""
