@@ -14,7 +14,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.fft import dct, idct
 
 from zonda.core.assembly.signals import note_signals
 from zonda.core.errors import PipelineError
@@ -258,21 +257,9 @@ class Survey:
         """The pipeline's high-pass filter on series (n_row, n) at the instants of a track, in
         place.
         """
-        step = self.steps.highpass
-        if step is None:
-            return
-        plan = plan_highpass(
-            len(track.index), step.frequency / track.rate, step.degree, step.oversampling
-        )
-        if plan.knots:
-            plan.apply(rows)
-            return
-        low = (rows @ plan.polynomials.T) @ plan.polynomials
-        if plan.cut:
-            spectrum = dct(rows - low, type=2, axis=1)
-            spectrum[:, plan.cut :] = 0
-            low += idct(spectrum, type=2, axis=1)
-        rows -= low.astype(rows.dtype)
+        if step := self.steps.highpass:
+            cut = step.frequency / track.rate
+            plan_highpass(len(track.index), cut, step.degree, step.oversampling).apply(rows)
 
     @property
     def grid(self) -> TangentGrid:
