@@ -116,8 +116,9 @@ class Pipeline:
         """The steps that act on every observation, with the signals that they make."""
         return self._chain(self.operators)
 
-    def _chain(self, operators: Sequence[Operator]) -> Chain:
-        return Chain(acting_steps(operators), self.signals.formed, self.signals.components)
+    def _chain(self, operators: Sequence[Operator], keep: Sequence[str] = ()) -> Chain:
+        steps = acting_steps(operators)
+        return Chain(steps, self.signals.formed, self.signals.components, tuple(keep))
 
     @faults_named(exceptions=False)
     def run(
@@ -168,13 +169,13 @@ class Pipeline:
         hooks.zonda_pipeline_start(pipeline=self, data=data)
         for operator in self.operators:
             timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
-        bands = self._bands(data)
+        bands = self._bands(data, keep)
         self._observe(data, bands, timer)
-        self._execute([band.keeping(keep) for band in bands], settings, timer)
+        self._execute(bands, settings, timer)
         self._finish(data, bands, timer)
         return data
 
-    def _bands(self, data: Data) -> list[Band]:
+    def _bands(self, data: Data, keep: Sequence[str] = ()) -> list[Band]:
         """The steps and data of each band; all of them where the camera has one.
 
         A step that acts on a band's data is a copy: it may keep what it lays out for them.
@@ -188,8 +189,8 @@ class Pipeline:
             acting = [
                 o for o in copies if (o.one_band if isinstance(o, Output) else of_one_band(o))
             ]
-            bands.append(Band(acting, self._chain(copies), own))
-        return bands or [Band(self.operators, self.chain, data)]
+            bands.append(Band(acting, self._chain(copies, keep), own))
+        return bands or [Band(self.operators, self._chain(self.operators, keep), data)]
 
     def _observe(
         self,

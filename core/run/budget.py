@@ -15,7 +15,7 @@ from ..machine import available_memory, resident_memory
 from ..mapmaker import joins, makes_products
 from ..plan.planning import planning_of
 from .prefetch import Ahead
-from .schedule import does_the_same, schedule, spares
+from .schedule import Schedule, does_the_same, schedule
 from .settings import Settings, megabytes
 from .views import Band, View
 
@@ -67,8 +67,7 @@ def _groups(
         _shared([view], settings, ahead, kept, sum(held) - mine)
         for view, mine in zip(views, held, strict=True)
     ]
-    first = views[0].observation
-    if len(bands) > 1 and all(view.observation.looks_as(first) for view in views):
+    if Schedule(views, settings).at_once > 1:
         with suppress(PipelineError):  # not all of them fit at once
             together = _shared(views, settings, ahead, kept)
             single = [schedule([view], own) for view, own in zip(views, alone, strict=True)]
@@ -155,9 +154,9 @@ def with_scan_ahead(views: Sequence[View], settings: Settings) -> Settings | Non
     there is no room for it.
     """
     size = memory_of(views) - memory_of(views, products=True)
-    if not spares(views, settings, size):
-        return None
-    return replace(settings, memory=settings.memory - size)
+    less = replace(settings, memory=settings.memory - size)
+    same = less.memory > 0 and does_the_same(views, less, [schedule(views, settings)])
+    return less if same else None
 
 
 def least_memory(views: Sequence[View], settings: Settings) -> int:

@@ -20,7 +20,7 @@ def execute(bands: Sequence[Band], settings: Settings, timer: Timer) -> None:
     heard = any(
         hook.get_hookimpls() for hook in hooks
     )  # who listens hears of one observation after the other
-    several = sum(len(band.data.observations) for band in bands) > 1
+    several = len(bands) + len(bands[0].data.observations) > 2
     ahead = Ahead(settings.threads > 1 and several and not heard)
     groups = divide(bands, settings, ahead)
     turns = [

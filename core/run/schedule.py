@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -300,14 +300,6 @@ def schedule(views: Sequence[View], settings: Settings) -> Schedule:
         made.at_once = 1
         made.make()
     return made
-
-
-def spares(views: Sequence[View], settings: Settings, size: int) -> bool:
-    """Tell whether streams and blocks do the same with ``size`` bytes less memory."""
-    if settings.memory <= size:
-        return False
-    less = replace(settings, memory=settings.memory - size)
-    return does_the_same(views, less, [schedule(views, settings)])
 
 
 def does_the_same(views: Sequence[View], settings: Settings, others: Sequence[Schedule]) -> bool:

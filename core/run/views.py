@@ -9,7 +9,7 @@ detectors is keyed by instrument and band (`Observation.detector_key`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from ..assembly.chain import Chain
@@ -68,10 +68,6 @@ class Band:
         """The scan of most samples."""
         scans = self.data.observations
         return View(self.chain, max(scans, key=lambda o: o.n_detectors * o.n_samples))
-
-    def keeping(self, streams: Sequence[str]) -> Band:
-        """The band, whose ``streams`` are kept."""
-        return replace(self, chain=replace(self.chain, keep=tuple(streams)))
 
     def watch(self, done: Progress) -> None:
         """Tell the outputs what is done."""
