@@ -242,10 +242,10 @@ class Execution:
             shape = self.views[-1].rows.stop, self._first.n_samples
             made[name] = self._store.allocate(name, shape, segment.how == "kept")
             if isinstance(made[name], np.memmap):
-                text = f"{made[name].nbytes / 1e9:.2f} GB"
                 for view in self.views:
                     what = f"stream {name} spilled to disk"
-                    view.observation.tally.state("Execution", what, text)
+                    size = f"{made[name][view.rows].nbytes / 1e9:.2f} GB"
+                    view.observation.tally.state("Execution", what, size)
 
         def work(view: View, detectors: slice, samples: slice, due: list[Due] | None) -> None:
             maker = self._makers[view.number]
