@@ -28,8 +28,8 @@ from zonda.core.site import Site
 from zonda.operators.atmosphere import fluctuations, resolution
 from zonda.operators.atmosphere.distribution import Fluctuation
 from zonda.operators.atmosphere.fluctuations import AtNodes, OfDetectors
-from zonda.operators.atmosphere.layers import AtmosphereLayers, Wind
-from zonda.operators.atmosphere.model import beam_sigma
+from zonda.operators.atmosphere.layers import AtmosphereLayers
+from zonda.operators.atmosphere.model import Wind, beam_sigma
 from zonda.operators.atmosphere.turbulence import sampling, tiles
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
 from zonda.operators.atmosphere.turbulence.geometry import axes, crossing, rays, scan_planes
