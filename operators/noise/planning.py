@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from zonda.core.knobs import Knob
 from zonda.core.numerics.chunks import TILE_DETECTORS
@@ -77,7 +76,9 @@ class PinkPlanning(Planning[PinkNoise]):
         rate, rms = observation.sample_rate, amplitude * math.sqrt(law.gain * law.variance)
         grid = np.geomspace(1e-9, 0.5, 600)
         # 2 int_f^(1/2) g |H|^2 df
-        above = -2 * cumulative_trapezoid(law.response(grid)[::-1], grid[::-1], initial=0)[::-1]
+        response = law.response(grid)
+        cells = np.diff(grid) * (response[1:] + response[:-1])
+        above = np.append(np.cumsum(cells[::-1])[::-1], 0.0)
 
         def faster(frequency: float) -> float:
             share = float(np.interp(math.log(max(frequency / rate, 1e-9)), np.log(grid), above))
