@@ -201,7 +201,7 @@ def cost(case: str) -> None:
         rng.standard_normal(dtype=np.float32, out=out)
     reference = (time.process_time() - start) / 8 / len(out) * 1e9
     n = o.n_detectors * o.n_samples
-    said = {what: text for _, what, text in o.tally}
+    said = {what: text for _, what, text in o.log}
     total = (setup + evaluation) / n * 1e9
     print(f"{case}: {CASES[case][0]}, {o.duration:.0f} s, {n / 1e6:.0f} M samples")
     print(

@@ -161,7 +161,7 @@ def report(data, rows, cpu, wall):
     for label, stage, seconds in data.provenance["timings"]:
         if seconds > 0.01 * cpu:
             print(f"  {label:18s} {stage:9s} {seconds:9.1f} s {seconds / n * 1e9:7.2f} ns/sample")
-    for who, what, text in data.tally:
+    for who, what, text in data.log:
         if who == "Execution":
             print(f"  {what}: {text}")
     print(

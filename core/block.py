@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import PluginError
+from .log import Log
 from .numerics.smooth import SmoothField
 from .observation import Observation
 from .signal import MAIN, Component, Entrance
-from .tally import Tally
 from .types import AnyFloats
 
 STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
@@ -59,7 +59,7 @@ class Block:
     """Array in which the executor wants a stream to be made, so that it need not be copied."""
     again: bool = False
     """These samples were worked on before, and are made again because the streams do not fit in
-    memory: an operator makes the same bits and counts nothing (what it tells ``observation.tally``
+    memory: an operator makes the same bits and counts nothing (what it tells ``observation.log``
     is thrown away)."""
 
     components: frozenset[Component] = frozenset()
@@ -90,7 +90,7 @@ class Block:
         observation = self.observation
         if stream != MAIN:
             observation = copy.copy(observation)
-            observation.tally = Tally()
+            observation.log = Log()
         hidden = {*others, *self.signals}
         seen = Block(
             observation,

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from .block import STREAMS, Block
 from .errors import PipelineError
+from .log import Log, percent
 from .observation import Observation
 from .pages import html_table
 from .product import Product
 from .results import kept, one_scan, product_of
 from .stream import Stream, in_order
-from .tally import Tally, percent
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -25,9 +25,9 @@ __all__ = [
     "STREAMS",
     "Block",
     "Data",
+    "Log",
     "Observation",
     "Stream",
-    "Tally",
     "html_table",
     "in_order",
     "percent",
@@ -46,7 +46,7 @@ class Data:
     scene: Scene
     observations: list[Observation] = field(default_factory=list)
     products: dict[str, Any] = field(default_factory=dict)
-    tally: Tally = field(default_factory=Tally)
+    log: Log = field(default_factory=Log)
     provenance: dict[str, Any] = field(default_factory=dict)
     output: Any = None
     """Folder (Path) that products are written to; None: nothing is written."""
@@ -129,7 +129,7 @@ class Data:
             text = f"{one}, the file's"
             if one != other:
                 text += f"; the scene's {other} is not used"
-            self.tally.state(label, what, text)
+            self.log.state(label, what, text)
         self.scene = self.scene.model_copy(
             update={what: own[what] for what in ("site", "instrument")}
         )
@@ -174,7 +174,7 @@ class Data:
         What pointing counted in the scans is added once, not for each band.
         """
         for scan in self.pointed:
-            self.tally.update(scan.tally)
+            self.log.update(scan.log)
         scans = zip(*(own.observations for own in self.bands.values()), strict=True)
         self.observations = [s for views in scans for s in views] or self.observations
         for band, own in self.bands.items():
@@ -192,7 +192,7 @@ class Data:
                 self.products[key] = product
             self.partial |= {f"{label} {band}": part for label, part in own.partial.items()}
             self.layouts |= {f"{label} {band}": part for label, part in own.layouts.items()}
-            self.tally.update(own.tally, suffix=f" {band}")
+            self.log.update(own.log, suffix=f" {band}")
 
     def named(self, key: str) -> str:
         """The name of a product or file of these data, the band's behind it where the camera has

@@ -15,10 +15,10 @@ from .errors import InputError
 from .flags import DEAD, EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, good
 from .focalplane import Focalplane
 from .intervals import Intervals, runs
+from .log import Log
 from .numerics.random import stream_key
 from .numerics.smooth import SmoothField
 from .pages import html_table
-from .tally import Tally
 from .types import AnyFloats
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ class Observation:
         Names of the streams of all signals that are formed, the complete one first (`core.signal`).
     unfiltered
         Those of them on which no filter acts.
-    tally
+    log
         What was counted or approximated.
     hwp_angle
         (n_samp,) rad, of a half-wave plate in the focal plane (`core.polarization`); None: there is
@@ -151,7 +151,7 @@ class Observation:
         default_factory=dict
     )
     quoted_net: NDArray[np.float64] | None = None
-    tally: Tally = field(default_factory=Tally)
+    log: Log = field(default_factory=Log)
     output: Any = None
     expected_load: Callable[[], tuple[float, float]] | None = None
     load_spectra: Callable[[], LoadSpectra] | None = None
@@ -256,7 +256,7 @@ class Observation:
                 quoted_net=None,
                 expected_load=None,
                 load_spectra=None,
-                tally=Tally(),
+                log=Log(),
             )
             found.append(view)
         return found

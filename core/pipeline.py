@@ -251,7 +251,7 @@ class Pipeline:
         if part.scans is not None:
             data.pointed = (
                 [data.pointed[k] for k in part.scans] if data.pointed else []
-            )  # the tally counts these alone
+            )  # the log counts these alone
             for band in bands:
                 band.data.observations = [band.data.observations[k] for k in part.scans]
         self._execute(bands, replace(settings, fresh=False), timer)
@@ -317,7 +317,7 @@ class Pipeline:
         data = Data(scene=scene, output=None if output is None else Path(output))
         data.provenance = {**self.provenance(scene), **(provenance or {})}
         for what, text in scene.instrument.notes.items():
-            data.tally.state(scene.instrument.name, what, text)
+            data.log.state(scene.instrument.name, what, text)
         hooks = manager().hook
         settings = Settings(
             threads=threads or available_threads(),
@@ -359,7 +359,7 @@ class Pipeline:
                     f"its own from {self.signals.not_linear} on, which is not linear, instead of"
                     " those of the complete signal"
                 )
-                data.tally.state(name, "modes", text)
+                data.log.state(name, "modes", text)
 
     def _finish(self, data: Data, bands: Sequence[Band], timer: Timer) -> None:
         """Finish the products of all bands, and let the outputs act."""
@@ -383,7 +383,7 @@ class Pipeline:
             for product in data.partial.values():
                 if product.signals and stream_of(name) not in product.signals:
                     product.subtract(stream_of(name), [stream_of(part) for part in parts])
-            data.tally.state(name, "remainder", remainder(parts))
+            data.log.state(name, "remainder", remainder(parts))
         for operator in band.chain.steps:
             self._timed(timer, operator, "finalize", data)
 

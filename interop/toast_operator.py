@@ -168,7 +168,7 @@ class ToastOperator(Operator):
             before, sums = ob.detdata["flags"].data.copy(), _sums(ob)
             self._apply(ob, observation)
             if np.array_equal(sums, _sums(ob)) and np.array_equal(before, ob.detdata["flags"].data):
-                observation.tally.state(
+                observation.log.state(
                     self.label,
                     "no effect",
                     f"{self.operator} left the signal and its flags as they were",
@@ -271,12 +271,10 @@ def _newly_flagged(label: str, stream: Stream, ob: Any, before: Any) -> Any:
         dead = used & (own != 0)
         observation.detector_flags[dead] |= own[dead]
         observation.flags[instants] |= PROCESSING
-        tally = observation.tally
-        tally.count(label, "detectors that TOAST flagged", int(dead.sum()), observation.n_detectors)
-        tally.count(
-            label, "instants that TOAST flagged", int(instants.sum()), observation.n_samples
-        )
-        tally.count(
+        log = observation.log
+        log.count(label, "detectors that TOAST flagged", int(dead.sum()), observation.n_detectors)
+        log.count(label, "instants that TOAST flagged", int(instants.sum()), observation.n_samples)
+        log.count(
             label,
             "further single samples that TOAST flagged",
             int((new & ~instants).sum()),

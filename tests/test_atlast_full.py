@@ -44,14 +44,14 @@ def test_made_again_is_the_same_map():
     whole = 4 * DETECTORS * SECONDS * 900
     kept = pipeline.run(scene, threads=1, memory=1 << 30)
     again = pipeline.run(scene, threads=2, memory=int(1.7 * whole))
-    assert not any(who == "Execution" for who, _, _ in kept.tally)
-    assert any("made again" in what for who, what, _ in again.tally if who == "Execution")
+    assert not any(who == "Execution" for who, _, _ in kept.log)
+    assert any("made again" in what for who, what, _ in again.log if who == "Execution")
     one, other = kept.products["map"], again.products["map"]
     for name in ("signal", "hits", "weights", "noise"):
         assert np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)
     assert one.hits.sum() == DETECTORS * SECONDS * 900
-    rows = [row for row in kept.tally if row[0] != "Execution"]
-    assert rows == [row for row in again.tally if row[0] != "Execution"]
+    rows = [row for row in kept.log if row[0] != "Execution"]
+    assert rows == [row for row in again.log if row[0] != "Execution"]
 
 
 def test_singular_modes_of_a_stream_beyond_memory_and_disk_are_refused_with_a_way_out(monkeypatch):

@@ -173,7 +173,7 @@ def test_very_short_runs(source, duration):
     data = zonda.Pipeline(steps(source, duration)).run(scene())
     product = data.products["map"]
     assert (
-        product.hits.sum() + data.tally.get("BinMap", "samples dropped: flagged")
+        product.hits.sum() + data.log.get("BinMap", "samples dropped: flagged")
         == data.observations[0].n_samples * 223
     )
     assert (product.hits.sum() > 0) == (duration == "0.5 s")

@@ -253,7 +253,7 @@ def test_blocks_and_threads_change_no_bit(threads: int, megabytes_each: int, see
 @few
 @given(workers=st.integers(1, 7))
 def test_workers_change_no_bit_of_a_campaign(workers: int) -> None:
-    """Tasks are done in whatever order the threads take them; the whole file is compared, tally and
+    """Tasks are done in whatever order the threads take them; the whole file is compared, log and
     headers too.
     """
     from concurrent.futures import ThreadPoolExecutor

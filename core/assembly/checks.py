@@ -14,7 +14,7 @@ from ..mapmaker import made_by, makes_products
 from ..operator import Operator
 from ..output import may_write
 from ..pipeline import Pipeline
-from ..plausible import doubts
+from ..plausibility import doubts
 from ..signal import is_stream
 
 if TYPE_CHECKING:

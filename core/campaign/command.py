@@ -181,8 +181,8 @@ def _say(text: str) -> None:
 
 
 def _show(result: CampaignResult, verbose: bool) -> None:
-    """Print losses, or with ``verbose`` the whole tally."""
-    for combination, who, what, value, counted in result.tally:
+    """Print losses, or with ``verbose`` the whole log."""
+    for combination, who, what, value, counted in result.log:
         if verbose or (counted and value != "0" and "/" not in who and what != "samples binned"):
             _say(f"{combination}{': ' if combination else ''}{who}: {what}: {value}")
 

@@ -54,13 +54,13 @@ class Products:
     sets
         For each set of co-added products: values on the axes over which nothing is co-added, and
         the folder of its files.
-    tally
+    log
         What was counted, chosen and approximated: rows (set, who, what, value).
     """
 
     folder: Path
     sets: tuple[tuple[dict[str, Any], Path], ...]
-    tally: tuple[tuple[str, str, str, str], ...] = field(repr=False)
+    log: tuple[tuple[str, str, str, str], ...] = field(repr=False)
 
 
 def campaign(
@@ -135,7 +135,7 @@ def campaign(
             )
             result = run.begin([source], folder, call, pool, _say, Pruning(prune_all=prune))
     sets = tuple((dict(c.axes), folder / c.folder) for c in Job.read(folder).combinations)
-    return Products(folder, sets, tuple(row[:4] for row in result.tally))
+    return Products(folder, sets, tuple(row[:4] for row in result.log))
 
 
 def _keys(pipeline: Any) -> list[str]:

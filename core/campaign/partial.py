@@ -15,10 +15,10 @@ from ..configuration.time import Instant
 from ..data import Data
 from ..errors import InputError, PipelineError
 from ..focalplane import Focalplane
+from ..log import Log
 from ..observation import Observation
 from ..product import Product
 from ..scene import Scene
-from ..tally import Tally
 from . import parts
 
 POINTS = 512
@@ -47,7 +47,7 @@ class Partial:
     """
 
     products: dict[str, Product]
-    tally: Tally
+    log: Log
     scans: list[dict[str, Any]]
 
     @classmethod
@@ -78,16 +78,16 @@ class Partial:
             )
         # figures of scans of one number share a row, whatever the entry: there may be a million
         # entries
-        tally = _tally(
+        log = _tally(
             {
-                **_rows(data.tally),
-                "figures": [(a, b.removeprefix(prefix), c) for a, b, c in data.tally.figures()],
+                **_rows(data.log),
+                "figures": [(a, b.removeprefix(prefix), c) for a, b, c in data.log.figures()],
             }
         )
         bands = max(1, len(data.scene.instrument.bands))
         return cls(
             data.partial,
-            tally,
+            log,
             [_thinned(o, k // bands + before) for k, o in enumerate(data.observations)],
         )
 
@@ -98,7 +98,7 @@ class Partial:
                 self.products[label] += product
             else:
                 self.products[label] = product
-        self.tally.update(other.tally)
+        self.log.update(other.log)
         self.scans += other.scans
         return self
 
@@ -108,7 +108,7 @@ class Partial:
             label: {"kind": p.identity(), "arrays": p.arrays()}
             for label, p in self.products.items()
         }
-        tree = {"products": products, "scans": self.scans, "tally": _rows(self.tally)}
+        tree = {"products": products, "scans": self.scans, "tally": _rows(self.log)}
         parts.write(path, identity, tree, made)
 
     @classmethod
@@ -202,18 +202,18 @@ class Thinned(Observation):
         )
 
 
-def _rows(tally: Tally) -> dict[str, list[Any]]:
-    return {"counts": tally.counts(), "totals": tally.totals(), "figures": tally.figures()}
+def _rows(log: Log) -> dict[str, list[Any]]:
+    return {"counts": log.counts(), "totals": log.totals(), "figures": log.figures()}
 
 
-def _tally(rows: Mapping[str, Any]) -> Tally:
-    tally = Tally()
+def _tally(rows: Mapping[str, Any]) -> Log:
+    log = Log()
     totals = {(who, what): total for who, what, total in rows["totals"]}
     for who, what, count in rows["counts"]:
-        tally.count(who, what, count, totals.get((who, what), 0))
+        log.count(who, what, count, totals.get((who, what), 0))
     for who, what, text in rows["figures"]:
-        tally.state(who, what, text)
-    return tally
+        log.state(who, what, text)
+    return log
 
 
 def _thinned(observation: Observation, number: int) -> dict[str, Any]:

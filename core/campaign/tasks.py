@@ -167,21 +167,21 @@ FAN = 32
 
 @dataclass(frozen=True)
 class Combined:
-    """Result of a combination: its tally (who, what, value, is a count), and the figures that were
+    """Result of a combination: its log (who, what, value, is a count), and the figures that were
     measured of its products.
     """
 
-    tally: tuple[tuple[str, str, str, bool], ...] = ()
+    log: tuple[tuple[str, str, str, bool], ...] = ()
     figures: tuple[tuple[Any, ...], ...] = ()
 
 
 def combine(folder: Path, number: int) -> Combined:
     """Add up one combination's parts, finish its products and write them."""
     data = combined(Job.read(folder), folder, number)
-    counts = {(who, what) for who, what, _ in data.tally.counts()}
+    counts = {(who, what) for who, what, _ in data.log.counts()}
     measured = [product for product in data.products.values() if isinstance(product, Figures)]
     return Combined(
-        tuple((who, what, value, (who, what) in counts) for who, what, value in data.tally.told()),
+        tuple((who, what, value, (who, what) in counts) for who, what, value in data.log.told()),
         tuple(astuple(figure) for figures in measured for figure in figures),
     )
 
@@ -207,7 +207,7 @@ def combined(job: Job, folder: Path, number: int) -> Data:
     while FAN**depth < len(tasks):
         depth += 1
     whole = _sum(tasks, folder, 0, depth)
-    data.partial, data.tally = whole.products, whole.tally
+    data.partial, data.log = whole.products, whole.log
     data.observations = whole.observations(scene)
     pipeline.finish(data)
     return data
@@ -235,7 +235,7 @@ class CampaignResult:
 
     Attributes
     ----------
-    tally
+    log
         Of all combinations: rows (combination, who, what, value, whether it is a count).
     tasks
         Number of tasks that were run now.
@@ -246,7 +246,7 @@ class CampaignResult:
     """
 
     folder: Path
-    tally: list[tuple[str, str, str, str, bool]] = field(default_factory=list)
+    log: list[tuple[str, str, str, str, bool]] = field(default_factory=list)
     tasks: int = 0
     samples: int = 0
     seconds: float = 0.0
@@ -349,7 +349,7 @@ class Combinations(Work[int, Combined]):
         if not isinstance(result, Lost):
             self.record.combine(item, result.figures)
             name = self.job.combinations[item].name
-            self.result.tally += [(name, *row) for row in result.tally]
+            self.result.log += [(name, *row) for row in result.log]
             if not self.job.keep_tasks:
                 self.record.discard_parts(item)
             return False

@@ -183,9 +183,9 @@ def _knobs(file: PipelineFile, wanted: Accuracy) -> tuple[str, ...]:
 
 def _show(data: Data, verbose: bool) -> None:
     """Print what was lost; with ``verbose`` all that was counted, chosen and approximated."""
-    counts = {(who, what) for who, what, number in data.tally.counts() if number and "/" not in who}
+    counts = {(who, what) for who, what, number in data.log.counts() if number and "/" not in who}
     lost = {(who, what) for who, what in counts if what != "samples binned"}
-    for who, what, value in data.tally.told():
+    for who, what, value in data.log.told():
         if verbose or (who, what) in lost:
             click.echo(f"{who}: {what}: {value}", err=True)
 

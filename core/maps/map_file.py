@@ -43,7 +43,7 @@ class Provenance:
     cards, history
         For the first header: who made it, with what; the resolved YAML as HISTORY.
     tables
-        The resolved YAML (a row per line), the plan and the tally: binary tables of text, as they
+        The resolved YAML (a row per line), the plan and the log: binary tables of text, as they
         stand at a file's end.
     """
 
@@ -95,7 +95,7 @@ class Provenance:
         texts: list[tuple[str, tuple[str, ...], Any]] = [
             ("RESOLVED_YAML", ("LINE",), [(line,) for line in yaml.splitlines()]),
             ("PLAN", ("EFFECT", "DECISION", "BOUND", "FORMULA"), provenance.get("plan")),
-            ("TALLY", ("STEP", "WHAT", "VALUE"), list(data.tally)),
+            ("TALLY", ("STEP", "WHAT", "VALUE"), list(data.log)),
         ]
         written = (
             _table(name, dict(zip(keys, map(_texts, zip(*rows, strict=True)), strict=False)))

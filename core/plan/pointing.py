@@ -70,7 +70,7 @@ def observed(operators: Sequence[Operator], scene: Scene, band: str = "") -> Dat
         data.split()
         data.hand_out()
         for scan, whole in zip(data.bands[band].observations, data.observations, strict=True):
-            scan.tally.update(whole.tally)
+            scan.log.update(whole.log)
         data, operators = data.bands[band], [o for o in operators if of_one_band(o)]
     for operator in operators:
         operator.observe(data)

@@ -20,11 +20,11 @@ from ..block import Block
 from ..errors import PipelineError
 from ..faults import whose
 from ..kernels import kernel
+from ..log import Log
 from ..mapmaker import MapMaker, filters, forms
 from ..numerics.chunks import TILE_SAMPLES
 from ..operator import Operator
 from ..signal import Formed, is_stream
-from ..tally import Tally
 from ..types import AnyFloats
 from .means import exec_whole, knows_means, means_of, names_of
 from .schedule import Schedule
@@ -279,7 +279,7 @@ class BlockMaker:
         source, observation = segment.source, self._observation
         if again:
             observation = copy.copy(observation)
-            observation.tally = Tally()
+            observation.log = Log()
         buffers = self._local.__dict__.setdefault("blocks", {}).setdefault(id(segment), {})
         block = Block(
             observation, detectors, reach, dtype=self._dtype, buffers=buffers, again=again

@@ -34,7 +34,7 @@ def execute(bands: Sequence[Band], settings: Settings, timer: Timer) -> None:
         for (these, execution), after in zip(turns, following, strict=True):
             execution.run(ahead, after)
             for band, view in zip(these, execution.views, strict=True):
-                band.data.tally.update(view.observation.tally)
+                band.data.log.update(view.observation.log)
                 if band is bands[-1] and view.observation.common is not None:
                     view.observation.common.clear()  # the last that may need it
                 band.watch("scan")

@@ -33,6 +33,7 @@ import numpy as np
 from ..discovery import RAISED
 from ..errors import PipelineError
 from ..focalplane import Focalplane
+from ..log import Log
 from ..machine import resident_memory
 from ..mapmaker import filters, joins
 from ..numerics.smooth import SmoothField
@@ -40,7 +41,6 @@ from ..observation import Observation
 from ..operator import Operator
 from ..signal import MAIN, Formed, is_signal
 from ..stream import Stream, forget_pages, in_order
-from ..tally import Tally
 from ..types import AnyFloats
 from ..whole_stream import whole
 from .block_maker import BlockMaker, Due
@@ -228,7 +228,7 @@ class Execution:
             found.means[view.number] = dict(block.means)
             for name in sorted(found.names):
                 what = f"stream {name} made again when it is read"
-                view.observation.tally.state("Execution", what, segment.why)
+                view.observation.log.state("Execution", what, segment.why)
         return found
 
     def _worked_through(self, segment: Segment) -> Source:
@@ -245,7 +245,7 @@ class Execution:
                 for view in self.views:
                     what = f"stream {name} spilled to disk"
                     size = f"{made[name][view.rows].nbytes / 1e9:.2f} GB"
-                    view.observation.tally.state("Execution", what, size)
+                    view.observation.log.state("Execution", what, size)
 
         def work(view: View, detectors: slice, samples: slice, due: list[Due] | None) -> None:
             maker = self._makers[view.number]
@@ -388,7 +388,7 @@ class Execution:
                 means[name] = joined
         elif held != name:  # what is found out of it is not the scene's
             observation = copy.copy(observation)
-            observation.tally = Tally()
+            observation.log = Log()
             observation.flags = observation.flags.copy()
             observation.detector_flags = observation.detector_flags.copy()
         if source.segment is not None:
@@ -454,12 +454,12 @@ class Execution:
 
     def _note(self, views: Sequence[View], label: str, whole: Observation) -> None:
         """Note in each band's observation what was flagged and counted in that of all."""
-        views[0].observation.tally.update(whole.tally)
+        views[0].observation.log.update(whole.log)
         for view, rows in zip(views, _rows_of(views), strict=True):
             own = view.observation
             own.detector_flags |= whole.detector_flags[rows]
             elsewhere = own.good_samples & ~whole.good_samples
-            own.tally.count(label, ELSEWHERE, int(elsewhere.sum()), elsewhere.size)
+            own.log.count(label, ELSEWHERE, int(elsewhere.sum()), elsewhere.size)
             own.flags |= whole.flags
 
 
@@ -487,5 +487,5 @@ def all_detectors(scans: Sequence[Observation]) -> Observation:
         detector_flags=np.concatenate([scan.detector_flags for scan in scans]),
         smooth={},
         detdata={},
-        tally=Tally(),
+        log=Log(),
     )

@@ -54,13 +54,13 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
         if y.min() < -1 or y.max() > top:
             clipped = np.clip(y, -1.0, top)
             count, y = int((clipped != y)[:, own].sum()), clipped
-        observation.tally.count(label, "values of the PWV clipped to the table", count)
+        observation.log.count(label, "values of the PWV clipped to the table", count)
         return y, weighted
 
     for what, text in _statements(model, path):
-        observation.tally.state(label, what, text)
+        observation.log.state(label, what, text)
     if "path_delay" in parameters.outputs:
-        observation.tally.state(
+        observation.log.state(
             label, "wet path delay", f"{per_vapour:.3f} times the PWV (non-dispersive)"
         )
     arguments = chosen.nodes, turbulence, pwv, response, chosen.step, observation.n_samples
@@ -103,7 +103,7 @@ def _of_bands(models: Sequence[AtmosphereModel], label: str) -> dict[str, Drifti
         named = ((models[k].observation.instrument.band.name, n) for k, n in sorted(others.items()))
         if parts := ", ".join(f"{name} ({n} of {whole} layers)" for name, n in named):
             text = f"lattices made once with those of {parts}"
-        model.observation.tally.state(label, "turbulence beside other bands", text)
+        model.observation.log.state(label, "turbulence beside other bands", text)
     return {model.observation.name: one for model, one in zip(models, layers, strict=True)}
 
 
@@ -132,7 +132,7 @@ def state_drawn(model: AtmosphereModel, label: str, state: AtNodes | OfDetectors
         mean = total / count
         rms = math.sqrt(max(squares / count - mean**2, 0.0))
         text = f"mean {mean:+.3%}, rms {rms:.3%} of the mean PWV, over the field and the scan"
-        model.observation.tally.state(label, "PWV of this realization", text)
+        model.observation.log.state(label, "PWV of this realization", text)
 
 
 def streams(outputs: Sequence[str]) -> tuple[str, ...]:

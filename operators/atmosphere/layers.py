@@ -26,7 +26,7 @@ from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.observation import Observation
-from zonda.core.plausible import PWV, doubt
+from zonda.core.plausibility import PWV, doubt
 
 from .closed_form import closed_form
 from .drawing import draw, state_drawn

@@ -233,7 +233,7 @@ class AtmosphereScreens(Output):
         """
         if data.laid_out:
             text = "the scans of a campaign are not here when it is combined; run one of them"
-            data.tally.state(self.label, "not drawn", text)
+            data.log.state(self.label, "not drawn", text)
             return
         data.check_scan(self.observation, self.label)
         load = data.observations[self.observation].expected_load

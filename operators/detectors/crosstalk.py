@@ -78,7 +78,7 @@ class Crosstalk(Operator):
         found = (
             neighbours(plane, self.level) if self.file is None else read_shares(self.file, plane)
         )
-        observation.tally.state(
+        observation.log.state(
             self.label, "pairs of detectors with crosstalk", f"{len(found.source)}"
         )
         return found

@@ -72,7 +72,7 @@ class GainDrift(Operator):
         amplitude = self.rms * np.sqrt(power / power.sum()) * 3 / (2 + np.cos(turn))
         field = drifts(observation, self.label, amplitude, (step, nodes))
         text = f"rms {self.rms:.3g}, {frequency[0]:.3g} to {frequency[-1]:.3g} Hz"
-        observation.tally.state(self.label, f"{observation.name}: drift of the gains", text)
+        observation.log.state(self.label, f"{observation.name}: drift of the gains", text)
         return field
 
     def exec(self, block: Block, state: DetectorField) -> None:

@@ -59,7 +59,7 @@ class Glitches(Operator):
         """Draw the pulses of the scan."""
         found = self.arrivals(observation)
         inside = int(np.count_nonzero(found.time >= 0))
-        observation.tally.count(self.label, "glitches", inside)
+        observation.log.count(self.label, "glitches", inside)
         return found
 
     def exec(self, block: Block, state: Arrivals) -> None:
@@ -76,12 +76,12 @@ class Glitches(Operator):
                 )
         if self.flag_above is not None:
             size = block.shape[0] * block.shape[1]
-            observation.tally.count(self.label, "samples lost to glitches", lost, size)
+            observation.log.count(self.label, "samples lost to glitches", lost, size)
 
     def collect(self, data: Data, observation: Observation, state: Arrivals) -> None:
         """State how many detectors had one."""
         hit = int(np.count_nonzero(np.diff(state.first)))
-        observation.tally.count(self.label, "detectors with glitches", hit, observation.n_detectors)
+        observation.log.count(self.label, "detectors with glitches", hit, observation.n_detectors)
 
     def arrivals(self, observation: Observation) -> Arrivals:
         """Pulses of all detectors from `REACH` decay times before the scan to its end."""

@@ -88,7 +88,7 @@ class TimeConstant(Operator):
                 f"{1e3 * np.median(tau):.4g} ms (median); half power at {cut:.4g} Hz of"
                 f" {rate / 2:.4g} Hz"
             )
-            observation.tally.state(self.label, "time constant", text)
+            observation.log.state(self.label, "time constant", text)
         different, which = np.unique(tau, return_inverse=True)
         made = [
             [math.exp(-1 / (t * rate)) if t else 0.0, _reach(t, rate), *weights(t * rate)]

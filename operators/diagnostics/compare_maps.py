@@ -126,7 +126,7 @@ class CompareMaps(Output):
         both = [plane for plane in maps if plane in references]
         if len(both) < max(len(maps), len(references)):
             which = "reference" if len(references) == 1 else "map"
-            data.tally.state(self.label, "Q and U", f"not compared: the {which} has none")
+            data.log.state(self.label, "Q and U", f"not compared: the {which} has none")
         first = plane_of(maps["I"][1], self.map)
         references = on_meridians_of(first, {plane: references[plane] for plane in both})
         runs = data.provenance.get("runs", {})
@@ -172,7 +172,7 @@ class CompareMaps(Output):
             return planes_of(_product(data, self.reference, self.label), self.reference)
         read, band = self._read(), data.scene.instrument.band
         for what, _, note in (note.partition(": ") for note in read.notes):
-            data.tally.state(self.label, what, note)
+            data.log.state(self.label, what, note)
         return {which: _in_kelvin(plane, band) for which, plane in read.planes.items()}
 
     def _read(self) -> ReadMap:
@@ -237,4 +237,4 @@ def _tell(label: str, of: str, data: Data, found: Comparison) -> None:
         ratio, error = f["chi2"] / f["chi2 pixels"], math.sqrt(2 / f["chi2 values"])
         told.append(("chi2 of the difference / pixels", f"{ratio:.4g} +- {error:.2g}"))
     for what, text in told:
-        data.tally.state(label, of + what, text)
+        data.log.state(label, of + what, text)

@@ -140,7 +140,7 @@ class CompareStreams(Operator):
                 assert state.welch is not None
                 state.found[detector] = pair(x, y, state.welch)
             else:
-                block.observation.tally.count(
+                block.observation.log.count(
                     self.label, "detectors left out for samples that are not finite", 1
                 )
 
@@ -153,7 +153,7 @@ class CompareStreams(Operator):
                 if state.welch is None
                 else "without a detector to compare"
             )
-            observation.tally.count(self.label, f"scans {why}", 1)
+            observation.log.count(self.label, f"scans {why}", 1)
             return
         names = [observation.focalplane.names[d] for d in every]
         pairs = [state.found[d] for d in every]
@@ -165,9 +165,9 @@ class CompareStreams(Operator):
         if found is None:
             return
         other = "scans left out: other detectors or length"
-        data.tally.count(self.label, other, found.of_another_length)
+        data.log.count(self.label, other, found.of_another_length)
         for figure, text in found.lines():
-            data.tally.state(self.label, figure, text)
+            data.log.state(self.label, figure, text)
         publish(
             data,
             found.product,

@@ -82,7 +82,7 @@ class MeasureFigures(Output):
         key = key_of(self, "figures")
         figures = data.products[key] = Figures(found)
         for figure in figures:
-            data.tally.state(self.label, figure.name, str(figure).partition(" = ")[2])
+            data.log.state(self.label, figure.name, str(figure).partition(" = ")[2])
         if data.output is not None:
             figures.write(product_path(data.output, data.named(key), ".ecsv"), about(data))
 

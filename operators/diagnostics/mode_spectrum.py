@@ -211,18 +211,18 @@ class ModeSpectrum(Operator):
 
     def measure(self, stream: Stream, model: Any = None) -> Any:
         """Read the stream twice: for the covariance, and for the streams of the modes."""
-        observation, tally = stream.observation, stream.observation.tally
+        observation, log = stream.observation, stream.observation.log
         chosen = spread_evenly(observation, self.detectors)
         lag = max(1, round(self.delay * observation.sample_rate))
         lagged = Lagged(stream, chosen, self.delays, lag)
         if chosen.size < 2 or np.count_nonzero(lagged.good) < 2:
-            tally.count(self.label, "scans without two detectors and two samples: no modes", 1)
+            log.count(self.label, "scans without two detectors and two samples: no modes", 1)
             return stream.state
         found = components(lagged, self.modes, center=self.center, normalize=self.normalize)
         left = int(np.count_nonzero(~found.used))
-        tally.count(self.label, "detectors left out: signal not finite", left)
+        log.count(self.label, "detectors left out: signal not finite", left)
         if not found.energy > 0:
-            tally.count(self.label, "scans whose signal is constant: no modes", 1)
+            log.count(self.label, "scans whose signal is constant: no modes", 1)
             return stream.state
         values = found.values[:KEPT]
         modes = Modes(

@@ -171,7 +171,7 @@ class PowerSpectrum(Operator):
                 if np.isfinite(power).all():
                     found[name] = power
                 else:
-                    block.observation.tally.count(
+                    block.observation.log.count(
                         self.label, f"detectors left out for non-finite samples of {name}", 1
                     )
 
@@ -181,7 +181,7 @@ class PowerSpectrum(Operator):
         names = in_order(set().union(*rows))
         if state.welch is None or not names:
             why = "too short for" if state.welch is None else "without a detector that has"
-            observation.tally.count(self.label, f"scans {why} a power spectrum", 1)
+            observation.log.count(self.label, f"scans {why} a power spectrum", 1)
             return
         psd = {name: np.mean([row[name] for row in rows if name in row], axis=0) for name in names}
         net, f = observation.focalplane.net[every], state.welch.frequency
@@ -199,7 +199,7 @@ class PowerSpectrum(Operator):
         mean: Spectrum | None = data.take(self.label)
         if mean is not None:
             what = "scans of another length left out of the mean spectrum"
-            data.tally.count(self.label, what, mean.of_another_length)
+            data.log.count(self.label, what, mean.of_another_length)
             data.products[key_of(self, "spectrum")] = mean
 
 

@@ -268,7 +268,7 @@ def _tally(data: Data) -> list[tuple[str, str, str]]:
     rows: list[tuple[str, str, str]] = []
     previous = ""
     order = {label: k for k, (label, *_) in enumerate(data.provenance.get("operators", []))}
-    told = sorted(data.tally.told(), key=lambda row: order.get(row[0], len(order)))
+    told = sorted(data.log.told(), key=lambda row: order.get(row[0], len(order)))
     for who, what, value in told:
         value = re.sub(r"^\d+(?=$| \()", lambda m: f"{int(m[0]):,}".replace(",", "\u202f"), value)
         # a folded table begins with a name

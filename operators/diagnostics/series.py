@@ -240,7 +240,7 @@ def count_flagged(observation: Observation, place: str, what: str) -> None:
     """Count the flagged samples of a scan that ``what`` includes."""
     if flagged := int(np.count_nonzero(~observation.good_samples)):
         told = f"flagged samples that {what}"
-        observation.tally.count(place, told, flagged, observation.n_samples)
+        observation.log.count(place, told, flagged, observation.n_samples)
 
 
 def no_stream(name: str, have: Iterable[str], place: str) -> PipelineError:

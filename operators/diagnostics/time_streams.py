@@ -89,7 +89,7 @@ class TimeStreams(Operator):
             return
         for name in [s for s, values in state.streams.items() if np.isnan(values).all()]:
             del state.streams[name]
-            observation.tally.count(self.label, f"stream {name} is absent at this step", 1)
+            observation.log.count(self.label, f"stream {name} is absent at this step", 1)
         data.add(self.label, state)
 
     def finalize(self, data: Data) -> None:

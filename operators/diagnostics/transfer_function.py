@@ -115,16 +115,16 @@ class TransferFunction(Output):
         after, before = (self._map(data, signal) for signal in self.shown)
         window = window_of(before, self.radius, self.taper, self.least_coverage)
         edges = self._edges(before, window)
-        data.tally.state(self.label, "window", f"{np.count_nonzero(window)} pixels")
+        data.log.state(self.label, "window", f"{np.count_nonzero(window)} pixels")
         if self.modes == "full":
             alone = "" if self.shown[0] else ", which are the sky alone"
-            data.tally.state(self.label, "singular modes", f"of the complete data{alone}")
+            data.log.state(self.label, "singular modes", f"of the complete data{alone}")
         both = zip(before.by_stokes().items(), after.by_stokes().values(), strict=True)
         for (plane, a), b in both:
             rings = compare(a.signal, b.signal, window, a.pixel, edges)
             empty = int(np.count_nonzero(~np.isfinite(rings.transfer)))
             what = "" if plane == "I" else f"{plane}: "
-            data.tally.count(self.label, f"{what}rings without modes or power: NaN", empty)
+            data.log.count(self.label, f"{what}rings without modes or power: NaN", empty)
             key = plane_key(key_of(self, "transfer_function"), plane)
             of = plane_key(self.map, plane)
             found = Transfer(rings, edges, self.modes, before.fwhm, self.label, of)

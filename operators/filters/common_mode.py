@@ -260,19 +260,19 @@ class ModeSearch:
             u, values = detectors.use / root, np.array([v @ v])
             found = Ritz(values, u[None], v[None], np.zeros(1), rank, 1, "detector mean")
         found.count = min(1, max(0, found.rank - 1))
-        observation.tally.count(self.step.label, KEPT, 1 - found.count)
+        observation.log.count(self.step.label, KEPT, 1 - found.count)
         return detectors, found
 
     def _choose(self, found: Ritz, gram: Gram) -> int:
         """Number of modes to remove; may replace the modes by the detectors' mean."""
-        step, tally = self.step, self.stream.observation.tally
+        step, log = self.step, self.stream.observation.log
         wanted = min(step.modes, max(0, found.rank - 1))
         size = np.append(np.sqrt(np.maximum(found.values, 0.0)), 0.0)
         determined = max(
             (i + 1 for i in range(wanted) if size[i + 1] <= step.gap * size[i]), default=0
         )
-        tally.count(step.label, KEPT, step.modes - wanted)
-        tally.count(step.label, UNDETERMINED, wanted - determined)
+        log.count(step.label, KEPT, step.modes - wanted)
+        log.count(step.label, UNDETERMINED, wanted - determined)
         if determined == wanted or step.on_undetermined == "remove":
             return wanted
         if step.on_undetermined == "mean" and determined == 0:
@@ -286,16 +286,16 @@ class ModeSearch:
     def _tell(self, detectors: Usable, found: Ritz) -> None:
         """State what was found; flag the dead detectors, which the complete signal shows."""
         stream, inside = self.stream, self.inside
-        observation, tally, who = stream.observation, stream.observation.tally, self.step.label
+        observation, log, who = stream.observation, stream.observation.log, self.step.label
         if inside is not None:
             masked, covered = counts(inside, observation.n_detectors, observation.n_samples)
-            tally.count(who, MASKED, masked, observation.n_detectors * observation.n_samples)
+            log.count(who, MASKED, masked, observation.n_detectors * observation.n_samples)
             what = "instants with all detectors in the source mask: no mode removed"
-            tally.count(who, what, covered, observation.n_samples)
+            log.count(who, what, covered, observation.n_samples)
         if stream.signal == MAIN:
             useless = {"not finite": detectors.not_finite, "constant": detectors.constant}
             for name, dead in useless.items():
-                tally.count(who, f"detectors flagged: signal {name}", int(dead.sum()))
+                log.count(who, f"detectors flagged: signal {name}", int(dead.sum()))
                 observation.detector_flags[dead] |= DEAD
         sizes = np.sqrt(
             np.maximum(found.values[: self.step.modes + 1], 0.0)
@@ -304,17 +304,17 @@ class ModeSearch:
         values = ", ".join(f"{s:.4g}" for s in sizes)
         worst = found.residuals[: found.count].max(initial=0.0)
         unit = "K" if detectors.scale is None else "of the detectors' rms"
-        tally.state(
+        log.state(
             who,
             f"{observation.name}: singular values / sqrt(detectors x samples)",
             f"{values or 'none'} {unit}",
         )
-        tally.state(
+        log.state(
             who,
             f"{observation.name}: residual of the modes",
             f"{worst:.1e} after {found.steps} steps",
         )
-        tally.state(who, f"{observation.name}: modes removed", f"{found.count} ({found.what})")
+        log.state(who, f"{observation.name}: modes removed", f"{found.count} ({found.what})")
 
 
 def _check_precision(found: Ritz, detectors: Usable, stream: Stream, place: str) -> None:

@@ -74,7 +74,7 @@ class GroundFilter(LinearFilter):
             warnings.warn(
                 f"{self.label}: {text}: the template is a mean; choose a smaller bin", stacklevel=2
             )
-        observation.tally.state(self.label, f"{observation.name}: bins of the template", f"{size}")
+        observation.log.state(self.label, f"{observation.name}: bins of the template", f"{size}")
         trend = polynomials(observation.n_samples, self.trend).functions[1:]
         return Template.of(number, trend, has_a_signal(observation.flags)), None
 

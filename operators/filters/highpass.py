@@ -102,25 +102,25 @@ class HighpassFilter(LinearFilter):
 
     def prepare(self, observation: Observation) -> tuple[Bridged, Inside | None]:
         """Tables for this observation's length, flagged samples; flags the trimmed ends."""
-        n, rate, tally = observation.n_samples, observation.sample_rate, observation.tally
+        n, rate, log = observation.n_samples, observation.sample_rate, observation.log
         fine, trimmed = has_a_signal(observation.flags), self._check_length(observation)
         observation.flags[:trimmed] |= TRIMMED
         observation.flags[n - trimmed :] |= TRIMMED
-        tally.count(self.label, "samples trimmed", 2 * trimmed, n)
+        log.count(self.label, "samples trimmed", 2 * trimmed, n)
         bad = np.flatnonzero(~fine)
-        tally.count(self.label, "flagged samples bridged before filtering", bad.size, n)
+        log.count(self.label, "flagged samples bridged before filtering", bad.size, n)
         inside = self._inside(observation)
         if self.response == "bessel":
             trend = None if self.degree is None else Fit.of(polynomials(n, self.degree), fine)
             return Bridged(causal(self.frequency, rate), bad, trend), inside
         if observation.smooth.get("atmosphere") is not None and inside is None:
-            tally.state(self.label, "smooth mean emission", "removed analytically")
+            log.state(self.label, "smooth mean emission", "removed analytically")
         degree = self.degree or 0
         plan = plan_highpass(n, self.frequency / rate, degree, self.oversampling)
         if plan.cut == 0:
             left = f"nothing is left of {n} sample{'s' if n > 1 else ''}"
             text = self._short() if n > 1 + min(degree, 1) else left
-            tally.state(self.label, f"{observation.name} is shorter than 1/frequency", text)
+            log.state(self.label, f"{observation.name} is shorter than 1/frequency", text)
         return Bridged(lambda row: plan.apply(row[None]), bad, plan=plan), inside
 
     def exec(self, block: Block, state: tuple[Bridged, Inside | None]) -> None:
@@ -131,7 +131,7 @@ class HighpassFilter(LinearFilter):
         else:
             block.means.pop("signal", None)
             spoilt = bridged.plan.apply(block.detdata["signal"], bridged.bad)
-            block.observation.tally.count(self.label, SPOILT, spoilt)
+            block.observation.log.count(self.label, SPOILT, spoilt)
 
     def _check_length(self, observation: Observation) -> int:
         """Samples at either end that are trimmed. Raises PipelineError where nothing is left of a

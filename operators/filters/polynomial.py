@@ -93,7 +93,7 @@ class Despline(LinearFilter):
         """The fit to this observation's good samples."""
         self._inside(observation)
         basis = splines(observation.n_samples, self.knots * observation.sample_rate)
-        observation.tally.state(
+        observation.log.state(
             self.label, f"{observation.name}: functions fitted to each detector", f"{basis.size}"
         )
         return Fit.of(basis, has_a_signal(observation.flags)), None
@@ -127,10 +127,10 @@ class PolynomialFilter(LinearFilter):
         n, parts = observation.n_samples, self._parts(observation)
         pieces = Pieces.of(parts, self.order, has_a_signal(observation.flags))
         observation.flags[pieces.outside] |= TRIMMED
-        observation.tally.count(
+        observation.log.count(
             self.label, "samples between intervals, flagged", int(pieces.outside.sum()), n
         )
-        observation.tally.state(
+        observation.log.state(
             self.label, f"{observation.name}: polynomials of order {self.order}", f"{len(parts)}"
         )
         return pieces, self._inside(observation)

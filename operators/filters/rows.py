@@ -107,7 +107,7 @@ class LinearFilter(Operator):
 
     def exec(self, block: Block, state: Any) -> None:
         """Subtract the fit from each row and its mean; no mean is left beside the rows."""
-        (fit, inside), signal, tally = state, block.detdata["signal"], block.observation.tally
+        (fit, inside), signal, log = state, block.detdata["signal"], block.observation.log
         mean, spoilt, n_masked = block.means.pop("signal", None), 0, 0
         for part in chunks(len(signal), ROWS):
             detectors = slice(block.detectors.start + part.start, block.detectors.start + part.stop)
@@ -120,8 +120,8 @@ class LinearFilter(Operator):
                 n_masked += int(masked.sum())
             spoilt += fit.remove(rows, masked)
         if inside is not None:
-            tally.count(self.label, MASKED, n_masked, signal.size)
-        tally.count(self.label, SPOILT, spoilt)
+            log.count(self.label, MASKED, n_masked, signal.size)
+        log.count(self.label, SPOILT, spoilt)
 
 
 @kernel(fastmath=False)

@@ -68,11 +68,11 @@ class Taper(LinearFilter):
             level = mean.evaluate(detectors, block.samples).astype(np.float64)
             signal[part] = window * signal[part] - (1 - window) * level
             largest = max(largest, float(np.abs(level).max(initial=0.0)))
-        tally = block.observation.tally
-        tally.count(self.label, MEAN, int((window < 1).sum()) * len(signal), signal.size)
+        log = block.observation.log
+        log.count(self.label, MEAN, int((window < 1).sum()) * len(signal), signal.size)
         if largest:
             step = largest * float(np.finfo(signal.dtype).eps) / 2
-            tally.state(
+            log.state(
                 self.label,
                 "rounding of the mean emission",
                 f"up to {step * 1e6:.2g} µK in a sample",

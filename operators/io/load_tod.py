@@ -116,7 +116,7 @@ class LoadTOD(RecordedFiles):
         if state.mean is not None:
             block.means[RECORDED] = state.mean
         spoilt = state.add(block.detectors, block.samples, out)
-        block.observation.tally.count(
+        block.observation.log.count(
             self.label, "samples of single detectors that the file flags", spoilt
         )
 
@@ -337,17 +337,17 @@ def boresights(
 
 def state_celestial(label: str, observation: Observation, source: str, rate: float) -> None:
     """State where directions come from, how even the times are, and how many gaps there are."""
-    observation.tally.state(label, f"{observation.name}: directions on the sky", source)
+    observation.log.state(label, f"{observation.name}: directions on the sky", source)
     steps = np.diff(observation.seconds) * rate
     if steps.size and (gaps := int(np.count_nonzero(steps > GAP))):
         what = f"{observation.name}: gaps between samples, which filters and noise do not see"
-        observation.tally.count(label, what, gaps, steps.size)
+        observation.log.count(label, what, gaps, steps.size)
     if observation.jitter * rate > 1e-3:
         text = (
             f"depart from a comb of {rate:.6g} Hz by {observation.jitter * 1e3:.3g} ms rms; noise"
             " and filters count samples"
         )
-        observation.tally.state(label, f"{observation.name}: times of the samples", text)
+        observation.log.state(label, f"{observation.name}: times of the samples", text)
 
 
 def _check_same_scan(first: RecordedBand, part: RecordedBand, place: str) -> None:
@@ -370,11 +370,11 @@ def _check_same_scan(first: RecordedBand, part: RecordedBand, place: str) -> Non
 def _tell(label: str, observation: Observation, file: File) -> None:
     """State what an observation of one band has of its file, and what is left out of it."""
     good, dead = flags.good(file.flags, flags.EXCLUDE_SAMPLE), observation.detector_flags != 0
-    observation.tally.state(label, "noise of the detectors", file.noise)
-    observation.tally.count(
+    observation.log.state(label, "noise of the detectors", file.noise)
+    observation.log.count(
         label, "samples that the file's flags exclude", int((~good).sum()), good.size
     )
-    observation.tally.count(
+    observation.log.count(
         label, "detectors that the file's flags exclude", int(np.count_nonzero(dead)), len(dead)
     )
 
@@ -389,7 +389,7 @@ def _recorded_azimuth(label: str, observation: Observation, tod: TimeOrderedData
     known = np.isfinite(away)
     if away[known].max(initial=0.0) > SAME_AZIMUTH:
         what = f"{observation.name}: the column azimuth is not used; it is not the boresight's"
-        observation.tally.state(label, what, f"{np.degrees(away[known].max()):.3g} deg away")
+        observation.log.state(label, what, f"{np.degrees(away[known].max()):.3g} deg away")
         return None
     return np.where(known, tod.azimuth, own)
 

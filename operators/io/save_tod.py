@@ -125,16 +125,16 @@ class SaveTOD(StreamOutput):
         tod = state.writer.tod
         tod.weather = observation.weather or _weather(data, observation, self.label)
         if self.dtype == "float32":
-            observation.tally.state(
+            observation.log.state(
                 self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}"
             )
         if "white" not in observation.components:
-            observation.tally.state(
+            observation.log.state(
                 self.label, "NET of the detectors", "the instrument's; this run has no white noise"
             )
         tod.take_flags(observation)
-        log = "\n".join(f"{who}: {what}: {value}" for who, what, value in observation.tally)
-        tod.metadata.update(_provenance(data), tally=log)
+        log = "\n".join(f"{who}: {what}: {value}" for who, what, value in observation.log)
+        tod.metadata.update(_provenance(data), log=log)
         state.writer.finish()
         state.whole.close()
         data.add(self.label, Files([str(state.path)]))
@@ -155,7 +155,7 @@ def _weather(data: Data, observation: Observation, place: str) -> GroundWeather 
     try:
         return data.scene.ground_weather()
     except InputError as err:
-        observation.tally.state(place, "weather is not written", str(err).splitlines()[0])
+        observation.log.state(place, "weather is not written", str(err).splitlines()[0])
         return None
 
 

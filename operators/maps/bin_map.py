@@ -160,14 +160,14 @@ class BinMap(MapParameters):
         self._note_beams(observation, sums, binned)
         used = observation.focalplane.net[observation.good_detectors]
         sums.unknown_variance |= self.weights == "inverse_variance" and not (used > 0).all()
-        every, tally = observation.n_detectors * observation.n_samples, observation.tally
-        tally.count(self.label, "samples binned", binned, every)
+        every, log = observation.n_detectors * observation.n_samples, observation.log
+        log.count(self.label, "samples binned", binned, every)
         for what, number in (
             ("outside the map", OUTSIDE),
             ("flagged", FLAGGED),
             ("not finite", NOT_FINITE),
         ):
-            tally.count(self.label, f"samples dropped: {what}", int(dropped[number]), every)
+            log.count(self.label, f"samples dropped: {what}", int(dropped[number]), every)
         if dropped[TOO_LARGE]:
             raise PipelineError(
                 f"{int(dropped[TOO_LARGE])} samples are too large for the map's fixed-point sums",
@@ -199,9 +199,9 @@ class BinMap(MapParameters):
             window = np.zeros(0)
         else:
             seen &= (heavy := window >= LIGHTEST)
-            observation.tally.count(self.label, LIGHT, int((~heavy).sum()), heavy.size)
+            observation.log.count(self.label, LIGHT, int((~heavy).sum()), heavy.size)
         if "white" not in observation.components and self.noise == "net" and self.contents == "all":
-            observation.tally.state(self.label, "noise of a pixel", NO_WHITE)
+            observation.log.state(self.label, "noise of a pixel", NO_WHITE)
         return (weight, noise, window), seen
 
     def _weights(self, observation: Observation) -> tuple[Any, Any]:

@@ -13,13 +13,13 @@ import numpy as np
 
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
+from zonda.core.log import Log
 from zonda.core.maps.beams import SPREAD
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.planes import ScanHits
 from zonda.core.numerics.angles import angle_text
 from zonda.core.numerics.chunks import empty
 from zonda.core.signal import MAIN, product_name
-from zonda.core.tally import Tally
 from zonda.core.types import AnyFloats, Floats
 
 from .angle_checks import warn_after
@@ -64,7 +64,7 @@ class MapFromSums:
             product.band = data.scene.instrument.band
             if stream == MAIN:
                 self._add_coverage(product)
-                self._state_choices(product, data.tally)
+                self._state_choices(product, data.log)
                 band = f", {data.band}" if data.band else ""
                 warn_after(product, self.parameters.label + band)
                 self._state_beams(product, data)
@@ -180,7 +180,7 @@ class MapFromSums:
                 f"{angle_text(product.fwhm)}: peak times its area is the flux density;"
                 f" detectors have {beams}"
             )
-            data.tally.state(self.parameters.label, "beam of the map (FWHM)", text)
+            data.log.state(self.parameters.label, "beam of the map (FWHM)", text)
             if wide > SPREAD * narrow:
                 more = (
                     "fluxes are right by it, shapes are not: map detectors of one beam by"
@@ -193,43 +193,43 @@ class MapFromSums:
                     stacklevel=4,
                 )
 
-    def _state_choices(self, product: MapProduct, tally: Tally) -> None:
+    def _state_choices(self, product: MapProduct, log: Log) -> None:
         """State how the map was made, and its approximations."""
         if product.polarization is not None:
             hit = int(np.count_nonzero(product.hits))
-            tally.count(
+            log.count(
                 self.parameters.label, UNSOLVED, hit - int(np.count_nonzero(product.known)), hit
             )
         if self.parameters.noise == "scatter":
             alone = int(np.count_nonzero(product.hits == 1))
-            tally.count(
+            log.count(
                 self.parameters.label,
                 "pixels with one sample, whose scatter is unknown: noise NaN",
                 alone,
             )
             equal = int(np.count_nonzero((product.hits > 1) & (product.noise == 0)))
-            tally.count(
+            log.count(
                 self.parameters.label,
                 "pixels whose samples scatter by less than rounding: noise 0",
                 equal,
             )
             if self.parameters.smooth is not None:
-                tally.count(
+                log.count(
                     self.parameters.label,
                     "of them left out of the smoothed noise, which is too low around them",
                     alone,
                 )
         if self.sums.unknown_variance:
-            tally.state(self.parameters.label, "weights", "uniform: every NET is 0")
-        tally.state(
+            log.state(self.parameters.label, "weights", "uniform: every NET is 0")
+        log.state(
             self.parameters.label, "fixed-point step of the sums", f"{1 / VALUE:.1e} K per sample"
         )
         if not self.sums.of_scans:
-            tally.state(
+            log.state(
                 self.parameters.label, "half-difference of", DIFFERENCES[self.parameters.split]
             )
         if self.parameters.half_difference and not self.sums.halved:
-            tally.state(self.parameters.label, "half-difference", "not made: it needs two scans")
+            log.state(self.parameters.label, "half-difference", "not made: it needs two scans")
 
 
 def _mean(hits: Sums, weights: Sums, data: Sums) -> tuple[Floats, Floats]:

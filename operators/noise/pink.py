@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from zonda.core.configuration.units import Fraction, Hertz, KelvinRootSecond
 from zonda.core.errors import placed
 from zonda.core.operator import Operator
-from zonda.core.plausible import KNEE, doubt
+from zonda.core.plausibility import KNEE, doubt
 from zonda.core.types import Floats
 
 from .models import Amplitude, FixedNet, NoiseLevel, announced, resolve
@@ -95,7 +95,7 @@ class PinkNoise(Operator):
         """Fit the filter; draw the common part. None: there is no pink noise."""
         if spectrum := PinkSpectrum.of(self, observation):
             return _prepared(self, spectrum, observation)
-        observation.tally.state(self.label, "pink noise", "none: the knee is at 0 Hz")
+        observation.log.state(self.label, "pink noise", "none: the knee is at 0 Hz")
         observation.focalplane.knee = np.zeros(observation.n_detectors)
         return None
 
@@ -126,7 +126,7 @@ class PinkNoise(Operator):
             middle = np.median(
                 state.amplitude.of(observation).time_mean() * np.sqrt(state.streams.variance)
             )
-            observation.tally.state(
+            observation.log.state(
                 self.label, "rms at the detector, median (mK)", f"{1e3 * middle:.4g}"
             )
 
@@ -142,7 +142,7 @@ class _State(NamedTuple):
 def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation) -> _State:
     """Raises InputError as `PinkSpectrum.filters`."""
     laws, slopes = spectrum.filters(pink), spectrum.different
-    observation.tally.state(
+    observation.log.state(
         pink.label, "power over that of white noise", spectrum.describe(laws[spectrum.slope])
     )
     resolve(observation)

@@ -15,7 +15,7 @@ from zonda.core.kernels import kernel
 from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
 from zonda.core.numerics.smooth import series_into
 from zonda.core.operator import Operator
-from zonda.core.plausible import NET, doubt
+from zonda.core.plausibility import NET, doubt
 
 from .models import Amplitude, FixedNet, NoiseLevel, NoiseModel, noise_model, resolve
 
@@ -119,9 +119,7 @@ class WhiteNoise(Operator):
             f" ({net.min():.4g} to {net.max():.4g})" if net.max() > net.min() else ""
         )
         whose = f"{observation.name}: " if level.follows_load else ""  # differs from scan to scan
-        observation.tally.state(
-            self.label, f"{whose}NET on the sky, median (range), mK s^1/2", text
-        )
+        observation.log.state(self.label, f"{whose}NET on the sky, median (range), mK s^1/2", text)
 
 
 class _State(NamedTuple):

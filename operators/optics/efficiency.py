@@ -85,8 +85,8 @@ class Efficiency(Operator):
         """Coefficients of equation (2); flags what is opaque."""
         found = self._coefficients(observation)
         what = f"{found.zeta.mean():.4g}, {found.epsilon.mean():.4g}"
-        observation.tally.state(self.label, "zeta and epsilon (mean)", what)
-        observation.tally.state(self.label, "calibrated by", f"zeta e^-tau, {self.calibration}")
+        observation.log.state(self.label, "zeta and epsilon (mean)", what)
+        observation.log.state(self.label, "calibrated by", f"zeta e^-tau, {self.calibration}")
         return found
 
     def exec(self, block: Block, state: Calibration) -> None:
@@ -104,7 +104,7 @@ class Efficiency(Operator):
         clipped = _make_signal(block, state, instantaneous)
         if instantaneous:
             what = f"samples whose fluctuating e^-tau was raised to {LEAST_TRANSMISSION:g}"
-            block.observation.tally.count(self.label, what, clipped)
+            block.observation.log.count(self.label, what, clipped)
 
     def _scatter(self, observation: Observation) -> None:
         """Scatter zeta."""
@@ -117,7 +117,7 @@ class Efficiency(Operator):
         drawn = nominal * (1 + self.scatter * _normals(observation, self.label, "zeta"))
         plane.main_beam_efficiency = np.clip(drawn, 0.01 * nominal, 1.0)
         clipped = int(np.count_nonzero(plane.main_beam_efficiency != drawn))
-        observation.tally.count(self.label, "detectors whose scattered zeta was clipped", clipped)
+        observation.log.count(self.label, "detectors whose scattered zeta was clipped", clipped)
 
     def _coefficients(self, observation: Observation) -> Calibration:
         zeta, epsilon = (
@@ -137,7 +137,7 @@ class Efficiency(Operator):
                 )
             mean = ratio.scaled(share)
             text = f"{error * np.abs(share).max():.1e} K_RJ"
-            observation.tally.state(self.label, "largest error of the smooth mean emission", text)
+            observation.log.state(self.label, "largest error of the smooth mean emission", text)
         return Calibration(zeta, epsilon, gain, transmission, mean)
 
 
@@ -311,13 +311,13 @@ def _flag_opaque(label: str, observation: Observation, transmission: SmoothField
     observation.detector_flags[dead] |= flags.OPAQUE
     bad = np.repeat(cell[:-1] | cell[1:], transmission.step)[: observation.n_samples]
     observation.flags[bad] |= flags.OPAQUE
-    observation.tally.count(
+    observation.log.count(
         label,
         f"detectors flagged: band transmission below {LEAST_TRANSMISSION:g}",
         int(dead.sum()),
         observation.n_detectors,
     )
-    observation.tally.count(
+    observation.log.count(
         label,
         f"samples flagged: band transmission below {LEAST_TRANSMISSION:g}",
         int(bad.sum()),

@@ -63,7 +63,7 @@ class GroundPickup(Operator):
             stream_key(seed, "ground", self.label),
         )
         profile *= (observation.elevation / (math.pi / 4)) ** self.power
-        observation.tally.state(
+        observation.log.state(
             self.label,
             f"{observation.name}: rms at the detector",
             f"{1e3 * profile.std():.3g} mK_RJ",

@@ -44,12 +44,12 @@ class HalfWavePlate(Operator):
     def prepare(self, observation: Observation) -> None:
         """State it; with detectors that are not polarized it has no effect."""
         modulated = 4 * abs(self.frequency)
-        observation.tally.state(self.label, "polarization is modulated at", f"{modulated:g} Hz")
+        observation.log.state(self.label, "polarization is modulated at", f"{modulated:g} Hz")
         if modulated >= observation.sample_rate / 2:
             what = (
                 f"{modulated:g} Hz is not below half the sample rate,"
                 f" {observation.sample_rate / 2:g} Hz"
             )
-            observation.tally.state(self.label, "modulation aliased", what)
+            observation.log.state(self.label, "modulation aliased", what)
         if not observation.focalplane.polarized:
-            observation.tally.state(self.label, "no effect", "no detector is polarized")
+            observation.log.state(self.label, "no effect", "no detector is polarized")

@@ -50,7 +50,7 @@ class Leakage(Operator):
         )
         size = self.share * plane.polarization_efficiency
         if not plane.polarized:
-            observation.tally.state(self.label, "no effect", "no detector is polarized")
+            observation.log.state(self.label, "no effect", "no detector is polarized")
         return np.stack([size * np.cos(2 * turn), size * np.sin(2 * turn)]), np.zeros(
             0
         ) if chi is None else 4 * chi

@@ -125,7 +125,7 @@ class Scans(Operator):
             self.summary(scans, made) + part,
             f"elevation: {elevations.min():.2f} to {elevations.max():.2f} deg",
             *distances(made),
-            *(f"{what}: {text}" for _, what, text in made[0].tally if what.startswith(topics)),
+            *(f"{what}: {text}" for _, what, text in made[0].log if what.startswith(topics)),
         ]
 
     def _rate(self, data: Data) -> float:
@@ -370,7 +370,7 @@ class Pointing(Scans):
         if self.jitter > 0:
             state_times(self.label, observation)
         if (wanted := self.scan_duration * rate) < 0.5:
-            observation.tally.state(
+            observation.log.state(
                 self.label,
                 f"{observation.name}: shorter than a sample",
                 f"{wanted:.2g} of one; one is taken",

@@ -233,7 +233,7 @@ class LargestMotion:
         ]
 
     def statements(self) -> list[tuple[str, str]]:
-        """(what, text) for the tally."""
+        """(what, text) for the log."""
         said = []
         for order in (1, 2):
             parts = []

@@ -68,7 +68,7 @@ class Mispointing(Operator):
             )
             rms = np.degrees([np.sqrt(np.mean(x * x)), np.sqrt(np.mean(y * y))]) * 3600
             what = f"{observation.name}: rms error towards azimuth and elevation"
-            observation.tally.state(self.label, what, f"{rms[0]:.3g} and {rms[1]:.3g} arcsec")
+            observation.log.state(self.label, what, f"{rms[0]:.3g} and {rms[1]:.3g} arcsec")
 
     def errors(self, observation: Observation) -> tuple[Floats, Floats]:
         """(x, y), (n_samp,) each, rad."""

@@ -188,7 +188,7 @@ class SamplesPerBeam:
         return self._fwhm * self._rate / self._fastest if self._fastest else math.inf
 
     def statements(self) -> list[tuple[str, str]]:
-        """(what, text) for the tally."""
+        """(what, text) for the log."""
         if not self._fastest:
             return []
         usual = self._fwhm * self._rate / max(self._usual, 1e-3 * self._fastest)

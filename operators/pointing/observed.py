@@ -1,4 +1,4 @@
-"""From directions at instants to an `Observation` with its entries in the tally: what all pointing
+"""From directions at instants to an `Observation` with its entries in the log: what all pointing
 steps share.
 """
 
@@ -66,8 +66,8 @@ def observed(
         f"{transform.error:.1e} rad, {transform.error / beam:.1e} of a beam (nodes every"
         f" {transform.spacing:g} s)"
     )
-    observation.tally.state(label, "interpolation error of the pointing", error)
-    observation.tally.state(label, "Earth orientation", transform.source)
+    observation.log.state(label, "interpolation error of the pointing", error)
+    observation.log.state(label, "Earth orientation", transform.source)
     if not transform.orientation_known:
         warnings.warn(
             f"{label}: Earth orientation at {transform.start}: {transform.source}", stacklevel=4
@@ -91,7 +91,7 @@ def mark_turnarounds(
 ) -> None:
     """Count the samples ``turning`` (n,), and flag them if that is asked for."""
     what = "samples in turnarounds" + (", flagged" if flagged else ", used")
-    observation.tally.count(label, what, int(turning.sum()), observation.n_samples)
+    observation.log.count(label, what, int(turning.sum()), observation.n_samples)
     observation.flags |= np.where(flagged & turning, TURNAROUND, 0).astype(np.uint8)
 
 
@@ -103,14 +103,14 @@ def state_times(label: str, observation: Observation) -> None:
     rms, most, rate = observation.jitter, float(abs(late).max()), observation.sample_rate
     step = np.diff(observation.seconds) * rate
     at_nyquist = math.pi * rate * rms
-    observation.tally.state(
+    observation.log.state(
         label,
         f"{observation.name}: times of the samples",
         f"depart from a comb of {rate:.6g} Hz by {rms * 1e3:.3g} ms rms, {most * 1e3:.3g} ms at"
         f" most (intervals of {step.min():.3g} to {step.max():.3g} of the mean); pointing and"
         " atmosphere follow them",
     )
-    observation.tally.state(
+    observation.log.state(
         label,
         f"{observation.name}: noise and filters take the samples as a comb",
         f"a component at frequency f is off by at most 2 pi f {rms * 1e3:.3g} ms of its rms: "
@@ -121,11 +121,11 @@ def state_times(label: str, observation: Observation) -> None:
 def report(
     label: str, observations: Sequence[Observation], *findings: LargestMotion | SamplesPerBeam
 ) -> None:
-    """Enter findings in the tally of each observation, and warn."""
+    """Enter findings in the log of each observation, and warn."""
     for found in findings:
         for what, text in found.statements():
             for observation in observations:
-                observation.tally.state(label, what, text)
+                observation.log.state(label, what, text)
     for found in findings:
         for text in found.warnings():
             warnings.warn(f"{label}: {text}", stacklevel=4)

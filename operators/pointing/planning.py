@@ -26,7 +26,7 @@ from .recorded import PointingRecorded
 from .schedule import PointingSchedule
 
 MOTION = LargestMotion.TOPICS + SamplesPerBeam.TOPICS
-"""Beginnings of the tally's entries about the telescope's motion."""
+"""Beginnings of the log's entries about the telescope's motion."""
 
 STEEPEST = math.sqrt(8 * math.log(2)) * math.exp(-0.5)
 """Largest slope of a Gaussian beam, in peaks per FWHM."""
@@ -123,7 +123,7 @@ def _shift(context: Context, delta: float) -> dict[str, float]:
 def _motion(context: Context) -> list[tuple[str, str]]:
     """The telescope's motion: (what, text). Samples per beam are those of the planned band."""
     topics = LargestMotion.TOPICS if context.band else MOTION
-    found = [(what, text) for _, what, text in context.first.tally if what.startswith(topics)]
+    found = [(what, text) for _, what, text in context.first.log if what.startswith(topics)]
     sampled = SamplesPerBeam()
     for o in context.observations if context.band else ():
         sampled.add(o, o.sample_rate)

@@ -242,14 +242,14 @@ class PointingRaster(RasterParameters):
             *lines,
             *(
                 f"raster: {text}"
-                for _, what, text in data.observations[first].tally
+                for _, what, text in data.observations[first].log
                 if what.endswith(RASTER)
             ),
         ]
 
     def describe(self, observation: Observation) -> None:
         rows = self.rows
-        observation.tally.state(
+        observation.log.state(
             self.label,
             observation.name + RASTER,
             _stated(rows, self.position_angle, self.scan_duration),

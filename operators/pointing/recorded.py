@@ -109,7 +109,7 @@ class PointingRecorded(Operator):
             sampled.add(observation, observation.sample_rate)
             data.observations.append(observation)
         for what, number in found.counts.items():
-            data.observations[first].tally.count(self.label, what, number)
+            data.observations[first].log.count(self.label, what, number)
         report(self.label, data.observations[first:], sampled)
 
     def _read(self) -> tuple[Recording, Comb]:
@@ -235,4 +235,4 @@ def _state_celestial(
                 f"{label}: {observation.name}: directions on the sky are {text}: {cure}",
                 stacklevel=4,
             )
-    observation.tally.state(label, f"{observation.name}: directions on the sky", text)
+    observation.log.state(label, f"{observation.name}: directions on the sky", text)

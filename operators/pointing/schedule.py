@@ -241,13 +241,13 @@ class PointingSchedule(ScheduleParameters):
                 found = _motion(track, begin, end, limits)
                 known = {q: peak for q, peak in found.items() if bounded or q[1] < 3}
                 moved.add(observation.name, known, refused)
-        tally = observation.tally
-        tally.state(self.label, f"{observation.name}: row of the schedule", row.label)
+        log = observation.log
+        log.state(self.label, f"{observation.name}: row of the schedule", row.label)
         turning = sweep.turning(seconds - delay) & scanning
         mark_turnarounds(self.label, observation, turning, self.flag_turnarounds)
         if ahead:
             what = "samples in elevation nods, flagged"
-            tally.count(self.label, what, ahead, len(seconds))
+            log.count(self.label, what, ahead, len(seconds))
         return observation
 
 

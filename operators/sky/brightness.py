@@ -43,7 +43,7 @@ class Conversion:
     typical
         K_RJ per unit, at the median pixel where pixels differ.
     text
-        For the tally.
+        For the log.
     """
 
     factor: float | Floats
@@ -100,7 +100,7 @@ class Brightness:
     covered
         (ny, nx), or (0, 0): everywhere.
     notes, counts
-        What was chosen, and what was taken for something else, for the tally.
+        What was chosen, and what was taken for something else, for the log.
     polarization
         (2, ny, nx) Q and U from the meridians through `Grid.axis`; 0 where nothing is known. None:
         there are none.

@@ -77,8 +77,8 @@ class CMBSky(FullSky):
     def prepare(self, observation: Observation) -> tuple[SkyMap, ScanSampler]:
         """The step that samples the map, and what that one knows of the scan."""
         sky, rms = self.sky(observation.seed, observation.focalplane.polarized)
-        observation.tally.state(self.label, "spectrum", self.read().text)
-        observation.tally.state(
+        observation.log.state(self.label, "spectrum", self.read().text)
+        observation.log.state(
             self.label,
             "rms of the sky before the beam",
             f"{1e6 * rms:.4g} uK_CMB, nside {self.nside}",

@@ -58,7 +58,7 @@ class InputMap:
     unit
         ``Jy/pixel``, ``Jy/beam``, ``MJy/sr``, ``K_RJ``, ``K_CMB`` or ``y``.
     notes
-        What was chosen or changed, for the tally.
+        What was chosen or changed, for the log.
     zeroed
         Missing pixels set to zero on request.
     polarization

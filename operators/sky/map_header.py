@@ -84,7 +84,7 @@ class MapHeader:
     place
         The file, as messages call it.
     notes
-        What is chosen or changed, for the tally.
+        What is chosen or changed, for the log.
     """
 
     header: Any

@@ -33,7 +33,7 @@ from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
-from zonda.core.plausible import FLUX, doubt
+from zonda.core.plausibility import FLUX, doubt
 from zonda.core.storage.table_files import read_table
 from zonda.core.types import Floats
 
@@ -94,7 +94,7 @@ class PointSources(Operator):
         found = Sources.of(
             catalogue, catalogue.brightness(observation.instrument.band, self.scale), observation
         )
-        observation.tally.state(
+        observation.log.state(
             self.label,
             f"{observation.name}: sources",
             f"{found.in_view} of {len(catalogue.flux)} in view",

@@ -85,7 +85,7 @@ class PySMSky(FullSky):
     def prepare(self, observation: Observation) -> tuple[SkyMap, ScanSampler]:
         """The step that samples the band's map, and what that one knows of the scan."""
         sky = self.sky(observation)
-        observation.tally.state(self.label, "sky of PySM", self._what)
+        observation.log.state(self.label, "sky of PySM", self._what)
         return sky, sky.prepare(observation)
 
     def sky(self, observation: Observation) -> SkyMap:

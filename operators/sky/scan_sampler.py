@@ -25,7 +25,7 @@ from .grid import Grid
 from .sampling import Chunks, Rows, pointing, sample
 
 if TYPE_CHECKING:
-    from zonda.core.data import Tally
+    from zonda.core.data import Log
 
 
 class Cache:
@@ -95,10 +95,10 @@ class Beam:
     def nbytes(self) -> int:
         return self.covered.nbytes + sum(plane.nbytes for plane in self.planes)
 
-    def tell(self, tally: Tally, label: str) -> None:
+    def tell(self, log: Log, label: str) -> None:
         """State its width and how finely it is sampled."""
         if self.fwhm == 0.0:
-            tally.state(label, "beam", "none")
+            log.state(label, "beam", "none")
             return
         first = self.planes[0]
         text = f"Gaussian, {' x '.join(str(q) for q in first.steps)} grid steps per input pixel"
@@ -107,7 +107,7 @@ class Beam:
                 "; the input has fewer than 2 pixels per FWHM: it is taken as smooth between its"
                 " pixels"
             )
-        tally.state(label, f"beam of {np.degrees(self.fwhm) * 3600:.6g} arcsec", text)
+        log.state(label, f"beam of {np.degrees(self.fwhm) * 3600:.6g} arcsec", text)
 
     def pointing(self, block: Block, kind: Any) -> Chunks:
         """`sampling.pointing` of a block, for samples of the type ``kind``."""
@@ -150,15 +150,15 @@ class ScanSampler:
     _counts: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     _chunks: Cache = field(default_factory=lambda: Cache(2**22))
 
-    def tell(self, tally: Tally, label: str) -> None:
+    def tell(self, log: Log, label: str) -> None:
         """State what was chosen, and count what was taken for something else."""
         for what, text in self.sky.notes.items():
-            tally.state(label, what, text)
+            log.state(label, what, text)
         for what, number in self.sky.counts.items():
             if number:
-                tally.count(label, what, number)
+                log.count(label, what, number)
         for beam in self.beams:
-            beam.tell(tally, label)
+            beam.tell(log, label)
 
     def sample(self, block: Block, out: AnyFloats, linear: bool, over: bool) -> None:
         """Add the sky to a block's stream (`sampling.sample`), and count the samples that see

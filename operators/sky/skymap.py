@@ -71,18 +71,18 @@ class SkyMap(ConvolvedSky):
     def prepare(self, observation: Observation) -> ScanSampler:
         grid, (widths, index) = self.grid_of(observation), self.beam_widths(observation)
         if stated := self.warn_of_beams(grid.source, observation.focalplane.fwhm):
-            observation.tally.state(self.label, "resolution", stated)
+            observation.log.state(self.label, "resolution", stated)
         sky = self.brightness_on(grid, observation.instrument.band)
         state = ScanSampler(grid, sky, [], index)
         if not grid.reached(observation, float(widths.max(initial=0.0))):
             what = f"{observation.name}: not convolved"
-            observation.tally.state(self.label, what, "no detector reaches the input map")
+            observation.log.state(self.label, what, "no detector reaches the input map")
             return state
         band = observation.instrument.band
         state.beams = [self.with_beam(grid, band, float(fwhm)) for fwhm in widths]
         if sky.polarization is not None:
             state.angles = PolarizationAngles.of(observation, observation.sky_boresight, grid.axis)
-        state.tell(observation.tally, self.label)
+        state.tell(observation.log, self.label)
         return state
 
     def exec(self, block: Block, state: ScanSampler) -> None:
@@ -110,7 +110,7 @@ class SkyMap(ConvolvedSky):
         """Count the samples that see no sky, and warn where all of them are."""
         beyond, behind = state.totals()
         total = observation.n_detectors * observation.n_samples
-        observation.tally.count(self.label, "samples outside the input map", beyond, total)
+        observation.log.count(self.label, "samples outside the input map", beyond, total)
         if beyond == total:
             ra, dec = np.degrees(observation.centre)
             cure = (
@@ -124,7 +124,7 @@ class SkyMap(ConvolvedSky):
                 stacklevel=3,
             )
         if behind:
-            observation.tally.count(
+            observation.log.count(
                 self.label, "samples more than 90 deg from the input map's centre", behind, total
             )
 

@@ -91,7 +91,7 @@ def gaps_and_nan() -> Measured:
     spoilt[:, 7000:7050], spoilt[1, 100], spoilt[2] = 1e6, np.nan, np.inf
     data = run([HighpassFilter()], o, spoilt, keep=("signal",))
     good = np.r_[0:100, 101:7000, 7050:20000]
-    counted = data.tally.get("HighpassFilter", "samples not finite")
+    counted = data.log.get("HighpassFilter", "samples not finite")
     change = abs(data.observations[0].detdata["signal"] - clean)[:2, good].max() / WHITE
     return float(change) if counted == 20001 else np.inf, f"{counted} samples counted as not finite"
 
@@ -124,7 +124,7 @@ def one_or_identical() -> int:
             data = run([CommonModeFilter(method=method)], scan(n_det, N), a, keep=("signal",))
             wrong += differing(data.observations[0].detdata["signal"], a)
             wrong += (
-                data.tally.get(
+                data.log.get(
                     "CommonModeFilter", "modes kept because the data do not determine them (rank)"
                 )
                 != 1
@@ -150,7 +150,7 @@ def undetermined_mode() -> Measured:
     """
     a = np.random.default_rng(4).standard_normal((N_DET, N))
     data = run([CommonModeFilter()], scan(N_DET, N), a, keep=("signal",))
-    counted = data.tally.get("CommonModeFilter", UNDETERMINED)
+    counted = data.log.get("CommonModeFilter", UNDETERMINED)
     error = float(
         np.linalg.norm(data.observations[0].detdata["signal"] - (a - a.mean(0))) / np.linalg.norm(a)
     )
@@ -171,14 +171,14 @@ def dead_in_one_block() -> Measured:
         product = data.products["map"]
         dropped = sum(
             n
-            for who, what, n in data.tally.counts()
+            for who, what, n in data.log.counts()
             if who == "BinMap" and what.startswith("samples dropped")
         )
         wrong += abs(int(product.hits.sum()) + dropped - a.size) + int(
             (~np.isfinite(product.signal[product.hits > 0])).sum()
         )
         wrong += abs(int(product.hits.sum()) - a.size + N)
-        said.append(data.tally.get("CommonModeFilter", "detectors flagged: signal not finite"))
+        said.append(data.log.get("CommonModeFilter", "detectors flagged: signal not finite"))
     return wrong, f"{said[0]} detector flagged"
 
 

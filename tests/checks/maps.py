@@ -58,7 +58,7 @@ def nan_in_the_signal() -> Measured:
     spoilt[2, 300:320], spoilt[3, 50] = np.nan, -np.inf
     data = run([BinMap(pixel="5 arcsec")], o, spoilt)
     whole = run([BinMap(pixel="5 arcsec")], scan(7, 3000), a).products["map"]
-    product, counted = data.products["map"], data.tally.get("BinMap", "samples dropped: not finite")
+    product, counted = data.products["map"], data.log.get("BinMap", "samples dropped: not finite")
     same = whole.hits == product.hits
     wrong = differing(product.signal[same], whole.signal[same]) + abs(
         int((whole.hits - product.hits).sum()) - 21
@@ -79,7 +79,7 @@ def nan_in_the_input_map() -> Measured:
     spoilt[30:33, 40] = np.nan
     found, data = _sampled(spoilt, missing="zero")
     expected, _ = _sampled(zeroed)
-    counted = data.tally.get(
+    counted = data.log.get(
         "SkyMap", "pixels of the input map that are NaN or infinite, taken as zero"
     )
     corner, clean = _sampled(far)[0], _sampled(values)[0]
@@ -107,7 +107,7 @@ def beyond_the_map() -> Measured:
     3 mK
     """
     found, data = _sampled(np.full((21, 21), 1e-3), outside="3 mK")
-    counted = data.tally.get("SkyMap", "samples outside the input map")
+    counted = data.log.get("SkyMap", "samples outside the input map")
     o = data.observations[0]
     plane = o.focalplane
     with_reach = np.hypot(plane.xi, plane.eta) < np.radians(
@@ -126,13 +126,13 @@ def tiny_maps() -> int:
         found, data = _sampled(np.full(shape, 1e-3), 500, radius=0.005)
         wrong += int(
             (~np.isfinite(found)).sum()
-            + (data.tally.get("SkyMap", "samples outside the input map") == 0)
+            + (data.log.get("SkyMap", "samples outside the input map") == 0)
         )
     a = np.ones((7, 3000))
     data = run([BinMap(pixel="10 arcmin", width="10 arcmin")], scan(7, 3000), a)
     product, outside = (
         data.products["map"],
-        data.tally.get("BinMap", "samples dropped: outside the map"),
+        data.log.get("BinMap", "samples dropped: outside the map"),
     )
     return (
         wrong

@@ -148,9 +148,9 @@ def map_of_an_opaque_band() -> Measured:
         ]
         data = run(list(steps), o)
         product = data.products["map"]
-        dropped = data.tally.get("BinMap", "samples dropped: flagged")
+        dropped = data.log.get("BinMap", "samples dropped: flagged")
         flagged.append(
-            f"{data.tally.get('Efficiency', 'detectors flagged: band transmission below 1e-06')} of"
+            f"{data.log.get('Efficiency', 'detectors flagged: band transmission below 1e-06')} of"
             " 7 detectors"
         )
         wrong += (
@@ -175,8 +175,8 @@ def positive_water() -> Measured:
         )
         water = 1e-3 / np.sin(o.elevation.max()) + data.observations[0].detdata["pwv"]
         wrong += int((~(water > -1e-9)).sum())
-        clipped += data.tally.get("AtmosphereLayers", "values of the PWV clipped to the table")
-    return wrong, f"{clipped} values clipped, as the tally counts"
+        clipped += data.log.get("AtmosphereLayers", "values of the PWV clipped to the table")
+    return wrong, f"{clipped} values clipped, as the log counts"
 
 
 @checks.add(

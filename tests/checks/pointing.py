@@ -176,7 +176,7 @@ def right_ascension_wrap() -> int:
 
 
 @checks.add(
-    SPHERE, reference="a warning, a line in the tally, finite directions", limit=0, unit="dates"
+    SPHERE, reference="a warning, a line in the log, finite directions", limit=0, unit="dates"
 )
 def beyond_the_tables() -> int:
     """dates beyond the bundled IERS tables that pass without a word, 1950 and 2090; dates inside
@@ -190,7 +190,7 @@ def beyond_the_tables() -> int:
                 PointingStare(scan_duration="1 s", target="az 0 deg el 45 deg"),
                 time=f"{year}-11-25T12:00Z",
             )
-        said = {what: text for _, what, text in o.tally}["Earth orientation"]
+        said = {what: text for _, what, text in o.log}["Earth orientation"]
         warned = any("Earth orientation" in str(w.message) for w in caught)
         told = "none for this date" in said
         wrong += int(

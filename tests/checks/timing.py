@@ -116,7 +116,7 @@ def recorded_gaps_and_nan() -> Measured:
         "samples whose row is not a number, flagged": 11,
     }
     wrong += sum(
-        abs(o.tally.get("PointingRecorded", what) - number) for what, number in counts.items()
+        abs(o.log.get("PointingRecorded", what) - number) for what, number in counts.items()
     )
-    bridged = o.tally.get("HighpassFilter", "flagged samples bridged before filtering")
+    bridged = o.log.get("HighpassFilter", "flagged samples bridged before filtering")
     return wrong + abs(bridged - 214), f"{bridged} flagged, bridged by the filter, without hits"

@@ -260,9 +260,7 @@ def test_what_was_read_under_another_name_and_what_was_not_is_told(tmp_path: Pat
     camera = zonda.Instrument(**CAMERA, focalplane=str(table))
     told = "gamma is read as polarization_angle; not used: pixel, ufm"
     assert camera.notes == {"focal plane": told}
-    assert ("camera", "focal plane", told) in list(
-        mapped(CAMERA | {"focalplane": str(table)}).tally
-    )
+    assert ("camera", "focal plane", told) in list(mapped(CAMERA | {"focalplane": str(table)}).log)
 
 
 def test_columns_that_say_again_what_ours_say_are_left_out(tmp_path: Path) -> None:

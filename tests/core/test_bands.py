@@ -125,7 +125,7 @@ def test_products_scans_and_the_log_bear_the_bands_names(both: Any) -> None:
         ("scan-000", 2 * PIXELS),
         ("scan-001", 2 * PIXELS),
     ]
-    assert both.tally.get("BinMap f090", "samples binned") == both["map_f090"].hits.sum()
+    assert both.log.get("BinMap f090", "samples binned") == both["map_f090"].hits.sum()
     ratio = np.nanmax(both["input_f090"].values) / np.nanmax(both["input_f150"].values)
     kelvin = [to_kelvin_rj("K_CMB", camera(name).band) for name in BANDS]
     assert ratio == pytest.approx(kelvin[0] / kelvin[1], rel=1e-12)

@@ -58,7 +58,7 @@ class Ones(Operator):
     """What to fill in."""
     def exec(self, block, state):
         block.new("signal")[...] = self.value
-        block.observation.tally.count(self.label, "samples", block.detdata["signal"].size)
+        block.observation.log.count(self.label, "samples", block.detdata["signal"].size)
 
 class Total(Operator):
     """Writes the sum of the signal."""

@@ -4,30 +4,30 @@ from __future__ import annotations
 
 import pytest
 
-from zonda.core.data import Tally, percent
+from zonda.core.data import Log, percent
 
 
 def test_counts_are_told_with_their_share():
     """Parts and wholes are added up over scans; what happened to none has no share, nor what was
     counted among nothing.
     """
-    tally, other = Tally(), Tally()
-    tally.count("SkyMap", "samples outside", 30, 1000)
+    log, other = Log(), Log()
+    log.count("SkyMap", "samples outside", 30, 1000)
     other.count("SkyMap", "samples outside", 173, 0)
     other.count("SkyMap", "samples outside", 0, 3000)
     other.count("BinMap", "samples dropped", 0, 3000)
     other.count("BinMap", "pixels", 5)
     other.state("BinMap", "weights", "uniform")
-    tally.update(other, prefix="")
-    assert list(tally.told()) == [
+    log.update(other, prefix="")
+    assert list(log.told()) == [
         ("BinMap", "pixels", "5"),
         ("BinMap", "samples dropped", "0"),
         ("BinMap", "weights", "uniform"),
         ("SkyMap", "samples outside", "203 (5.08 %)"),  # of 4000
     ]
-    assert ("SkyMap", "samples outside", "203") in list(tally)  # files keep the number
-    tally.update(other, prefix="source_free/")
-    assert ("source_free/SkyMap", "samples outside", "173 (5.77 %)") in list(tally.told())
+    assert ("SkyMap", "samples outside", "203") in list(log)  # files keep the number
+    log.update(other, prefix="source_free/")
+    assert ("source_free/SkyMap", "samples outside", "173 (5.77 %)") in list(log.told())
 
 
 @pytest.mark.parametrize(

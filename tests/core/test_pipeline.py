@@ -167,7 +167,7 @@ class Flag(Operator):
     _prepared: int = PrivateAttr(0)
 
     def prepare(self, observation):
-        observation.tally.state(self.label, "prepared before", f"{self._prepared} times")
+        observation.log.state(self.label, "prepared before", f"{self._prepared} times")
         observation.smooth["transmission"] = SmoothField.constant(
             np.full(1, self._prepared), observation.n_samples
         )
@@ -175,7 +175,7 @@ class Flag(Operator):
 
     def exec(self, block, state):
         block.observation.flags[0] = 1
-        block.observation.tally.count(self.label, "signals seen", 1)
+        block.observation.log.count(self.label, "signals seen", 1)
 
 
 def test_a_scan_is_prepared_and_told_of_once(scene):
@@ -190,8 +190,8 @@ def test_a_scan_is_prepared_and_told_of_once(scene):
     for number, observation in enumerate(data.observations):
         assert observation.flags[0] == 1
         assert observation.smooth["transmission"].weights[0, 0] == number
-        assert ("Flag", "prepared before", f"{number} times") in list(observation.tally)
-    assert data.tally.get("Flag", "signals seen") == alone.tally.get("Flag", "signals seen") > 0
+        assert ("Flag", "prepared before", f"{number} times") in list(observation.log)
+    assert data.log.get("Flag", "signals seen") == alone.log.get("Flag", "signals seen") > 0
 
 
 class Uses(Operator):

@@ -250,11 +250,9 @@ def test_what_it_cannot_do_is_told_with_its_own_words():
 
 def test_an_operator_that_changes_nothing_is_told():
     data = run(theirs("PolyFilter", pattern="no such detector"))
-    assert {what for who, what, _ in data.tally if who.startswith("ToastOperator")} >= {"no effect"}
+    assert {what for who, what, _ in data.log if who.startswith("ToastOperator")} >= {"no effect"}
     data = run(theirs("PolyFilter", view=None))
-    assert "no effect" not in {
-        what for who, what, _ in data.tally if who.startswith("ToastOperator")
-    }
+    assert "no effect" not in {what for who, what, _ in data.log if who.startswith("ToastOperator")}
 
 
 def test_where_no_detector_is_left_no_instant_is_flagged():
@@ -267,7 +265,7 @@ def test_where_no_detector_is_left_no_instant_is_flagged():
     data = run(Dead(), theirs("PolyFilter", order=3, view="throw"))
     flagged = [
         text
-        for who, what, text in data.tally
+        for who, what, text in data.log
         if who.startswith("ToastOperator") and what == "instants that TOAST flagged"
     ]
     assert flagged == ["0", "0"]

@@ -153,12 +153,12 @@ class Workbench:
             site=many[0].site, instrument=many[0].instrument, time="2024-11-25T07:00", seed=5
         )
         data = pipeline.run(scene, threads=threads, memory=memory, keep=keep)
-        text = {(who, what): value for who, what, value in data.tally}
+        text = {(who, what): value for who, what, value in data.log}
         return SimpleNamespace(
             data=data,
             observations=data.observations,
             signal=data.observations[0].detdata.get("signal"),
-            tally=text,
+            log=text,
             map=data.products.get("map"),
         )
 

@@ -117,7 +117,7 @@ def test_a_remainder_is_what_would_be_formed(filters, precision):
         "there is a sky to be taken away"
     )
     assert same(found, true, "hits", "weights", "noise")
-    assert ("rest", "remainder", "the complete signal minus sky") in list(data.tally)
+    assert ("rest", "remainder", "the complete signal minus sky") in list(data.log)
 
 
 class Unsaid(Operator):
@@ -407,7 +407,7 @@ class Holes(Operator):
 def test_a_step_that_is_not_linear_acts_on_each_signal_and_they_share_its_mask():
     pipeline, data = observed(steps(HIGHPASS, Holes()), BOTH)
     assert pipeline.signals.remainders == {}
-    said = {(who, what): text for who, what, text in data.tally}
+    said = {(who, what): text for who, what, text in data.log}
     assert (
         said["sky", "modes"]
         == "its own from Holes on, which is not linear, instead of those of the complete signal"
@@ -846,7 +846,7 @@ def test_a_signal_that_is_made_again_alone_has_what_its_filters_read(monkeypatch
     _, ample = observed(operators, BOTH, scans=1, threads=1)
     monkeypatch.setattr("zonda.core.run.schedule.Schedule._keeps", lambda *arguments: False)
     _, tight = observed(operators, BOTH, scans=1, threads=1)
-    assert any("made again" in what for _, what, _ in tight.tally)
+    assert any("made again" in what for _, what, _ in tight.log)
     for name in ("map", "sky/map", "rest/map"):
         assert same(ample.products[name], tight.products[name], "signal", "hits")
 

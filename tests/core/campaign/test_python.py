@@ -96,7 +96,7 @@ def test_products_say_what_the_array_was(with_array, module_bench, tmp_path):
     _, ours = with_array
     pipeline = zonda.Pipeline(steps(sky()))
     plain = pipeline.run(scene(camera(7)), output=tmp_path, threads=1)
-    told = {what: value for who, what, value in plain.tally if who == "SkyMap"}["input"]
+    told = {what: value for who, what, value in plain.log if who == "SkyMap"}["input"]
     assert (
         told == f"array of 64 x 48, float64, hash {pipeline.operators[1].map.digest}, in K_RJ,"
         " given in Python"
@@ -185,7 +185,7 @@ def test_sets_of_products_by_their_values(tmp_path):
         {"PointingDaisy.radius": t} for t in ("1 arcmin", "1.5 arcmin")
     ]
     assert all((folder / "map.fits").is_file() for _, folder in made.sets)
-    assert {row[0] for row in made.tally} == {
+    assert {row[0] for row in made.log} == {
         f"PointingDaisy.radius={t}" for t in ("1 arcmin", "1.5 arcmin")
     }
 

@@ -92,7 +92,7 @@ def test_a_tree_of_several_levels_gives_the_same_maps(undisturbed, bench, monkey
 
 
 def test_scans_as_tasks_are_the_plain_run(bench, capsys):
-    """One entry is an ordinary run: same maps, same mean spectrum, same tally, the same told of it
+    """One entry is an ordinary run: same maps, same mean spectrum, same log, the same told of it
     with its shares.
     """
     plain, split = bench.new(), bench.new()

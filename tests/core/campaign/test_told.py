@@ -56,13 +56,13 @@ def test_tasks_count_their_own_scans(bands, tmp_path):
     )
     once = [
         row
-        for row in steps.run(scene, output=tmp_path / "once", threads=1).tally.told()
+        for row in steps.run(scene, output=tmp_path / "once", threads=1).log.told()
         if row[1].startswith("samples")
     ]
     made = zonda.campaign(
         steps, scene, output=tmp_path / "tasks", realizations=1, engine="serial", threads=1
     )
-    assert [row[1:] for row in made.tally if row[2].startswith("samples")] == once
+    assert [row[1:] for row in made.log if row[2].startswith("samples")] == once
     assert any(
         what.startswith("samples in turnarounds") and value.endswith("%)")
         for _, what, value in once

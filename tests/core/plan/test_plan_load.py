@@ -227,10 +227,10 @@ def pink_rms(file):
     file = dataclasses.replace(
         file, steps=tuple(s for s in file.steps if s.key not in ("SaveMap", "HighpassFilter"))
     )
-    tally = file.pipeline().run(file.scene(), threads=1).tally
+    log = file.pipeline().run(file.scene(), threads=1).log
     (text,) = (
         text
-        for name, what, text in tally.figures()
+        for name, what, text in log.figures()
         if name == "PinkNoise" and what.startswith("rms at the detector")
     )
     return float(text)

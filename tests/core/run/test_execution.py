@@ -265,7 +265,7 @@ def test_blocks_halos_threads_and_spilling_change_no_bit():
 
 
 class Peek(Operator):
-    """Make no stream: count how often each sample is seen, and tell the tally."""
+    """Make no stream: count how often each sample is seen, and tell the log."""
 
     requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"seen"})
@@ -287,7 +287,7 @@ class Tell(Source):
 
     def exec(self, block, state):
         super().exec(block, state)
-        block.observation.tally.count(self.label, "samples made", block.shape[0] * block.shape[1])
+        block.observation.log.count(self.label, "samples made", block.shape[0] * block.shape[1])
 
 
 class Level(Operator):
@@ -392,7 +392,7 @@ CHAINS_MADE_AGAIN = {
 @pytest.mark.parametrize("name", CHAINS_MADE_AGAIN)
 def test_streams_made_again_change_no_bit_and_are_counted_once(name, threads):
     """Steps that make no stream see every sample once, in whichever reading comes first; so does
-    the tally.
+    the log.
     """
     chain = CHAINS_MADE_AGAIN[name]
     want, _ = run(chain, observation(), memory=1 << 30)
@@ -405,9 +405,9 @@ def test_streams_made_again_change_no_bit_and_are_counted_once(name, threads):
                 chain, obs, memory=memory, threads=threads, how=how, room=size // 2
             )
         assert np.array_equal(got, want)
-        assert any(said in what for _, what, _ in obs.tally)
+        assert any(said in what for _, what, _ in obs.log)
         assert all((seen == 1).all() for seen in data.products.values())
-        assert obs.tally.get("Tell.0", "samples made") == want.size
+        assert obs.log.get("Tell.0", "samples made") == want.size
         assert peak[0] <= memory
 
 
@@ -416,7 +416,7 @@ def test_a_stream_wanted_whole_is_spilled_or_refused(monkeypatch):
     obs = observation()
     size = 4 * obs.n_detectors * obs.n_samples
     run(chain, obs, memory=int(1.9 * size))
-    assert any("spilled" in what for _, what, _ in obs.tally)
+    assert any("spilled" in what for _, what, _ in obs.log)
     monkeypatch.setattr("zonda.core.run.schedule.free_disk", lambda: 1000)
     with pytest.raises(
         PipelineError,
@@ -425,7 +425,7 @@ def test_a_stream_wanted_whole_is_spilled_or_refused(monkeypatch):
         run(chain, observation(), memory=int(1.9 * size))
     level, obs = [Source(), Demean(), Level(), Sink()], observation()
     run(level, obs, memory=int(1.9 * size))
-    assert any("made again" in what for _, what, _ in obs.tally)
+    assert any("made again" in what for _, what, _ in obs.log)
 
 
 def test_the_memory_of_the_process_leaves_what_is_not_held_already():
@@ -476,7 +476,7 @@ def test_margins_that_reach_the_ends_leave_the_source_alone():
 def test_spilling_is_stated():
     obs = observation()
     got, _ = run(CHAIN, obs, memory=int(1.9 * obs.n_detectors * obs.n_samples * 4))
-    assert any("spilled" in what for _, what, _ in obs.tally)
+    assert any("spilled" in what for _, what, _ in obs.log)
     assert np.array_equal(got, reference(observation()))
 
 

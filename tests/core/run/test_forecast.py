@@ -86,7 +86,7 @@ def test_the_schedule_is_followed(last, how, said):
     )
     assert execution.schedule.segments[0].how == how
     assert execution.schedule.elsewhere[0] == f"signal {said}"
-    assert any(f"stream signal {said}" in what for _, what, _ in obs.tally)
+    assert any(f"stream signal {said}" in what for _, what, _ in obs.log)
 
 
 class Heavy(Operator):

@@ -256,7 +256,7 @@ def test_streams_made_again_are_whole():
     _, want, _ = execute(chain, obs)
     _, got, _ = execute(chain, obs, room=0)
     assert ("Execution", "stream signal made again when it is read") in {
-        (who, what) for who, what, _ in obs.tally
+        (who, what) for who, what, _ in obs.log
     }
     assert np.array_equal(got, want)
 

@@ -77,7 +77,7 @@ class Maker(Operator):
 
     def prepare(self, observation):
         self.at("prepare", observation)
-        observation.tally.count(self.label, "prepared", 1)
+        observation.log.count(self.label, "prepared", 1)
         drawn = np.random.default_rng(observation.index).normal(size=observation.n_samples) * (
             observation.index + 1
         )
@@ -141,7 +141,7 @@ def test_same_bits_and_tally_and_really_ahead(scene, log, monkeypatch):
     ]
     for a, b in zip(alone.products["total"], beside.products["total"], strict=True):
         assert np.array_equal(a, b)
-    assert list(alone.tally) == list(beside.tally)
+    assert list(alone.log) == list(beside.log)
     assert [row for row in log.rows if row[0] == "collect"] == [("collect", k) for k in range(3)]
     assert not [t for t in threading.enumerate() if t.name.startswith("ahead")]
 

@@ -127,7 +127,7 @@ def test_the_mode_is_that_of_all_detectors(before: Any, method: str) -> None:
         here = np.concatenate(streams(found, name))
         assert np.abs(np.outer(u, u @ a)).max() > 1e-7  # there is something to remove
         np.testing.assert_allclose(here[:, good], expected[:, good], atol=1e-9)
-    assert any("all bands: modes removed" in key[1] for key in found.tally)
+    assert any("all bands: modes removed" in key[1] for key in found.log)
 
 
 def test_bits_depend_neither_on_threads_nor_on_memory() -> None:
@@ -137,8 +137,8 @@ def test_bits_depend_neither_on_threads_nor_on_memory() -> None:
         scene(detectors=169, sample_rate="200 Hz"),
     )
     first, tight = run(fast, threads=1), run(fast, threads=1, memory=24_000_000)
-    assert any("spilled" in key[1] or "made again" in key[1] for key in tight.tally)
-    assert not any("spilled" in key[1] or "made again" in key[1] for key in first.tally)
+    assert any("spilled" in key[1] or "made again" in key[1] for key in tight.log)
+    assert not any("spilled" in key[1] or "made again" in key[1] for key in first.log)
     for other in (run(fast, threads=2), tight):
         for name in ("map_f090", "map_f150", "noiseless/map_f150"):
             for plane in PLANES:
@@ -168,7 +168,7 @@ def test_samples_that_one_band_flags_are_no_data_of_the_other_which_would_keep_i
     changed = (one.detdata["signal"] != unfiltered).any(axis=0)
     assert changed[one.good_samples].all()
     assert not changed[500:600].any()  # the mode is still there
-    told = {who: number for who, what, number in data.tally.counts() if "another band" in what}
+    told = {who: number for who, what, number in data.log.counts() if "another band" in what}
     assert told == {"CommonModeFilter f090": 100, "CommonModeFilter f150": 0}
 
 

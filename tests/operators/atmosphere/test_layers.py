@@ -257,8 +257,8 @@ def test_large_rms_takes_the_log_normal_map_and_keeps_mean_and_rms() -> None:
     assert y.std() == pytest.approx(0.4, rel=0.02)
     o = observe(5.0)
     op.prepare(o)
-    assert ("AtmosphereLayers", "distribution of the PWV", "log-normal") in list(o.tally)
-    assert o.tally.get("AtmosphereLayers", "values of the PWV clipped to the table") == 0
+    assert ("AtmosphereLayers", "distribution of the PWV", "log-normal") in list(o.log)
+    assert o.log.get("AtmosphereLayers", "values of the PWV clipped to the table") == 0
     covariance = np.mean(law(g) * law(g))  # exp(s^2 v) - 1 = p^2
     assert covariance == pytest.approx(0.16, rel=0.03)
 
@@ -377,7 +377,7 @@ def test_the_default_job_is_compressed_by_nodes_and_steps() -> None:
     assert isinstance(state, AtNodes)
     assert state.fields["emission"].weights.shape[1] <= 9
     assert state.fields["emission"].step >= 64
-    said = {what: text for who, what, text in o.tally if who == "AtmosphereLayers"}
+    said = {what: text for who, what, text in o.log if who == "AtmosphereLayers"}
     assert "Chebyshev" in said["nodes"]
     assert "samples" in said["step in time"]
     assert "0.500% of the mean before the beam" in said["PWV rms"]
@@ -647,7 +647,7 @@ def test_a_narrow_scan_keeps_one_plane_and_the_horizon_falls_back() -> None:
     assert track.kind == "horizontal"
     assert track.bound == pytest.approx(1 / np.tan(np.radians(50.0)) ** 2, rel=0.01)
     operator(layers=2, tolerance="20 %").prepare(o)
-    said = {what: text for _, what, text in o.tally}
+    said = {what: text for _, what, text in o.log}
     assert "horizontal" in said["plane of the turbulence"]
 
 
@@ -724,7 +724,7 @@ def test_winds_and_weights_per_layer() -> None:
 def test_climatology_gives_the_pwv_where_none_is_asked_for() -> None:
     o = observe(1.0)
     AtmosphereLayers().prepare(o)
-    said = {what: text for _, what, text in o.tally}
+    said = {what: text for _, what, text in o.log}
     assert said["mean PWV"].endswith("mm (of the weather)")
 
 
@@ -806,7 +806,7 @@ def test_outputs_are_the_fluctuations_along_each_line_of_sight() -> None:
     # Bevis et al. (1994): 6.2 to 6.5 over the world's weather; here vapour at about 0 C (0.35 % per
     # K).
     assert 6.3 < ratio.mean() < 6.8
-    said = {what: text for _, what, text in o.tally}
+    said = {what: text for _, what, text in o.log}
     assert said["wet path delay"].startswith(f"{ratio.mean():.3f} times")
 
 
@@ -877,7 +877,7 @@ def test_layers_take_steps_of_their_own_within_the_same_bound(
     op = operator(layers=4, lowest="300 m", tolerance="1 %")
     o = swept(50.0, 180 + 12 * np.sin(2 * np.pi * np.arange(3000) / 6000), camera)
     state = op.prepare(o)
-    said = {what: text for _, what, text in o.tally}
+    said = {what: text for _, what, text in o.log}
     assert "by layer" in said["step in time"]
     direct, band, elevation = directly(op, o)
     left = direct - direct.mean(0)

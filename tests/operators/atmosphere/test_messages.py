@@ -158,7 +158,7 @@ def test_water_past_the_table_is_refused_or_has_its_mean_and_rms() -> None:
 def test_the_realization_is_reported() -> None:
     o = observe(60.0)
     operator(layers=2).prepare(o)
-    assert any("realization" in f"{what} {text}" for _, what, text in o.tally)
+    assert any("realization" in f"{what} {text}" for _, what, text in o.log)
 
 
 def test_the_rms_stated_after_the_beam_is_that_of_the_log_normal() -> None:
@@ -166,8 +166,8 @@ def test_the_rms_stated_after_the_beam_is_that_of_the_log_normal() -> None:
     zonda.AtmosphereLayers(
         pwv="1 mm", pwv_rms=1.0, layers=1, lowest="1 km", outer_scale="20 m"
     ).prepare(o)
-    stated = next(text for _, what, text in o.tally if what == "PWV rms")
-    variance = next(text for _, what, text in o.tally if what.startswith("PWV rms after the beam"))
+    stated = next(text for _, what, text in o.log if what == "PWV rms")
+    variance = next(text for _, what, text in o.log if what.startswith("PWV rms after the beam"))
     v = (float(variance.split(": ")[1].rstrip("%")) / 100) ** 2
     assert float(stated.split(", ")[1].split("%")[0]) / 100 == pytest.approx(
         np.sqrt(np.expm1(np.log(2) * v)), rel=2e-3

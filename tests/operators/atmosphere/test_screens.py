@@ -189,5 +189,5 @@ def test_the_log_of_a_campaign_says_that_there_is_no_scan(tmp_path):
     made = zonda.campaign(
         zonda.Pipeline(steps), scene, output=tmp_path / "out", realizations=2, engine="serial"
     )
-    assert ("AtmosphereScreens", "not drawn") in {row[1:3] for row in made.tally}
+    assert ("AtmosphereScreens", "not drawn") in {row[1:3] for row in made.log}
     assert (tmp_path / "out" / "map.fits").is_file()

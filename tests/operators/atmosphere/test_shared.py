@@ -85,7 +85,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
 
 def told_of(data: zonda.Data, what: str) -> dict[str, str]:
     """By band."""
-    return {label.split()[-1]: text for label, name, text in data.tally if name == what}
+    return {label.split()[-1]: text for label, name, text in data.log if name == what}
 
 
 @pytest.mark.parametrize(("field", "dish"), CASES.values(), ids=CASES)
@@ -194,7 +194,7 @@ def test_streams_that_are_made_again_have_the_same_bits(tolerance: str, steps: i
     ample, little = (
         run(where, tolerance, "column", threads=1, memory=memory) for memory in (1 << 30, 3_000_000)
     )
-    assert any("stream" in what for _, what, _ in little.tally)
+    assert any("stream" in what for _, what, _ in little.log)
     assert len({text.split(";")[0] for text in told_of(little, "step in time").values()}) == steps
     for name in ("f090", "f150"):
         np.testing.assert_array_equal(ample[f"map_{name}"].signal, little[f"map_{name}"].signal)

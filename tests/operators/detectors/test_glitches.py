@@ -86,7 +86,7 @@ def test_samples_above_a_threshold_are_in_no_map_and_filters_bridge_them():
         )
         maps[threshold] = data.products["map"], data.products["quiet/map"]
         text = next(
-            (value for who, what, value in data.tally if what == "samples lost to glitches"), "0"
+            (value for who, what, value in data.log if what == "samples lost to glitches"), "0"
         )
         lost = int(str(text).split()[0].replace(",", ""))
     (loud, quiet), (cut, rest) = maps[None], maps["1 mK"]

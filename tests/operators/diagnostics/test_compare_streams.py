@@ -185,7 +185,7 @@ def test_what_cannot_be_compared(tmp_path):
     data = scenes.run(steps, scenes.scan(7, 20))
     assert "stream_comparison" not in data.products
     assert ("CompareStreams", "scans too short to compare streams", "1") in [
-        tuple(row) for row in data.tally.told()
+        tuple(row) for row in data.log.told()
     ]
 
 

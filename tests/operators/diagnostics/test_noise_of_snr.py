@@ -124,7 +124,7 @@ def test_without_a_map_of_the_noise_alone_it_says_white_noise_only(tmp_path):
         free=False,
     )
     assert data["comparison"].noise["snr"] == (WHITE, None)
-    assert ("CompareMaps", "noise of the map", WHITE) in list(data.tally.told())
+    assert ("CompareMaps", "noise of the map", WHITE) in list(data.log.told())
     header = fits.getheader(tmp_path / "map.fits", "NOISE")
     assert header["NOISEOF"] == WHITE
     assert "NOISEFAC" not in header

@@ -139,8 +139,7 @@ def test_scans_are_averaged(make_observation, data, noise):
     assert both.observations == 2
     np.testing.assert_allclose(both.psd["signal"], 5 * before, rtol=1e-6)  # (1 + 9) / 2
     assert (
-        data.tally.get("PowerSpectrum", "scans of another length left out of the mean spectrum")
-        == 1
+        data.log.get("PowerSpectrum", "scans of another length left out of the mean spectrum") == 1
     )
 
 
@@ -152,14 +151,11 @@ def test_flagged_and_broken_detectors(make_observation, data, noise):
     assert np.isfinite(found.psd["signal"]).all()
     assert found.detectors == 9
     assert (
-        observation.tally.get(
-            "PowerSpectrum", "detectors left out for non-finite samples of signal"
-        )
+        observation.log.get("PowerSpectrum", "detectors left out for non-finite samples of signal")
         == 1
     )
     assert (
-        observation.tally.get("PowerSpectrum", "flagged samples that the power spectra include")
-        == 13
+        observation.log.get("PowerSpectrum", "flagged samples that the power spectra include") == 13
     )
 
 
@@ -174,7 +170,7 @@ def test_a_scan_of_one_sample(make_observation, data):
     operator.collect(data, observation, state)
     operator.finalize(data)
     assert data.products == {}
-    assert observation.tally.get("PowerSpectrum", "scans too short for a power spectrum") == 1
+    assert observation.log.get("PowerSpectrum", "scans too short for a power spectrum") == 1
 
 
 def test_a_scan_whose_detectors_are_all_flagged(make_observation, data, noise):
@@ -187,7 +183,7 @@ def test_a_scan_whose_detectors_are_all_flagged(make_observation, data, noise):
     operator.finalize(data)
     assert data.products == {}
     assert (
-        observation.tally.get("PowerSpectrum", "scans without a detector that has a power spectrum")
+        observation.log.get("PowerSpectrum", "scans without a detector that has a power spectrum")
         == 1
     )
 

@@ -71,8 +71,8 @@ def report(data, make_observation):
 
 
 def test_it_says_what_was_simulated(data, report):
-    data.tally.count("SkyMap", "samples outside the input map", 12345)
-    data.tally.state("AtmosphereLayers", "mean PWV", "7.7 mm")
+    data.log.count("SkyMap", "samples outside the input map", 12345)
+    data.log.state("AtmosphereLayers", "mean PWV", "7.7 mm")
     data.provenance["versions"] = {"zonda": "0.1.0", "numpy": "9.9.9"}
     data.provenance["command"] = "zonda run demo"
     data.provenance["timings"] = [
@@ -114,12 +114,12 @@ def test_what_was_counted_follows_the_order_of_the_steps(data, report):
     data.provenance["runs"] = {"noiseless": {"only": ["sky"]}}
     data.provenance["timings"] = [("SkyMap", "exec", 1.5), ("BinMap", "observe", 0.0)]
     for step in ("BinMap", "SkyMap"):
-        data.tally.count(step, "apples", 1)
+        data.log.count(step, "apples", 1)
     _, text, _ = report()
-    tally = text[
+    log = text[
         text.index("step what value") : text.index("Computing time", text.index("step what value"))
     ]
-    assert tally.index("SkyMap") < tally.index("BinMap")
+    assert log.index("SkyMap") < log.index("BinMap")
     assert "signal noiseless only sky" in text
     assert (
         "BinMap"
@@ -133,7 +133,7 @@ def test_every_text_is_escaped(data, report):
     )
     data.provenance["operators"] = [(EVIL, EVIL, {EVIL: EVIL})]
     data.provenance["timings"] = [(EVIL, EVIL, 1.0)]
-    data.tally.state(EVIL, EVIL, EVIL)
+    data.log.state(EVIL, EVIL, EVIL)
     data.products["pictures"] = [Picture("map", EVIL, EVIL, PNG)]
     page, text, _ = report()
     assert "<script" not in page
@@ -266,7 +266,7 @@ def test_long_lists_are_folded(data, make_observation):
     """
     data.observations += [make_observation(50, index=k) for k in range(40)]
     for k in range(30):
-        data.tally.state("Step", f"figure {k:02d}", "1")
+        data.log.state("Step", f"figure {k:02d}", "1")
     data.provenance["plan"] = [(f"effect {k}", "full", "0", "x") for k in range(20)]
     data.products["tod_file"] = [data.output / f"tod_{k:03d}.h5" for k in range(50)]
     data.products["pictures"] = []
@@ -304,7 +304,7 @@ def test_short_lists_are_not_folded(data, make_observation):
 
 
 def test_counts_have_their_share(data, report):
-    data.tally.count("SkyMap", "samples outside the input map", 2623184, 57531250)
+    data.log.count("SkyMap", "samples outside the input map", 2623184, 57531250)
     _, text, _ = report()
     assert "2 623 184 (4.56 %)" in text  # spaces are narrow ones that do not break
 

@@ -114,7 +114,7 @@ def test_each_plane_is_compared_with_its_own(made):
     peak = np.nanmax(np.abs(data["comparison_U"].planes["reference"]))
     assert peak == pytest.approx(np.abs(data["comparison_U"].figures["peak reference"]))
     assert data["comparison_U"].figures["peak reference"] < 0
-    told = {what for who, what, _ in data.tally.told() if who == "CompareMaps"}
+    told = {what for who, what, _ in data.log.told() if who == "CompareMaps"}
     assert {"gain of the map", "Q: gain of the map", "U: gain of the map"} <= told
 
 
@@ -129,7 +129,7 @@ def test_transfer_function_of_each_plane(made):
         assert (folder / f"transfer_function{which}.ecsv").exists()
         assert data[f"transfer_function{which}"].map == f"map{which}"
         of = f"{which[1:]}: " if which else ""
-        assert f"{of}rings without modes or power: NaN" in [what for _, what, _ in data.tally]
+        assert f"{of}rings without modes or power: NaN" in [what for _, what, _ in data.log]
     assert not np.allclose(rings[""], rings["_Q"], equal_nan=True)
 
 
@@ -150,7 +150,7 @@ def test_a_map_of_i_is_compared_with_i_of_the_reference():
     data = pipeline(zonda.CompareMaps(map="given/map"), stokes="I").run(scene(), threads=1)
     assert "comparison" in data
     assert "comparison_Q" not in data
-    assert ("CompareMaps", "Q and U", "not compared: the map has none") in data.tally.told()
+    assert ("CompareMaps", "Q and U", "not compared: the map has none") in data.log.told()
 
 
 def test_a_map_in_galactic_axes_is_compared_with_the_input_in_those(tmp_path):

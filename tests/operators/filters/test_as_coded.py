@@ -79,7 +79,7 @@ def test_unit_rms_modes_of_other_signals_are_those_of_the_complete_one(bench):
     np.testing.assert_allclose(scaled.signal, plain.signal, rtol=0, atol=1e-9)
     assert (
         "of the detectors' rms"
-        in scaled.tally["CommonModeFilter", "scan0: singular values / sqrt(detectors x samples)"]
+        in scaled.log["CommonModeFilter", "scan0: singular values / sqrt(detectors x samples)"]
     )
 
 
@@ -178,7 +178,7 @@ def test_flagged_samples_do_not_ring(bench):
         np.abs(run.signal - clean)[:, fine].max() < 0.5 * 0.017
     )  # 50 samples of white noise became a line
     assert np.isnan(run.signal[1, 100])
-    assert run.tally["HighpassFilter", "samples not finite"] == "1"
+    assert run.log["HighpassFilter", "samples not finite"] == "1"
 
 
 def test_what_cannot_be_is_refused(bench):

@@ -72,14 +72,12 @@ def test_residual_is_reached_and_reported(bench):
     value = np.linalg.norm(a.T @ u0) ** 2
     assert np.linalg.norm(a @ (a.T @ u0) - value * u0) / s[0] ** 2 < 1.1e-6
     reported = float(
-        result.tally[
-            "CommonModeFilter", "scan0: singular values / sqrt(detectors x samples)"
-        ].split(",")[0]
+        result.log["CommonModeFilter", "scan0: singular values / sqrt(detectors x samples)"].split(
+            ","
+        )[0]
     )
     assert abs(reported * np.sqrt(a.size) / s[0] - 1) < 1e-3  # four printed digits
-    assert (
-        float(result.tally["CommonModeFilter", "scan0: residual of the modes"].split()[0]) <= 1e-6
-    )
+    assert float(result.log["CommonModeFilter", "scan0: residual of the modes"].split()[0]) <= 1e-6
 
 
 def test_leading_mode_orthogonal_to_the_mean_is_found(bench):
@@ -111,7 +109,7 @@ def test_closed_gap(bench, policy, expected):
     result = run(bench, a, on_undetermined=policy, residual=1e-8)
     wanted = {"mean": a - a.mean(axis=0), "same": a, "svd": numpy_removed(a, 1)}[expected]
     assert np.linalg.norm(result.signal - wanted) < 1e-5 * np.linalg.norm(a)
-    assert result.tally["CommonModeFilter", UNDETERMINED] == "1"
+    assert result.log["CommonModeFilter", UNDETERMINED] == "1"
 
 
 def test_second_mode_undetermined_is_skipped_and_the_first_removed(bench):
@@ -120,7 +118,7 @@ def test_second_mode_undetermined_is_skipped_and_the_first_removed(bench):
     assert np.linalg.norm(result.signal - numpy_removed(a, 1)) < 1e-5 * np.linalg.norm(
         result.signal
     )
-    assert result.tally["CommonModeFilter", UNDETERMINED] == "1"
+    assert result.log["CommonModeFilter", UNDETERMINED] == "1"
 
 
 def test_dead_constant_and_nan_detectors_are_flagged_and_take_no_part(bench):
@@ -129,8 +127,8 @@ def test_dead_constant_and_nan_detectors_are_flagged_and_take_no_part(bench):
     spoilt[3], spoilt[7], spoilt[11, 200] = 0.0, 4.25, np.nan
     result = run(bench, spoilt)
     assert np.flatnonzero(result.observations[0].detector_flags).tolist() == [3, 7, 11]
-    assert result.tally["CommonModeFilter", "detectors flagged: signal constant"] == "2"
-    assert result.tally["CommonModeFilter", "detectors flagged: signal not finite"] == "1"
+    assert result.log["CommonModeFilter", "detectors flagged: signal constant"] == "2"
+    assert result.log["CommonModeFilter", "detectors flagged: signal not finite"] == "1"
     good = np.setdiff1d(np.arange(N_DET), [3, 7, 11])
     assert np.linalg.norm(result.signal[good] - numpy_removed(a[good], 1)) < 1e-4 * np.linalg.norm(
         result.signal[good]
@@ -270,7 +268,7 @@ def sky_and_noise(filters, sky=True, noise=True, dead=()):
 
 
 def counted(data, what, run=""):
-    return data.tally.get(f"{run}CommonModeFilter", what)
+    return data.log.get(f"{run}CommonModeFilter", what)
 
 
 @pytest.mark.parametrize("method", ["svd", "mean"])
@@ -351,7 +349,7 @@ def test_a_sky_that_no_detector_sees_is_a_map_of_zeros(method):
     main, companion = data.products["map"], data.products["alone/map"]
     np.testing.assert_array_equal(companion.hits, main.hits)
     assert (companion.signal[companion.hits > 0] == 0).all()
-    assert data.tally.get("CommonModeFilter", "detectors flagged: signal constant") == 0
+    assert data.log.get("CommonModeFilter", "detectors flagged: signal constant") == 0
 
 
 @pytest.mark.parametrize(
@@ -370,8 +368,8 @@ def test_wafer_by_wafer_each_is_filtered_as_if_it_were_alone(bench, parameters):
         expected = alone - alone.mean(0) if "method" in parameters else numpy_removed(alone, 1)
         rows = np.flatnonzero((wafer == number) & np.isfinite(a[:, 0]))
         assert np.linalg.norm(found.signal[rows] - expected) < 1e-7 * np.linalg.norm(expected)
-    assert found.tally["CommonModeFilter", "scan0, wafer 1: modes removed"].startswith("1 ")
-    assert found.tally["CommonModeFilter", "detectors flagged: signal not finite"] in (1, "1")
+    assert found.log["CommonModeFilter", "scan0, wafer 1: modes removed"].startswith("1 ")
+    assert found.log["CommonModeFilter", "detectors flagged: signal not finite"] in (1, "1")
 
 
 def test_wafers_take_the_modes_of_the_complete_signal(bench):

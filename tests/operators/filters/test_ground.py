@@ -98,7 +98,7 @@ def test_white_noise_loses_its_degrees_of_freedom(bench):
     x = np.random.default_rng(4).standard_normal((n_det, N))
     bins = len(np.unique(ground(observation, 0)[1]))
     found = bench.run([GroundFilter(trend=3)], observation, {"signal": x}, precision="float64")
-    assert found.tally["GroundFilter", "scan0: bins of the template"] == str(bins)
+    assert found.log["GroundFilter", "scan0: bins of the template"] == str(bins)
     lost = n_det * (bins + 3)
     assert abs((np.sum(x**2) - np.sum(found.signal**2)) / lost - 1) < 4 * np.sqrt(2 / lost)  # chi^2
 

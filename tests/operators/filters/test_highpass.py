@@ -168,7 +168,7 @@ def test_short_scans(bench, n):
     np.testing.assert_allclose(
         run.signal, brick_wall(x, cut, 2 if cut else degree), rtol=0, atol=3e-7
     )
-    assert any("shorter" in what for _, what in run.tally) == (n < 1250)
+    assert any("shorter" in what for _, what in run.log) == (n < 1250)
 
 
 @pytest.mark.parametrize("flag", [TRIMMED, TURNAROUND, SUN_UP, SUN_CLOSE])
@@ -184,7 +184,7 @@ def test_samples_with_a_signal_are_not_bridged(bench, flag):
     observation.flags[2000:2500] = flag
     run = bench.run([HighpassFilter()], observation, {"signal": x})
     np.testing.assert_array_equal(run.signal, plain.signal)
-    assert run.tally["HighpassFilter", "flagged samples bridged before filtering"] == "0"
+    assert run.log["HighpassFilter", "flagged samples bridged before filtering"] == "0"
 
 
 def test_modelled_mean_is_dropped_analytically(bench):
@@ -213,8 +213,8 @@ def test_flagged_gap_and_nan_do_not_ring(bench):
     assert np.abs(run.signal - clean)[:2, good].max() < 0.2 * WHITE
     assert np.isnan(run.signal[1, 100])
     assert not np.isfinite(run.signal[2]).any()
-    assert run.tally["HighpassFilter", "samples not finite"] == "20001"
-    assert run.tally["HighpassFilter", "flagged samples bridged before filtering"] == "50"
+    assert run.log["HighpassFilter", "samples not finite"] == "20001"
+    assert run.log["HighpassFilter", "flagged samples bridged before filtering"] == "50"
 
 
 def test_trim_flags_the_ends_and_is_reported(bench):
@@ -226,7 +226,7 @@ def test_trim_flags_the_ends_and_is_reported(bench):
     assert flags[-200:].all()
     assert not flags[200:-200].any()
     np.testing.assert_array_equal(run.signal, plain.signal)
-    assert run.tally["HighpassFilter", "samples trimmed"] == "400"
+    assert run.log["HighpassFilter", "samples trimmed"] == "400"
     with pytest.raises(PipelineError, match="leaves nothing"):
         bench.run([HighpassFilter(trim="30 s")], bench.observation(3, 6000), {"signal": x})
 
@@ -262,7 +262,7 @@ def test_a_scan_shorter_than_one_cycle_loses_a_line_and_says_so(bench, n):
     x = np.random.default_rng(3).standard_normal((3, n)) + 5
     run = bench.run([HighpassFilter()], bench.observation(3, n), {"signal": x}, precision="float64")
     np.testing.assert_allclose(run.signal, brick_wall(x, 0, min(1, n - 1)), rtol=0, atol=1e-12)
-    said = run.tally["HighpassFilter", "scan0 is shorter than 1/frequency"]
+    said = run.log["HighpassFilter", "scan0 is shorter than 1/frequency"]
     assert said == {1: "nothing is left of 1 sample", 2: "nothing is left of 2 samples"}.get(
         n, ONLY_A_LINE
     )
@@ -325,4 +325,4 @@ def test_gaps_at_the_ends_and_inside_of_short_scans_are_bridged(bench, frequency
             run.signal[d, good], expected[d, good], rtol=0, atol=1e-5 * np.abs(bridged).max()
         )
         assert np.isnan(run.signal[d, gap]).all()
-    assert run.tally["HighpassFilter", "samples not finite"] == str(sum(map(len, lost)))
+    assert run.log["HighpassFilter", "samples not finite"] == str(sum(map(len, lost)))

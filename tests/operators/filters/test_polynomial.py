@@ -115,7 +115,7 @@ def test_between_passes_goes_a_straight_line_and_the_samples_are_flagged(bench):
         0.05, rel=0.01
     )  # behind the last pass a constant goes: 5 s x 10 mK/s
     np.testing.assert_array_equal(found.observations[0].flags == TRIMMED, ~inside)
-    assert found.tally["PolynomialFilter", "samples between intervals, flagged"].startswith(
+    assert found.log["PolynomialFilter", "samples between intervals, flagged"].startswith(
         str(np.count_nonzero(~inside))
     )
 

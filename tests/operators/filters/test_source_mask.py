@@ -124,7 +124,7 @@ def test_common_mode_fills_with_the_mean_of_the_others(bench):
     )
     np.testing.assert_allclose(found.signal, x - np.outer(u, u @ filled), rtol=0, atol=1e-8)
     assert (
-        found.tally[
+        found.log[
             "CommonModeFilter", "instants with all detectors in the source mask: no mode removed"
         ]
         == "0"

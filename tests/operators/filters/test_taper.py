@@ -113,7 +113,7 @@ def test_where_the_window_leaves_nothing_there_is_no_map(bench, before):
     for product in (run.map, run.map.smoothed(1e-5)):
         np.testing.assert_array_equal(np.isfinite(product.signal), product.hits > 0)
     assert (run.map.weights[run.map.hits > 0] > 0).all()
-    assert int(run.tally["BinMap", LIGHT]) == np.count_nonzero(tukey(3000, 1.0) < LIGHTEST)
+    assert int(run.log["BinMap", LIGHT]) == np.count_nonzero(tukey(3000, 1.0) < LIGHTEST)
 
 
 def test_what_is_added_behind_the_window_is_raised_by_ten_at_most(bench):
@@ -156,7 +156,7 @@ def test_a_mean_beside_the_signal_is_multiplied_and_told(precision):
     assert level > 10
     np.testing.assert_allclose(one, other, rtol=0, atol=4 * level * eps)
     assert abs(one[:, 0]).max() < 4 * level * eps  # the window is zero there
-    told = [(str(what), text) for who, what, text in made[0].tally if who == "Taper"]
+    told = [(str(what), text) for who, what, text in made[0].log if who == "Taper"]
     assert any(what == MEAN for what, _ in told)
     assert any("rounding" in what and "µK" in text for what, text in told)
-    assert not any(what == MEAN for who, what, _ in made[2].tally if who == "Taper")
+    assert not any(what == MEAN for who, what, _ in made[2].log if who == "Taper")

@@ -205,7 +205,7 @@ def test_another_instrument_in_the_scene_is_not_used(night: Any) -> None:
         "LoadTOD",
         "instrument",
         "camera, the file's; the scene's mustang2 is not used",
-    ) in list(found.tally)
+    ) in list(found.log)
 
 
 def test_every_band_has_the_flags_of_its_file(night: Any, tmp_path: Path) -> None:
@@ -217,7 +217,7 @@ def test_every_band_has_the_flags_of_its_file(night: Any, tmp_path: Path) -> Non
     same(found["map_f090"], whole["map_f090"])
     assert whole["map_f150"].hits.sum() - found["map_f150"].hits.sum() == 100 * 12
     what = "samples that the file's flags exclude"
-    assert [found.tally.get(f"LoadTOD {band}", what) for band in ("f090", "f150")] == [0, 100]
+    assert [found.log.get(f"LoadTOD {band}", what) for band in ("f090", "f150")] == [0, 100]
     twin = load([files[0], flagged], zonda.WhiteNoise(), zonda.Efficiency(), MAP, signal="none")
     for band in ("f090", "f150"):
         same(twin[f"map_{band}"], found[f"map_{band}"], ("hits",))
@@ -275,7 +275,7 @@ def test_every_band_says_where_its_noise_comes_from(night: Any, tmp_path: Path) 
     with h5py.File(with_model, "a") as file, h5py.File(files[1]) as source:
         source.copy("metadata/noise_model", file["metadata"])
     found = load([files[0], with_model])
-    stated = {who: text for who, what, text in found.tally if what == "noise of the detectors"}
+    stated = {who: text for who, what, text in found.log if what == "noise of the detectors"}
     assert stated == {
         "LoadTOD f090": "the file's",
         "LoadTOD f150": "fitted to the file's noise_model",

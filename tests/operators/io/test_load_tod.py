@@ -300,7 +300,7 @@ def test_flags_and_their_masks(saved: Any, tmp_path: Path) -> None:
     data = load(path, MAP)
     assert data["map"].hits.sum() == 18 * (n - 50) - 10
     assert ("LoadTOD", "samples of single detectors that the file flags", "10") in [
-        (a, b, c.split()[0]) for a, b, c in data.tally
+        (a, b, c.split()[0]) for a, b, c in data.log
     ]
     every = load(path, MAP, load={"flag_mask": 4 | 32, "detector_mask": 64 | 7})
     assert every["map"].hits.sum() == 18 * (n - 50) - 30
@@ -327,7 +327,7 @@ def test_flagged_samples_are_counted_whatever_the_blocks(
     path = changed(saved["Filtered"][0], tmp_path / "flagged.h5", flag)
     data = load(path, MAP, memory=memory)
     n = data.observations[0].n_samples
-    assert data.tally.get("LoadTOD", "samples of single detectors that the file flags") == 10 + n
+    assert data.log.get("LoadTOD", "samples of single detectors that the file flags") == 10 + n
 
 
 @pytest.mark.parametrize("format", ["hdf5", "fits"])

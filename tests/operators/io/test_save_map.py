@@ -73,7 +73,7 @@ def healpix_map(n, nside=256, nest=True):
 @pytest.fixture
 def run(data, make_observation):
     data.observations.append(make_observation(100))
-    data.tally.count("SkyMap", "samples outside", 3)
+    data.log.count("SkyMap", "samples outside", 3)
 
     def finalize(**products):
         data.products.update({k.replace("__", "/"): v for k, v in products.items()})

@@ -103,7 +103,7 @@ def equal(a, b):
 @pytest.mark.parametrize("threads", [False, True])
 def test_what_is_written_is_what_was_there(format, threads, make_observation, data, streams, mean):
     observation = make_observation()
-    observation.tally.count("SkyMap", "samples outside the input map", 3)
+    observation.log.count("SkyMap", "samples outside the input map", 3)
     operator = SaveTOD(format=format, streams=["signal", "sky", "transmission"])
     path = write(operator, observation, data, streams, mean, threads)
     tod = load_tod(path)
@@ -313,7 +313,7 @@ def test_float32_says_what_it_rounds(make_observation, data, streams, mean):
         assert f["detdata/signal"].dtype == np.float32
         truth = streams["signal"].astype(float) + np.linspace(70.0, 75.0, 19)[:, None]
         worst = np.abs(f["detdata/signal"][:] - truth).max()
-    rows = {what: value for who, what, value in observation.tally if who == "SaveTOD"}
+    rows = {what: value for who, what, value in observation.log if who == "SaveTOD"}
     stated = float(rows["largest rounding to float32 [K]"])
     assert worst <= stated * 1.05  # two digits are stated
     assert stated < 1e-5

@@ -331,7 +331,7 @@ def test_zonda_looks_where_toast_looked(simulated):
     zonda.PointingRecorded(file=path).observe(found)
     (o,) = found.observations
     np.testing.assert_array_equal(o.boresight_radec, theirs.shared["boresight_radec"].data)
-    said = {what: text for _, what, text in o.tally}[f"{o.name}: directions on the sky"]
+    said = {what: text for _, what, text in o.log}[f"{o.name}: directions on the sky"]
     assert said.startswith("as recorded, up to ")
     assert (
         20 < float(said.split()[4]) < 70

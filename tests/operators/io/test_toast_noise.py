@@ -143,7 +143,7 @@ def test_a_model_of_the_file_is_chosen_by_name(saved: Path) -> None:
         observation.focalplane.knee, 0.2 * own / expected**2, rtol=1e-4
     )  # slope 1
     assert ("noise of the detectors", "fitted to the file's measured") in [
-        (what, text) for _, what, text in observation.tally
+        (what, text) for _, what, text in observation.log
     ]
 
 

@@ -99,7 +99,7 @@ def test_scans_of_two_beams(bench):
                 made = bench.run([step], list(order), {"signal": jansky}, precision="float64")
             assert made.map.fwhm == pytest.approx(expected, rel=1e-3)
             assert np.nanmax(made.map.signal) * area(made.map.fwhm) == pytest.approx(1e-6, rel=0.01)
-            assert made.tally["BinMap", "beam of the map (FWHM)"].startswith(
+            assert made.log["BinMap", "beam of the map (FWHM)"].startswith(
                 "51.1″: peak times its area"
             )
             assert found.setdefault(stokes, made.map.fwhm) == made.map.fwhm  # to the bit

@@ -104,7 +104,7 @@ def test_outside_flagged_and_nan_are_dropped_and_counted(bench):
     result = bench.run([BinMap(width="1 arcmin")], observation, {"signal": a})
     count = {
         what: int(v)
-        for (who, what), v in result.tally.items()
+        for (who, what), v in result.log.items()
         if who == "BinMap" and what.startswith("samples")
     }
     assert count["samples dropped: flagged"] == N + (N_DET - 1) * 50
@@ -115,7 +115,7 @@ def test_outside_flagged_and_nan_are_dropped_and_counted(bench):
     assert np.isnan(result.map.signal[result.map.hits == 0]).all()
     np.testing.assert_array_equal(result.map.signal[result.map.hits > 0], 1.0)
     whole = bench.run([BinMap()], bench.observation(N_DET, N), {"signal": np.ones((N_DET, N))})
-    assert whole.tally["BinMap", "samples dropped: outside the map"] == "0"
+    assert whole.log["BinMap", "samples dropped: outside the map"] == "0"
 
 
 @pytest.mark.parametrize("how", [{"width": "1 arcmin"}, {"nside": 4096}])
@@ -135,7 +135,7 @@ def test_what_is_dropped_is_counted_once_whatever_else_is_wrong_with_it(bench, h
     result = bench.run([BinMap(weights=weights, **how)], observation, {"signal": a})
     count = {
         what: int(v)
-        for (who, what), v in result.tally.items()
+        for (who, what), v in result.log.items()
         if who == "BinMap" and what.startswith("samples")
     }
     assert count["samples dropped: flagged"] == 9 * 15
@@ -156,7 +156,7 @@ def test_behind_the_image_is_outside(bench):
     there = BinMap(width="1 deg", height="1 deg", pixel="1 arcmin", centre="255 deg -20 deg")
     result = bench.run([there], bench.observation(N_DET, N), {"signal": np.ones((N_DET, N))})
     assert result.map.hits.sum() == 0
-    assert result.tally["BinMap", "samples dropped: outside the map"] == str(N_DET * N)
+    assert result.log["BinMap", "samples dropped: outside the map"] == str(N_DET * N)
 
 
 def test_scans_of_the_next_thread_and_pass_begin_with_empty_sums(bench):
@@ -261,7 +261,7 @@ def test_half_difference_removes_the_sky(bench):
     assert product.signal[both].max() > 0.9
     alone = bench.run([BinMap()], many[:1], {"signal": lambda o: sky_of(o, source(0, 0))})
     assert alone.map.half_difference is None
-    assert alone.tally["BinMap", "half-difference"].startswith("not made")
+    assert alone.log["BinMap", "half-difference"].startswith("not made")
     assert (
         bench.run(
             [BinMap(half_difference=False)], many, {"signal": lambda o: sky_of(o, source(0, 0))}
@@ -449,7 +449,7 @@ def test_zero_net_needs_uniform_weights(bench):
     observation.detector_flags[3] = INVALID  # then it does not matter
     found = bench.run([BinMap()], observation, {"signal": np.ones((7, 300))})
     assert found.map.hits.sum() == 1800
-    assert "uniform: every NET is 0" not in str(found.tally)
+    assert "uniform: every NET is 0" not in str(found.log)
 
 
 def test_two_maps_need_two_names(bench):
@@ -521,16 +521,16 @@ def test_noise_that_is_not_known_is_counted(bench):
     )
     alone = int((run.map.hits == 1).sum())
     assert alone > 10
-    assert run.tally[
-        "BinMap", "pixels with one sample, whose scatter is unknown: noise NaN"
-    ] == str(alone)
-    assert run.tally[
+    assert run.log["BinMap", "pixels with one sample, whose scatter is unknown: noise NaN"] == str(
+        alone
+    )
+    assert run.log[
         "BinMap", "of them left out of the smoothed noise, which is too low around them"
     ] == str(alone)
     observation = bench.observation(7, 300)
     observation.focalplane.net[:] = 0
     run = bench.run([BinMap()], observation, {"signal": np.ones((7, 300))})
-    assert run.tally["BinMap", "weights"] == "uniform: every NET is 0"
+    assert run.log["BinMap", "weights"] == "uniform: every NET is 0"
 
 
 def test_equal_samples_have_no_scatter_and_are_counted(bench):
@@ -541,9 +541,7 @@ def test_equal_samples_have_no_scatter_and_are_counted(bench):
         {"signal": np.full((7, 3000), 0.3)},
     )
     several = run.map.hits > 1
-    counted = int(
-        run.tally["BinMap", "pixels whose samples scatter by less than rounding: noise 0"]
-    )
+    counted = int(run.log["BinMap", "pixels whose samples scatter by less than rounding: noise 0"])
     assert counted == np.count_nonzero(run.map.noise[several] == 0) > 0
     assert np.isfinite(run.map.noise[several]).all()
     assert run.map.noise[several].max() < 1e-6
@@ -551,7 +549,7 @@ def test_equal_samples_have_no_scatter_and_are_counted(bench):
     run = bench.run(
         [BinMap(pixel="4 arcsec", noise="scatter")], bench.observation(7, 3000), {"signal": rng}
     )
-    assert run.tally["BinMap", "pixels whose samples scatter by less than rounding: noise 0"] == "0"
+    assert run.log["BinMap", "pixels whose samples scatter by less than rounding: noise 0"] == "0"
 
 
 @pytest.mark.parametrize("net", ["1e-3 uK s(1/2)", "1 uK s(1/2)", "5 K s(1/2)", "100 K s(1/2)"])

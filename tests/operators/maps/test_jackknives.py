@@ -51,9 +51,9 @@ def test_the_map_itself_keeps_its_bits(bench, split):
         np.testing.assert_array_equal(
             getattr(maps[split].map, plane), getattr(maps[True].map, plane)
         )
-    said = {key: value for key, value in maps[split].tally.items() if "samples" in key[1]}
-    assert said == {key: value for key, value in maps[True].tally.items() if "samples" in key[1]}
-    assert maps[split].tally["BinMap", "half-difference of"] == DIFFERENCES[split]
+    said = {key: value for key, value in maps[split].log.items() if "samples" in key[1]}
+    assert said == {key: value for key, value in maps[True].log.items() if "samples" in key[1]}
+    assert maps[split].log["BinMap", "half-difference of"] == DIFFERENCES[split]
 
 
 @pytest.mark.parametrize("split", SPLITS)

@@ -164,8 +164,8 @@ def assert_as_alone(together: Any, how: Any, steps: Any) -> None:
                 np.testing.assert_array_equal(
                     plane, expected[name], err_msg=f"{one['name']} {product} {name}"
                 )
-        counted = {(who, what, value) for who, what, value in alone.tally if "BinMap" in who}
-        assert counted <= {(who, what, value) for who, what, value in together.tally}
+        counted = {(who, what, value) for who, what, value in alone.log if "BinMap" in who}
+        assert counted <= {(who, what, value) for who, what, value in together.log}
         assert any("dropped" in what for _, what, _ in counted)
 
 
@@ -213,7 +213,7 @@ def test_streams_that_are_made_again_for_neighbours_give_the_same_maps() -> None
 
     ample = run()
     little = run(memory=24_000_000)
-    assert any("made again" in f"{what} {text}" for _, what, text in little.tally)
+    assert any("made again" in f"{what} {text}" for _, what, text in little.log)
     for name in ("before_f090", "before_f150", "after_f090", "after_f150"):
         for plane, expected in planes(ample.products[name]).items():
             np.testing.assert_array_equal(

@@ -215,7 +215,7 @@ def test_pixels_that_are_not_determined_are_nan_and_counted():
     assert np.isnan(planes(product)).all()
     assert np.isinf(product.polarization.condition[hit]).all()
     assert np.isnan(product.polarization.condition[~hit]).all()
-    count = {what: value for who, what, value in data.tally if who == "BinMap"}
+    count = {what: value for who, what, value in data.log if who == "BinMap"}
     assert count["pixels whose samples do not determine I, Q and U: NaN"].startswith(
         str(int(hit.sum()))
     )
@@ -430,7 +430,7 @@ def test_flagged_and_not_finite_samples_are_dropped_and_counted():
     data = run([BinMap(stokes="IQU", width="1 arcmin", pixel="15 arcsec")], o, signal)
     count = {
         what: int(value.split()[0])
-        for who, what, value in data.tally
+        for who, what, value in data.log
         if who == "BinMap" and what.startswith("samples")
     }
     assert count["samples dropped: flagged"] == o.n_samples + (o.n_detectors - 1) * 50

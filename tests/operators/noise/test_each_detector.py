@@ -203,7 +203,7 @@ def test_the_log_says_how_far_detectors_differ(
     tmp_path: Path, knees: Any, slopes: Any, expected: str
 ) -> None:
     data = short(camera(tmp_path, knees, slopes), zonda.PinkNoise())
-    (told,) = [text for _, what, text in data.tally if what == "power over that of white noise"]
+    (told,) = [text for _, what, text in data.log if what == "power over that of white noise"]
     assert told.startswith(expected)
 
 

@@ -359,13 +359,13 @@ def test_own_level(make_observation, simulate):
 def test_no_knee_no_noise(make_observation, simulate):
     observation = make_observation(knee="0 Hz")
     assert not simulate(observation, PinkNoise())["pink"].any()
-    assert ("PinkNoise", "pink noise", "none: the knee is at 0 Hz") in list(observation.tally)
+    assert ("PinkNoise", "pink noise", "none: the knee is at 0 Hz") in list(observation.log)
 
 
 def test_the_fit_is_stated(make_observation, simulate):
     observation = make_observation()
     simulate(observation, PinkNoise())
-    stated = {what: text for _, what, text in observation.tally}
+    stated = {what: text for _, what, text in observation.log}
     law = power_law_filter(1e-3, 1.0, 8)
     expected = (
         f"(f / 1 Hz)^-1 from 0.1 Hz to 50 Hz within {100 * law.error:.2g} %, levelling off below to"

@@ -187,7 +187,7 @@ def test_each_scan_has_a_level_of_its_own():
         zonda.Efficiency(),
     ]
     data = zonda.Pipeline(steps).run(scene)
-    told = {what: text for who, what, text in data.tally if who == "WhiteNoise"}
+    told = {what: text for who, what, text in data.log if who == "WhiteNoise"}
     for o in data.observations:
         net = 1e3 * float(np.median(o.focalplane.net))
         assert float(
@@ -200,6 +200,6 @@ def test_each_scan_has_a_level_of_its_own():
 @pytest.mark.parametrize("white", [[], [WhiteNoise()]], ids=["none", "white"])
 def test_a_run_without_white_noise_says_so(white, tmp_path):
     data = run(white, output=tmp_path, after=[zonda.SaveTOD(), zonda.PowerSpectrum(segment="2 s")])
-    told = [who for who, _, text in data.tally if text.endswith("no white noise")]
+    told = [who for who, _, text in data.log if text.endswith("no white noise")]
     assert told == ([] if white else ["BinMap", "SaveTOD"])
     assert (data.products["spectrum"].white_level > 0) == bool(white)

@@ -179,7 +179,7 @@ def test_the_level_is_stated(make_observation, simulate):
     observation = make_observation()
     simulate(observation, WhiteNoise())
     assert ("WhiteNoise", "NET on the sky, median (range), mK s^1/2", "1.7") in list(
-        observation.tally
+        observation.log
     )
 
 

@@ -161,9 +161,7 @@ def test_opaque_detector_is_flagged_and_finite(bench, streams):
     run = bench.run([Efficiency()], bench.observation(N_DET, N), streams, smooth=smooth)
     assert np.flatnonzero(run.observations[0].detector_flags).tolist() == [3]
     assert (
-        run.tally[
-            "Efficiency", f"detectors flagged: band transmission below {LEAST_TRANSMISSION:g}"
-        ]
+        run.log["Efficiency", f"detectors flagged: band transmission below {LEAST_TRANSMISSION:g}"]
         == "1"
     )
     assert np.isfinite(run.signal).all()
@@ -237,9 +235,9 @@ def test_an_instantaneous_calibration_that_cannot_divide_is_counted(bench, strea
         streams,
         smooth=fields(),
     )
-    assert run.tally["Efficiency", "samples whose fluctuating e^-tau was raised to 1e-06"] == "31"
+    assert run.log["Efficiency", "samples whose fluctuating e^-tau was raised to 1e-06"] == "31"
     mean = bench.run([Efficiency()], bench.observation(N_DET, N), streams, smooth=fields())
-    assert ("Efficiency", "samples whose fluctuating e^-tau was raised to 1e-06") not in mean.tally
+    assert ("Efficiency", "samples whose fluctuating e^-tau was raised to 1e-06") not in mean.log
 
 
 @pytest.mark.parametrize("cells", [1, 2, 3, 50])

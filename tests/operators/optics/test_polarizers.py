@@ -204,7 +204,7 @@ def test_without_polarized_detectors_neither_has_an_effect_and_the_log_says_so()
     np.testing.assert_allclose(data.observations[0].detdata["sky"], 1.0, rtol=1e-12)
     said = {
         who
-        for who, what, value in data.tally
+        for who, what, value in data.log
         if (what, value) == ("no effect", "no detector is polarized")
     }
     assert said == {"HalfWavePlate", "Leakage"}
@@ -212,7 +212,7 @@ def test_without_polarized_detectors_neither_has_an_effect_and_the_log_says_so()
 
 def test_modulation_beyond_half_the_sample_rate_is_told():
     data = run([HalfWavePlate(frequency="20 Hz")], pairs(2, 500), np.zeros((2, 500)))
-    assert any(what == "modulation aliased" for _, what, _ in data.tally)
+    assert any(what == "modulation aliased" for _, what, _ in data.log)
 
 
 def test_a_plate_goes_to_files_and_back(tmp_path):

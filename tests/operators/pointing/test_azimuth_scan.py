@@ -136,13 +136,13 @@ def test_intervals_are_toasts(jitter: str, observe: Callable[..., Data]) -> None
 def test_turnarounds_are_counted_and_flagged_on_demand(observe: Callable[..., Data]) -> None:
     (used,) = observe(PointingBackAndForth(**SCAN, scan_duration="12 s")).observations
     assert not used.flags.any()
-    assert used.tally.get("PointingBackAndForth", "samples in turnarounds, used") == pytest.approx(
+    assert used.log.get("PointingBackAndForth", "samples in turnarounds, used") == pytest.approx(
         400, abs=4
     )
     (flagged,) = observe(
         PointingBackAndForth(**SCAN, scan_duration="12 s", flag_turnarounds=True)
     ).observations
-    count = flagged.tally.get("PointingBackAndForth", "samples in turnarounds, flagged")
+    count = flagged.log.get("PointingBackAndForth", "samples in turnarounds, flagged")
     assert set(np.unique(flagged.flags)) == {0, TURNAROUND}
     assert np.count_nonzero(flagged.flags) == count
     assert flagged.flags.dtype == np.uint8

@@ -355,7 +355,7 @@ def test_dates_beyond_every_table_work_and_say_so(
     (o,) = observe(
         PointingStare(scan_duration="1 s"), time=f"{year}-11-25T12:00Z", target="az 0 deg el 45 deg"
     ).observations
-    statement = {what: value for _, what, value in o.tally}["Earth orientation"]
+    statement = {what: value for _, what, value in o.log}["Earth orientation"]
     assert statement == "none for this date: UT1 = UTC (within 0.9 s) and the mean pole assumed"
     truth = reference.icrs(rotation_matrices(o.boresight_azel)[:2, :, 2], o.start, o.seconds[:2])
     assert angle(rotation_matrices(o.boresight_radec)[:2, :, 2], truth).max() < 1e-9

@@ -188,13 +188,13 @@ def test_a_second_pointing_operator_goes_on_after_the_first(observe: Callable[..
 
 def test_figures_reach_the_tally(observe: Callable[..., Data]) -> None:
     (o,) = observe(PointingDaisy()).observations
-    told = {what: value for _, what, value in o.tally}
+    told = {what: value for _, what, value in o.log}
     assert "of a beam (nodes every 600 s)" in told["interpolation error of the pointing"]
     assert told["Earth orientation"] == "IERS C04"
     (finer,) = observe(
         PointingDaisy(interpolation_error=2e-9)
     ).observations  # 8e-14 rad: 600 s would give 2.7e-13 rad
-    told = {what: value for _, what, value in finer.tally}
+    told = {what: value for _, what, value in finer.log}
     assert "nodes every 300 s" in told["interpolation error of the pointing"]
 
 

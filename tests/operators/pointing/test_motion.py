@@ -267,7 +267,7 @@ def test_a_warning_instead_is_repeated_in_the_report(observe: Callable[..., Data
             telescope={"acceleration_max": "1 deg/s2", "name": "AtLAST"},
         )
     for o in data.observations:
-        said = {what: text for _, what, text in o.tally}
+        said = {what: text for _, what, text in o.log}
         assert "1 deg/s2" in said["over the limit of sky acceleration (check_limits: warn)"]
         assert re.search(
             r"sky 1\.23\d* deg/s2 \(124 % of 1 deg/s2\)", said["largest acceleration of the axes"]
@@ -285,7 +285,7 @@ def test_near_the_zenith_the_azimuth_axis_runs_away(observe: Callable[..., Data]
         observe(scan, target="az 0 deg el 88 deg", telescope={"azimuth_speed_max": "3 deg/s"})
     # arccos(5.731 cos(88 deg) / 3) = 86.18 deg
     assert "an elevation below 86.1 deg" in caught.value.cure
-    said = {w: t for _, w, t in observe(scan, target="az 0 deg el 88 deg").observations[0].tally}
+    said = {w: t for _, w, t in observe(scan, target="az 0 deg el 88 deg").observations[0].log}
     assert said["largest speed of the axes"].startswith("azimuth 5.731 deg/s")
     assert "states no limits" in said["largest speed of the axes"]
 
@@ -340,7 +340,7 @@ def test_few_samples_per_beam_warn(observe: Callable[..., Data]) -> None:
         observe(
             PointingBackAndForth(**scan, sample_rate=f"{rate + 1} Hz"), target="az 0 deg el 45 deg"
         )
-    assert any(what == "samples per FWHM of 8.11 arcsec" for _, what, _ in o.tally)
+    assert any(what == "samples per FWHM of 8.11 arcsec" for _, what, _ in o.log)
 
 
 def test_a_turning_field_counts(observe: Callable[..., Data]) -> None:
@@ -350,7 +350,7 @@ def test_a_turning_field_counts(observe: Callable[..., Data]) -> None:
         target="05h00m00s +38d00m00s",
         time="2024-11-25T05:56:00Z",
     ).observations
-    text = next(text for _, what, text in o.tally if what.startswith("samples per FWHM"))
+    text = next(text for _, what, text in o.log if what.startswith("samples per FWHM"))
     speed = float(re.search(r"at ([\d.]+) arcsec/s", text)[1])  # type: ignore[index]
     psi = np.unwrap(o.derotate("boresight_radec")[2])
     assert speed == pytest.approx(

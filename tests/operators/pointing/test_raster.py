@@ -167,7 +167,7 @@ def test_turnarounds_are_flagged_on_request_and_counted(observe: Callable[..., D
     turning = ROWS.turning(o.seconds)
     assert np.array_equal(o.flags == TURNAROUND, turning)
     assert ("samples in turnarounds, flagged", int(turning.sum())) in [
-        (what, n) for _, what, n in o.tally.counts()
+        (what, n) for _, what, n in o.log.counts()
     ]
     covered = sum(stop - start for start, stop in o.intervals["scanning"])
     assert covered == pytest.approx((~turning).sum() / o.sample_rate, abs=0.05)

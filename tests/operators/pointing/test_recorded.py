@@ -179,7 +179,7 @@ def test_repeated_rows_are_dropped_without_a_word(
         warnings.simplefilter("error")
         data = observe(PointingRecorded(file=file))
     assert data.observations[0].n_samples == 600
-    assert data.observations[0].tally.get("PointingRecorded", "rows repeated, dropped") == 600
+    assert data.observations[0].log.get("PointingRecorded", "rows repeated, dropped") == 600
 
 
 def test_a_stamp_ahead_of_its_time_is_dropped_and_said(
@@ -390,7 +390,7 @@ def test_outside_the_telescopes_range(observe: Callable[..., Data], tmp_path: Pa
     write_csv(path, UNIX + t, 10 + 0 * t, np.where(t == 60, NAN, 45))
     (o,) = observe(PointingRecorded(file=path)).observations
     assert np.flatnonzero(o.flags).tolist() == [60]
-    assert o.tally.get("PointingRecorded", "samples whose row is not a number, flagged") == 1
+    assert o.log.get("PointingRecorded", "samples whose row is not a number, flagged") == 1
 
 
 # ---- jitter
@@ -420,7 +420,7 @@ def test_jitter_moves_the_pointing_by_speed_times_delay(observe: Callable[..., D
         ).max()
         < 1e-12
     )
-    said = {what: text for _, what, text in o.tally}
+    said = {what: text for _, what, text in o.log}
     assert "depart from a comb of 100 Hz by 1" in said["scan-000: times of the samples"]
     assert "of its rms" in said["scan-000: noise and filters take the samples as a comb"]
 
@@ -514,7 +514,7 @@ def test_only_the_mask_excludes(saved: Any, observe: Callable[..., Data]) -> Non
     (o,) = observe(PointingRecorded(file=path)).observations
     assert o.flags[:8].tolist() == [1, 2, 4, 8, 16, 32, 0, 0]
     assert np.flatnonzero(~o.good_samples).tolist() == [0, 1, 2, 3]
-    assert o.tally.get("PointingRecorded", "samples flagged in the file") == 4
+    assert o.log.get("PointingRecorded", "samples flagged in the file") == 4
     (o,) = observe(PointingRecorded(file=path, flag_mask=1 | 32 | 64)).observations
     assert np.flatnonzero(~o.good_samples).tolist() == [0, 5, 6]
     assert o.flags[4] == 16
@@ -558,7 +558,7 @@ def test_directions_on_the_sky_are_those_recorded(saved: Any, observe: Callable[
     shift = (o.ra - plain.ra + np.pi) % (2 * np.pi) - np.pi
     assert shift == pytest.approx(turn, abs=1e-12)
     most = 45 * np.cos(o.dec).max()
-    said = {what: text for _, what, text in o.tally}["scan-000: directions on the sky"]
+    said = {what: text for _, what, text in o.log}["scan-000: directions on the sky"]
     assert said.startswith("as recorded, up to ")
     assert float(said.split()[4]) == pytest.approx(most, rel=5e-3)  # three digits are stated
     (again,) = observe(PointingRecorded(file=path, celestial="recomputed")).observations
@@ -570,7 +570,7 @@ def test_directions_on_the_sky_are_those_recorded(saved: Any, observe: Callable[
     )
     assert (
         "recomputed from"
-        in {what: text for _, what, text in again.tally}["scan-000: directions on the sky"]
+        in {what: text for _, what, text in again.log}["scan-000: directions on the sky"]
     )
 
 

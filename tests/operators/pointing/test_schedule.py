@@ -320,7 +320,7 @@ def test_limits_hold_for_nods_and_scans_not_for_what_lies_between_them(tmp_path,
     path = version_5(tmp_path / "a.ecsv")
     data = Data(scene)
     PointingSchedule(schedule=path, elevation_acceleration="0.8 deg/s2", **given).observe(data)
-    said = {what: text for _, what, text in data.observations[0].tally}[
+    said = {what: text for _, what, text in data.observations[0].log}[
         "largest acceleration of the axes"
     ]
     assert "azimuth 0.8 deg/s2 (16 %" in said

@@ -285,7 +285,7 @@ def test_zeroed_pixels_are_counted(made, save):
     scan = made.observation([np.radians(75.0)], np.radians(20.0))
     made.look(SkyMap(file=save(values, made.tan_header((6, 7))), missing="zero"), scan)
     assert (
-        scan.tally.get("SkyMap", "pixels of the input map that are NaN or infinite, taken as zero")
+        scan.log.get("SkyMap", "pixels of the input map that are NaN or infinite, taken as zero")
         == 1
     )
 

@@ -68,7 +68,7 @@ def test_a_small_map_under_a_wide_scan_asks_for_a_small_grid(made, save):
     assert max(operator.grid_of(scan).shape) < 1500
     got = made.look(operator, scan)
     assert got.max() > 0.05
-    assert scan.tally.get("SkyMap", "samples outside the input map") > 0.9 * scan.n_samples
+    assert scan.log.get("SkyMap", "samples outside the input map") > 0.9 * scan.n_samples
 
 
 def test_a_map_that_no_sample_comes_near(made):

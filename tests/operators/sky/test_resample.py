@@ -76,8 +76,8 @@ def test_other_projections(made, save, kind, frame):
     # waves of 0.02 rad on 30 arcsec pixels: 140 rad per pixel^-1, cubic splines are good to (2 pi /
     # 860)^4; FK4 moves by E-terms
     np.testing.assert_allclose(got, field(directions), atol=1e-5)
-    assert any("interpolated" in value for _, _, value in scan.tally)
-    assert scan.tally.get("SkyMap", "samples outside the input map") == 0
+    assert any("interpolated" in value for _, _, value in scan.log)
+    assert scan.log.get("SkyMap", "samples outside the input map") == 0
 
 
 def test_distorted_tan(made, save):
@@ -102,7 +102,7 @@ def test_the_seam_of_a_whole_sky_map(made, save):
         scan, directions = scan_about(made, ra, 5.0, reach=np.radians(2))
         got = made.look(SkyMap(file=path, beam="none"), scan)[0]
         np.testing.assert_allclose(got, field(directions, 0.5), atol=2e-6)
-        assert scan.tally.get("SkyMap", "samples outside the input map") == 0
+        assert scan.log.get("SkyMap", "samples outside the input map") == 0
 
 
 def test_outside_a_resampled_map(made, save):
@@ -116,7 +116,7 @@ def test_outside_a_resampled_map(made, save):
     np.testing.assert_allclose(
         got, [1, 1, 0.5, 0.5], atol=1e-4
     )  # 8 grid points from the edge: 0.27^8
-    assert scan.tally.get("SkyMap", "samples outside the input map") == 2
+    assert scan.log.get("SkyMap", "samples outside the input map") == 2
 
 
 @pytest.mark.parametrize("kind", ["TAN", "SIN", "ZEA"])
@@ -163,7 +163,7 @@ def test_flux_beyond_a_projection_is_counted(made, save):
     made.look(SkyMap(file=save(values, header), beam="none"), scan)
     y, x = np.mgrid[:150, :150] - 74.5
     beyond = (np.hypot(x, y) * np.radians(1.2) > 2) & (values != 0)
-    counted = scan.tally.get(
+    counted = scan.log.get(
         "SkyMap", "bright pixels of the input map beyond its projection, whose flux is lost"
     )
     assert abs(counted - beyond.sum()) < 0.05 * beyond.sum()  # by the midpoints of edges
@@ -210,7 +210,7 @@ def test_healpix_against_the_analytic_field(made, tmp_path, nest, frame, ra, dec
     # waves of 0.1 rad / 1.4 on pixels of 0.004 rad: h k = 0.057, (h k)^4 = 1e-5 times the fit's
     # constant, amplitude 1.8
     np.testing.assert_allclose(got, field(directions, 0.1), atol=3e-5)
-    assert scan.tally.get("SkyMap", "samples outside the input map") == 0
+    assert scan.log.get("SkyMap", "samples outside the input map") == 0
 
 
 def test_partial_healpix_and_its_border(made, tmp_path):
@@ -231,7 +231,7 @@ def test_partial_healpix_and_its_border(made, tmp_path):
         got = made.look(SkyMap(file=path, beam="none", outside="7 K"), scan)[0]
         exact = field(unit(lon, lat), 0.1)
         np.testing.assert_allclose(got, [*exact[:3], 7, 7], atol=1e-4)
-        assert scan.tally.get("SkyMap", "samples outside the input map") == 2
+        assert scan.log.get("SkyMap", "samples outside the input map") == 2
 
 
 def test_healpix_far_away(made, tmp_path):
@@ -239,7 +239,7 @@ def test_healpix_far_away(made, tmp_path):
     path = healpix(tmp_path / "p.fits", 64, partial=lambda d: d @ centre > np.cos(np.radians(2.0)))
     scan = made.observation(np.full(20, np.radians(200.0)), np.radians(-40.0))
     np.testing.assert_array_equal(made.look(SkyMap(file=path), scan), 0.0)
-    assert scan.tally.get("SkyMap", "samples outside the input map") == 20
+    assert scan.log.get("SkyMap", "samples outside the input map") == 20
 
 
 def test_constant_healpix_is_constant(made, tmp_path):
@@ -272,7 +272,7 @@ def test_grid_points_without_a_fit_are_counted(made, tmp_path):
     scan = made.observation(lon, 0.0, centre=(np.radians(60), 0.0))
     np.testing.assert_allclose(made.look(SkyMap(file=path, beam="none"), scan), 2.0)
     assert (
-        scan.tally.get(
+        scan.log.get(
             "SkyMap",
             "grid points whose neighbours determine no third-order fit, taken as their mean",
         )
@@ -295,7 +295,7 @@ def test_partial_maps_of_a_few_pixels(made, tmp_path, number):
     np.testing.assert_allclose(
         made.look(SkyMap(file=path, beam="none", outside="2 K"), scan), 2.0, rtol=1e-6
     )
-    assert scan.tally.get("SkyMap", "samples outside the input map") == 0
+    assert scan.log.get("SkyMap", "samples outside the input map") == 0
 
 
 def test_a_full_map_of_twelve_pixels(made, tmp_path):

@@ -37,7 +37,7 @@ def test_a_second_beam_is_told_in_every_unit(made, save, unit):
         warnings.simplefilter("error")
         as_it_is = made.look(SkyMap(file=save(values, header), beam="none"), scan)[0, 0]
     assert seen / as_it_is == pytest.approx(0.5, abs=2e-3)
-    assert any(what == "resolution" and "2.83′ in all" in text for _, what, text in scan.tally)
+    assert any(what == "resolution" and "2.83′ in all" in text for _, what, text in scan.log)
 
 
 def test_the_cure_for_a_wider_telescope_makes_its_beam(made, save):
@@ -57,7 +57,7 @@ def test_a_beam_far_narrower_than_the_telescope_s_is_stated_alone(made, save):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         made.look(SkyMap(file=save(values, header)), scan)
-    assert any(what == "resolution" for _, what, _ in scan.tally)
+    assert any(what == "resolution" for _, what, _ in scan.log)
 
 
 def test_healpix_and_arrays(made, tmp_path):

@@ -266,7 +266,7 @@ def test_two_maps_add(made, save):
 
 
 # -----------------------------------------------------------------------------------------------
-# outside, tally
+# outside, log
 
 
 def test_samples_outside_take_the_value_and_are_counted(made, save):
@@ -275,16 +275,16 @@ def test_samples_outside_take_the_value_and_are_counted(made, save):
     lon, lat = made.offset(np.radians(75), np.radians(20), np.tan(east * ARCSEC), 0 * east)
     scan = made.observation(lon, lat, fwhm=3.0)
     got = made.look(SkyMap(file=path, outside="0.25 K"), scan)[0]
-    assert scan.tally.get("SkyMap", "samples outside the input map") == 3
+    assert scan.log.get("SkyMap", "samples outside the input map") == 3
     np.testing.assert_allclose(got[[0, 4, 5]], [1.0, 0.25, 0.25], atol=1e-7)
     assert 0.25 < got[3] < got[2] < 1.0  # the beam smooths the edge
-    assert ("SkyMap", "conversion", "1 K_RJ per K_RJ") in list(scan.tally)
+    assert ("SkyMap", "conversion", "1 K_RJ per K_RJ") in list(scan.log)
 
 
 def test_none_outside_is_stated(made, save):
     scan, _, _ = stare(made, 75.0, 20.0)
     made.look(SkyMap(file=save(np.zeros((64, 64)), made.tan_header())), scan)
-    assert ("SkyMap", "samples outside the input map", "0") in list(scan.tally)
+    assert ("SkyMap", "samples outside the input map", "0") in list(scan.log)
 
 
 def test_a_sky_that_no_detector_reaches(made, save):
@@ -299,8 +299,8 @@ def test_a_sky_that_no_detector_reaches(made, save):
         ):
             got = made.look(SkyMap(file=path, outside="1 mK"), scan, dtype=np.float32)
         np.testing.assert_array_equal(got, np.float32(1e-3))
-        assert scan.tally.get("SkyMap", "samples outside the input map") == 600
-    assert scan.tally.get("SkyMap", "samples more than 90 deg from the input map's centre") == 600
+        assert scan.log.get("SkyMap", "samples outside the input map") == 600
+    assert scan.log.get("SkyMap", "samples more than 90 deg from the input map's centre") == 600
 
 
 def test_a_sky_that_no_detector_reaches_is_not_convolved(made, save, monkeypatch):
@@ -346,7 +346,7 @@ def test_a_map_is_reached_whatever_its_axes(made, save, axes):
         made.observation(np.full(30, middle.ra.rad), middle.dec.rad),
     )
     np.testing.assert_allclose(made.look(operator, scan), 1.0, rtol=0.05)
-    assert scan.tally.get("SkyMap", "samples outside the input map") == 0
+    assert scan.log.get("SkyMap", "samples outside the input map") == 0
 
 
 def test_a_block_made_twice_is_counted_once(made, save):
@@ -356,7 +356,7 @@ def test_a_block_made_twice_is_counted_once(made, save):
     made.look(operator, scan, state=state)
     second = made.observation(np.full(30, np.radians(80)), np.radians(20))
     made.look(operator, second, state=state)
-    assert second.tally.get("SkyMap", "samples outside the input map") == 30
+    assert second.log.get("SkyMap", "samples outside the input map") == 30
 
 
 def test_a_map_much_coarser_than_the_beam(made, save):
@@ -369,7 +369,7 @@ def test_a_map_much_coarser_than_the_beam(made, save):
     scan, east, _ = stare(made, 75.0, 20.0, reach=300.0, fwhm=FWHM)
     got = made.look(SkyMap(file=path), scan)[0]
     np.testing.assert_allclose(got, np.sin(2 * np.pi * (29.5 - east / 60) / 20), atol=3e-3)
-    assert any("fewer than 2 pixels per FWHM" in value for _, _, value in scan.tally)
+    assert any("fewer than 2 pixels per FWHM" in value for _, _, value in scan.log)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (2, 3)])
@@ -462,7 +462,7 @@ def test_pixel_size_overrides_the_scale(made, save):
     assert made.look(SkyMap(file=path, pixel_size="2 arcsec"), scan)[0, 0] == pytest.approx(
         4 * gaussian(0, 0), rel=3e-3
     )
-    assert any("overridden" in value for _, _, value in scan.tally)
+    assert any("overridden" in value for _, _, value in scan.log)
 
 
 # ---------------------------------------------------------------------------------------------

@@ -267,7 +267,7 @@ def test_the_scenes_weather_reaches_the_pipeline():
         zonda.AtmosphereLayers(layers=2),
         zonda.Efficiency(),
     ]
-    said = {what: text for _, what, text in zonda.Pipeline(steps).run(s).tally}
+    said = {what: text for _, what, text in zonda.Pipeline(steps).run(s).log}
     assert said["PWV"] == "3 mm, as given"
     assert said["wind"] == "medians of the components"
     with pytest.raises(InputError, match="given twice"):

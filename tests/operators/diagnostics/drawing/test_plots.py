@@ -622,7 +622,7 @@ def test_time_streams_are_kept_whole(make_observation, data):
         rtol=1e-14,
         atol=1e-14,
     )
-    assert observation.tally.get("TimeStreams", "stream pink is absent at this step") == 1
+    assert observation.log.get("TimeStreams", "stream pink is absent at this step") == 1
     assert TimeStreams(observation=1).prepare(observation) is None
 
 

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 
 
-class Tally:
+class Log:
     """Counts and figures that the user must know of: what was clipped, dropped, approximated.
     Thread-safe.
 
@@ -33,8 +33,8 @@ class Tally:
         with self._lock:
             self._figures[who, what] = text
 
-    def update(self, other: Tally, prefix: str = "", suffix: str = "") -> None:
-        """Add another tally's counts and statements, ``prefix`` before their operators' labels,
+    def update(self, other: Log, prefix: str = "", suffix: str = "") -> None:
+        """Add another log's counts and statements, ``prefix`` before their operators' labels,
         ``suffix`` behind them.
         """
         for (who, what), number in other._counts.items():

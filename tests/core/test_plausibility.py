@@ -11,7 +11,7 @@ import pytest
 
 import zonda
 from zonda.core.assembly.checks import looks
-from zonda.core.plausible import doubt, doubts
+from zonda.core.plausibility import doubt, doubts
 from zonda.core.registry import instruments
 
 
