@@ -348,7 +348,8 @@ class Execution:
             self._store.drop(lent)
             model = found if signal.stream == MAIN else model
             for view, rows in zip(views, _rows_of(views), strict=True):
-                own = step.of_rows(found, rows) if len(views) > 1 else found  # type: ignore[attr-defined]
+                joined: Any = step
+                own = joined.of_rows(found, rows) if len(views) > 1 else found
                 view.measured[label, signal.stream] = own
             if len(views) > 1 and signal.stream == stream.name:
                 self._note(views, label, stream.observation)

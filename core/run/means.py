@@ -140,7 +140,7 @@ class MeansOfBands:
         self._fields = fields
 
     def evaluate(self, detectors: slice, samples: slice) -> NDArray[np.float64]:
-        """As `SmoothField.evaluate`."""
+        """Values of all bands on a rectangle (n_det_block, n_samp_block), as of `SmoothField`."""
         shape = detectors.stop - detectors.start, samples.stop - samples.start
         found = np.zeros(shape)
         for mean, rows in self._fields:

@@ -215,7 +215,8 @@ def calibration(block: Block, detector: int) -> Floats | float:
     zeta = block.observation.focalplane.main_beam_efficiency[detector]
     passed = block.observation.smooth.get("transmission")
     one = slice(detector, detector + 1)
-    return 1 / (zeta * (passed.evaluate(one, block.samples)[0] if passed else 1.0))  # type: ignore[no-any-return]
+    transmission = passed.evaluate(one, block.samples)[0] if passed else 1.0
+    return np.asarray(1 / (zeta * transmission))
 
 
 def on_sky(block: Block, detector: int, name: str, gain: Floats | float) -> Floats:

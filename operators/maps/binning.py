@@ -119,7 +119,7 @@ class Binning:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of the sums: those of I have a border for what falls outside of the map (`sums`)."""
+        """Shape of the sums; those of I have a border for samples outside of the map (`sums`)."""
         grid = self.looking.grid
         if self.angles is not None:
             more = 6 if self.own else 0

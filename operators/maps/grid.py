@@ -102,7 +102,7 @@ class ImageGrid(PixelGrid):
         return slice(None)
 
     def described(self, seen: Any) -> dict[str, Any]:
-        """What a map states of its pixels."""
+        """Header, pixel size and places, as `Map` takes them."""
         return {"header": self.header, "pixel": self.pixel}
 
 
@@ -198,7 +198,7 @@ class HealpixGrid(PixelGrid):
         return np.flatnonzero(hits)
 
     def described(self, seen: Any) -> dict[str, Any]:
-        """What a map states of its pixels."""
+        """Header, pixel size and places, as `Map` takes them."""
         return {
             "header": None,
             "pixel": math.sqrt(4 * math.pi / (12 * self.nside**2)),

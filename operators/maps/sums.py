@@ -273,8 +273,8 @@ def _add(  # type: ignore[no-untyped-def]
 
 @kernel
 def _scales(weight, per_variance, scatter):  # type: ignore[no-untyped-def]
-    """Of one detector: the largest |d| [K] that is accepted, units of w d per K, and units of the
-    scatter per K^2.
+    """Scales of one detector: the largest |d| [K] that is accepted, units of w d per K, and units
+    of the scatter per K^2.
     """
     limit, square = LARGEST / VALUE / max(weight, 1.0), weight * per_variance * WEIGHT
     if scatter:
