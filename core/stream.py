@@ -71,7 +71,7 @@ class Stream:
 
         ``work`` is called from several threads and must not change or keep the part. Results come
         in an order in which no detector's samples and no sample's detectors are ever out of order,
-        whatever the blocks and threads: what is added up tile by tile (`core.numerics.tiles`) has
+        whatever the blocks and threads: what is added up tile by tile (`core.numerics.chunks`) has
         the same bits.
         """
         n_det, n_samp = self.shape

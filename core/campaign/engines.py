@@ -485,7 +485,7 @@ def share_out(pool: Pool, need: int, place: str) -> None:
     Parameters
     ----------
     need
-        Least bytes with which any task runs (`core.run.forecast.need`); 0: not known.
+        Least bytes with which any task runs (`core.run.budget`); 0: not known.
     place
         The campaign's name, for errors.
 

@@ -37,7 +37,7 @@ from .covariance import mixture
 SPLINE_TABLE = Path(__file__).parent.parent / "data" / "spline_error.npz"
 
 LARGEST_STEP = 2048
-"""Samples; see `core.numerics.tiles`."""
+"""Samples; see `core.numerics.chunks`."""
 
 GRIDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 32, 40, 48, 64)
 _TRIED = 64
