@@ -4,7 +4,7 @@ from.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -83,11 +83,8 @@ class Provenance:
         for key, every in zip(
             ("TELESCOP", "INSTRUME", "SITE"), zip(*origins, strict=True), strict=True
         ):
-            names = sorted({ascii_text(name) for name in every})
-            text = ", ".join(names)
-            if len(text) > LONGEST:
-                history += [f"{key}: {name}" for name in names]
-                text = f"{len(names)} of them, see HISTORY"
+            text, names = listed(every)
+            history += [f"{key}: {name}" for name in names]
             cards.append((key, text))
         yaml = str(provenance.get("resolved_yaml", ""))
         history += map(ascii_text, filter(None, (str(provenance.get("command", "")),)))
@@ -309,3 +306,12 @@ def _table(name: str, columns: Mapping[str, NDArray[Any]]) -> bytes:
     kinds = [(title, values.dtype) for title, values in columns.items()]
     rows = np.rec.fromarrays(list(columns.values()), dtype=kinds)
     return table_bytes(fits.BinTableHDU(rows, name=name))
+
+
+def listed(every: Iterable[str]) -> tuple[str, list[str]]:
+    """Text of a card for some names, and those that stand in the history if it is too long."""
+    names = sorted({ascii_text(name) for name in every})
+    text = ", ".join(names)
+    if len(text) <= LONGEST:
+        return text, []
+    return f"{len(names)} of them, see HISTORY", names

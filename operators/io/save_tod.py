@@ -134,7 +134,7 @@ class SaveTOD(StreamOutput):
             )
         tod.take_flags(observation)
         log = "\n".join(f"{who}: {what}: {value}" for who, what, value in observation.log)
-        tod.metadata.update(_provenance(data), log=log)
+        tod.metadata.update(_provenance(data), tally=log)
         state.writer.finish()
         state.whole.close()
         data.add(self.label, Files([str(state.path)]))

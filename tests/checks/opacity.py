@@ -201,7 +201,7 @@ def ranges() -> Measured:
             (lambda: _band(990, 1010), "990 to 1010 GHz is not inside"),
             (lambda: profile(SITE, START, 0.1), "outside the limits, 0 to 60 mm"),
             (lambda: _read_humidity(130), "the relative humidity is above 120 %"),
-            (lambda: _read_humidity(-1), "the relative humidity is negative"),
+            (lambda: _read_humidity(-1), "the share of water vapour is not between 0 and 0.1"),
         ]
     )
 

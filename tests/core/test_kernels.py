@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dis
 import os
 import pkgutil
 import subprocess
@@ -235,7 +236,8 @@ def test_what_kernels_import_is_part_of_their_folder() -> None:
 
     def names(code: CodeType) -> set[str]:
         inner = (names(c) for c in code.co_consts if isinstance(c, CodeType))
-        return set(code.co_names).union(*inner)
+        own = {i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"}
+        return own.union(*inner)
 
     unseen = set()
     for function in every_kernel():

@@ -143,7 +143,8 @@ def impossible(column: Column) -> Iterator[tuple[NDArray[np.bool_], str]]:
     for name, (low, high, unit) in LIMITS.items():
         values = getattr(column, name)
         limits = f"between {low:g} and {high:g} {unit}".rstrip()
-        yield ~((values >= low) & (values <= high)), f"the {name} is not {limits}".replace("_", " ")
+        what = "share of water vapour" if name == "h2o" else name.replace("_", " ")
+        yield ~((values >= low) & (values <= high)), f"the {what} is not {limits}"
 
 
 def wind_speed(above_ground: ArrayLike) -> Floats:

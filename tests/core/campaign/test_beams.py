@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from zonda.core.instrument import Band
-from zonda.core.maps.map_file import _names
+from zonda.core.maps.map_file import listed
 from zonda.core.numerics.radiation import to_kelvin_rj
 
 from ...scenes import camera
@@ -54,9 +54,9 @@ def header(tmp_path, first, second):
 
 
 def test_names_that_a_card_does_not_hold_stand_in_the_history():
-    assert _names(["b", "a", "b"]) == ("a, b", [])
+    assert listed(["b", "a", "b"]) == ("a, b", [])
     many = [f"camera number {k:02d}" for k in range(9)]
-    assert _names(many) == ("9 of them, see HISTORY", many)
+    assert listed(many) == ("9 of them, see HISTORY", many)
 
 
 def test_beams_and_names_of_all_entries(tmp_path):

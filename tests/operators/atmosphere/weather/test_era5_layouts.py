@@ -313,7 +313,7 @@ def test_valid_time_beside_the_time_axis(tmp_path, right):
         ({"units": {"latitude": "radians"}}, "latitude has the unit 'radians'"),
         ({"values": {"t": lambda t: t - 273.15}}, "the temperature is not between"),
         ({"values": {"z": lambda z: z / GRAVITY}}, "its pressure does not belong to its height"),
-        ({"values": {"q": lambda q: 1e3 * q}}, "the h2o is not between"),
+        ({"values": {"q": lambda q: 1e3 * q}}, "the share of water vapour is not between"),
         ({"values": {"u": lambda u: 100 * u}}, "the wind east is not between"),
         ({"units": {"pressure_level": "Pa"}}, "too coarse|does not belong"),
     ],

@@ -543,7 +543,11 @@ def test_table_without_winds_and_with_density(tmp_path):
             "height [m]",
             "line 5: its pressure does not belong to its height: no air has that",
         ),
-        ("-18, 20", "-18, -20", "line 6: the h2o is not between 0 and 0.1 of the air"),
+        (
+            "-18, 20",
+            "-18, -20",
+            "line 6: the share of water vapour is not between 0 and 0.1 of the air",
+        ),
         ("-18, 20", "-18, 200", "line 6: the relative humidity is above 120 %"),
         ("10, 50", "283, 50", "line 3: the temperature is not between 150 and 340 K"),
         ("9, 2", "900, 2", "line 5: the wind east is not between -200 and 200 m/s"),
