@@ -1,25 +1,42 @@
-"""Positions of targets, the Sun, the Moon and planets above the horizon of a site, by astropy.
+"""Positions of targets, the Sun, the Moon and planets above the horizon of a site.
 
-Without refraction; with its built-in ephemeris, and the Earth's orientation of the tables that are
-installed with it: nothing is downloaded.
+Directions are ERFA's, without refraction: aberration, precession-nutation (IAU 2006/2000A), Earth
+rotation, polar motion. Planets are those of Simon et al. 1994 (plan94), the Moon that of Meeus 1998
+(moon98), as in astropy's built-in ephemeris: nothing is downloaded. Topocentric: the Moon's
+parallax is in. Light is not bent by the Sun (below 2 arcsec).
 """
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..types import Floats
+from .earth_orientation import orientation
 from .sphere import unit_vectors
 
 if TYPE_CHECKING:
     from ..configuration.target import Target
     from ..site import Site
 
-BODIES = ("sun", "moon", "mercury", "venus", "mars", "jupiter", "saturn", "uranus", "neptune")
+PLANETS = {
+    "mercury": 1,
+    "venus": 2,
+    "mars": 4,
+    "jupiter": 5,
+    "saturn": 6,
+    "uranus": 7,
+    "neptune": 8,
+}
+"""Planets, with their numbers in ERFA's plan94."""
+BODIES = ("sun", "moon", *PLANETS)
+LIGHT = 173.14463267424
+"""Speed of light, au/day (IAU 2012)."""
+DAY = 86400.0
 
 
 @dataclass(frozen=True)
@@ -54,32 +71,59 @@ class Track:
 
 def tracks(site: Site, times: Floats, *what: Target | str) -> list[Track]:
     """Tracks of targets and bodies (`BODIES`) at ``times`` (n,), POSIX seconds, from a site."""
-    from astropy import units as u
-    from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_body
-    from astropy.time import Time
-    from astropy.utils import iers
+    import erfa
 
-    found = []
-    place = EarthLocation.from_geodetic(
-        site.longitude * u.rad, site.latitude * u.rad, site.altitude * u.m
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore", erfa.ErfaWarning
+        )  # "dubious year": leap seconds to come are unknown
+        jd, days = np.full(len(times), 2440587.5), times / DAY
+        earth = orientation(jd - 2400000.5 + days)
+        place = (site.longitude, site.latitude, site.altitude, earth.x, earth.y)
+        star, _ = erfa.apco13(jd, days, earth.ut1_utc, *place, 0.0, 0.0, 0.0, 1.0)
+        when = erfa.taitt(*erfa.utctai(jd, days))
+        return [_track(one, star, when, len(times)) for one in what]
+
+
+def _track(one: Target | str, star: Any, when: Any, n: int) -> Track:
+    import erfa
+
+    if not isinstance(one, str) and one.frame == "horizontal":
+        c = math.cos(one.latitude)
+        fixed = [c * math.cos(one.longitude), c * math.sin(one.longitude), math.sin(one.latitude)]
+        return Track(np.tile(fixed, (n, 1)))
+    natural = (
+        _of_body(one, star, when)
+        if isinstance(one, str)
+        else np.tile(unit_vectors(*one.icrs()), (n, 1))
     )
-    there = AltAz(obstime=Time(times, format="unix"), location=place)
-    with (
-        warnings.catch_warnings(),
-        iers.conf.set_temp("auto_download", False),
-        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
-    ):
-        warnings.simplefilter("ignore")  # "dubious year": leap seconds to come are unknown
-        for one in what:
-            if not isinstance(one, str) and one.frame == "horizontal":
-                fixed = unit_vectors(one.longitude, one.latitude)
-                found.append(Track(np.tile(fixed, (len(times), 1))))
-                continue
-            source = (
-                get_body(one, there.obstime, place, ephemeris="builtin")
-                if isinstance(one, str)
-                else SkyCoord(*one.icrs(), unit="rad")
-            )
-            seen = source.transform_to(there)
-            found.append(Track(unit_vectors(seen.az.rad, seen.alt.rad)))
-    return found
+    distance = np.ascontiguousarray(star["em"])
+    seen = erfa.ab(
+        natural, np.ascontiguousarray(star["v"]), distance, np.ascontiguousarray(star["bm1"])
+    )
+    azimuth, zenith, *_ = erfa.atioq(
+        *erfa.c2s(erfa.rxp(np.ascontiguousarray(star["bpn"]), seen)), star
+    )
+    sine = np.sin(zenith)
+    return Track(np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=1))
+
+
+def _of_body(name: str, star: Any, when: Any) -> Floats:
+    """(n, 3) unit vectors from the observer to a body, BCRS axes."""
+    import erfa
+
+    from_sun = star["eh"] * star["em"][:, None]  # of the observer, au
+    if name == "moon":
+        _, earth = erfa.epv00(*when)
+        vector = erfa.moon98(*when)["p"] - (star["eb"] - earth["p"])
+        vector -= (
+            np.linalg.norm(vector, axis=1)[:, None] * star["v"]
+        )  # it moves with the Earth while its light is on the way
+    elif name == "sun":
+        vector = -from_sun
+    else:
+        late = np.zeros(len(from_sun))
+        for _ in range(2):  # the light's way
+            vector = erfa.plan94(when[0], when[1] - late, PLANETS[name])["p"] - from_sun
+            late = np.linalg.norm(vector, axis=1) / LIGHT
+    return np.ascontiguousarray(vector / np.linalg.norm(vector, axis=1)[:, None])

@@ -13,6 +13,7 @@ import numpy as np
 
 from zonda.core.configuration.time import Instant
 from zonda.core.numerics.bodies import BODIES as BODIES
+from zonda.core.numerics.bodies import LIGHT as LIGHT
 from zonda.core.numerics.bodies import Track, tracks
 from zonda.core.types import Floats
 

@@ -68,6 +68,14 @@ def of_astropy(what: str, times: Any, site: Site = GREEN_BANK) -> Track:
     return Track(np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=1))
 
 
+@pytest.mark.parametrize("what", [*BODIES, "05h00m00s +20d00m00s"])
+def test_directions_are_astropys(what: str, offline: None) -> None:
+    times = EVENING.posix + np.arange(0, 30 * DAY, 1.37 * DAY)
+    (found,) = tracks(GREEN_BANK, times, what if what in BODIES else Target.parse(what))
+    # 2 arcsec: light that the Sun bends is not in, and the Moon's way is that of one second
+    assert np.degrees(found.distance(of_astropy(what, times)).max()) * 3600 < 2.0
+
+
 @pytest.mark.parametrize("what", ["05h00m00s +20d00m00s", "moon", "mars"])
 def test_rise_and_set_within_a_minute_of_astropy(what: str, offline: None) -> None:
     night = night_of(GREEN_BANK, EVENING, what if what in BODIES else Target.parse(what), THIRTY)
