@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,14 +37,24 @@ varies by half of it within.
 """
 CUT = 5.0
 """Standard deviations at which kernels end."""
+STEEP = 0.15
+"""sigma tan(latitude) up to which the mean of two kernels for each row serves CAR images, to some
+0.5 %.
+"""
 MOST_PAIRS = 3e6
 """Pairs of HEALPix pixels under a kernel up to which each is looked at: harmonics of a whole sphere
 take as long.
 """
 LARGEST_NSIDE = 2048
 """Of HEALPix maps that are smoothed by harmonics: beyond, a whole sphere takes gigabytes."""
+DIRECT = 1e9
+"""Pairs of pixels of an image under a kernel up to which each is looked at: some 3 s. Of CAR images
+a hundredth.
+"""
+TILE = 64
+"""Pixels on a side of a tile up to which it is halved until one kernel serves it."""
 MOST_DIRECT = 3e11
-"""Pairs of pixels under a kernel beyond which an image is refused: some 15 minutes."""
+"""Such pairs beyond which an image is refused: some 15 minutes."""
 SKEW = 1e-2
 """Skewness of pixels below which the kernel is that of pixels at right angles: right to half of it,
 of the kernel's peak.
@@ -67,10 +78,15 @@ def smoother(grid: MapGrid, fwhm: float) -> Smoother:
     car = grid.kind == "CAR" and grid.cylinder
     if car and sigma * np.tan(abs(grid.latitudes)).max(initial=0.0) < GENTLE:
         return _by_rows(grid, sigma)
-    if (steps := _even_steps(grid)) is None:
-        return _directly(grid, sigma)
-    along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
-    return lambda values, power=1.0: np.asarray(convolved(values, along_y**power, along_x**power))
+    if (steps := _even_steps(grid)) is not None:
+        return _evenly(steps, sigma)
+    reach = grid.reach(CUT * sigma)
+    pairs = 4.0 * math.prod(grid.shape) * math.prod(reach)
+    if car and pairs >= DIRECT / 100:
+        return _by_latitudes(grid, sigma)
+    if pairs >= DIRECT and not 0 < grid.around <= grid.shape[1]:
+        return _by_tiles(grid, sigma, reach)
+    return _directly(grid, sigma)
 
 
 def weighted_mean(convolve: Smoother, values: Floats, weights: Floats) -> tuple[Floats, Floats]:
@@ -116,24 +132,103 @@ def smoothed(
     return found, None if noise is None else error_of_mean(convolve, noise, weights, known, total)
 
 
-def _by_rows(grid: ImagePixels, sigma: float) -> Smoother:
+def _evenly(steps: tuple[float, float], sigma: float) -> Smoother:
+    """Smoother of an image whose pixels are alike."""
+    along_y, along_x = (gaussian_taps(sigma / step) for step in steps)
+    return lambda values, power=1.0: np.asarray(convolved(values, along_y**power, along_x**power))
+
+
+def _by_tiles(grid: ImagePixels, sigma: float, reach: tuple[int, int]) -> Smoother:
+    """Smoother of a large image: tile by tile where one kernel serves a tile, else pixel by
+    pixel.
+    """
+    halo, rest = [math.ceil(1.2 * n) + 2 for n in reach], np.zeros(grid.shape, np.bool_)
+    tiles = []
+    for tile, steps in _tiles(grid, *(slice(0, n) for n in grid.shape)):
+        if steps is None:
+            rest[tile] = True
+            continue
+        low = [max(own.start - n, 0) for own, n in zip(tile, halo, strict=True)]
+        whole = tuple(slice(a, own.stop + n) for a, own, n in zip(low, tile, halo, strict=True))
+        inner = tuple(slice(own.start - a, own.stop - a) for a, own in zip(low, tile, strict=True))
+        tiles.append((tile, whole, inner, _evenly(steps, sigma)))
+    directly = _directly(grid, sigma, rest)
+
+    def found(values: AnyFloats, power: float = 1.0) -> Floats:
+        out, values = directly(values, power), np.asarray(values, np.float64)
+        for tile, whole, inner, evenly in tiles:
+            out[tile] = evenly(values[whole], power)[inner]
+        return out
+
+    return found
+
+
+def _tiles(
+    grid: ImagePixels, *tile: slice
+) -> list[tuple[tuple[slice, ...], tuple[float, float] | None]]:
+    """Halves of halves of the image, until each is even or of no more than `TILE` pixels a side;
+    and its steps, None where these differ.
+    """
+    steps, sides = _even_steps(grid.window(*tile)), [own.stop - own.start for own in tile]
+    if steps is not None or max(sides) <= TILE:
+        return [(tile, steps)]
+    along, found = int(sides[1] > sides[0]), []
+    middle = tile[along].start + sides[along] // 2
+    for half in (slice(tile[along].start, middle), slice(middle, tile[along].stop)):
+        found += _tiles(grid, *((tile[0], half) if along else (half, tile[1])))
+    return found
+
+
+def _by_latitudes(grid: ImagePixels, sigma: float) -> Smoother:
+    """Smoother of a large CAR image: row by row, but near the poles pixel by pixel."""
+    rows, poles = _by_rows(grid, sigma, both=True), []
+    for pole in (-1, 1):
+        near = sigma * np.sin(pole * grid.latitudes) >= STEEP * np.cos(grid.latitudes)
+        if near.any():
+            poles.append((near, _directly(grid, sigma, near[:, None])))
+
+    def found(values: AnyFloats, power: float = 1.0) -> Floats:
+        out = rows(values, power)
+        for near, directly in poles:
+            out[near] = directly(values, power)[near]
+        return out
+
+    return found
+
+
+def _by_rows(grid: ImagePixels, sigma: float, both: bool = False) -> Smoother:
     """Smoother of a CAR image: along each row with its own width, then along the columns; right to
     sigma tan(latitude) / 2.
+
+    ``both``: the mean of that, of the height that equation (2) has, and of columns first, rows
+    then. The widths go with cos(latitude) of the pixel that is seen, and of the one that sees it;
+    so has r^2 the mean of both: right to the square.
     """
     side, taps = (
         abs(float(grid.matrix[0, 0])),
         gaussian_taps(sigma / abs(float(grid.matrix[1, 1]))),
     )
-    rows = [gaussian_taps(sigma / side / cosine) for cosine in np.cos(grid.latitudes)]
+    cosines = np.cos(grid.latitudes)
+    if both:  # rows nearer to a pole are left to `_directly`
+        cosines = np.maximum(cosines, sigma / 2 / STEEP)
+    rows = [gaussian_taps(sigma / side / cosine) for cosine in cosines]
     around, nx = grid.around, grid.shape[1]
-    columns, own = np.arange(nx), np.arange(nx)
+    columns: Any = slice(None)
+    own: Any = columns
     if 0 < around <= nx:
         reach = min(max((len(row) for row in rows), default=0), (around - 1) // 2)
-        columns, own = np.arange(-reach, around + reach) % around, reach + own % around
+        columns = np.arange(-reach, around + reach) % around
+        own = reach + np.arange(nx) % around
 
     def found(values: AnyFloats, power: float = 1.0) -> Floats:
         whole = np.asarray(values, np.float64)[:, columns]
-        return convolved_rows(whole, taps**power, [row**power for row in rows])[:, own]
+        along, one = [row**power for row in rows], np.ones(1)
+        if not both:
+            return convolved_rows(whole, taps**power, along)[:, own]
+        height = cosines[:, None] ** power
+        seen = height * convolved_rows(whole / height, taps**power, along)
+        whole = convolved_rows(whole, taps**power, [one] * len(rows))
+        return (seen + convolved_rows(whole, one, along))[:, own] / 2
 
     return found
 
@@ -158,19 +253,20 @@ def _even_steps(grid: ImagePixels) -> tuple[float, float] | None:
     return None
 
 
-def _directly(grid: ImagePixels, sigma: float) -> Smoother:
-    """Equation (2) as it stands: each pixel with its own kernel. InputError where that would take
-    hours.
+def _directly(
+    grid: ImagePixels, sigma: float, where: NDArray[np.bool_] = np.ones((1, 1), np.bool_)
+) -> Smoother:
+    """Equation (2) as it stands, of the pixels ``where`` (others are 0): each with its own kernel.
+    InputError where that would take hours.
     """
     ny, nx = grid.shape
     whole = 0 < grid.around <= nx
     columns = grid.around if whole else nx
-    directions = np.ascontiguousarray(grid.directions()[:, :columns])
-    areas = np.nan_to_num(np.broadcast_to(grid.areas, grid.shape)[:, :columns])
-    reach = np.zeros((2, ny, columns), np.int32)
-    for first in range(0, ny, ROWS):
-        rows = np.arange(first, min(first + ROWS, ny), dtype=np.float64)
-        xx, xy, yy = grid.metric(np.arange(columns, dtype=np.float64), rows[:, None])
+    where = np.broadcast_to(where, grid.shape)[:, :columns]
+    wanted = np.flatnonzero(where.any(axis=1))
+    across, reach = np.arange(columns, dtype=np.float64), np.zeros((2, ny, columns), np.int32)
+    for part in np.array_split(wanted, math.ceil(len(wanted) / ROWS) or 1):
+        xx, xy, yy = grid.metric(across, part[:, None])
         with np.errstate(invalid="ignore", divide="ignore"):
             wide = 1.1 * CUT * sigma * np.sqrt(np.stack([yy, xx]) / (xx * yy - xy**2)) + 1
             if grid.cylinder:  # meridians meet: a circle about the pole has all columns
@@ -178,7 +274,7 @@ def _directly(grid: ImagePixels, sigma: float) -> Smoother:
                 share = math.sin(min(CUT * sigma, math.pi / 2)) / (np.sqrt(xx) / side)
                 wide[0] = np.where(share < 1, np.arcsin(np.minimum(share, 1.0)) / side + 1, np.inf)
         most = np.array([columns // 2 if whole else columns, ny])[:, None, None]
-        reach[:, first : first + ROWS] = np.minimum(np.where(np.isnan(wide), 0.0, wide), most)
+        reach[:, part] = np.minimum(np.where(np.isnan(wide), 0.0, wide), most) * where[part]
     if (pairs := 4 * float(reach.prod(axis=0, dtype=np.float64).sum())) > MOST_DIRECT:
         raise InputError(
             f"a map of {nx} x {ny} pixels, smoothed by {angle_text(sigma * FWHM_PER_SIGMA)}, would"
@@ -186,11 +282,20 @@ def _directly(grid: ImagePixels, sigma: float) -> Smoother:
             place="smoothing",
             cure="smooth it less, cut off the poles of a CAR map, or make a HEALPix map (nside)",
         )
+    high = int(reach[1].max(initial=0))
+    first, stop = wanted.min(initial=ny) - high, wanted.max(initial=-1) + high + 1
+    seen = slice(max(int(first), 0), min(int(stop), ny))
+    rows = np.arange(ny)[seen]
+    parts = np.array_split(rows, math.ceil(len(rows) / ROWS) or 1)
+    directions = np.concatenate([grid.at(across, part[:, None]) for part in parts])
+    areas = np.nan_to_num(np.where(where, grid.areas[:, :columns], 0.0)[seen])
+    reach = np.ascontiguousarray(reach[:, seen])
 
     def found(values: AnyFloats, power: float = 1.0) -> Floats:
-        own = np.ascontiguousarray(values[:, :columns], np.float64)
-        out = smooth_directly(own, directions, areas, reach, whole, sigma, power, table(power))
-        return np.asarray(out[:, np.arange(nx) % columns], np.float64)
+        own, out = np.ascontiguousarray(values[seen, :columns], np.float64), np.zeros((ny, nx))
+        ours = smooth_directly(own, directions, areas, reach, whole, sigma, power, table(power))
+        out[seen] = ours[:, np.arange(nx) % columns]
+        return out
 
     return found
 

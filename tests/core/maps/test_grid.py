@@ -171,9 +171,31 @@ def test_the_pole_of_a_whole_plate_carree_sky():
         )
 
 
+@pytest.mark.parametrize("width", [6.0, 18.0])
+def test_a_large_plate_carree_sky_is_smoothed_as_a_small_one(width, monkeypatch):
+    """By rows where these are nearly alike, pixel by pixel near the poles: as pixel by pixel
+    everywhere, to 0.5 % of the peak.
+    """
+    shape = (90, 180)
+    grid = image_grid(header("CAR", 0, shape, (-2.0, 2.0)), shape)
+    fwhm, rows = math.radians(width), (3, 15, 40, 60, 75, 85)
+    values = np.zeros(shape)
+    for row in rows:
+        values[row, (37 * row) % 180] = 1.0
+    monkeypatch.setattr("zonda.core.maps.smoothing.DIRECT", 1e99)
+    expected, noise = smoothed(grid, values, fwhm, noise=np.ones(shape))
+    monkeypatch.setattr("zonda.core.maps.smoothing.DIRECT", 0.0)
+    found, other = smoothed(grid, values, fwhm, noise=np.ones(shape))
+    for row in rows:
+        near = slice(max(row - 3, 0), row + 4)
+        assert abs(found - expected)[near].max() < 0.005 * expected[near].max()
+    np.testing.assert_allclose(other, noise, rtol=0.005)
+
+
 def test_a_pole_that_would_take_hours_is_refused(monkeypatch):
     shape = (90, 180)
     grid = image_grid(header("CAR", 0, shape, (-2.0, 2.0)), shape)
+    monkeypatch.setattr("zonda.core.maps.smoothing.DIRECT", 0.0)
     monkeypatch.setattr("zonda.core.maps.smoothing.MOST_DIRECT", 1.0)
     with pytest.raises(InputError, match="would take"):
         smoother(grid, math.radians(6.0))

@@ -10,6 +10,7 @@ import pytest
 from zonda.core.instrument import Band
 from zonda.core.maps.map_plots import plot_map
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.smoothing import smoothed
 from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
 from zonda.operators.diagnostics.report_results import expected
 from zonda.operators.maps.grid import PlateCarreeGrid, tangent_wcs
@@ -134,6 +135,23 @@ def test_a_wide_tangent_plane_is_smoothed_by_its_own_pixels():
     assert found.noise[at] == pytest.approx(
         math.sqrt(areas[at] / (4 * math.pi * sigma**2)), rel=0.005
     )
+
+
+def test_large_images_are_smoothed_by_tiles(monkeypatch):
+    """A single pixel 20 deg from the tangent point, as in small images, where each pixel has its
+    own kernel.
+    """
+    one = product("TAN", 0.0, side=45.0, pixel=10 * ARCMIN)
+    fwhm, sigma = 50 * ARCMIN, 50 * ARCMIN / FWHM_PER_SIGMA
+    values = np.zeros(one.signal.shape)
+    for at in ((135, 135 + 114), (135 + 78, 135 - 78), (64, 128)):
+        values[at] = 1.0
+    found, noise = smoothed(one.grid, values, fwhm, noise=np.ones(values.shape))
+    monkeypatch.setattr("zonda.core.maps.smoothing.DIRECT", 0.0)
+    tiled, other = smoothed(one.grid, values, fwhm, noise=np.ones(values.shape))
+    peak = one.areas().max() / (2 * math.pi * sigma**2)
+    assert abs(tiled - found).max() < 0.005 * peak
+    np.testing.assert_allclose(other[20:-20, 20:-20], noise[20:-20, 20:-20], rtol=0.005)
 
 
 def test_the_beam_of_a_picture_is_round_on_the_sky():
