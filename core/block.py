@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -161,7 +161,7 @@ class Block:
         before: Mapping[str, AnyFloats],
         provides: frozenset[str],
         due: frozenset[str],
-        who: str,
+        who: Callable[[], str],
     ) -> None:
         """Refuse what `Operator.exec` must not leave: a stream that is missing, or is no array of
         the block's shape and type.
@@ -173,12 +173,12 @@ class Block:
         provides, due
             Streams that the step may take away, and those that it must have made.
         who
-            The step, its class and where that comes from.
+            Tells the step, its class and where that comes from, if there is something to refuse.
 
         Raises
         ------
         PluginError
-            Names ``who``.
+            Names the step.
         """
         for name, stream in self.detdata.items():
             if stream is before.get(name):
@@ -194,7 +194,7 @@ class Block:
             wanted = f"an array {self.shape} of {np.dtype(self.dtype)} in C order"
             raise PluginError(
                 f"exec left the stream {name!r} as {found}; it must be {wanted}",
-                place=who,
+                place=who(),
                 cure=f"fill it in place: block.new({name!r})[...] = values",
             )
         gone = (due - self.detdata.keys()) | (before.keys() - provides - self.detdata.keys())
@@ -204,6 +204,6 @@ class Block:
             cure = f"make it with block.new({name!r}), or leave it out of provides"
             raise PluginError(
                 f"exec left no stream {name!r}, which {what}",
-                place=who,
+                place=who(),
                 cure=cure if name in due else "leave it in block.detdata",
             )

@@ -61,9 +61,10 @@ class BlockMaker:
         self._view, self._observation, self._dtype = view, view.observation, schedule.settings.dtype
         self._streams, self._schedule = schedule.streams, schedule
         self._timer, self._stopped = timer, stopped
-        # a label is a property, which is slow
+        # the attributes of a step are slow to look up, and each piece needs them
         own = ((o, o.label) for o in view.chain.steps)
         self._own = {id(o): mine for o, mine in zip(chain.steps, own, strict=True)}
+        self._labels = {id(step): label for step, label in self._own.values()}
         acting = [o for o in chain.steps if type(o).exec is not Operator.exec]
         self._declared = {
             o.label: names_of(o, self._observation.signals) for o in acting if not knows_means(o)
@@ -233,7 +234,7 @@ class BlockMaker:
 
     def _act(self, step: Operator, block: Block, state: Any) -> None:
         """`Operator.exec`, and a look at what it left."""
-        label = step.label
+        label = self._labels[id(step)]
 
         def work(block: Block) -> None:
             before = dict(block.detdata)
@@ -247,7 +248,7 @@ class BlockMaker:
                     place=label,
                     cure='write block.detdata["signal"][...] = ..., and return nothing',
                 )
-            block.check(before, step.provides, self._due[label], whose(step))
+            block.check(before, step.provides, self._due[label], lambda: whose(step))
 
         fields = {}
         if names := self._declared.get(label, frozenset()) & block.detdata.keys():
