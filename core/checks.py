@@ -29,7 +29,7 @@ Measured = float | tuple[float, str]
 
 @dataclass(frozen=True)
 class Case:
-    """A row of the stability matrix: what is hard, and what is accepted."""
+    """A row of the stability matrix: a numerical difficulty, and the error that is accepted."""
 
     text: str
     acceptance: str

@@ -51,12 +51,12 @@ class Log:
         return iter(sorted(rows))
 
     def counts(self) -> list[tuple[str, str, int]]:
-        """The counts alone, in a fixed order."""
+        """All counts (who, what, number), sorted."""
         with self._lock:
             return sorted((*k, v) for k, v in self._counts.items())
 
     def figures(self) -> list[tuple[str, str, str]]:
-        """The statements alone, in a fixed order."""
+        """All statements (who, what, text), sorted."""
         with self._lock:
             return sorted((*k, v) for k, v in self._figures.items())
 

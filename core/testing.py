@@ -93,7 +93,7 @@ def check_parameters_survive_text(operator: Operator) -> None:
 
 
 def check_knobs(operator: Operator) -> None:
-    """Knobs turn parameters that exist, on ladders of at least two values that these accept."""
+    """Check that each knob names a parameter and has at least two values that it accepts."""
     for knob in planning_of(operator).knobs:
         assert knob.parameter in type(operator).model_fields, (
             f"knob {knob.parameter} is not a parameter"

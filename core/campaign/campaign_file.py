@@ -118,8 +118,8 @@ class Task:
 
 @dataclass(frozen=True)
 class Combination:
-    """One set of co-added products, in ``folder`` ('': the output folder); its tasks share a
-    layout.
+    """Tasks whose products are added up into one set of maps, written in ``folder`` ('': the
+    output folder); they share a layout.
     """
 
     name: str

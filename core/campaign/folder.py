@@ -40,8 +40,8 @@ def check_free(folder: Path) -> None:
 
 
 def make_way(folder: Path, job: Job | None = None) -> None:
-    """Remove what an earlier campaign left besides its products, and records where those of ``job``
-    will stand. The caller holds the folder's lock.
+    """Delete the files of an earlier campaign except its products, and the task records that
+    ``job`` will write anew. The caller holds the folder's lock.
     """
     records = [job.record(folder, number) for number in range(len(job.combinations))] if job else []
     for old in (folder / FILE, folder / RECORD, *records):
@@ -133,7 +133,7 @@ COLUMNS = tuple(column.name for column in fields(TaskRow))
 
 
 class Record:
-    """The state of tasks, as one main process reads and writes it.
+    """The file that says which tasks of a campaign are done or failed.
 
     Parameters
     ----------

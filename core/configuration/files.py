@@ -92,8 +92,8 @@ class InMemory(Protocol):
     """A step that may hold arrays in place of a file that a pipeline file names."""
 
     def in_files(self, path: Path) -> Self:
-        """The step with its arrays in a FITS file at ``path``, to the same bits; itself where it
-        holds none.
+        """A copy of the step that reads its arrays from a FITS file, written at ``path`` to the
+        same bits; the step itself if it has none.
         """
         ...
 

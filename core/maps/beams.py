@@ -46,7 +46,7 @@ def check_width(fwhm: float, across: float, place: str, cure: str) -> None:
 
 
 def size_text(angle: float) -> str:
-    """rad in the units of headers: ``20 deg``, ``18 arcsec``."""
+    """An angle [rad] as headers write it: ``20 deg``, ``18 arcsec``."""
     return (
         f"{math.degrees(angle):.4g} deg"
         if angle >= math.radians(0.1)

@@ -80,9 +80,9 @@ def noise_alone(
     name: str,
     wanted: Sequence[Noise] = ("source_free", "half_difference"),
 ) -> tuple[Floats, str] | None:
-    """A map of the noise alone of the map ``name``, and what it is in words: all but the sky, else
-    half the difference of two halves of the samples (``wanted``: which, in this order). None where
-    there is none."""
+    """The noise map that belongs to the map ``name``, and which it is: all but the sky, else half
+    the difference of two halves of the samples (in the order of ``wanted``); None if there is none.
+    """
     sources = noise_sources(maps, name)
     for of in wanted:
         if of in sources:

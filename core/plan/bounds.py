@@ -402,13 +402,14 @@ class Context:
 
     @property
     def turns(self) -> bool:
-        """A filter removes modes that it finds in the data, which turn where a part of the data is
-        left out; or one without a planning class may."""
+        """True if a filter finds its modes in the data, so that they turn if a part of the data is
+        left out; a filter without a planning class may.
+        """
         return any(t.turns for t in self.traits.values())
 
     @cached_property
     def before_filters(self) -> bool:
-        """A stream is saved, measured or drawn above a filter; it holds what filters remove."""
+        """True if a stream is saved, measured or drawn before a filter acts on it."""
         filtering = {
             label for label, t in self.traits.items() if t.removes_common or t.response is not None
         }

@@ -145,8 +145,8 @@ class OfDetectors:
         """The number that bands have in common whose detectors look along the same lines."""
 
     def join(self, bands: list[weakref.ref[OfDetectors]]) -> None:
-        """Let bands that look alike make units together; ``bands``: a list that all of them are
-        given.
+        """Let bands with the same lines of sight compute their blocks of atmosphere together;
+        ``bands``: a list that all of them are given.
         """
         if self._keeps_all:
             others = [one for held in bands if (one := held()) is not None]

@@ -31,8 +31,8 @@ class GainPlanning(Planning[GainDrift]):
         return 8 * observation.n_detectors * (observation.n_samples // step + 4)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size: all that is in the stream, the mean emission included, changes by the rms of
-        the gains.
+        """Error of leaving the drift out: the rms of the gains times all that is in the stream,
+        the mean emission included.
         """
         return single(
             "gain drift",
@@ -47,7 +47,9 @@ class TimeConstantPlanning(Planning[TimeConstant]):
     of = TimeConstant
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size for a point source: 1 - |H| at the highest frequency of a beam that passes."""
+        """Error of leaving the step out, of a point source: 1 - |H| at the highest frequency of a
+        beam that passes.
+        """
         o, tau = context.first, self.operator.tau
         speed = context.coverage.speed if context.coverage else 0.0
         # a Gaussian of FWHM passes to 1 % of its power below 0.71 v / FWHM
@@ -71,8 +73,9 @@ class CrosstalkPlanning(Planning[Crosstalk]):
         return 24 * len(self._shares(observation).source)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size: the signals of others, all alike. A table may give one detector more than the
-        rest.
+        """Error of leaving the step out: the signals of others, all alike.
+
+        A table may give one detector more than the rest.
         """
         shares, o = self._shares(context.first), context.first
         rows = np.repeat(np.arange(o.n_detectors), np.diff(shares.first))
@@ -95,7 +98,7 @@ class GlitchPlanning(Planning[Glitches]):
     of = Glitches
 
     def traits(self, observation: Observation) -> Traits:
-        """Its rms, Campbell's theorem."""
+        """Rms of the glitches in a stream (Campbell's theorem)."""
         return Traits(rms=self._rms(observation))
 
     def memory(self, observation: Observation) -> int:
@@ -104,7 +107,7 @@ class GlitchPlanning(Planning[Glitches]):
         return int(64 * observation.n_detectors * (self.operator.rate * span + 8))
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size."""
+        """Error of leaving the step out."""
         size = context.bound(self._rms(context.first), self.operator.decay)
         text = "sqrt(rate decay) amplitude (Campbell), at the detector, over zeta e^-tau"
         return single("glitches", size, text, without=size)

@@ -217,7 +217,7 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         return 1 if self.operator.method == "mean" else 0
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size: what it removes."""
+        """Error of leaving the step out: what it removes."""
         step = self.operator
         slow = 1 / context.cut if context.cut > 0 else context.first.duration
         size = context.bound(context.passed, slow, common=True)

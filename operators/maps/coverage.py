@@ -69,7 +69,7 @@ class Directions:
 
     @classmethod
     def of(cls, looking: Looking, good: NDArray[np.bool_]) -> Directions:
-        """``good`` (n_samp,): which samples count."""
+        """Directions of a scan without any block; ``good`` (n_samp,): the samples that count."""
         towards = PixelGrid.pointing(looking.grid, looking.observation)
         motion = np.gradient(towards, axis=1) if towards.shape[1] > 1 else np.zeros_like(towards)
         return cls(looking, towards, motion, good.astype(np.uint8))

@@ -96,8 +96,8 @@ the misfit that ends it.
 
 @dataclass(frozen=True)
 class PowerLawFilter:
-    """Equation (1) for given f_min / f_s, slope and number of poles; make one with
-    `power_law_filter`.
+    """Poles, zeros and gain of a recursive filter whose power response falls as f^-slope, equation
+    (1); `power_law_filter` makes one.
 
     Attributes
     ----------

@@ -37,12 +37,13 @@ class GroundPlanning(Planning[Any]):
     """The profile, and what it is made of."""
 
     def traits(self, observation: Observation) -> Traits:
-        """Its rms."""
+        """Rms of what the step adds to a stream."""
         return Traits(rms=self._rms(observation))
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size. A filter that removes what the detectors have in common removes most
-        of it: that is not counted.
+        """Error of leaving the step out.
+
+        A filter that removes what detectors have in common removes most of it: that is not counted.
         """
         rms = max(self._rms(o) for o in context.observations)
         size = context.bound(rms, context.first.duration, common=True)
@@ -59,15 +60,15 @@ class GroundPlanning(Planning[Any]):
 
 
 class HalfWavePlatePlanning(Planning[Any]):
-    """Angles of one plate; what they do is done where the sky is sampled and mapped."""
+    """Planning of `HalfWavePlate`: memory of its angles, and the error of leaving it out."""
 
     of = "zonda.operators.optics.half_wave_plate:HalfWavePlate"
     per_sample = 8
     """The angles."""
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size: without it polarized detectors see Q and U at other angles, up to 2 (Q^2 +
-        U^2)^(1/2) apart.
+        """Error of leaving the step out: polarized detectors see Q and U at other angles, up to
+        2 (Q^2 + U^2)^(1/2) apart.
         """
         efficiency = context.first.focalplane.polarization_efficiency
         most = 2 * context.peak * float(efficiency.max(initial=0.0))
@@ -90,7 +91,7 @@ class LeakagePlanning(Planning[Any]):
         return 8 * observation.n_samples if observation.hwp_angle is not None else 0
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size."""
+        """Error of leaving the step out."""
         efficiency = context.first.focalplane.polarization_efficiency
         share = self.operator.share * float(efficiency.max(initial=0.0))
         text = "p l x (rms of the stream + mean emission); of the sky, p l"

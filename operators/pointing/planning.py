@@ -150,7 +150,7 @@ class MispointingPlanning(Planning[Mispointing]):
     """The true boresight, and what it is made from."""
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size by the shift of the beam, three standard deviations."""
+        """Error of leaving the step out, by the shift of the beam, three standard deviations."""
         step = self.operator
         rms = math.hypot(step.scan_rms, step.jitter_rms)
         delta = math.hypot(*(step.offset or (0.0, 0.0))) + 3 * rms

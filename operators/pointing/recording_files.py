@@ -76,7 +76,7 @@ CURE = "give HDF5, a FITS table, CSV or an antenna log of ASTE"
 
 @dataclass
 class RecordedTable:
-    """Content of a file.
+    """Columns, start time and flags of one file of recorded pointing.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class RecordedTable:
 
     @classmethod
     def of(cls, columns: Mapping[str, tuple[NDArray[Any], str]], place: str) -> RecordedTable:
-        """Table of arrays with units: its columns are those that have one number per row."""
+        """Build the table from arrays with units: those with one number per row become columns."""
         plain = {
             name: (values, unit)
             for name, (values, unit) in columns.items()

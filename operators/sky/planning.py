@@ -184,7 +184,7 @@ class SourcesPlanning(Planning[Any]):
         return 8 * entries + 200 * observation.n_detectors + 100 * sources
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size: the brightest source."""
+        """Error of leaving the step out: the brightest source."""
         text, what = "the brightest source in its beam", "exact: each through its beam"
         size = brightness(self.traits(context.first))
         return Estimate((exact("point sources", size, text, what), one_beam(context)))
@@ -220,7 +220,7 @@ class CMBPlanning(Planning[Any]):
         return int(12 * self.operator.nside**2 * (110 if polarized else 50))
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size."""
+        """Error of leaving the step out."""
         size, what = brightness(self.traits(context.first)), f"drawn at nside {self.operator.nside}"
         return single("CMB", size, "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB", what)
 
@@ -243,7 +243,7 @@ class PySMPlanning(Planning[Any]):
         return own + self._sampled(observation).memory(observation)
 
     def estimate(self, context: Context) -> Estimate:
-        """Its size."""
+        """Error of leaving the step out."""
         size, what = brightness(self.traits(context.first)), f"at nside {self.operator.nside}"
         return single("sky of PySM", size, "largest brightness in view", what)
 

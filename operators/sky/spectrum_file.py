@@ -48,7 +48,7 @@ CURE = (
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Power spectra that were read.
+    """Power spectra C_l of the CMB (TT, EE, BB, TE) that a file holds.
 
     Attributes
     ----------

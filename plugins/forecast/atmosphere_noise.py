@@ -81,8 +81,9 @@ class Mode:
 
 @dataclass(frozen=True)
 class Left:
-    """Variance [K^2] after each scan, (n_scan,), and the relative standard error of its last value
-    from the scatter of the waves."""
+    """Atmospheric noise that is left in a map: its variance [K^2] after each scan, (n_scan,), and
+    the relative standard error of the last value from the scatter of the waves.
+    """
 
     variance: Floats
     error: float

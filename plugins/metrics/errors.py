@@ -137,7 +137,7 @@ TRACE = "accuracy-structure"
 
 
 class MapRms(OfPlanes):
-    """Equation (1)."""
+    """Rms of the difference from the reference map over the map's noise, equation (1)."""
 
     says: ClassVar[str] = "rms of the difference map / the map's instrument noise"
     instead: ClassVar[str | None] = (
@@ -179,7 +179,7 @@ class MapRms(OfPlanes):
 
 
 class Peak(OfPlanes):
-    """Equation (2)."""
+    """Relative change of the extreme value of the beam-smoothed map, equation (2)."""
 
     says: ClassVar[str] = "relative change of the beam-smoothed map's extreme value"
     instead: ClassVar[str | None] = (
@@ -221,7 +221,7 @@ class Peak(OfPlanes):
 
 
 class Transfer(OfPlanes):
-    """Equation (3)."""
+    """Rms error of the transfer function over angular scales, equation (3)."""
 
     says: ClassVar[str] = (
         "rms error of the transfer function over angular scales (absolute; it is 1 where nothing is"
@@ -298,7 +298,7 @@ class _Binned(Metric):
 
 
 class Psd(_Binned):
-    """Equation (4)."""
+    """Rms relative error of the signal's power spectrum, equation (4)."""
 
     says: ClassVar[str] = (
         "rms over log-frequency bins of the relative error of the signal's power spectrum"

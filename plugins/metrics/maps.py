@@ -303,7 +303,7 @@ class CentralRms(_OfSmoothMap):
         return (self.signal,)
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
-        """Equation (7)."""
+        """Rms of the map about its centre, equation (7), and its error."""
         product = map_of(data, "central_rms", self.signal, self.map)
         return central_rms(self.smoothed(product), self.radius, self.of)
 
@@ -355,7 +355,7 @@ class PeakRatio(_OfSmoothMap):
         return ()
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
-        """Equation (8)."""
+        """Peak of the source left by filters, equation (8), and its error."""
         after = map_of(data, "peak_ratio", names[0], self.map)
         seen = self.smoothed(after)
         if self.against == "unfiltered":

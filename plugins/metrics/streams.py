@@ -146,7 +146,7 @@ class PsdSlope(_OfSpectrum):
         return self
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
-        """Equation (1)."""
+        """Slope of the spectrum between two frequencies, equation (1), and its error."""
         spectrum = self.spectrum_of(data, "psd_slope")
         psd = stream_in(spectrum, self.stream, "psd_slope")
         use = (spectrum.frequency >= self.low) & (spectrum.frequency <= self.high) & (psd > 0)
@@ -182,7 +182,7 @@ class Crossing(_OfSpectrum):
     """In place of `other`: the level 2 NET^2."""
 
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
-        """Equation (2)."""
+        """Frequency at which two spectra cross, equation (2), and its error."""
         spectrum = self.spectrum_of(data, "crossing")
         psd = stream_in(spectrum, self.stream, "crossing")
         if self.net:

@@ -57,7 +57,7 @@ class CrossSections:
 
 
 class AbsorptionTable:
-    """The table of `TABLE`; get it from `absorption_table`.
+    """Absorption of air against frequency, pressure and temperature (`absorption_table` reads it).
 
     Attributes
     ----------

@@ -61,7 +61,7 @@ def scans(number: int) -> str:
 
 @draw.register
 def draw_spectra(spectrum: Spectrum, file: str, where: str) -> list[Sketch]:
-    """A picture for the streams of each unit."""
+    """Draw power spectra, one picture for the streams of each unit."""
     made = []
     for kind in dict.fromkeys(map(unit_of_stream, spectrum.psd)):
         psd = {name: psd for name, psd in spectrum.psd.items() if unit_of_stream(name) == kind}
