@@ -45,6 +45,8 @@ from .pixels import Cells, Looking, fingerprint, tiles
 from .stokes_kernel import MATRIX, add_stokes
 from .sums import DATA, FLAGGED, HITS, NOISE, OUTSIDE, WEIGHT, WEIGHTS, Sums, add_image, add_list
 
+IN_CACHE = 1 << 14
+"""Pixels of an image that are added to the sums of a run at a time."""
 LOCK = threading.Lock()
 """Held while a thread is given sums."""
 
@@ -55,7 +57,7 @@ class Folded(NamedTuple):
     Attributes
     ----------
     pixels, hits
-        (n,): numbers of the pixels, and samples there.
+        (n,): numbers of the pixels (or a slice of these), and samples there.
     weights, right, noise
         (n, 1 or 6); (n, 1 or 3) of each signal; (n, 1 or 6), or None: as the weights.
     dropped
@@ -64,7 +66,7 @@ class Folded(NamedTuple):
         Term of the weights and the noise, and terms of the data of each signal.
     """
 
-    pixels: NDArray[np.int64]
+    pixels: NDArray[np.int64] | slice
     hits: Sums
     weights: Sums
     right: list[Sums]
@@ -145,42 +147,60 @@ class Binning:
 
     def folded(self) -> Iterator[Folded]:
         """Sums of each thread, which are zero afterwards."""
-        polarized, grid, n = self.angles is not None, self.looking.grid, self.signals
+        polarized, n = self.angles is not None, self.signals
         top = float(max(self.weight.max(initial=0.0), self.noise.max(initial=0.0))) * WEIGHT
+        alike = [np.rint(x[:1] * WEIGHT).astype(np.int64) for x in (self.weight, self.noise)]
         for sums, dropped, largest in self.parts.values():
-            pixels = np.flatnonzero(sums[:, stokes_kernel.HIT if polarized else HITS])
-            found = sums.take(pixels, axis=0)
-            sums[pixels] = 0
+            for pixels, found, outside in self._in_pixels(sums):
+                dropped[OUTSIDE] += outside
+                if polarized:
+                    first = stokes_kernel.DATA
+                    right = [found[:, first + 3 * k : first + 3 * k + 3] for k in range(n)]
+                    noise = found[:, -6:] if self.own else None
+                    high = float(largest[0]), [float(largest[1])] * n
+                    hits = found[:, stokes_kernel.HIT]
+                    yield Folded(pixels, hits, found[:, MATRIX], right, noise, dropped, high)
+                else:
+                    hits = found[:, HITS]
+                    weights, noise = (
+                        found[:, [column]] if self.own else hits[:, None] * each
+                        for column, each in zip((WEIGHTS, NOISE), alike, strict=True)
+                    )
+                    others = range(found.shape[1] - n + 1, found.shape[1])
+                    right = [found[:, [k]] for k in (DATA, *others)]
+                    every = max(top, *largest[WEIGHTS : NOISE + 1])
+                    ends = [float(largest[k]) for k in (DATA, *range(NOISE + 1, NOISE + n))]
+                    yield Folded(pixels, hits, weights, right, noise, dropped, (every, ends))
+                dropped = np.zeros_like(dropped)
             self.spare.append(sums)
-            if polarized:
-                first = stokes_kernel.DATA
-                right = [found[:, first + 3 * k : first + 3 * k + 3] for k in range(n)]
-                noise = found[:, -6:] if self.own else None
-                high = float(largest[0]), [float(largest[1])] * n
-                hits = found[:, stokes_kernel.HIT]
-                yield Folded(pixels, hits, found[:, MATRIX], right, noise, dropped, high)
-                continue
-            inside = pixels > 0
-            if isinstance(grid, TangentGrid):
-                ny, nx = grid.shape
-                y, x = np.divmod(pixels, nx + 2)
-                inside = (y > 0) & (y <= ny) & (x > 0) & (x <= nx)
-                pixels = (y - 1) * nx + x
-            dropped[OUTSIDE] += int(found[~inside, HITS].sum())
-            pixels, found = pixels[inside] - 1, found[inside]
-            hits = found[:, HITS]
-            if self.own:
-                weights, noise = found[:, [WEIGHTS]], found[:, [NOISE]]
-            else:
-                weights, noise = (
-                    hits[:, None] * np.rint(x[:1] * WEIGHT).astype(np.int64)
-                    for x in (self.weight, self.noise)
-                )
-            right = [found[:, [k]] for k in (DATA, *range(found.shape[1] - n + 1, found.shape[1]))]
-            every = max(top, *largest[WEIGHTS : NOISE + 1])
-            high = float(every), [float(largest[k]) for k in (DATA, *range(NOISE + 1, NOISE + n))]
-            yield Folded(pixels, hits, weights, right, noise, dropped, high)
         self.parts.clear()
+
+    def _in_pixels(self, sums: Sums) -> Iterator[tuple[NDArray[np.int64] | slice, Sums, int]]:
+        """Pixels with samples, their sums (n, columns), which are zero in ``sums`` afterwards, and
+        samples outside of the map. Of a TAN image: all pixels, some rows at a time.
+        """
+        grid = self.looking.grid
+        if self.angles is None and isinstance(grid, TangentGrid):
+            ny, nx = grid.shape
+            image = sums.reshape(ny + 2, nx + 2, -1)
+            step = max(1, IN_CACHE // nx)
+            for first in range(0, ny, step):
+                last = min(first + step, ny)
+                rows = image[first + (first > 0) : last + 1 + (last == ny)]  # with the border
+                hits = int(rows[:, :, HITS].sum())
+                if hits or not first:
+                    found = image[first + 1 : last + 1, 1:-1].copy().reshape(-1, image.shape[2])
+                    rows[...] = 0
+                    outside = hits - int(found[:, HITS].sum())
+                    yield slice(first * nx, last * nx), found, outside
+            return
+        pixels = np.flatnonzero(sums[:, HITS if self.angles is None else stokes_kernel.HIT])
+        found = sums.take(pixels, axis=0)
+        sums[pixels] = 0
+        border = int(self.angles is None and pixels.size > 0 and pixels[0] == 0)
+        outside = int(found[:border, HITS].sum())
+        pixels = pixels if self.angles is not None else pixels - 1
+        yield pixels[border:], found[border:], outside
 
 
 def binnings(
