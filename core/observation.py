@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -219,6 +219,28 @@ class Observation:
     def sampling(self) -> tuple[int, float]:
         """Samples and sample rate [Hz] with which a run takes the scan."""
         return self.seen_of or (self.n_samples, self.sample_rate)
+
+    @property
+    def name_of_all_bands(self) -> str:
+        """The name of the scan without that of its band."""
+        return self.name.removesuffix(f"-{self.instrument.band.name}")
+
+    @classmethod
+    def of_bands(cls, scans: Sequence[Observation]) -> Observation:
+        """A scan with the detectors of all bands. A sample that one band flags is flagged: the
+        bands have no common mode there.
+        """
+        first = scans[0]
+        return replace(
+            first,
+            name=f"{first.name_of_all_bands}, all bands",
+            focalplane=Focalplane.of_bands({str(k): s.focalplane for k, s in enumerate(scans)}),
+            flags=np.bitwise_or.reduce([scan.flags for scan in scans]),
+            detector_flags=np.concatenate([scan.detector_flags for scan in scans]),
+            smooth={},
+            detdata={},
+            log=Log(),
+        )
 
     def of_each_band(self) -> list[Observation]:
         """The scan as a camera with each of the instrument's bands alone sees it: its detectors,

@@ -32,7 +32,6 @@ import numpy as np
 
 from ..discovery import RAISED
 from ..errors import PipelineError
-from ..focalplane import Focalplane
 from ..log import Log
 from ..machine import resident_memory
 from ..mapmaker import filters, joins
@@ -262,7 +261,7 @@ class Execution:
         labels = ", ".join(o.label for o in working)
         together = self.schedule.at_once > 1
         for views in [self.views] if together else [[view] for view in self.views]:
-            scan = name_of_all(self._first) if together else views[0].observation.name
+            scan = self._first.name_of_all_bands if together else views[0].observation.name
             sweep = partial(self._on_block, views, work, bool(segment.split()[1]))
             self._sweep(sweep, self.schedule.blocks(segment, views[0]), f"{scan}: {labels}")
         segment.has_been_swept(self.views)
@@ -382,7 +381,7 @@ class Execution:
             means = {MAIN: means[held]} if held in means else {}
         if len(views) > 1:
             every = [source.means[view.number].get(held) for view in views]
-            observation = all_detectors([view.observation for view in views])
+            observation = Observation.of_bands([view.observation for view in views])
             means = {}
             if any(mean is not None for mean in every):
                 joined: Any = MeansOfBands(list(zip(every, _rows_of(views), strict=True)))
@@ -439,7 +438,7 @@ class Execution:
             for view, rows in zip(views, _rows_of(views), strict=True)
             for block in self.schedule.blocks(segment, view)
         ]
-        scan = name_of_all(self._first) if len(views) > 1 else views[0].observation.name
+        scan = self._first.name_of_all_bands if len(views) > 1 else views[0].observation.name
         for done, result in enumerate(in_order(one, todo, self.settings.threads), 1):
             self.settings.progress(done, len(todo), f"{scan}: {what}")
             yield result
@@ -468,25 +467,3 @@ def _rows_of(views: Sequence[View]) -> list[slice]:
     """Rows of bands in a stream of these bands alone."""
     start = views[0].rows.start
     return [slice(view.rows.start - start, view.rows.stop - start) for view in views]
-
-
-def name_of_all(scan: Observation) -> str:
-    """The name of a scan without that of its band."""
-    return scan.name.removesuffix(f"-{scan.instrument.band.name}")
-
-
-def all_detectors(scans: Sequence[Observation]) -> Observation:
-    """A scan with the detectors of all bands. A sample that one band flags is flagged: the bands
-    have no common mode there.
-    """
-    first = scans[0]
-    return replace(
-        first,
-        name=f"{name_of_all(first)}, all bands",
-        focalplane=Focalplane.of_bands({str(k): scan.focalplane for k, scan in enumerate(scans)}),
-        flags=np.bitwise_or.reduce([scan.flags for scan in scans]),
-        detector_flags=np.concatenate([scan.detector_flags for scan in scans]),
-        smooth={},
-        detdata={},
-        log=Log(),
-    )
