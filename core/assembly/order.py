@@ -52,7 +52,9 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                 )
             else:
                 found, above = makers(what), {type(o).__name__ for o in operators[:index]}
-                cure = f"{' or '.join(found)} would" if found else nearest(what, sorted(have)) or ""
+                cure = nearest(what, sorted(have)) or ""
+                if found:
+                    cure = f"{' or '.join(found)} provides it"
                 if on_request := sorted(above & {*found}):
                     cure = f"{on_request[0]} makes it if its parameters ask for it"
                 elif not found and not cure and have:
@@ -94,7 +96,7 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
         if not changes_components(operator):
             have |= operator.provides
     if operators and not any("boresight" in o.provides | o.requires for o in operators):
-        cure = f"{' or '.join(makers('boresight'))} would"
+        cure = f"steps that do: {', '.join(makers('boresight'))}"
         problems.append(
             OrderProblem(0, "no step points the telescope", "begin with a pointing step", cure)
         )

@@ -38,7 +38,7 @@ ROWS = 256
 
 class MapGrid:
     """Positions and sizes of a map's pixels on the sky: an image (`image_grid`) or a list of
-    HEALPix pixels (`healpix_grid`).
+    HEALPix pixels (`HealpixPixels`).
 
     Attributes
     ----------
