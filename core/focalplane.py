@@ -182,7 +182,7 @@ class Focalplane:
         return Focalplane(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
     def rows(self, index: NDArray[np.intp]) -> Focalplane:
-        """Some of the detectors, in this order: copies."""
+        """A focal plane of some of the detectors, copied in this order."""
         found = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "names"}
         return Focalplane([self.names[row] for row in index], **found)
 

@@ -70,7 +70,7 @@ class Setup:
             )
 
     def variant(self, setting: Setting) -> Variant:
-        """The pipeline with a setting."""
+        """The pipeline with a setting applied."""
         given = (*self.settings, *overrides(self.shorter), *overrides(setting))
         return Variant(self.pipeline, given)
 
@@ -185,7 +185,7 @@ class Bench:
         return values + timed + due - in_timed
 
     def may(self, runs: float) -> bool:
-        """True if so many runs more are within the budget, each as dear as the dearest so far."""
+        """True if so many more runs fit in the budget, each at the cost of the costliest so far."""
         unit = self._references[0].cpu if self._references else 0.0
         used = (self.cpu + runs * self._dearest) / unit if unit > 0 else 0.0
         return max(self.runs + runs, used) <= self.setup.budget
@@ -246,7 +246,7 @@ class Bench:
         return max(repeats, REFERENCE_RUNS) if setting == self.yardstick else repeats
 
     def _reference(self) -> TimedRun:
-        """The reference's last run, made again where that is too long ago."""
+        """The last run of the reference, which is made again if it is too old."""
         if not self._references:
             self.measure(self.yardstick)
         if self._since >= BETWEEN:

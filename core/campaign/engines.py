@@ -67,11 +67,11 @@ class Pool:
     asked: int | None = None
 
     def start(self, workers: int | None = None) -> bool:
-        """Start other workers in place of these; False where that is not ours to do."""
+        """Start other workers in place of these; False if zonda did not start them."""
         return False
 
     def stop(self) -> bool:
-        """End the workers at once; False where that is not ours to do."""
+        """End the workers at once; False if zonda did not start them."""
         return False
 
 
@@ -113,7 +113,7 @@ class ProcessPool(Pool):
 
 
 class _Workers(ProcessPoolExecutor):
-    """Processes that never see Ctrl-C, not while they import either."""
+    """Processes that ignore Ctrl-C from their start, imports included."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """See `Executor.submit`."""

@@ -198,7 +198,7 @@ class Record:
         self._write()
 
     def put_off(self, tasks: Iterable[Task] = ()) -> None:
-        """Tasks at work wait again, and these with all their attempts before them."""
+        """Mark tasks at work as waiting; these get all their attempts again."""
         for task in tasks:
             discard(_failed_path(task, self.folder))
         self._at_work.clear()
@@ -288,7 +288,7 @@ def _row(task: Task, folder: Path, at_work: bool) -> TaskRow:
 
 
 def _failure(task: Task, folder: Path) -> TaskRow:
-    """The row that the last attempt that failed left; that of a task that waits where none did."""
+    """Row of the last failed attempt of a task; that of a waiting task if none failed."""
     try:
         found: Mapping[str, Any] = json.loads(
             _failed_path(task, folder).read_text(encoding="utf-8")

@@ -116,7 +116,7 @@ class Values:
 
     @property
     def mean(self) -> float:
-        """Mean; NaN for none."""
+        """Mean over the realizations; NaN if there are none."""
         return math.fsum(self.values) / len(self.values) if self.values else math.nan
 
     @property

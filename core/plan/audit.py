@@ -111,7 +111,7 @@ class Checked:
 
     @property
     def idle(self) -> bool:
-        """True if nothing is said of the bound."""
+        """True if the audit says nothing about the bound."""
         return not self.exercised
 
     @property

@@ -81,7 +81,7 @@ class InputMap:
 
     @property
     def beam_solid_angle(self) -> float | None:
-        """sr."""
+        """Solid angle, sr."""
         if self.beam is None:
             return None
         return float(np.pi / (4 * np.log(2)) * self.beam[0] * self.beam[1])
@@ -197,7 +197,7 @@ class ImageMap(InputMap):
 
     @cached_property
     def grid(self) -> ImagePixels:
-        """Its pixels in the frame of `wcs`."""
+        """Pixels of the image in the frame of `wcs`."""
         return wcs_grid(self.wcs, self.shape)
 
     @cached_property

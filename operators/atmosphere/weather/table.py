@@ -124,7 +124,7 @@ class Table(WeatherSource):
 
     @staticmethod
     def _check(table: table_files.Table, column: Column, kind: str, humidity: Floats) -> None:
-        """Note what no air is."""
+        """Note levels that no air has."""
         height, faults = column.height, list(impossible(column))
         if kind == "relative humidity":
             faults.append((humidity > 1.2, f"the {kind} is above 120 %"))
