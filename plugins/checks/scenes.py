@@ -173,7 +173,7 @@ def sky_file(values: AnyFloats, pixel: float = 1.0) -> Iterator[Path]:
 
 
 def largest(*figures: float) -> float:
-    """The largest; NaN where one is (`max` would pass over it)."""
+    """Largest value, NaN if any value is NaN (`max` would ignore it)."""
     return float(np.max(figures))
 
 

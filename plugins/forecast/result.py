@@ -213,14 +213,14 @@ class Sensitivity:
 def audited(
     each: Sequence[Sensitivity], seeds: int, threads: int | None = None
 ) -> list[Sensitivity]:
-    """The forecasts of all bands with what simulations find."""
+    """Forecasts of all bands, each with the depth that simulations find."""
     forecasts = {one.band: Forecasted(one.planes, one.radius, one.survey.fwhm) for one in each}
     audits = audit(each[0].file, forecasts, seeds, threads)
     return [replace(one, audit=audits[one.band]) for one in each]
 
 
 def text(found: Sensitivity) -> str:
-    """The table and what it stands for."""
+    """Text of a forecast: header, table of depths, errors."""
     parts = [_header(found)]
     for plane, depth in found.planes.items():
         parts.append(([plane] if found.polarization else []) + _table(found, depth))

@@ -112,7 +112,7 @@ def test_the_traps_work(hostile: Path) -> None:
 
 
 def test_a_run_with_its_pictures(hostile: Path) -> None:
-    """A first run: beside it one process compiles and one draws."""
+    """A first run, compilation and pictures included."""
     unsprung(
         hostile,
         zonda(hostile, "run", "mustang2_cluster", *SHORT, "--output", hostile.parent / "out"),
