@@ -78,7 +78,7 @@ class Partial:
             )
         # figures of scans of one number share a row, whatever the entry: there may be a million
         # entries
-        log = _tally(
+        log = _log_of(
             {
                 **_rows(data.log),
                 "figures": [(a, b.removeprefix(prefix), c) for a, b, c in data.log.figures()],
@@ -125,7 +125,7 @@ class Partial:
                     cure="import the class in the module of the step that makes it",
                 )
             products[label] = kind.of(product["arrays"])
-        return cls(products, _tally(tree["tally"]), tree["scans"])
+        return cls(products, _log_of(tree["tally"]), tree["scans"])
 
     def observations(self, scene: Scene) -> list[Observation]:
         """Thinned scans, each of its bands in turn; the focal plane is as the steps left it in the
@@ -206,7 +206,7 @@ def _rows(log: Log) -> dict[str, list[Any]]:
     return {"counts": log.counts(), "totals": log.totals(), "figures": log.figures()}
 
 
-def _tally(rows: Mapping[str, Any]) -> Log:
+def _log_of(rows: Mapping[str, Any]) -> Log:
     log = Log()
     totals = {(who, what): total for who, what, total in rows["totals"]}
     for who, what, count in rows["counts"]:

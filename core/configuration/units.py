@@ -130,11 +130,7 @@ class Unit:
         if isinstance(value, str):
             number, unit, caret = self._split(value)
             result = number * self._factor(value, unit, caret) if unit else number
-        elif (
-            isinstance(value, bool)
-            or value is None
-            or not (isinstance(value, Real) or hasattr(value, "to_value"))
-        ):
+        elif isinstance(value, bool) or not (isinstance(value, Real) or hasattr(value, "to_value")):
             raise mistake(f"expected {self.kind.noun} such as '{self.example}', got {value!r:.60}")
         elif isinstance(value, Real):
             if self.unit:

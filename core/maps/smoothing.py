@@ -63,13 +63,13 @@ STEPS = 8192
 """Of the table of the Gaussian: linear interpolation is right to (12.5 power / STEPS)^2 / 8, some
 1e-6.
 """
-DEEPEST = 12.5
-"""r^2 / 2 sigma^2 at which kernels end: 5 sigma."""
+DEEPEST = CUT**2 / 2
+"""r^2 / 2 sigma^2 at which kernels end."""
 
 
 def smoother(grid: MapGrid, fwhm: float) -> Smoother:
     """The convolution with a Gaussian of ``fwhm`` [rad], equation (2), by the fastest kernel that
-    is right for the grid. Raises InputError where it would take hours.
+    is right for the grid. Raises InputError beyond `MOST_DIRECT` pairs.
     """
     sigma = fwhm / FWHM_PER_SIGMA
     if isinstance(grid, HealpixPixels):
@@ -90,8 +90,8 @@ def smoother(grid: MapGrid, fwhm: float) -> Smoother:
 
 
 def weighted_mean(convolve: Smoother, values: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Equation (3): the mean of ``values`` under a Gaussian, NaN where these are, which count in no
-    other pixel; and the convolved weights.
+    """Equation (3): the weighted mean of ``values`` under a Gaussian, and the convolved weights.
+    Pixels that are NaN stay so, and count in no other pixel.
 
         m'_p = sum_q K_pq w_q m_q / sum_q K_pq w_q,
         n'_p = [sum_q (K_pq w_q n_q)^2]^(1/2) / sum_q K_pq w_q          (3)
@@ -108,8 +108,8 @@ def weighted_mean(convolve: Smoother, values: Floats, weights: Floats) -> tuple[
 def error_of_mean(
     convolve: Smoother, noise: Floats, weights: Floats, known: NDArray[np.bool_], total: Floats
 ) -> Floats:
-    """Equation (3): standard error of the mean of pixels with independent ``noise``, ``weights``
-    whose convolution is ``total``; NaN where the mean is not ``known``, or the noise.
+    """Equation (3): standard error of `weighted_mean` for independent ``noise`` in the pixels; NaN
+    where the mean is not ``known``, or the noise. ``total``: the convolved ``weights``.
     """
     quiet = known & np.isfinite(noise)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -121,7 +121,7 @@ def error_of_mean(
 def smoothed(
     grid: MapGrid, values: Floats, fwhm: float, noise: Floats | None = None
 ) -> tuple[Floats, Floats | None]:
-    """(values, noise) of `weighted_mean`. The weights are the solid angles, so that values are
+    """(values, noise) of `weighted_mean` and `error_of_mean`. Weights are solid angles: values are
     points of a brightness.
     """
     convolve = smoother(grid, fwhm)
@@ -257,7 +257,7 @@ def _directly(
     grid: ImagePixels, sigma: float, where: NDArray[np.bool_] = np.ones((1, 1), np.bool_)
 ) -> Smoother:
     """Equation (2) as it stands, of the pixels ``where`` (others are 0): each with its own kernel.
-    InputError where that would take hours.
+    InputError beyond `MOST_DIRECT` pairs.
     """
     ny, nx = grid.shape
     whole = 0 < grid.around <= nx

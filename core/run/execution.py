@@ -305,7 +305,9 @@ class Execution:
         def one(detectors: slice, samples: slice) -> None:
             try:
                 work(detectors, samples)
-            except BaseException as error:  # also one that a generator would turn (StopIteration)
+            except (
+                BaseException
+            ) as error:  # also StopIteration, which a generator turns into RuntimeError
                 failed.append(error)
                 stop()
 
@@ -453,7 +455,7 @@ class Execution:
         return time.process_time() - self.timer.of_stage("exec") - self._ahead.seconds()
 
     def _note(self, views: Sequence[View], label: str, whole: Observation) -> None:
-        """Note in each band's observation what was flagged and counted in that of all."""
+        """Note flags of the scan of all bands in each band, and its log in the first."""
         views[0].observation.log.update(whole.log)
         for view, rows in zip(views, _rows_of(views), strict=True):
             own = view.observation

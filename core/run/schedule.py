@@ -124,8 +124,8 @@ class Schedule:
             )
             made = source.names.union(*(self.chain.expanded(o.provides) for o in segment.operators))
             segment.wanted = made & self.chain.expanded(wanted) & self.streams - apart
-            known = segment.halo or source.segment
-            new = segment.wanted if known else segment.wanted - source.names
+            copied = segment.halo or source.segment  # nothing is changed in place
+            new = segment.wanted if copied else segment.wanted - source.names
             size = len(new) * self.stream_size
             if later and new and not self._keeps(segment, size, held, later):
                 segment.how, segment.why = self._where(segment, sorted(new), size, held, later)

@@ -108,9 +108,7 @@ class Store:
         size = shape[0] * shape[1] * kind.itemsize
         if in_memory and self.fits(size):
             alike = [a for a in self._spare if a.shape == shape and a.dtype == kind]
-            self._spare[:] = alike[1:]
-            if not alike:
-                self._spare.clear()
+            self._spare[:] = alike[1:]  # arrays of another shape are given back
             array = alike[0] if alike else empty(shape, kind)
         else:
             array = self._file(name, shape, kind)

@@ -25,11 +25,11 @@ def opened(path: str | os.PathLike[str], place: str, kind: str, cure: str) -> It
     External links, data kept in other files and virtual data sets are refused: a file must not make
     zonda open others.
     """
-    with reading(place, kind, cure), checked(path, place, cure) as file:
+    with reading(place, kind, cure), checked(path, place) as file:
         yield file
 
 
-def checked(path: str | os.PathLike[str], place: str, cure: str) -> Any:
+def checked(path: str | os.PathLike[str], place: str) -> Any:
     """An `h5py.File` that the caller closes; it refuses what `opened` refuses.
 
     Other errors are those of h5py.

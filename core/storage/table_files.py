@@ -24,6 +24,7 @@ from .files import atomic_path, reading
 
 LARGEST = 1 << 28
 """Bytes of the text of a table that is read."""
+AS_TEXT = "give ECSV, or text whose heading names the columns, with their units in brackets"
 MOST_COLUMNS = 999
 """Columns of a table, as of one in FITS."""
 MOST_TOLD = 12
@@ -218,20 +219,21 @@ def read_table(path: Path, place: str = "", text: str | None = None) -> Table:
             named = [(name, described[name]) for name in rows[0]]
             meta = head["meta"] if isinstance(head.get("meta"), Mapping) else {}
     else:
-        first = body[0][1] if body else ""
-        mark = max(",;\t|", key=first.count)
-        mark = mark if mark in first else " "
-        numbers, rows = _cells(body, mark)
-        if rows and any(math.isfinite(_number(cell)) for cell in rows[0]):
-            above = [(k, line.lstrip("# ")) for k, line in written if k < body[0][0]]
-            fitting = [
-                both
-                for both in zip(*_cells(above, mark), strict=True)
-                if len(both[1]) == len(rows[0])
-            ]
-            fitting.sort(key=lambda both: any("[" in cell for cell in both[1]))
-            for number, heading in fitting[-1:]:
-                numbers, rows = [number, *numbers], [heading, *rows]
+        with reading(place, "a table", AS_TEXT):  # a quote that is not closed
+            first = body[0][1] if body else ""
+            mark = max(",;\t|", key=first.count)
+            mark = mark if mark in first else " "
+            numbers, rows = _cells(body, mark)
+            if rows and any(math.isfinite(_number(cell)) for cell in rows[0]):
+                above = [(k, line.lstrip("# ")) for k, line in written if k < body[0][0]]
+                fitting = [
+                    both
+                    for both in zip(*_cells(above, mark), strict=True)
+                    if len(both[1]) == len(rows[0])
+                ]
+                fitting.sort(key=lambda both: any("[" in cell for cell in both[1]))
+                for number, heading in fitting[-1:]:
+                    numbers, rows = [number, *numbers], [heading, *rows]
         found = [(word, BRACKETED.fullmatch(word)) for word in (rows[0] if rows else [])]
         named = [(m[1], m[2] or m[3] or "") if m else (word, "") for word, m in found]
     names = [name for name, _ in named]
@@ -257,8 +259,7 @@ def read_text(path: Path, place: str) -> str:
     """The text of a table, unpacked. Raises InputError for one that is larger than `LARGEST`, or
     no text.
     """
-    cure = "give ECSV, or text whose heading names the columns, with their units in brackets"
-    with reading(place, "a table", cure):
+    with reading(place, "a table", AS_TEXT):
         return packed.text(path, place, LARGEST)
 
 

@@ -327,7 +327,7 @@ class Reader:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.place = f"time-ordered data {path}"
         with reading(self.place, KIND, CURE):
-            self._file = checked(path, self.place, CURE)
+            self._file = checked(path, self.place)
         try:
             with reading(self.place, KIND, CURE):
                 _check_parts(self._file, self.place)

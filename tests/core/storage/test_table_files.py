@@ -133,3 +133,11 @@ def test_more_columns_than_are_read(tmp_path):
     path.write_text(",".join(f"c{k}" for k in range(60_000)) + "\n" + ",".join("1" * 60_000))
     with pytest.raises(InputError, match="has 60000 columns, more than the 999"):
         read_table(path)
+
+
+def test_a_quote_that_is_not_closed(tmp_path):
+    """The csv module reads on to the end of the file, up to 131072 characters."""
+    path = tmp_path / "t.csv"
+    path.write_text("a,b\n" + '"x,1\n' + "1,2\n" * 60000)
+    with pytest.raises(InputError, match=r"t\.csv"):
+        read_table(path)
