@@ -110,12 +110,12 @@ class Basis:
         self,
         rows: Rows,
         coefficients: Floats,
-        bins: Bins | None = None,
+        bins: Bins = NO_BINS,
         means: Floats | None = None,
     ) -> None:
         """Subtract B^T ``coefficients`` (n_det, K), and ``means`` (n_det, number) of bins."""
         means = np.empty((0, 0)) if means is None else means
-        arrays = self.functions, self.stops, self.firsts, *(bins or NO_BINS)
+        arrays = self.functions, self.stops, self.firsts, *bins
         _subtract(*rows, *arrays, coefficients, means)
 
 
@@ -142,9 +142,8 @@ def splines(n: int, spacing: float) -> Basis:
     """Cubic B-splines with knots every ``spacing`` samples, a whole number of intervals centred on
     a scan of ``n`` samples.
     """
-    inner = max(
-        1, math.ceil((n - 1) / spacing)
-    )  # knots inside the scan, half of an interval or less from either end
+    # knots inside the scan, half of an interval or less from either end
+    inner = max(1, math.ceil((n - 1) / spacing))
     position = (np.arange(n) - (n - 1) / 2) / spacing + (inner - 1) / 2 + 1
     first = np.clip(np.floor(position).astype(np.int64), 0, inner)
     return Basis.of(spline_basis(position - first), first, inner + 4)
@@ -204,8 +203,9 @@ class Fit:
         """
         left, basis = use & ~masked, self.basis
         whole = inverse if len(inverse) == basis.size else basis.inverse(use)
-        found, inside = basis.inverse(left), basis.normal(use & masked)
-        lost = np.trace(whole @ basis.normal(use)) - np.trace(found @ basis.normal(left))
+        outside, inside = basis.normal(left), basis.normal(use & masked)
+        found = _inverse(outside)
+        lost = np.trace(whole @ basis.normal(use)) - np.trace(found @ outside)
         if lost > 0.5 or np.trace(found @ inside) > np.count_nonzero(use & masked):
             return use, inverse
         return left, found

@@ -131,6 +131,7 @@ class MapSums(Product):
                 if self.polarized and binning.own:
                     self._with_noise()
                 own, names = names[: binning.signals], names[binning.signals :]
+                threads, most = len(binning.parts), 0
                 for found in binning.folded():
                     if not n:
                         self.table[k, found.pixels, 0] += found.hits
@@ -141,9 +142,11 @@ class MapSums(Product):
                     if own[0] in self.noise:
                         noise = found.weights if found.noise is None else found.noise
                         self.noise[own[0]][k][found.pixels] += noise
-                    deepest = 0 if n else self._deepest[k] + int(found.hits.max(initial=0))
+                    most = max(most, int(found.hits.max(initial=0)))
                     high, every = found.largest
-                    self._note(k, deepest, high, dict(zip(own, every, strict=True)))
+                    self._note(k, 0, high, dict(zip(own, every, strict=True)))
+                if not n:  # each thread may have its most in the same pixel
+                    self._note(k, self._deepest[k] + threads * most, 0.0, {})
         # what belongs to the other half counted as flagged
         dropped[FLAGGED] -= (len(halves) - 1) * observation.n_detectors * observation.n_samples
         self.scans.append(observation.name)

@@ -203,8 +203,9 @@ def _mixed(frequency: Floats, step: float) -> tuple[Floats, Floats]:
     share (m,) of each.
     """
     x = np.linspace(-1.9, 1.9, 39)
-    window = np.sinc(x) / np.where(np.abs(np.abs(x) - 1) < 1e-9, np.inf, 1 - x**2)
-    window[np.abs(np.abs(x) - 1) < 1e-9] = 0.5
+    pole = np.abs(np.abs(x) - 1) < 1e-9
+    window = np.sinc(x) / np.where(pole, np.inf, 1 - x**2)
+    window[pole] = 0.5
     share = window**2 / np.sum(window**2)
     return np.maximum(np.abs(frequency[:, None] + step * x), 0.5 * step), share
 

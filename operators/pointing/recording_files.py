@@ -108,7 +108,7 @@ class RecordedTable:
             for name, (values, unit) in columns.items()
             if values.ndim == 1 and values.dtype.kind in "fiub"
         }
-        lines = [0] * (1 + max([len(values) for values, _ in plain.values()] or [0]))
+        lines = [0] * (1 + max((len(values) for values, _ in plain.values()), default=0))
         found = cls(Table(place, plain, lines))
         if "boresight_azel" in columns:
             _check_rotation(columns["boresight_azel"][0], place)
@@ -175,7 +175,9 @@ def _dated(found: RecordedTable) -> RecordedTable:
 
 
 def _antenna_log(path: Path, place: str) -> RecordedTable:
-    """A log of ASTE; it also writes `prog` for `prg`, and one name too few."""
+    """A log of ASTE. Two column names of its files are mended: one says `prog` for `prg`, that of
+    el-prog(center) is missing.
+    """
     text = read_text(path, place).replace("(center) type", "(center) el-prog(center) type", 1)
     table = read_table(path, place, text)
     states = table.texts("type")

@@ -40,7 +40,7 @@ from .input_map import InputMap
 from .region import Progress, blocks, no_progress, places_on
 
 LEAST, MOST = 0.2, 0.5
-"""Of f."""
+"""Limits of f, the share of the beam's variance that the narrower Gaussians have."""
 PIXELS = 0.65
 """Standard deviation of the narrower Gaussians, in pixels of the map, from which these do not show.
 """

@@ -10,7 +10,7 @@ from zonda.core.numerics.chunks import chunks
 from zonda.core.types import Floats
 
 NEIGHBOURS = 24
-"""HEALPix pixels in each local fit: two rings and a few more."""
+"""Points in each local fit: of HEALPix pixels, two rings and a few more."""
 AT_ONCE = 16384
 """Positions that are fitted together."""
 

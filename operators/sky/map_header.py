@@ -32,7 +32,7 @@ OBLONG = 20.0
 COARSE = 100.0
 """Beams in a pixel beyond which an image's scale is doubted."""
 TOLD = 5e-3
-"""Share by which a second beam lowers the peaks of point sources from which it is told."""
+"""Loss of point sources' peaks by a second beam, as a share, from which a run warns."""
 DOUBT = "doubtful"
 """Key of the note about what is possible and not likely."""
 BEAM = "set the header keys BMAJ and BMIN (FWHM in degrees), or the operator's parameter input_beam"
