@@ -17,8 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar, overload
 
-from .component_files import described, is_file, names_in
-from .discovery import API_VERSION, RAISED, Found, discover
+from .discovery import API_VERSION, RAISED, Found, described, discover, is_file, names_in
 from .errors import ZondaError
 
 T = TypeVar("T")

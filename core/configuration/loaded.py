@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from zonda import __version__
 
 from ..assembly.checks import looks, run_checks, warn_of_nothing_saved
-from ..component_files import is_file
+from ..discovery import is_file
 from ..errors import ZondaError
 from ..operator import Operator
 from ..pipeline import Pipeline

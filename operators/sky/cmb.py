@@ -7,25 +7,226 @@ for every l and m, g complex normal deviates of unit variance (real for m = 0); 
 them (Gorski et al. 2005). A deviate belongs to its l and m, so that another `nside` shows the same
 sky with more or less detail. K_CMB become K_RJ over the band as in any map of `SkyMap`, which does
 everything else.
+
+Files of power spectra say in comments above the numbers which columns they have, in which unit,
+with which factor. CAMB writes l, TT, EE, BB, TE as l (l + 1) C_l / (2 pi) in uK^2; CLASS l, TT, EE,
+TE, BB without dimension (of Delta T / T), or with ``format = camb`` as CAMB; Planck's likelihood l,
+TT, TE, EE, BB, PP.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, PrivateAttr
 
 from zonda.core.configuration.files import InputPath
 from zonda.core.data import Data
+from zonda.core.errors import InputError
+from zonda.core.numerics.radiation import T_CMB
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.observation import Observation
+from zonda.core.storage.files import check_memory, reading
 from zonda.core.types import Floats
 
-from .full_sky import FullSky, Nside
-from .scan_sampler import ScanSampler
-from .skymap import SkyMap
-from .spectrum_file import Scaling, Spectrum, Unit, read
+from .skymap import FullSky, Nside, ScanSampler, SkyMap
+
+Unit = Literal["uK^2", "K^2", "dimensionless"]
+Scaling = Literal["l(l+1)/2pi", "none"]
+
+HIGHEST = 30_000
+"""Multipole above which a spectrum is not read."""
+READ = ("TT", "EE", "BB", "TE")
+BY_NUMBER: dict[int, tuple[str, ...]] = {1: ("TT",), 4: READ}
+"""Columns behind l where no heading names them."""
+FACTORS: dict[Unit, float] = {"uK^2": 1e-12, "K^2": 1.0, "dimensionless": T_CMB**2}
+"""K^2 per unit."""
+PLAUSIBLE = 1.0, 3000.0
+"""uK: limits of the rms of a CMB sky, which is 110 uK for all multipoles and 30 uK for the first
+few.
+"""
+FALLS = 0.1
+"""Of l (l + 1) C_l about l = 200 over that about l = 15: it is 5 in the CMB; below, the column is
+C_l itself, with 0.03.
+"""
+CURE = (
+    "give columns of text: l, TT or l, TT, EE, BB, TE, as l (l + 1) C_l / (2 pi) in uK^2 (as CAMB"
+    " writes them)"
+)
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Power spectra C_l of the CMB (TT, EE, BB, TE) that a file holds.
+
+    Attributes
+    ----------
+    values
+        C_l [K^2], (4, lmax + 1): TT, EE, BB, TE from l = 0; zero where the file has none.
+    text
+        What was taken for what.
+    """
+
+    values: Floats
+    text: str
+
+    @property
+    def rms(self) -> float:
+        """Rms of the intensity, K."""
+        ell = np.arange(self.values.shape[1])
+        return float(np.sqrt(((2 * ell + 1) * self.values[0])[2:].sum() / (4 * np.pi)))
+
+
+def read(
+    place: str,
+    unit: Unit | None = None,
+    scaling: Scaling | None = None,
+    columns: Sequence[str] = (),
+) -> Spectrum:
+    """Read a file of spectra. ``unit``, ``scaling`` and ``columns`` (behind l) stand above what its
+    comments say.
+
+    Raises
+    ------
+    InputError
+        It is no table of rising multipoles without gaps; columns that no heading names; no sky has
+        these spectra; the rms of the sky is not `PLAUSIBLE`, or the spectrum falls as C_l does,
+        where no ``unit`` or ``scaling`` says so.
+    """
+    with reading(place, "a power spectrum", CURE):
+        check_memory(4 * Path(place).stat().st_size, "the table", place)
+        try:
+            table = np.loadtxt(place, ndmin=2)
+        except ValueError as error:  # numpy's own cures are for those who call it
+            raise ValueError(str(error).partition("; use `")[0]) from None
+        with open(place, encoding="utf-8", errors="replace") as file:
+            lines = [line.strip() for line in islice(file, 100)]
+    comments = [line.strip("#! \t") for line in lines if line.startswith(("#", "!"))]
+    ell, stated = table[:, 0], " ".join(comments).lower()
+    if not np.isfinite(table).all():
+        row, column = np.argwhere(~np.isfinite(table))[0]
+        text = f"row {row + 1} of the numbers has {table[row, column]} in column {column + 1}"
+        raise InputError(text, place=place, cure="mend that row")
+    rising = (ell == np.round(ell)).all() and (np.diff(ell) > 0).all()
+    for wrong, text in (
+        (table.shape[1] < 2, "has one column"),
+        (
+            not (rising and ell[0] >= 0 and ell[-1] <= HIGHEST),
+            f"the first column is no rising series of multipoles up to {HIGHEST}",
+        ),
+        (
+            ell[-1] - max(ell[0], 2) + 1 != np.count_nonzero(ell >= 2),
+            "multipoles are missing between the first and the last",
+        ),
+    ):
+        if wrong:
+            raise InputError(text, place=place, cure=CURE)
+    names, named = _names(table.shape[1] - 1, comments, columns, place)
+    found_unit: Unit = unit or _unit_of(stated) or "uK^2"
+    plain = (scaling or _scaling_of(stated)) == "none"
+    values = np.zeros((4, int(ell[-1]) + 1))
+    flat = np.ones(len(ell))
+    if not plain:
+        flat = np.where(ell > 0, 2 * np.pi / np.maximum(ell * (ell + 1), 1), 0.0)
+    for name, powers in zip(names, table.T[1:], strict=True):
+        if name in READ:
+            values[READ.index(name), ell.astype(int)] = powers * flat * FACTORS[found_unit]
+    if plain:
+        values[:, :2] = 0.0  # monopole and dipole
+    tt, ee, _, te = values
+    if values[:3].min() < 0 or (te**2 > tt * ee * (1 + 1e-6)).any():
+        text = "no sky has this spectrum: TT, EE or BB is negative, or TE^2 exceeds TT EE"
+        raise InputError(text, place=place, cure=CURE)
+    used, unused = ([n for n in names if (n in READ) is read] for read in (True, False))
+    text = f"{', '.join(used)} ({named}) as {'C_l' if plain else 'l (l + 1) C_l / 2 pi'}"
+    text += f" in {found_unit}" + (f"; not used: {', '.join(unused)}" if unused else "")
+    found = Spectrum(values, text)
+    if unit is None:
+        _check_rms(found, found_unit, place)
+    if scaling is None:
+        _check_shape(tt, place)
+    return found
+
+
+def _names(
+    number: int, comments: Sequence[str], given: Sequence[str], place: str
+) -> tuple[list[str], str]:
+    """Names of the columns behind l, and who says so."""
+    names, who = [_plain(name) for name in given], "as given"
+    if not names:
+        headings = [names for line in comments if len(names := _heading(line)) == number]
+        names, who = list(BY_NUMBER.get(number, ())), "by their number"
+        if headings:
+            names, who = headings[-1], "by the file's heading"
+    if len(names) != number or "TT" not in names or len(set(names)) < number:
+        cure = f"set columns to the names of those behind l, e.g. columns: TT, EE, TE, BB; {CURE}"
+        told = f"columns names {', '.join(names)}" if given else "no heading names them"
+        raise InputError(f"has {number + 1} columns, and {told}", place=place, cure=cure)
+    return names, who
+
+
+def _heading(line: str) -> list[str]:
+    """Names behind l of a line such as ``L TT EE`` or ``1:l 2:TT 3:EE``; empty where it is none."""
+    words = [re.sub(r"^\d+:", "", word) for word in re.split(r"[\s,]+", line.strip())]
+    return [_plain(w) for w in words[1:]] if words[0].lower() in ("l", "ell", "multipole") else []
+
+
+def _plain(name: str) -> str:
+    """``TT`` of TT, dl_tt, CL_TT, D_ell^TT; ``TE`` of ET."""
+    plain = re.sub(r"^(D|C)_?(L|ELL)?[_^]*", "", name.strip().upper()) or name.strip().upper()
+    return {"ET": "TE", "T": "TT", "E": "EE", "B": "BB", "": "TT"}.get(plain, plain)
+
+
+def _unit_of(stated: str) -> Unit | None:
+    """Unit that comments state."""
+    if re.search(r"(micro|mu|\bu|\N{MICRO SIGN}|\N{GREEK SMALL LETTER MU})\s*-?k", stated):
+        return "uK^2"
+    return "dimensionless" if "dimensionless" in stated else None
+
+
+def _scaling_of(stated: str) -> Scaling | None:
+    """Factor that comments state."""
+    return "l(l+1)/2pi" if re.search(r"l\s*\*?\s*\(\s*l\s*\+\s*1\s*\)", stated) else None
+
+
+def _check_rms(found: Spectrum, unit: Unit, place: str) -> None:
+    """Raise InputError if the rms is not plausible, and name units in which it is."""
+    least, most = PLAUSIBLE
+    rms = {name: 1e6 * found.rms * (f / FACTORS[unit]) ** 0.5 for name, f in FACTORS.items()}
+    if rms[unit] == 0.0 or least <= rms[unit] <= most:
+        return
+    right = [f"{name} (rms {r:.3g} uK)" for name, r in rms.items() if least <= r <= most]
+    cure = f"set unit: {' or '.join(right)}"
+    if not right:
+        cure = "set unit to uK^2, K^2 or dimensionless, if that is what is meant"
+    text = f"a sky of this spectrum, taken in {unit}, has an rms of {rms[unit]:.3g} uK"
+    raise InputError(f"{text}, and the CMB about 100 uK", place=place, cure=cure)
+
+
+def _check_shape(tt: Floats, place: str) -> None:
+    """Raise InputError if C_l itself stands in the column."""
+    if len(tt) <= 300:
+        return
+    ell = np.arange(len(tt))
+    power = ell * (ell + 1) * tt
+    low, high = power[10:21].mean(), power[150:301].mean()
+    if low > 0 and high < FALLS * low:
+        factor = f"{low / max(high, 1e-300):.3g}"
+        raise InputError(
+            f"l (l + 1) C_l falls from l = 15 to 200 by a factor of {factor}, where that of the CMB"
+            " rises",
+            place=place,
+            cure=(
+                "set scaling: none where the columns are C_l, or scaling: l(l+1)/2pi where they are"
+                " as stated"
+            ),
+        )
 
 
 class CMBSky(FullSky):
@@ -70,7 +271,7 @@ class CMBSky(FullSky):
         ]
 
     def read(self) -> Spectrum:
-        """The spectra of the file. Raises InputError as `spectrum_file.read`."""
+        """The spectra of the file. Raises InputError as the function `read`."""
         columns = [name for name in (self.columns or "").replace(",", " ").split() if name]
         return read(str(self.spectrum), self.unit, self.scaling, columns)
 

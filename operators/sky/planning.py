@@ -26,7 +26,7 @@ from zonda.core.plan.bounds import (
 from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
-from .brightness import conversion
+from .convolved import conversion
 from .grid import Grid
 from .gridding import extremes
 from .skymap import SkyMap

@@ -1,22 +1,32 @@
-"""The sky: a map convolved with each detector's beam and sampled where each detector looks."""
+"""The sky: a map convolved with each detector's beam and sampled where each detector looks; base of
+the steps that make HEALPix maps of the whole sky.
+"""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
 
-from zonda.core.data import Block, Data, Observation
+from zonda.core.data import Block, Data, Log, Observation
 from zonda.core.maps.image import Image
+from zonda.core.operator import Operator
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.product import Product
 from zonda.core.storage.fits_files import header_of
+from zonda.core.types import AnyFloats, Floats
 
-from .convolved import ConvolvedSky
+from .convolved import Beam, Brightness, ConvolvedSky
+from .grid import Grid
 from .input_map import HealpixMap
-from .scan_sampler import ScanSampler
+from .sampling import Rows
+from .sky_input import Cache
 
 POLARIZED = ("polarization", "axis")
 """Fields of an `Image` of I, Q and U."""
@@ -42,6 +52,80 @@ class InputImage(Product):
         """See `Product.of`."""
         polarized = {key: arrays[key] for key in POLARIZED if key in arrays}
         return cls(Image(arrays["values"], header_of(arrays["header"].items()), **polarized))
+
+
+@dataclass
+class ScanSampler:
+    """State for `SkyMap.exec`: samples the convolved maps in the blocks of a scan.
+
+    Attributes
+    ----------
+    beams
+        None where no detector reaches the map.
+    index
+        (n_det,) number of each detector's beam.
+    angles
+        Of the detectors on the sky, from the meridians of the grid's Q and U; None: there are no Q
+        and U.
+    """
+
+    grid: Grid
+    sky: Brightness
+    beams: list[Beam]
+    index: NDArray[np.int64]
+    angles: PolarizationAngles | None = None
+    _counts: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
+    _chunks: Cache = field(default_factory=lambda: Cache(2**22))
+
+    def tell(self, log: Log, label: str) -> None:
+        """State what was chosen, and count what was taken for something else."""
+        for what, text in self.sky.notes.items():
+            log.state(label, what, text)
+        for what, number in self.sky.counts.items():
+            if number:
+                log.count(label, what, number)
+        for beam in self.beams:
+            beam.tell(log, label)
+
+    def sample(self, block: Block, out: AnyFloats, linear: bool, over: bool) -> None:
+        """Add the sky to a block's stream (`sampling.sample`), and count the samples that see
+        none.
+        """
+        plane, index = block.observation.focalplane, self.index[block.detectors]
+        xi, eta = plane.xi[block.detectors], plane.eta[block.detectors]
+        efficiency = plane.polarization_efficiency[block.detectors]
+        beyond = behind = 0
+        if not self.beams:
+            boresight = block.observation.sky_boresight[block.samples]
+            beyond, behind = out.size, self.grid.behind(boresight, xi, eta)
+        for number, beam in enumerate(self.beams):
+            rows = np.flatnonzero(index == number)
+            if not rows.size:
+                continue
+            kind = out.dtype.type
+            key = block.samples.start, block.samples.stop, number, kind
+            chunks = self._chunks.get(
+                key, partial(beam.pointing, block, kind)
+            )  # detectors share it
+            found = beam.add(0, chunks, Rows(rows, xi[rows], eta[rows]), out, linear, over)
+            beyond, behind = beyond + found[0], behind + found[1]
+            rows = rows[efficiency[rows] > 0]
+            if self.angles is None or not rows.size:
+                continue
+            # p (Q cos 2 psi + U sin 2 psi), equation (1) of core.polarization
+            own = Rows(np.arange(rows.size), xi[rows], eta[rows])
+            q, u = (block.buffer(f"sky {name}", (rows.size, out.shape[1])) for name in "QU")
+            beam.add(1, chunks, own, q, linear, True)
+            beam.add(2, chunks, own, u, linear, True)
+            detectors, start = rows + block.detectors.start, block.samples.start
+            self.angles.add(detectors, start, efficiency[rows], (q, u), rows, out)
+        if not block.again:  # a block that is made again is counted once
+            self._counts[block.detectors.start, block.samples.start] = (beyond, behind)
+
+    def totals(self) -> tuple[int, int]:
+        """Samples (outside the input map, more than 90 deg from its centre)."""
+        counts = list(self._counts.values())
+        return sum(c[0] for c in counts), sum(c[1] for c in counts)
 
 
 class SkyMap(ConvolvedSky):
@@ -139,3 +223,62 @@ def show_input(label: str, data: Data) -> None:
 def _show(label: str, data: Data, image: Image) -> None:
     taken = "input" in data.products and data.products["input"].header.get("OPERATOR") != label
     data.products.setdefault(f"input.{label}" if taken else "input", image)
+
+
+def _power_of_two(value: int) -> int:
+    if value & (value - 1):
+        raise ValueError(f"nside is a power of two, not {value}")
+    return value
+
+
+Nside = Annotated[int, Field(ge=16, le=8192), AfterValidator(_power_of_two)]
+"""Resolution of a HEALPix map of the whole sky."""
+
+
+class FullSky(Operator):
+    """A step whose maps a `SkyMap` samples: that and what it knows of the scan are the state."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+
+    def exec(self, block: Block, state: tuple[SkyMap, ScanSampler]) -> None:
+        """See `SkyMap`."""
+        state[0].exec(block, state[1])
+
+    def collect(
+        self, data: Data, observation: Observation, state: tuple[SkyMap, ScanSampler]
+    ) -> None:
+        """See `SkyMap`."""
+        state[0].collect(data, observation, state[1])
+
+    def finalize(self, data: Data) -> None:
+        """See `SkyMap`."""
+        show_input(self.label, data)
+
+    def sampler(self, maps: Floats, unit: str, coordsys: str) -> SkyMap:
+        """The step that samples maps (1 or 3, n_pix) of I, or I, Q and U: ring order, COSMO's
+        convention, ``coordsys`` C or G.
+        """
+        found = SkyMap(map=_table(maps, unit, coordsys))
+        found._label = self.label
+        return found
+
+
+def _table(maps: Floats, unit: str, coordsys: str) -> Any:
+    """The maps as a HEALPix table."""
+    import healpy
+    from astropy.io import fits
+
+    columns = [
+        fits.Column(name, "D", unit=unit, array=values)
+        for name, values in zip("IQU", maps, strict=False)
+    ]
+    table = fits.BinTableHDU.from_columns(columns)
+    table.header.update(
+        PIXTYPE="HEALPIX",
+        ORDERING="RING",
+        NSIDE=healpy.npix2nside(maps.shape[1]),
+        COORDSYS=coordsys,
+    )
+    table.header.update(INDXSCHM="IMPLICIT", POLCCONV="COSMO")
+    return table

@@ -53,8 +53,8 @@ def instrument(name: str, output: Path | None) -> None:
 
 
 def _instrument(name: str) -> Instrument:
-    from zonda.core.component_files import is_file, names_in
     from zonda.core.configuration.pipeline_file import load
+    from zonda.core.discovery import is_file, names_in
     from zonda.core.registry import instruments
 
     if is_file(name) and "operators" in names_in(Path(name)):

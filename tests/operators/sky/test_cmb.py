@@ -18,8 +18,7 @@ from zonda.core.plan.pointing import context_of
 from zonda.core.plan.structure import Structure
 from zonda.core.registry import instruments
 from zonda.operators.sky import cmb
-from zonda.operators.sky.cmb import CMBSky, draw
-from zonda.operators.sky.spectrum_file import read
+from zonda.operators.sky.cmb import CMBSky, draw, read
 from zonda.plugins.checks import scenes
 
 LMAX, NSIDE = 95, 64

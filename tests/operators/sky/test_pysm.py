@@ -26,8 +26,7 @@ from zonda.core.numerics.projection import directions, frame_rotation
 from zonda.core.numerics.radiation import band_average, cmb_slope, rayleigh_jeans
 from zonda.core.plan.planning import planning_class
 from zonda.core.polarization import PolarizationAngles
-from zonda.operators.sky.pysm import PySMSky
-from zonda.operators.sky.pysm_emission import _seeded, band_weights, configuration, emission
+from zonda.operators.sky.pysm import PySMSky, _seeded, band_weights, configuration, emission
 from zonda.testing import check_operator
 
 NSIDE = 16

@@ -139,7 +139,7 @@ def test_planning_interpolates_nothing(made, tmp_path, monkeypatch):
     """Memory, bounds and costs come from the grid's shape; cost grows with the points that are
     worked on.
     """
-    from zonda.operators.sky import brightness
+    from zonda.operators.sky import convolved
 
     healpy.write_map(
         tmp_path / "h.fits",
@@ -152,7 +152,7 @@ def test_planning_interpolates_nothing(made, tmp_path, monkeypatch):
     def refuse(*arguments):
         raise AssertionError("interpolated")
 
-    monkeypatch.setattr(brightness, "interpolated", refuse)
+    monkeypatch.setattr(convolved, "interpolated", refuse)
     operator = SkyMap(file=tmp_path / "h.fits")
     small, wide = strip(made, 5.0, fwhm=3600.0), strip(made, 60.0, fwhm=3600.0)
     assert planning_of(operator).traits(wide).peak == pytest.approx(2.0)

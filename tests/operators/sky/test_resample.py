@@ -11,7 +11,7 @@ from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.radiation import to_kelvin_rj
-from zonda.operators.sky.brightness import tangent_areas
+from zonda.operators.sky.convolved import tangent_areas
 from zonda.operators.sky.gridding import interpolated
 from zonda.operators.sky.input_map import ImageMap
 from zonda.operators.sky.read import read_map
