@@ -35,56 +35,65 @@ _IN_DEGREES = {"rad": math.degrees(1.0), "arcmin": 1 / 60, "arcsec": 1 / 3600, "
 _EQUATORIAL = ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH")
 
 
-def number(header: Any, key: str, place: str, cure: str = "") -> float | None:
-    """The finite number of a card; None where there is no such card, or it has no value. Raises
-    InputError for anything else.
-    """
-    value = header.get(key)
-    if value is None or _is_blank(value):
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(
-            f"{key} = {value!r} is no number",
-            place=place,
-            cure=cure or f"write {key} as a number, or remove it",
-        )
-    return float(value)
+class FileHeader:
+    """A header of the file ``place``, as messages call it, with checked cards."""
 
+    def __init__(self, header: Any, place: str) -> None:
+        self.header, self.place = header, place
 
-def text(header: Any, key: str, place: str, cure: str = "") -> str:
-    """The text of a card, empty where there is none. Raises InputError for a number or a logical
-    value.
-    """
-    value = header.get(key)
-    if value is None or _is_blank(value):
-        return ""
-    if not isinstance(value, str):
-        raise InputError(
-            f"{key} = {value!r} is no text", place=place, cure=cure or f"write {key} in quotes"
-        )
-    return value.strip()
+    def error(self, message: str, cure: str) -> InputError:
+        """An error about the file, to be raised."""
+        return InputError(message, place=self.place, cure=cure)
+
+    def number(self, key: str, cure: str = "") -> float | None:
+        """The finite number of a card; None where there is no such card, or it has no value. Raises
+        InputError for anything else.
+        """
+        if (value := self._value(key)) is None:
+            return None
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not math.isfinite(value)
+        ):
+            cure = cure or f"write {key} as a number, or remove it"
+            raise self.error(f"{key} = {value!r} is no number", cure)
+        return float(value)
+
+    def text(self, key: str) -> str:
+        """The text of a card, empty where there is none. Raises InputError for a number or a
+        logical value.
+        """
+        if (value := self._value(key)) is None:
+            return ""
+        if not isinstance(value, str):
+            raise self.error(f"{key} = {value!r} is no text", f"write {key} in quotes")
+        return value.strip()
+
+    def _value(self, key: str) -> Any:
+        """The value of a card; None without a card or a value: astropy has an object of its own for
+        it.
+        """
+        value = self.header.get(key)
+        blank = type(value).__name__ == "Undefined" or not str(value).strip()
+        return None if blank else value
 
 
 UNSEEN = -1.6375e30
 """Value of pixels that HEALPix's tools did not see."""
 
 
-def marked_bad(values: AnyFloats, header: Any, place: str) -> NDArray[np.bool_]:
+def marked_bad(values: AnyFloats, header: FileHeader) -> NDArray[np.bool_]:
     """True for values that a map's file marks as not observed: `UNSEEN`, and that of the card
     BAD_DATA. NaN is not among them.
 
     Raises InputError where BAD_DATA is no number.
     """
-    stated, found = number(header, "BAD_DATA", place), np.zeros(values.shape, bool)
+    stated, found = header.number("BAD_DATA"), np.zeros(values.shape, bool)
     with np.errstate(over="ignore", invalid="ignore"):
         for bad in {UNSEEN} | (set() if stated is None else {stated}):
             found |= np.abs(values - bad) <= 1e-5 * abs(bad)
     return found
-
-
-def _is_blank(value: Any) -> bool:
-    """True if a card is there without a value: astropy has an object of its own for it."""
-    return type(value).__name__ == "Undefined" or (isinstance(value, str) and not value.strip())
 
 
 def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
@@ -99,47 +108,41 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
         RADESYS is none that is known, or no text; cards of the world coordinates are no numbers,
         units no texts.
     """
-    made = header.copy()
+    about = FileHeader(header.copy(), place)
+    made = about.header
     for key in list(made):
-        if _NUMBERS.fullmatch(key) and number(made, key, place) is None and key in made:
-            del made[key]
+        if _NUMBERS.fullmatch(key) and about.number(key) is None:
+            made.remove(key, ignore_missing=True)
         elif key in ("CUNIT1", "CUNIT2"):
-            text(made, key, place)
+            about.text(key)
     for axis in "12":
-        key, unit = f"CRVAL{axis}", text(made, f"CUNIT{axis}", place) or "deg"
-        if abs(number(made, key, place) or 0.0) * _IN_DEGREES.get(unit.lower(), 1.0) > 720.0:
+        key, unit = f"CRVAL{axis}", about.text(f"CUNIT{axis}") or "deg"
+        if abs(about.number(key) or 0.0) * _IN_DEGREES.get(unit.lower(), 1.0) > 720.0:
             cure = f"correct {key}, or the unit CUNIT{axis}"
-            raise InputError(
-                f"{key} = {made[key]:g} {unit} is no longitude or latitude", place=place, cure=cure
-            )
+            raise about.error(f"{key} = {made[key]:g} {unit} is no longitude or latitude", cure)
     kinds = {str(header.get(f"CTYPE{axis}", "")).strip().upper()[:4] for axis in "12"}
     if kinds == {"GLON", "GLAT"}:
         for key in _EQUATORIAL:
-            if key in made:
-                del made[key]
+            made.remove(key, ignore_missing=True)
         return made, ""
     for key in ("EQUINOX", "EPOCH"):
-        if key in made and not number(made, key, place):  # 0: not known
-            del made[key]
+        if not about.number(key):  # 0: not known
+            made.remove(key, ignore_missing=True)
     key = "RADESYS" if "RADESYS" in made else "RADECSYS"
-    written = text(made, key, place)
-    if key in made and not written:
-        del made[key]
+    written = about.text(key)
+    if not written:
+        made.remove(key, ignore_missing=True)
     if not written or written in FRAMES:
         return made, ""
     plain = re.sub(r"[ ()_/]", "", written.upper())
     frame, equinox = _SAME.get(plain, (written.upper(), None))
     if frame not in FRAMES:
-        raise InputError(
+        raise about.error(
             f"{key} = '{written}' is no frame of coordinates that is read",
-            place=place,
-            cure=(
-                f"set {key} to {', '.join(FRAMES[:-1])} or {FRAMES[-1]}, or convert the map to ICRS"
-            ),
+            f"set {key} to {', '.join(FRAMES[:-1])} or {FRAMES[-1]}, or convert the map to ICRS",
         )
     made[key] = frame
-    stated = number(made, "EQUINOX", place)
-    if equinox is not None and stated is None:
+    if equinox is not None and about.number("EQUINOX") is None:
         made["EQUINOX"] = equinox
     return made, f"{frame}: {key} = '{written}'"
 

@@ -1,28 +1,28 @@
-"""The map in a FITS file: its extension, the plane of its cube, the pixels of its HEALPix table.
+"""Maps in FITS files: the extension, the planes of its cube or the pixels of its HEALPix table, and
+which of them are I, Q and U.
 
-Readers of skies and of maps to be compared share these rules. Nothing is guessed: if a file leaves
-a choice, the error lists the possible ones.
+The one reader below `SkyMap` and all that compares maps. Nothing is guessed: if a file leaves a
+choice, the error lists the possible ones.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
 from ..types import Floats
-from .header import number, text
-from .stokes_names import along_axis, pixel_column
+from .header import FileHeader, marked_bad
 
 Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
 """Names of frames as astropy has them."""
 STOKES = "Stokes parameters"
 """Key of the note about Stokes parameters that are not used."""
+Index = tuple[int, ...]
+"""Of a plane, among the axes of an image before the last two."""
 _FRAMES: dict[str, Frame] = {
     **dict.fromkeys(("C", "Q", "EQ", "ICRS", "CELESTIAL", "EQUATORIAL"), "icrs"),
     **dict.fromkeys(("G", "GALACTIC"), "galactic"),
@@ -30,19 +30,65 @@ _FRAMES: dict[str, Frame] = {
 }
 """Values of COORDSYS."""
 
+# --------------------------------------------------------------------------------------------------
+# names of Stokes parameters
 
-@dataclass(frozen=True)
-class Cures:
-    """Cures of messages, which say where the user sets an option; default: those of operators."""
 
-    plane: str = "set the operator's parameter plane: {example} ({ranges})"
-    coordsys: str = (
-        "set the header key COORDSYS to C (ICRS), G or E, or the operator's parameter coordsys to"
-        " icrs, galactic or ecliptic (WMAP's and Planck's maps are galactic)"
+_NAMES = {1: "I", 2: "Q", 3: "U", 4: "V"}
+"""Values of a FITS axis STOKES (Greisen & Calabretta 2002); those below zero are correlations."""
+_POLARIZED = re.compile(r"(STOKES[ _-]?)?([QUV])([ _-].*)?", re.IGNORECASE)
+"""Names of columns and extensions: Q_POLARISATION (healpy), Q_STOKES (Planck), STOKES_Q, Q."""
+_INTENSITY = re.compile(
+    r"(STOKES[ _-]?)?[IT]|[IT][ _-]?STOKES|I["
+    r" _-]POL[A-Z]*|TEMP(ERATURE)?|INTENSITY|SIGNAL|BRIGHTNESS|T[ _-]?B",
+    re.IGNORECASE,
+)
+"""Names of columns of a brightness: I_STOKES (Planck), TEMPERATURE (healpy), SIGNAL (zonda,
+HEALPix's own tools).
+"""
+_PIXEL = re.compile(
+    r"(I?PIX(EL|ELS|NUM|NO|ID)?|PIXEL?[ _-]?(INDEX|NUMBER|NUM|ID)|INDEX|HPX["
+    r" _-]?(PIXEL|INDEX|ID)|HEALPIX|HPIX)",
+    re.IGNORECASE,
+)
+_OTHER = re.compile(
+    r"(.*[ _-])?(N?[ _-]?HITS?|N[ _-]?OBS(ERVATIONS)?|N["
+    r" _-]?SAMP(LES)?|COUNTS?|WEIGHTS?|WGTS?|COV(ARIANCE|ERAGE)?|"
+    r"STD(DEV)?|STDEV|SIGMA|RMS|ERR(ORS?)?|VAR(IANCE)?|NOISE|[TPIQU]?MASK|R?COND(ITION)?"
+    r"|EXPOSURE|TIME|FLAGS?|RA|DEC|GLON|GLAT|LON|LAT)"
+    r"([ _-].*|\d+)?|[IQUV][IQUV]",
+    re.IGNORECASE,
+)
+"""Names of columns that hold no map of the sky: hits, weights, errors, masks, coordinates."""
+
+
+def polarized_letter(name: str) -> str:
+    """Q, U or V of the name of a column or an extension that holds it; empty of another one."""
+    found = _POLARIZED.fullmatch(name.strip())
+    return "" if found is None or _OTHER.fullmatch(name.strip()) else found[2].upper()
+
+
+def unused(what: str, names: Sequence[str], read: int | None = None) -> dict[str, str]:
+    """The note about Stokes parameters among ``names`` beside ``what`` is read as I."""
+    beside = [name for k, name in enumerate(names) if k != read and polarized_letter(name)]
+    return {STOKES: f"{what} is read as I; {_not_used(beside)}"} if beside else {}
+
+
+def _not_used(names: Sequence[str]) -> str:
+    """Statement about Stokes parameters that unpolarized detectors do not see."""
+    return (
+        f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} not used: detectors measure total"
+        " intensity"
     )
 
 
-OPERATORS = Cures()
+def q_and_u(names: Sequence[str]) -> list[int]:
+    """Numbers of the columns or extensions of these names that hold Q and U; none if they are not
+    both there.
+    """
+    letters = [polarized_letter(name) for name in names]
+    return [letters.index("Q"), letters.index("U")] if {"Q", "U"} <= set(letters) else []
+
 
 # --------------------------------------------------------------------------------------------------
 # extensions
@@ -57,51 +103,41 @@ def is_healpix(hdu: Any) -> bool:
     )
 
 
-def is_map(hdu: Any) -> bool:
-    """True for a HEALPix table and for an image of two axes or more."""
-    return is_healpix(hdu) or bool(hdu.is_image and hdu.header.get("NAXIS", 0) > 1)
-
-
 def chosen(hdus: Any, wanted: int | str | None, place: str) -> tuple[Any, dict[str, str]]:
     """The extension ``wanted``, by name or number, else the first map; notes.
 
-    Raises InputError if there is none, or it is no map.
+    Raises InputError if there is none, or it is no map: a HEALPix table, or an image of two axes or
+    more.
     """
-    maps = [hdu for hdu in hdus if is_map(hdu)]
-    if wanted is None:
-        if not maps:
-            one = any(hdu.is_image and hdu.header.get("NAXIS", 0) == 1 for hdu in hdus)
-            what = (
-                "its image has one axis (a spectrum?)"
-                if one
-                else "it holds no image of two axes and no HEALPix table"
-            )
-            raise InputError(
-                f"is not a map: {what}; in the file: {_contents(hdus)}",
-                place=place,
-                cure="give a FITS file with a two-dimensional image that has a celestial WCS, or"
-                " with a HEALPix table",
-            )
-        told = f"the first of {len(maps)} maps is read; in the file: {_contents(hdus)}"
-        return maps[0], {"extension": told} if len(maps) > 1 else {}
-    found = [
+    name, contents, about = str(wanted).strip().upper(), _contents(hdus), FileHeader({}, place)
+    asked = [
         hdu
         for k, hdu in enumerate(hdus)
-        if str(wanted).strip().upper() in (str(k), str(hdu.name).upper())
+        if wanted is None or name in (str(k), str(hdu.name).upper())
     ]
-    if not found:
-        raise InputError(
-            f"there is no extension {wanted}",
-            place=place,
-            cure=f"set hdu to one of these: {_contents(hdus)}",
+    maps = [
+        hdu for hdu in asked if is_healpix(hdu) or (hdu.is_image and hdu.header.get("NAXIS", 0) > 1)
+    ]
+    if wanted is None and not maps:
+        one = any(hdu.is_image and hdu.header.get("NAXIS", 0) == 1 for hdu in hdus)
+        what = "it holds no image of two axes and no HEALPix table"
+        if one:
+            what = "its image has one axis (a spectrum?)"
+        raise about.error(
+            f"is not a map: {what}; in the file: {contents}",
+            "give a FITS file with a two-dimensional image that has a celestial WCS, or with a"
+            " HEALPix table",
         )
-    if not is_map(found[0]):
-        raise InputError(
-            f"the extension {wanted} is neither an image of two axes nor a HEALPix table",
-            place=place,
-            cure=f"set hdu to another of these: {_contents(hdus)}",
-        )
-    return found[0], {}
+    if not asked:
+        message = f"there is no extension {wanted}"
+        raise about.error(message, f"set hdu to one of these: {contents}")
+    if asked[0] not in maps and wanted is not None:
+        message = f"the extension {wanted} is neither an image of two axes nor a HEALPix table"
+        raise about.error(message, f"set hdu to another of these: {contents}")
+    if wanted is not None or len(maps) == 1:
+        return maps[0], {}
+    told = f"the first of {len(maps)} maps is read; in the file: {contents}"
+    return maps[0], {"extension": told}
 
 
 def _contents(hdus: Any) -> str:
@@ -116,11 +152,8 @@ def _kind(hdu: Any) -> str:
         return "HEALPix table"
     if not hdu.is_image:
         return f"table of {header.get('NAXIS2', 0)} rows"
-    if not header.get("NAXIS", 0):
-        return "empty"
-    return "image of " + " x ".join(
-        str(header.get(f"NAXIS{k + 1}")) for k in range(header["NAXIS"])
-    )
+    sides = [str(header.get(f"NAXIS{k + 1}")) for k in range(header.get("NAXIS", 0))]
+    return f"image of {' x '.join(sides)}" if sides else "empty"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -134,216 +167,193 @@ def is_celestial(ctype: str) -> bool:
     )
 
 
-def plane_of_cube(
-    header: Any,
-    shape: Sequence[int],
-    wanted: tuple[int, ...] | None,
-    place: str,
-    cures: Cures = OPERATORS,
-) -> tuple[tuple[int, ...], dict[str, str]]:
-    """Index of a plane among the axes before the last two, and notes about the others.
-
-    Parameters
-    ----------
-    shape
-        Of the image, slowest axis first.
-    wanted
-        The plane, counted from 1, in FITS's order of the axes. An axis STOKES may be left out: of
-        it I is read.
-
-    Raises
-    ------
-    InputError
-        A cube without a wanted plane, or one that is not there; no I; axes of the sky that are not
-        the first two.
+class Cube(FileHeader):
+    """The planes of an image of ``shape`` (slowest axis first): it has axes before the last two, or
+    none.
     """
-    axes = {
-        len(shape) - k: length for k, length in enumerate(shape[:-2])
-    }  # FITS counts from the fastest
-    names = {axis: str(header.get(f"CTYPE{axis}", "")).strip().upper() for axis in axes}
-    if stray := [f"{axis} ({name})" for axis, name in names.items() if is_celestial(name)]:
-        raise InputError(
-            "the axes of the sky are not the first two of the cube, but"
-            f" {', '.join(sorted(stray))}",
-            place=place,
-            cure="transpose it, so that axes 1 and 2 are longitude and latitude",
-        )
-    numbers = _numbers_of_planes(axes, names, shape, wanted, place, cures)
-    notes: dict[str, str] = {}
-    for axis, length in axes.items():
-        if names[axis] == "STOKES":
-            numbers[axis], note = _plane_of_i(header, axis, length, numbers.get(axis), place)
-            notes |= note
-        elif length > 1:
-            found = _which(header, axis, length, numbers[axis])
-            notes["plane"] = "; ".join([*([notes["plane"]] if "plane" in notes else []), found])
-    return tuple(numbers.get(axis, 1) - 1 for axis in axes), notes
 
+    def __init__(self, header: Any, place: str, shape: Sequence[int]) -> None:
+        super().__init__(header, place)
+        self.sides = " x ".join(str(n) for n in reversed(shape))
+        # FITS counts from the fastest
+        self.lengths = {len(shape) - k: n for k, n in enumerate(shape[:-2])}
+        self.names = {axis: self._word("CTYPE", axis).upper() for axis in self.lengths}
+        self.asked = [
+            axis
+            for axis, length in sorted(self.lengths.items())
+            if length > 1 and self.names[axis] != "STOKES"
+        ]
+        """FITS numbers of the axes along which a plane is to be chosen."""
 
-def axes_of_planes(header: Any, shape: Sequence[int]) -> list[int]:
-    """FITS numbers of the axes along which a plane is to be chosen."""
-    every = range(3, len(shape) + 1)
-    stokes = [a for a in every if str(header.get(f"CTYPE{a}", "")).strip().upper() == "STOKES"]
-    return [a for a in every if shape[len(shape) - a] > 1 and a not in stokes]
+    def _word(self, key: str, axis: int) -> str:
+        return str(self.header.get(f"{key}{axis}", "")).strip()
 
+    def plane(self, wanted: Index | None) -> tuple[Index, dict[str, str]]:
+        """Index of a plane, and notes about the others.
 
-def _numbers_of_planes(
-    axes: dict[int, int],
-    names: dict[int, str],
-    shape: Sequence[int],
-    wanted: tuple[int, ...] | None,
-    place: str,
-    cures: Cures,
-) -> dict[int, int]:
-    """The number of the wanted plane by axis."""
-    sides = " x ".join(str(n) for n in reversed(shape))
-    long = sorted(axis for axis, length in axes.items() if length > 1) or sorted(axes)
-    asked = [axis for axis in long if names[axis] != "STOKES" and axes[axis] > 1]
-    ranges = ", ".join(
-        f"1 to {axes[axis]}{f' along {names[axis]}' if names[axis] else f' along axis {axis}'}"
-        for axis in asked
-    )
-    ones = ", ".join("1" for _ in asked)
-    example = ones if len(asked) == 1 else f"[{ones}]"
-    if wanted is None:
-        if asked:
-            known = all(names[axis] for axis in asked)
-            cure = cures.plane.format(
-                example=example, ranges=ranges, list=ones.replace(" ", "")
-            ) + ("" if known else ", or CTYPE3 to STOKES if its planes are I, Q, U")
-            message = f"the image is a cube of {sides} pixels, not a map"
-            raise InputError(message, place=place, cure=cure)
-        return {}
-    numbered = next((counted for counted in (long, asked) if len(counted) == len(wanted)), None)
-    if not numbered:
-        raise InputError(
-            f"plane has {len(wanted)} numbers, and the image has {sides} pixels",
-            place=place,
-            cure=f"set plane: {example} ({ranges})" if asked else "remove plane",
-        )
-    for axis, n in zip(numbered, wanted, strict=True):
-        if not 1 <= n <= axes[axis]:
-            where = f" along {names[axis]}" if names[axis] else ""
-            raise InputError(
-                f"there is no plane {n} of {axes[axis]}{where}",
-                place=place,
-                cure="planes are counted from 1",
+        Parameters
+        ----------
+        wanted
+            The plane, counted from 1, in FITS's order of the axes. An axis STOKES may be left out:
+            of it I is read.
+
+        Raises
+        ------
+        InputError
+            A cube without a wanted plane, or one that is not there; no I; axes of the sky that are
+            not the first two.
+        """
+        if stray := [f"{axis} ({name})" for axis, name in self.names.items() if is_celestial(name)]:
+            raise self.error(
+                "the axes of the sky are not the first two of the cube, but"
+                f" {', '.join(sorted(stray))}",
+                "transpose it, so that axes 1 and 2 are longitude and latitude",
             )
-    return dict(zip(numbered, wanted, strict=True))
+        numbers, planes = self._numbers(wanted), []
+        notes: dict[str, str] = {}
+        for axis, length in self.lengths.items():
+            if self.names[axis] == "STOKES":
+                numbers[axis], note = self._plane_of_i(axis, numbers.get(axis))
+                notes |= note
+            elif length > 1:
+                planes.append(self._which(axis, numbers[axis]))
+        if planes:
+            notes["plane"] = "; ".join(planes)
+        return tuple(numbers.get(axis, 1) - 1 for axis in self.lengths), notes
 
-
-def _which(header: Any, axis: int, length: int, plane: int) -> str:
-    name, unit = (str(header.get(f"{key}{axis}", "")).strip() for key in ("CTYPE", "CUNIT"))
-    told = f"{plane} of {length}{f' along {name}' if name else ''}"
-    try:
-        step = header.get(f"CDELT{axis}", header.get(f"CD{axis}_{axis}"))
-        away = plane - float(header.get(f"CRPIX{axis}", 0.0))
-        value = float(header[f"CRVAL{axis}"]) + away * float(step)
-    except (KeyError, TypeError, ValueError):
-        return told
-    return f"{told}, at {value:.6g}{f' {unit}' if unit else ''}"
-
-
-def _plane_of_i(
-    header: Any, axis: int, length: int, wanted: int | None, place: str
-) -> tuple[int, dict[str, str]]:
-    """Number of the plane of I, or of the wanted one, along the FITS axis STOKES; the note about
-    the others. Raises InputError for an axis without I.
-    """
-    found = along_axis(header, axis, length, place)
-    if "I" not in found and wanted is None:
-        raise InputError(
-            f"its axis STOKES has {', '.join(found)} and no I",
-            place=place,
-            cure=f"give a map of I, or correct CRVAL{axis}, CDELT{axis} and CRPIX{axis}",
+    def _numbers(self, wanted: Index | None) -> dict[int, int]:
+        """The number of the wanted plane by axis."""
+        lengths, asked = self.lengths, self.asked
+        ranges = ", ".join(
+            f"1 to {lengths[axis]} along {self.names[axis] or f'axis {axis}'}" for axis in asked
         )
-    plane = found.index("I") + 1 if wanted is None else wanted
-    unused = [name for k, name in enumerate(found, 1) if k != plane]
-    if not unused:
-        return plane, {}
-    as_what = found[plane - 1] + ("" if found[plane - 1] == "I" else " as I")
-    return plane, {STOKES: f"plane {plane} of {length} is read, {as_what}; {not_used(unused)}"}
+        ones = ", ".join("1" for _ in asked)
+        example = ones if len(asked) == 1 else f"[{ones}]"
+        if wanted is None:
+            if not asked:
+                return {}
+            cure = f"choose its plane ({ranges}): --plane {ones.replace(' ', '')} of zonda compare,"
+            cure += f" plane: {example} of a step"
+            if not all(self.names[axis] for axis in asked):
+                cure += ", or CTYPE3 to STOKES if its planes are I, Q, U"
+            raise self.error(f"the image is a cube of {self.sides} pixels, not a map", cure)
+        long = sorted(axis for axis, length in lengths.items() if length > 1) or sorted(lengths)
+        numbered = next((some for some in (long, asked) if len(some) == len(wanted)), None)
+        if not numbered:
+            cure = f"set plane: {example} ({ranges})" if asked else "remove plane"
+            message = f"plane has {len(wanted)} numbers, and the image has {self.sides} pixels"
+            raise self.error(message, cure)
+        found = dict(zip(numbered, wanted, strict=True))
+        for axis, n in found.items():
+            if not 1 <= n <= lengths[axis]:
+                where = f" along {self.names[axis]}" if self.names[axis] else ""
+                message = f"there is no plane {n} of {lengths[axis]}{where}"
+                raise self.error(message, "planes are counted from 1")
+        return found
 
+    def _which(self, axis: int, plane: int) -> str:
+        header, name, unit = self.header, self._word("CTYPE", axis), self._word("CUNIT", axis)
+        told = f"{plane} of {self.lengths[axis]}{f' along {name}' if name else ''}"
+        try:
+            step = header.get(f"CDELT{axis}", header.get(f"CD{axis}_{axis}"))
+            away = plane - float(header.get(f"CRPIX{axis}", 0.0))
+            value = float(header[f"CRVAL{axis}"]) + away * float(step)
+        except (KeyError, TypeError, ValueError):
+            return told
+        return f"{told}, at {value:.6g}{f' {unit}' if unit else ''}"
 
-def planes_of_q_and_u(
-    header: Any, shape: Sequence[int], plane: tuple[int, ...]
-) -> list[tuple[int, ...]] | None:
-    """Indices of the planes of Q and U beside that of I, ``plane``, in a cube; None without them.
+    def _plane_of_i(self, axis: int, wanted: int | None) -> tuple[int, dict[str, str]]:
+        """Number of the plane of I, or of the wanted one, along the FITS axis STOKES; the note
+        about the others. Raises InputError for an axis without I.
+        """
+        found = self.along_stokes(axis)
+        if "I" not in found and wanted is None:
+            cure = f"give a map of I, or correct CRVAL{axis}, CDELT{axis} and CRPIX{axis}"
+            raise self.error(f"its axis STOKES has {', '.join(found)} and no I", cure)
+        plane = found.index("I") + 1 if wanted is None else wanted
+        beside = [name for k, name in enumerate(found, 1) if k != plane]
+        if not beside:
+            return plane, {}
+        as_what = found[plane - 1] + ("" if found[plane - 1] == "I" else " as I")
+        text = f"plane {plane} of {len(found)} is read, {as_what}; {_not_used(beside)}"
+        return plane, {STOKES: text}
 
-    A plane of Q that is named as if it were I has no others.
-    """
-    for k, length in enumerate(shape[:-2]):
-        axis = len(shape) - k
-        if str(header.get(f"CTYPE{axis}", "")).strip().upper() == "STOKES":
-            found = along_axis(header, axis, length)
-            if found[plane[k]] == "I" and {"Q", "U"} <= set(found):
-                return [(*plane[:k], found.index(name), *plane[k + 1 :]) for name in ("Q", "U")]
-    return None
+    def along_stokes(self, axis: int) -> list[str]:
+        """Stokes parameter of each plane along the FITS axis STOKES: I, Q and U if no card says
+        anything.
 
+        Raises
+        ------
+        InputError
+            Its cards are no numbers, or not all there; they give no whole numbers, or one for
+            several planes.
+        """
+        length = self.lengths[axis]
+        cure = f"correct CRVAL{axis}, CDELT{axis} and CRPIX{axis}: 1, 1, 1 for I, Q, U"
+        given = [self.number(f"{key}{axis}", cure) for key in ("CRVAL", "CDELT", "CRPIX")]
+        if (given[0] is None) != (given[2] is None):
+            raise self.error(f"of CRVAL{axis} and CRPIX{axis} one is missing", cure)
+        first, step, pixel = (1.0 if value is None else value for value in given)
+        values = [first + (n + 1 - pixel) * step for n in range(length)]
+        if (
+            any(abs(value - round(value)) > 1e-3 for value in values)
+            or len({round(value) for value in values}) < length
+        ):
+            told = ", ".join(f"{value:g}" for value in values[:4])
+            raise self.error(f"the planes of its axis STOKES have the values {told}", cure)
+        return [_NAMES.get(round(value), "a correlation") for value in values]
 
-def not_used(names: Sequence[str]) -> str:
-    """Statement about Stokes parameters that unpolarized detectors do not see."""
-    return (
-        f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} not used: detectors measure total"
-        " intensity"
-    )
+    def q_and_u(self, plane: Index) -> list[Index]:
+        """Indices of the planes of Q and U beside that of I, ``plane``; none without them.
+
+        A plane of Q that is named as if it were I has no others.
+        """
+        for k, axis in enumerate(self.lengths):
+            if self.names[axis] == "STOKES":
+                found = self.along_stokes(axis)
+                if found[plane[k]] == "I" and {"Q", "U"} <= set(found):
+                    return [(*plane[:k], found.index(name), *plane[k + 1 :]) for name in "QU"]
+        return []
 
 
 # --------------------------------------------------------------------------------------------------
 # HEALPix tables
 
 
-@dataclass(frozen=True)
-class HealpixTable:
-    """A FITS table of HEALPix pixels.
+class HealpixTable(FileHeader):
+    """A FITS table of HEALPix pixels."""
 
-    Attributes
-    ----------
-    place
-        The file, as messages call it.
-    """
-
-    hdu: Any
-    place: str
-
-    @property
-    def header(self) -> Any:
-        """The header of the table."""
-        return self.hdu.header
-
-    @property
-    def names(self) -> list[str]:
+    def __init__(self, hdu: Any, place: str) -> None:
+        super().__init__(hdu.header, place)
+        self.hdu = hdu
+        self.names: list[str] = list(hdu.columns.names)
         """The names of the columns."""
-        return list(self.hdu.columns.names)
 
     @property
     def nest(self) -> bool:
         """True for pixels that are numbered in the nested scheme. Raises InputError without one."""
         ordering = str(self.header.get("ORDERING", "")).strip().upper()
         if ordering == "NUNIQ":
-            raise InputError(
+            raise self.error(
                 "multi-order HEALPix maps (ORDERING = NUNIQ) are not read",
-                place=self.place,
-                cure="flatten it to one resolution, e.g. with ligo-skymap-flatten",
+                "flatten it to one resolution, e.g. with ligo-skymap-flatten",
             )
         if not ordering.startswith(("RING", "NEST")):
-            raise InputError(
-                "the ordering of the HEALPix map is missing",
-                place=self.place,
-                cure="set the header key ORDERING to RING or NESTED",
-            )
+            message = "the ordering of the HEALPix map is missing"
+            raise self.error(message, "set the header key ORDERING to RING or NESTED")
         return ordering.startswith("NEST")
 
-    def frame(self, given: str | None, cures: Cures = OPERATORS) -> tuple[Frame, dict[str, str]]:
+    def frame(self, given: str | None) -> tuple[Frame, dict[str, str]]:
         """The frame by COORDSYS, or the ``given`` one; a note about a contradiction."""
-        written = text(self.header, "COORDSYS", self.place).upper()
+        written = self.text("COORDSYS").upper()
         system = written if given is None else given.upper()
         if system not in _FRAMES:
             what = f"unknown: COORDSYS = {system!r}" if system else "missing"
-            raise InputError(
+            raise self.error(
                 f"the coordinate system of the HEALPix map is {what}",
-                place=self.place,
-                cure=cures.coordsys,
+                "set the header key COORDSYS to C, G or E, or give coordsys: icrs, galactic or"
+                " ecliptic (WMAP's and Planck's maps are galactic); zonda compare takes --coordsys"
+                " C (ICRS), G or E",
             )
         found = _FRAMES[system]
         if given is not None and _FRAMES.get(written, found) != found:
@@ -353,98 +363,129 @@ class HealpixTable:
     @property
     def pixel_column(self) -> int | None:
         """The column that numbers the pixels; None: row k is pixel k."""
-        found, scheme = pixel_column(self.names), text(self.header, "INDXSCHM", self.place).upper()
+        found = next((k for k, n in enumerate(self.names) if _PIXEL.fullmatch(n.strip())), None)
+        scheme = self.text("INDXSCHM").upper()
         if scheme not in ("", "IMPLICIT", "EXPLICIT"):
-            raise InputError(
-                f"INDXSCHM = '{scheme}' is not known",
-                place=self.place,
-                cure="set it to IMPLICIT or EXPLICIT",
+            raise self.error(
+                f"INDXSCHM = '{scheme}' is not known", "set it to IMPLICIT or EXPLICIT"
             )
         if found is None and scheme == "EXPLICIT":
-            raise InputError(
+            raise self.error(
                 f"INDXSCHM is EXPLICIT, and no column numbers the pixels: {', '.join(self.names)}",
-                place=self.place,
-                cure="name the column of pixel numbers PIXEL",
+                "name the column of pixel numbers PIXEL",
             )
         return found
 
-    def numbers(self, column: int) -> Floats:
-        """The values (n,) of a column. Raises InputError for text."""
+    def intensity(self, wanted: int | str | None = None) -> int:
+        """The column that is read as I: the one that is ``wanted``, by name or counted from 1; that
+        of a known name, or the only possible one.
+
+        Raises
+        ------
+        InputError
+            There is no such column; none may be I; several may be.
+        """
+        names, pixel, there = self.names, self.pixel_column, ", ".join(self.names)
+        if wanted is not None:
+            name = str(wanted).strip().upper()
+            same = [k for k, n in enumerate(names) if name in (n.strip().upper(), str(k + 1))]
+            if not same or same[0] == pixel:
+                message = f"there is no map in a column {wanted}"
+                raise self.error(message, f"set column to one of: {there}")
+            return same[0]
+        may_be = [
+            k
+            for k, name in enumerate(names)
+            if k != pixel and not polarized_letter(name) and not _OTHER.fullmatch(name.strip())
+        ]
+        if not may_be:
+            raise self.error(
+                f"none of its columns is an intensity: {there}",
+                "write a column I_STOKES, or set the operator's parameter column to the one that is"
+                " the map",
+            )
+        known = [k for k in may_be if _INTENSITY.fullmatch(names[k].strip())]
+        known = known or [
+            k for k in may_be if re.match(r"I[ _-]|STOKES[ _-]?I", names[k].strip(), re.IGNORECASE)
+        ]
+        if not known and len(may_be) > 1:
+            which = ", ".join(names[k] for k in may_be)
+            cure = f"set the operator's parameter column, e.g. to {names[may_be[0]]}"
+            raise self.error(f"several of its columns may be the map: {which}", cure)
+        return (known or may_be)[0]
+
+    def read(
+        self, columns: Mapping[str, int], header_alone: bool = False
+    ) -> tuple[dict[str, Floats], NDArray[np.int64] | None, int]:
+        """Values (n,) of ``columns``, the first of which is I, in the order of their pixels; the
+        pixels' numbers (None: value k is pixel k); nside.
+
+        Pixels that the file marks as not seen are left out of I, and NaN in the others. Raises
+        InputError for columns of text, and where number, resolution and pixels do not agree.
+        """
+        if header_alone:
+            repeat = re.match(r"\s*(\d*)", str(self.hdu.columns.formats[columns["I"]]))
+            n = int(self.header.get("NAXIS2", 0)) * int((repeat and repeat[1]) or 1)
+            return {"I": np.zeros(0)}, None, self._nside(n)
+        values = np.stack([self._numbers(k) for k in columns.values()])
+        nside, n = self._nside(values.shape[1]), values.shape[1]
+        if (pixels := self._pixels(nside, n)) is not None:
+            order = np.argsort(pixels, kind="stable")
+            pixels, values = pixels[order], values[:, order]
+        unseen = marked_bad(values, self)
+        values[1:][unseen[1:]] = np.nan
+        if unseen[0].any():
+            seen = ~unseen[0]
+            pixels = np.flatnonzero(seen) if pixels is None else pixels[seen]
+            values = values[:, seen]
+        return dict(zip(columns, values, strict=True)), pixels, nside
+
+    def _numbers(self, column: int) -> Floats:
         found = np.asarray(self.hdu.data.field(column))
         if found.dtype.kind not in "iuf":
             cure = "give a column of numbers, or set the operator's parameter column to another"
-            raise InputError(
-                f"its column {self.names[column]} holds no numbers", place=self.place, cure=cure
-            )
+            raise self.error(f"its column {self.names[column]} holds no numbers", cure)
         return np.array(found, np.float64).ravel()
 
-    def pixels(self, nside: int, n: int) -> NDArray[np.int64] | None:
-        """The numbers of the pixels of ``n`` values; None: value k is pixel k.
-
-        Raises InputError for numbers that are not whole, out of range or twice there, and for
-        another number of them.
-        """
-        column = self.pixel_column
-        if column is None:
+    def _pixels(self, nside: int, n: int) -> NDArray[np.int64] | None:
+        """The numbers of the pixels of ``n`` values."""
+        if (column := self.pixel_column) is None:
             return None
-        found, name = self.numbers(column), self.names[column]
+        found, name = self._numbers(column), self.names[column]
         if (
             len(found) != n
             or not np.isfinite(found).all()
             or (found != np.round(found)).any()
             or (np.abs(found) > 2**52).any()
         ):
-            raise InputError(
-                f"its column {name} does not number its {n} values",
-                place=self.place,
-                cure=f"check the column {name}",
-            )
+            message = f"its column {name} does not number its {n} values"
+            raise self.error(message, f"check the column {name}")
         pixels = found.astype(np.int64)
-        if len(pixels) and (
-            pixels.min() < 0
-            or pixels.max() >= 12 * nside * nside
-            or len(np.unique(pixels)) < len(pixels)
-        ):
-            raise InputError(
-                "the pixel numbers are out of range or twice there",
-                place=self.place,
-                cure="check NSIDE and the PIXEL column",
-            )
+        if len(np.unique(pixels)) < n or ((pixels < 0) | (pixels >= 12 * nside * nside)).any():
+            message = "the pixel numbers are out of range or twice there"
+            raise self.error(message, "check NSIDE and the PIXEL column")
         return pixels
 
-    def length(self, column: int) -> int:
-        """Number of values of a column by the header."""
-        found = re.match(r"\s*(\d*)", str(self.hdu.columns.formats[column]))
-        return int(self.header.get("NAXIS2", 0)) * (int(found[1] or 1) if found else 1)
-
-    def nside(self, n: int) -> int:
+    def _nside(self, n: int) -> int:
         """The resolution of a table of ``n`` values. Raises InputError if it is none, or NSIDE
         contradicts it.
         """
         import healpy
 
-        stated = number(self.header, "NSIDE", self.place)
+        stated = self.number("NSIDE")
         if self.pixel_column is not None:
             nside = int(stated or 0) if stated == int(stated or 0) else 0
         else:
             nside = round((n / 12) ** 0.5)
             if 12 * nside * nside != n:
-                raise InputError(
-                    f"{n} values are no HEALPix map",
-                    place=self.place,
-                    cure="a full map has 12 nside^2 of them",
-                )
+                message = f"{n} values are no HEALPix map"
+                raise self.error(message, "a full map has 12 nside^2 of them")
             if stated is not None and stated != nside:
-                cure = f"set the header key NSIDE to {nside}, or give all of the map"
-                raise InputError(
+                raise self.error(
                     f"NSIDE = {stated:g}, and {n} values are a map of nside {nside}",
-                    place=self.place,
-                    cure=cure,
+                    f"set the header key NSIDE to {nside}, or give all of the map",
                 )
         if nside < 1 or not healpy.isnsideok(nside, nest=self.nest):
-            raise InputError(
-                f"NSIDE = {self.header.get('NSIDE')} is not valid",
-                place=self.place,
-                cure="set the header key NSIDE",
-            )
+            message = f"NSIDE = {self.header.get('NSIDE')} is not valid"
+            raise self.error(message, "set the header key NSIDE")
         return nside

@@ -13,7 +13,7 @@ from astropy.wcs import WCS
 
 from zonda.core.configuration.target import Target
 from zonda.core.errors import InputError
-from zonda.core.maps.header import text, with_known_frame
+from zonda.core.maps.header import with_known_frame
 from zonda.core.maps.map_reading import is_celestial
 from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
 from zonda.core.numerics.sphere import angle_between, angles, local_axes, unit_vectors
@@ -173,7 +173,7 @@ class ImageHeader(MapHeader):
         header = self.header.copy()
         for axis in "12":
             key = f"CUNIT{axis}"
-            written = text(header, key, self.place)
+            written = self.text(key)
             if written and written.lower() in ANGLES:
                 header[key] = ANGLES[written.lower()].name
             elif written and _celestial(header, axis):

@@ -5,14 +5,14 @@ has, beyond which arithmetic overflows.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from zonda.core.errors import InputError
 from zonda.core.maps.beams import check_width, size_text
-from zonda.core.maps.header import number, text
+from zonda.core.maps.header import FileHeader
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
 from zonda.core.numerics.angles import ARCSEC, angle_text
 from zonda.core.types import Floats
@@ -75,34 +75,14 @@ class Wanted:
     header_alone: bool = False
 
 
-@dataclass
-class MapHeader:
-    """A map's header with what is wanted of it.
-
-    Attributes
-    ----------
-    place
-        The file, as messages call it.
-    notes
-        What is chosen or changed, for the log.
+class MapHeader(FileHeader):
+    """A map's header with what is ``wanted`` of it; ``notes``: what is chosen or changed, for the
+    log.
     """
 
-    header: Any
-    place: str
-    wanted: Wanted
-    notes: dict[str, str] = field(default_factory=dict)
-
-    def error(self, message: str, cure: str) -> InputError:
-        """An error about the file, to be raised."""
-        return InputError(message, place=self.place, cure=cure)
-
-    def text(self, key: str) -> str:
-        """See `core.maps.header.text`."""
-        return text(self.header, key, self.place)
-
-    def number(self, key: str, cure: str = "") -> float | None:
-        """See `core.maps.header.number`."""
-        return number(self.header, key, self.place, cure)
+    def __init__(self, header: Any, place: str, wanted: Wanted, notes: dict[str, str]) -> None:
+        super().__init__(header, place)
+        self.wanted, self.notes = wanted, notes
 
     def refuse(self, message: str, **options: object) -> None:
         """Raise InputError if one of the ``options`` is given, which ``message`` names."""

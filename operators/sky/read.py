@@ -7,24 +7,23 @@ error lists the header keys and the parameters that would mend it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from zonda.core.maps.header import marked_bad, text
+from zonda.core.maps.header import FileHeader
 from zonda.core.maps.map_reading import (
     STOKES,
+    Cube,
     HealpixTable,
     chosen,
     is_healpix,
-    not_used,
-    plane_of_cube,
-    planes_of_q_and_u,
+    polarized_letter,
+    q_and_u,
+    unused,
 )
-from zonda.core.maps.stokes_names import columns_of_q_and_u, intensity_column, is_polarized
 from zonda.core.storage.fits_files import check_size, opened
 from zonda.core.types import Floats
 
@@ -73,12 +72,6 @@ def read_map(source: Path | ArrayMap, **options: Any) -> InputMap:
     return made
 
 
-def _unused(what: str, names: Sequence[str], read: int | None = None) -> dict[str, str]:
-    """The note about Stokes parameters among ``names`` beside the one that is read."""
-    unused = [name for k, name in enumerate(names) if k != read and is_polarized(name)]
-    return {STOKES: f"{what} is read as I; {not_used(unused)}"} if unused else {}
-
-
 def _filled(header: MapHeader, found: InputMap, planes: Floats, factor: float, where: str) -> None:
     """Put ``planes`` (1 or 3, ...) of I, or I, Q and U in COSMO's convention, into a map; in its
     unit they are times ``factor``. ``where`` names a pixel by its indices.
@@ -103,13 +96,13 @@ def _image(hdu: Any, hdus: Any, header: ImageHeader) -> ImageMap:
         raise header.error(message, "give an image of numbers")
     header.refuse("{} is for HEALPix maps", coordsys=wanted.coordsys, column=wanted.column)
     shape = values[0].shape
-    plane, more = plane_of_cube(header.header, shape, wanted.plane, place)
+    cube = Cube(header.header, place, shape)
+    plane, more = cube.plane(wanted.plane)
     notes |= more
-    found = planes_of_q_and_u(header.header, shape, plane) if wanted.polarized else None
     planes = [values[0][plane], *values[1:]]
-    if found is not None:
+    if wanted.polarized and (found := cube.q_and_u(plane)):
         planes = [values[0][k] for k in (plane, *found)]
-    units = [text(image.header, "BUNIT", place) for image in beside]
+    units = [FileHeader(image.header, place).text("BUNIT") for image in beside]
     unit, factor = header.unit("BUNIT", units, "images")
     beam = header.beam(unit)
     wcs, placeless = header.geometry(shape)
@@ -136,16 +129,16 @@ def _beside(first: Any, hdus: Any, header: MapHeader) -> list[Any]:
     """Images of Q and U beside the ``first`` one, if they are wanted and there; a note names them
     otherwise.
     """
-    if is_polarized(first.name):
+    if polarized_letter(first.name):
         raise header.error(
             f"its first image, {first.name}, is no intensity",
             "put the image of I first, or name it by the operator's parameter hdu",
         )
     what = f"the first image{f', {first.name},' if first.name else ''}"
-    header.notes |= _unused(what, [hdu.name for hdu in hdus if hdu.is_image])
+    header.notes |= unused(what, [hdu.name for hdu in hdus if hdu.is_image])
     images = [hdu for hdu in hdus if hdu.is_image and hdu.header.get("NAXIS", 0) == 2]
-    found = columns_of_q_and_u([hdu.name for hdu in images]) if header.wanted.polarized else None
-    beside = [images[k] for k in found or ()]
+    found = q_and_u([hdu.name for hdu in images]) if header.wanted.polarized else []
+    beside = [images[k] for k in found]
     if any(hdu.shape != first.shape for hdu in beside):
         raise header.error(
             "its images of I, Q and U differ in size", "give three images of one grid"
@@ -156,8 +149,8 @@ def _beside(first: Any, hdus: Any, header: MapHeader) -> list[Any]:
 
 
 def _healpix(table: HealpixTable, header: MapHeader) -> HealpixMap:
-    """The map of a table in its column of I (`intensity_column`)."""
-    place, wanted, notes = header.place, header.wanted, header.notes
+    """The map of a table in its column of I (`HealpixTable.intensity`)."""
+    wanted, notes = header.wanted, header.notes
     header.refuse(
         "{} does not apply to a HEALPix map",
         centre=wanted.centred,
@@ -166,33 +159,19 @@ def _healpix(table: HealpixTable, header: MapHeader) -> HealpixMap:
     )
     nest, names = table.nest, table.names
     frame, more = table.frame(wanted.coordsys)
-    first = intensity_column(names, wanted.column, place)
-    notes |= more | _unused(f"column {names[first]}", names, first)
+    first = table.intensity(wanted.column)
+    notes |= more | unused(f"column {names[first]}", names, first)
     if len(names) > 1 + (table.pixel_column is not None) or wanted.column is not None:
         notes["column"] = f"{names[first]} ({first + 1} of {len(names)}: {', '.join(names)})"
-    others = columns_of_q_and_u(names) if wanted.polarized else None
-    if is_polarized(names[first]):
-        others = None
-    columns = [first, *(others or ())]
-    units = [str(header.header.get(f"TUNIT{1 + k}", "") or "").strip() for k in columns[1:]]
+    wanted_too = wanted.polarized and not polarized_letter(names[first])
+    others = q_and_u(names) if wanted_too else []
+    units = [str(header.header.get(f"TUNIT{1 + k}", "") or "").strip() for k in others]
     unit, factor = header.unit(f"TUNIT{1 + first}", units, "columns")
     beam = header.beam(unit)
     sign = header.sign_of_u(False) if others else 1.0
-    if wanted.header_alone:
-        values, pixels, nside = np.zeros((1, 0)), None, table.nside(table.length(first))
-    else:
-        values = np.stack([table.numbers(k) for k in columns])
-        nside = table.nside(values.shape[1])
-        pixels = table.pixels(nside, values.shape[1])
-    if pixels is not None:
-        order = np.argsort(pixels, kind="stable")
-        pixels, values = pixels[order], values[:, order]
-    unseen = marked_bad(values, header.header, place)
-    values[1:][unseen[1:]] = np.nan
-    if unseen[0].any():
-        seen = ~unseen[0]
-        pixels = np.flatnonzero(seen) if pixels is None else pixels[seen]
-        values = values[:, seen]
+    columns = dict(zip("IQU", (first, *others), strict=False))
+    planes, pixels, nside = table.read(columns, wanted.header_alone)
+    values = np.stack(list(planes.values()))
     found = HealpixMap(
         values=values[0],
         unit=unit,

@@ -24,24 +24,21 @@ import numpy as np
 from zonda.core.errors import InputError
 from zonda.core.maps.beams import check_width
 from zonda.core.maps.grid import HealpixPixels
-from zonda.core.maps.header import marked_bad, number, text, with_known_frame
+from zonda.core.maps.header import FileHeader, with_known_frame
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_file import ascii_text
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.map_reading import (
     STOKES,
-    Cures,
+    Cube,
     HealpixTable,
-    axes_of_planes,
     chosen,
     is_healpix,
-    plane_of_cube,
-    planes_of_q_and_u,
+    q_and_u,
 )
 from zonda.core.maps.measured_noise import ELSEWHERE
 from zonda.core.maps.noise_figures import FREE
 from zonda.core.maps.planes import IQU
-from zonda.core.maps.stokes_names import columns_of_q_and_u, intensity_column
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit, scale_of
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA, beam_area
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
@@ -121,13 +118,6 @@ NOISES = {
     "HALF_DIFFERENCE_U": "half U",
 }
 """Of a file's extensions and columns: standard errors, or variances; and noise alone."""
-CURES = Cures(
-    plane="choose its plane ({ranges}): --plane {list}, or plane: {example}",
-    coordsys=(
-        "give it: --coordsys C (ICRS), G (galactic) or E (ecliptic), or coordsys: C; or set the"
-        " header key COORDSYS"
-    ),
-)
 
 
 @dataclass(frozen=True)
@@ -259,7 +249,7 @@ def _read(path: Path, name: str, wanted: Wanted) -> ReadMap:
                 )
                 raise InputError(what, place=place, cure=cure)
         found = _healpix(hdu, wanted, place) if healpix else _images(hdus, hdu, wanted, place)
-        return found.read(name, hdu.header, place)
+        return found.read(name, FileHeader(hdu.header, place))
 
 
 @dataclass(frozen=True)
@@ -274,18 +264,18 @@ class Found:
     notes: list[str] = field(default_factory=list)
     halves: str = "of two halves"
 
-    def read(self, name: str, about: Any, place: str) -> ReadMap:
+    def read(self, name: str, about: FileHeader) -> ReadMap:
         """The planes with what the header ``about`` says of them."""
         image = not isinstance(self.where, HealpixPixels)
         unit, factor = "", 1.0
         if written := str(self.unit or "").strip():
-            scale = text(about, "TEMPSCAL", place) or None
-            unit, factor = parse_unit(written, place=place, temperature_scale=scale)
-        major = number(about, "BMAJ", place) or 0.0
-        minor = number(about, "BMIN", place) or major
+            scale = about.text("TEMPSCAL") or None
+            unit, factor = parse_unit(written, place=about.place, temperature_scale=scale)
+        major = about.number("BMAJ") or 0.0
+        minor = about.number("BMIN") or major
         fwhm = math.radians(math.sqrt(major * minor)) if min(major, minor) > 0 else None
-        hertz = number(about, "RESTFRQ", place) or number(about, "RESTFREQ", place) or 0.0
-        convention = (text(about, "POLCCONV", place) or ("" if image else "COSMO")).upper()
+        hertz = about.number("RESTFRQ") or about.number("RESTFREQ") or 0.0
+        convention = (about.text("POLCCONV") or ("" if image else "COSMO")).upper()
         letters, notes = [key for key in IQU if key in self.values], list(self.notes)
         if "Q" in letters and convention not in ("COSMO", "IAU"):
             unknown = f"{name} has them and no POLCCONV; set that header key to COSMO or IAU"
@@ -318,14 +308,17 @@ class Found:
             shape, sides = planes["I"].values.shape, planes["I"].grid.sides
             cure = "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them"
             check_width(
-                fwhm, max(n * side for n, side in zip(shape, sides, strict=True)), place, cure
+                fwhm,
+                max(n * side for n, side in zip(shape, sides, strict=True)),
+                about.place,
+                cure,
             )
         return ReadMap(
             planes,
             hertz if hertz > 0 else None,
-            text(about, "BAND", place),
+            about.text("BAND"),
             notes,
-            text(about, "ORIGIN", place).lower() == "zonda",
+            about.text("ORIGIN").lower() == "zonda",
             {key: words for key, (_, words) in self.stated.items()},
         )
 
@@ -350,24 +343,25 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
     for axis in range(3, len(shape) + 1):
         if shape[len(shape) - axis] == 1:  # whatever it is of, there is no choice
             header[f"CTYPE{axis}"] = ""
-    plane = wanted.plane if axes_of_planes(header, shape) or not wanted.shared else None
-    index, told = plane_of_cube(header, shape, plane, place, CURES)
-    polarized = planes_of_q_and_u(header, shape, index) or ()
+    cube = Cube(header, place, shape)
+    index, told = cube.plane(wanted.plane if cube.asked or not wanted.shared else None)
+    polarized = cube.q_and_u(index)
     planes = {"I": index, **dict(zip("QU", polarized, strict=False))}
     found = {key: np.asarray(hdu.data[at], np.float64) for key, at in planes.items()}
     stated: dict[str, tuple[float, str]] = {}
     halves, alike = "of two halves", []
     if wanted.hdu is None and STOKES not in told and not polarized:  # extensions beside are of it
         alike = [other for other in hdus if other.is_image and other.shape == shape]
-    letters = columns_of_q_and_u([str(other.name) for other in alike]) or ()
+    letters = q_and_u([str(other.name) for other in alike])
     noises: Any = {k: NOISES.get(str(other.name).upper()) for k, other in enumerate(alike)}
     for k, key in (noises | dict(zip(letters, "QU", strict=False))).items():
         if key is not None:
             values = np.asarray(alike[k].data[index], np.float64).reshape(shape[-2:])
             found[key] = _root(values) if alike[k].name.upper().startswith("COV") else values
         if noises[k] is not None:
-            stated |= _stated(alike[k].header, noises[k], place)
-            halves = text(alike[k].header, "JACKKNIF", place) or halves
+            about = FileHeader(alike[k].header, place)
+            stated |= _stated(about, noises[k])
+            halves = about.text("JACKKNIF") or halves
     both = found.keys() >= {"Q", "U"}
     kept = {k: v for k, v in found.items() if both or k[-1] == "I"}
     told["frame"] = frame
@@ -381,52 +375,45 @@ def _root(variance: Floats) -> Floats:
     return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
 
-def _stated(header: Any, of: str, place: str) -> dict[str, tuple[float, str]]:
+def _stated(header: FileHeader, of: str) -> dict[str, tuple[float, str]]:
     """The factor on white noise that the header of a plane of noise states, and what it was
     measured in.
     """
     if not of.startswith("noise"):
         return {}
-    words = text(header, "NOISEOF", place)
-    factor = 1.0 if words == ELSEWHERE else number(header, "NOISEFAC", place) or 0.0
+    words = header.text("NOISEOF")
+    factor = 1.0 if words == ELSEWHERE else header.number("NOISEFAC") or 0.0
     return {of[-1]: (factor, words or "its file")} if factor > 0 else {}
 
 
 def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
     """Pixels of a HEALPix table with a value, with their noise and what holds noise alone."""
     table, header = HealpixTable(hdu, place), hdu.header
-    stated_there = text(header, "COORDSYS", place)
-    given = (stated_there or wanted.coordsys) if wanted.shared else wanted.coordsys
-    frame, _ = table.frame(given or None, CURES)
+    given = (table.text("COORDSYS") or wanted.coordsys) if wanted.shared else wanted.coordsys
+    frame, _ = table.frame(given or None)
     names = [name.upper() for name in table.names]
-    first = intensity_column(names, None, place)
-    columns = {"I": first, **dict(zip(("Q", "U"), columns_of_q_and_u(names) or (), strict=False))}
+    columns = dict(zip("IQU", (table.intensity(), *q_and_u(names)), strict=False))
     columns |= {
         key: names.index(name)
         for name, key in NOISES.items()
         if name in names and key[-1] in columns
     }
-    planes = {}
-    for key, k in columns.items():
-        values = table.numbers(k)
-        values = np.where(marked_bad(values, header, place), np.nan, values)
-        planes[key] = _root(values) if names[k].startswith("COV") else values
-    n = planes["I"].size
-    nside = table.nside(n)
-    pixels = table.pixels(nside, n)
-    pixels = np.arange(n) if pixels is None else pixels
+    planes, pixels, nside = table.read(columns)
     seen = np.isfinite(planes["I"])
     if not seen.any():
         raise InputError(EMPTY, place=place, cure=NOT_EMPTY)
-    order = np.flatnonzero(seen)[np.argsort(pixels[seen])]
-    where = HealpixPixels(nside, table.nest, pixels[order], frame)
+    pixels = np.flatnonzero(seen) if pixels is None else pixels[seen]
+    where = HealpixPixels(nside, table.nest, pixels, frame)
     stated: dict[str, tuple[float, str]] = {}
     for key in IQU if "Q" in columns else "I":
         cards = {"NOISEFAC": header.get(f"NOISFAC{key}"), "NOISEOF": header.get("NOISEOF")}
-        stated |= _stated(cards, f"noise {key}", place)
-    values_of = {key: v[order] for key, v in planes.items()}
-    halves = text(header, "JACKKNIF", place) or "of two halves"
-    return Found(where, values_of, header.get(f"TUNIT{1 + first}"), stated, halves=halves)
+        stated |= _stated(FileHeader(cards, place), f"noise {key}")
+    values_of = {
+        key: (_root(v) if names[columns[key]].startswith("COV") else v)[seen]
+        for key, v in planes.items()
+    }
+    unit, halves = header.get(f"TUNIT{1 + columns['I']}"), table.text("JACKKNIF")
+    return Found(where, values_of, unit, stated, halves=halves or "of two halves")
 
 
 def plane_of(

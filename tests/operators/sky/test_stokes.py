@@ -6,8 +6,7 @@ import pytest
 from astropy.io import fits
 
 from zonda.core.errors import InputError
-from zonda.core.maps.map_reading import STOKES
-from zonda.core.maps.stokes_names import is_polarized
+from zonda.core.maps.map_reading import STOKES, polarized_letter
 from zonda.operators.sky.read import read_map
 from zonda.operators.sky.skymap import SkyMap
 
@@ -30,7 +29,7 @@ from zonda.operators.sky.skymap import SkyMap
     ],
 )
 def test_names(name, polarized):
-    assert is_polarized(name) is polarized
+    assert bool(polarized_letter(name)) is polarized
 
 
 def healpix_file(path, **options):
