@@ -81,15 +81,11 @@ def welch_of(observation: Observation, seconds: float, most: int) -> Welch | Non
 
     Their length has no prime factor above 5: transforms of others take up to ten times as long.
     """
-    length = quick_length(max(1, min(most, round(seconds * observation.sample_rate))))
+    from scipy.fft import prev_fast_len
+
+    wanted = min(most, round(seconds * observation.sample_rate))
+    length = prev_fast_len(max(1, wanted), real=True)
     return Welch(observation.n_samples, observation.sample_rate, length) if length >= 4 else None
-
-
-def quick_length(n: int) -> int:
-    """Largest number up to ``n`` without a prime factor above 5."""
-    from scipy.fft import next_fast_len
-
-    return next(k for k in range(n, 0, -1) if next_fast_len(k, real=True) == k)
 
 
 @dataclass
