@@ -187,6 +187,8 @@ def small(text):
                 parameters["scan_duration"] = duration
             elif name == "PointingSchedule":
                 parameters["sample_rate"] = "20 Hz"
+            elif "formats" in parameters:
+                parameters["formats"] = ["svg"]
     campaign, sweep = tree.get("campaign"), tree.get("sweep")
     for many in (many for many in (campaign, sweep) if many):
         many |= {"engine": "serial"} | {

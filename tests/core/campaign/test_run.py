@@ -62,10 +62,9 @@ def test_products(undisturbed):
 
 
 def test_processes_give_the_same_bits(undisturbed, bench):
-    for workers in (2, 7):
-        out = bench.run(bench.CAMPAIGN, "--engine", "processes", "--workers", workers)
-        assert bench.planes(out) == bench.planes(undisturbed)
-        assert bench.planes(out, "noise_map.fits") == bench.planes(undisturbed, "noise_map.fits")
+    out = bench.run(bench.CAMPAIGN, "--engine", "processes", "--workers", 3)
+    assert bench.planes(out) == bench.planes(undisturbed)
+    assert bench.planes(out, "noise_map.fits") == bench.planes(undisturbed, "noise_map.fits")
 
 
 def test_any_order_of_completion_gives_the_same_bits(undisturbed, bench, monkeypatch):
