@@ -89,6 +89,14 @@ def _inside(samples: int, dtype: str) -> AnyFloats:
     return (np.arange(samples) / samples).astype(dtype)
 
 
+def _limits(samples: slice, n: int) -> tuple[int, int]:
+    """First and last sample of a block. Raises ValueError where they are not among ``n``."""
+    start, stop = samples.start, samples.stop
+    if not 0 <= start <= stop <= n:
+        raise ValueError(f"samples {start}:{stop} outside 0:{n}")
+    return start, stop
+
+
 class Series(NamedTuple):
     """A field over a block, for kernels that evaluate it where they use it with `series_into`."""
 
@@ -212,9 +220,7 @@ class SmoothField:
         """Arrays with which a kernel evaluates f at the detectors and samples of a block, to the
         same bits as `evaluate`.
         """
-        start, stop = samples.start, samples.stop
-        if not 0 <= start <= stop <= self.n_samples:
-            raise ValueError(f"samples {start}:{stop} outside 0:{self.n_samples}")
+        start, stop = _limits(samples, self.n_samples)
         kind = dtype.str
         if (kept := self._kept.get(kind)) is not None:
             return Series(kept[detectors], 0, _inside(self.step, kind))
@@ -279,13 +285,11 @@ class DetectorField:
 
     def evaluate(self, detectors: slice, samples: slice, out: AnyFloats | None = None) -> AnyFloats:
         """Values at detectors and samples; see `SmoothField.evaluate`."""
-        start, stop = samples.start, samples.stop
-        if not 0 <= start <= stop <= self.n_samples:
-            raise ValueError(f"samples {start}:{stop} outside 0:{self.n_samples}")
+        start, stop = _limits(samples, self.n_samples)
         rows = self.coefficients[detectors]
         if out is None:
             out = np.empty((len(rows), stop - start))
-        _evaluate_rows(rows, _inside(self.step, out.dtype.str), start, out)
+        _evaluate(rows, 0, _inside(self.step, out.dtype.str), start, out)
         return out
 
 
@@ -304,12 +308,6 @@ def _prefilter(values, taps, out):  # type: ignore[no-untyped-def]
                 total[t] += weight * (left[t] + right[t])
         for t in range(n):
             target[t] = total[t]
-
-
-@kernel(error_model="python")
-def _evaluate_rows(coefficients, inside, start, out):  # type: ignore[no-untyped-def]
-    for d in range(out.shape[0]):
-        series_into(coefficients[d], 0, inside, start, out[d])
 
 
 @kernel(error_model="python")

@@ -8,12 +8,10 @@ formed in the order of the detectors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import model_validator
 
 from zonda.core.block import Block
@@ -27,7 +25,6 @@ from zonda.core.kernels import kernel
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.storage.table_files import read_table
-from zonda.core.types import Floats
 
 NEXT = 1.2
 """Detectors up to this many of the smallest distance away are neighbours: six in a hexagon, four in
@@ -70,57 +67,32 @@ class Crosstalk(Operator):
             read_shares(self.file, data.observations[0].focalplane)
         return []
 
-    def prepare(self, observation: Observation) -> Shares:
-        """The shares by detector. Raises InputError for a file that does not suit the focal
+    def prepare(self, observation: Observation) -> Any:
+        """C, a `scipy.sparse.csr_array`. Raises InputError for a file that does not suit the focal
         plane.
         """
-        plane = observation.focalplane
-        found = (
-            neighbours(plane, self.level) if self.file is None else read_shares(self.file, plane)
-        )
-        observation.log.state(
-            self.label, "pairs of detectors with crosstalk", f"{len(found.source)}"
-        )
+        found = self.shares(observation)
+        observation.log.state(self.label, "pairs of detectors with crosstalk", f"{found.nnz}")
         return found
 
-    def exec(self, block: Block, state: Shares) -> None:
+    def shares(self, observation: Observation) -> Any:
+        """See `prepare`."""
+        plane = observation.focalplane
+        return neighbours(plane, self.level) if self.file is None else read_shares(self.file, plane)
+
+    def exec(self, block: Block, state: Any) -> None:
         """Equation (1); the block has all detectors."""
         signal = block.detdata["signal"]
         given = block.buffer("(before)", block.shape)
         given[...] = signal
-        _add_shares(given, state.first, state.source, state.share, signal)
+        _add_shares(given, state.indptr, state.indices, state.data, signal)
 
 
-@dataclass(frozen=True)
-class Shares:
-    """C of equation (1), row by row.
-
-    Attributes
-    ----------
-    first
-        (n_det + 1,) where the entries of each detector begin.
-    source, share
-        (n,) whose signal, and which share of it.
-    """
-
-    first: NDArray[np.int64]
-    source: NDArray[np.int64]
-    share: Floats
-
-    @classmethod
-    def of(
-        cls, n_det: int, detector: NDArray[np.int64], source: NDArray[np.int64], share: Floats
-    ) -> Shares:
-        """From entries in any order."""
-        order = np.lexsort((source, detector))
-        first = np.searchsorted(detector[order], np.arange(n_det + 1))
-        return cls(np.asarray(first, np.int64), source[order], share[order])
-
-
-def neighbours(plane: Focalplane, level: float) -> Shares:
+def neighbours(plane: Focalplane, level: float) -> Any:
     """``level`` for each pair of nearest neighbours of one band; detectors in one place are
     none.
     """
+    from scipy.sparse import csr_array
     from scipy.spatial import cKDTree
 
     at, bands = np.stack([plane.xi, plane.eta], axis=1).round(12), np.asarray(plane.band)
@@ -135,11 +107,13 @@ def neighbours(plane: Focalplane, level: float) -> Shares:
             pairs += [near, near[:, ::-1]]
     found = np.concatenate(pairs)
     found = found[(at[found[:, 0]] != at[found[:, 1]]).any(axis=1)]
-    return Shares.of(len(plane), found[:, 0], found[:, 1], np.full(len(found), level))
+    return csr_array((np.full(len(found), level), found.T), (len(plane), len(plane)))
 
 
-def read_shares(path: Path, plane: Focalplane) -> Shares:
+def read_shares(path: Path, plane: Focalplane) -> Any:
     """C from a table of `COLUMNS`."""
+    from scipy.sparse import csr_array
+
     table = read_table(path)
     number = {name: k for k, name in enumerate(plane.names)}
     index = []
@@ -158,11 +132,12 @@ def read_shares(path: Path, plane: Focalplane) -> Shares:
     )
     share = table.numbers(COLUMNS[2])
     table.check()
-    if len(set(zip(detector.tolist(), source.tolist(), strict=True))) < len(share):
+    found = csr_array((share, (detector, source)), (len(plane), len(plane)))
+    if found.nnz < len(share):
         raise InputError(
             "a pair of detectors is there twice", place=table.place, cure="remove one of the rows"
         )
-    return Shares.of(len(plane), detector, source, share)
+    return found
 
 
 @kernel

@@ -12,11 +12,9 @@ over.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.block import Block
@@ -32,6 +30,9 @@ from zonda.core.types import Floats
 
 REACH = 23
 """Decay times after which a pulse counts no more: e^-23 = 1e-10."""
+
+Pulses = list[tuple[Floats, Floats]]
+"""Of each detector of a scan times (n,) [s since the start], rising, and amplitudes (n,) [K]."""
 
 
 class Glitches(Operator):
@@ -55,46 +56,34 @@ class Glitches(Operator):
     flag_above: Kelvin | None = Field(None, ge=0)
     """Samples above this (K_RJ at the detector) are lost; where absent, none are."""
 
-    def prepare(self, observation: Observation) -> Arrivals:
-        """Draw the pulses of the scan."""
-        found = self.arrivals(observation)
-        inside = int(np.count_nonzero(found.time >= 0))
+    def prepare(self, observation: Observation) -> Pulses:
+        """Draw the pulses of all detectors from `REACH` decay times before the scan to its end."""
+        begin, end = -REACH * self.decay, float(observation.seconds[-1])
+        found = []
+        for d in range(observation.n_detectors):
+            when, u = self._of_detector(observation, d, end - begin)
+            found.append((begin + when, -self.amplitude * np.log(u)))
+        inside = sum(int(np.count_nonzero(times >= 0)) for times, _ in found)
         observation.log.count(self.label, "glitches", inside)
         return found
 
-    def exec(self, block: Block, state: Arrivals) -> None:
+    def exec(self, block: Block, state: Pulses) -> None:
         """Add the pulses of the block's detectors."""
         stream, observation = block.new("glitches"), block.observation
         threshold = math.inf if self.flag_above is None else self.flag_above
         lost = 0
-        for row, d in zip(stream, range(block.detectors.start, block.detectors.stop), strict=True):
-            of = slice(int(state.first[d]), int(state.first[d + 1]))
-            if of.stop > of.start:
+        for row, (times, sizes) in zip(stream, state[block.detectors], strict=True):
+            if times.size:
                 seconds = observation.seconds[block.samples]
-                lost += _add_pulses(
-                    state.time[of], state.amplitude[of], self.decay, seconds, threshold, row
-                )
+                lost += _add_pulses(times, sizes, self.decay, seconds, threshold, row)
         if self.flag_above is not None:
             size = block.shape[0] * block.shape[1]
             observation.log.count(self.label, "samples lost to glitches", lost, size)
 
-    def collect(self, data: Data, observation: Observation, state: Arrivals) -> None:
+    def collect(self, data: Data, observation: Observation, state: Pulses) -> None:
         """State how many detectors had one."""
-        hit = int(np.count_nonzero(np.diff(state.first)))
+        hit = sum(times.size > 0 for times, _ in state)
         observation.log.count(self.label, "detectors with glitches", hit, observation.n_detectors)
-
-    def arrivals(self, observation: Observation) -> Arrivals:
-        """Pulses of all detectors from `REACH` decay times before the scan to its end."""
-        begin, end = -REACH * self.decay, float(observation.seconds[-1])
-        times, sizes, count = [], [], [0]
-        for d in range(observation.n_detectors):
-            when, u = self._of_detector(observation, d, end - begin)
-            times.append(begin + when)
-            sizes.append(-self.amplitude * np.log(u))
-            count.append(len(when))
-        return Arrivals(
-            np.cumsum(count, dtype=np.int64), np.concatenate(times), np.concatenate(sizes)
-        )
 
     def _of_detector(
         self, observation: Observation, detector: int, span: float
@@ -115,23 +104,6 @@ class Glitches(Operator):
                 kept = int(np.searchsorted(when, span))
                 return when[:kept], u[:kept, 1]
             number *= 2
-
-
-@dataclass(frozen=True)
-class Arrivals:
-    """The pulses of a scan, those of a detector together in time order.
-
-    Attributes
-    ----------
-    first
-        (n_det + 1,) where those of each detector begin.
-    time, amplitude
-        (n,) s since the start, K.
-    """
-
-    first: NDArray[np.int64]
-    time: Floats
-    amplitude: Floats
 
 
 @kernel

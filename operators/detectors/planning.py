@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from zonda.core.observation import Observation
 from zonda.core.plan.bounds import Context, Estimate, Traits, calibration, single
 from zonda.core.plan.planning import Planning
 
-from .crosstalk import Crosstalk, Shares, neighbours, read_shares
+from .crosstalk import Crosstalk
 from .gain_drift import GainDrift, grid
 from .glitches import REACH, Glitches
 from .time_constant import TimeConstant
@@ -70,26 +68,21 @@ class CrosstalkPlanning(Planning[Crosstalk]):
 
     def memory(self, observation: Observation) -> int:
         """The pairs."""
-        return 24 * len(self._shares(observation).source)
+        return 24 * int(self.operator.shares(observation).nnz)
 
     def estimate(self, context: Context) -> Estimate:
         """Error of leaving the step out: the signals of others, all alike.
 
         A table may give one detector more than the rest.
         """
-        shares, o = self._shares(context.first), context.first
-        rows = np.repeat(np.arange(o.n_detectors), np.diff(shares.first))
-        largest = float(np.bincount(rows, np.abs(shares.share), o.n_detectors).max(initial=0.0))
+        shares = abs(self.operator.shares(context.first))
+        largest = float(shares.sum(axis=1).max(initial=0.0))
         return single(
             "crosstalk",
             context.of_all(largest),
             "largest sum of a detector's shares x (rms of the stream + mean emission); of the sky,"
             " that sum",
         )
-
-    def _shares(self, observation: Observation) -> Shares:
-        step, plane = self.operator, observation.focalplane
-        return neighbours(plane, step.level) if step.file is None else read_shares(step.file, plane)
 
 
 class GlitchPlanning(Planning[Glitches]):

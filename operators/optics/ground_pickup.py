@@ -14,7 +14,7 @@ has the same dependence on elevation. G_d scatters about 1.
 from __future__ import annotations
 
 import math
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +54,8 @@ class GroundPickup(Operator):
     """Number of the ground: the same for every seed. Where absent the seed draws it, and in a
     campaign every entry has another."""
 
-    def prepare(self, observation: Observation) -> _Pickup:
-        """Equation (1) over the scan."""
+    def prepare(self, observation: Observation) -> tuple[Floats, Floats]:
+        """Gains (n_det,), and equation (1) over the scan (n_samp,) [K_RJ]."""
         seed = observation.seed if self.realization is None else self.realization
         profile = self.rms * horizon(
             np.asarray(observation.azimuth, np.float64),
@@ -73,21 +73,13 @@ class GroundPickup(Operator):
             gains += self.scatter * normals(
                 observation.camera_key(self.label), 0, len(gains)
             ).astype(np.float64)
-        return _Pickup(profile, gains)
+        return gains, profile
 
-    def exec(self, block: Block, state: _Pickup) -> None:
+    def exec(self, block: Block, state: tuple[Floats, Floats]) -> None:
         """Add it to ``ground``."""
         stream = block.new("ground")
-        stream += np.multiply.outer(
-            state.gains[block.detectors], state.profile[block.samples]
-        ).astype(stream.dtype)
-
-
-class _Pickup(NamedTuple):
-    profile: Floats
-    """(n_samp,) K_RJ."""
-    gains: Floats
-    """(n_det,)."""
+        gains, profile = state
+        stream += np.outer(gains[block.detectors], profile[block.samples]).astype(stream.dtype)
 
 
 def horizon(azimuth: Floats, fwhm: float, key: NDArray[np.uint32]) -> Floats:

@@ -27,16 +27,15 @@ def test_it_keeps_the_contract():
 def test_arrivals_are_a_poisson_process(bench):
     """Counts have mean and variance rate T; times are uniform; amplitudes exponential."""
     n, rate = 4000, 0.5
-    found = Glitches(rate=f"{rate} Hz", decay="1 ms").arrivals(bench.observation(n, 2001))
-    number, mean = np.diff(found.first), rate * (20 + 0.023)
+    found = Glitches(rate=f"{rate} Hz", decay="1 ms").prepare(bench.observation(n, 2001))
+    number, mean = np.array([len(times) for times, _ in found]), rate * (20 + 0.023)
+    time, amplitude = (np.concatenate(values) for values in zip(*found, strict=True))
     assert abs(number.mean() - mean) < 4 * np.sqrt(mean / n)
     assert abs(number.var() - mean) < 4 * np.sqrt(
         (mean + 2 * mean**2) / n
     )  # of the variance of Poisson counts
-    assert abs(found.time.mean() - (20 - 0.023) / 2) < 4 * 20 / np.sqrt(12 * len(found.time))
-    assert found.amplitude.mean() == pytest.approx(
-        0.1, rel=4 / np.sqrt(len(found.time))
-    )  # rms = mean
+    assert abs(time.mean() - (20 - 0.023) / 2) < 4 * 20 / np.sqrt(12 * len(time))
+    assert amplitude.mean() == pytest.approx(0.1, rel=4 / np.sqrt(len(time)))  # rms = mean
 
 
 def test_campbells_theorem(bench):
@@ -53,15 +52,13 @@ def test_campbells_theorem(bench):
 
 def test_each_is_an_exponential_from_its_arrival_on(bench):
     observation = bench.observation(30, 3000)
-    found = Glitches(rate="20 mHz", decay="50 ms").arrivals(observation)
+    found = Glitches(rate="20 mHz", decay="50 ms").prepare(observation)
     g, t = stream(bench, 30, 3000, rate="20 mHz", decay="50 ms"), observation.seconds
     for d in range(30):
         expected = np.zeros(3000)
-        for k in range(found.first[d], found.first[d + 1]):
-            late = t - found.time[k]
-            expected += np.where(
-                late >= 0, found.amplitude[k] * np.exp(-np.maximum(late, 0) / 0.05), 0
-            )
+        for time, amplitude in zip(*found[d], strict=True):
+            late = t - time
+            expected += np.where(late >= 0, amplitude * np.exp(-np.maximum(late, 0) / 0.05), 0)
         np.testing.assert_allclose(g[d], expected, rtol=0, atol=1e-9)
     assert g.max() > 0.05
 

@@ -73,7 +73,7 @@ def test_a_realization_is_the_same_for_every_seed(bench):
     other.seed = 99
     for realization, same in ((None, False), (4, True)):
         step = GroundPickup(realization=realization)
-        assert np.array_equal(step.prepare(one).profile, step.prepare(other).profile) == same
+        assert np.array_equal(step.prepare(one)[1], step.prepare(other)[1]) == same
 
 
 def test_a_ground_filter_removes_it():
@@ -134,9 +134,9 @@ def test_the_plan_bounds_it(power):
 
     observation = scenes.scan(3, 2000, elevation=40.0)
     step = GroundPickup(rms="1 mK", power=power)
-    profile = step.prepare(observation).profile
+    profile = step.prepare(observation)[1]
     many = [
-        GroundPickup(rms="1 mK", power=power, realization=k).prepare(observation).profile[0]
+        GroundPickup(rms="1 mK", power=power, realization=k).prepare(observation)[1][0]
         for k in range(400)
     ]
     bound = planning_of(step).traits(observation).rms * 0.3  # at the detector
