@@ -62,7 +62,7 @@ class GroundPlanning(Planning[Any]):
 class HalfWavePlatePlanning(Planning[Any]):
     """Planning of `HalfWavePlate`: memory of its angles, and the error of leaving it out."""
 
-    of = "zonda.operators.optics.half_wave_plate:HalfWavePlate"
+    of = "zonda.operators.optics.polarizers:HalfWavePlate"
     per_sample = 8
     """The angles."""
 
@@ -84,7 +84,7 @@ class HalfWavePlatePlanning(Planning[Any]):
 class LeakagePlanning(Planning[Any]):
     """Exact: it has no coarser form."""
 
-    of = "zonda.operators.optics.leakage:Leakage"
+    of = "zonda.operators.optics.polarizers:Leakage"
 
     def memory(self, observation: Observation) -> int:
         """The plate's angles."""

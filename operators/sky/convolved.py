@@ -21,8 +21,7 @@ from zonda.core.types import AnyFloats, Floats
 
 from .beam import REACH, SIGMA, Convolved, convolve, convolve_evenly, distinct
 from .geometry import moved, placed
-from .grid import Grid, is_resolved, own_pixels, tangent_grid
-from .gridding import Gridding, gridded, interpolated
+from .gridding import Grid, Gridding, gridded, interpolated, is_resolved, own_pixels, tangent_grid
 from .input_map import ImageMap
 from .map_header import DOUBT, check_brightness, odd_pixels
 from .region import Progress, directions_on

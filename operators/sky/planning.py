@@ -27,8 +27,7 @@ from zonda.core.plan.planning import Planning
 from zonda.core.types import Floats
 
 from .convolved import conversion
-from .grid import Grid
-from .gridding import extremes
+from .gridding import Grid, extremes
 from .skymap import SkyMap
 
 CUBIC = 3e-3

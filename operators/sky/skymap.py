@@ -23,7 +23,7 @@ from zonda.core.storage.fits_files import header_of
 from zonda.core.types import AnyFloats, Floats
 
 from .convolved import Beam, Brightness, ConvolvedSky
-from .grid import Grid
+from .gridding import Grid
 from .input_map import HealpixMap
 from .sampling import Rows
 from .sky_input import Cache

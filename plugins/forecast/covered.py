@@ -17,7 +17,7 @@ from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.noise.pink import PinkNoise
 from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.efficiency import Efficiency
-from zonda.operators.optics.half_wave_plate import HalfWavePlate
+from zonda.operators.optics.polarizers import HalfWavePlate
 from zonda.operators.sky.skymap import SkyMap
 
 if TYPE_CHECKING:

@@ -34,7 +34,7 @@ from zonda.operators.maps.grid import TangentGrid, tangent_wcs
 from zonda.operators.noise.pink import PinkNoise, PinkSpectrum, level_of
 from zonda.operators.noise.planning import calibrated as calibrated_level
 from zonda.operators.noise.white import WhiteNoise
-from zonda.operators.optics.half_wave_plate import HalfWavePlate
+from zonda.operators.optics.polarizers import HalfWavePlate
 
 from .covered import BY_SEEDS, Steps, steps_of
 

@@ -33,8 +33,8 @@ def test_the_planning_of_a_run_imports_no_operator_that_it_lacks():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout.split()
     others = (
-        "sky.cmb sky.pysm sky.point_sources atmosphere.screens optics.leakage"
-        " optics.half_wave_plate optics.ground_pickup filters.ground filters.polynomial"
+        "sky.cmb sky.pysm sky.point_sources atmosphere.screens optics.polarizers"
+        " optics.ground_pickup filters.ground filters.polynomial"
         " diagnostics.compare_maps diagnostics.mode_spectrum"
     )
     assert "zonda.operators.sky.skymap" in loaded

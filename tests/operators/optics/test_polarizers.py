@@ -8,8 +8,7 @@ import pytest
 import zonda
 import zonda.testing
 from zonda.operators.maps.bin_map import BinMap
-from zonda.operators.optics.half_wave_plate import HalfWavePlate
-from zonda.operators.optics.leakage import Leakage
+from zonda.operators.optics.polarizers import HalfWavePlate, Leakage
 from zonda.operators.sky.skymap import SkyMap
 from zonda.plugins.checks.scenes import run, scan
 
