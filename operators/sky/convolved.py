@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -14,7 +13,6 @@ from zonda.core.configuration.target import Target
 from zonda.core.data import Block
 from zonda.core.maps.header import exact_header
 from zonda.core.maps.image import Image
-from zonda.core.numerics.projection import pixel_matrix
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.types import AnyFloats, Floats
@@ -24,7 +22,7 @@ from .geometry import moved, placed
 from .gridding import Grid, Gridding, gridded, interpolated, is_resolved, own_pixels, tangent_grid
 from .input_map import ImageMap
 from .map_header import DOUBT, check_brightness, odd_pixels
-from .region import Progress, directions_on
+from .region import directions_on
 from .sampling import Chunks, Rows, pointing, sample
 from .sky_input import SkyInput
 
@@ -102,136 +100,38 @@ class Brightness:
 
     Attributes
     ----------
-    key
-        Of the grid.
-    values
-        (ny, nx).
+    planes
+        (1 or 3, ny, nx) I, or I, Q and U from the meridians through `Grid.axis`; Q and U are 0
+        where nothing is known.
     covered
         (ny, nx), or (0, 0): everywhere.
     notes, counts
         What was chosen, and what was taken for something else, for the log.
-    polarization
-        (2, ny, nx) Q and U from the meridians through `Grid.axis`; 0 where nothing is known. None:
-        there are none.
     resolution
         FWHM [rad] of the Gaussians with which pixels were gridded; 0: they were not.
     """
 
-    key: tuple[Hashable, ...]
-    values: Floats
+    planes: Floats
     covered: NDArray[np.bool_]
-    wcs: Any
     notes: dict[str, str]
     counts: dict[str, int]
-    polarization: Floats | None = None
     resolution: float = 0.0
 
     @property
     def nbytes(self) -> int:
-        return (
-            self.values.nbytes
-            + self.covered.nbytes
-            + (0 if self.polarization is None else self.polarization.nbytes)
-        )
+        return self.planes.nbytes + self.covered.nbytes
 
-    def image(self, label: str, axis: Floats) -> Image:
-        """For pictures and comparisons; NaN where nothing is known. ``label``: the operator's;
-        ``axis``: the grid's.
-        """
-        header = exact_header(self.wcs)
+    def image(self, label: str, grid: Grid) -> Image:
+        """For pictures and comparisons; NaN where nothing is known. ``label``: the operator's."""
+        header = exact_header(grid.wcs)
         header["BUNIT"], header["TEMPSCAL"], header["OPERATOR"] = "K", "K_RJ", label
         if self.resolution:
             header["BMAJ"] = header["BMIN"] = float(np.degrees(self.resolution))
-        values = np.where(self.covered, self.values, np.nan) if self.covered.size else self.values
-        return Image(values, header, "K_RJ", self.polarization, axis)
-
-
-def on_own_pixels(grid: Grid, found: Conversion, scale: float, place: str) -> Brightness:
-    """The values of a TAN image times ``scale``. Raises InputError where it is brighter than
-    anything.
-    """
-    source, polarization = grid.source, None
-    values = source.values * found.factor * scale
-    check_brightness(values, place)
-    if source.polarization is not None and grid.pole is not None:
-        y, x = np.indices(grid.shape, np.float64)
-        turn = between_meridians(directions_on(grid.matrix, x, y), grid.pole, grid.axis)
-        polarization = turned_by(source.polarization * (found.factor * scale), turn)
-        check_brightness(polarization, place)
-    sides = np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0) * 3600
-    what = (
-        f"TAN, {grid.shape[1]} x {grid.shape[0]} pixels of {sides[0]:.6g} x {sides[1]:.6g} arcsec"
-    )
-    notes = {**source.notes, "input map": what, "conversion": found.text}
-    everywhere, counts = np.zeros((0, 0), bool), {ZEROED: source.zeroed}
-    return Brightness(grid.key, values, everywhere, grid.wcs, notes, counts, polarization)
-
-
-def resampled(
-    grid: Grid,
-    found: Conversion,
-    scale: float,
-    outside: float,
-    place: str,
-    progress: Progress,
-    gridding: Gridding | None,
-) -> Brightness:
-    """A map on a TAN grid, gridded or interpolated; ``outside`` where it has no data. Raises as
-    `on_own_pixels`.
-    """
-    assert isinstance(found.factor, float)  # of own pixels alone there is one for each
-    source, factor, resolution = grid.source, found.factor * scale, 0.0
-    ends = np.array([np.min(source.values, initial=0.0), np.max(source.values, initial=0.0)])
-    check_brightness(ends * (found.typical * scale), place)
-    counts, axis = {ZEROED: source.zeroed}, None if source.polarization is None else grid.axis
-    counts[LOST] = source.lost
-    where = (
-        f"TAN grid of {grid.shape[1]} x {grid.shape[0]} pixels of"
-        f" {np.degrees(grid.step) * 3600:.6g} arcsec about the observation"
-    )
-    if grid.tiles is not None:
-        where += f", of which {grid.points / np.prod(grid.shape):.0%} is reached"
-    if gridding is not None:
-        how, resolution = "its pixels spread, by their own solid angles, over", gridding.resolution
-        values, covered = gridded(
-            source,
-            grid.wcs,
-            gridding,
-            factor,
-            per_area=found.per_area,
-            outside=outside,
-            tiles=grid.tiles,
-            progress=progress,
-            axis=axis,
-        )
-        values[0] += outside
-    else:
-        how = "interpolated (third order) onto"
-        where += "; its error falls with the third power of the input's pixel size"
-        values, covered, counts[POOR] = interpolated(
-            source, grid.wcs, grid.tiles, progress, found.per_area, axis
-        )
-        values *= factor
-        values[0, ~covered] = outside
-    progress(0, 0)
-    what = f"{source.kind}, {how} a {where}"
-    notes = {**source.notes, "input map": what, "conversion": found.text}
-    mask = np.zeros((0, 0), bool) if covered.all() else covered
-    q_and_u = None if axis is None else values[1:]
-    return Brightness(grid.key, values[0], mask, grid.wcs, notes, counts, q_and_u, resolution)
-
-
-def too_bright(peak: float, conversion: str) -> str:
-    """The warning about a sky whose brightness in the beam is up to ``peak`` [K_RJ]; empty where
-    that is plausible.
-    """
-    if peak <= BRIGHT:
-        return ""
-    return (
-        f"in the beam the sky is as bright as {peak:.3g} K_RJ, and the Sun has 6000 K; is the map's"
-        f" unit right ({conversion}), or are its pixels counts? `unit` replaces the header's,"
-        " `scale` multiplies the map"
-    )
+        values = self.planes[0]
+        if self.covered.size:
+            values = np.where(self.covered, values, np.nan)
+        polarization = self.planes[1:] if len(self.planes) > 1 else None
+        return Image(values, header, "K_RJ", polarization, grid.axis)
 
 
 @dataclass(frozen=True)
@@ -254,12 +154,6 @@ class Beam:
     planes: tuple[Convolved, ...]
     matrix: Floats
     covered: NDArray[np.uint8]
-
-    @classmethod
-    def of(cls, sky: Brightness, fwhm: float, planes: tuple[Convolved, ...]) -> Beam:
-        """``planes``: those of ``sky`` with the beam of ``fwhm`` [rad]."""
-        first = planes[0]
-        return cls(fwhm, planes, first.to_grid @ pixel_matrix(sky.wcs), first.covered(sky.covered))
 
     @property
     def nbytes(self) -> int:
@@ -349,13 +243,73 @@ class ConvolvedSky(SkyInput):
         def make() -> Brightness:
             found = conversion(grid, band, self.spectral_index)
             if not grid.resampled:
-                return on_own_pixels(grid, found, self.scale, self.place)
-            progress = self._progress(
-                f"{'interpolating' if gridding is None else 'spreading'} {self.source}"
-            )
-            return resampled(grid, found, self.scale, self.outside, self.place, progress, gridding)
+                return self._on_own_pixels(grid, found)
+            return self._resampled(grid, found, gridding)
 
         return cast(Brightness, self._cache.get((*grid.key, gridding), make))
+
+    def _on_own_pixels(self, grid: Grid, found: Conversion) -> Brightness:
+        """The values of a TAN image times `scale`. Raises InputError where it is brighter than
+        anything.
+        """
+        source = grid.source
+        planes = [source.values * found.factor * self.scale]
+        if source.polarization is not None and grid.pole is not None:
+            y, x = np.indices(grid.shape, np.float64)
+            turn = between_meridians(directions_on(grid.matrix, x, y), grid.pole, grid.axis)
+            planes += list(turned_by(source.polarization * (found.factor * self.scale), turn))
+        made = np.array(planes)
+        check_brightness(made, self.place)
+        sides = np.linalg.norm(np.asarray(grid.wcs.pixel_scale_matrix), axis=0) * 3600
+        what = f"TAN, {grid.size} pixels of {sides[0]:.6g} x {sides[1]:.6g} arcsec"
+        notes = {**source.notes, "input map": what, "conversion": found.text}
+        return Brightness(made, np.zeros((0, 0), bool), notes, {ZEROED: source.zeroed})
+
+    def _resampled(self, grid: Grid, found: Conversion, gridding: Gridding | None) -> Brightness:
+        """The map on a TAN grid, gridded or interpolated; `outside` where it has no data. Raises as
+        `_on_own_pixels`.
+        """
+        assert isinstance(found.factor, float)  # of own pixels alone there is one for each
+        source, factor = grid.source, found.factor * self.scale
+        ends = np.array([np.min(source.values, initial=0.0), np.max(source.values, initial=0.0)])
+        check_brightness(ends * (found.typical * self.scale), self.place)
+        axis = None if source.polarization is None else grid.axis
+        counts, resolution = {ZEROED: source.zeroed, LOST: source.lost}, 0.0
+        side = np.degrees(grid.step) * 3600
+        where = f"TAN grid of {grid.size} pixels of {side:.6g} arcsec about the observation"
+        if grid.tiles is not None:
+            where += f", of which {grid.points / np.prod(grid.shape):.0%} is reached"
+        progress = self._progress(
+            f"{'interpolating' if gridding is None else 'spreading'} {self.source}"
+        )
+        if gridding is not None:
+            how = "its pixels spread, by their own solid angles, over"
+            resolution = gridding.resolution
+            planes, covered = gridded(
+                source,
+                grid.wcs,
+                gridding,
+                factor,
+                per_area=found.per_area,
+                outside=self.outside,
+                tiles=grid.tiles,
+                progress=progress,
+                axis=axis,
+            )
+            planes[0] += self.outside
+        else:
+            how = "interpolated (third order) onto"
+            where += "; its error falls with the third power of the input's pixel size"
+            planes, covered, counts[POOR] = interpolated(
+                source, grid.wcs, grid.tiles, progress, found.per_area, axis
+            )
+            planes *= factor
+            planes[0, ~covered] = self.outside
+        progress(0, 0)
+        what = f"{source.kind}, {how} a {where}"
+        notes = {**source.notes, "input map": what, "conversion": found.text}
+        mask = np.zeros((0, 0), bool) if covered.all() else covered
+        return Brightness(planes, mask, notes, counts, resolution)
 
     def with_beam(self, grid: Grid, band: Band, fwhm: float) -> Beam:
         """The map convolved with one beam.
@@ -376,17 +330,20 @@ class ConvolvedSky(SkyInput):
                     return convolve_evenly(
                         values, grid.step, evenly.variance(fwhm), outside, linear
                     )
-                jacobian = np.radians(np.asarray(sky.wcs.pixel_scale_matrix, np.float64))
+                jacobian = np.radians(np.asarray(grid.wcs.pixel_scale_matrix, np.float64))
                 return convolve(values, jacobian, fwhm, outside, self.pixels_per_fwhm, linear)
 
-            intensity = convolved(sky.values, self.outside)
-            if text := too_bright(
-                float(np.abs(intensity.coefficients["float64"]).max(initial=0.0)),
-                sky.notes["conversion"],
-            ):
-                self.warn(text)
-            more = () if sky.polarization is None else sky.polarization
-            return Beam.of(sky, fwhm, (intensity, *(convolved(plane, 0.0) for plane in more)))
+            intensity = convolved(sky.planes[0], self.outside)
+            peak = float(np.abs(intensity.coefficients["float64"]).max(initial=0.0))
+            if peak > BRIGHT:
+                self.warn(
+                    f"in the beam the sky is as bright as {peak:.3g} K_RJ, and the Sun has 6000 K;"
+                    f" is the map's unit right ({sky.notes['conversion']}), or are its pixels"
+                    " counts? `unit` replaces the header's, `scale` multiplies the map"
+                )
+            planes = intensity, *(convolved(plane, 0.0) for plane in sky.planes[1:])
+            covered = intensity.covered(sky.covered)
+            return Beam(fwhm, planes, intensity.to_grid @ grid.matrix, covered)
 
         return cast(
             Beam,

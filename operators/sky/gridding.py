@@ -311,6 +311,11 @@ class Grid:
         ny, nx = self.shape
         return (8 if self.pole is None else 24) * ny * nx + (ny * nx if self.resampled else 0)
 
+    @property
+    def size(self) -> str:
+        """``64 x 48``, columns and rows."""
+        return f"{self.shape[1]} x {self.shape[0]}"
+
     @cached_property
     def matrix(self) -> Floats:
         """(3, 3) from ICRS directions to points, see `pixel_matrix`; its last row is the tangent

@@ -82,7 +82,7 @@ class SkyPlanning(Planning[SkyMap]):
         if not grid.reached(observation, self._widest(observation)):
             return Traits(peak=abs(sky.outside))
         if not grid.resampled:
-            values = sky.brightness_on(grid, band).values
+            values = sky.brightness_on(grid, band).planes[0]
             return Traits(peak=float(np.nanmax(np.abs(values - sky.outside), initial=0.0)))
         found = conversion(grid, band, sky.spectral_index)
         factor = sky.scale * float(np.asarray(found.factor).max())

@@ -164,7 +164,7 @@ class SkyMap(ConvolvedSky):
             return state
         band = observation.instrument.band
         state.beams = [self.with_beam(grid, band, float(fwhm)) for fwhm in widths]
-        if sky.polarization is not None:
+        if len(sky.planes) > 1:
             state.angles = PolarizationAngles.of(observation, observation.sky_boresight, grid.axis)
         state.tell(observation.log, self.label)
         return state
@@ -179,7 +179,7 @@ class SkyMap(ConvolvedSky):
     def collect(self, data: Data, observation: Observation, state: ScanSampler) -> None:
         self._count(observation, state)
         if self.label not in data.partial:
-            image = state.sky.image(self.label, state.grid.axis)
+            image = state.sky.image(self.label, state.grid)
             data.add(self.label, InputImage(image))
             if not data.laid_out:  # pictures of it may be begun
                 _show(self.label, data, image)

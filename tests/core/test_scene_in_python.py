@@ -112,17 +112,18 @@ def test_a_loop_over_seeds_reads_convolves_and_compiles_once(tmp_path, monkeypat
         cards | {"CDELT1": -2 / 3600, "CDELT2": 2 / 3600, "BUNIT": "K", "TEMPSCAL": "K_RJ"}
     )
     fits.PrimaryHDU(np.random.default_rng(3).normal(0, 1e-3, (64, 64)), header).writeto(path)
-    calls = {"read_map": 0, "convolve": 0, "on_own_pixels": 0}
+    calls = {"read_map": 0, "convolve": 0, "_on_own_pixels": 0}
 
     def counted(name):
-        module = sky_input if name == "read_map" else convolved
-        original = getattr(module, name)
+        owners = {"read_map": sky_input, "_on_own_pixels": convolved.ConvolvedSky}
+        owner = owners.get(name, convolved)
+        original = getattr(owner, name)
 
         def call(*args, **kwargs):
             calls[name] += 1
             return original(*args, **kwargs)
 
-        monkeypatch.setattr(module, name, call)
+        monkeypatch.setattr(owner, name, call)
 
     for name in calls:
         counted(name)
@@ -149,7 +150,7 @@ def test_a_loop_over_seeds_reads_convolves_and_compiles_once(tmp_path, monkeypat
         scene(camera(19)),
     )
     maps = [pipeline.run(where.replace(seed=0), threads=1)["map"].signal]
-    assert calls == {"read_map": 1, "convolve": 1, "on_own_pixels": 1}
+    assert calls == {"read_map": 1, "convolve": 1, "_on_own_pixels": 1}
     event.register("numba:compile", compiled)
     listening.append(True)
     try:
@@ -159,7 +160,7 @@ def test_a_loop_over_seeds_reads_convolves_and_compiles_once(tmp_path, monkeypat
     finally:
         listening.clear()
         event.unregister("numba:compile", compiled)
-    assert calls == {"read_map": 1, "convolve": 1, "on_own_pixels": 1}
+    assert calls == {"read_map": 1, "convolve": 1, "_on_own_pixels": 1}
     assert compiled.buffer == []
     assert [
         name for name in opened if "iers" not in name.lower()

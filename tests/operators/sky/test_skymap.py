@@ -556,7 +556,7 @@ def test_of_several_input_images_the_first_stays(made, save):
     )
     scan = made.observation(np.full(30, np.radians(75)), np.radians(20))
     states = [o.prepare(scan) for o in (first, second)]
-    one, other = (InputImage(state.sky.image("SkyMap", state.grid.axis)) for state in states)
+    one, other = (InputImage(state.sky.image("SkyMap", state.grid)) for state in states)
     one += other
     back = InputImage.of(one.arrays()).image
     np.testing.assert_array_equal(back.values, np.ones((20, 20)))
