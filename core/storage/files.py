@@ -9,6 +9,7 @@ import errno
 import os
 import re
 import secrets
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -194,6 +195,32 @@ def put(path: Path, content: bytes) -> None:
     except BaseException:
         discard(temporary)
         raise
+
+
+def open_own(path: str | os.PathLike[str], flags: int, mode: int = 0o644) -> int:
+    """Descriptor of a file that zonda alone names, in a folder that others may write to: it follows
+    no link and waits for no pipe.
+
+    Raises
+    ------
+    OutputError
+        It is a link, a pipe, a device or a folder.
+    OSError
+        As `os.open`.
+    """
+    try:
+        opened = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, mode)
+        if stat.S_ISREG(os.fstat(opened).st_mode):
+            return opened
+        os.close(opened)
+    except OSError as error:
+        if error.errno not in (errno.ELOOP, errno.EMLINK, errno.ENXIO, errno.EISDIR):
+            raise
+    raise OutputError(
+        "is no regular file (a link, a pipe, a device or a folder)",
+        place=str(path),
+        cure="remove it, if you know who made it, or choose another output folder",
+    )
 
 
 def discard(temporary: Path) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from ..errors import OutputError
-from .files import writing
+from .files import open_own, writing
 
 NAME = ".zonda-lock"
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
@@ -52,8 +52,12 @@ def lock(folder: str | os.PathLike[str], part: str = "") -> Iterator[None]:
 def _held(path: Path) -> Iterator[None]:
     """Hold one lock file, which is removed behind the body."""
     holder = ""
-    with contextlib.suppress(OSError):  # before it is opened, which may empty it
-        holder = path.read_text().strip()
+    if os.path.lexists(path):  # read before it is locked, which may empty it
+        with (
+            contextlib.suppress(OSError),
+            open(open_own(path, os.O_RDONLY), errors="replace") as file,
+        ):
+            holder = file.read(200).strip()
     with writing(path):
         taken = _take(path)
         while taken is not None and (again := _take(path)) is not None:
@@ -67,8 +71,8 @@ def _held(path: Path) -> Iterator[None]:
             cure="wait for it or choose another output folder",
         )
     try:
-        with writing(path):
-            path.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+        with writing(path), open(open_own(path, os.O_WRONLY | os.O_TRUNC), "w") as file:
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         yield
     finally:
         with contextlib.suppress(OSError):

@@ -100,3 +100,24 @@ def test_a_file_system_without_locks_is_refused(tmp_path, monkeypatch, number):
         pass
     assert "local disk" in caught.value.cure
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling", "pipe", "folder"])
+def test_nothing_but_a_regular_file_is_opened(tmp_path, kind):
+    """A link in a folder that others may write to would empty the file that it names; a pipe would
+    be waited for.
+    """
+    place, other = tmp_path / NAME, tmp_path / "other.txt"
+    other.write_text("somebody's")
+    if kind == "pipe":
+        os.mkfifo(place)
+    elif kind == "folder":
+        place.mkdir()
+    else:
+        place.symlink_to(other if kind == "link" else tmp_path / "absent")
+    with pytest.raises(OutputError) as told, lock(tmp_path):
+        pass
+    assert told.value.place == str(place)
+    assert "remove it" in told.value.cure
+    assert other.read_text() == "somebody's"
+    assert not (tmp_path / "absent").exists()
