@@ -254,9 +254,9 @@ class ConvolvedSky(SkyInput):
         """
         source = grid.source
         planes = [source.values * found.factor * self.scale]
-        if source.polarization is not None and grid.pole is not None:
+        if source.polarization is not None:
             y, x = np.indices(grid.shape, np.float64)
-            turn = between_meridians(directions_on(grid.matrix, x, y), grid.pole, grid.axis)
+            turn = between_meridians(directions_on(grid.matrix, x, y), source.turn[2], grid.axis)
             planes += list(turned_by(source.polarization * (found.factor * self.scale), turn))
         made = np.array(planes)
         check_brightness(made, self.place)
@@ -278,7 +278,7 @@ class ConvolvedSky(SkyInput):
         side = np.degrees(grid.step) * 3600
         where = f"TAN grid of {grid.size} pixels of {side:.6g} arcsec about the observation"
         if grid.tiles is not None:
-            where += f", of which {grid.points / np.prod(grid.shape):.0%} is reached"
+            where += f", of which {grid.tiles.mean():.0%} is reached"
         progress = self._progress(
             f"{'interpolating' if gridding is None else 'spreading'} {self.source}"
         )

@@ -282,11 +282,6 @@ class Grid:
         TAN, two-dimensional.
     shape
         (ny, nx).
-    points
-        How many are filled.
-    pole
-        ICRS direction (3,) of the pole of the meridians from which the input's Q and U are counted;
-        None: it has none.
     resampled
         False: on the pixels of the file.
     tiles
@@ -299,8 +294,6 @@ class Grid:
     source: InputMap
     wcs: Any
     shape: tuple[int, int]
-    points: int
-    pole: Floats | None
     resampled: bool = False
     tiles: NDArray[np.bool_] | None = None
     gridding: Gridding | None = None
@@ -309,7 +302,8 @@ class Grid:
     def nbytes(self) -> int:
         """Bytes of the map there, and of what is kept of the file where that is another."""
         ny, nx = self.shape
-        return (8 if self.pole is None else 24) * ny * nx + (ny * nx if self.resampled else 0)
+        each = 8 if self.source.polarization is None else 24
+        return (each + self.resampled) * ny * nx
 
     @property
     def size(self) -> str:
@@ -391,9 +385,7 @@ def _angles(observation: Observation, direction: Floats) -> tuple[float, float]:
 
 def own_pixels(source: ImageMap, wcs: Any, key: tuple[Hashable, ...]) -> Grid:
     """The grid of a TAN image, whose pixels are at ``wcs``."""
-    pole = None if source.polarization is None else source.turn[2]
-    made = *key, "image", tuple(wcs.wcs.crval)
-    return Grid(made, source, wcs, source.shape, source.values.size, pole)
+    return Grid((*key, "image", tuple(wcs.wcs.crval)), source, wcs, source.shape)
 
 
 def tangent_grid(
@@ -423,9 +415,8 @@ def tangent_grid(
     ra, dec = observation.centre
     wcs = tangent_grid_wcs(ra, dec, found.box, step)
     tiles = None if found.tiles is None else found.tiles.tobytes()
-    pole = None if source.polarization is None else source.turn[2]
     made = *key, "grid", ra, dec, step, gridding, found.box, tiles
-    return Grid(made, source, wcs, found.shape, found.points, pole, True, found.tiles, gridding)
+    return Grid(made, source, wcs, found.shape, True, found.tiles, gridding)
 
 
 def is_resolved(source: InputMap, fwhm: float) -> bool:

@@ -70,7 +70,7 @@ class SkyPlanning(Planning[SkyMap]):
         """
         widths, _ = self.operator.beam_widths(observation)
         grid = self.operator.grid_of(observation)
-        angles = 0 if grid.pole is None else 40 * observation.n_samples
+        angles = 0 if grid.source.polarization is None else 40 * observation.n_samples
         each = 2 if grid.gridding is None or grid.is_flat else 3  # pixels are spread for each beam
         source = grid.source.nbytes if grid.resampled else 0
         return (5 + each * len(widths)) * grid.nbytes + source + angles

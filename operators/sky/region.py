@@ -73,12 +73,6 @@ class Region:
         x0, x1, y0, y1 = self.box
         return y1 - y0, x1 - x0
 
-    @property
-    def points(self) -> int:
-        """Number of points that are worked on."""
-        ny, nx = self.shape
-        return ny * nx if self.tiles is None else int(self.tiles.sum()) * TILE**2
-
 
 def region(
     observation: Observation, step: float, reach: float, disc: Disc | None, place: str

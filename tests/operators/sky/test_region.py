@@ -43,7 +43,7 @@ def test_every_sample_and_its_beam_is_in_a_tile(made):
     step, reach = 0.5 * ARCMIN, 6 * ARCMIN
     found = region(scan, step, reach, None, "here")
     assert found.tiles is not None
-    assert found.points < 0.5 * found.shape[0] * found.shape[1]
+    assert found.tiles.mean() < 0.5
     from zonda.core.numerics.projection import directions, pixel_matrix
 
     p = (
@@ -75,7 +75,6 @@ def test_a_map_that_no_sample_comes_near(made):
     far = Disc(-direction(*CENTRE), 0.1)
     found = region(strip(made), ARCMIN, 0.0, far, "here")
     assert not found.tiles.any()
-    assert found.points == 0
 
 
 @pytest.mark.parametrize("kind", ["healpix", "CAR"])
