@@ -22,8 +22,7 @@ as in TOAST (`StokesWeights`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +39,7 @@ AT_ONCE = 512
 """Samples whose angles are in the first cache together."""
 
 
-@dataclass(frozen=True)
-class PolarizationAngles:
+class PolarizationAngles(NamedTuple):
     """Equations (2) and (3) for an observation and meridians through one pole.
 
     Attributes
@@ -79,7 +77,7 @@ class PolarizationAngles:
 
     @property
     def nbytes(self) -> int:
-        return self.poles.nbytes + self.axes.nbytes + self.plate.nbytes + self.gamma.nbytes
+        return sum(part.nbytes for part in self)
 
     def fill(self, detectors: NDArray[np.intp], start: int, cosine: Floats, sine: Floats) -> None:
         """cos 2 psi and sin 2 psi of ``detectors`` (numbers, n) from sample ``start`` on, into
@@ -88,7 +86,7 @@ class PolarizationAngles:
         At the pole itself, where psi is not defined, 1 and 0. The bits depend on detector and
         sample alone.
         """
-        _fill(self.poles, self.axes, self.plate, self.gamma, detectors, start, cosine, sine)
+        _fill(*self, detectors, start, cosine, sine)
 
     def add(
         self,
@@ -103,8 +101,7 @@ class PolarizationAngles:
 
         ``efficiency`` (n,) p and ``q_and_u``, both (n, m), of ``detectors``; the rest as of `fill`.
         """
-        angles = self.poles, self.axes, self.plate, self.gamma, detectors, start
-        _add(*angles, efficiency, *q_and_u, rows, out)
+        _add(*self, detectors, start, efficiency, *q_and_u, rows, out)
 
 
 def seen_from(quaternions: Floats, direction: Floats) -> Floats:

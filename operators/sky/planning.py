@@ -24,7 +24,6 @@ from zonda.core.plan.bounds import (
     single,
 )
 from zonda.core.plan.planning import Planning
-from zonda.core.types import Floats
 
 from .convolved import conversion
 from .gridding import Grid, extremes
@@ -170,17 +169,15 @@ class SourcesPlanning(Planning[Any]):
 
     def traits(self, observation: Observation) -> Traits:
         """Brightness of the brightest source in the smallest beam."""
-        power, _ = self._seen(observation)
+        found = self._seen(observation)
         area = math.pi * float(observation.focalplane.fwhm.min()) ** 2 / (4 * math.log(2))
-        return Traits(peak=float(np.abs(power).max(initial=0.0)) / area)
+        return Traits(peak=float(np.abs(found.power[found.in_view]).max(initial=0.0)) / area)
 
     def memory(self, observation: Observation) -> int:
         """The catalogue, and lists of what is in view."""
-        from .point_sources import Catalogue
-
-        _, entries = self._seen(observation)
-        sources = len(Catalogue.read(self.operator).flux)
-        return 8 * entries + 200 * observation.n_detectors + 100 * sources
+        found = self._seen(observation)
+        lists, sources = 8 * len(found.number), 100 * len(found.power)
+        return lists + 200 * observation.n_detectors + sources
 
     def estimate(self, context: Context) -> Estimate:
         """Error of leaving the step out: the brightest source."""
@@ -188,14 +185,10 @@ class SourcesPlanning(Planning[Any]):
         size = brightness(self.traits(context.first))
         return Estimate((exact("point sources", size, text, what), one_beam(context)))
 
-    def _seen(self, observation: Observation) -> tuple[Floats, int]:
-        """Power of the sources that come into view, K_RJ sr; and how long the lists of them are."""
-        from .point_sources import Catalogue, Sources
+    def _seen(self, observation: Observation) -> Any:
+        from .point_sources import Sources
 
-        catalogue = Catalogue.read(self.operator)
-        power = catalogue.brightness(observation.instrument.band, self.operator.scale)
-        found = Sources.of(catalogue, power, observation)
-        return power[np.unique(found.number)], len(found.number)
+        return Sources.of(self.operator, observation)
 
 
 class CMBPlanning(Planning[Any]):

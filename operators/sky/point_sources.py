@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,34 +90,17 @@ class PointSources(Operator):
 
     def prepare(self, observation: Observation) -> Sources:
         """The sources with their brightness, and which of them are in view when."""
-        catalogue = Catalogue.read(self)
-        found = Sources.of(
-            catalogue, catalogue.brightness(observation.instrument.band, self.scale), observation
-        )
-        observation.log.state(
-            self.label,
-            f"{observation.name}: sources",
-            f"{found.in_view} of {len(catalogue.flux)} in view",
-        )
+        found = Sources.of(self, observation)
+        text = f"{len(found.in_view)} of {len(found.power)} in view"
+        observation.log.state(self.label, f"{observation.name}: sources", text)
         return found
 
     def exec(self, block: Block, state: Sources) -> None:
         """Add the sources to ``sky``."""
-        stream, at = block.new("sky"), block.detectors
-        matrices = rotation_matrices(
-            np.asarray(block.observation.sky_boresight[block.samples], np.float64)
-        )
-        beams = state.rays[at], state.width[at], state.per_area[at]
-        _add_sources(
-            matrices,
-            block.samples.start,
-            *beams,
-            state.towards,
-            state.power,
-            state.first,
-            state.number,
-            stream,
-        )
+        boresight = block.observation.sky_boresight[block.samples]
+        matrices = rotation_matrices(np.asarray(boresight, np.float64))
+        start = block.detectors.start, block.samples.start
+        _add_sources(matrices, *start, *state, block.new("sky"))
 
 
 @dataclass(frozen=True)
@@ -183,8 +166,7 @@ class Catalogue:
         return np.asarray(scale * self.flux * at_centre * np.array(factors)[which])
 
 
-@dataclass(frozen=True)
-class Sources:
+class Sources(NamedTuple):
     """Sources and detectors of one scan.
 
     Attributes
@@ -207,8 +189,12 @@ class Sources:
     number: NDArray[np.int64]
 
     @classmethod
-    def of(cls, catalogue: Catalogue, power: Floats, observation: Observation) -> Sources:
-        """Sources that come into the field, widened by the beam."""
+    def of(cls, step: PointSources, observation: Observation) -> Sources:
+        """Sources that come into the field, widened by the beam. Raises InputError as
+        `Catalogue.read`.
+        """
+        catalogue = Catalogue.read(step)
+        power = catalogue.brightness(observation.instrument.band, step.scale)
         plane, n = observation.focalplane, observation.n_samples
         rays = np.stack([-plane.eta, -plane.xi, np.ones(len(plane))], axis=1)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -236,18 +222,19 @@ class Sources:
         )
 
     @property
-    def in_view(self) -> int:
-        """Number of sources that come near the field at any time."""
-        return len(np.unique(self.number))
+    def in_view(self) -> NDArray[np.int64]:
+        """Numbers of the sources that come near the field at any time."""
+        return np.unique(self.number)
 
 
 @kernel
 def _add_sources(  # type: ignore[no-untyped-def]
-    matrices, start, rays, width, per_area, towards, power, first, number, out
+    matrices, detector, start, rays, width, per_area, towards, power, first, number, out
 ):
-    """Add equation (1) to ``out`` (n_det, n) from sample ``start`` on: each sample sums over the
-    sources in their order.
+    """Add equation (1) to ``out`` (n_det, n) from ``detector`` and sample ``start`` on: each sample
+    sums over the sources in their order.
     """
+    rays, width, per_area = rays[detector:], width[detector:], per_area[detector:]
     farthest = REACH * REACH / 2  # of the exponent
     seen = np.empty(3)
     for t in range(out.shape[1]):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -326,7 +326,7 @@ def polarization_angles(survey: Survey, observation: Observation, index: Any) ->
     pole = frame_rotation(survey.steps.binning.frame)[2]
     found = PolarizationAngles.of(observation, observation.boresight_radec[index], pole)
     return (
-        replace(found, plate=np.ascontiguousarray(found.plate[:, index]))
+        found._replace(plate=np.ascontiguousarray(found.plate[:, index]))
         if found.plate.size
         else found
     )
