@@ -215,7 +215,7 @@ def draw(rows, memory, title):
 
 def full(seconds, threads, memory):
     from zonda.core.configuration.pipeline_file import load
-    from zonda.core.plan.bands import plan
+    from zonda.core.plan.planner import plan
 
     file = load("atlast_full", (f"PointingDaisy.scan_duration={seconds} s",))
     file = plan(file, threads=threads, memory=int(memory * 1e9)).apply(file)

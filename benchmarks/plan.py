@@ -87,18 +87,16 @@ def difference(one, other):
 def row(scene, repeat):
     """A row of the table."""
     import zonda
-    from zonda.core.plan.bands import PLANNED_FROM, PlanOfBands
+    from zonda.core.plan.planner import PLANNED_FROM
     from zonda.core.plan.pointing import samples_of
 
     file = loaded(scene)
     made = zonda.plan(file, threads=1)
     samples = samples_of(file.pipeline(), file.scene())
-    plans = list(made.plans.values()) if isinstance(made, PlanOfBands) else [made]
-    applied = made.summary.settings
     left_out = made.summary.omitted(file)
     coarse, dropped = [], [f"`{name}` (structure)" for name in left_out]
-    for d in plans[0].decided:
-        if d.chosen and d.choice.settings.keys() <= applied.get(d.operator, {}).keys():
+    for d in made.decided:
+        if d.chosen:
             (dropped if d.choice.decision == "dropped" else coarse).append(
                 f"{d.effect.name}: {d.choice.what}"
             )
@@ -127,7 +125,6 @@ def forms(scene, repeat):
     warnings.simplefilter("ignore")
     import zonda
     from zonda.core.output import Output
-    from zonda.core.plan.bands import PlanOfBands
 
     whole = loaded(scene)
     pointing = next(s.key for s in whole.steps if "boresight" in s.operator.provides)
@@ -136,17 +133,16 @@ def forms(scene, repeat):
     steps = tuple(s for s in file.steps if not isinstance(s.operator, Output))
     file = dataclasses.replace(file, steps=steps)
     made = zonda.plan(file, threads=1, prune_all=False)
-    one = next(iter(made.plans.values())) if isinstance(made, PlanOfBands) else made
     from zonda.core.plan.pointing import samples_of
 
     factor = samples_of(whole.pipeline(), whole.scene()) / samples_of(file.pipeline(), file.scene())
-    variants = {"": one.apply(file)}
+    variants = {"": made.apply(file)}
     operators = {}
-    for d in one.decided:
+    for d in made.decided:
         for k, choice in enumerate(d.effect.choices[1:], 1):
             name = f"{d.name}: {choice.what}"
             changed = dataclasses.replace(d, chosen=k)
-            variants[name] = dataclasses.replace(one, decided=(changed,)).apply(file)
+            variants[name] = made.deciding(changed).apply(file)
             operators[name] = d.operator
     least = {name: {} for name in variants}
     for turn in range(repeat + 1):

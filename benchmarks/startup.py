@@ -58,11 +58,11 @@ def stages(folder: str, pipeline: str) -> dict[str, Any]:
     mark("Python and the command line")
     from zonda.core.output import Output
     from zonda.core.pipeline import Pipeline
-    from zonda.core.plan import bands
+    from zonda.core.plan import planner
     from zonda.core.run import execute
 
     mark("import zonda, numpy, numba, pydantic")
-    after(bands, "for_run", "plan")
+    after(planner, "for_run", "plan")
     usual = execute.run
 
     def observe(*arguments: Any) -> None:

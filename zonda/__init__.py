@@ -28,7 +28,7 @@ _WHERE = {
     "Pipeline": "zonda.core.pipeline",
     "ZondaError": "zonda.core.errors",
     "load": "zonda.core.configuration.pipeline_file",
-    "plan": "zonda.core.plan.bands",
+    "plan": "zonda.core.plan.planner",
     "campaign": "zonda.core.campaign.function",
     "measure": "zonda.core.figures",
     "sensitivity": "zonda.plugins.forecast.sensitivity",
@@ -108,7 +108,7 @@ if TYPE_CHECKING:
     from zonda.core.output import Output as Output
     from zonda.core.output import StreamOutput as StreamOutput
     from zonda.core.pipeline import Pipeline as Pipeline
-    from zonda.core.plan.bands import plan as plan
+    from zonda.core.plan.planner import plan as plan
     from zonda.core.plan.planning import Planning as Planning
     from zonda.core.product import Product as Product
     from zonda.core.registry import register as register

@@ -152,7 +152,7 @@ class _Draft:
     def _plan(self, source: CampaignFile, entry: Entry, share: float) -> int:
         """Plan an entry's pipeline; its number."""
         from ..assembly.checks import run_checks
-        from ..plan.bands import for_run
+        from ..plan.planner import for_run
 
         with within(f"entry {about(entry) or source.file.header.name}"):
             file = _with_budget(source.variant.changed(entry.settings).file, share)

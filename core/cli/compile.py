@@ -23,7 +23,7 @@ def compile_kernels(names: tuple[str, ...]) -> None:
     from ..configuration.locate import shipped
     from ..errors import OutputError
     from ..kernels import folder
-    from ..plan.bands import for_run
+    from ..plan.planner import for_run
     from ..plan.prediction import sliced
 
     place = folder()

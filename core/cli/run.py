@@ -119,7 +119,7 @@ def _run_campaign(request: RunRequest) -> None:
 
 
 def _run_one(request: RunRequest, file: PipelineFile) -> None:
-    from ..plan.bands import for_run
+    from ..plan.planner import for_run
     from ..storage.files import check_output_folder, write_text
     from ..storage.lock import lock
 

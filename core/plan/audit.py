@@ -33,10 +33,10 @@ from ..errors import PipelineError
 from ..mapmaker import made_by
 from ..signal import Signal
 from ..tables import aligned
-from .bands import PlanOfBands, files_of_bands
 from .bounds import Choice, Context, add, figure
 from .decide import Decided
-from .planner import NAME, Wishes, plan_band
+from .planner import NAME
+from .planner import plan as plan_of
 from .pointing import DEEP
 from .prediction import SECONDS, sliced
 from .result import Plan
@@ -179,17 +179,14 @@ class AuditOfBands:
         )
 
 
-def audit_of_bands(
-    file: PipelineFile, made: PlanOfBands, *, threads: int | None = None
-) -> AuditOfBands:
-    """`audit` of each band, in a camera that has no other: what the plan of that band decides. A
-    run for all bands takes of that what they have in common."""
-    return AuditOfBands(
-        {
-            name: audit(one, made.plans[name], threads=threads)
-            for name, one in files_of_bands(file).items()
-        }
-    )
+def audit_of_bands(file: PipelineFile, made: Plan, *, threads: int | None = None) -> AuditOfBands:
+    """`audit` of each band, in a camera that has no other."""
+    scene, found = file.scene(), {}
+    for name, camera in scene.instrument.cameras.items():
+        alone = scene.model_copy(update={"instrument": camera})
+        one = dataclasses.replace(made, bands={name: made.bands[name]})
+        found[name] = audit(dataclasses.replace(file, _scene=alone), one, threads=threads)
+    return AuditOfBands(found)
 
 
 def audit(
@@ -200,14 +197,14 @@ def audit(
     chosen = [d for d in made.decided if d.chosen > 0]
     size = extent(made, len(chosen) + 2) if seconds is None else Extent(seconds)
     if made.structure.instead:  # nothing that is made of the complete signal is asked for
-        file = dataclasses.replace(made, decided=()).apply(file)
+        file = made.deciding().apply(file)
     part = sliced(file, size.seconds, size.every)
     labels = tuple(o.label for o in part.pipeline().operators)
     whole = Structure(labels, tuple(part.runs), ())
     kept = (*made.structure.operators, "Slice")
     fewer = dataclasses.replace(whole, operators=tuple(label for label in labels if label in kept))
     dropped = [d.operator for d in chosen if d.effect.name == NAME and d.operator in labels]
-    plan = plan_band(part, Wishes(prune_all=False, drop=dropped))
+    plan = plan_of(part, prune_all=False, drop=dropped)
     words = f"the first {size.seconds:.3g} s of 1 scan"
     if size.every > 1:
         words += f", every {size.every}th detector"
@@ -218,7 +215,7 @@ def audit(
         )
 
     def planned(*those: Decided, structure: Structure = whole) -> PipelineFile:
-        return dataclasses.replace(plan, structure=structure, decided=those).apply(part)
+        return plan.deciding(*those, structure=structure).apply(part)
 
     noise = dataclasses.replace(plan, structure=whole).apply(part)
     rows = _noise(noise, plan, threads)
@@ -252,7 +249,7 @@ def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]
     through which it is calibrated.
     """
     provided = [made_by(s.operator) for s in part.steps]
-    if not made.noise[1] or not any("white" in p for p in provided):
+    if not made.context.map_noise or not any("white" in p for p in provided):
         return []
     air = ["atmosphere"] if any("atmosphere" in p for p in provided) else []
     runs = {"white": Signal(only=["white", *air], filters="none")}
@@ -279,7 +276,7 @@ def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]
     actual, error = _rms(np.array_split(noise[seen] ** 2 * hits[seen] / deep, PARTS))
     within = HEADLINE if made.context.coverage and made.context.coverage.exact else ROUGH
     about = ("white noise", "of the plan", "map_rms")
-    return [Checked(*about, made.noise[1], actual, error, within=within)]
+    return [Checked(*about, made.context.map_noise, actual, error, within=within)]
 
 
 def _on_slice(d: Decided, stated: Mapping[str, Decided]) -> Decided | None:

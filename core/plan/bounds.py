@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..assembly.chain import Chain
 from ..data import Observation
 from ..mapmaker import joins
 from ..numerics.radiation import LEAST_TRANSMISSION
@@ -89,6 +90,11 @@ class Choice:
     def pays(self) -> bool:
         """True if the form saves time in this scene."""
         return self.saves is not None or self.seconds > 0
+
+    @property
+    def sets(self) -> tuple[Mapping[str, Any], bool]:
+        """What it does to the pipeline."""
+        return self.settings, self.leave_out
 
 
 @dataclass(frozen=True)
@@ -308,8 +314,8 @@ class Context:
     metrics: frozenset[str] = frozenset()
     depth: Depth = Depth(0.0, 0.0)
     """The white noise that the run will have."""
-    bands_alike: int = 1
-    """Number of the camera's bands, where all look through the same pixels."""
+    chain: Chain | None = None
+    """Steps and signals of each observation."""
     readers: frozenset[str] = frozenset()
     """Labels of the operators that make a product of the time streams themselves
     (`Planning.reads_streams`).

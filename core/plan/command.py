@@ -64,8 +64,7 @@ def plan(
 
     one_blas_thread()
     from ..configuration.pipeline_file import load
-    from .bands import PlanOfBands
-    from .bands import plan as make
+    from .planner import plan as make
     from .structure import only as alone
 
     file = load(pipeline, settings)
@@ -89,11 +88,8 @@ def plan(
     from .audit import audit as compare
     from .audit import audit_of_bands
 
-    found = (
-        audit_of_bands(file, made, threads=threads)
-        if isinstance(made, PlanOfBands)
-        else compare(file, made, threads=threads)
-    )
+    audits = compare if "" in made.bands else audit_of_bands
+    found = audits(file, made, threads=threads)
     click.echo(found.json() if as_json else str(found))
     if found.violated:
         raise click.exceptions.Exit(1)

@@ -85,20 +85,23 @@ class Decided:
 
 
 def decide(
-    effects: Sequence[Decided],
-    allowed: Mapping[str, float],
+    bands: Sequence[Sequence[Decided]],
+    allowed: Sequence[Mapping[str, float]],
     *,
     kept: Collection[str] = (),
     forced: Collection[str] = (),
     prune_all: bool = True,
     joined: str = "",
-) -> list[Decided]:
-    """Choose one form of each effect, so that the sums of bounds stay within the budget.
+) -> list[list[Decided]]:
+    """Choose one form of each effect for all bands, so that in each band the sums of bounds stay
+    within its budget.
 
     Parameters
     ----------
+    bands
+        The effects of each band.
     allowed
-        The budget by metric.
+        The budget of each band by metric.
     kept, forced
         Names of effects that stay as the pipeline asks for them, and of those that take their
         coarsest form.
@@ -107,28 +110,37 @@ def decide(
     joined
         Steps for which the bounds do not hold (`Context.joined`): likewise.
     """
-    forms = [replace(d, chosen=k) for d in effects for k in range(len(d.effect.choices))]
-    taken = {form.name: form for form in forms if form.name in forced}  # the last: the coarsest
-    left = {m: v - sum(form.error(m) for form in taken.values()) for m, v in allowed.items()}
+    forms = _forms(bands)
+    taken = {form[0].name: form for form in forms if form[0].name in forced}  # the coarsest
+    left = [
+        {m: v - sum(form[k].error(m) for form in taken.values()) for m, v in own.items()}
+        for k, own in enumerate(allowed)
+    ]
 
-    def order(form: Decided) -> tuple[float, float, float]:
+    def order(form: list[Decided]) -> tuple[float, float, float]:
         """Largest measured saving first, then what planning classes state in seconds, then the
         smallest share of the budget.
         """
-        used = [(form.error(m), allowed[m]) for m in allowed if form.error(m) > 0]
+        used = [
+            (d.error(m), limit)
+            for d, own in zip(form, allowed, strict=True)
+            for m, limit in own.items()
+            if d.error(m) > 0
+        ]
         share = max((b / limit if limit else math.inf for b, limit in used), default=0.0)
-        saves = form.choice.saves
-        return -(saves.share if saves else 0.0), -form.choice.seconds, share
+        choice = form[0].choice
+        return -(choice.saves.share if choice.saves else 0.0), -choice.seconds, share
 
     free = prune_all and not joined
-    tried = [f for f in forms if free and f.chosen and f.choice.pays and f.name not in kept]
-    for form in sorted(tried, key=order):
-        if form.name not in taken and all(form.error(m) <= left[m] for m in left):
-            taken[form.name] = form
-            left = {m: left[m] - form.error(m) for m in left}
+    tried = [f for f in forms if free and f[0].chosen and f[0].name not in kept]
+    for form in sorted((f for f in tried if all(d.choice.pays for d in f)), key=order):
+        both = list(zip(form, left, strict=True))
+        if form[0].name not in taken and all(d.error(m) <= own[m] for d, own in both for m in own):
+            taken[form[0].name] = form
+            left = [{m: v - d.error(m) for m, v in own.items()} for d, own in both]
     stated = dict.fromkeys(kept, "--keep") | dict.fromkeys(forced, "--drop")
 
-    def reason(d: Decided) -> str:
+    def reason(d: Decided, left: Mapping[str, float]) -> str:
         coarser = d.effect.choices[1:]
         if not d.simulated:
             over = [m for m, v in d.choice.bound.items() if v > left.get(m, math.inf)]
@@ -141,9 +153,31 @@ def decide(
             return "--no-prune"
         if not any(choice.pays for choice in coarser):
             return "coarser only with --drop" if coarser else ""
-        return "coarser exceeds the budget"
+        return f"coarser exceeds the budget{' of a band' if len(bands) > 1 else ''}"
 
-    return [replace(taken.get(d.name, d), reason=reason(d)) for d in effects]
+    return [
+        [
+            replace(taken[d.name][k] if d.name in taken else d, reason=reason(d, left[k]))
+            for d in own
+        ]
+        for k, own in enumerate(bands)
+    ]
+
+
+def _forms(bands: Sequence[Sequence[Decided]]) -> list[list[Decided]]:
+    """The forms that an effect has in all bands, each as one `Decided` of every band: those with
+    the same settings.
+    """
+    found, (first, *others) = [], bands
+    for d in first:
+        for k, choice in enumerate(d.effect.choices):
+            form = [replace(d, chosen=k)]
+            for e in (e for own in others for e in own if e.name == d.name):
+                alike = [n for n, c in enumerate(e.effect.choices) if c.sets == choice.sets]
+                form += [replace(e, chosen=n) for n in alike[:1]]
+            if len(form) == len(bands):
+                found.append(form)
+    return found
 
 
 def named(names: Sequence[str], effects: Sequence[Decided], labels: Sequence[str]) -> set[str]:

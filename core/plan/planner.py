@@ -1,10 +1,11 @@
-"""The planner: effects that are simulated, coarsened or dropped within an error budget."""
+"""`zonda.plan`: effects that are simulated, coarsened or dropped within an error budget."""
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,81 +18,146 @@ from ..run.settings import Settings
 from .bounds import OTHER_MODES, Bound, Choice, Context, Effect, Estimate, add, exact, full
 from .decide import Decided, check_droppable, decide, limits, named
 from .planning import planning_of
-from .pointing import context_of
-from .prediction import memory_of
-from .result import Plan
-from .structure import Structure, chain_of, prune
+from .pointing import context_of, samples_of
+from .prediction import Timing, memory_of, timed
+from .result import Plan, PlanOfBand, PlanSummary, unplanned
+from .structure import Structure, prune
 
 NAME = "everything"
 """Name of the effect of an operator that is dropped altogether."""
 
 
-@dataclass(frozen=True)
-class Wishes:
-    """Options of a plan: the parameters of `zonda.plan`."""
-
-    keep: Sequence[str] = ()
-    drop: Sequence[str] = ()
-    prune_all: bool = True
-    threads: int | None = None
-    memory: int | None = None
+PLANNED_FROM = 200_000_000
+"""Detectors x samples x bands of a scene from which it is planned unasked: below, a run takes less
+time than planning could save."""
 
 
-def plan_band(file: PipelineFile, wishes: Wishes | None = None, band: str = "") -> Plan:
-    """Plan a pipeline file for a camera's only band, or for one ``band`` of several. Errors are
-    those of `zonda.plan`.
+def plan(
+    file: PipelineFile,
+    *,
+    keep: Sequence[str] = (),
+    drop: Sequence[str] = (),
+    prune_all: bool = True,
+    threads: int | None = None,
+    memory: int | None = None,
+    measure: bool = False,
+) -> Plan:
+    """Plan a pipeline file. A step has one form for all bands of a camera: a coarser one, where its
+    bound fits in the budget of each band.
+
+    Parameters
+    ----------
+    keep
+        Effects or operators that stay as the pipeline asks for them (``poles``,
+        ``PinkNoise.poles``, ``PinkNoise``).
+    drop
+        Effects or operators to leave out, whatever that costs; their bounds are stated.
+    prune_all
+        False: leave nothing out, coarsen nothing (``--no-prune``); ``drop`` still holds.
+    threads, memory
+        Threads and bytes of the run whose memory is predicted; decisions do not depend on them.
+        None: those of this machine.
+    measure
+        Run slices of a few seconds to predict the CPU time; decisions do not depend on it.
+
+    Raises
+    ------
+    ZondaError
+        For a name that is not in the plan, or a budget that is not a number from 0 to 1.
     """
-    wishes = wishes or Wishes()
-    _check_arguments(file, wishes)
+    _check_arguments(file, keep, drop)
     pipeline, scene = file.pipeline(), file.scene()
-    if not band:
-        scene.instrument.check_one_band("zonda plan")
     labels = [o.label for o in pipeline.operators]
     structure = Structure.of_all(pipeline)
-    if wishes.prune_all:
-        keep = [name if name in labels else name.partition(".")[0] for name in wishes.keep]
-        structure = prune(pipeline, keep)
-    context = context_of(pipeline, scene, structure, band)
-    budget = limits(file.header.budget, context.map_noise, context.depth.sample)
-    allowed = {m: v for m, v in budget.items() if m in context.metrics}
-    estimates = {o.label: planning_of(o).estimate(context) for o in context.operators}
-    effects = [Decided(label, e) for label, estimate in estimates.items() for e in estimate.effects]
-    effects.append(Decided("pipeline", _precision(pipeline.precision, context)))
-    check_droppable(wishes.drop, effects, labels)
-    left, remaining = context, structure
-    if whole := [label for label in structure.operators if label in wishes.drop]:
-        remaining = _without(pipeline, structure, whole)
-        pipeline = file.pipeline()
-        left = context_of(pipeline, file.scene(), remaining, band)
-        effects = [d for d in effects if d.operator not in whole]
-        effects += [Decided(o, _everything_of(o, estimates, context, left)) for o in whole]
+    if prune_all:
+        kept = [name if name in labels else name.partition(".")[0] for name in keep]
+        structure = prune(pipeline, kept)
+    whole = [label for label in structure.operators if label in drop]
+    remaining = _without(pipeline, structure, whole) if whole else structure
+    names = [band.name for band in scene.instrument.bands] or [""]
+    limited: list[Mapping[str, float]] = []
+    bands: list[list[Decided]] = []
+    contexts: list[Context] = []
+    joined = ""
+    for name in names:
+        context = context_of(file.pipeline(), file.scene(), structure, name)
+        budget = limits(file.header.budget, context.map_noise, context.depth.sample)
+        limited.append({m: v for m, v in budget.items() if m in context.metrics})
+        estimates = {o.label: planning_of(o).estimate(context) for o in context.operators}
+        found = [Decided(o, e) for o, estimate in estimates.items() for e in estimate.effects]
+        found.append(Decided("pipeline", _precision(pipeline.precision, context)))
+        check_droppable(drop, found, labels)
+        joined = context.joined
+        if whole:
+            left = context_of(file.pipeline(), file.scene(), remaining, name)
+            found = [d for d in found if d.operator not in whole]
+            found += [Decided(o, _everything_of(o, estimates, context, left)) for o in whole]
+            context = left
+        bands.append(found)
+        contexts.append(context)
+    every = [d for found in bands for d in found]
     decided = decide(
-        effects,
-        allowed,
-        kept=named(wishes.keep, effects, labels),
-        forced={d.name for d in effects if d.effect.name == NAME or any(map(d.means, wishes.drop))},
-        prune_all=wishes.prune_all,
-        joined=context.joined,
+        bands,
+        limited,
+        kept=named(keep, every, labels),
+        forced={d.name for d in every if d.effect.name == NAME or any(map(d.means, drop))},
+        prune_all=prune_all,
+        joined=joined,
     )
-    threads, free = wishes.threads or available_threads(), wishes.memory or available_memory() // 2
     dtype = np.float64 if pipeline.precision == "float64" else np.float32
-    return Plan(
+    free = memory or available_memory() // 2
+    made = Plan(
         structure,
-        tuple(decided),
-        limits=allowed,
-        spent={m: sum(d.choice.bound.get(m, 0.0) for d in decided if d.chosen) for m in allowed},
-        noise=(left.depth.sample, left.map_noise, left.coverage.hits if left.coverage else 0.0),
-        memory=memory_of(left, chain_of(pipeline, remaining), Settings(threads, free, dtype)),
-        context=context,
+        {
+            name: PlanOfBand(tuple(own), allowed, context)
+            for name, own, allowed, context in zip(names, decided, limited, contexts, strict=True)
+        },
+        memory_of(contexts, Settings(threads or available_threads(), free, dtype)),
     )
+    return replace(made, timing=_measured(made.apply(file), contexts)) if measure else made
 
 
-def _check_arguments(file: Any, wishes: Wishes) -> None:
+def for_run(
+    file: PipelineFile,
+    *,
+    keep: Sequence[str] = (),
+    drop: Sequence[str] = (),
+    prune_all: bool | None = None,
+    threads: int | None = None,
+    memory: int | None = None,
+) -> PlanSummary:
+    """Summary for a run: a plan from `PLANNED_FROM` samples on, or where one is asked for by
+    ``prune_all`` (True), ``keep`` or ``drop``; else what the outputs depend on, in full; everything
+    if ``prune_all`` is False. Errors are those of `plan`.
+    """
+    pipeline = file.pipeline()
+    if not (keep or drop or prune_all):
+        if prune_all is False:
+            return unplanned(Structure.of_all(pipeline), "--no-prune: everything in full")
+        samples = samples_of(pipeline, file.scene())
+        if samples < PLANNED_FROM:
+            few = f"{samples:.2g} samples, less than {PLANNED_FROM:.0e}: no plan is made"
+            return unplanned(prune(pipeline), few)
+    return plan(file, keep=keep, drop=drop, prune_all=prune_all is not False, threads=threads,
+                memory=memory).summary  # fmt: skip
+
+
+def _measured(file: PipelineFile, contexts: Sequence[Context]) -> Timing | None:
+    """CPU time of a planned pipeline; None, with a warning, if a slice of it cannot be run."""
+    try:
+        return timed(file, [o for context in contexts for o in context.observations])
+    except ZondaError as err:
+        text = f"no time is predicted, since a slice of the pipeline does not run: {err.message}"
+        warnings.warn(text, stacklevel=3)
+        return None
+
+
+def _check_arguments(file: Any, keep: Any, drop: Any) -> None:
     text = cure = ""
     if not isinstance(file, PipelineFile):
         text = f"a plan is made of a pipeline file, not of {file!r:.60}"
         cure = "write zonda.plan(zonda.load(path_or_name))"
-    for what, names in (("keep", wishes.keep), ("drop", wishes.drop)):
+    for what, names in (("keep", keep), ("drop", drop)):
         if isinstance(names, str):
             text = f"{what} is a list of names, not the text {names!r}"
             cure = f"write {what}=[{names!r}]"

@@ -101,7 +101,7 @@ def context_of(pipeline: Pipeline, scene: Scene, structure: Structure, band: str
         readers=readers,
         kept_streams=frozenset().union(*(o.optional | o.requires for o in reading)) - {MAIN},
         band=band,
-        bands_alike=scene.instrument.focalplane().bands_alike if band else 1,
+        chain=chain,
     )
     context.traits = {o.label: planning_of(o).traits(context.lowest) for o in operators}
     context.depth = _depth(shown, context)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from tempfile import TemporaryDirectory
 from typing import ClassVar
@@ -14,14 +14,13 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from ..assembly.chain import Chain
 from ..configuration.pipeline_file import PipelineFile, Step
 from ..data import Data, Observation
 from ..mapmaker import joins, made_by, makes_products
 from ..operator import Operator
 from ..output import Output
 from ..run.budget import BASE
-from ..run.schedule import does_the_same, schedule
+from ..run.schedule import Schedule, does_the_same, schedule
 from ..run.settings import Settings
 from ..run.views import View
 from ..signal import Signal
@@ -44,47 +43,33 @@ LEAST_SECONDS = 4.0
 """Length of the timed slice before detectors are left out, s."""
 
 
-@dataclass(frozen=True)
-class Memory:
-    """Bytes of a run.
-
-    Attributes
-    ----------
-    bytes
-        At once, at most.
-    products
-        Held while another band of the camera acts: what steps add up over all scans, and all where
-        bands are executed together.
+def memory_of(contexts: Sequence[Context], settings: Settings) -> float:
+    """Bytes that a run holds at once, at most. ``contexts``: of each band; ``settings``: as of a
+    run, but the memory is that of the whole process.
     """
+    views, held, products, outputs = list[View](), list[int](), list[int](), list[int]()
+    for context in contexts:
+        longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
+        assert context.chain is not None
+        views.append(View(context.chain, longest))
+        every = [(o, planning_of(o).memory(longest)) for o in context.operators]
+        during = [(o, size) for o, size in every if not isinstance(o, Output)]
+        held.append(POINTED * context.times + sum(size for _, size in during))
+        products.append(sum(size for o, size in during if makes_products(o)))
+        outputs.append(sum(size for o, size in every if isinstance(o, Output)))
 
-    bytes: float
-    products: float = 0.0
+    def without(taken: int) -> Settings:
+        return replace(settings, memory=max(int(settings.memory - BASE - taken), 1))
 
-
-def memory_of(context: Context, chain: Chain, settings: Settings) -> Memory:
-    """Memory of a pipeline, all signals. ``settings``: as of a run, but the memory is that of the
-    whole process.
-    """
-    longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
-
-    def hold(operators: Iterable[Operator]) -> int:
-        return sum(planning_of(o).memory(longest) for o in operators)
-
-    outputs = [o for o in context.operators if isinstance(o, Output)]
-    during = [o for o in context.operators if not isinstance(o, Output)]
-    held = POINTED * context.times + hold(during)
-    products: float = hold(filter(makes_products, during))
-    settings = replace(settings, memory=max(int(settings.memory - BASE - held), 1))
-    view, number = View(chain, longest), context.bands_alike
-    alone = schedule([view], settings)
-    size: float = alone.bytes
-    settings = replace(settings, memory=max(settings.memory - (number - 1) * int(held), 1))
-    together = number > 1 and does_the_same([view] * number, settings, [alone])
-    if together:
-        size = schedule([view] * number, settings).bytes / number
-    if together or any(map(joins, chain.steps)):
-        products = held + size
-    return Memory(BASE + max(held + size, hold(outputs)), products)
+    alone = [schedule([view], without(own)) for view, own in zip(views, held, strict=True)]
+    joined, rest = any(map(joins, views[0].chain.steps)), without(sum(held))
+    if len(views) > 1 and (
+        joined or (Schedule(views, rest).at_once > 1 and does_the_same(views, rest, alone))
+    ):
+        return BASE + max(sum(held) + schedule(views, rest).bytes, *outputs)
+    # band after band: what the others have added up stays
+    each = zip(held, alone, outputs, products, strict=True)
+    return BASE + sum(products) + max(max(h + one.bytes, out) - own for h, one, out, own in each)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from ..operator import labels
 from ..tables import aligned
 from .bounds import Context, figure, kelvin
 from .decide import Decided
-from .prediction import Memory, Timing
+from .prediction import Timing
 from .structure import Structure
 
 WIDTH = 120
@@ -47,7 +47,7 @@ class PlanSummary:
     runs: tuple[str, ...]
     settings: Mapping[str, Mapping[str, Any]]
     short: list[Row]
-    memory: Memory | None = None
+    memory: float | None = None
     words: str = ""
 
     def omitted(self, file: PipelineFile) -> list[str]:
@@ -89,71 +89,41 @@ def unplanned(structure: Structure, why: str) -> PlanSummary:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """Decisions on each effect; the errors they add, the limits; the memory of the run.
+class PlanOfBand:
+    """Errors of a plan in one band, and its decisions as they stand there: all bands have the same
+    forms.
 
     Attributes
     ----------
-    structure
-        What takes part at all.
     decided
         One for each effect.
-    limits, spent
-        By metric: the budget, and the sum of the bounds of what was dropped or coarsened.
-    noise
-        White noise that the run will have, under the load of the atmosphere: rms of one sample and
-        of a map pixel (0: no map), K; samples per pixel in the deep part of the map.
-    memory
-        With the plan.
-    timing
-        CPU time, where it was measured.
+    limits
+        The budget by metric.
+    context
+        Scans, noise and coverage, without the operators that are dropped as a whole.
     """
 
-    structure: Structure
     decided: tuple[Decided, ...]
     limits: Mapping[str, float]
-    spent: Mapping[str, float]
-    noise: tuple[float, float, float]
-    memory: Memory
     context: Context
-    timing: Timing | None = None
 
     @property
-    def operators(self) -> tuple[str, ...]:
-        """Labels of the operators that act."""
-        left_out = {d.operator for d in self.decided if d.choice.leave_out}
-        return tuple(label for label in self.structure.operators if label not in left_out)
+    def spent(self) -> dict[str, float]:
+        """Sum of the bounds of what was dropped or coarsened, by metric."""
+        chosen = [d.choice.bound for d in self.decided if d.chosen]
+        return {m: sum(bound.get(m, 0.0) for bound in chosen) for m in self.limits}
 
     @property
-    def summary(self) -> PlanSummary:
-        """Summary for a run."""
-        return PlanSummary(
-            self.operators,
-            self.structure.runs,
-            self.settings(),
-            self.short(),
-            self.memory,
-            foreseen(self.memory, self.timing),
-        )
-
-    def apply(self, file: PipelineFile) -> PipelineFile:
-        """The pipeline that is run: an ordinary one, with parameters changed and operators
-        omitted.
+    def noise(self) -> tuple[float, float, float]:
+        """White noise that the run will have, under the load of the atmosphere: rms of one sample
+        and of a map pixel (0: no map), K; samples per pixel in the deep part of the map.
         """
-        return self.summary.apply(file)
-
-    def settings(self) -> dict[str, dict[str, Any]]:
-        """Changed parameters by operator. Lists that several effects set are joined."""
-        found: dict[str, dict[str, Any]] = {}
-        for d in self.decided:
-            for key, value in d.choice.settings.items():
-                mine = found.setdefault(d.operator, {})
-                mine[key] = [*mine.get(key, []), *value] if isinstance(value, list) else value
-        return found
+        own = self.context
+        return own.depth.sample, own.map_noise, own.coverage.hits if own.coverage else 0.0
 
     def short(self) -> list[Row]:
-        """Rows for headers: steps that are omitted by structure first."""
-        found = omissions(self.structure)
+        """Rows for headers."""
+        found = []
         for d in self.decided:
             bound = d.choice.bound if d.adds_error else {}
             errors = ", ".join(f"{m} {figure(m, bound[m])}" for m in self.limits if m in bound)
@@ -163,19 +133,15 @@ class Plan:
     def as_dict(self) -> dict[str, Any]:
         """Everything, for JSON."""
         sample, pixel, hits = self.noise
-        structure = self.structure
         return {
             "noise": {"sample": sample, "map_pixel": pixel, "samples_per_pixel": hits},
             "budget": {m: {"limit": v, "spent": self.spent[m]} for m, v in self.limits.items()},
-            "left_out": [dataclasses.asdict(row) for row in structure.rows],
-            "derived": dict(structure.derived),
             "joins_bands": self.context.joined,
             "effects": [self._effect(d) for d in self.decided],
-            "prediction": as_dict_of(self.memory, self.timing),
         }
 
     def _effect(self, d: Decided) -> dict[str, Any]:
-        metrics, saves = self.context.metrics, d.choice.saves
+        metrics, saves = self.limits, d.choice.saves
         return {
             "operator": d.operator,
             "effect": d.effect.name,
@@ -189,21 +155,15 @@ class Plan:
             "reason": d.reason,
         }
 
-    def _repr_html_(self) -> str:
-        from ..pages import html_table
-
-        return html_table(
-            "Plan", [(d.name, f"{d.choice.decision}: {d.choice.what}") for d in self.decided]
-        )
-
-    def __str__(self) -> str:
+    def text(self, omitted: Sequence[Row]) -> str:
+        """Noise, budget and effects. ``omitted``: what is left out by structure."""
         said = [f"noise: {self._noise()}"]
         if joined := self.context.joined:
             said.append(
                 f"{joined} joins the bands: the bounds are of this band alone and need not hold, so"
                 " that nothing is coarsened"
             )
-        said += [f"{name} {what}: {why}" for name, what, _, why in omissions(self.structure)]
+        said += [f"{name} {what}: {why}" for name, what, _, why in omitted]
         sums = [
             (name, *(figure(m, values[m]) for m in self.limits))
             for name, values in (("added by this plan", self.spent), ("budget", self.limits))
@@ -218,7 +178,6 @@ class Plan:
             self._table("In full, with what each effect contributes at most:", kept),
             self._table("Not simulated by zonda, with the error of that at most:", absent),
             [wrapped(f"{d.effect.name}: {d.formula}") for d in kept if not d.effect.size],
-            ["docs/plan.md and --json have the formulas", *self._times(), str(self.summary)],
         ]
         return "\n\n".join(filter(None, map("\n".join, parts)))
 
@@ -260,13 +219,121 @@ class Plan:
         head, align = ["", "", *metrics], "<<" + ">" * len(metrics) + "<"
         return [title, *aligned(rows, head, align)] if rows else []
 
-    def _times(self) -> list[str]:
-        """CPU time of each step, where it was measured."""
-        if self.timing is None:
-            return []
-        each = {label: self.timing.of(label) for label in self.timing.growing}
-        text = ", ".join(f"{label} {duration(used)}" for label, used in each.items() if used > 0)
-        return [wrapped(f"CPU time: {text}")]
+
+@dataclass(frozen=True)
+class Plan:
+    """Decisions on each effect, the same for all bands of the camera; the errors that they add in
+    each band; memory and time of the run.
+
+    Attributes
+    ----------
+    structure
+        What takes part at all.
+    bands
+        Errors by name of the band; the name of a camera's only band is empty.
+    memory
+        Bytes of the run.
+    timing
+        CPU time, where it was measured.
+    """
+
+    structure: Structure
+    bands: Mapping[str, PlanOfBand]
+    memory: float
+    timing: Timing | None = None
+
+    @property
+    def _first(self) -> PlanOfBand:
+        return next(iter(self.bands.values()))
+
+    @property
+    def decided(self) -> tuple[Decided, ...]:
+        """Decisions with the bounds of the first band."""
+        return self._first.decided
+
+    @property
+    def context(self) -> Context:
+        """Scans of the first band."""
+        return self._first.context
+
+    @property
+    def noise(self) -> tuple[float, float, float]:
+        """`PlanOfBand.noise` of the first band."""
+        return self._first.noise
+
+    @property
+    def operators(self) -> tuple[str, ...]:
+        """Labels of the operators that act."""
+        left_out = {d.operator for d in self.decided if d.choice.leave_out}
+        return tuple(label for label in self.structure.operators if label not in left_out)
+
+    @property
+    def summary(self) -> PlanSummary:
+        """Summary for a run."""
+        return PlanSummary(
+            self.operators,
+            self.structure.runs,
+            self.settings(),
+            self.short(),
+            self.memory,
+            foreseen(self.memory, self.timing),
+        )
+
+    def apply(self, file: PipelineFile) -> PipelineFile:
+        """The pipeline that is run: an ordinary one, with parameters changed and operators
+        omitted.
+        """
+        return self.summary.apply(file)
+
+    def deciding(self, *decided: Decided, structure: Structure | None = None) -> Plan:
+        """The plan with other decisions, of its first band alone."""
+        band = dataclasses.replace(self._first, decided=decided)
+        return dataclasses.replace(self, bands={"": band}, structure=structure or self.structure)
+
+    def settings(self) -> dict[str, dict[str, Any]]:
+        """Changed parameters by operator. Lists that several effects set are joined."""
+        found: dict[str, dict[str, Any]] = {}
+        for d in self.decided:
+            for key, value in d.choice.settings.items():
+                mine = found.setdefault(d.operator, {})
+                mine[key] = [*mine.get(key, []), *value] if isinstance(value, list) else value
+        return found
+
+    def short(self) -> list[Row]:
+        """Rows for headers: steps that are omitted by structure first."""
+        every = [(name, row) for name, own in self.bands.items() for row in own.short()]
+        return [*omissions(self.structure), *((_of(n) + row[0], *row[1:]) for n, row in every)]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything, for JSON."""
+        each = {name: own.as_dict() for name, own in self.bands.items()}
+        return {
+            **each.get("", {"bands": each}),
+            "left_out": [dataclasses.asdict(row) for row in self.structure.rows],
+            "derived": dict(self.structure.derived),
+            "prediction": as_dict_of(self.memory, self.timing),
+        }
+
+    def _repr_html_(self) -> str:
+        from ..pages import html_table
+
+        return html_table("Plan", [row[:2] for row in self.short()])
+
+    def __str__(self) -> str:
+        omitted = omissions(self.structure)
+        parts = [_of(name, "band ") + own.text(omitted) for name, own in self.bands.items()]
+        last = ["docs/plan.md and --json have the formulas"]
+        if self.timing is not None:
+            each = {label: self.timing.of(label) for label in self.timing.growing}
+            used = ", ".join(f"{label} {duration(s)}" for label, s in each.items() if s > 0)
+            last.append(wrapped(f"CPU time: {used}"))
+        last.append(("" if "" in self.bands else "all bands: ") + str(self.summary))
+        return "\n\n".join([*parts, "\n".join(last)])
+
+
+def _of(band: str, what: str = "") -> str:
+    """The beginning of a line about a band; empty for a camera's only one."""
+    return f"{what}{band}: " if band else ""
 
 
 def wrapped(text: str) -> str:
@@ -284,9 +351,9 @@ def omissions(structure: Structure) -> list[Row]:
     return found + [(f"signal {run}", "remainder", "", how) for run, how in derived]
 
 
-def foreseen(memory: Memory, timing: Timing | None) -> str:
+def foreseen(memory: float, timing: Timing | None) -> str:
     """Memory, and time where it was measured, as one line."""
-    size = f"{memory.bytes / 1e9:.2g} GB"
+    size = f"{memory / 1e9:.2g} GB"
     if timing is None:
         return f"about {size}"
     setup = duration(sum(timing.setup.values()))
@@ -296,7 +363,7 @@ def foreseen(memory: Memory, timing: Timing | None) -> str:
     )
 
 
-def as_dict_of(memory: Memory, timing: Timing | None) -> dict[str, Any]:
+def as_dict_of(memory: float, timing: Timing | None) -> dict[str, Any]:
     """Memory and time, for JSON."""
     times = timing and {
         "cpu_seconds": timing.total,
@@ -304,7 +371,7 @@ def as_dict_of(memory: Memory, timing: Timing | None) -> dict[str, Any]:
         "with_samples": dict(timing.growing),
         "slice": timing.slice,
     }
-    return {"bytes": memory.bytes, **(times or {})}
+    return {"bytes": memory, **(times or {})}
 
 
 def duration(seconds: float) -> str:

@@ -356,7 +356,7 @@ def test_the_plan_of_a_file_with_several_bands(tmp_path: Path) -> None:
         zonda.load(file, ["instrument.band=so_145ghz"]).scene().instrument.band.name == "so_145ghz"
     )
     made = zonda.plan(zonda.load(file))
-    assert set(made.plans) == {"so_93ghz", "so_145ghz"}
+    assert set(made.bands) == {"so_93ghz", "so_145ghz"}
     assert "band so_145ghz:" in str(made)
     again = tmp_path / "again.yaml"
     again.write_text(made.apply(zonda.load(file)).resolved_yaml())
@@ -418,14 +418,20 @@ def test_a_campaign_adds_up_each_band(tmp_path: Path) -> None:
 
 
 def test_the_forecast_knows_that_maps_of_all_bands_grow_beside_each_other(tmp_path: Path) -> None:
-    """`zonda plan`: the largest band without its maps, and the maps of all."""
-    file = two_bands(tmp_path, "BinMap: {pixel: 2 arcsec}, SaveMap")
-    made = zonda.plan(zonda.load(file))
-    each = [p.memory for p in made.plans.values()]
-    whole = made.summary.memory
-    maps = sum(p.products for p in each)
-    assert maps > 10e6
-    assert whole.bytes == max(p.bytes - p.products for p in each) + maps
+    """`zonda plan`: the bands' maps beside what one of them holds."""
+    file = zonda.load(two_bands(tmp_path, "BinMap: {pixel: 2 arcsec}, SaveMap"))
+    both = zonda.plan(file).memory
+    alone = [
+        zonda.plan(zonda.load(tmp_path / "two.yaml", [f"instrument.band={name}"]))
+        for name in ("so_93ghz", "so_145ghz")
+    ]
+    maps = []
+    for made in alone:
+        (step,) = (o for o in made.context.operators if o.label == "BinMap")
+        maps.append(planning_of(step).memory(made.context.first))
+    assert min(maps) > 5e6
+    assert both >= max(m.memory for m in alone) + min(maps)
+    assert both < sum(m.memory for m in alone)
 
 
 def test_what_bands_hold_for_each_other_counts_in_the_budget() -> None:

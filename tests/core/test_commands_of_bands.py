@@ -60,17 +60,17 @@ def test_a_band_is_planned_as_in_a_camera_that_has_no_other(path: Path) -> None:
     both = zonda.plan(zonda.load(path), threads=1)
     for name in NAMES:
         alone = zonda.plan(zonda.load(path, [f"instrument.band={name}"]), threads=1)
-        one = both.plans[name]
+        one = both.bands[name]
         assert one.noise == alone.noise
         assert [(d.name, d.choice) for d in one.decided] == [
             (d.name, d.choice) for d in alone.decided
         ]
-    samples = [both.plans[name].noise[0] for name in NAMES]
+    samples = [both.bands[name].noise[0] for name in NAMES]
     assert samples[1] / samples[0] == pytest.approx(
         700 / 300, rel=0.05
     )  # the load of the atmosphere raises both a little
     beams = [
-        d.name for name in NAMES for d in both.plans[name].decided if "samples per FWHM" in d.name
+        d.name for name in NAMES for d in both.bands[name].decided if "samples per FWHM" in d.name
     ]
     assert beams == [
         "PointingDaisy.samples per FWHM of 137 arcsec",
@@ -88,7 +88,7 @@ def test_arrays_side_by_side_are_planned_where_they_are(path: Path) -> None:
     plane = zonda.load(path).scene().instrument.focalplane()
     for k, name in enumerate(NAMES):
         own = plane.of_band(k)
-        made = both.plans[name].context.first.focalplane
+        made = both.bands[name].context.first.focalplane
         np.testing.assert_array_equal([made.xi, made.eta], [own.xi, own.eta])
         assert made.radius > 1.8 * made.reach
         assert made.reach == pytest.approx(alone.context.first.focalplane.radius, rel=1e-9)

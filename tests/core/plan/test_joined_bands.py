@@ -14,7 +14,7 @@ from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import PipelineError
 from zonda.core.experiment import run_file
 from zonda.core.plan.audit import Audit, audit_of_bands
-from zonda.core.plan.bands import PlanOfBands
+from zonda.core.plan.result import Plan
 
 TEXT = """
 name: joined
@@ -45,12 +45,12 @@ operators:
   - CommonModeFilter: {group: all, method: mean}
   - BinMap: {pixel: 1 arcmin, width: 1 deg}
 """
-LARGE = "instrument.detectors=919", "PointingDaisy.scan_duration=5 min"
+LARGE = "instrument.detectors=919", "PointingDaisy.scan_duration=5 min", "budget=0.3"
 BY_BAND = "CommonModeFilter.group=band"
 
 
-def coarse(made: PlanOfBands) -> set[str]:
-    return {d.name for one in made.plans.values() for d in one.decided if d.chosen}
+def coarse(made: Plan) -> set[str]:
+    return {d.name for one in made.bands.values() for d in one.decided if d.chosen}
 
 
 def test_a_plan_coarsens_nothing_where_bands_are_joined() -> None:
@@ -60,8 +60,6 @@ def test_a_plan_coarsens_nothing_where_bands_are_joined() -> None:
     by_band, joined = (
         zonda.plan(parse(TEXT, overrides=[*LARGE, *more]), threads=1) for more in ([BY_BAND], [])
     )
-    assert isinstance(by_band, PlanOfBands)
-    assert isinstance(joined, PlanOfBands)
     assert "HighpassFilter.high-pass decimation" in coarse(by_band)
     assert coarse(joined) == set()
     assert joined.summary.settings == {}
@@ -72,7 +70,7 @@ def test_a_plan_coarsens_nothing_where_bands_are_joined() -> None:
         == 2
     )
     assert "joins" not in str(by_band)
-    reasons = {d.name: d.reason for d in joined.plans["f090"].decided}
+    reasons = {d.name: d.reason for d in joined.bands["f090"].decided}
     assert reasons["HighpassFilter.high-pass decimation"] == "CommonModeFilter joins the bands"
     assert [one["joins_bands"] for one in joined.as_dict()["bands"].values()] == [
         "CommonModeFilter"
@@ -82,7 +80,6 @@ def test_a_plan_coarsens_nothing_where_bands_are_joined() -> None:
 def test_what_is_dropped_all_the_same_is_audited_of_each_band_alone() -> None:
     file = parse(TEXT)
     made = zonda.plan(file, drop=["high-pass decimation"], threads=1)
-    assert isinstance(made, PlanOfBands)
     assert coarse(made) == {"HighpassFilter.high-pass decimation"}
     found = audit_of_bands(file, made, threads=1)
     for one in found.bands.values():

@@ -17,9 +17,9 @@ from zonda.core.configuration.loaded import Limits
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.plan import decide as deciding
-from zonda.core.plan.bands import for_run
 from zonda.core.plan.bounds import Choice, Context, Coverage, Effect, Saving, figure, full, kelvin
 from zonda.core.plan.decide import Decided, limits
+from zonda.core.plan.planner import for_run
 from zonda.core.plan.pointing import cover, samples_of
 
 SHORT = ["PointingDaisy.scan_duration=40 s", "PointingDaisy.scans=1"]
@@ -39,7 +39,7 @@ def made(file):
 
 
 def decide(effects, allowed, **options):
-    found = deciding.decide([Decided("A", e) for e in effects], allowed, **options)
+    (found,) = deciding.decide([[Decided("A", e) for e in effects]], [allowed], **options)
     return {d.effect.name: d for d in found}
 
 
@@ -81,6 +81,20 @@ def test_of_equal_savings_the_smallest_error_first():
 def test_the_form_that_saves_most_of_those_that_fit():
     forms = (0.1, 0.1), (0.5, 0.2), (2.0, 0.5)
     assert decide([effect("one", *forms)], {"map_rms": 1.0})["one"].chosen == 2
+
+
+def test_a_form_of_several_bands_is_the_finest_that_one_of_them_needs():
+    """Forms are found by what they set; one that a band does not have is none."""
+    low, high = effect("one", (0.1, 0.01), (0.2, 0.5)), effect("one", (0.1, 0.01), (2.0, 0.5))
+    alone = effect("other", (0.1, 0.5))
+    bands = [[Decided("A", low), Decided("A", alone)], [Decided("A", high)]]
+    found = deciding.decide(bands, [{"map_rms": 1.0}] * 2)
+    assert [[d.chosen for d in band] for band in found] == [[1, 0], [1]]
+    assert found[0][1].reason == "coarser exceeds the budget of a band"
+    found = deciding.decide(bands, [{"map_rms": 1.0}, {"map_rms": 0.0}])
+    assert [[d.chosen for d in band] for band in found] == [[0, 0], [0]]
+    found = deciding.decide(bands, [{"map_rms": 1.0}, {"map_rms": 3.0}])
+    assert [[d.chosen for d in band] for band in found] == [[2, 0], [2]]
 
 
 def test_no_saving_no_error():
@@ -172,8 +186,8 @@ def test_a_budget_in_the_file(file):
         "mustang2_cluster", overrides=[*SHORT, "budget={map_rms: 3 uK, transfer: 0.1 %}"]
     )
     found = zonda.plan(stated, threads=1)
-    assert found.limits["map_rms"] == pytest.approx(3e-6)
-    assert found.limits["transfer"] == pytest.approx(1e-3)
+    assert found.bands[""].limits["map_rms"] == pytest.approx(3e-6)
+    assert found.bands[""].limits["transfer"] == pytest.approx(1e-3)
     nothing = zonda.plan(
         zonda.load("mustang2_cluster", overrides=[*SHORT, "budget=0 %"]), threads=1
     )
@@ -210,9 +224,9 @@ def test_an_operator_may_be_dropped(file):
 
 
 def test_within_the_budget(made):
-    for metric, limit in made.limits.items():
-        assert made.spent[metric] <= limit
-    assert {"map_rms", "peak", "transfer", "tod", "psd"} == set(made.limits)
+    for metric, limit in made.bands[""].limits.items():
+        assert made.bands[""].spent[metric] <= limit
+    assert {"map_rms", "peak", "transfer", "tod", "psd"} == set(made.bands[""].limits)
 
 
 def test_what_runs_is_an_ordinary_pipeline(file):
@@ -267,7 +281,7 @@ def test_the_table_and_json(made):
         assert words in shown
     data = json.loads(json.dumps(made.as_dict()))
     assert len(data["effects"]) == len(made.decided)
-    assert data["prediction"] == {"bytes": made.memory.bytes}
+    assert data["prediction"] == {"bytes": made.memory}
     assert all(len(row) == 4 for row in made.summary.short)
     covered = {d.effect.name for d in made.decided}
     assert covered >= {
@@ -311,8 +325,8 @@ def test_units():
 def test_no_noise_no_budget():
     file = zonda.load("mustang2_cluster", overrides=[*SHORT, "WhiteNoise.net=0 K s(1/2)"])
     found = zonda.plan(file, threads=1)
-    assert found.limits["map_rms"] == 0
-    assert found.spent["map_rms"] == 0
+    assert found.bands[""].limits["map_rms"] == 0
+    assert found.bands[""].spent["map_rms"] == 0
 
 
 # ---- prediction of the noise

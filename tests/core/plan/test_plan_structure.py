@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from zonda import plan
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.mapmaker import MapMaker
 from zonda.core.operator import Operator
 from zonda.core.output import Output, StreamOutput
 from zonda.core.pipeline import Pipeline
-from zonda.core.plan.planner import plan_band
 from zonda.core.plan.structure import Structure, chain_of, prune
 from zonda.core.signal import Component, Signal
 
@@ -251,7 +251,7 @@ def test_what_runs_of_a_file(end, without, tmp_path):
 
     sky = Path(__file__).parents[3] / "pipelines" / "data" / "merging_cluster.fits"
     file = parse(FILE.replace("FILE", str(sky)) + end)
-    planned = plan_band(file).apply(file)
+    planned = plan(file).apply(file)
     assert {s.key for s in file.steps} - {s.key for s in planned.steps} == without
     data = planned.pipeline().run(planned.scene(), output=tmp_path, threads=1)
     assert {label for label, _, _ in data.provenance["timings"]} == {

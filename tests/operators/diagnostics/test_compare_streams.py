@@ -250,8 +250,8 @@ def test_a_signal_that_there_is_not(reference, runs, said):
 
 
 def test_the_plan_keeps_a_signal_that_is_compared(tmp_path):
+    from zonda import plan
     from zonda.core.configuration.pipeline_file import parse
-    from zonda.core.plan.planner import plan_band
 
     text = """
 site: green_bank
@@ -268,7 +268,7 @@ operators:
   - Report
 """
     file = parse(text)
-    applied = plan_band(file).apply(file)
+    applied = plan(file).apply(file)
     assert list(applied.pipeline().runs) == ["quiet"]  # nothing reads the other
     data = applied.pipeline().run(applied.scene(), output=tmp_path, threads=1)
     assert data.products["stream_comparison"].reference == "signal/quiet"
