@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -223,8 +223,7 @@ class ConvolvedSky(SkyInput):
             if self.centre == "target" or (centre is None and source.placeless):
                 centre = observation.centre
             wcs = placed(source, centre)
-            if centre is not None:
-                source = moved(source, centre, self.place)
+            source = moved(source, centre, self.place)
             if wcs is not None:
                 own = own_pixels(source, wcs, key)
                 reach = REACH * SIGMA * widths[1]
@@ -246,7 +245,7 @@ class ConvolvedSky(SkyInput):
                 return self._on_own_pixels(grid, found)
             return self._resampled(grid, found, gridding)
 
-        return cast(Brightness, self._cache.get((*grid.key, gridding), make))
+        return self._cache.get((*grid.key, gridding), make)
 
     def _on_own_pixels(self, grid: Grid, found: Conversion) -> Brightness:
         """The values of a TAN image times `scale`. Raises InputError where it is brighter than
@@ -345,12 +344,8 @@ class ConvolvedSky(SkyInput):
             covered = intensity.covered(sky.covered)
             return Beam(fwhm, planes, intensity.to_grid @ grid.matrix, covered)
 
-        return cast(
-            Beam,
-            self._cache.get(
-                (*grid.key, "beam", self.pixels_per_fwhm, self.interpolation, fwhm), make
-            ),
-        )
+        key = *grid.key, "beam", self.pixels_per_fwhm, self.interpolation, fwhm
+        return self._cache.get(key, make)
 
     def _looked_at(self, data: Data) -> list[str]:
         """Lines of `zonda check` about the map, which the code of a run reads.

@@ -64,7 +64,7 @@ class Footprint:
             return None
         at = None if centre is None else centre.icrs()
         wcs = placed(image, at)
-        disc, _ = (image if at is None else moved(image, at, place)).extent
+        disc, _ = moved(image, at, place).extent
         matrix = None if wcs is None else pixel_matrix(wcs)
         return None if disc is None else cls(disc.centre, disc.radius, matrix, image.shape)
 
@@ -308,9 +308,9 @@ def placed(image: ImageMap, centre: tuple[float, float] | None) -> Any:
     return rescaled(wcs, matrix)
 
 
-def moved(image: ImageMap, centre: tuple[float, float], place: str) -> ImageMap:
+def moved(image: ImageMap, centre: tuple[float, float] | None, place: str) -> ImageMap:
     """An image of any projection moved over the sky with its centre to ``centre``, ICRS (ra, dec)
-    [rad].
+    [rad]; None: as it is.
 
     The sphere is turned, so that the image keeps its shape, and directions at its centre keep their
     angles from ICRS north: what lies east stays east, whatever the frame of the image. Its Q and U
@@ -318,6 +318,8 @@ def moved(image: ImageMap, centre: tuple[float, float], place: str) -> ImageMap:
 
     Raises InputError where the image's centre is beyond its projection.
     """
+    if centre is None:
+        return image
     if image.placeless:
         return replace(image, wcs=placed(image, centre), placeless=False)
     turn = _turned(image, centre)

@@ -9,7 +9,7 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, Self, TypeVar, cast
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -34,6 +34,8 @@ from .map_header import DOUBT, seen_twice
 from .read import read_map
 from .region import Progress, no_progress
 
+T = TypeVar("T")
+
 
 class Cache:
     """Computed values by key. Thread-safe; copies and pickles are empty.
@@ -50,7 +52,7 @@ class Cache:
         self._lock = threading.RLock()
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
 
-    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
+    def get(self, key: Hashable, make: Callable[[], T]) -> T:
         """The value of ``key``, made where it is not there. Values have ``nbytes``."""
         with self._lock:
             if key not in self._kept:
@@ -60,7 +62,8 @@ class Cache:
                 ):
                     self._kept.popitem(last=False)
             self._kept.move_to_end(key)
-            return self._kept[key]
+            found: T = self._kept[key]
+            return found
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Cache)
@@ -71,9 +74,13 @@ class Cache:
         return Cache, (self._limit,)
 
 
-class SkyParameters(Operator):
-    """Parameters of `SkyMap`. What is computed of the map is kept from observation to
-    observation.
+LARGE = 1 << 26
+"""Bytes of a file above which the progress bar shows that it is read."""
+
+
+class SkyInput(Operator):
+    """Parameters of `SkyMap`, and the map of the sky that it reads from a file or an array. What is
+    computed of the map is kept from observation to observation.
     """
 
     file: InputPath | None = None
@@ -147,7 +154,7 @@ class SkyParameters(Operator):
     _cache: Cache = PrivateAttr(default_factory=Cache)
 
     @model_validator(mode="after")
-    def _one_map(self) -> SkyParameters:
+    def _one_map(self) -> SkyInput:
         if (self.file is None) == (self.map is None):
             raise ValueError("give either file, the path of a FITS map, or in Python map, an array")
         if self.map is None:
@@ -164,7 +171,7 @@ class SkyParameters(Operator):
         return self
 
     @model_validator(mode="after")
-    def _consistent(self) -> SkyParameters:
+    def _consistent(self) -> SkyInput:
         if isinstance(self.centre, Target) and self.centre.frame == "horizontal":
             raise ValueError("centre must be fixed on the sky (ICRS or galactic), not horizontal")
         if self.beam == "none" and self.fwhm is not None:
@@ -195,18 +202,10 @@ class SkyParameters(Operator):
             array.write(temporary)
         return self.model_copy(update={"file": path, "map": None, "wcs": None})
 
-
-LARGE = 1 << 26
-"""Bytes of a file above which the progress bar shows that it is read."""
-
-
-class SkyInput(SkyParameters):
-    """A map of the sky that is read from a file or an array."""
-
     def _input(self, polarized: bool) -> tuple[InputMap, tuple[Hashable, ...]]:
         """The map, read once for all observations, and its key in the cache."""
         key = (*self._identity(), *(["polarized"] if polarized else []))
-        return cast(InputMap, self._cache.get(key, lambda: self.read_input(polarized))), key
+        return self._cache.get(key, lambda: self.read_input(polarized)), key
 
     def read_input(self, polarized: bool = False, header_alone: bool = False) -> InputMap:
         """The map of the file or the array, with Q and U if the camera is ``polarized``; warns of
@@ -271,7 +270,7 @@ class SkyInput(SkyParameters):
     def _header(self) -> InputMap:
         """The map without its values."""
         key = *self._identity(), "header"
-        return cast(InputMap, self._cache.get(key, lambda: self._read(header_alone=True)))
+        return self._cache.get(key, lambda: self._read(header_alone=True))
 
     def _footprint(self) -> Footprint | None:
         centre = self.centre if isinstance(self.centre, Target) else None
