@@ -35,7 +35,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,19 +44,16 @@ from pydantic import Field, model_validator
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
-from zonda.core.operator import Operator
 from zonda.core.pages import html_table
-from zonda.core.product import Record
 from zonda.core.storage.table_files import Column
-from zonda.core.stream_names import AnyStream, check_signals, streams_asked, streams_needed
+from zonda.core.stream_names import AnyStream, check_signals
 from zonda.core.types import Floats
 
 from .power_spectrum import Chosen, Welch, welch_of
 from .series import (
-    check_streams,
+    OfStreams,
+    Series,
     count_flagged,
-    key_of,
-    publish,
     spread_evenly,
     unit_of_stream,
 )
@@ -71,7 +68,7 @@ SHARED = 35 / 18
 """Neighbouring frequencies behind a Hann window: 1 + 2 (2/3)^2 + 2 (1/6)^2."""
 
 
-class CompareStreams(Operator):
+class CompareStreams(OfStreams):
     """Comparison of a stream with another at this step: rms, correlation, gain, ratio of spectra
     and coherence.
 
@@ -86,7 +83,6 @@ class CompareStreams(Operator):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"stream_comparison"})
-    knows_means: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     stream: AnyStream = "signal"
@@ -101,40 +97,24 @@ class CompareStreams(Operator):
     that transforms quickly.
     """
 
-    @property
-    def requires(self) -> frozenset[str]:
-        """`signal`, and streams of other steps."""
-        return streams_needed(self.streams)
-
-    @property
-    def optional(self) -> frozenset[str]:
-        """Components among the streams."""
-        return streams_asked(self.streams)
-
     @model_validator(mode="after")
     def _two(self) -> Self:
         if self.stream == self.reference:
             raise ValueError("stream and reference are the same")
         return self
 
-    def check(self, data: Data) -> list[str]:
-        """Refuse streams that no step makes."""
-        check_streams(data, self.streams, self.label)
-        return []
-
-    @property
-    def streams(self) -> tuple[str, str]:
+    def asked(self) -> tuple[str, str]:
         """The stream and its reference."""
         return self.stream, self.reference
 
     def prepare(self, observation: Observation) -> Chosen:
-        check_signals(self.streams, observation, self.label)
+        check_signals(self.asked(), observation, self.label)
         count_flagged(observation, self.label, "the comparison includes")
         welch = welch_of(observation, self.segment, observation.n_samples // LEAST_SEGMENTS)
         return Chosen(spread_evenly(observation, self.detectors), welch)
 
     def exec(self, block: Block, state: Chosen) -> None:
-        for detector, streams in state.streams(block, self.streams, self.label):
+        for detector, streams in state.streams(block, self.asked(), self.label):
             x, y = streams.values()
             if np.isfinite(x).all() and np.isfinite(y).all():
                 assert state.welch is not None
@@ -159,25 +139,6 @@ class CompareStreams(Operator):
         pairs = [state.found[d] for d in every]
         found = StreamComparison.of_pairs(self, pairs, state.welch, names)
         data.add(self.label, found)
-
-    def finalize(self, data: Data) -> None:
-        found: StreamComparison | None = data.take(self.label)
-        if found is None:
-            return
-        other = "scans left out: other detectors or length"
-        data.log.count(self.label, other, found.of_another_length)
-        for figure, text in found.lines():
-            data.log.state(self.label, figure, text)
-        publish(
-            data,
-            found.product,
-            found,
-            {"": found.columns(), "_detectors": found.detector_columns()},
-            STREAM=found.stream,
-            REFERENCE=found.reference,
-            SCANS=found.observations,
-            SEGMENTS=found.segments,
-        )
 
 
 @dataclass(frozen=True)
@@ -233,15 +194,15 @@ def figures(found: Pair, step: float, segments: float) -> tuple[Floats, Floats]:
 
 
 @dataclass
-class StreamComparison(Record):
+class StreamComparison(Series):
     """Comparison of a stream of a run with another.
 
     Attributes
     ----------
     stream, reference
         x and y.
-    label, product
-        Of the step; name among the products.
+    label
+        Of the step.
     names
         (n_det) detectors.
     values, errors
@@ -253,14 +214,14 @@ class StreamComparison(Record):
         (3, n) mean spectra P_x, P_y, P_d over detectors and scans; (n,) mean of equation (3).
     segments
         n of one scan.
-    observations, of_another_length
-        Scans in the mean, and those left out since their detectors or frequencies differ.
     """
+
+    usual: ClassVar[str] = "stream_comparison"
+    means: ClassVar[tuple[str, ...]] = ("values", "power", "coherence")
 
     stream: str
     reference: str
     label: str
-    product: str
     names: list[str]
     values: Floats
     errors: Floats
@@ -268,8 +229,6 @@ class StreamComparison(Record):
     power: Floats
     coherence: Floats
     segments: float
-    observations: int = 1
-    of_another_length: int = 0
 
     @classmethod
     def of_pairs(
@@ -282,22 +241,19 @@ class StreamComparison(Record):
         if unit_of_stream(step.stream) != unit_of_stream(step.reference):
             found[:, 0, FIGURES.index("rms_difference")] = power[2] = np.nan
         coherence = np.mean([p.coherence for p in pairs], axis=0)
-        key = key_of(step, "stream_comparison")
-        what = (*step.streams, step.label, key, names)
+        what = (*step.asked(), step.label, names)
         return cls(*what, found[:, 0], found[:, 1], f, power, coherence, segments)
 
-    def __iadd__(self, other: StreamComparison) -> StreamComparison:
+    def alike(self, other: Self) -> bool:
+        """True where detectors and frequencies are the same."""
+        return self.names == other.names and self.frequency.shape == other.frequency.shape
+
+    def __iadd__(self, other: Self) -> Self:
         """The mean of all scans, each with the same weight."""
-        self.of_another_length += other.of_another_length
-        if self.names != other.names or self.frequency.shape != other.frequency.shape:
-            self.of_another_length += other.observations
-            return self
-        n, m = self.observations, other.observations
-        for name in ("values", "power", "coherence"):
-            setattr(self, name, (getattr(self, name) * n + getattr(other, name) * m) / (n + m))
-        self.errors = np.hypot(self.errors * n, other.errors * m) / (n + m)
-        self.observations = n + m
-        return self
+        if self.alike(other):
+            n, m = self.observations, other.observations
+            self.errors = np.hypot(self.errors * n, other.errors * m) / (n + m)
+        return super().__iadd__(other)
 
     def over_detectors(self, figure: str) -> tuple[float, float, float]:
         """(mean over detectors, their standard deviation, standard error of one detector or NaN) of
@@ -313,8 +269,15 @@ class StreamComparison(Record):
         """(n,) of the coherence, equation (4)."""
         return np.asarray((1 - self.coherence) ** 2 / self.segments, np.float64)
 
-    def columns(self) -> list[Column]:
-        """The table of the spectra."""
+    def meta(self) -> dict[str, Any]:
+        """The streams, and the number of segments."""
+        return {"STREAM": self.stream, "REFERENCE": self.reference, "SEGMENTS": self.segments}
+
+    def tables(self) -> dict[str, list[Column]]:
+        """The spectra, and the values of each detector."""
+        return {"": self._spectra(), "_detectors": self._of_detectors()}
+
+    def _spectra(self) -> list[Column]:
         x, y, d = self.power
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = x / y
@@ -335,8 +298,7 @@ class StreamComparison(Record):
             Column("coherence_bias", self.bias, "", bias),
         ]
 
-    def detector_columns(self) -> list[Column]:
-        """The table of the figures of each detector."""
+    def _of_detectors(self) -> list[Column]:
         unit = {"K_RJ": "K", "m": "m"}
         own, other = (unit.get(unit_of_stream(name), "") for name in (self.stream, self.reference))
         kinds = {

@@ -33,11 +33,10 @@ from zonda.core.configuration.units import Seconds
 from zonda.core.data import Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.chunks import TILE_SAMPLES
-from zonda.core.operator import Operator
 from zonda.core.stream import Stream, forget_pages
 from zonda.core.types import Floats
 
-from .series import Modes, key_of, publish, spread_evenly
+from .series import Modes, OfStreams, spread_evenly
 
 
 @dataclass
@@ -161,7 +160,7 @@ KEPT = 64
 """Singular values that are kept of each scan."""
 
 
-class ModeSpectrum(Operator):
+class ModeSpectrum(OfStreams):
     """Singular values of the matrix detectors x time of `signal` at this step, their shares, and
     the leading modes.
 
@@ -173,9 +172,7 @@ class ModeSpectrum(Operator):
     (ECSV). `Plots` and `Report` show them.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
     provides: ClassVar[frozenset[str]] = frozenset({"modes"})
-    knows_means: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
 
     modes: int = Field(4, ge=1, le=KEPT)
@@ -237,7 +234,6 @@ class ModeSpectrum(Operator):
             "" if self.normalize else "K_RJ",
             observation.name,
             self.label,
-            key_of(self, "modes"),
         )
         stream.state.append(modes)
         return stream.state
@@ -245,10 +241,3 @@ class ModeSpectrum(Operator):
     def collect(self, data: Data, observation: Observation, state: list[Modes]) -> None:
         for modes in state:
             data.add(self.label, modes)
-
-    def finalize(self, data: Data) -> None:
-        found: Modes | None = data.take(self.label)
-        if found is not None:
-            tables = {"": found.columns(), "_streams": found.stream_columns()}
-            scans = {"SCAN": found.observation, "SCANS": len(found.values)}
-            publish(data, found.product, found, tables, **scans)

@@ -14,12 +14,11 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.flags import has_a_signal
-from zonda.core.operator import Operator
 from zonda.core.signal import BUILT_IN, MAIN, TRANSMISSION, Component
-from zonda.core.stream_names import StreamName, streams_asked, streams_needed
+from zonda.core.stream_names import StreamName
 from zonda.core.types import Floats
 
-from .series import Spectrum, check_streams, count_flagged, key_of, no_stream, spread_evenly
+from .series import OfStreams, Spectrum, count_flagged, no_stream, spread_evenly
 
 ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")
 """Of spectra in pictures."""
@@ -113,7 +112,7 @@ class Chosen:
                     yield int(detector), {n: on_sky(block, int(detector), n, gain) for n in names}
 
 
-class PowerSpectrum(Operator):
+class PowerSpectrum(OfStreams):
     """Mean one-sided power spectra of the streams at this step, in K_RJ^2/Hz on the calibrated sky.
 
     Components at the detector are divided as the calibration divides them: `atmosphere` times
@@ -124,7 +123,6 @@ class PowerSpectrum(Operator):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"spectrum"})
-    knows_means: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     streams: list[StreamName] | None = Field(None, min_length=1)
@@ -136,20 +134,9 @@ class PowerSpectrum(Operator):
     """Length of Welch's segments (at most the scan): the inverse of the frequency resolution.
     Shortened to a number of samples that has no prime factor above 5."""
 
-    @property
-    def requires(self) -> frozenset[str]:
-        """`signal`, and streams of other steps."""
-        return streams_needed(self.streams)
-
-    @property
-    def optional(self) -> frozenset[str]:
-        """Components among the streams."""
-        return streams_asked(self.streams)
-
-    def check(self, data: Data) -> list[str]:
-        """Refuse streams that no step makes."""
-        check_streams(data, self.streams or (), self.label)
-        return []
+    def asked(self) -> Sequence[str] | None:
+        """The list."""
+        return self.streams
 
     def prepare(self, observation: Observation) -> Chosen:
         count_flagged(observation, self.label, "the power spectra include")
@@ -190,13 +177,6 @@ class PowerSpectrum(Operator):
         averages = state.welch.independent * len(every)
         found = Spectrum(f, psd, averages, white, self.label, len(every), closed_forms=forms)
         data.add(self.label, found)
-
-    def finalize(self, data: Data) -> None:
-        mean: Spectrum | None = data.take(self.label)
-        if mean is not None:
-            what = "scans of another length left out of the mean spectrum"
-            data.log.count(self.label, what, mean.of_another_length)
-            data.products[key_of(self, "spectrum")] = mean
 
 
 def in_order(streams: Iterable[str]) -> list[str]:

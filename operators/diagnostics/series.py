@@ -6,27 +6,122 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import PipelineError
+from zonda.core.operator import Operator
 from zonda.core.pages import html_table
 from zonda.core.product import Record
 from zonda.core.signal import is_stream
 from zonda.core.storage.files import product_path
 from zonda.core.storage.table_files import Column, write_ecsv
-from zonda.core.stream_names import UNITS
+from zonda.core.stream_names import UNITS, streams_asked, streams_needed
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
     from zonda.core.data import Data, Observation
-    from zonda.core.operator import Operator
+
+
+class OfStreams(Operator):
+    """Base of steps that look at streams; what they add up is one of the products below, and tells
+    its tables itself.
+    """
+
+    knows_means: ClassVar[bool] = True
+
+    def asked(self) -> Sequence[str] | None:
+        """Streams that it looks at; None: `signal` and all components."""
+        return ("signal",)
+
+    @property
+    def requires(self) -> frozenset[str]:
+        """`signal`, and streams of other steps."""
+        return streams_needed(self.asked())
+
+    @property
+    def optional(self) -> frozenset[str]:
+        """Components among the streams."""
+        return streams_asked(self.asked())
+
+    def check(self, data: Data) -> list[str]:
+        """Refuse streams that no step makes."""
+        known = {*data.made, "signal"}
+        for name in (self.asked() or ()) if data.made else ():
+            if name.partition("/")[0] not in known:
+                raise no_stream(name, filter(is_stream, known), self.label)
+        return []
+
+    def finalize(self, data: Data) -> None:
+        """Make the product, state its values, and write its tables."""
+        found: Series | None = data.take(self.label)
+        if found is not None:
+            what = "scans left out: other detectors, streams or length"
+            data.log.count(self.label, what, found.of_another_length)
+            for name, text in found.lines():
+                data.log.state(self.label, name, text)
+            key = key_of(self, found.usual)
+            publish(data, key, found, found.tables(), **found.meta(), SCANS=found.observations)
+
+
+@dataclass(kw_only=True)
+class Series(Record):
+    """Base of products of streams: quantities along frequency or time, over one or several scans.
+
+    Attributes
+    ----------
+    usual
+        Name among the products of one whose step has no name of its own.
+    means
+        Names of fields, arrays or mappings of arrays, that are means over the scans.
+    observations, of_another_length
+        How many scans are in the means; scans that are not, since they are not `alike`.
+    """
+
+    usual: ClassVar[str]
+    means: ClassVar[tuple[str, ...]] = ()
+
+    observations: int = 1
+    of_another_length: int = 0
+
+    def alike(self, other: Self) -> bool:
+        """True if the two can be averaged."""
+        return True
+
+    def __iadd__(self, other: Self) -> Self:
+        """The mean of all scans, each with the same weight."""
+        self.of_another_length += other.of_another_length
+        if not self.alike(other):
+            self.of_another_length += other.observations
+            return self
+        n, m = self.observations, other.observations
+        self.observations = n + m
+        for name in self.means:
+            own, more = getattr(self, name), getattr(other, name)
+            if isinstance(own, dict):
+                mean: Any = {k: (own[k] * n + more[k] * m) / (n + m) for k in own if k in more}
+            else:
+                mean = (own * n + more * m) / (n + m)
+            setattr(self, name, mean)
+        return self
+
+    def lines(self) -> list[tuple[str, str]]:
+        """Values that are stated in the log: name, and text."""
+        return []
+
+    def tables(self) -> dict[str, list[Column]]:
+        """Tables that are written, by what stands behind the product's name."""
+        return {}
+
+    def meta(self) -> dict[str, Any]:
+        """Cards of the tables."""
+        return {}
 
 
 @dataclass
-class Spectrum(Record):
+class Spectrum(Series):
     """Mean one-sided power spectral densities of time streams.
 
     Attributes
@@ -43,13 +138,14 @@ class Spectrum(Record):
         simulated.
     label
         Of the step that measured it.
-    detectors, observations
+    detectors
         How many were averaged.
     closed_forms
         (n,) per component: what the law that was simulated promises; where one is known.
-    of_another_length
-        Scans that are not in the mean, since their frequencies or streams differ.
     """
+
+    usual: ClassVar[str] = "spectrum"
+    means: ClassVar[tuple[str, ...]] = ("psd", "closed_forms", "white_level")
 
     frequency: Floats
     psd: dict[str, Floats]
@@ -57,27 +153,19 @@ class Spectrum(Record):
     white_level: float
     label: str
     detectors: int
-    observations: int = 1
-    of_another_length: int = 0
     closed_forms: dict[str, Floats] = field(default_factory=dict)
 
-    def __iadd__(self, other: Spectrum) -> Spectrum:
-        """The mean of all scans, each with the same weight."""
-        self.of_another_length += other.of_another_length
+    def alike(self, other: Self) -> bool:
+        """True where streams and frequencies are the same."""
         f, g = self.frequency, other.frequency
-        alike = f.shape == g.shape and np.allclose(f, g, rtol=1e-12)
-        if self.psd.keys() != other.psd.keys() or not alike:
-            self.of_another_length += other.observations
-            return self
-        n, m = self.observations, other.observations
-        for name in ("psd", "closed_forms"):
-            own, more = getattr(self, name), getattr(other, name)
-            means = {k: (own[k] * n + more[k] * m) / (n + m) for k in own if k in more}
-            setattr(self, name, means)
-        self.white_level = (self.white_level * n + other.white_level * m) / (n + m)
-        self.averages += other.averages
-        self.detectors, self.observations = other.detectors, n + m
-        return self
+        same = f.shape == g.shape and np.allclose(f, g, rtol=1e-12)
+        return self.psd.keys() == other.psd.keys() and same
+
+    def __iadd__(self, other: Self) -> Self:
+        """The mean of all scans; the periodograms of all count."""
+        if self.alike(other):
+            self.averages, self.detectors = self.averages + other.averages, other.detectors
+        return super().__iadd__(other)
 
     def regimes(self) -> list[tuple[str, float, float]]:
         """(component, lowest, highest frequency [Hz]) where one of atmosphere, 1/f and white noise
@@ -170,7 +258,7 @@ def unit_of_stream(name: str) -> str:
 
 
 @dataclass
-class TimeStream(Record):
+class TimeStream(Series):
     """Streams of a few detectors of one scan.
 
     Attributes
@@ -183,20 +271,15 @@ class TimeStream(Record):
         (n_det) detector names.
     observation, label
         Name of the scan; the step at which they were taken.
-    product
-        Name among the products.
     """
+
+    usual: ClassVar[str] = "time_streams"
 
     seconds: Floats
     streams: dict[str, Floats]
     names: list[str]
     observation: str
     label: str
-    product: str = "time_streams"
-
-    def __iadd__(self, other: TimeStream) -> TimeStream:
-        """The first one stays."""
-        return self
 
 
 def about(data: Data, **more: Any) -> dict[str, Any]:
@@ -275,21 +358,13 @@ def check_map(data: Data, name: str, place: str) -> None:
         raise PipelineError(f"there is no map {name!r}", place=place, cure=cure)
 
 
-def check_streams(data: Data, names: Iterable[str], place: str) -> None:
-    """In `Operator.check`: PipelineError where no step makes a stream of this name."""
-    known = {*data.made, "signal"}
-    for name in names if data.made else ():
-        if name.partition("/")[0] not in known:
-            raise no_stream(name, filter(is_stream, known), place)
-
-
 def plane_key(key: str, plane: str) -> str:
     """Name of a product of I, Q or U: ``key``, ``key_Q``, ``key_U``."""
     return key if plane == "I" else f"{key}_{plane}"
 
 
 @dataclass
-class Modes(Record):
+class Modes(Series):
     """Principal components of the detectors' streams (`components`).
 
     Attributes
@@ -311,9 +386,11 @@ class Modes(Record):
         Number of delays, and each in s; 0: instantaneous.
     unit
         Of the values: K_RJ; empty where detectors were divided by their rms.
-    observation, label, product
-        Name of the first scan; the step at which they were taken; name among the products.
+    observation, label
+        Name of the first scan; the step at which they were taken.
     """
+
+    usual: ClassVar[str] = "modes"
 
     values: Floats
     energy: Floats
@@ -326,13 +403,12 @@ class Modes(Record):
     unit: str
     observation: str
     label: str
-    product: str = "modes"
 
-    def __iadd__(self, other: Modes) -> Modes:
+    def __iadd__(self, other: Self) -> Self:
         """Values of all scans; streams and vectors of the first."""
         self.values = np.concatenate([self.values, other.values])
         self.energy = np.concatenate([self.energy, other.energy])
-        return self
+        return super().__iadd__(other)
 
     @property
     def detectors(self) -> int:
@@ -351,27 +427,29 @@ class Modes(Record):
         n = len(each)
         return each.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(each.shape[1], np.nan)
 
-    def columns(self) -> list[Column]:
-        """The table of the singular values, the largest first."""
+    def tables(self) -> dict[str, list[Column]]:
+        """The singular values, the largest first; and the leading modes in time."""
         used = self.values.any(axis=0)
         share, rms = self.shares[used], np.sqrt((self.values[:, used] ** 2).mean(axis=0))
         error = "standard error of share from its scatter over scans; nan: one scan"
         before = "share of this mode and those before"
-        return [
+        values = [
             Column("mode", np.arange(1, share.size + 1), "", "the largest first"),
             Column("singular_value", rms, self._fits, "/ sqrt(rows x samples), rms over the scans"),
             Column("share", share, "", "of the variance, mean over the scans"),
             Column("error", self.error[used], "", error),
             Column("cumulative", np.cumsum(share), "", before),
         ]
-
-    def stream_columns(self) -> list[Column]:
-        """The leading modes in time."""
         text = "v(t) = sum over detectors (and delays) of u A"
-        return [
+        streams = [
             Column("seconds", self.seconds, "s", f"since the start of {self.observation}"),
             *(Column(f"mode_{k}", row, self._fits, text) for k, row in enumerate(self.streams, 1)),
         ]
+        return {"": values, "_streams": streams}
+
+    def meta(self) -> dict[str, Any]:
+        """The scan whose streams are in the table."""
+        return {"SCAN": self.observation}
 
     @property
     def _fits(self) -> str:

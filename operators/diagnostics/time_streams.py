@@ -8,14 +8,13 @@ import numpy as np
 from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
-from zonda.core.operator import Operator
-from zonda.core.stream_names import StreamName, streams_asked, streams_needed
+from zonda.core.stream_names import StreamName
 from zonda.core.types import Floats
 
-from .series import TimeStream, key_of
+from .series import OfStreams, TimeStream
 
 
-class TimeStreams(Operator):
+class TimeStreams(OfStreams):
     """Streams of a few detectors of one scan at this step, for a picture: product ``time_streams``.
 
     Components (`sky`, `white`, those of plugins ...) are at the detector, before the calibration;
@@ -25,7 +24,6 @@ class TimeStreams(Operator):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
-    knows_means: ClassVar[bool] = True
 
     streams: list[StreamName] = Field(["signal"], min_length=1)
     """Streams to keep; components that are absent at this step are skipped and counted."""
@@ -34,15 +32,9 @@ class TimeStreams(Operator):
     observation: int = Field(0, ge=0)
     """Which scan, counted from 0."""
 
-    @property
-    def requires(self) -> frozenset[str]:
-        """`signal`, and streams of other steps."""
-        return streams_needed(self.streams)
-
-    @property
-    def optional(self) -> frozenset[str]:
-        """Components among the streams."""
-        return streams_asked(self.streams)
+    def asked(self) -> list[str]:
+        """The list."""
+        return self.streams
 
     def check(self, data: Data) -> list[str]:
         """Refuse a scan that is not there, once the telescope is pointed."""
@@ -56,21 +48,12 @@ class TimeStreams(Operator):
     def prepare(self, observation: Observation) -> TimeStream | None:
         if observation.index != self.observation:
             return None
-        n, shape = (
-            observation.n_detectors,
-            (min(observation.n_detectors, self.detectors), observation.n_samples),
-        )
+        n = observation.n_detectors
+        shape = min(n, self.detectors), observation.n_samples
         chosen = np.linspace(0, n - 1, shape[0]).round().astype(int)
         names = [observation.focalplane.names[d] for d in chosen]
         streams: dict[str, Floats] = {name: np.full(shape, np.nan) for name in self.streams}
-        return TimeStream(
-            observation.seconds,
-            streams,
-            names,
-            observation.name,
-            self.label,
-            key_of(self, "time_streams"),
-        )
+        return TimeStream(observation.seconds, streams, names, observation.name, self.label)
 
     def exec(self, block: Block, state: TimeStream | None) -> None:
         if state is None:
@@ -91,7 +74,3 @@ class TimeStreams(Operator):
             del state.streams[name]
             observation.log.count(self.label, f"stream {name} is absent at this step", 1)
         data.add(self.label, state)
-
-    def finalize(self, data: Data) -> None:
-        if (kept := data.take(self.label)) is not None:
-            data.products[kept.product] = kept

@@ -139,7 +139,7 @@ def test_scans_are_averaged(make_observation, data, noise):
     assert both.observations == 2
     np.testing.assert_allclose(both.psd["signal"], 5 * before, rtol=1e-6)  # (1 + 9) / 2
     assert (
-        data.log.get("PowerSpectrum", "scans of another length left out of the mean spectrum") == 1
+        data.log.get("PowerSpectrum", "scans left out: other detectors, streams or length") == 1
     )
 
 
