@@ -83,6 +83,7 @@ class CompareStreams(OfStreams):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"stream_comparison"})
+    knows_means: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     stream: AnyStream = "signal"

@@ -173,6 +173,7 @@ class ModeSpectrum(OfStreams):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"modes"})
+    knows_means: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
 
     modes: int = Field(4, ge=1, le=KEPT)

@@ -123,6 +123,7 @@ class PowerSpectrum(OfStreams):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"spectrum"})
+    knows_means: ClassVar[bool] = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     streams: list[StreamName] | None = Field(None, min_length=1)

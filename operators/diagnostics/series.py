@@ -30,8 +30,6 @@ class OfStreams(Operator):
     its tables itself.
     """
 
-    knows_means: ClassVar[bool] = True
-
     def asked(self) -> Sequence[str] | None:
         """Streams that it looks at; None: `signal` and all components."""
         return ("signal",)

@@ -24,6 +24,7 @@ class TimeStreams(OfStreams):
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
+    knows_means: ClassVar[bool] = True
 
     streams: list[StreamName] = Field(["signal"], min_length=1)
     """Streams to keep; components that are absent at this step are skipped and counted."""
