@@ -102,8 +102,13 @@ def finish(ax: Any, across: str, up: str, title: str = "", **legend: Any) -> Non
         ax.legend(**{"frameon": False, "fontsize": 8} | legend)
 
 
-def axis_above(ax: Any, inverse: Any, name: str) -> None:
-    """Add a second, logarithmic axis on top, by a function that is its own inverse."""
+def axis_above(ax: Any, product: float, name: str) -> None:
+    """Add a second, logarithmic axis on top: ``product`` divided by the values of the first."""
+
+    def inverse(values: Any) -> Any:
+        with np.errstate(divide="ignore"):
+            return product / np.asarray(values, np.float64)
+
     upper = ax.secondary_xaxis("top", functions=(inverse, inverse))
     upper.set_xlabel(name)
     log_labels(upper.xaxis)

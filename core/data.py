@@ -13,10 +13,10 @@ from .block import STREAMS, Block
 from .errors import PipelineError
 from .log import Log, percent
 from .observation import Observation
-from .pages import html_table
 from .product import Product
 from .results import kept, one_scan, product_of
 from .stream import Stream, in_order
+from .tables import html_table
 
 if TYPE_CHECKING:
     from .scene import Scene

@@ -20,9 +20,8 @@ from .accuracy.metrics import Metric, OfFunction, get
 from .configuration.diagnostics import TextValue, mistake, refusal
 from .configuration.parameters import Parameters
 from .errors import InputError, PipelineError, ZondaError
-from .pages import html_table
 from .signal import Signal
-from .tables import Table
+from .tables import Table, html_table
 from .types import Floats
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .pages import html_table
+from .tables import html_table
 from .types import Floats
 
 DEFAULTS: dict[str, float] = {

@@ -18,7 +18,7 @@ from .intervals import Intervals, runs
 from .log import Log
 from .numerics.random import stream_key
 from .numerics.smooth import SmoothField
-from .pages import html_table
+from .tables import html_table
 from .types import AnyFloats
 
 if TYPE_CHECKING:

@@ -22,7 +22,6 @@ from .machine import available_memory, available_threads
 from .observation import Observation
 from .operator import Operator, labels
 from .output import Output
-from .pages import html_table
 from .run.budget import least_memory
 from .run.execute import execute
 from .run.settings import Settings, Timer
@@ -30,6 +29,7 @@ from .run.views import Band, View
 from .scene import Scene, WithScene
 from .signal import Signal, stream_of
 from .storage.files import check_output_folder
+from .tables import html_table
 from .versions import versions
 
 

@@ -3,12 +3,55 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .storage.table_files import Column, write_ecsv
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from markupsafe import Markup
+
+    from .storage.table_files import Column
+
+
+def render(package: str, template: str, **values: Any) -> str:
+    """The text of a template in the folder ``templates`` of a package, or in that of the core.
+
+    Every value is escaped, unless it is `markupsafe.Markup`.
+    """
+    return _environment(package).get_template(template).render(**values)
+
+
+def html_table(title: str, rows: Sequence[tuple[Any, Any]]) -> str:
+    """A table of two columns that shows an object in a notebook."""
+    return render("zonda.core", "notebook.html", title=title, rows=rows)
+
+
+@cache
+def _environment(package: str) -> Environment:
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+
+    packages = dict.fromkeys((package, "zonda.core"))
+    made = Environment(
+        loader=ChoiceLoader([PackageLoader(name) for name in packages]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters |= {"code": code, "number": cell_text}
+    return made
+
+
+def code(text: str) -> Markup:
+    """Docstring text with single and double backquotes as code."""
+    from markupsafe import Markup, escape
+
+    plain = str(escape(" ".join(text.split())))
+    return Markup(re.sub(r"``(.+?)``|`(.+?)`", lambda m: f"<code>{m[1] or m[2]}</code>", plain))
 
 
 def aligned(
@@ -57,6 +100,8 @@ class Table:
         cls, records: Sequence[Mapping[str, Any]], about: Mapping[str, str], meta: Mapping[str, Any]
     ) -> Table:
         """A table of mappings that have the same keys; ``about``: descriptions of the columns."""
+        from .storage.table_files import Column  # with astropy's tables
+
         made = [Column(k, [one[k] for one in records], "", text) for k, text in about.items()]
         return cls(made, meta)
 
@@ -84,6 +129,8 @@ class Table:
 
     def write(self, path: str | Path) -> Path:
         """Write an ECSV file, and return its path. Raises `OutputError`."""
+        from .storage.table_files import write_ecsv
+
         return write_ecsv(path, self.columns, self.meta)
 
 

@@ -18,9 +18,8 @@ import numpy as np
 from ..canvas import SEQUENCE, new_axes
 from ..configuration.units import factor_to
 from ..experiment import Values
-from ..pages import render
 from ..storage.files import atomic_path, write_text
-from ..tables import Table
+from ..tables import Table, render
 
 if TYPE_CHECKING:
     from .folder import Record

@@ -21,7 +21,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from ..errors import ZondaError
-from ..pages import html_table
+from ..tables import html_table
 from .describe import described, document, own_doc, remember_place, signature
 from .diagnostics import ConfigurationError, Diagnostic, refusal
 from .explain import explain

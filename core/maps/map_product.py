@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..numerics.angles import FWHM_PER_SIGMA, angle_text, sides_text
-from ..pages import html_table
+from ..tables import html_table
 from ..types import Floats
 from .map_arrays import MapArrays
 from .measured_noise import central_diameter

@@ -315,7 +315,7 @@ class Plan:
         }
 
     def _repr_html_(self) -> str:
-        from ..pages import html_table
+        from ..tables import html_table
 
         return html_table("Plan", [row[:2] for row in self.short()])
 

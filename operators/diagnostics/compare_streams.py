@@ -44,9 +44,9 @@ from pydantic import Field, model_validator
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
-from zonda.core.pages import html_table
 from zonda.core.storage.table_files import Column
 from zonda.core.stream_names import AnyStream, check_signals
+from zonda.core.tables import html_table
 from zonda.core.types import Floats
 
 from .power_spectrum import Chosen, Welch, welch_of
@@ -218,6 +218,7 @@ class StreamComparison(Series):
     """
 
     usual: ClassVar[str] = "stream_comparison"
+    left_out: ClassVar[str] = "scans left out: other detectors or length"
     means: ClassVar[tuple[str, ...]] = ("values", "power", "coherence")
 
     stream: str

@@ -12,7 +12,7 @@ from .map_spectra import MapSpectrum
 from .plot_operators import Plots
 from .power_spectrum import PowerSpectrum
 from .report import Report
-from .time_streams import TimeStreams
+from .series import TimeStreams
 from .transfer_function import TransferFunction
 
 

@@ -40,9 +40,9 @@ from zonda.core.types import AnyFloats, Floats
 
 from .comparison.files import plane_of
 from .comparison.statistics import Comparison
-from .drawing.comparison_plots import draw_comparison
-from .drawing.plots import draw, draw_scan
+from .comparison_plots import draw_comparison
 from .series import Spectrum, TimeStream
+from .series_plots import draw, draw_scan
 
 Window = tuple[slice, slice]
 LARGEST = 1500

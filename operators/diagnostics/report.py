@@ -1,42 +1,42 @@
-"""One self-contained page that shows what a run made and says how."""
+"""One self-contained page that shows what a run made and says how; the layout is the template's."""
 
 from __future__ import annotations
 
 import base64
+import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
+from zonda.core.band import Band
 from zonda.core.configuration.describe import described, own_doc
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
+from zonda.core.errors import ZondaError
 from zonda.core.figures import Figures
 from zonda.core.maps.beams import expected_fwhm
-from zonda.core.numerics.angles import ARCSEC, angle_text
+from zonda.core.maps.measured_noise import central_diameter, in_beams
+from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures
+from zonda.core.numerics.angles import ARCSEC, angle_text, beam_area, sides_text
+from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.operator import Operator
 from zonda.core.output import Output, output_folder
-from zonda.core.pages import render
+from zonda.core.registry import declared, operators
 from zonda.core.storage.files import write_text
+from zonda.core.tables import render
 from zonda.core.types import AnyFloats
 
 from .plot_operators import DRAWN, Picture, Plots, pictures
-from .report_results import (
-    class_of,
-    flux_density,
-    has_white_noise,
-    readable,
-    results,
-    sexagesimal,
-    spread,
-)
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
-    from zonda.core.data import Observation
     from zonda.core.instrument import Instrument
+    from zonda.core.maps.map_product import MapProduct
 
 LONG = 12
 """Rows of a table that are shown; the rest of a longer one is folded away. Half as many of files,
@@ -78,53 +78,31 @@ class Report(Output):
         )
 
 
-TITLES = {
-    "results": "Results",
-    "figures": "Figures",
-    "pictures": "Pictures",
-    "scene": "Scene",
-    "scans": "Scans",
-    "steps": "Steps",
-    "tally": "Counted and approximated",
-    "plan": "Plan",
-    "time": "Computing time",
-    "provenance": "Provenance",
-}
-"""Sections of the page in their order; one without content is left out."""
-
-
 def page(data: Data, shown: Sequence[Picture], central_diameter: float | None) -> str:
     """The whole page. All text is escaped by the template."""
     provenance, scene = data.provenance, data.scene
     version = str(provenance.get("versions", {}).get("zonda", ""))
-    line = (
-        f"{scene.instrument.name} on {scene.instrument.telescope.name} at {scene.site.name},"
-        f" {scene.time}, seed {scene.seed}"
-    )
-    sections = {
-        "results": results(data, central_diameter),
-        "figures": _figures(data),
-        "pictures": _pictures(shown, [band.name for band in scene.instrument.bands]),
-        "scene": _scene(data),
-        "scans": _scans(data),
-        "steps": _steps(data),
-        "tally": _tally(data),
-        "plan": list(provenance.get("plan", [])),
-        "time": _timings(data),
-        "provenance": _provenance(data),
-    }
     return render(
         __package__,
         "report.html",
         title=str(provenance.get("name") or "zonda run"),
         description=str(provenance.get("description") or ""),
-        line=f"{line}, zonda {version}" if version else line,
+        data=data,
+        scene=scene,
         version=version,
-        titles=TITLES,
-        sections=sections,
+        results=results(data, central_diameter),
+        figures=[f for p in data.products.values() if isinstance(p, Figures) for f in p],
+        pictures=_pictures(shown, [band.name for band in scene.instrument.bands]),
+        about=_scene(data),
+        steps=_steps(data),
+        log=_log(data),
+        timings=_timings(data),
+        provenance=_provenance(provenance, scene.seed),
         long=LONG,
         written=[p.name for key in ("map_file", "tod_file") for p in data.products.get(key, [])],
-        resolved=str(provenance.get("resolved_yaml", "")),
+        sexagesimal=sexagesimal,
+        spans=_span,
+        unwrap=np.unwrap,
     )
 
 
@@ -132,94 +110,68 @@ def _pictures(shown: Sequence[Picture], bands: Sequence[str]) -> list[dict[str, 
     found = []
     for picture in shown:
         band = next((b for b in bands if picture.name.endswith(f"_{b}")), "")
-        named = band in picture.title
-        found.append(
-            {
-                "title": picture.title if named else f"{picture.title} ({band})",
-                "caption": picture.caption,
-                "image": base64.b64encode(picture.png).decode(),
-                "wide": int.from_bytes(picture.png[16:20], "big") > _WIDE,
-            }
-        )
+        title = picture.title if band in picture.title else f"{picture.title} ({band})"
+        image = base64.b64encode(picture.png).decode()
+        wide = int.from_bytes(picture.png[16:20], "big") > _WIDE
+        found.append({"title": title, "caption": picture.caption, "image": image, "wide": wide})
     return found
 
 
-def _figures(data: Data) -> list[tuple[str, ...]]:
-    """Name, value, standard error and meaning of each figure of `MeasureFigures`."""
-    every = (product for product in data.products.values() if isinstance(product, Figures))
-    return [
-        (
-            f.name,
-            f"{f.value:.5g} {f.unit}".strip(),
-            f"{f.error:.2g}" if np.isfinite(f.error) else "",
-            f.description,
-        )
-        for figures in every
-        for f in figures
-    ]
-
-
-def _scene(data: Data) -> list[tuple[str, Any]]:
+def _scene(data: Data) -> dict[str, Any]:
+    """What the scene is called, and what it is."""
     scene = data.scene
     instrument, site, telescope = scene.instrument, scene.site, scene.instrument.telescope
     cameras, target = instrument.cameras, scene.target
     number = " + ".join(str(camera.detectors) for camera in cameras.values())
     place = f"{np.degrees(site.latitude):.4f}°, {np.degrees(site.longitude):.4f}°"
     field = f"detectors in a field of {angle_text(instrument.field_of_view)}"
-    campaign = data.provenance.get("campaign")
     note = "this table and the plan are of its first entry, figures of its last, counts of all"
-    rows: list[tuple[str, Any]] = [
-        *([("Campaign", f"{campaign}; {note}")] if campaign else []),
-        ("Site", f"{site.name}: {place}, {site.altitude:.0f} m"),
-        ("Telescope", f"{telescope.name}, {telescope.diameter:.4g} m"),
-        ("Instrument", f"{instrument.name}: {number} {field}"),
-    ]
-    for camera in cameras.values():
-        rows += _band(camera, data, several=len(cameras) > 1)
-    if data.observations:
-        rows.append(("Read-out", f"{data.observations[0].sample_rate:.6g} Hz"))
-    rows += [
-        ("Target", "given by the pointing step" if target is None else _target(target)),
-        ("Start", scene.time),
-        ("Seed", scene.seed),
-    ]
+    campaign = data.provenance.get("campaign")
+    rows = {
+        "Campaign": campaign and f"{campaign}; {note}",
+        "Site": f"{site.name}: {place}, {site.altitude:.0f} m",
+        "Telescope": f"{telescope.name}, {telescope.diameter:.4g} m",
+        "Instrument": f"{instrument.name}: {number} {field}",
+    }
     sources = {"Site": site.provenance, "Instrument": instrument.provenance}
     for camera in cameras.values():
-        name = f"Band {camera.band.name}" if len(cameras) > 1 else "Band"
-        sources[name] = camera.band.provenance
-    rows += [(f"{kind}: source of the numbers", text) for kind, text in sources.items() if text]
-    return rows
+        tell = f" {camera.band.name}" if len(cameras) > 1 else ""
+        rows |= {f"{name}{tell}": text for name, text in _band(camera, data).items()}
+        sources[f"Band{tell}"] = camera.band.provenance
+    rate = f"{data.observations[0].sample_rate:.6g} Hz" if data.observations else ""
+    rows |= {
+        "Read-out": rate,
+        "Target": "given by the pointing step" if target is None else _target(target),
+        "Start": scene.time,
+        "Seed": scene.seed,
+    }
+    return rows | {f"{kind}: source of the numbers": text for kind, text in sources.items()}
 
 
-def _band(camera: Instrument, data: Data, *, several: bool) -> list[tuple[str, Any]]:
+def _band(camera: Instrument, data: Data) -> dict[str, str]:
     """A band, with what its detectors are like in the first scan."""
-    band, tell = camera.band, f" {camera.band.name}" if several else ""
+    band = camera.band
     low, high, centre = (f / 1e9 for f in (band.frequency[0], band.frequency[-1], band.centre))
-    edges = f"{low:.4g} to {high:.4g} GHz about {centre:.4g} GHz"
-    rows: list[tuple[str, Any]] = [("Band", f"{band.name}: {edges}")]
+    rows = {"Band": f"{band.name}: {low:.4g} to {high:.4g} GHz about {centre:.4g} GHz"}
     scans = [o for o in data.observations if o.instrument == camera]
-    if scans:
-        plane = scans[0].focalplane
-        jansky = flux_density(1.0, expected_fwhm(plane.fwhm, plane.net), band)
-        rows += [
-            ("Beam (FWHM)", spread(plane.fwhm / ARCSEC, "″")),
-            ("1 K_RJ at a point source's peak", jansky),
-            ("Main-beam efficiency ζ", spread(plane.main_beam_efficiency)),
-            ("Illumination efficiency ε", spread(plane.illumination_efficiency)),
-            ("NET on the sky", _net(scans, data)),
-        ]
-    return [(f"{name}{tell}", text) for name, text in rows]
-
-
-def _net(scans: Sequence[Observation], data: Data) -> str:
-    """NET of all detectors in all scans (they differ where noise follows from the load); of a
-    campaign, in the first scan.
-    """
+    if not scans:
+        return rows
+    plane = scans[0].focalplane
+    # they differ where noise follows from the load; of a campaign the first scan is known
     known = scans[:1] if "campaign" in data.provenance else scans
-    text = spread(np.concatenate([o.focalplane.net for o in known]) * 1e3, " mK_RJ √s")
+    net = spread(np.concatenate([o.focalplane.net for o in known]) * 1e3, " mK_RJ √s")
     if not has_white_noise(data):
-        return f"{text} (no white noise is simulated)"
-    return f"{text} (of the first scan)" if len(known) < len(scans) else text
+        net += " (no white noise is simulated)"
+    elif len(known) < len(scans):
+        net += " (of the first scan)"
+    jansky = flux_density(1.0, expected_fwhm(plane.fwhm, plane.net), band)
+    return rows | {
+        "Beam (FWHM)": spread(plane.fwhm / ARCSEC, "″"),
+        "1 K_RJ at a point source's peak": jansky,
+        "Main-beam efficiency ζ": spread(plane.main_beam_efficiency),
+        "Illumination efficiency ε": spread(plane.illumination_efficiency),
+        "NET on the sky": net,
+    }
 
 
 def _target(target: Target) -> str:
@@ -230,23 +182,7 @@ def _target(target: Target) -> str:
     return ", ".join(f"{name} {angle:.6g}°" for name, angle in zip(names, angles, strict=True))
 
 
-def _scans(data: Data) -> list[tuple[str, ...]]:
-    return [
-        (
-            o.name,
-            str(o.start).replace("T", " "),
-            f"{o.duration:.1f} s",
-            f"{o.n_detectors} × {o.n_samples}",
-            sexagesimal(*o.centre),
-            _range(o.elevation),
-            _range(np.unwrap(o.azimuth)),
-            f"{np.count_nonzero(~o.good_samples)} / {np.count_nonzero(~o.good_detectors)}",
-        )
-        for o in data.observations
-    ]
-
-
-def _range(angles: AnyFloats) -> str:
+def _span(angles: AnyFloats) -> str:
     return f"{np.degrees(angles.min()):.2f}° – {np.degrees(angles.max()):.2f}°"
 
 
@@ -263,7 +199,7 @@ def _steps(data: Data) -> list[dict[str, Any]]:
     return found
 
 
-def _tally(data: Data) -> list[tuple[str, str, str]]:
+def _log(data: Data) -> list[tuple[str, str, str]]:
     """The log of counts and figures, in the order of the steps."""
     rows: list[tuple[str, str, str]] = []
     previous = ""
@@ -277,30 +213,244 @@ def _tally(data: Data) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _timings(data: Data) -> list[dict[str, Any]]:
-    """CPU seconds of each step, in all and by stage."""
-    by_step: dict[str, Any] = {}
+def _timings(data: Data) -> dict[str, Counter[str]]:
+    """CPU seconds of each step by stage."""
+    by_step: dict[str, Counter[str]] = {}
     for label, stage, seconds in data.provenance.get("timings", []):
-        by_step.setdefault(str(label), Counter())[str(stage)] += float(seconds)
-    return [
-        {
-            "label": label,
-            "seconds": sum(stages.values()),
-            "stages": ", ".join(f"{k} {v:.2g} s" for k, v in stages.items() if v >= 0.0005),
-        }
-        for label, stages in by_step.items()
-    ]
+        by_step.setdefault(label, Counter())[stage] += seconds
+    return by_step
 
 
-def _provenance(data: Data) -> list[tuple[str, Any]]:
-    provenance = data.provenance
-    rows = {"seed": data.scene.seed, "command": provenance.get("command")}
-    rows |= provenance.get("versions", {})
-    rows["precision"] = provenance.get("precision")
-    for name, run in provenance.get("runs", {}).items():
+def _provenance(known: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    """Where the numbers come from: seed, command, versions, signals."""
+    rows = {"seed": seed, "command": known.get("command"), **known.get("versions", {})}
+    rows["precision"] = known.get("precision")
+    for name, run in known.get("runs", {}).items():
         parts = (
             f"{how} {' and '.join(what) if isinstance(what, list) else what}"
             for how, what in run.items()
         )
         rows[f"signal {name}"] = ", ".join(parts)
-    return [(name, value) for name, value in rows.items() if value not in ("", None)]
+    return rows
+
+
+PREFIXES = ((1.0, ""), (1e3, "m"), (1e6, "µ"))
+
+
+def scaled(value: float, unit: str, least: float = 1.0) -> str:
+    """Three figures, in the unit or the first of its thousandth and millionth in which the value is
+    at least ``least``.
+    """
+    if not math.isfinite(value):
+        return "unknown"
+    factor, prefix = next((u for u in PREFIXES if abs(value) * u[0] >= least), PREFIXES[-1])
+    return f"{value * factor:.3g}\u00a0{prefix}{unit}".replace("-", "−")
+
+
+def spread(values: Any, unit: str = "") -> str:
+    """One number where all are the same, else the range and the mean."""
+    low, high = float(np.min(values)), float(np.max(values))
+    if math.isclose(low, high, rel_tol=1e-9):
+        return f"{low:.4g}{unit}"
+    return f"{low:.4g} to {high:.4g}{unit}, mean {float(np.mean(values)):.4g}"
+
+
+def sexagesimal(ra: float, dec: float) -> str:
+    """``02h32m11.00s −04°40′00.0″``, from rad."""
+    s = round(ra % (2 * math.pi) * 43200 / math.pi, 2) % 86400
+    a = round(abs(dec) * 648000 / math.pi, 1)
+    hours = f"{s // 3600:02.0f}h{s % 3600 // 60:02.0f}m{s % 60:05.2f}s"
+    degrees = f"{a // 3600:02.0f}°{a % 3600 // 60:02.0f}′{a % 60:04.1f}″"
+    return f"{hours} {'−' if dec < 0 else '+'}{degrees}"
+
+
+_NUMBER = re.compile(r"([-+]?\d+\.?\d*(?:e[-+]?\d+)?) ([A-Za-z][A-Za-z0-9 /()]*)", re.IGNORECASE)
+_ANGLES = ((180 / math.pi, "deg"), (10800 / math.pi, "arcmin"), (648000 / math.pi, "arcsec"))
+_KELVIN = ((1.0, ""), (1e3, "m"), (1e6, "u"))
+_UNITS = {
+    "rad": _ANGLES,
+    "rad / s": tuple((factor, f"{name}/s") for factor, name in _ANGLES),
+    "s": ((1 / 60, "min"), (1, "s"), (1e3, "ms")),
+    "Hz": ((1e-9, "GHz"), (1e-3, "kHz"), (1, "Hz")),
+    "m": ((1e-3, "km"), (1, "m"), (1e3, "mm")),
+    "K": tuple((factor, f"{prefix}K") for factor, prefix in _KELVIN),
+    "K s(1/2)": tuple((factor, f"{prefix}K sqrt(s)") for factor, prefix in _KELVIN),
+}
+
+
+def readable(text: str) -> str:
+    """``0.0011635528346628863 rad`` as ``4 arcmin``; other text as it is."""
+    match = _NUMBER.fullmatch(text.strip())
+    if match is None or match[2].strip() not in _UNITS:
+        return text
+    value, unit = float(match[1]), match[2].strip()
+    if value == 0:
+        return f"0 {unit.replace(' / ', '/')}"
+    fitting = [(f, n) for f, n in _UNITS[unit] if abs(value) * f >= 0.9999995] or _UNITS[unit][-1:]
+    factor, name = next(((f, n) for f, n in fitting if len(f"{value * f:.6g}") < 6), fitting[0])
+    return f"{value * factor:.6g} {name}"
+
+
+Card = tuple[str, str]
+"""A figure, and what it is."""
+
+
+def brightness(kelvin: float) -> str:
+    """A brightness with three figures, in the unit that reads best."""
+    return scaled(kelvin, "K_RJ")
+
+
+def flux_density(kelvin: float, fwhm: float, band: Band) -> str:
+    """Flux density of a point source with a flat spectrum whose peak is ``kelvin`` behind a
+    Gaussian beam of ``fwhm`` [rad].
+    """
+    jansky = kelvin / to_kelvin_rj("Jy/beam", band, beam_solid_angle=beam_area(fwhm))
+    return scaled(jansky, "Jy", 0.9995)
+
+
+def results(data: Data, given: float | None) -> list[Card]:
+    """Cards of how much was observed, how noisy and how deep the maps are.
+
+    ``given`` is the diameter [rad] of the circle in which that is taken; None stands for
+    `central_diameter` of each map.
+    """
+    maps, whole = maps_of(data.products), maps_of(data.products, split=False)
+    wide = {name: central_diameter(m.fwhm, m.pixel, given) for name, m in maps.items()}
+    main = {name: product for name, product in maps.items() if "/" not in name}
+    seconds = sum(o.duration for o in data.scans)
+    samples = sum(o.n_samples * o.n_detectors for o in data.observations)
+    cards: list[Card] = [
+        (str(len(data.scans)), "scan" if len(data.scans) == 1 else "scans"),
+        (f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s", "on the sky"),
+        (f"{samples:,}".replace(",", "\u202f"), "samples of all detectors"),
+    ]
+    for name, product in whole.items():
+        if "/" not in name:
+            cards += _unsolved(name, product)
+    for figure in noise_figures(maps, given):
+        cards += _noise(figure, maps[figure.product])
+    for name, product in main.items():
+        if name in data.products:
+            cards += _depth(name, product, wide[name])
+    for name, product in main.items() if has_white_noise(data) else ():
+        cards += expected(name, product, wide[name])
+    strongest = {
+        "input": getattr(data.products.get("input"), "values", np.nan),
+        "noiseless map": getattr(maps.get("noiseless/map"), "signal", np.nan),
+    }
+    for what, values in strongest.items():
+        known = np.asarray(values)[np.isfinite(values)]
+        if known.size:
+            peak = float(known[np.abs(known).argmax()])
+            cards.append((brightness(peak), f"strongest pixel of the {what}"))
+    return cards
+
+
+def _of(name: str) -> str:
+    """Name of a map behind what is said of it; that of ``map`` is left out."""
+    return "" if name == "map" else f", {name}"
+
+
+def _unsolved(name: str, product: MapProduct) -> list[Card]:
+    """In how many pixels with samples a map has no I, Q and U: a card, or none where there are
+    all.
+    """
+    if product.polarization is None:
+        return []
+    hit, solved = int(np.count_nonzero(product.hits)), int(np.count_nonzero(product.known))
+    label = _of(name)
+    text = f"pixels with samples are NaN: too few angles of polarization for I, Q and U{label}"
+    return [(f"{hit - solved} of {hit}", text)] if solved < hit else []
+
+
+def _noise(figure: NoiseFigure, product: MapProduct) -> list[Card]:
+    """Cards of the noise at the centre of a map, smoothed with the beam if that can be done, and as
+    it is.
+    """
+    of = {
+        "half_difference": product.difference.replace(" - ", " − "),
+        "source_free": "all but the sky",
+    }[figure.of]
+    where = f"rms, {_central(figure.diameter, product)}, {of}"
+    label = _of(figure.product)
+    if math.isfinite(figure.smoothed):
+        how = _smoothed(figure.smoothed, product)
+        before = f"the same before smoothing, per {sides_text(*product.sides)} pixel"
+        return [
+            (brightness(figure.smoothed), f"{where}, {how}{label}"),
+            (brightness(figure.rms), before),
+        ]
+    if math.isfinite(figure.rms):
+        return [(brightness(figure.rms), f"{where}{label}")]
+    return [("unknown", f"{where}{label}: too few pixels; set central_diameter")]
+
+
+def _central(diameter: float, product: MapProduct) -> str:
+    return f"central {np.degrees(diameter) * 60:.3g}′{in_beams(diameter, product.fwhm)}"
+
+
+def has_white_noise(data: Data) -> bool:
+    """True if a step of the pipeline makes white noise."""
+    classes = (class_of(kind) for _, kind, _ in data.provenance.get("operators", []))
+    return any(cls is not None and "white" in declared(cls, "provides") for cls in classes)
+
+
+def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
+    """Card of the white noise at the centre of a map that NET and samples promise; none if nothing
+    is known.
+
+    Smoothing with a beam of width sigma divides the variance of pixels of area A by 4 pi sigma^2 /
+    A: the weight of the pixels 1 / noise^2 is added up per solid angle.
+    """
+    near = product.distance() <= diameter / 2
+    noise, areas = product.noise[near], np.broadcast_to(product.areas(), product.hits.shape)[near]
+    known = np.isfinite(noise) & (noise > 0)
+    if not known.any() or product.noise_from != "net" or product.contents != "all":
+        return []
+    rms = float(1 / np.sqrt(np.sum(noise[known] ** -2.0) / noise.size))  # of the mean weight
+    label = _of(name)
+    where = _central(diameter, product)
+    side = math.sqrt(float(areas.mean()))
+    factor = math.inf
+    if product.fwhm > 0 and not product.smoothed_by:
+        factor = side / product.fwhm * math.sqrt(2 * math.log(2) / math.pi)
+    what = f"white noise by NET and samples, {where}"
+    if factor > 0.5:  # pixels that are not small beside the beam
+        return [(brightness(rms), f"{what}{label}")]
+    return [(brightness(rms * factor), f"{what}, {_smoothed(rms * factor, product)}{label}")]
+
+
+def _smoothed(kelvin: float, product: MapProduct) -> str:
+    """Resolution of a map smoothed with its beam, and the flux density of ``kelvin`` in it, in
+    words.
+    """
+    resolution = math.sqrt(2) * product.fwhm
+    how = f"{angle_text(product.fwhm)} beam and as much smoothing, added in quadrature"
+    text = f"smoothed with the beam to {angle_text(resolution)} ({how})"
+    if product.band:
+        text += f": {flux_density(kelvin, resolution, product.band)} per such beam"
+    return text
+
+
+def _depth(name: str, product: MapProduct, diameter: float) -> list[Card]:
+    """Card of the time for which the centre of a map was observed, the median over its pixels; none
+    if it is not known.
+    """
+    factor, near = product.seconds_per_beam(), product.distance() <= diameter / 2
+    if factor is None or not near.any():
+        return []
+    samples = product.hits[near]
+    each = np.broadcast_to(np.asarray(factor), product.hits.shape)[near]
+    seconds = float(np.median(samples * each))
+    time = f"{seconds:.3g}\u00a0s" if seconds < 6000 else f"{seconds / 3600:.3g}\u00a0h"
+    where = _central(diameter, product) + _of(name)
+    counted = f"{np.median(samples):.4g} samples per {sides_text(*product.sides)} pixel"
+    return [(time, f"of all detectors per {angle_text(product.fwhm)} beam, {where}; {counted}")]
+
+
+def class_of(kind: str) -> type[Operator] | None:
+    """The operator class of that name; None where its plugin cannot be had any more."""
+    with suppress(ZondaError):
+        found: type[Operator] = operators.get(kind)
+        return found
+    return None

@@ -1,4 +1,6 @@
-"""Products of time streams: power spectra, modes, and the streams of a few detectors."""
+"""Base of steps that look at time streams, and their products: power spectra, modes, the streams of
+a few detectors.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +12,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
-from zonda.core.pages import html_table
 from zonda.core.product import Record
 from zonda.core.signal import is_stream
 from zonda.core.storage.files import product_path
 from zonda.core.storage.table_files import Column, write_ecsv
-from zonda.core.stream_names import UNITS, streams_asked, streams_needed
+from zonda.core.stream_names import UNITS, StreamName, streams_asked, streams_needed
+from zonda.core.tables import html_table
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
@@ -56,8 +60,8 @@ class OfStreams(Operator):
         """Make the product, state its values, and write its tables."""
         found: Series | None = data.take(self.label)
         if found is not None:
-            what = "scans left out: other detectors, streams or length"
-            data.log.count(self.label, what, found.of_another_length)
+            if found.left_out:
+                data.log.count(self.label, found.left_out, found.of_another_length)
             for name, text in found.lines():
                 data.log.state(self.label, name, text)
             key = key_of(self, found.usual)
@@ -72,6 +76,8 @@ class Series(Record):
     ----------
     usual
         Name among the products of one whose step has no name of its own.
+    left_out
+        How the log calls scans that are not `alike`; empty: each is in the product.
     means
         Names of fields, arrays or mappings of arrays, that are means over the scans.
     observations, of_another_length
@@ -79,6 +85,7 @@ class Series(Record):
     """
 
     usual: ClassVar[str]
+    left_out: ClassVar[str] = ""
     means: ClassVar[tuple[str, ...]] = ()
 
     observations: int = 1
@@ -143,6 +150,7 @@ class Spectrum(Series):
     """
 
     usual: ClassVar[str] = "spectrum"
+    left_out: ClassVar[str] = "scans of another length left out of the mean spectrum"
     means: ClassVar[tuple[str, ...]] = ("psd", "closed_forms", "white_level")
 
     frequency: Floats
@@ -457,3 +465,66 @@ class Modes(Series):
         shares = enumerate(self.shares[:8], 1)
         rows = [(f"mode {k}", f"{100 * share:.3g} %") for k, share in shares if share > 0]
         return html_table(f"Modes of {self.detectors} detectors", rows)
+
+
+class TimeStreams(OfStreams):
+    """Streams of a few detectors of one scan at this step, for a picture: product ``time_streams``.
+
+    Components (`sky`, `white`, those of plugins ...) are at the detector, before the calibration;
+    `signal` is the calibrated sum. `signal` holds the mean emission of the atmosphere, `atmosphere`
+    is the fluctuation about it. Further streams are those that a step above makes, e.g. `pwv`,
+    `opacity` and `path_delay` (`AtmosphereLayers.outputs`).
+    """
+
+    provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
+    knows_means: ClassVar[bool] = True
+
+    streams: list[StreamName] = Field(["signal"], min_length=1)
+    """Streams to keep; components that are absent at this step are skipped and counted."""
+    detectors: int = Field(3, ge=1, le=64)
+    """Number of detectors, chosen evenly."""
+    observation: int = Field(0, ge=0)
+    """Which scan, counted from 0."""
+
+    def asked(self) -> list[str]:
+        """The list."""
+        return self.streams
+
+    def check(self, data: Data) -> list[str]:
+        """Refuse a scan that is not there, once the telescope is pointed."""
+        if data.observations:
+            data.check_scan(self.observation, self.label)
+        return []
+
+    def observe(self, data: Data) -> None:
+        self.check(data)
+
+    def prepare(self, observation: Observation) -> TimeStream | None:
+        if observation.index != self.observation:
+            return None
+        n = observation.n_detectors
+        shape = min(n, self.detectors), observation.n_samples
+        chosen = np.linspace(0, n - 1, shape[0]).round().astype(int)
+        names = [observation.focalplane.names[d] for d in chosen]
+        streams: dict[str, Floats] = {name: np.full(shape, np.nan) for name in self.streams}
+        return TimeStream(observation.seconds, streams, names, observation.name, self.label)
+
+    def exec(self, block: Block, state: TimeStream | None) -> None:
+        if state is None:
+            return
+        for k, detector in enumerate(state.names):
+            d = block.observation.focalplane.names.index(detector)
+            if block.detectors.start <= d < block.detectors.stop:
+                for name in state.streams.keys() & block.detdata.keys():
+                    values = block.detdata[name][d - block.detectors.start].astype(np.float64)
+                    if name in block.means:
+                        values += block.means[name].evaluate(slice(d, d + 1), block.samples)[0]
+                    state.streams[name][k, block.samples] = values
+
+    def collect(self, data: Data, observation: Observation, state: TimeStream | None) -> None:
+        if state is None:
+            return
+        for name in [s for s, values in state.streams.items() if np.isnan(values).all()]:
+            del state.streams[name]
+            observation.log.count(self.label, f"stream {name} is absent at this step", 1)
+        data.add(self.label, state)

@@ -35,9 +35,9 @@ from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.output import Output
-from zonda.core.pages import html_table
 from zonda.core.signal import Signal, product_name, stream_of
 from zonda.core.storage.table_files import Column
+from zonda.core.tables import html_table
 from zonda.core.types import Floats
 
 from .comparison.radial import Rings, correlation, scale_of, tapered

@@ -218,7 +218,7 @@ def _compare(
         write_comparison,
     )
     from zonda.operators.diagnostics.comparison.planes import common_beam
-    from zonda.operators.diagnostics.drawing.comparison_plots import draw_comparison
+    from zonda.operators.diagnostics.comparison_plots import draw_comparison
     from zonda.operators.diagnostics.plot_operators import Plots
     from zonda.operators.diagnostics.series import plane_key
 

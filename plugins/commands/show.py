@@ -38,8 +38,7 @@ def instrument(name: str, output: Path | None) -> None:
     """
     from zonda.core.storage.files import atomic_path, product_path
 
-    from .instrument_plots import focal_plane_figure
-    from .instrument_text import lines
+    from .instrument_plots import focal_plane_figure, lines
 
     if output is not None and output.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise click.BadParameter(f"{output} is no .png, .pdf or .svg", param_hint="'--output'")

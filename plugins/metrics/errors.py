@@ -64,8 +64,7 @@ from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.operator import Operator
 from zonda.core.signal import Signal
 from zonda.core.types import Floats
-from zonda.operators.diagnostics.series import Spectrum
-from zonda.operators.diagnostics.time_streams import TimeStreams
+from zonda.operators.diagnostics.series import Spectrum, TimeStreams
 from zonda.operators.diagnostics.transfer_function import compare
 
 from .common import COVERED, as_seen, at_beam, covered, extreme, input_of, needs_tan

@@ -12,9 +12,8 @@ from typing import Any
 
 from zonda import __version__
 from zonda.core.experiment import Values
-from zonda.core.pages import render
 from zonda.core.storage.files import atomic_path, write_text
-from zonda.core.tables import Table
+from zonda.core.tables import Table, render
 
 from .claims import ClaimsFile
 from .figure import draw

@@ -12,7 +12,7 @@ from zonda.core.maps.map_plots import plot_map
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.smoothing import smoothed
 from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
-from zonda.operators.diagnostics.report_results import expected
+from zonda.operators.diagnostics.report import expected
 from zonda.operators.maps.grid import PlateCarreeGrid, tangent_wcs
 from zonda.operators.maps.plate_carree import box_about, centre_of
 from zonda.plugins.metrics.common import relative_error_of_rms

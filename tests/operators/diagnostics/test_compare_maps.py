@@ -22,7 +22,7 @@ from zonda.operators.diagnostics.compare_maps import CompareMaps
 from zonda.operators.diagnostics.comparison.files import plane_of, read_planes
 from zonda.operators.diagnostics.comparison.radial import radial_spectra
 from zonda.operators.diagnostics.comparison.statistics import compare
-from zonda.operators.diagnostics.drawing.comparison_plots import plot_radial_spectra
+from zonda.operators.diagnostics.comparison_plots import plot_radial_spectra
 from zonda.operators.diagnostics.map_spectra import MapSpectrum
 from zonda.operators.diagnostics.plot_operators import Plots
 from zonda.plugins.checks import scenes

@@ -138,7 +138,9 @@ def test_scans_are_averaged(make_observation, data, noise):
     both = data.products["spectrum"]
     assert both.observations == 2
     np.testing.assert_allclose(both.psd["signal"], 5 * before, rtol=1e-6)  # (1 + 9) / 2
-    assert data.log.get("PowerSpectrum", "scans left out: other detectors, streams or length") == 1
+    assert (
+        data.log.get("PowerSpectrum", "scans of another length left out of the mean spectrum") == 1
+    )
 
 
 def test_flagged_and_broken_detectors(make_observation, data, noise):

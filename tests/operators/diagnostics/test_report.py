@@ -14,8 +14,9 @@ import zonda
 from zonda.core.configuration.target import Target
 from zonda.core.errors import OutputError
 from zonda.operators.diagnostics.plot_operators import Picture
-from zonda.operators.diagnostics.report import Report, _target
-from zonda.operators.diagnostics.report_results import (
+from zonda.operators.diagnostics.report import (
+    Report,
+    _target,
     brightness,
     expected,
     flux_density,

@@ -12,8 +12,8 @@ from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import ARCSEC
 from zonda.core.storage.table_files import write_ecsv
-from zonda.operators.diagnostics.drawing.plots import draw
 from zonda.operators.diagnostics.plot_operators import Plots, pictures
+from zonda.operators.diagnostics.series_plots import draw
 from zonda.operators.diagnostics.transfer_function import (
     Transfer,
     TransferFunction,

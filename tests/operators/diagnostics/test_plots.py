@@ -25,13 +25,13 @@ from zonda.core.maps.map_plots import (
 )
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.on_plane import on_plane
-from zonda.operators.diagnostics.drawing.plots import (
+from zonda.operators.diagnostics.plot_operators import Flat, Plots
+from zonda.operators.diagnostics.power_spectrum import Spectrum
+from zonda.operators.diagnostics.series import TimeStream, TimeStreams
+from zonda.operators.diagnostics.series_plots import (
     draw,
     draw_scan,
 )
-from zonda.operators.diagnostics.plot_operators import Flat, Plots
-from zonda.operators.diagnostics.power_spectrum import Spectrum
-from zonda.operators.diagnostics.time_streams import TimeStream, TimeStreams
 
 ARCSEC = np.pi / 648000
 ARCMIN = 60 * ARCSEC

@@ -20,13 +20,13 @@ from zonda.core.maps.map_plots import (
 )
 from zonda.core.numerics.angles import ARCSEC, angle_text
 
-from ..compare_streams import StreamComparison
-from ..map_spectra import MapSpectra
-from .plots import draw, scans
+from .compare_streams import StreamComparison
+from .map_spectra import MapSpectra
+from .series_plots import draw, scans
 
 if TYPE_CHECKING:
-    from ..comparison.radial import RadialSpectra
-    from ..comparison.statistics import Comparison
+    from .comparison.radial import RadialSpectra
+    from .comparison.statistics import Comparison
 
 CONTOURS = (-8.0, -4.0, -2.0, 2.0, 4.0)
 """Default levels of the contours on SNR maps."""
@@ -150,16 +150,10 @@ def plot_radial_spectra(
     ax.set_xlim(first, last)
     if last < fwhm / ARCSEC < first:
         ax.axvline(fwhm / ARCSEC, color="black", linestyle=":", linewidth=1.0)
-    axis_above(ax, _inverse, "wavenumber 1/scale [1/arcmin]")
+    axis_above(ax, 60.0, "wavenumber 1/scale [1/arcmin]")
     up = f"power spectral density [{unit}² arcsec²]" if unit else "power spectral density [arcsec²]"
     finish(ax, "angular scale [arcsec]", up, loc="best")
     return ax
-
-
-def _inverse(arcsec: Any) -> Any:
-    """1/arcmin of a scale in arcsec, and back: the function is its own inverse."""
-    with np.errstate(divide="ignore"):
-        return 60.0 / np.asarray(arcsec, np.float64)
 
 
 @draw.register

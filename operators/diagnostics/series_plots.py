@@ -26,8 +26,8 @@ from zonda.core.numerics.projection import boresights
 from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import AnyFloats
 
-from ..series import Modes, Spectrum, TimeStream, unit_of_stream
-from ..transfer_function import Transfer
+from .series import Modes, Spectrum, TimeStream, unit_of_stream
+from .transfer_function import Transfer
 
 if TYPE_CHECKING:
     from zonda.core.data import Observation
@@ -193,7 +193,7 @@ def draw_transfer(transfer: Transfer, file: str, where: str) -> list[Sketch]:
     ax.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
     if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / ARCSEC <= edges[0]:
         ax.axvline(transfer.fwhm / ARCSEC, color="black", linestyle=":", linewidth=1.0)
-    axis_above(ax, _to_kilolambda, "baseline [1000 wavelengths]")
+    axis_above(ax, 1e-3 / ARCSEC, "baseline [1000 wavelengths]")
     whose = "the sky alone" if transfer.modes == "sky" else "the complete data"
     more = file.removeprefix("transfer_function").removeprefix("_")
     what = "Transfer function" + (f" ({more})" if more else "")
@@ -206,12 +206,6 @@ def draw_transfer(transfer: Transfer, file: str, where: str) -> list[Sketch]:
         f" Dotted, the beam. Singular modes of {whose}."
     )
     return [Sketch(file, what, caption, ax)]
-
-
-def _to_kilolambda(arcsec: Any) -> Any:
-    """1000 wavelengths of a scale in arcsec, and back: the function is its own inverse."""
-    with np.errstate(divide="ignore"):
-        return 1e-3 / (np.asarray(arcsec, np.float64) * ARCSEC)
 
 
 @draw.register

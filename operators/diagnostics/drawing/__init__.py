@@ -1,1 +1,0 @@
-"""Pictures of comparisons, spectra, streams and scans from plain values."""
