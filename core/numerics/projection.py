@@ -229,23 +229,14 @@ def central(wcs: WCS) -> Floats:
     return np.vstack([pixel, centre])
 
 
-def homographies(quaternions: Floats, wcs: WCS) -> Floats:
-    """Equation (1): coefficients h (n, 9) float64 for boresight quaternions (n, 4) in ICRS and a
-    TAN image.
-
-    A detector at focal-plane offsets (xi, eta) looks at R(q) (-eta, -xi, 1) (TOAST's boresight
-    frame). Pixels are 0-based, with integer coordinates at pixel centres. Error: some 1e-13 of the
-    distance to the image centre in pixels. Each coefficient lies in one piece (Fortran's order).
-    """
-    return ray_coefficients(quaternions, pixel_matrix(wcs))
-
-
 def ray_coefficients(quaternions: Floats, matrix: Floats) -> Floats:
-    """Coefficients h (n, 9): ``matrix`` (3, 3) times the direction of a detector, times the length
-    of (xi, eta, 1).
+    """Coefficients h (9, n) float64: ``matrix`` (3, 3) times the direction of a detector, times the
+    length of (xi, eta, 1), for boresight quaternions (n, 4) in ICRS.
 
-    Its components are h0 xi + h1 eta + h2, h3 xi + h4 eta + h5, h6 xi + h7 eta + h8. Each
-    coefficient lies in one piece (Fortran's order).
+    Its components are h0 xi + h1 eta + h2, h3 xi + h4 eta + h5, h6 xi + h7 eta + h8. A detector at
+    focal-plane offsets (xi, eta) looks at R(q) (-eta, -xi, 1) (TOAST's boresight frame). With the
+    `pixel_matrix` of a TAN image they are those of equation (1): pixels are 0-based, with integer
+    coordinates at pixel centres; error: some 1e-13 of the distance to the image centre in pixels.
     """
     h = empty((9, len(quaternions)))
     for s in chunks(len(quaternions)):
@@ -254,7 +245,7 @@ def ray_coefficients(quaternions: Floats, matrix: Floats) -> Floats:
             for column, (sign, axis) in enumerate(((-1, 1), (-1, 0), (1, 2))):
                 a, b, c = sign * matrix[row]
                 h[3 * row + column, s] = a * turn[0, axis] + b * turn[1, axis] + c * turn[2, axis]
-    return h.T
+    return h
 
 
 def directions(quaternions: Floats, xi: Floats, eta: Floats) -> Floats:

@@ -98,7 +98,7 @@ class SourceMask(Parameters):
         """Samples of a scan that are inside. Raises InputError for a file that cannot be used."""
         if self.file is not None:
             masked, matrix = _read(self.file, self.file.stat().st_mtime_ns)
-            h = np.ascontiguousarray(ray_coefficients(observation.boresight_radec, matrix).T)
+            h = ray_coefficients(observation.boresight_radec, matrix)
             return InsideImage(h, observation.focalplane.xi, observation.focalplane.eta, masked)
         ra, dec = self.centre.icrs() if self.centre else observation.centre
         centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])

@@ -22,7 +22,6 @@ from zonda.core.numerics.projection import (
     boresights,
     directions,
     frame_rotation,
-    homographies,
     pixel_matrix,
     ray_coefficients,
 )
@@ -54,7 +53,7 @@ class PixelGrid:
     def pointing(self, observation: Observation) -> Floats:
         """Coefficients (9, n_samp) of the directions that detectors look at, in the map's frame."""
         turn = frame_rotation(self.frame)
-        return np.ascontiguousarray(ray_coefficients(observation.boresight_radec, turn).T)
+        return ray_coefficients(observation.boresight_radec, turn)
 
     def pixels(
         self,
@@ -124,7 +123,7 @@ class TangentGrid(ImageGrid):
 
     def pointing(self, observation: Observation) -> Floats:
         """Homographies (9, n_samp), see `core.numerics.projection`."""
-        return np.ascontiguousarray(homographies(observation.boresight_radec, self.wcs).T)
+        return ray_coefficients(observation.boresight_radec, pixel_matrix(self.wcs))
 
 
 @dataclass(frozen=True)

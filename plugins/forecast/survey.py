@@ -20,7 +20,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.focalplane import Focalplane
 from zonda.core.maps.beams import expected_fwhm
 from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
-from zonda.core.numerics.projection import frame_rotation, homographies
+from zonda.core.numerics.projection import frame_rotation, pixel_matrix, ray_coefficients
 from zonda.core.observation import Observation, WhiteLevel
 from zonda.core.pipeline import Pipeline
 from zonda.core.plan.bounds import evenly
@@ -249,7 +249,9 @@ class Survey:
             index = np.arange(step // 2, o.n_samples // step * step, step)
             grid = self.grid
             plane = tangent_wcs(grid.origin, 1.0, (1, 1), grid.frame)
-            matrices = np.ascontiguousarray(homographies(o.boresight_radec[index], plane))
+            matrices = np.ascontiguousarray(
+                ray_coefficients(o.boresight_radec[index], pixel_matrix(plane)).T
+            )
             self._tracks[scan, step] = Track(o, index, step, o.sample_rate / step, matrices)
         return self._tracks[scan, step]
 
