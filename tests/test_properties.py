@@ -138,11 +138,10 @@ def test_turning_scan_wind_and_field_together_changes_nothing(
         o = scan(7, 2500, azimuth=azimuth + turn, elevation=elevation)
         return run([layers], o, keep=("atmosphere",)).observations[0].detdata["atmosphere"]
 
-    # To rounding, but where a step in time reaches far beyond the ends of the scan: how far the path
-    # goes on there (`geometry.axes_at`) follows from the largest component of its velocity in
-    # (east, north, up), not from its length, and the margin of the spline changes with that: 9e-7 K
-    # of 0.3 K, far below `tolerance`, 1 % of the rms.
-    np.testing.assert_allclose(air(angle), air(0.0), rtol=0, atol=3e-6)
+    # Rounding alone. A turned direction errs by some eps; a layer is seen at up to 5 km / tan(30 deg)
+    # = 9 km, so positions err by some 1e-11 m. The field, 0.3 K at most, changes over the beam's
+    # sigma of some metres: by less than 0.3 K x 1e-11 m / 1 m = 3e-12 K.
+    np.testing.assert_allclose(air(angle), air(0.0), rtol=0, atol=3e-12)
 
 
 @few

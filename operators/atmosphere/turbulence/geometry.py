@@ -97,8 +97,8 @@ def axes_at(quaternions: Floats, index: NDArray[np.int64], step: int) -> Floats:
         second = (2 * a - 5 * b + 4 * c - d) / gap**2
         third = (3 * b - a - 3 * c + d) / gap**3
         t = abs(index[beyond] - end).astype(np.float64)
-        sizes = [
-            abs(m).max() / math.factorial(k) + 1e-30
+        sizes = [  # of the axis that moves most: its length, whatever the azimuth
+            np.sqrt((m * m).sum(0)).max() / math.factorial(k) + 1e-30
             for k, m in enumerate((first, second, third), 1)
         ]
         limits = [(LARGEST_REACH / 2 / size) ** (1 / k) for k, size in enumerate(sizes, 1)]
