@@ -325,15 +325,10 @@ class Observation:
 
     def thinned(self, at: slice | NDArray[np.intp]) -> Observation:
         """The scan at some of its samples alone."""
-        azimuth = None if self.recorded_azimuth is None else self.recorded_azimuth[at]
-        return replace(
-            self,
-            seconds=self.seconds[at],
-            boresight_azel=self.boresight_azel[at],
-            boresight_radec=self.boresight_radec[at],
-            flags=self.flags[at],
-            recorded_azimuth=azimuth,
-        )
+        each = ("seconds", "boresight_azel", "boresight_radec", "flags",
+                "recorded_azimuth", "hwp_angle", "pointed_radec")  # fmt: skip
+        held = {name: getattr(self, name) for name in each}
+        return replace(self, **{name: x[at] for name, x in held.items() if x is not None})
 
     def key(self, *names: str | int) -> NDArray[np.uint32]:
         """Random-stream key (2,) uint32 that belongs to this seed, this observation and
