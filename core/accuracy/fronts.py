@@ -22,8 +22,7 @@ from ..experiment.variant import Variant
 from ..output import Output
 from ..plan.planning import planning_of
 from ..storage.files import write_text
-from .bands import metric_of
-from .metrics import get
+from .metrics import get, metric_of
 from .pareto import Point, cheapest
 from .settings import LENGTH, Setting, knobs_of, overrides
 from .sweep import tightest

@@ -92,7 +92,7 @@ def timed_run(
     global _warm
     from numba.core.event import install_recorder
 
-    from .bands import metric_of
+    from .metrics import metric_of
 
     with (
         open(os.devnull, "w") as nothing,

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
-from .bands import metric_of
 from .bench import BETWEEN, REFERENCE_RUNS, Bench, Run, Setup
 from .measure import TimedRun, run_in
+from .metrics import metric_of
 from .pareto import Point, cheapest, pareto, point, search
 from .settings import PipelineKnob
 from .sweep import Sweep, sweep, tightest

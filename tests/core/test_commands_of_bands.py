@@ -14,8 +14,7 @@ from astropy.table import Table
 
 import zonda
 from zonda.core import cli
-from zonda.core.accuracy.bands import OfBands, metric_of
-from zonda.core.accuracy.metrics import Metric, get
+from zonda.core.accuracy.metrics import Metric, OfBands, get, metric_of
 from zonda.core.errors import ZondaError
 
 PIPELINE = """

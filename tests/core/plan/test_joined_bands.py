@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.core.accuracy.bands import metric_of
+from zonda.core.accuracy.metrics import metric_of
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import PipelineError
 from zonda.core.experiment import run_file
