@@ -4,6 +4,7 @@ power spectra.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
@@ -49,24 +50,23 @@ def columns_of_model(
         A detector has no spectrum, or one that is not positive, finite and in kelvin^2 s.
     """
     spectra = _spectra(group, place)
-    mixed: dict[str, list[tuple[str, float]]] = {}
+    mixed = defaultdict[str, dict[str, float]](dict)
     for detector, key, weight in group["mixing_matrix"][:]:
-        mixed.setdefault(detector.decode(), []).append((key.decode(), float(weight)))
+        mixed[detector.decode()][key.decode()] = float(weight)
     found, known = np.full((4, len(detectors)), np.nan), dict[bytes, Floats]()
     for number in np.flatnonzero(~unused).tolist():
         detector = detectors[number]
-        parts = [(key, weight) for key, weight in mixed.get(detector, ()) if weight != 0]
-        if not parts or any(key not in spectra for key, _ in parts):
+        parts = {key: weight for key, weight in mixed[detector].items() if weight != 0}
+        if not parts or not parts.keys() <= spectra.keys():
             raise InputError(
                 f"{group.name} has no spectrum of detector {detector}", place=place, cure=NOISE_CURE
             )
-        frequency = spectra[parts[0][0]][0]
-        total = sum(weight**2 * np.interp(frequency, *spectra[key]) for key, weight in parts)
-        digest = frequency.tobytes() + np.asarray(total).tobytes()
+        frequency = spectra[next(iter(parts))][0]
+        total = np.array([w**2 * np.interp(frequency, *spectra[k]) for k, w in parts.items()])
+        digest = frequency.tobytes() + total.tobytes()
         if digest not in known:
-            known[digest] = fit(
-                frequency, np.asarray(total), f"{place}, {group.name}, detector {detector}"
-            )
+            text = f"{place}, {group.name}, detector {detector}"
+            known[digest] = fit(frequency, total.sum(axis=0), text)
         found[:, number] = known[digest]
     return dict(zip(("net", "knee", "minimum_frequency", "slope"), found, strict=True))
 
@@ -107,51 +107,39 @@ def fit(frequency: Floats, power: Floats, place: str) -> Floats:
     """
     from scipy.optimize import least_squares
 
-    if (
-        len(frequency) < 4
-        or not np.isfinite(power).all()
-        or (power <= 0).any()
-        or (np.diff(frequency) <= 0).any()
-    ):
+    sound = len(frequency) >= 4 and np.isfinite(power).all() and (power > 0).all()
+    if not sound or (np.diff(frequency) <= 0).any():
         raise InputError(
             "has a spectrum that is not positive and finite", place=place, cure=NOISE_CURE
         )
     x, y = np.log(frequency), np.log(power)
     if len(x) > BINS:
-        number = ((x - x[0]) * (BINS / (x[-1] - x[0]))).astype(int)
-        first = np.flatnonzero(np.diff(number, prepend=-1))
-        count = np.diff(first, append=len(x))
-        x, y = np.add.reduceat(x, first) / count, np.log(np.add.reduceat(power, first) / count)
+        count, xs, powers = (np.histogram(x, BINS, weights=w)[0] for w in (None, x, power))
+        some = count > 0
+        x, y = xs[some] / count[some], np.log(powers[some] / count[some])
     share = np.sqrt(np.gradient(x))
-    white, top = float(np.median(y[x > x[-1] - 1.0])), float(y.max())
-    least = float(np.exp(x[0]))
-    if top - white < np.log(RISE):
-        return np.array([np.exp(white / 2), 0.0, least, 1.0])
 
-    def toast(p: Any) -> Any:
-        level, knee, low, slope = p
+    def toast(level: Any, knee: Any, low: Any, slope: Any) -> Any:
         return level + np.logaddexp(slope * x, slope * knee) - np.logaddexp(slope * x, slope * low)
 
-    def own(p: Any) -> Any:
-        level, knee, low, slope = p
+    def own(level: Any, knee: Any, low: Any, slope: Any) -> Any:
         return level + np.logaddexp(0.0, slope * (knee - np.maximum(x, low)))
 
-    def away(p: Any, form: Any) -> Any:
-        return share * (form(p) - y)
-
-    knee = (
-        float(x[np.flatnonzero(y - white > np.log(2.0))[-1]])
-        if top - white > np.log(2.0)
-        else float(x[0])
-    )
+    white = float(np.median(y[x > x[-1] - 1.0]))
+    knee = x[y > white + np.log(2.0)].max(initial=x[0])
     limits = [white - 5, x[0] - 20, x[0] - 20, 0.05], [white + 5, x[-1] + 5, x[-1], STEEPEST]
     tried = [
-        least_squares(away, np.clip(start, *limits), args=(form,), bounds=limits)
+        least_squares(
+            lambda p, form=form: share * (form(*p) - y),
+            np.clip([white, knee, min(low, knee - 0.1), slope], *limits),
+            bounds=limits,
+        )
         for form in (toast, own)
         for low in (x[0] - 5.0, x[0] + 1.0)
-        for start in ([white, knee, min(low, knee - 0.1), slope] for slope in (1.0, 2.0))
+        for slope in (1.0, 2.0)
     ]
     level, knee, low, slope = min(tried, key=lambda one: float(one.cost)).x
-    if slope * (knee - max(low, x[0])) < np.log(RISE):
-        return np.array([np.exp(white / 2), 0.0, least, 1.0])
-    return np.array([np.exp(level / 2), np.exp(knee), max(np.exp(low), least), slope])
+    low = max(low, x[0])
+    if slope * (knee - low) < np.log(RISE):
+        level, knee, low, slope = white, -np.inf, x[0], 1.0
+    return np.array([*np.exp([level / 2, knee, low]), slope])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,31 +108,27 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
     InputError
         Fewer than two usable rows, or intervals so uneven (`UNEVEN`) that there is no comb.
     """
-    counts: dict[str, int] = {}
-    keep = np.isfinite(recording.seconds)
-    counts["rows without a time, dropped"] = int(np.count_nonzero(~keep))
-    rows = np.flatnonzero(keep)
-    rising = longest_rising(recording.seconds[rows])
-    rest = np.setdiff1d(np.arange(len(rows)), rising, assume_unique=True)
-    kept_before = rising[np.maximum(np.searchsorted(rising, rest) - 1, 0)]
-    repeated = int(
-        np.count_nonzero(recording.seconds[rows[rest]] == recording.seconds[rows[kept_before]])
-    )
-    counts[OUT_OF_ORDER], counts["rows repeated, dropped"] = len(rest) - repeated, repeated
-    rows = rows[rising]
-    seconds = recording.seconds[rows]
+    counts = dict[str, int]()
+    seconds, rows = recording.seconds, np.flatnonzero(np.isfinite(recording.seconds))
+
+    def keep(what: str, chosen: NDArray[Any]) -> None:
+        nonlocal rows
+        kept = rows[chosen]
+        counts[what], rows = len(rows) - len(kept), kept
+
+    counts["rows without a time, dropped"] = len(seconds) - len(rows)
+    keep("rows repeated, dropped", np.diff(seconds[rows], prepend=-np.inf) != 0)
+    keep(OUT_OF_ORDER, longest_rising(seconds[rows]))
     if len(rows) < 2:
         raise InputError(
             f"has {len(rows)} rows with increasing times",
             place=place,
             cure="check the column of times and its unit",
         )
-    step = float(np.median(np.diff(seconds)))
-    apart = np.r_[True, np.diff(seconds) >= step / 2]
-    counts["rows closer than half a sample to the one before, dropped"] = int(
-        np.count_nonzero(~apart)
-    )
-    rows, seconds = rows[apart], seconds[apart]
+    step = float(np.median(np.diff(seconds[rows])))
+    late = np.diff(seconds[rows], prepend=-np.inf) >= step / 2
+    keep("rows closer than half a sample to the one before, dropped", late)
+    seconds = seconds[rows]
     interval = np.diff(seconds) / step
     ahead = np.maximum(np.rint(interval), 1.0)
     near = ahead * step <= split
@@ -180,19 +176,13 @@ def longest_rising(values: Floats) -> NDArray[np.intp]:
     """
     if (np.diff(values) > 0).all():
         return np.arange(len(values))
-    tails: list[float] = []  # of the lowest chain of each length: its last value ...
-    ends: list[int] = []  # ... and index
+    tails, ends = list[float](), list[int]()  # of the lowest chain of each length
     before = np.full(len(values), -1, np.intp)
     for i, value in enumerate(values.tolist()):
-        k = len(tails) if not tails or value > tails[-1] else bisect_left(tails, value)
-        if k == len(tails):
-            tails.append(value)
-            ends.append(i)
-        elif value < tails[k]:
-            tails[k], ends[k] = value, i
-        else:
-            continue
-        before[i] = ends[k - 1] if k else -1
+        k = bisect_left(tails, value)
+        if tails[k : k + 1] != [value]:
+            tails[k : k + 1], ends[k : k + 1] = [value], [i]
+            before[i] = ends[k - 1] if k else -1
     chain = np.empty(len(tails), np.intp)
     i = ends[-1]
     for k in reversed(range(len(chain))):
