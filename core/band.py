@@ -16,7 +16,7 @@ from .configuration.parameters import Parameters, named, named_or_written
 from .configuration.units import Angle, Fraction, Hertz, KelvinRootSecond, RadioFrequency
 from .errors import InputError
 from .registry import RegistryError, bands
-from .storage import packed
+from .storage.files import unpacked_text
 
 SPEED_OF_LIGHT = 299792458.0
 
@@ -102,7 +102,7 @@ GIGAHERTZ_MIN, GIGAHERTZ_MAX = 0.5, 1e5
 def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     place, cure = f"passband file {path}", "write two columns: frequency in GHz and transmission"
     try:
-        table = np.loadtxt(io.StringIO(packed.text(path, place)), ndmin=2)
+        table = np.loadtxt(io.StringIO(unpacked_text(path, place)), ndmin=2)
     except OSError:
         raise InputError(
             "no such file",

@@ -21,8 +21,7 @@ from .block import Block
 from .data import Data
 from .errors import PipelineError, ZondaError
 from .operator import Operator
-from .stream import Stream
-from .whole_stream import Changed, whole
+from .stream import Changed, Stream, whole
 
 Function = Callable[[Block], Any]
 

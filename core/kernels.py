@@ -29,8 +29,8 @@ from numba.core import event
 
 from zonda import __version__
 
+from . import machine
 from .errors import OutputError
-from .storage import user_cache
 
 PATIENCE = 600
 """Longest wait for the compilation of another process, s."""
@@ -79,7 +79,7 @@ def folder() -> Path | None:
     stored.
     """
     try:
-        base = Path(os.environ.get("NUMBA_CACHE_DIR") or user_cache.folder(), "zonda-kernels")
+        base = Path(os.environ.get("NUMBA_CACHE_DIR") or machine.cache_folder(), "zonda-kernels")
         base.mkdir(parents=True, exist_ok=True, mode=0o700)
         state = base.stat()
         if hasattr(os, "getuid") and (state.st_uid != os.getuid() or state.st_mode & 0o022):
@@ -143,7 +143,7 @@ class CacheLock(event.Listener):  # type: ignore[misc]
 @functools.cache
 def _versions() -> str:
     """Name of the folder for one set of versions and one processor."""
-    processor = hashlib.blake2b(user_cache.processor().encode(), digest_size=4).hexdigest()
+    processor = hashlib.blake2b(machine.processor().encode(), digest_size=4).hexdigest()
     return (
         f"zonda-{__version__}_numba-{numba.__version__}_llvmlite-{llvmlite.__version__}"
         f"_numpy-{np.__version__}_python-{platform.python_version()}_{processor}"

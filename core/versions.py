@@ -65,7 +65,7 @@ def arithmetic() -> dict[str, str]:
     from llvmlite import binding
     from numba.core import config
 
-    from .storage.user_cache import processor
+    from .machine import processor
 
     features = config.CPU_FEATURES
     if features is None:

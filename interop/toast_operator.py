@@ -20,10 +20,9 @@ from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
 from zonda.core.signal import MAIN
-from zonda.core.stream import Stream
+from zonda.core.stream import Changed, Stream, whole
 from zonda.core.types import AnyFloats
 from zonda.core.versions import needed
-from zonda.core.whole_stream import Changed, whole
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 
 EXTRA = "toast"

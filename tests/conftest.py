@@ -10,11 +10,11 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import HealthCheck, settings
 
+from zonda.core.machine import cache_folder
 from zonda.core.registry import registries
-from zonda.core.storage import user_cache
 
 # kernels are compiled once, not in every session
-os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache.folder()))
+os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder()))
 
 # how quickly examples are made depends on what else the machine does
 settings.register_profile(

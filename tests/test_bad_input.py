@@ -321,7 +321,7 @@ def test_a_plugin_that_cannot_be_imported(here):
     }
 
     def run(*arguments):
-        command = [sys.executable, "-m", "zonda.core.cli", *arguments]
+        command = [sys.executable, "-m", "zonda", *arguments]
         return subprocess.run(command, env=environment, capture_output=True, text=True, cwd=here)
 
     assert run("check", "my.yaml").returncode == 0

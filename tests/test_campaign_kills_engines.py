@@ -206,7 +206,7 @@ def test_an_mpi_process_killed(place: Path, nursery: Nursery, whole_run: Any, vi
             "2",
             sys.executable,
             "-m",
-            "zonda.core.cli",
+            "zonda",
             *arguments,
             "--engine",
             "mpi",

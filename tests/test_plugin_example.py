@@ -29,7 +29,7 @@ def installed(tmp_path_factory):
 
 def zonda(environment, *arguments, cwd=None):
     return subprocess.run(
-        [sys.executable, "-m", "zonda.core.cli", *map(str, arguments)],
+        [sys.executable, "-m", "zonda", *map(str, arguments)],
         env=environment,
         capture_output=True,
         text=True,

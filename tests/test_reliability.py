@@ -44,7 +44,7 @@ operators:
 SCAN = 217 * 200 * 8
 """Bytes of a scan's signal: MUSTANG-2's detectors, 2 s at 100 Hz, float64."""
 INPUTS = {"p.yaml", "map.fits", "small.yaml"}
-ZONDA = [sys.executable, "-m", "zonda.core.cli"]
+ZONDA = [sys.executable, "-m", "zonda"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 
 

@@ -6,8 +6,8 @@ pluggy and the metadata.
 
 COMMANDS = {
     "accuracy": "zonda.core.accuracy.command:accuracy",
-    "check": "zonda.core.cli.check:check",
-    "compile": "zonda.core.cli.compile:compile_kernels",
+    "check": "zonda.core.cli.run:check",
+    "compile": "zonda.core.cli.run:compile_kernels",
     "completion": "zonda.core.cli.complete:completion",
     "compare": "zonda.plugins.commands.compare:compare",
     "doctor": "zonda.plugins.commands.doctor:doctor",

@@ -30,7 +30,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from .. import subprocesses
+from .. import machine
 from ..errors import PipelineError
 from ..machine import available_memory, available_threads, one_blas_thread, resident_memory
 from .settings import Engine, Tls
@@ -93,8 +93,8 @@ class ProcessPool(Pool):
         self.stop()
         self.workers = workers or self.workers
         self.threads = self._asked_threads or max(1, available_threads() // self.workers)
-        safe = os.environ.get(subprocesses.SAFE)
-        with subprocesses.safe_path():  # its queues start a process that counts them
+        safe = os.environ.get(machine.SAFE)
+        with machine.safe_path():  # its queues start a process that counts them
             self.executor = _Workers(
                 self.workers,
                 mp_context=get_context("spawn"),
@@ -117,7 +117,7 @@ class _Workers(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """See `Executor.submit`."""
-        with subprocesses.safe_path(), subprocesses.without_script(), _ctrl_c_held_back():
+        with machine.safe_path(), machine.without_script(), _ctrl_c_held_back():
             return super().submit(fn, *args, **kwargs)
 
 
@@ -213,7 +213,7 @@ def begin_worker(safe: str | None = None) -> None:
 
     ``safe``: ``PYTHONSAFEPATH`` of the main process.
     """
-    subprocesses.restore(safe)
+    machine.restore(safe)
     keep()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):

@@ -1,8 +1,11 @@
-"""``zonda run``. Only click is imported with this module."""
+"""``zonda run``, ``zonda check``, ``zonda compile``: commands about pipeline files. Only click is
+imported with this module.
+"""
 
 from __future__ import annotations
 
 import gc
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -205,3 +208,80 @@ def _verify(
     click.echo(
         f"error of {metric} against the tightest knobs: {100 * error:.2g} %{each}{wanted}", err=True
     )
+
+
+@click.command("compile")
+@click.argument("names", metavar="[FILE_OR_NAME]...", nargs=-1, shell_complete=complete.pipelines)
+def compile_kernels(names: tuple[str, ...]) -> None:
+    """Compile the kernels of pipelines, by default of all shipped ones, so that no later run does.
+
+    Run it once where many processes are going to start together, e.g. on a cluster whose nodes
+    share a home: while one process compiles, the others wait for it. Seconds of each pipeline are
+    simulated; nothing is written but the machine code.
+    """
+    from ..machine import one_blas_thread
+
+    one_blas_thread()
+    from ..configuration.locate import shipped
+    from ..errors import OutputError
+    from ..kernels import folder
+    from ..plan.planner import for_run
+    from ..plan.prediction import sliced
+
+    place = folder()
+    if place is None:
+        raise OutputError(
+            "machine code cannot be stored",
+            place="zonda compile",
+            cure="set NUMBA_CACHE_DIR to a folder of yours that lasts",
+        )
+    for name in names or shipped():
+        file = load(name, ())
+        part = sliced(for_run(file).apply(file), seconds=2.0)
+        part.pipeline().run(part.scene())
+        click.echo(f"compiled: {name}", err=True)
+    click.echo(place)
+
+
+@click.command()
+@click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change one value, as for `zonda run`.",
+)
+def check(pipeline: str, settings: tuple[str, ...]) -> None:
+    """Check a pipeline file without running it.
+
+    Every mistake in the file is shown at once, with its place. The telescope is pointed at some
+    instants of the scans: whether the target is up, how near they come to the telescope's speed and
+    acceleration, how many samples there are in a beam; and whether it is on the input maps. Files
+    are read by the code with which a run reads them, which begins with the same look.
+    """
+    file = load(pipeline, settings)
+    from ..scene import elsewhere
+
+    if note := elsewhere(file.scene()):
+        click.echo(f"warning: {note}", err=True)
+    found = file.look(say=_say if sys.stderr.isatty() else None)
+    if sys.stderr.isatty():
+        _say("")
+    click.echo(f"{file.place}: no mistakes, {len(file.steps)} steps")
+    for what, text in file.scene().instrument.notes.items():
+        click.echo(f"  {what}: {text}")
+    for step, lines in zip(file.steps, found, strict=True):
+        click.echo(f"  {step.key}")
+        for line in lines:
+            click.echo(f"    {line}")
+    if file.header.campaign is not None:
+        from ..campaign.command import source
+        from ..campaign.prepare import outline
+
+        click.echo(outline(source(pipeline, settings, False))[0])
+
+
+def _say(label: str) -> None:
+    """Name the step that is looked at, on one line of the terminal."""
+    click.echo(f"\r\033[K{f'checking {label}' if label else ''}", nl=False, err=True)

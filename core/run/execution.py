@@ -39,9 +39,8 @@ from ..numerics.smooth import SmoothField
 from ..observation import Observation
 from ..operator import Operator
 from ..signal import MAIN, Formed, is_signal
-from ..stream import Stream, forget_pages, in_order
+from ..stream import Stream, forget_pages, in_order, whole
 from ..types import AnyFloats
-from ..whole_stream import whole
 from .block_maker import BlockMaker, Due
 from .budget import memory_of
 from .means import MeansOfBands, WholeStream, knows_means, means_of

@@ -17,7 +17,7 @@ from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from . import packed
+from . import files
 from .files import check_memory, reading
 
 FIELDS_MAX = 999
@@ -105,14 +105,14 @@ def opened(
     """An `astropy.io.fits.HDUList` to read from; each failure of the body is an `InputError` about
     ``place``.
 
-    A compressed file is unpacked into memory, up to `packed.UNPACKED_MAX`. Headers that would keep
+    A compressed file is unpacked into memory, up to `files.UNPACKED_MAX`. Headers that would keep
     astropy busy without end are refused.
     """
     with reading(place, kind, cure), warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyWarning)
         content = None
-        if packed.is_packed(path):
-            content = packed.unpacked(path, place, packed.UNPACKED_MAX)
+        if files.is_packed(path):
+            content = files.unpacked(path, place, files.UNPACKED_MAX)
         with io.BytesIO(content) if content is not None else open(path, "rb") as file:
             while (size := _next_header(file, place)) is not None:
                 file.seek(-(-size // BLOCK) * BLOCK, os.SEEK_CUR)
@@ -126,9 +126,9 @@ def check_size(hdu: Any, place: str, *, whole: bool = True) -> None:
     they need more memory than is free."""
     size = _data_bytes(hdu.header)
     tiled = hdu.header.get("ZIMAGE") or type(hdu).__name__ == "CompImageHDU"
-    if tiled and size > packed.UNPACKED_MAX:
-        most = f"reading stops at {packed.UNPACKED_MAX / 1e9:.4g} GB"
-        raise packed.too_large(f"unpacks to {size / 1e9:.4g} GB; {most}", place)
+    if tiled and size > files.UNPACKED_MAX:
+        most = f"reading stops at {files.UNPACKED_MAX / 1e9:.4g} GB"
+        raise files.too_large(f"unpacks to {size / 1e9:.4g} GB; {most}", place)
     if whole:
         check_memory(size, "the array or table", place)
     info = hdu.fileinfo()

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from ..configuration.time import Instant
 from ..errors import InputError
-from . import packed
-from .files import atomic_path, reading
+from .files import atomic_path, reading, unpacked_text
 
 LARGEST = 1 << 28
 """Bytes of the text of a table that is read."""
@@ -260,7 +259,7 @@ def read_text(path: Path, place: str) -> str:
     no text.
     """
     with reading(place, "a table", AS_TEXT):
-        return packed.text(path, place, LARGEST)
+        return unpacked_text(path, place, LARGEST)
 
 
 def _cells(lines: Sequence[tuple[int, str]], mark: str) -> tuple[list[int], list[list[str]]]:

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.maps.map_file import ascii_text
-from zonda.core.storage import packed
-from zonda.core.storage.files import writing
+from zonda.core.storage.files import UNPACKED_MAX, is_packed, unpacked, writing
 from zonda.core.storage.fits_files import check_size, opened, table_bytes
 from zonda.core.stream_names import UNITS
 from zonda.core.types import AnyFloats, Floats
@@ -219,10 +218,10 @@ class Reader:
                 self._at[name] = begin + columns.dtype.fields[column.name][1], np.dtype(kind)
         self._lock = threading.Lock()
         self._file: Any = None
-        if not packed.is_packed(path):
+        if not is_packed(path):
             self._file = open(path, "rb", buffering=0)  # noqa: SIM115
         elif whole:
-            content = packed.unpacked(path, self.place, packed.UNPACKED_MAX)
+            content = unpacked(path, self.place, UNPACKED_MAX)
             self._file = io.BytesIO(content)
         else:
             text = "is compressed: its streams cannot be read in parts"

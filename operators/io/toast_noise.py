@@ -128,10 +128,15 @@ def fit(frequency: Floats, power: Floats, place: str) -> Floats:
     white = float(np.median(y[x > x[-1] - 1.0]))
     knee = x[y > white + np.log(2.0)].max(initial=x[0])
     limits = [white - 5, x[0] - 20, x[0] - 20, 0.05], [white + 5, x[-1] + 5, x[-1], STEEPEST]
+
+    def away(p: Any, form: Any) -> Any:
+        return share * (form(*p) - y)
+
     tried = [
         least_squares(
-            lambda p, form=form: share * (form(*p) - y),
+            away,
             np.clip([white, knee, min(low, knee - 0.1), slope], *limits),
+            args=(form,),
             bounds=limits,
         )
         for form in (toast, own)
@@ -141,5 +146,5 @@ def fit(frequency: Floats, power: Floats, place: str) -> Floats:
     level, knee, low, slope = min(tried, key=lambda one: float(one.cost)).x
     low = max(low, x[0])
     if slope * (knee - low) < np.log(RISE):
-        level, knee, low, slope = white, -np.inf, x[0], 1.0
+        level, knee, low, slope = np.array([white, -np.inf, x[0], 1.0])
     return np.array([*np.exp([level / 2, knee, low]), slope])

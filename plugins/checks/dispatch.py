@@ -11,7 +11,7 @@ import numpy as np
 
 import zonda
 from zonda.core.checks import Family, Measured
-from zonda.core.subprocesses import command
+from zonda.core.machine import command
 from zonda.core.versions import arithmetic
 
 from .cases import DISPATCH

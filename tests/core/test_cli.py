@@ -337,13 +337,13 @@ def test_operating_system_errors(
         return load
 
     monkeypatch.setattr(
-        "zonda.core.cli.check.load",
+        "zonda.core.cli.run.load",
         fail(PermissionError(errno.EACCES, "Permission denied", "secret.fits")),
     )
     assert cli.main(["check", "p.yaml"]) == 2
     assert capsys.readouterr().err == "error: secret.fits: Permission denied\n"
     monkeypatch.setattr(
-        "zonda.core.cli.check.load", fail(OSError(errno.EBADF, "Bad file descriptor"))
+        "zonda.core.cli.run.load", fail(OSError(errno.EBADF, "Bad file descriptor"))
     )  # a fault of ours: show where
     with pytest.raises(OSError, match="Bad file descriptor"):
         cli.main(["check", "p.yaml"])

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from zonda.core import subprocesses
+from zonda.core import machine
 from zonda.core.accuracy.measure import run_in
 from zonda.core.campaign.engines import engine
 from zonda.core.experiment import Variant
@@ -76,7 +76,7 @@ def hostile(tmp_path: Path) -> Path:
 
 def environment(folder: Path, **more: str) -> dict[str, str]:
     """As a shell has it: the packages are found, and nothing is remembered from earlier runs."""
-    given = {name: value for name, value in os.environ.items() if name != subprocesses.SAFE}
+    given = {name: value for name, value in os.environ.items() if name != machine.SAFE}
     path = os.pathsep.join(p for p in sys.path if p)
     return {**given, "PYTHONPATH": path, "ZONDA_CACHE_DIR": str(folder / "cache"), **more}
 
@@ -157,7 +157,7 @@ def test_modules_of_pythonpath_are_found(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir("/")
     done = subprocess.run(
-        subprocesses.command("za_child", "main", 3, 'it\'s \\ "so"'), capture_output=True, text=True
+        machine.command("za_child", "main", 3, 'it\'s \\ "so"'), capture_output=True, text=True
     )
     assert done.returncode == 2, done.stderr
     assert done.stdout == "3 " + repr('it\'s \\ "so"') + "\n"
@@ -166,15 +166,15 @@ def test_modules_of_pythonpath_are_found(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("before", [None, "", "1"])
 def test_the_environment_is_as_before(monkeypatch: pytest.MonkeyPatch, before: str | None) -> None:
     if before is None:
-        monkeypatch.delenv(subprocesses.SAFE, raising=False)
+        monkeypatch.delenv(machine.SAFE, raising=False)
     else:
-        monkeypatch.setenv(subprocesses.SAFE, before)
-    with subprocesses.safe_path():
-        assert os.environ[subprocesses.SAFE] == "1"
-    assert os.environ.get(subprocesses.SAFE) == before
+        monkeypatch.setenv(machine.SAFE, before)
+    with machine.safe_path():
+        assert os.environ[machine.SAFE] == "1"
+    assert os.environ.get(machine.SAFE) == before
 
 
 def test_no_interpreter_to_start_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", None)
     with pytest.raises(OSError, match="no Python interpreter"):
-        subprocesses.command("zonda", "main")
+        machine.command("zonda", "main")

@@ -129,7 +129,7 @@ def encrypted(certificates):
 def in_a_shell(arguments, **variables):
     """The command line in a process of its own; its exit status, and what it said."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | variables
-    command = [sys.executable, "-m", "zonda.core.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "zonda", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     return done.returncode, done.stderr
 
@@ -221,7 +221,7 @@ def mpi(bench):
             str(out),
         ]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-        command = [mpiexec, "-n", str(number), sys.executable, "-m", "zonda.core.cli", *arguments]
+        command = [mpiexec, "-n", str(number), sys.executable, "-m", "zonda", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, env=environment)
         assert done.returncode == 0, done.stderr
         assert done.stdout == f"{out}/\n"

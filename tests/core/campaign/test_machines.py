@@ -156,14 +156,14 @@ def test_an_unknown_machine_is_not_compared(tmp_path):
     ["NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE"],
 )
 def test_what_is_remembered_of_a_processor_knows_its_restraints(monkeypatch, name):
-    from zonda.core.storage import user_cache
+    from zonda.core import machine
 
     monkeypatch.delenv(name, raising=False)
-    user_cache.processor.cache_clear()
-    assert f" {name}=" not in user_cache.processor()
+    machine.processor.cache_clear()
+    assert f" {name}=" not in machine.processor()
     monkeypatch.setenv(name, "less")
-    user_cache.processor.cache_clear()
+    machine.processor.cache_clear()
     try:
-        assert f" {name}=less" in user_cache.processor()
+        assert f" {name}=less" in machine.processor()
     finally:
-        user_cache.processor.cache_clear()
+        machine.processor.cache_clear()

@@ -20,7 +20,7 @@ from astropy.io import fits
 
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.instrument import Band
-from zonda.core.storage import fits_files, hdf5_files, packed
+from zonda.core.storage import files, fits_files, hdf5_files
 from zonda.operators.pointing.recording_files import read_recording
 from zonda.operators.sky.read import read_map
 
@@ -77,7 +77,7 @@ def test_a_small_file_that_unpacks_to_much_is_refused(
     PACK[kind](path, image(tmp_path / "plain.fits", 1200))  # 5.8 MB
     assert path.stat().st_size < 30_000
     assert read_map(path).values.shape == (1200, 1200)
-    monkeypatch.setattr(packed, "UNPACKED_MAX", 5_000_000)
+    monkeypatch.setattr(files, "UNPACKED_MAX", 5_000_000)
     with pytest.raises(
         InputError, match="unpacks to more than 5 MB, where reading stops"
     ) as caught:
@@ -125,7 +125,7 @@ def test_tiles_that_unpack_to_much_are_refused(
     hdu.writeto(path)
     assert path.stat().st_size < 60_000
     assert read_map(path).values.shape == (1000, 1000)
-    monkeypatch.setattr(packed, "UNPACKED_MAX", 3_000_000)
+    monkeypatch.setattr(files, "UNPACKED_MAX", 3_000_000)
     with pytest.raises(InputError, match=r"unpacks to 0\.004 GB; reading stops at 0\.003 GB"):
         read_map(path)
 
@@ -135,7 +135,7 @@ def test_a_passband_that_unpacks_to_much_is_refused(kind: str, tmp_path: Path) -
     path = tmp_path / f"band.txt.{kind}"
     PACK[kind](path, b"80 0\n90 1\n100 0\n")
     assert Band(name="a", file=path).centre == pytest.approx(90e9)
-    PACK[kind](path, b"80 0\n90 1\n" + b"\n" * packed.TEXT_MAX)
+    PACK[kind](path, b"80 0\n90 1\n" + b"\n" * files.TEXT_MAX)
     assert path.stat().st_size < 30_000
     with pytest.raises(ZondaError, match="unpacks to more than 16 MB, where reading stops"):
         Band(name="a", file=path)

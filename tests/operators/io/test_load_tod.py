@@ -20,7 +20,7 @@ import zonda.testing
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import InputError, PipelineError, ZondaError
 from zonda.core.flags import INVALID, SUN_UP, TURNAROUND
-from zonda.core.testing_scan import Given, Points, made_up_scene
+from zonda.core.testing import Given, Points, made_up_scene
 from zonda.operators.io.save_tod import load_tod, save_tod
 from zonda.plugins.checks.scenes import sky_file
 

@@ -12,7 +12,7 @@ import pytest
 import zonda
 from zonda.core.errors import InputError
 from zonda.core.flags import INVALID
-from zonda.core.testing_scan import Given, Points, made_up_scene
+from zonda.core.testing import Given, Points, made_up_scene
 from zonda.operators.io.save_tod import load_tod, save_tod
 from zonda.operators.io.toast_noise import fit
 

@@ -116,7 +116,7 @@ def test_the_tests_of_a_new_plugin_pass_at_once(here, capsys):
     assert done.returncode == 0, done.stdout + done.stderr
     assert "4 passed" in done.stdout
     listed = subprocess.run(
-        [sys.executable, "-m", "zonda.core.cli", "plugins"],
+        [sys.executable, "-m", "zonda", "plugins"],
         env=environment,
         capture_output=True,
         text=True,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from zonda.core.storage import user_cache
+from zonda.core import machine
 
 
 def test_where(monkeypatch, tmp_path):
@@ -16,4 +16,4 @@ def test_where(monkeypatch, tmp_path):
         "win32": tmp_path / "zonda" / "cache",
         "darwin": Path.home() / "Library/Caches/zonda",
     }
-    assert user_cache.folder() == expected.get(sys.platform, tmp_path / "zonda")
+    assert machine.cache_folder() == expected.get(sys.platform, tmp_path / "zonda")
