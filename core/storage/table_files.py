@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from astropy import table as astropy_table
 from astropy.table.meta import get_header_from_yaml
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ LARGEST = 1 << 28
 AS_TEXT = "give ECSV, or text whose heading names the columns, with their units in brackets"
 MOST_COLUMNS = 999
 """Columns of a table, as of one in FITS."""
+MOST_VALUES = 100_000
+"""Values that the header of an ECSV table unfolds to: aliases multiply."""
 MOST_TOLD = 12
 """Mistakes that are told one by one; the others are counted."""
 BRACKETED = re.compile(r"(.*?)\s*(?:\[(.*)\]|\((degs?|degrees?|°|rad|radians?|s|secs?|seconds?)\))")
@@ -212,7 +215,10 @@ def read_table(path: Path, place: str = "", text: str | None = None) -> Table:
     if text.startswith("# %ECSV"):
         cure = "write it with astropy: table.write(path, format='ascii.ecsv')"
         with reading(place, "ECSV", cure):
-            head = get_header_from_yaml(line[2:] for _, line in written if line.startswith("# "))
+            header = [line[2:] for _, line in written if line.startswith("# ")]
+            if _unfolded(yaml.compose("\n".join(header)), {}) > MOST_VALUES:
+                raise ValueError(f"its aliases unfold to more than {MOST_VALUES} values")
+            head = get_header_from_yaml(header)
             numbers, rows = _cells(body, str(head.get("delimiter", " ")))
             described = {column["name"]: str(column.get("unit", "")) for column in head["datatype"]}
             named = [(name, described[name]) for name in rows[0]]
@@ -252,6 +258,18 @@ def read_table(path: Path, place: str = "", text: str | None = None) -> Table:
     columns = [list(column) for column in zip(*rows[1:], strict=True)]
     table.columns = {n: (c, unit) for (n, unit), c in zip(named, columns, strict=True)}
     return table
+
+
+def _unfolded(node: Any, sizes: dict[int, float]) -> float:
+    """Number of values below a YAML node, each as often as aliases repeat it."""
+    if isinstance(node, tuple):
+        return sum(_unfolded(each, sizes) for each in node)
+    if not isinstance(node, yaml.CollectionNode):
+        return 1.0
+    if id(node) not in sizes:
+        sizes[id(node)] = math.inf  # stands while it is counted: an alias of what it stands in
+        sizes[id(node)] = 1.0 + sum(_unfolded(each, sizes) for each in node.value)
+    return sizes[id(node)]
 
 
 def read_text(path: Path, place: str) -> str:

@@ -166,6 +166,13 @@ def text(asked: Asked) -> str:
     wanted = positive("--time", Unit("s", "3 h"), asked.time, 3600.0)
     usual = min(2 * max(instrument.field_of_view, 10 * instrument.beam_fwhm), WIDEST)
     scan = daisy(instrument, elevation, positive("--area", Unit("rad"), asked.area, usual), wanted)
+    if not scan.duration <= DAY:
+        raise InputError(
+            f"at an elevation of {math.degrees(elevation):.6g} deg the azimuth axis lets the beam"
+            f" scan with {math.degrees(scan.speed) * 3600:.3g} arcsec/s at most",
+            place="--elevation",
+            cure="give a lower one",
+        )
     middle = _midnight(site, asked.month)
     if asked.target is None:
         target = _culminating(site, middle, elevation)
@@ -213,6 +220,8 @@ def daisy(instrument: Instrument, elevation: float, area: float, seconds: float)
         radius / PERIOD,
         SAMPLED * instrument.beam_fwhm * instrument.sample_rate,
     )
+    if speed < 1e-12:  # rad/s, at the zenith
+        return Daisy(radius, speed, 0.0, math.inf, 1)
     cut = speed / (CUT * radius)
     scans = max(1, min(MOST, math.ceil(seconds / LONGEST - 1e-9)))
     least = max(TURN * radius / speed, CYCLES / cut)

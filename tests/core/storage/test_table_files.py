@@ -141,3 +141,18 @@ def test_a_quote_that_is_not_closed(tmp_path):
     path.write_text("a,b\n" + '"x,1\n' + "1,2\n" * 60000)
     with pytest.raises(InputError, match=r"t\.csv"):
         read_table(path)
+
+
+def test_aliases_of_a_header_do_not_multiply(tmp_path):
+    """1 kB of YAML whose text has 10^9 words, and one that stands inside itself."""
+    levels = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    levels += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 9)]
+    for meta in (levels, ["a0: &a0 [x, *a0]"]):
+        (tmp_path / "t.ecsv").write_text(
+            "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: ra, datatype: float64}\n# meta:\n"
+            + "".join(f"#   {line}\n" for line in meta)
+            + "ra\n1.0\n"
+        )
+        with pytest.raises(InputError, match="aliases unfold to more than") as told:
+            read_table(tmp_path / "t.ecsv")
+        assert "table.write" in told.value.cure

@@ -101,6 +101,8 @@ def test_one_detector_has_no_common_mode(monkeypatch):
         ({"pwv": "7 mm", "quantile": 0.5}, "given twice"),
         ({"elevation": "50 deg", "target": "5h 20d"}, "of its own"),
         ({"elevation": "95 deg"}, "outside the limits"),
+        ({"elevation": "90 deg"}, "azimuth axis"),
+        ({"elevation": "89.9999 deg"}, "azimuth axis"),
         ({"elevation": "50"}, "--elevation: .*no unit"),
         ({"quantile": 1.5}, "outside the limits"),
         ({"month": 13}, "no month 13"),
