@@ -19,7 +19,7 @@ from zonda.operators.atmosphere.turbulence import covariance, lattice
 from zonda.operators.atmosphere.weather import bands
 from zonda.operators.filters import brick_wall, common_mode
 from zonda.operators.maps import binning
-from zonda.operators.maps.sums import DATA
+from zonda.operators.maps.intensity_kernel import DATA
 from zonda.operators.noise import pink, white
 from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing import recording
@@ -140,24 +140,26 @@ def nan_pixels_that_stay(patch: Patch) -> None:
 
 
 def nan_samples_that_count_as_zero(patch: Patch) -> None:
-    add = binning.add_image
+    add = binning.add_intensity
     patch.setattr(
         binning,
-        "add_image",
-        lambda signal, *rest: add(np.nan_to_num(signal, posinf=0.0, neginf=0.0), *rest),
+        "add_intensity",
+        lambda signals, *rest: add(
+            tuple(np.nan_to_num(s, posinf=0.0, neginf=0.0) for s in signals), *rest
+        ),
     )
 
 
 def sums_rounded_by_block(patch: Patch) -> None:
     """Each block adds float32 sums, as a naive accumulator would."""
-    add = binning.add_image
+    add = binning.add_intensity
 
     def rounded(*arguments: Any) -> None:
         add(*arguments)
         sums = arguments[-3]
         sums[:, DATA] = sums[:, DATA].astype(np.float32).astype(np.int64)
 
-    patch.setattr(binning, "add_image", rounded)
+    patch.setattr(binning, "add_intensity", rounded)
 
 
 def noise_that_starts_again_in_each_block(patch: Patch) -> None:

@@ -1,13 +1,12 @@
-"""Averages samples into pixels.
+"""Averages samples into pixels: a weighted mean of I, or the best fitting I, Q and U (equations (1)
+and (2) of `binning`).
 
-    m_p = sum_i w_i d_i / sum_i w_i over the samples i in pixel p                                (1)
-
-Where a `Taper` multiplied the signal by a window W, the samples weigh w W:
+Where a `Taper` multiplied the signal by a window W, the samples of a map of I weigh w W:
 
     m_p = sum_i w_i (W d)_i / sum_i w_i W_i,
-    variance (sum_i w_i^2 W_i^2 sigma_i^2) / (sum_i w_i W_i)^2.  (2)
+    variance (sum_i w_i^2 W_i^2 sigma_i^2) / (sum_i w_i W_i)^2.  (1)
 
-The sums are kept in fixed point (`sums`), so that they are exact; each sample is rounded to 2^-36 K
+The sums are kept in fixed point, so that they are exact; each sample is rounded to 2^-36 K
 (1.5e-11 K).
 """
 
@@ -23,17 +22,18 @@ from pydantic import PrivateAttr
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
+from zonda.core.types import Floats
 
 from .angle_checks import check_polarized, warn_before
-from .binning import Binning, Part, add_blocks, binnings, detector_weights
+from .binning import BandBlock, Binning, Weights, add_blocks, binnings, weights_of
 from .coverage import COUNTS, Coverage, Directions
 from .grid import Grid
+from .intensity_kernel import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, Sums
 from .map_from_sums import MapFromSums
 from .map_layout import MapLayout
 from .map_sums import MapSums
 from .parameters import MapParameters
 from .pixels import Cells, Looking
-from .sums import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, Sums
 
 NO_WHITE = "what the detectors' NET would make; this scene has no white noise"
 """Said of the noise that the map of such a scene states."""
@@ -48,8 +48,8 @@ LIGHT = "instants that count as flagged: a window leaves less than a tenth of th
 
 
 class BinMap(MapParameters):
-    """Weighted mean of the samples in each pixel, equation (1), as a FITS image or a HEALPix map;
-    or I, Q and U (`stokes`).
+    """Weighted mean of the samples in each pixel, as a FITS image or a HEALPix map; or I, Q and U
+    (`stokes`).
     """
 
     provides: ClassVar[frozenset[str]] = frozenset({"map"})
@@ -109,7 +109,7 @@ class BinMap(MapParameters):
         Raises PipelineError where noise is wanted from the scatter of samples that a window has
         changed.
         """
-        levels, seen = self._levels(observation)
+        weights, seen = self._weights(observation)
         polarized, hits = self.stokes == "IQU", self.contents == "hits"
         if polarized:
             check_polarized(observation, self.label)
@@ -117,7 +117,7 @@ class BinMap(MapParameters):
         made = binnings(
             self.split,
             looking,
-            levels,
+            weights,
             seen,
             self._spare,
             signals=1 if hits else len(observation.signals),
@@ -133,12 +133,12 @@ class BinMap(MapParameters):
 
     def exec_bands(self, blocks: Sequence[Block], states: Sequence[Prepared]) -> None:
         """Add the blocks of several bands, each to its own sums; what is the same is found once."""
-        parts = [Part(s.signals(b), b, s.halves) for b, s in zip(blocks, states, strict=True)]
+        bands = [BandBlock(s.signals(b), b, s.halves) for b, s in zip(blocks, states, strict=True)]
         cells = Cells()
-        for part, state in zip(parts, states, strict=True):
+        for band, state in zip(bands, states, strict=True):
             if state.directions is not None:
-                state.directions.add(part.signals, part.block, cells)
-        add_blocks(parts, cells)
+                state.directions.add(band.signals, band.block, cells)
+        add_blocks(bands, cells)
 
     def collect(self, data: Data, observation: Observation, state: Prepared) -> None:
         """Add this observation to the even or the odd scans' sums; what is dropped is counted.
@@ -147,8 +147,13 @@ class BinMap(MapParameters):
         """
         if self.label not in data.partial:
             signals = () if self.contents == "hits" else observation.signals
-            how = self.stokes == "IQU", self.noise == "scatter", self.split == "scans"
-            made = MapSums(self.grid.n_pixels, signals, *how)
+            made = MapSums(
+                self.grid.n_pixels,
+                signals,
+                polarized=self.stokes == "IQU",
+                scatter=self.noise == "scatter",
+                of_scans=self.split == "scans",
+            )
             counts = [name for name in COUNTS if getattr(self, name)]
             made.coverage = Coverage.empty(self.grid.n_pixels, counts, self.scan_hits)
             data.add(self.label, made)
@@ -157,7 +162,7 @@ class BinMap(MapParameters):
         binned, dropped = sums.add(observation, state.halves, self.label)
         hits = None if before is None else sums.hits.sum(axis=0) - before
         sums.coverage.add(hits, state.directions, f"{self.label}, {observation.name}")
-        self._note_beams(observation, sums, binned)
+        self._note_beams(observation, sums, state.weights.detector, binned)
         used = observation.focalplane.net[observation.good_detectors]
         sums.unknown_variance |= self.weights == "inverse_variance" and not (used > 0).all()
         every, log = observation.n_detectors * observation.n_samples, observation.log
@@ -182,10 +187,10 @@ class BinMap(MapParameters):
         if sums is not None:
             MapFromSums(self, self.grid, self._layout, sums).finish(data)
 
-    def _levels(self, observation: Observation) -> tuple[tuple[Any, Any, Any], NDArray[np.bool_]]:
-        """((weight, noise of each detector, window), samples that count (n_samp,))."""
-        weight, noise = self._weights(observation)
-        window = observation.window if self.contents == "all" else None
+    def _weights(self, observation: Observation) -> tuple[Weights, NDArray[np.bool_]]:
+        """Weights of the samples, and which of these count (n_samp,)."""
+        everything = self.contents == "all"
+        window = observation.window if everything else None
         if window is not None and self.noise == "scatter":
             text = (
                 "noise: scatter needs samples that no window has changed;"
@@ -194,28 +199,26 @@ class BinMap(MapParameters):
             raise PipelineError(
                 text, place=self.label, cure="leave out noise: scatter, or the window"
             )
+        inverse = self.weights == "inverse_variance" and everything
+        weights = weights_of(
+            observation, self._layout["variance"], inverse, window, place=self.label
+        )
         seen = observation.good_samples
-        if window is None:
-            window = np.zeros(0)
-        else:
+        if window is not None:
             seen &= (heavy := window >= LIGHTEST)
             observation.log.count(self.label, LIGHT, int((~heavy).sum()), heavy.size)
-        if "white" not in observation.components and self.noise == "net" and self.contents == "all":
+        if "white" not in observation.components and self.noise == "net" and everything:
             observation.log.state(self.label, "noise of a pixel", NO_WHITE)
-        return (weight, noise, window), seen
+        return weights, seen
 
-    def _weights(self, observation: Observation) -> tuple[Any, Any]:
-        """Weight and noise of each detector (`detector_weights`)."""
-        inverse = self.weights == "inverse_variance" and self.contents == "all"
-        return detector_weights(observation, self._layout["variance"], inverse, self.label)
-
-    def _note_beams(self, observation: Observation, sums: MapSums, binned: int) -> None:
+    def _note_beams(
+        self, observation: Observation, sums: MapSums, weight: Floats, binned: int
+    ) -> None:
         """Note the beams of an observation's detectors, with what they weigh in the map: ``binned``
         samples, as many of each.
         """
         good = observation.good_detectors
         if count := int(np.count_nonzero(good)):
-            weight, _ = self._weights(observation)
             sums.beams.add(observation.focalplane.fwhm[good], weight[good], -(-binned // count))
 
 
@@ -232,13 +235,18 @@ class Prepared:
     directions: Directions | None
     hits: bool
 
+    @property
+    def weights(self) -> Weights:
+        """Weights of the samples."""
+        return self.halves[0][0].weights
+
     def signals(self, block: Block) -> tuple[Any, ...]:
         """Signals of a block, (n_det, n) each; zeros where only the hits are wanted."""
         if self.hits:
             nothing = block.buffer("nothing", block.shape)
             nothing.fill(0)
             return (nothing,)
-        window, unfiltered = self.halves[0][0].window[block.samples], block.observation.unfiltered
+        window, unfiltered = self.weights.window[block.samples], block.observation.unfiltered
         whole = any(name in block.means for name in block.signals) or (window.size and unfiltered)
         signals = [block.total(name) if whole else block.detdata[name] for name in block.signals]
         if window.size:  # no filter, no window, acted on these

@@ -1,19 +1,22 @@
 """Sums of the samples of one observation in the pixels of a map, in fixed point.
 
-A map of I has one weight in each pixel (`sums`). For maps of I, Q and U, a sample of a detector of
-polarization efficiency p whose axis is at the angle psi from the meridian sees (1, c, s) of (I, Q,
-U), with c = p cos 2 psi and s = p sin 2 psi (`core.polarization`). The map m that fits the samples
-d of a pixel best, with weights w:
+Samples d = P m + n see the map m through the pointing matrix P. With weights w on the diagonal of
+N^-1, the map that fits them best solves
 
-    A m = b,   A = sum_i w_i (1, c_i, s_i)^T (1, c_i, s_i),
-    b = sum_i w_i d_i (1, c_i, s_i).                    (1)
+    (P^T N^-1 P) m = P^T N^-1 d.                                                     (1)
 
-A window W that multiplied the signals multiplies w in A (`bin_map`, equation 2). The covariance of
-m is
+Both sides fall apart into pixels. A sample of a detector of polarization efficiency p whose axis is
+at the angle psi from the meridian sees r = (1, c, s) of (I, Q, U), with c = p cos 2 psi and
+s = p sin 2 psi (`core.polarization`). Added up over the samples i in a pixel are
 
-    A^-1 N A^-1,   N = sum_i w_i^2 W_i^2 sigma_i^2 (1, c_i, s_i)^T (1, c_i, s_i),   (2)
+    hits = sum_i 1,   A = sum_i w_i r_i^T r_i (weights),   b = sum_i w_i d_i r_i (data),
+    N = sum_i w_i^2 sigma_i^2 r_i^T r_i (noise),                                     (2)
 
-which is A^-1 where weights are inverse variances and there is no window: then N is not added up.
+of which `map_from_sums` makes m = A^-1 b and its covariance A^-1 N A^-1. A map of I has r = 1: one
+weight, and m is a weighted mean. A window W that multiplied the signals multiplies w in A and w^2
+in N by itself and its square. Where the weights of a map of I, Q and U are inverse variances and
+there is no window, N is A and is not added up; where all detectors of a map of I weigh the same, A
+and N follow from the hits.
 
 c and s are rounded to 2^-30 once, and all sums take the rounded ones. The terms of A and N are
 rounded to 2^-30 of the reference weight, those of b to 2^-36 K: as int64 the sums are exact, and
@@ -23,7 +26,7 @@ their bits depend neither on the order of blocks nor on the number of threads or
 from __future__ import annotations
 
 import threading
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -38,60 +41,70 @@ from zonda.core.observation import Observation
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 
-from . import stokes_kernel
-from .grid import TangentGrid
+from . import intensity_kernel as intensity
+from . import stokes_kernel as stokes
 from .halves import Split, halves_of
+from .intensity_kernel import FLAGGED, OUTSIDE, WEIGHT, Sums, add_intensity, move
 from .pixels import Cells, Looking, fingerprint, tiles
-from .stokes_kernel import MATRIX, add_stokes
-from .sums import DATA, FLAGGED, HITS, NOISE, OUTSIDE, WEIGHT, WEIGHTS, Sums, add_image, add_list
+from .stokes_kernel import add_stokes
 
-IN_CACHE = 1 << 14
-"""Pixels of an image that are added to the sums of a run at a time."""
 LOCK = threading.Lock()
 """Held while a thread is given sums."""
 
 
-class Folded(NamedTuple):
-    """Sums of one thread in the pixels with samples.
+class Weights(NamedTuple):
+    """Weights of an observation's samples, in units of the inverse of a reference variance.
 
     Attributes
     ----------
-    pixels, hits
-        (n,): numbers of the pixels (or a slice of these), and samples there.
-    weights, right, noise
-        (n, 1 or 6); (n, 1 or 3) of each signal; (n, 1 or 6), or None: as the weights.
-    dropped
-        (4,) samples by the reason.
-    largest
-        Term of the weights and the noise, and terms of the data of each signal.
+    detector
+        (n_det,) w.
+    noise
+        (n_det,) w^2 sigma^2 of one sample.
+    window
+        (n_samp,): `Observation.window`, or (0,).
     """
 
-    pixels: NDArray[np.int64] | slice
-    hits: Sums
-    weights: Sums
-    right: list[Sums]
-    noise: Sums | None
+    detector: Floats
+    noise: Floats
+    window: Floats
+
+    @property
+    def alike(self) -> bool:
+        """True if all detectors weigh the same."""
+        return all(bool((values == values[0]).all()) for values in self[:2])
+
+
+class ThreadSums(NamedTuple):
+    """Sums that one thread adds to.
+
+    Attributes
+    ----------
+    sums
+        In pixels; columns as in `intensity_kernel` or `stokes_kernel`.
+    dropped
+        (4,) samples that were dropped, by the reason.
+    largest
+        (2,) largest term of weights and noise, and of the data.
+    """
+
+    sums: Sums
     dropped: Sums
-    largest: tuple[float, list[float]]
+    largest: Floats
 
 
 @dataclass
 class Binning:
-    """Samples of one observation (or of half of it) that count, their weights, and the sums of each
-    thread.
+    """Samples of one observation, or of half of it, with their weights, and each thread's sums.
 
     Attributes
     ----------
-    use, good, window
-        (n_det,), (n_samp,) uint8: which detectors and samples count; (n_samp,):
-        `Observation.window`, or (0,).
-    weight, noise
-        (n_det,): w, and w^2 times the variance of one sample, in units of the reference variance.
+    detectors, samples
+        (n_det,), (n_samp,) uint8: which of them count.
     signals
-        Number of signals.
-    own
-        Of I: weights and noise have sums, where detectors differ; else they follow from the hits.
-        Of I, Q and U: N is not A, and is added up.
+        Which of the observation's signals.
+    own_noise
+        Of I: weights and noise have sums, as detectors differ. Of I, Q and U: N is not A.
     scatter
         Inverse of the reference variance [K^-2] where the noise is that of the samples' scatter;
         else 0.
@@ -106,38 +119,32 @@ class Binning:
     """
 
     looking: Looking
-    use: NDArray[np.bool_]
-    good: NDArray[np.uint8]
-    window: Floats
-    weight: Floats
-    noise: Floats
-    signals: int = 1
-    own: bool = False
+    detectors: NDArray[np.bool_]
+    samples: NDArray[np.uint8]
+    weights: Weights
+    signals: slice
+    own_noise: bool = False
     scatter: float = 0.0
     spare: list[Sums] = field(default_factory=list)
     angles: PolarizationAngles | None = None
     key: Hashable = None
-    parts: dict[int, tuple[Sums, Sums, Floats]] = field(default_factory=dict)
+    threads: dict[int, ThreadSums] = field(default_factory=dict)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape of the sums; those of I have a border for samples outside of the map (`sums`)."""
-        grid = self.looking.grid
-        if self.angles is not None:
-            more = 6 if self.own else 0
-            return grid.n_pixels, stokes_kernel.DATA + 3 * self.signals + more
-        columns = (4 if self.own else 2) + self.signals - 1
-        if isinstance(grid, TangentGrid):
-            return (grid.shape[0] + 2) * (grid.shape[1] + 2), columns
-        return grid.n_pixels + 1, columns
+        """Shape of a thread's sums; those of I have a row more (`intensity_kernel`)."""
+        n, number = self.looking.grid.n_pixels, self.signals.stop - self.signals.start
+        if self.angles is None:
+            return n + 1, (4 if self.own_noise else 2) + number - 1
+        return n, stokes.DATA + 3 * number + (6 if self.own_noise else 0)
 
-    def of_thread(self) -> tuple[Sums, Sums, Floats]:
-        """(sums, dropped (4,), largest terms (3 + signals,)) of this thread."""
-        mine = threading.get_ident()
+    def of_thread(self) -> ThreadSums:
+        """Sums of this thread."""
+        thread = threading.get_ident()
         with LOCK:
-            if mine not in self.parts:
-                self.parts[mine] = self._zeros(), np.zeros(4, np.int64), np.zeros(3 + self.signals)
-            return self.parts[mine]
+            if thread not in self.threads:
+                self.threads[thread] = ThreadSums(self._zeros(), np.zeros(4, np.int64), np.zeros(2))
+            return self.threads[thread]
 
     def _zeros(self) -> Sums:
         while self.spare:
@@ -145,68 +152,51 @@ class Binning:
                 return sums
         return np.zeros(self.shape, np.int64)
 
-    def folded(self) -> Iterator[Folded]:
-        """Sums of each thread, which are zero afterwards."""
-        polarized, n = self.angles is not None, self.signals
-        top = float(max(self.weight.max(initial=0.0), self.noise.max(initial=0.0))) * WEIGHT
-        alike = [np.rint(x[:1] * WEIGHT).astype(np.int64) for x in (self.weight, self.noise)]
-        for sums, dropped, largest in self.parts.values():
-            for pixels, found, outside in self._in_pixels(sums):
-                dropped[OUTSIDE] += outside
-                if polarized:
-                    first = stokes_kernel.DATA
-                    right = [found[:, first + 3 * k : first + 3 * k + 3] for k in range(n)]
-                    noise = found[:, -6:] if self.own else None
-                    high = float(largest[0]), [float(largest[1])] * n
-                    hits = found[:, stokes_kernel.HIT]
-                    yield Folded(pixels, hits, found[:, MATRIX], right, noise, dropped, high)
-                else:
-                    hits = found[:, HITS]
-                    weights, noise = (
-                        found[:, [column]] if self.own else hits[:, None] * each
-                        for column, each in zip((WEIGHTS, NOISE), alike, strict=True)
-                    )
-                    others = range(found.shape[1] - n + 1, found.shape[1])
-                    right = [found[:, [k]] for k in (DATA, *others)]
-                    every = max(top, *largest[WEIGHTS : NOISE + 1])
-                    ends = [float(largest[k]) for k in (DATA, *range(NOISE + 1, NOISE + n))]
-                    yield Folded(pixels, hits, weights, right, noise, dropped, (every, ends))
-                dropped = np.zeros_like(dropped)
-            self.spare.append(sums)
-        self.parts.clear()
+    def columns(self, signals: Sequence[str]) -> dict[str, list[tuple[int, int]]]:
+        """Columns of a thread's sums, and factors, that make those of `MapSums.columns`."""
+        n, end = len(signals), self.shape[1]
+        if self.angles is None:
+            first, hits = end - n + 1, intensity.HITS
+            data = [[intensity.DATA], *([k] for k in range(first, end))]
+            weights, noise = [(intensity.WEIGHTS, 1)], [(intensity.NOISE, 1)]
+            if not self.own_noise:
+                weights, noise = (
+                    [(hits, int(np.rint(values[0] * WEIGHT)))] for values in self.weights[:2]
+                )
+        else:
+            first, hits = stokes.DATA, stokes.HIT
+            data = [list(range(first + 3 * k, first + 3 * k + 3)) for k in range(n)]
+            weights = noise = [(k, 1) for k in range(stokes.FIRST, first)]
+            if self.own_noise:
+                noise = [(k, 1) for k in range(end - 6, end)]
+        found = {"hits": [(hits, 1)], "weights": weights, f"noise {signals[0]}": noise}
+        for name, some in zip(signals, data, strict=True):
+            found[f"data {name}"] = [(k, 1) for k in some]
+        return found
 
-    def _in_pixels(self, sums: Sums) -> Iterator[tuple[NDArray[np.int64] | slice, Sums, int]]:
-        """Pixels with samples, their sums (n, columns), which are zero in ``sums`` afterwards, and
-        samples outside of the map. Of a TAN image: all pixels, some rows at a time.
+    def move(self, out: Sums, moves: Sums) -> tuple[int, int, Sums, Floats]:
+        """Move all threads' sums to ``out`` (n_pixels, columns), as `intensity_kernel.move` does:
+        (samples moved, most in a pixel, dropped (4,), largest terms (2,)).
         """
-        grid = self.looking.grid
-        if self.angles is None and isinstance(grid, TangentGrid):
-            ny, nx = grid.shape
-            image = sums.reshape(ny + 2, nx + 2, -1)
-            step = max(1, IN_CACHE // nx)
-            for first in range(0, ny, step):
-                last = min(first + step, ny)
-                rows = image[first + (first > 0) : last + 1 + (last == ny)]  # with the border
-                hits = int(rows[:, :, HITS].sum())
-                if hits or not first:
-                    found = image[first + 1 : last + 1, 1:-1].copy().reshape(-1, image.shape[2])
-                    rows[...] = 0
-                    outside = hits - int(found[:, HITS].sum())
-                    yield slice(first * nx, last * nx), found, outside
-            return
-        pixels = np.flatnonzero(sums[:, HITS if self.angles is None else stokes_kernel.HIT])
-        found = sums.take(pixels, axis=0)
-        sums[pixels] = 0
-        border = int(self.angles is None and pixels.size > 0 and pixels[0] == 0)
-        outside = int(found[:border, HITS].sum())
-        pixels = pixels if self.angles is not None else pixels - 1
-        yield pixels[border:], found[border:], outside
+        moved, deepest, dropped, largest = 0, 0, np.zeros(4, np.int64), np.zeros(2)
+        hits = intensity.HITS if self.angles is None else stokes.HIT
+        for sums, lost, high in self.threads.values():
+            rows = sums
+            if self.angles is None:
+                lost[OUTSIDE] += sums[0, hits]
+                sums[0], rows = 0, sums[1:]
+            number, most = move(rows, hits, out, moves)
+            moved, deepest = moved + number, max(deepest, most)
+            dropped, largest = dropped + lost, np.maximum(largest, high)
+            self.spare.append(sums)
+        self.threads.clear()
+        return moved, deepest, dropped, largest
 
 
 def binnings(
     split: Split,
     looking: Looking,
-    levels: tuple[Floats, Floats, Floats],
+    weights: Weights,
     good: NDArray[np.bool_],
     spare: list[Sums],
     *,
@@ -217,42 +207,39 @@ def binnings(
     """Empty sums for one observation, of each half of its samples: one for all ``signals``, or one
     for each if their noise is that of their ``scatter``.
 
-    ``levels``: weights and noise of the detectors (`detector_weights`), and the window (n_samp,) or
-    (0,); ``good`` (n_samp,): which samples count.
+    ``good`` (n_samp,): which samples count.
     """
-    observation, (weight, noise, window) = looking.observation, levels
+    observation = looking.observation
     halves = [(use, (good & some).astype(np.uint8)) for use, some in halves_of(split, observation)]
-    key, angles, own = None, None, bool(scatter or window.size)
+    key, angles, own = None, None, bool(scatter or weights.window.size)
     if polarized:
         pole = frame_rotation(looking.grid.frame)[2]
         angles = PolarizationAngles.of(observation, observation.boresight_radec, pole)
-        own |= not np.allclose(weight, noise, rtol=1e-6, atol=0)
+        own |= not np.allclose(weights.detector, weights.noise, rtol=1e-6, atol=0)
+        if looking.key is not None:
+            seen = angles.poles, angles.axes, angles.plate, angles.gamma, weights.window
+            efficiency = observation.focalplane.polarization_efficiency
+            masks = (mask for half in halves for mask in half)
+            key = looking.key, own, fingerprint(*seen, efficiency, *masks)
     else:
-        own |= bool((weight != weight[0]).any() or (noise != noise[0]).any())
-    if angles is not None and looking.key is not None:
-        seen = angles.poles, angles.axes, angles.plate, angles.gamma, window
-        efficiency = observation.focalplane.polarization_efficiency
-        masks = (mask for half in halves for mask in half)
-        key = looking.key, own, fingerprint(*seen, efficiency, *masks)
-    count, each = (signals, 1) if scatter else (1, signals)
-    more: Any = each, own, scatter, spare, angles, key
-    return [
-        [Binning(looking, *half, window, weight, noise, *more) for _ in range(count)]
-        for half in halves
-    ]
+        own |= not weights.alike
+    groups = [slice(k, k + 1) for k in range(signals)] if scatter else [slice(0, signals)]
+    more: Any = own, scatter, spare, angles, key
+    return [[Binning(looking, *half, weights, some, *more) for some in groups] for half in halves]
 
 
-def detector_weights(
-    observation: Observation, reference: float, inverse: bool, place: str
-) -> tuple[Any, Any]:
-    """(w, w^2 times the variance of one sample) of each detector, in units of the variance
-    ``reference`` [K^2]; ``inverse``: w is the inverse variance, else 1.
+def weights_of(
+    observation: Observation, reference: float, inverse: bool, window: Floats | None, place: str
+) -> Weights:
+    """Weights in units of the inverse of the variance ``reference`` [K^2]; ``inverse``: w is the
+    inverse variance, else 1.
 
     Raises PipelineError where they differ by too much, or are not known.
     """
+    window = np.zeros(0) if window is None else window
     usable, net = observation.good_detectors, observation.focalplane.net.copy()
     if not usable.any():
-        return np.ones(len(net)), np.ones(len(net))
+        return Weights(np.ones(len(net)), np.ones(len(net)), window)
     net[~usable] = net[usable][0]  # they weigh nothing, whatever their noise
     variance = net**2 * observation.sample_rate / reference
     weight, cure = np.ones(len(net)), "set weights: uniform"
@@ -269,10 +256,10 @@ def detector_weights(
         if net.max() > 1000 * net.min():
             text = "the detectors' NETs differ by more than a factor of 1000"
         raise PipelineError(text, place=place, cure=cure)
-    return weight, weight**2 * variance
+    return Weights(weight, weight**2 * variance, window)
 
 
-class Part(NamedTuple):
+class BandBlock(NamedTuple):
     """A block of one band: ``signals`` (n_det, n) each, ``halves`` as `binnings` makes them."""
 
     signals: tuple[AnyFloats, ...]
@@ -283,85 +270,91 @@ class Part(NamedTuple):
         """Detectors of the block (n_det,) that count in each half."""
         rows = self.block.detectors
         good = self.block.observation.good_detectors[rows]
-        return [half[0].use[rows] & good for half in self.halves]
+        return [half[0].detectors[rows] & good for half in self.halves]
 
 
-def add_blocks(parts: Sequence[Part], cells: Cells) -> None:
+def add_blocks(bands: Sequence[BandBlock], cells: Cells) -> None:
     """Add the blocks of one band, or of several, to this thread's sums. What bands whose samples
     fall in the same pixels have in common is found once.
     """
-    if parts[0].halves[0][0].angles is None:
-        _add_intensity(parts)
+    if bands[0].halves[0][0].angles is None:
+        _add_intensity(bands)
         return
-    alike: dict[Hashable, list[Part]] = {}
-    for part in parts:
-        key = part.halves[0][0].key, len(part.signals), part.signals[0].dtype.str
-        alike.setdefault(key, []).append(part)
+    alike: dict[Hashable, list[BandBlock]] = {}
+    for band in bands:
+        key = band.halves[0][0].key, len(band.signals), band.signals[0].dtype.str
+        alike.setdefault(key, []).append(band)
     for together in alike.values():
         _add_polarized(together, cells)
 
 
-def _add_intensity(parts: Sequence[Part]) -> None:
+def _add_intensity(bands: Sequence[BandBlock]) -> None:
     """Add blocks to the sums of I."""
-    todo: list[tuple[Any, ...]] = []
-    block = parts[0].block
-    begin, rows = block.samples.start, block.detectors
-    for part in parts:
-        plane = part.block.observation.focalplane
-        for half, use in zip(part.halves, part.used(), strict=True):
-            left = part.signals
-            for one in half:
-                signals, left, looking = left[: one.signals], left[one.signals :], one.looking
-                good, window = one.good[block.samples], one.window[block.samples]
-                how = one.weight[rows], one.noise[rows], one.scatter > 0, one.scatter
-                mine = use, good, window, *how, *one.of_thread()
-                if isinstance(looking.grid, TangentGrid):
-                    where = looking.pointing, begin, plane.xi[rows], plane.eta[rows]
-                    add_image(signals, *where, *looking.grid.shape, *mine)
-                else:
-                    todo.append((signals, looking, mine))
-    which = np.arange(rows.start, rows.stop)
-    for start in range(begin, block.samples.stop if todo else begin, TILE_SAMPLES):
-        stop, cells = min(start + TILE_SAMPLES, block.samples.stop), Cells()
-        for signals, looking, mine in todo:
-            if mine[1][start - begin : stop - begin].any():
-                add_list(signals, start - begin, cells.of(looking, which, start, stop), *mine)
-            else:
-                mine[-2][FLAGGED] += (stop - start) * which.size
+    detectors, samples = bands[0].block.detectors, bands[0].block.samples
+    which = np.arange(detectors.start, detectors.stop)
+    todo = [
+        (band.signals[binning.signals], binning, use, binning.of_thread())
+        for band in bands
+        for half, use in zip(band.halves, band.used(), strict=True)
+        for binning in half
+    ]
+    for start in range(samples.start, samples.stop, TILE_SAMPLES):
+        stop, cells = min(start + TILE_SAMPLES, samples.stop), Cells()
+        for signals, binning, use, thread in todo:
+            good = binning.samples[start:stop]
+            if not good.any():
+                thread.dropped[FLAGGED] += good.size * which.size
+                continue
+            weight, noise, window = binning.weights
+            add_intensity(
+                signals,
+                start - samples.start,
+                cells.of(binning.looking, which, start, stop),
+                use,
+                good,
+                window[start:stop],
+                weight[detectors],
+                noise[detectors],
+                binning.scatter,
+                *thread,
+            )
 
 
-def _add_polarized(parts: Sequence[Part], cells: Cells) -> None:
+def _add_polarized(bands: Sequence[BandBlock], cells: Cells) -> None:
     """Add the blocks of bands that have the same key to the sums of I, Q and U."""
-    used = [part.used() for part in parts]
+    used = [band.used() for band in bands]
     if any(not np.array_equal(some, used[0]) for some in used):  # detectors that a filter flagged
-        for part in parts:
-            _add_polarized([part], cells)
+        for band in bands:
+            _add_polarized([band], cells)
         return
-    block, looking = parts[0].block, parts[0].halves[0][0].looking
-    a: Any = parts[0].halves[0][0].angles
+    block, looking = bands[0].block, bands[0].halves[0][0].looking
+    a: Any = bands[0].halves[0][0].angles
     detectors, samples = block.detectors, block.samples
     angles = a.poles, a.axes, a.plate, a.gamma, block.observation.focalplane.polarization_efficiency
-    signals = tuple(signal for part in parts for signal in part.signals)
-    halves = [[half[0] for half in some] for some in zip(*(p.halves for p in parts), strict=True)]
-    sums = [[band.of_thread() for band in half] for half in halves]
+    signals = tuple(signal for band in bands for signal in band.signals)
+    halves = [
+        (use, [(half[0], half[0].of_thread()) for half in of_bands])
+        for use, *of_bands in zip(used[0], *(band.halves for band in bands), strict=True)
+    ]
 
-    def flag(mine: Sequence[Any], number: int) -> None:
-        for _, dropped, _ in mine:
-            dropped[FLAGGED] += number
+    def flag(binnings: Sequence[tuple[Binning, ThreadSums]], number: int) -> None:
+        for _, thread in binnings:
+            thread.dropped[FLAGGED] += number
 
-    for of_half, mine in zip(used[0], sums, strict=True):
-        flag(mine, (samples.stop - samples.start) * int(np.count_nonzero(~of_half)))
+    for use, made in halves:
+        flag(made, (samples.stop - samples.start) * int(np.count_nonzero(~use)))
     for rows, start, stop in tiles(block, np.any(used[0], axis=0)):
-        for half, of_half, mine in zip(halves, used[0], sums, strict=True):
-            at, good = np.flatnonzero(of_half[rows]), half[0].good[start:stop]
+        for use, made in halves:
+            at, first = np.flatnonzero(use[rows]), made[0][0]
+            good, window = first.samples[start:stop], first.weights.window[start:stop]
             if not good.any():
-                flag(mine, (stop - start) * at.size)
+                flag(made, (stop - start) * at.size)
             elif at.size:
                 index = cells.of(looking, rows + detectors.start, start, stop)
                 which = rows[at] + detectors.start
                 where = start - samples.start, rows[at], at, index, angles, which, start
-                bands = tuple(
-                    (band.weight[which], band.noise[which], *own)
-                    for band, own in zip(half, mine, strict=True)
+                each = tuple(
+                    (binning.weights.detector[which], binning.weights.noise[which], *thread)
+                    for binning, thread in made
                 )
-                add_stokes(signals, *where, good, half[0].window[start:stop], half[0].own, bands)
+                add_stokes(signals, *where, good, window, first.own_noise, each)

@@ -36,8 +36,8 @@ from zonda.core.maps.planes import Plane
 from zonda.core.types import Floats
 
 from .grid import PixelGrid
+from .intensity_kernel import WEIGHT, Sums
 from .pixels import Cells, Looking, tiles
-from .sums import WEIGHT, Sums
 
 SLOWEST = 1e-10
 """Radians per sample below which a detector does not move: far below sidereal motion, far above the

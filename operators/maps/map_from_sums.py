@@ -1,5 +1,5 @@
-"""Map products from the sums of their samples: equation (1) of `bin_map`, and equations (1) and (2)
-of `binning`, solved in each pixel.
+"""Map products from the sums of their samples: m = A^-1 b and its covariance A^-1 N A^-1 in each
+pixel, equations (1) and (2) of `binning`.
 """
 
 from __future__ import annotations
@@ -7,7 +7,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,10 +25,10 @@ from zonda.core.types import AnyFloats, Floats
 from .angle_checks import warn_after
 from .grid import Grid
 from .halves import DIFFERENCES
-from .map_sums import MapSums
+from .intensity_kernel import VALUE, WEIGHT
+from .map_sums import MapSums, PixelSums
 from .parameters import MapParameters
 from .stokes_kernel import PLACES
-from .sums import VALUE, WEIGHT, Sums
 
 AT_ONCE = 1 << 14
 """Pixels whose maps are made at a time: intermediate arrays stay in the cache."""
@@ -120,9 +120,9 @@ class MapFromSums:
         return {name: np.atleast_2d(values) for name, values in found.items()}
 
     def _plain(self, stream: str, part: slice, variance: float) -> dict[str, AnyFloats]:
-        hits, weights, data, noise = self.sums.parts(stream, part)
-        signal, weight = _mean(hits, weights, data)
-        term = noise[:, 0] / WEIGHT * variance
+        sums = self.sums.in_pixels(stream, part)
+        hits, term = sums.hits, sums.noise[:, 0] / WEIGHT * variance
+        signal, weight = _mean(sums)
         with np.errstate(invalid="ignore", divide="ignore"):
             if self.sums.scatter:
                 # equal samples leave the rounding of their squares, of either sign: a scatter below
@@ -133,35 +133,37 @@ class MapFromSums:
                 error = np.where(hits > 0, np.sqrt(term) / weight, np.nan)
         found = {"signal": signal, "hits": hits, "weights": weight, "noise": error}
         if self.halves:
-            (one, w), (two, v) = (
-                _mean(*self.sums.parts(stream, part, half)[:3]) for half in (0, 1)
-            )
+            (one, w), (two, v) = (_mean(self.sums.in_pixels(stream, part, half)) for half in (0, 1))
             with np.errstate(invalid="ignore", divide="ignore"):
                 found["half_difference"] = (one - two) * np.sqrt(w * v) / (w + v)
         return found
 
     def _polarized(self, stream: str, part: slice, variance: float) -> dict[str, AnyFloats]:
-        whole, limit = self.sums.parts(stream, part), self.parameters.condition_limit
-        values, spread, matrices, condition = _solved(whole, limit, bool(self.sums.noise))
-        covariance = matrices[:, TRIANGLE[0], TRIANGLE[1]].T * variance
+        limit = self.parameters.condition_limit
+        sums = self.sums.in_pixels(stream, part)
+        solved = _solved(sums, limit, self.sums.own_noise)
+        covariance = solved.covariance[:, TRIANGLE[0], TRIANGLE[1]].T * variance
         found = {
-            "signal": values.T,
-            "hits": whole[0],
-            "weights": np.nan_to_num(1 / spread.T),
+            "signal": solved.stokes.T,
+            "hits": sums.hits,
+            "weights": np.nan_to_num(1 / solved.spread.T),
             "noise": np.sqrt(covariance[[0, 3, 5]]),
             "covariance": covariance,
-            "condition": condition,
+            "condition": solved.condition,
         }
         if self.halves:
-            (one, a, *_), (two, b, *_) = (
-                _solved(self.sums.parts(stream, part, half), limit, False) for half in (0, 1)
+            one, two = (
+                _solved(self.sums.in_pixels(stream, part, half), limit, False) for half in (0, 1)
             )
-            found["half_difference"] = ((one - two) * np.sqrt(spread / (a + b))).T
+            share = np.sqrt(solved.spread / (one.spread + two.spread))
+            found["half_difference"] = ((one.stokes - two.stokes) * share).T
         return found
 
     def _add_coverage(self, product: MapProduct) -> None:
         """Add the planes that tell how scans cross, and the hits of each scan, if asked for."""
         coverage = self.sums.coverage
+        if not coverage.sums and coverage.pixels is None:
+            return
         seen = self.grid.seen(self.sums.hits.any(axis=0))
         for key, plane in coverage.planes().items():
             values = plane.values[:, seen].reshape(-1, *product.hits.shape)
@@ -232,38 +234,54 @@ class MapFromSums:
             log.state(self.parameters.label, "half-difference", "not made: it needs two scans")
 
 
-def _mean(hits: Sums, weights: Sums, data: Sums) -> tuple[Floats, Floats]:
-    """(signal, weight) of fixed-point sums; NaN where there are no hits."""
-    weight = weights[:, 0] / WEIGHT
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(hits > 0, data[:, 0] / VALUE / weight, np.nan), weight
+class Solved(NamedTuple):
+    """I, Q and U of pixels.
 
-
-def _solved(
-    sums: tuple[Sums, Sums, Sums, Sums], limit: float, own_noise: bool
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """I, Q and U (n, 3) of some pixels [K], NaN where the condition number is above the ``limit``;
-    (n, 3) diagonal of A^-1; (n, 3, 3) covariance in units of the reference variance; (n,) condition
-    number, NaN without hits.
+    Attributes
+    ----------
+    stokes
+        (n, 3) [K], NaN where the condition number is above the limit.
+    spread
+        (n, 3) diagonal of A^-1.
+    covariance
+        (n, 3, 3) A^-1 N A^-1, in units of the reference variance.
+    condition
+        (n,) condition number of A, NaN without hits.
     """
-    hits, weights, data, noise = sums
-    n = len(hits)
-    values, spread = np.full((2, n, 3), np.nan)
+
+    stokes: Floats
+    spread: Floats
+    covariance: Floats
+    condition: Floats
+
+
+def _mean(sums: PixelSums) -> tuple[Floats, Floats]:
+    """(signal, weight) of I; NaN where there are no hits."""
+    weight = sums.weights[:, 0] / WEIGHT
+    with np.errstate(invalid="ignore", divide="ignore"):
+        signal = sums.data[:, 0] / VALUE / weight
+    return np.where(sums.hits > 0, signal, np.nan), weight
+
+
+def _solved(sums: PixelSums, limit: float, own_noise: bool) -> Solved:
+    """I, Q and U of pixels whose condition number is at most the ``limit``."""
+    n = len(sums.hits)
+    stokes, spread = np.full((2, n, 3), np.nan)
     covariance, condition = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
-    hit = np.flatnonzero(hits)
-    a = weights[hit][:, PLACES].reshape(-1, 3, 3) / WEIGHT
+    hit = np.flatnonzero(sums.hits)
+    a = sums.weights[hit][:, PLACES].reshape(-1, 3, 3) / WEIGHT
     low, axes = np.linalg.eigh(a)
     with np.errstate(divide="ignore"):
         condition[hit] = np.where(low[:, 0] > SINGULAR * low[:, 2], low[:, 2] / low[:, 0], np.inf)
     fine = condition[hit] <= limit
     pixels, axes, low = hit[fine], axes[fine], low[fine]
-    inverse, b = (axes / low[:, None, :]) @ axes.transpose(0, 2, 1), data[pixels] / VALUE
-    values[pixels] = np.einsum("nij,nj->ni", inverse, b)
-    rest = b - np.einsum("nij,nj->ni", a[fine], values[pixels])  # one step of refinement
-    values[pixels] += np.einsum("nij,nj->ni", inverse, rest)
+    inverse, b = (axes / low[:, None, :]) @ axes.transpose(0, 2, 1), sums.data[pixels] / VALUE
+    stokes[pixels] = np.einsum("nij,nj->ni", inverse, b)
+    rest = b - np.einsum("nij,nj->ni", a[fine], stokes[pixels])  # one step of refinement
+    stokes[pixels] += np.einsum("nij,nj->ni", inverse, rest)
     spread[pixels] = np.einsum("nii->ni", inverse)
     covariance[pixels] = inverse
     if own_noise:
-        middle = noise[pixels][:, PLACES].reshape(-1, 3, 3) / WEIGHT
-        covariance[pixels] = inverse @ middle @ inverse
-    return values, spread, covariance, condition
+        noise = sums.noise[pixels][:, PLACES].reshape(-1, 3, 3) / WEIGHT
+        covariance[pixels] = inverse @ noise @ inverse
+    return Solved(stokes, spread, covariance, condition)

@@ -5,7 +5,8 @@ every signal.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +17,26 @@ from zonda.core.maps.beams import Beams
 from zonda.core.numerics.chunks import empty
 from zonda.core.product import Product
 from zonda.core.signal import MAIN
+from zonda.core.types import Floats
 
 from .binning import Binning
 from .coverage import Coverage
-from .sums import FLAGGED, VALUE, Sums
+from .intensity_kernel import FLAGGED, VALUE, WEIGHT, Sums
 
 MOST = 2.0**62
 """Below what a sum must stay."""
 JOINED = "the sum of the maps of all tasks"
+
+
+class PixelSums(NamedTuple):
+    """Sums of a signal in some pixels: ``hits`` (n,), ``weights`` (n, 1 or 6), ``data`` (n, 1 or
+    3), ``noise`` (n, 1 or 6), equation (2) of `binning`.
+    """
+
+    hits: Sums
+    weights: Sums
+    data: Sums
+    noise: Sums
 
 
 class MapSums(Product):
@@ -45,13 +58,12 @@ class MapSums(Product):
 
     Attributes
     ----------
-    table
-        (2, n_pixels, 2 or 7): hits, and the weights of all signals.
-    right
-        (2, n_pixels, 1 or 3) sums of w d of each signal.
-    noise
-        (2, n_pixels, 1 or 6) by stream, of signals with noise of their own; under the name of the
-        first signal that of all, where it is not that of the weights.
+    sums
+        (2, n_pixels, columns) of each half.
+    columns
+        Of the hits, the ``weights`` (1 or 6), the ``data NAME`` of each signal (1 or 3), and the
+        ``noise NAME`` (1 or 6) of signals with noise of their own; under the name of the first
+        signal that of all, where it is not that of the weights.
     scans, rates
         Names of the observations, and their sample rates, Hz.
     unknown_variance
@@ -77,13 +89,18 @@ class MapSums(Product):
         self.unknown_variance = False
         self.coverage = Coverage()
         self.beams = Beams()
-        own = self.signals or (MAIN,)
-        self.table = zeros(n_pixels, 7 if polarized else 2)
-        self.right = {name: zeros(n_pixels, 3 if polarized else 1) for name in own}
-        noisy = () if polarized else own if scatter else own[:1]
-        self.noise = {name: zeros(n_pixels, 1) for name in noisy}
-        self._largest = 0.0
-        self._largest_of = dict.fromkeys(own, 0.0)
+        names = self.signals or (MAIN,)
+        sizes = {"hits": 1, "weights": 6 if polarized else 1}
+        sizes |= {f"data {name}": 3 if polarized else 1 for name in names}
+        if not polarized:
+            sizes |= {f"noise {name}": 1 for name in (names if scatter else names[:1])}
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        self.columns = {
+            name: slice(*pair) for name, pair in zip(sizes, pairwise(ends), strict=True)
+        }
+        self.sums = zeros(n_pixels, ends[-1])
+        self._rests: dict[str, Sequence[str]] = {}
+        self._largest = np.zeros(2)
         self._deepest = [0, 0]
 
     @property
@@ -94,7 +111,12 @@ class MapSums(Product):
     @property
     def hits(self) -> Sums:
         """(2, n_pixels) samples in each pixel."""
-        return self.table[:, :, 0]
+        return self.sums[:, :, 0]
+
+    @property
+    def own_noise(self) -> bool:
+        """True if the noise is not that of the weights."""
+        return f"noise {self.first}" in self.columns
 
     @property
     def halved(self) -> bool:
@@ -106,18 +128,6 @@ class MapSums(Product):
         """The half that the next observation begins with."""
         return len(self.scans) % 2 if self.of_scans else 0
 
-    @property
-    def _tables(self) -> dict[str, Sums]:
-        """Sums by their names in files, (2, n_pixels, columns) each."""
-        found = {"table": self.table}
-        for k, name in enumerate(self.right):
-            found |= {
-                f"{what}_{k}": tables[name]
-                for what, tables in (("right", self.right), ("noise", self.noise))
-                if name in tables
-            }
-        return found
-
     def add(
         self, observation: Observation, halves: Sequence[Sequence[Binning]], place: str
     ) -> tuple[int, Sums]:
@@ -126,27 +136,21 @@ class MapSums(Product):
         """
         inside, dropped = 0, np.zeros(4, np.int64)
         for k, half in enumerate(halves, start=self._shift):
-            names = list(self.right)
             for n, binning in enumerate(half):
-                if self.polarized and binning.own:
+                if self.polarized and binning.own_noise:
                     self._with_noise()
-                own, names = names[: binning.signals], names[binning.signals :]
-                threads, most = len(binning.parts), 0
-                for found in binning.folded():
-                    if not n:
-                        self.table[k, found.pixels, 0] += found.hits
-                        self.table[k, found.pixels, 1:] += found.weights
-                        inside, dropped = inside + int(found.hits.sum()), dropped + found.dropped
-                    for name, right in zip(own, found.right, strict=True):
-                        self.right[name][k][found.pixels] += right
-                    if own[0] in self.noise:
-                        noise = found.weights if found.noise is None else found.noise
-                        self.noise[own[0]][k][found.pixels] += noise
-                    most = max(most, int(found.hits.max(initial=0)))
-                    high, every = found.largest
-                    self._note(k, 0, high, dict(zip(own, every, strict=True)))
-                if not n:  # each thread may have its most in the same pixel
-                    self._note(k, self._deepest[k] + threads * most, 0.0, {})
+                found = binning.columns((self.signals or (MAIN,))[binning.signals])
+                shared = ("hits", "weights") if n else ()  # the first binning has them
+                moves = [
+                    (to, *source)
+                    for name, sources in found.items()
+                    if name in self.columns and name not in shared
+                    for to, source in enumerate(sources, self.columns[name].start)
+                ]
+                moved, deepest, lost, largest = binning.move(self.sums[k], np.array(moves))
+                if not n:
+                    inside, dropped = inside + moved, dropped + lost
+                self._note(k, deepest, largest)
         # what belongs to the other half counted as flagged
         dropped[FLAGGED] -= (len(halves) - 1) * observation.n_detectors * observation.n_samples
         self.scans.append(observation.name)
@@ -155,41 +159,42 @@ class MapSums(Product):
         return inside, dropped
 
     def _with_noise(self) -> None:
-        """Keep the noise of polarized maps, which so far was that of the weights."""
-        if not self.noise:
-            self.noise[self.first] = self.table[..., 1:].copy()
-
-    def parts(
-        self, stream: str, pixels: slice, half: int | None = None
-    ) -> tuple[Sums, Sums, Sums, Sums]:
-        """Hits (n,), weights (n, 1 or 6), right sides (n, 1 or 3) and noise (n, 1 or 6) of a signal
-        in some pixels; of one half, or of both together.
+        """Give the noise of polarized maps, which so far was that of the weights, columns of its
+        own.
         """
+        if not self.own_noise:
+            _, n_pixels, end = self.sums.shape
+            sums = zeros(n_pixels, end + 6)
+            if self.scans:
+                sums[..., :end], sums[..., end:] = self.sums, self.sums[..., 1:7]
+            self.sums, self.columns[f"noise {self.first}"] = sums, slice(end, end + 6)
 
-        def of(table: Sums) -> Sums:
-            if half is not None or not self.halved:
-                return table[half or 0, pixels]
-            return np.asarray(table[0, pixels] + table[1, pixels])
-
-        table = of(self.table)
-        noise = self.noise.get(stream if self.scatter else self.first)
-        weights = table[:, 1:]
-        return table[:, 0], weights, of(self.right[stream]), weights if noise is None else of(noise)
+    def in_pixels(self, stream: str, pixels: slice, half: int | None = None) -> PixelSums:
+        """Sums of a signal in some pixels; of one half, or of both together."""
+        rows = self.sums[half or 0, pixels]
+        if half is None and self.halved:
+            rows = rows + self.sums[1, pixels]
+        columns, (name, *parts) = self.columns, self._rests.get(stream, (stream,))
+        data = rows[:, columns[f"data {name}"]]
+        for part in parts:
+            data = data - rows[:, columns[f"data {part}"]]
+        weights = rows[:, columns["weights"]]
+        noise = columns.get(f"noise {stream if self.scatter else self.first}", columns["weights"])
+        return PixelSums(rows[:, 0], weights, data, rows[:, noise])
 
     def __iadd__(self, other: MapSums) -> MapSums:
         """Add sums whose scans follow those that are here: exact, so that their order does not
         matter but for which are even.
         """
-        if self.polarized and (self.noise or other.noise):
+        if self.polarized and (self.own_noise or other.own_noise):
             self._with_noise()
             other._with_noise()
-        theirs, shift = other._tables, self._shift
+        shift = self._shift
         for k in range(2):
             half, pixels = (k + shift) % 2, np.flatnonzero(other.hits[k])
-            for name, table in self._tables.items():
-                table[half][pixels] += theirs[name][k].take(pixels, axis=0)
+            self.sums[half][pixels] += other.sums[k].take(pixels, axis=0)
             deepest = int(self.hits[half].take(pixels).max(initial=0))
-            self._note(half, deepest, other._largest, other._largest_of)
+            self._note(half, deepest, other._largest)
         self.scans += other.scans
         self.rates |= other.rates
         self.unknown_variance |= other.unknown_variance
@@ -202,25 +207,23 @@ class MapSums(Product):
     def arrays(self) -> dict[str, Any]:
         """Numbers of the pixels with hits, and their sums."""
         found = {
-            "signals": list(self.signals),
+            "signals": [name for name in self.signals if name not in self._rests],
+            "rests": {name: list(parts) for name, parts in self._rests.items()},
             "polarized": self.polarized,
             "scatter": self.scatter,
-            "own_noise": bool(self.noise),
+            "own_noise": self.own_noise,
             "of_scans": self.of_scans,
             "scans": list(self.scans),
             "rates": sorted(self.rates),
             "unknown_variance": self.unknown_variance,
-            "n_pixels": self.table.shape[1],
+            "n_pixels": self.sums.shape[1],
             "coverage": self.coverage.arrays(),
             "beams": [list(pair) for pair in sorted(self.beams.weights.items())],
             "largest": self._largest,
-            "largest_of": dict(self._largest_of),
         }
         for k in range(2):
             pixels = np.flatnonzero(self.hits[k])
-            found[f"pixels_{k}"] = pixels
-            for name, table in self._tables.items():
-                found[f"{name}_of_{k}"] = table[k].take(pixels, axis=0)
+            found |= {f"pixels_{k}": pixels, f"sums_{k}": self.sums[k].take(pixels, axis=0)}
         return found
 
     @classmethod
@@ -230,55 +233,51 @@ class MapSums(Product):
         made = cls(int(arrays["n_pixels"]), list(arrays["signals"]), *flags)
         if arrays["own_noise"] and made.polarized:
             made._with_noise()
+        for name, parts in arrays["rests"].items():
+            made._rests[name] = parts
+            made.signals += (name,)
         made.scans, made.rates = list(arrays["scans"]), {float(rate) for rate in arrays["rates"]}
         made.unknown_variance = bool(arrays["unknown_variance"])
         made.coverage = Coverage.of(arrays["coverage"], int(arrays["n_pixels"]))
         made.beams = Beams({float(fwhm): int(weight) for fwhm, weight in arrays["beams"]})
-        highest = {name: float(high) for name, high in arrays["largest_of"].items()}
         for k in range(2):
-            pixels = arrays[f"pixels_{k}"]
-            for name, table in made._tables.items():
-                table[k][pixels] = arrays[f"{name}_of_{k}"]
-            deepest = int(made.hits[k].take(pixels).max(initial=0))
-            made._note(k, deepest, float(arrays["largest"]), highest)
+            pixels, sums = arrays[f"pixels_{k}"], arrays[f"sums_{k}"]
+            made.sums[k][pixels] = sums
+            made._note(k, int(sums[:, 0].max(initial=0)), np.asarray(arrays["largest"]))
         return made
 
     def subtract(self, stream: str, parts: Sequence[str]) -> None:
-        """The right sides are subtracted, exactly. The largest term is at most the sum of
-        theirs.
-        """
-        rest = self.right[self.first].copy()
-        for part in parts:
-            rest -= self.right[part]
-        self.right[stream] = rest
-        terms = (self._largest_of[name] for name in (self.first, *parts))
-        self._largest_of[stream] = sum(terms)
+        """The data are subtracted, exactly, where they are asked for."""
+        self._rests[stream] = (self.first, *parts)
         self.signals += (stream,)
-        self._check(stream)
+        self._check(stream, (len(parts) + 1) / 2)  # the first and one of them fit in 2^63
 
-    def _note(self, half: int, deepest: int, largest: float, of: Mapping[str, float]) -> None:
-        """Most samples in a pixel of a half; largest terms, of weights and noise and of each
-        signal.
-        """
+    def _note(self, half: int, deepest: int, largest: Floats) -> None:
+        """Note the most samples in a pixel of a half, and the largest terms."""
         self._deepest[half] = max(self._deepest[half], deepest)
-        self._largest = max(self._largest, largest)
-        for name, high in of.items():
-            self._largest_of[name] = max(self._largest_of[name], high)
+        self._largest = np.maximum(self._largest, largest)
 
-    def _check(self, place: str) -> None:
-        """Raise PipelineError where a sum may have overflowed."""
-        highest = max(self._largest_of.values())
-        largest = max(self._largest, highest)
+    def _check(self, place: str, terms: float = 1.0) -> None:
+        """Raise PipelineError where a sum, or so many of the data, may have overflowed."""
+        largest = float(max(self._largest[0], terms * self._largest[1]))
         if sum(self._deepest) * largest < MOST:
             return
         deepest = float(self.hits.sum(axis=0).max(initial=0))
-        if deepest * largest >= MOST:
-            raise PipelineError(
-                f"{deepest:.0f} samples in one pixel, each up to {highest / VALUE:.3g} K, overflow"
-                " the map's fixed-point sums",
-                place=place,
-                cure="make smaller pixels, or put a HighpassFilter before",
+        if deepest * largest < MOST:
+            return
+        each = f"each up to {self._largest[1] / VALUE:.3g} K"
+        cure = "make smaller pixels, or put a HighpassFilter before"
+        if not self.scatter and self._largest[0] > terms * self._largest[1]:
+            each = (
+                f"with weights or variances up to {self._largest[0] / WEIGHT:.3g} times those of"
+                " the first scan"
             )
+            cure = "make smaller pixels, or a map of the detectors that are alike"
+        raise PipelineError(
+            f"{deepest:.0f} samples in one pixel, {each}, overflow the map's fixed-point sums",
+            place=place,
+            cure=cure,
+        )
 
 
 def zeros(n_pixels: int, columns: int) -> NDArray[np.int64]:

@@ -23,7 +23,17 @@ from zonda.core.numerics.columns import (
 )
 from zonda.core.polarization import fill_row
 
-from .sums import FLAGGED, LARGEST, MAGIC, MAGIC_BITS, NOT_FINITE, OUTSIDE, TOO_LARGE, VALUE, WEIGHT
+from .intensity_kernel import (
+    FLAGGED,
+    LARGEST,
+    MAGIC,
+    MAGIC_BITS,
+    NOT_FINITE,
+    OUTSIDE,
+    TOO_LARGE,
+    VALUE,
+    WEIGHT,
+)
 
 HIT = 0
 FIRST = 1

@@ -31,11 +31,11 @@ from zonda.core.block import Block
 from zonda.core.numerics.transforms import convolved, gaussian_taps
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
-from zonda.operators.maps.binning import Binning, Part, add_blocks
+from zonda.operators.maps.binning import BandBlock, Binning, Weights, add_blocks
 from zonda.operators.maps.grid import TangentGrid
+from zonda.operators.maps.intensity_kernel import WEIGHT
 from zonda.operators.maps.pixels import Cells, Looking
-from zonda.operators.maps.stokes_kernel import PLACES
-from zonda.operators.maps.sums import WEIGHT
+from zonda.operators.maps.stokes_kernel import MATRIX, PLACES
 
 from .detector_noise import SIGNS, Comb, Filtered, Series, combs
 from .survey import Survey, Track, polarization_angles
@@ -120,17 +120,18 @@ def _scans(survey: Survey, grid: TangentGrid) -> Iterator[Floats]:
         looking = Looking(o, grid, np.ascontiguousarray(grid.pointing(o)[:, index]))
         angles: PolarizationAngles = polarization_angles(survey, o, index)
         ones, good = np.ones(len(plane)), np.ones(index.size, np.uint8)
-        binning = Binning(looking, ones > 0, good, np.zeros(0), ones, ones, angles=angles)
+        weights = Weights(ones, ones, np.zeros(0))
+        binning = Binning(looking, ones > 0, good, weights, slice(0, 1), angles=angles)
         for first in range(0, len(plane), DETECTORS):
             for start in range(0, index.size, INSTANTS):
                 detectors = slice(first, min(first + DETECTORS, len(plane)))
                 block = Block(o, detectors, slice(start, min(start + INSTANTS, index.size)))
                 n_det, n = block.shape
                 signals = (np.ascontiguousarray(signal[:n_det, :n]),)
-                add_blocks([Part(signals, block, [[binning]])], Cells())
+                add_blocks([BandBlock(signals, block, [[binning]])], Cells())
         total = np.zeros((grid.n_pixels, 6))
-        for found in binning.folded():
-            total[found.pixels] += found.weights * (o.n_samples / index.size / WEIGHT)
+        for thread in binning.threads.values():
+            total += thread.sums[:, MATRIX] * (o.n_samples / index.size / WEIGHT)
         yield total
 
 

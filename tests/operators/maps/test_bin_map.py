@@ -20,6 +20,8 @@ from zonda.core.numerics.projection import directions, frame_rotation
 from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
+from zonda.operators.maps.intensity_kernel import VALUE, WEIGHT
+from zonda.operators.maps.map_sums import MapSums
 
 ARCSEC = np.radians(1 / 3600)
 N_DET, N = 19, 4500
@@ -420,6 +422,23 @@ def test_healpix_smoothing(bench):
         [BinMap(nside=256, smooth="40 arcmin")], observation, {"signal": np.ones((N_DET, N))}
     ).map
     np.testing.assert_allclose(product.signal, 1.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("weight", "kelvin", "words"),
+    [(1e6, 1.0, "weights or variances up to 1e\\+06 times"), (1.0, 1e4, "each up to 1e\\+04 K")],
+)
+def test_an_overflow_names_what_overflows(weight, kelvin, words):
+    """2^32 samples in a pixel of two tasks together."""
+
+    def task():
+        sums = MapSums(1, ["signal"])
+        sums.sums[0, 0, 0], sums.scans = 2**31, ["scan"]
+        return MapSums.of(sums.arrays() | {"largest": [weight * WEIGHT, kelvin * VALUE]})
+
+    sums = task()
+    with pytest.raises(PipelineError, match=f"4294967296 samples in one pixel, .*{words}"):
+        sums += task()
 
 
 def test_far_too_large_samples_and_overflow_are_refused(bench):

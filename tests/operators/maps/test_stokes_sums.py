@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zonda.core.polarization import PolarizationAngles
-from zonda.operators.maps.stokes_kernel import AT_ONCE, DATA, add_stokes
-from zonda.operators.maps.sums import (
+from zonda.operators.maps.intensity_kernel import (
     FLAGGED,
     LARGEST,
     NOT_FINITE,
@@ -20,6 +19,7 @@ from zonda.operators.maps.sums import (
     VALUE,
     WEIGHT,
 )
+from zonda.operators.maps.stokes_kernel import AT_ONCE, DATA, add_stokes
 
 N_PIXELS = 7
 

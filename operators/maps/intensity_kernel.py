@@ -6,8 +6,8 @@
 over the samples i in pixel p, as int64: exact, so that their bits depend neither on the order of
 blocks nor on the number of threads. Where all detectors weigh the same, W and N follow from H.
 
-A thread's sums have a border for what falls outside of the map: a pixel all around an image, row 0
-before a list of pixels. What is flagged, not finite or too large goes to row 0 too.
+Row 0 of a thread's sums is for what falls outside of the map, is flagged, not finite or too large;
+those of pixel p are in row p + 1.
 
 Several signals share pixels, hits, weights and noise: the data of those beside the first follow its
 columns. What one of them lacks is dropped from all.
@@ -45,158 +45,43 @@ AHEAD = 16
 memory.
 """
 
-AT_ONCE = 256
-"""Samples of `TOGETHER` detectors whose pixels, values and pointing are in the first cache
-together.
-"""
-
 DATA, HITS, WEIGHTS, NOISE = range(4)
 OUTSIDE, FLAGGED, NOT_FINITE, TOO_LARGE = range(4)
 
 
 @kernel
-def add_image(  # type: ignore[no-untyped-def]
-    signals,
-    h,
-    start,
-    xi,
-    eta,
-    ny,
-    nx,
-    use,
-    good,
-    window,
-    weight,
-    noise,
-    scatter,
-    per_var,
-    sums,
-    dropped,
-    largest,
+def add_intensity(  # type: ignore[no-untyped-def]
+    signals, first, index, use, good, window, weight, noise, per_variance, sums, dropped, largest
 ):
-    """Add a block that begins at sample ``start`` to an image of (ny, nx) pixels; the rest as in
-    `_add`.
+    """Add samples of all ``signals`` (a tuple) to their pixels.
+
+    Parameters
+    ----------
+    first
+        The first sample of each row of ``signals``.
+    index
+        (n_det, n) pixels, -1 outside.
+    use, good, window
+        (n_det,); (n,); (n,), or (0,): none.
+    weight, noise
+        (n_det,), in reference weights and variances.
+    per_variance
+        Inverse of the reference variance where the noise is that of the samples' scatter; else 0.
+    sums
+        (n_pixels + 1, 4 and one for each further signal; or 2: all detectors weigh the same).
+    dropped
+        (4,). What is dropped for another reason is counted out of those outside: all of row 0 will
+        be added.
+    largest
+        (2,): the largest term of weights and noise, and that of the data to the next power of two.
     """
-    n = signals[0].shape[1]
-    space = np.empty(xi.size * AT_ONCE, np.int32)
-    for low in range(0, n, AT_ONCE):
-        high = min(low + AT_ONCE, n)
-        cells = space[: xi.size * (high - low)].reshape(xi.size, high - low)
-        for d in range(xi.size):
-            if use[d]:
-                _cells(h, start + low, xi[d], eta[d], ny, nx, cells[d])
-        _add(
-            signals,
-            low,
-            cells,
-            nx + 2,
-            use,
-            good,
-            window,
-            weight,
-            noise,
-            scatter,
-            per_var,
-            sums,
-            dropped,
-            largest,
-        )
-
-
-@kernel(fastmath={"contract", "nsz"})
-def _cells(h, start, a, b, ny, nx, cells):  # type: ignore[no-untyped-def]
-    """Place (y + 1) (nx + 2) + x + 1 of the pixel that holds each sample of a detector at (a, b);
-    beyond the edge, the border's.
-
-    ``h`` (9, n_samp): homographies. ``start``: sample of the first of ``cells`` (n,).
-    """
-    stop = start + cells.size
-    h0, h1, h2 = h[0, start:stop], h[1, start:stop], h[2, start:stop]
-    h3, h4, h5 = h[3, start:stop], h[4, start:stop], h[5, start:stop]
-    h6, h7, h8 = h[6, start:stop], h[7, start:stop], h[8, start:stop]
-    right, top, row_length = nx + 1.0, ny + 1.0, np.int32(nx + 2)
-    for t in range(cells.size):
-        w = h6[t] * a + h7[t] * b + h8[t]
-        scale = 1.0 / (w if w > 0.0 else np.nan)
-        x = (h0[t] * a + h1[t] * b + h2[t]) * scale + 1.5
-        y = (h3[t] * a + h4[t] * b + h5[t]) * scale + 1.5
-        x = x if x > 0.0 else 0.0
-        y = y if y > 0.0 else 0.0
-        x = x if x < right else right
-        y = y if y < top else top
-        cells[t] = np.int32(np.int32(y) * row_length + np.int32(x))
-
-
-@kernel
-def add_list(  # type: ignore[no-untyped-def]
-    signals,
-    first,
-    index,
-    use,
-    good,
-    window,
-    weight,
-    noise,
-    scatter,
-    per_variance,
-    sums,
-    dropped,
-    largest,
-):
-    """Add samples first .. of a block to the pixels ``index`` (n_det, n) of a list, -1 outside; the
-    rest as in `_add`.
-    """
-    places = index + np.int32(1)  # other bands may need the pixels as they are
-    _add(
-        signals,
-        first,
-        places,
-        0,
-        use,
-        good,
-        window,
-        weight,
-        noise,
-        scatter,
-        per_variance,
-        sums,
-        dropped,
-        largest,
-    )
-
-
-@kernel
-def _add(  # type: ignore[no-untyped-def]
-    signals,
-    first,
-    cells,
-    stride,
-    use,
-    good,
-    window,
-    weight,
-    noise,
-    scatter,
-    per_variance,
-    sums,
-    dropped,
-    largest,
-):
-    """Add samples of all ``signals`` (a tuple) to their places in ``sums`` (n, 4 and one for each
-    further signal; or 2: all detectors weigh the same); count what is dropped; note the largest
-    terms, those of the data to the next power of two.
-
-    ``cells`` (n_det, n): places of the samples first .. first + n - 1 of the block, like ``good``.
-    ``stride``: places in a row of an image, 0 for a list. What is dropped for another reason is
-    counted out of those outside: all of the border will be added.
-    """
+    cells = index + np.int32(1)  # other bands may need the pixels as they are
     n, m = cells.shape[1], len(signals)
     flat, columns = sums.reshape(-1), np.uintp(sums.shape[1])
     base = sums.shape[1] - (m - 1)
-    fine = good[first : first + n]
     n_fine = np.int64(0)
     for t in range(n):  # numpy's all() and flatnonzero() would take a second more to compile
-        n_fine += np.int64(fine[t] != 0)
+        n_fine += np.int64(good[t] != 0)
     rows, n_rows = np.empty(use.size, np.int64), 0
     for d in range(use.size):
         if use[d]:
@@ -204,58 +89,38 @@ def _add(  # type: ignore[no-untyped-def]
             n_rows += 1
     rows = rows[: n_rows if n_fine else 0]
     dropped[FLAGGED] += n * (use.size - rows.size)
-    shifted, highest = np.empty((m, TOGETHER, n)), np.empty(m)
+    shifted = np.empty((m, TOGETHER, n))
     units = shifted.view(np.int64)
     for begin in range(0, rows.size, TOGETHER):
         group = rows[begin : begin + TOGETHER]
         for k in range(group.size):
             d = group[k]
-            limit, factor, square = _scales(weight[d], per_variance, scatter)
-            drop = n_fine < n
-            for s in range(m):
-                high = _units(signals[s][d, first : first + n], factor, shifted[s, k], units[s, k])
-                highest[s] = float(high + 1)
+            limit, factor, square = _scales(weight[d], per_variance)
+            drop, highest = n_fine < n, np.int64(0)
+            for i in range(m):
+                high = _units(signals[i][d, first : first + n], factor, shifted[i, k], units[i, k])
+                highest = max(highest, high)
                 drop |= high >= limit * factor
             if drop:
-                _drop(
-                    signals,
-                    d,
-                    first,
-                    fine,
-                    limit,
-                    cells[d],
-                    units[:, k],
-                    stride,
-                    sums.shape[0] // max(stride, 1),
-                    dropped,
-                )
-                for s in range(m):
-                    high = 0
+                _drop(signals, d, first, good, limit, cells[d], units[:, k], dropped)
+                highest = np.int64(0)
+                for i in range(m):
                     for t in range(n):
-                        high |= units[s, k, t] if units[s, k, t] >= 0 else ~units[s, k, t]
-                    highest[s] = float(high + 1)
-            largest[DATA] = max(largest[DATA], highest[0])
-            for s in range(1, m):
-                largest[NOISE + s] = max(largest[NOISE + s], highest[s])
+                        highest |= units[i, k, t] if units[i, k, t] >= 0 else ~units[i, k, t]
+            w, term = np.int64(np.rint(weight[d] * WEIGHT)), np.int64(np.rint(noise[d] * WEIGHT))
+            largest[0] = max(largest[0], max(weight[d], noise[d]) * WEIGHT)
+            largest[1] = max(largest[1], float(highest + 1))
             if base == 4:
                 unit, places = units[0, k], cells[d]
-                w, term = (
-                    np.int64(np.rint(weight[d] * WEIGHT)),
-                    np.int64(np.rint(noise[d] * WEIGHT)),
-                )
-                largest[WEIGHTS], largest[NOISE] = (
-                    max(largest[WEIGHTS], float(w)),
-                    max(largest[NOISE], float(term)),
-                )
                 for t in range(n):
                     if window.size:
-                        share = window[first + t]
+                        share = window[t]
                         w = np.int64(np.rint(weight[d] * share * WEIGHT))
                         term = np.int64(np.rint(noise[d] * share * share * WEIGHT))
-                    if scatter:
+                    if per_variance:
                         y = np.float64(unit[t]) / factor
                         term = np.int64(np.rint(square * y * y))
-                        largest[NOISE] = max(largest[NOISE], float(term))
+                        largest[0] = max(largest[0], float(term))
                     at = np.uintp(places[t]) * columns
                     flat[at + np.uintp(WEIGHTS)] += w
                     flat[at + np.uintp(NOISE)] += term
@@ -272,12 +137,12 @@ def _add(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _scales(weight, per_variance, scatter):  # type: ignore[no-untyped-def]
+def _scales(weight, per_variance):  # type: ignore[no-untyped-def]
     """Scales of one detector: the largest |d| [K] that is accepted, units of w d per K, and units
     of the scatter per K^2.
     """
     limit, square = LARGEST / VALUE / max(weight, 1.0), weight * per_variance * WEIGHT
-    if scatter:
+    if per_variance:
         limit = min(limit, math.sqrt(2.0**60 / square))
     return limit, weight * VALUE, square
 
@@ -301,26 +166,21 @@ def _units(row, factor, shifted, units):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _drop(  # type: ignore[no-untyped-def]
-    signals, d, first, fine, limit, places, units, stride, n_rows, dropped
-):
+def _drop(signals, d, first, good, limit, places, units, dropped):  # type: ignore[no-untyped-def]
     """Send what is flagged, or in one signal not finite or too large, to place 0 with no value, and
     count it once.
     """
     for t in range(places.size):
-        place, size = places[t], 0.0
-        for s in range(len(signals)):
-            one = abs(np.float64(signals[s][d, first + t]))
+        size = 0.0
+        for i in range(len(signals)):
+            one = abs(np.float64(signals[i][d, first + t]))
             size = one if not one <= size else size  # NaN stays: nothing is <= NaN, nor is NaN
             if not one < np.inf:
                 size = np.nan
                 break
-        outside = place == 0
-        if stride:
-            x, y = place % stride, place // stride
-            outside = (x == 0) | (x == stride - 1) | (y == 0) | (y == n_rows - 1)
+        outside = places[t] == 0
         why = OUTSIDE
-        if not fine[t]:
+        if not good[t]:
             why = FLAGGED
         elif not size < np.inf:
             why = NOT_FINITE
@@ -410,3 +270,23 @@ def _scatter_any(flat, columns, base, cells, rows, units):  # type: ignore[no-un
             flat[at + np.uintp(HITS)] += 1
             for s in range(1, units.shape[0]):
                 flat[at + base + np.uintp(s - 1)] += units[s, k, t]
+
+
+@kernel
+def move(sums, hits, out, moves):  # type: ignore[no-untyped-def]
+    """Add the sums of all pixels with ``hits`` (a column) to those of ``out``, and set them to
+    zero: how many hits these are, and the most that a pixel of ``out`` has.
+
+    ``moves`` (n, 3): a column of ``out``, that of ``sums`` which is added there, and its factor.
+    """
+    moved, deepest = np.int64(0), np.int64(0)
+    for p in range(np.uintp(sums.shape[0])):
+        if not sums[p, hits]:
+            continue
+        moved += sums[p, hits]
+        for k in range(moves.shape[0]):
+            out[p, np.uintp(moves[k, 0])] += sums[p, np.uintp(moves[k, 1])] * moves[k, 2]
+        deepest = max(deepest, out[p, 0])
+        for column in range(np.uintp(sums.shape[1])):
+            sums[p, column] = 0
+    return moved, deepest
