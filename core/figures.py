@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from .data import Data
-    from .operator import Operator
 
 
 @dataclass(frozen=True)
@@ -104,20 +103,6 @@ class FigureMetric(Metric, Parameters):
 
     # ---- as a metric of `zonda accuracy`
 
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        """Raise `PipelineError` where no step makes a product that it reads."""
-        made = frozenset[str]().union(*(o.provides for o in operators))
-        for what in sorted(self.reads - made):
-            from .registry import makers
-
-            found = " or ".join(makers(what))
-            cure = f"add {found}" if found else "choose another metric"
-            raise PipelineError(
-                f"the metric {self.own_name()} needs {what}, which no step makes",
-                place="--metric",
-                cure=cure,
-            )
-
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
         """Names in `needs` that the pipeline does not have."""
         return {
@@ -137,13 +122,6 @@ class FigureMetric(Metric, Parameters):
         """The standard error, relative to the value."""
         share = abs(float(reference[1] / reference[0])) if reference[0] else math.nan
         return share if math.isfinite(share) else None
-
-    @classmethod
-    def own_name(cls) -> str:
-        """The class's name as metrics are written: ``CentralRms`` is ``central_rms``."""
-        return "".join(
-            f"_{c.lower()}" if c.isupper() and k else c.lower() for k, c in enumerate(cls.__name__)
-        )
 
 
 def names_of(data: Data, wanted: Sequence[Signal]) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 from .. import registry
 from ..configuration import yaml_places
 from ..configuration.parameters import Parameters
-from ..errors import InputError
+from ..errors import InputError, PipelineError
 from ..types import Floats
 
 if TYPE_CHECKING:
@@ -37,6 +37,8 @@ class Metric:
     needs_end
         True where `measure` reads products of an `Output` (plots, reports); these are left out
         otherwise.
+    reads
+        Streams and products on which it is measured: ``map``, ``spectrum`` ...
     instead
         Of a metric that is no number of one run, only an error between two: what to measure of one
         run in its place. None: a number of one run.
@@ -44,12 +46,22 @@ class Metric:
 
     says: ClassVar[str] = "|m - m0| / |m0|"
     needs_end: ClassVar[bool] = False
+    reads: ClassVar[frozenset[str]] = frozenset()
     instead: ClassVar[str | None] = None
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         """Raise `PipelineError` where a pipeline of these steps and signals cannot have this
-        metric.
+        metric: no step makes what it ``reads``.
         """
+        made = frozenset[str]().union(*(o.provides for o in operators))
+        for what in sorted(self.reads - made):
+            found = " or ".join(registry.makers(what))
+            cure = f"add {found}" if found else "choose another metric"
+            raise PipelineError(
+                f"the metric {self.own_name()} needs {what}, which no step makes",
+                place="--metric",
+                cure=cure,
+            )
 
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
         """Signals that `measure` reads beside those of the pipeline, ``runs``. They are not
@@ -107,6 +119,13 @@ class Metric:
     def floor(self, reference: Any) -> float | None:
         """The instrument's noise in units of the error; None where it has no meaning."""
         return None
+
+    @classmethod
+    def own_name(cls) -> str:
+        """The class's name as metrics are written: ``CentralRms`` is ``central_rms``."""
+        return "".join(
+            f"_{c.lower()}" if c.isupper() and k else c.lower() for k, c in enumerate(cls.__name__)
+        )
 
 
 class OfFunction(Metric):

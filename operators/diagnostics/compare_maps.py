@@ -32,7 +32,7 @@ from .comparison.files import (
     write_comparison,
 )
 from .comparison.planes import EMPTY, NOT_EMPTY, Plane
-from .comparison.statistics import THRESHOLD, Comparison, Settings, compare
+from .comparison.statistics import THRESHOLD, Comparison, compare
 from .series import about, check_map, key_of, plane_key
 from .transfer_function import window_of
 
@@ -130,7 +130,6 @@ class CompareMaps(Output):
         first = plane_of(maps["I"][1], self.map)
         references = on_meridians_of(first, {plane: references[plane] for plane in both})
         runs = data.provenance.get("runs", {})
-        settings = Settings(self.beam, self.threshold, self.bins)
         for which in both:
             name, found = maps[which]
             plane = self._with_noise(data, which, plane_of(found, name))
@@ -141,7 +140,7 @@ class CompareMaps(Output):
             if self.file is None:
                 reference = replace(reference, quiet=is_quiet(runs, self.reference))
             fwhm = self.beam or resolution(plane, reference, found) or None
-            made = compare(reference, plane, replace(settings, fwhm=fwhm), self.label)
+            made = compare(reference, plane, fwhm, self.threshold, self.bins, self.label)
             _tell(self.label, "" if which == "I" else f"{which}: ", data, made)
             key = plane_key(key_of(self, "comparison"), which)
             data.products[key] = made
@@ -226,7 +225,7 @@ def _product(data: Data, name: str, place: str) -> Any:
 
 
 def _tell(label: str, of: str, data: Data, found: Comparison) -> None:
-    f = found.figures
+    f = found.values
     told = [note.split(": ", 1) if ": " in note else ("grid", note) for note in found.notes]
     told += [
         ("gain of the map", f"{f['gain']:.4g} +- {f['gain error']:.2g}"),

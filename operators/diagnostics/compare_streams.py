@@ -62,8 +62,8 @@ LEAST_SEGMENTS = 8
 """A segment is at most this part of the scan: with a single one the coherence is 1 whatever the
 streams.
 """
-FIGURES = ("rms", "rms_reference", "rms_difference", "correlation", "gain")
-"""Figures of each detector; the last two have standard errors."""
+VALUES = ("rms", "rms_reference", "rms_difference", "correlation", "gain")
+"""Values of each detector; the last two have standard errors."""
 SHARED = 35 / 18
 """Neighbouring frequencies behind a Hann window: 1 + 2 (2/3)^2 + 2 (1/6)^2."""
 
@@ -169,11 +169,11 @@ def pair(x: Floats, y: Floats, welch: Welch) -> Pair:
     return Pair(found[0].real, found[1].real, found[2])
 
 
-def figures(found: Pair, step: float, segments: float) -> tuple[Floats, Floats]:
-    """`FIGURES` (5,) of one detector and their standard errors: equations (2), (5), (6). ``step``:
+def values_of(found: Pair, step: float, segments: float) -> tuple[Floats, Floats]:
+    """`VALUES` (5,) of one detector and their standard errors: equations (2), (5), (6). ``step``:
     df, Hz; NaN where a stream is zero.
     """
-    values, errors = np.full((2, len(FIGURES)), math.nan)
+    values, errors = np.full((2, len(VALUES)), math.nan)
     parts = found.power, found.reference, found.rest(1.0)
     values[:3] = [math.sqrt(float(p.sum()) * step) for p in parts]
     x, y, cross = (float(p.sum()) for p in (found.power, found.reference, found.cross.real))
@@ -207,7 +207,7 @@ class StreamComparison(Series):
     names
         (n_det) detectors.
     values, errors
-        (n_det, 5) `FIGURES` and their standard errors, means over the scans; NaN where there is
+        (n_det, 5) `VALUES` and their standard errors, means over the scans; NaN where there is
         none, and for `rms_difference` where the streams have not the same unit.
     frequency
         (n,) Hz, without zero.
@@ -238,10 +238,10 @@ class StreamComparison(Series):
     ) -> StreamComparison:
         """Comparison of one scan, from the spectra of each detector."""
         f, segments = welch.frequency, welch.independent
-        found = np.array([figures(p, float(f[0]), segments) for p in pairs])
+        found = np.array([values_of(p, float(f[0]), segments) for p in pairs])
         power = np.mean([(p.power, p.reference, p.rest(1.0)) for p in pairs], axis=0)
         if unit_of_stream(step.stream) != unit_of_stream(step.reference):
-            found[:, 0, FIGURES.index("rms_difference")] = power[2] = np.nan
+            found[:, 0, VALUES.index("rms_difference")] = power[2] = np.nan
         coherence = np.mean([p.coherence for p in pairs], axis=0)
         what = (*step.asked(), step.label, names)
         return cls(*what, found[:, 0], found[:, 1], f, power, coherence, segments)
@@ -257,11 +257,11 @@ class StreamComparison(Series):
             self.errors = np.hypot(self.errors * n, other.errors * m) / (n + m)
         return super().__iadd__(other)
 
-    def over_detectors(self, figure: str) -> tuple[float, float, float]:
+    def over_detectors(self, name: str) -> tuple[float, float, float]:
         """(mean over detectors, their standard deviation, standard error of one detector or NaN) of
-        one of `FIGURES`.
+        one of `VALUES`.
         """
-        k = FIGURES.index(figure)
+        k = VALUES.index(name)
         values = self.values[:, k]
         scatter = float(values.std(ddof=1)) if values.size > 1 else math.nan
         return float(values.mean()), scatter, float(self.errors[:, k].mean())
@@ -318,15 +318,15 @@ class StreamComparison(Series):
         return rows
 
     def lines(self) -> list[tuple[str, str]]:
-        """(figure, mean and scatter over detectors)."""
+        """(name, mean and scatter over detectors)."""
         found = []
-        for figure in FIGURES:
-            mean, scatter, error = self.over_detectors(figure)
-            of = self.reference if figure == "rms_reference" else self.stream
-            text = f"{mean:.4g}{f' {unit_of_stream(of)}' if 'rms' in figure else ''}".rstrip()
+        for name in VALUES:
+            mean, scatter, error = self.over_detectors(name)
+            of = self.reference if name == "rms_reference" else self.stream
+            text = f"{mean:.4g}{f' {unit_of_stream(of)}' if 'rms' in name else ''}".rstrip()
             text += f" +- {error:.2g}" if math.isfinite(error) else ""
             text += f", scatter over detectors {scatter:.2g}" if math.isfinite(scatter) else ""
-            found.append((figure.replace("rms_", "rms of the "), text))
+            found.append((name.replace("rms_", "rms of the "), text))
         return found
 
     def _repr_html_(self) -> str:

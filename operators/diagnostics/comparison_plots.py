@@ -42,7 +42,7 @@ def draw_comparison(file: str, found: Comparison, contours: Sequence[float] = ()
 
 
 def _maps(file: str, found: Comparison) -> Sketch:
-    planes, where, f = found.planes, wcs_of(found.header), found.figures
+    planes, where, f = found.planes, wcs_of(found.header), found.values
     axes = map_axes(planes["map"].shape, where, 3)
     both = np.abs(np.stack([planes["reference"], planes["map"]]))
     limit = float(np.percentile(both[np.isfinite(both)], 99.7))

@@ -243,8 +243,7 @@ def _compare(
         fwhm = 0.0 if sky else one.fwhm
         common = beam or common_beam(replace(one, fwhm=fwhm), maps[plane])
         one, other = _in_one_unit(one, maps[plane], unit, hertz, common)
-        settings = statistics.Settings(beam, threshold)
-        found = statistics.compare(replace(one, fwhm=fwhm), other, settings)
+        found = statistics.compare(replace(one, fwhm=fwhm), other, beam, threshold)
         text = "\n".join(lines(found))
         click.echo(f"Stokes {plane}\n{text}\n" if len(both) > 1 else text)
         name = plane_key("comparison", plane)
@@ -294,7 +293,7 @@ def lines(found: Comparison) -> list[str]:
     from zonda.core.numerics.angles import angle_text
     from zonda.core.tables import aligned
 
-    f = found.figures
+    f = found.values
     factor, unit = _readable(f["rms reference"], found.unit)
     rows = [
         ("reference", found.names[0]),

@@ -55,8 +55,7 @@ from numpy.typing import NDArray
 
 from zonda.core.accuracy.metrics import Metric
 from zonda.core.data import Data
-from zonda.core.errors import InputError, PipelineError
-from zonda.core.mapmaker import made_by
+from zonda.core.errors import InputError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.planes import IQU
@@ -74,8 +73,8 @@ class OfPlanes(Metric):
     """Base of metrics whose `measure` finds something of each plane: by its name, ``I`` alone or
     ``I``, ``Q`` and ``U``.
 
-    A subclass has `between` and `summary` of one plane, and `floor_of`; `counted`, where not all
-    planes of a reference count.
+    A subclass has `summary` and `floor_of` of one plane; `between`, where its error is another;
+    `counted`, where not all planes of a reference count.
     """
 
     def error(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> float:
@@ -110,7 +109,7 @@ class OfPlanes(Metric):
 
     def between(self, found: Any, reference: Any) -> float:
         """`error` of one plane."""
-        raise NotImplementedError
+        return super().error(found, reference)
 
     def floor_of(self, reference: Any) -> float | None:
         """`floor` of one plane."""
@@ -139,12 +138,10 @@ class MapRms(OfPlanes):
     """Rms of the difference from the reference map over the map's noise, equation (1)."""
 
     says: ClassVar[str] = "rms of the difference map / the map's instrument noise"
+    reads: ClassVar[frozenset[str]] = frozenset({"map"})
     instead: ClassVar[str | None] = (
         "measure central_rms, or name map_rms in zonda accuracy --metric"
     )
-
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        _needs_map("map_rms", operators)
 
     def measure(self, data: Data) -> dict[str, dict[str, Floats]]:
         return {
@@ -181,12 +178,10 @@ class Peak(OfPlanes):
     """Relative change of the extreme value of the beam-smoothed map, equation (2)."""
 
     says: ClassVar[str] = "relative change of the beam-smoothed map's extreme value"
+    reads: ClassVar[frozenset[str]] = frozenset({"map"})
     instead: ClassVar[str | None] = (
         "measure peak_ratio or peak_snr, or name peak in zonda accuracy --metric"
     )
-
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        _needs_map("peak", operators)
 
     def measure(self, data: Data) -> dict[str, Floats]:
         main, sky = _map(data), _map(data, _sky_alone(data.provenance.get("runs", {})))
@@ -207,9 +202,6 @@ class Peak(OfPlanes):
             if plane == "I" or one[0] > POLARIZED * abs(reference["I"][0])
         ]
 
-    def between(self, found: Floats, reference: Floats) -> float:
-        return Metric.error(self, found, reference)
-
     def summary(self, found: Floats) -> Floats:
         return np.asarray(found[:1], np.float64)
 
@@ -226,14 +218,10 @@ class Transfer(OfPlanes):
         "rms error of the transfer function over angular scales (absolute; it is 1 where nothing is"
         " lost)"
     )
+    reads: ClassVar[frozenset[str]] = frozenset({"map", "sky"})
     instead: ClassVar[str | None] = (
         "measure transfer_at, or name transfer in zonda accuracy --metric"
     )
-
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        _needs_map("transfer", operators)
-        sky = any("sky" in made_by(o) for o in operators)
-        _needs(sky, "the metric transfer needs a sky, and no step makes one", "add a SkyMap")
 
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
         """The sky alone, where the pipeline has no such signal."""
@@ -302,16 +290,10 @@ class Psd(_Binned):
     says: ClassVar[str] = (
         "rms over log-frequency bins of the relative error of the signal's power spectrum"
     )
+    reads: ClassVar[frozenset[str]] = frozenset({"spectrum"})
     instead: ClassVar[str | None] = (
         "measure psd_slope or crossing, or name psd in zonda accuracy --metric"
     )
-
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        _needs(
-            any("spectrum" in o.provides for o in operators),
-            "the metric psd needs a spectrum, and no step measures one",
-            "add a PowerSpectrum where the spectrum matters, e.g. after Efficiency",
-        )
 
     def measure(self, data: Data) -> Floats:
         """(2, n): P_j, and its relative standard error."""
@@ -335,15 +317,8 @@ class Structure(_Binned):
     says: ClassVar[str] = (
         "rms relative error of the atmosphere's structure functions in time and across the field"
     )
+    reads: ClassVar[frozenset[str]] = frozenset({"atmosphere", "signal"})
     instead: ClassVar[str | None] = "name structure in zonda accuracy --metric"
-
-    def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
-        made = frozenset[str]().union(*(o.provides for o in operators))
-        _needs(
-            {"atmosphere", "signal"} <= made,
-            "the metric structure needs an atmosphere, and no step makes one",
-            "add AtmosphereLayers and Efficiency",
-        )
 
     def steps(self, operators: list[Operator]) -> list[Operator]:
         """The steps with a `TimeStreams` of the atmosphere, and of the noise, behind the one that
@@ -401,19 +376,6 @@ def _uncertain(d: Floats, noise: float, pairs: Floats) -> Floats:
 def _mean_square(values: Floats, weights: Floats, use: NDArray[np.bool_]) -> float:
     total = float(weights[use].sum())
     return float((weights[use] * values[use] ** 2).sum() / total) if total > 0 else 0.0
-
-
-def _needs(made: bool, message: str, cure: str) -> None:
-    if not made:
-        raise PipelineError(message, place="--metric", cure=cure)
-
-
-def _needs_map(metric: str, operators: Sequence[Operator]) -> None:
-    _needs(
-        any("map" in o.provides for o in operators),
-        f"the metric {metric} needs a map, and no step of this pipeline makes one",
-        "add `- BinMap` to the operators, or choose another metric: psd, structure",
-    )
 
 
 def _map(data: Data, run: str = "") -> MapProduct:

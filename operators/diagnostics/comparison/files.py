@@ -533,7 +533,7 @@ def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> 
             write_image(file, joined(world, header), values, np.float64)
     about = {key: value for key, value in meta.items() if value not in ("", None)}
     about |= {"REFERENCE": found.names[0], "MAP": found.names[1]}
-    about |= {key.upper(): value for key, value in found.figures.items() if math.isfinite(value)}
+    about |= {key.upper(): value for key, value in found.values.items() if math.isfinite(value)}
     unit = fits_unit(found.unit)
     write_ecsv(paths[1], found.spectra.columns(unit, coherence=True), about)
     p, error = found.profiles, "standard error from the scatter, one value per beam"

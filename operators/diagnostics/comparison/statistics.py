@@ -1,4 +1,4 @@
-"""Differences of a map from a reference: figures, difference, fidelity and SNR.
+"""Differences of a map from a reference: values, difference, fidelity and SNR.
 
     B = g A + o,
     g and o by least squares, A without error                                                  (1)
@@ -58,8 +58,8 @@ class Comparison:
         Celestial WCS of all of them.
     unit, fwhm, pixel
         Of the values; resolution, and side of a pixel, rad. ``fwhm`` 0: not known.
-    figures
-        By name, see `figures_of`.
+    values
+        By name, see `values_of`.
     spectra, profiles
         Of ``reference``, ``map`` and ``difference``.
     notes
@@ -79,7 +79,7 @@ class Comparison:
     unit: str
     fwhm: float
     pixel: float
-    figures: dict[str, float]
+    values: dict[str, float]
     spectra: RadialSpectra
     profiles: Profiles
     notes: list[str]
@@ -88,23 +88,26 @@ class Comparison:
     noise: dict[str, tuple[str, float | None]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Settings of a comparison: common resolution [rad] (None: the wider of the two), t of equation
-    (2), number of rings.
-    """
-
-    fwhm: float | None = None
-    threshold: float = THRESHOLD
-    bins: int = 24
-
-
 def compare(
-    reference: Plane, other: Plane, settings: Settings | None = None, label: str = "compare"
+    reference: Plane,
+    other: Plane,
+    fwhm: float | None = None,
+    threshold: float = THRESHOLD,
+    bins: int = 24,
+    label: str = "compare",
 ) -> Comparison:
-    """Compare a map with a reference. Raises InputError where they cannot be: `planes.common`."""
-    settings = settings or Settings()
-    a, b, notes = common(reference, other, settings.fwhm)
+    """Compare a map with a reference. Raises InputError where they cannot be: `planes.common`.
+
+    Parameters
+    ----------
+    fwhm
+        Common resolution, rad; None: the wider of the two.
+    threshold
+        t of equation (2).
+    bins
+        Number of rings.
+    """
+    a, b, notes = common(reference, other, fwhm)
     centre, names = _centre(a), (reference.name, other.name)
     a, b = _cropped(a, b)
     grid, both = a.grid, np.isfinite(a.values) & np.isfinite(b.values)
@@ -114,55 +117,51 @@ def compare(
     }
     difference = planes["difference"] = planes["map"] - planes["reference"]
     areas, weights = _weights(grid, both)
-    floor = settings.threshold * rms(difference, weights)
+    floor = threshold * rms(difference, weights)
     with np.errstate(invalid="ignore", divide="ignore"):
         planes["fidelity"] = np.abs(planes["reference"]) / np.maximum(np.abs(difference), floor)
-        for name, plane in (("snr", b), ("reference_snr", a)):
+        noise = {}
+        for name, plane, of in (("snr", b, "map"), ("reference_snr", a, "reference")):
             if plane.noise is not None and np.isfinite(plane.noise[both]).any():
                 planes[name] = np.where(
                     both & (plane.noise > 0), plane.values / plane.noise, np.nan
                 )
-    pixel, fwhm = a.pixel, max(a.fwhm or 0.0, b.fwhm or 0.0)
+                noise[name] = plane.noise_in_words, plane.factor
+                notes.append(f"noise of the {of}: {plane.noise_in_words}")
+    pixel, width = a.pixel, max(a.fwhm or 0.0, b.fwhm or 0.0)
     maps = {name: planes[name] for name in ("reference", "map", "difference")}
-    found = profiles(maps, grid.distance(centre), areas, max(pixel, fwhm / 2), beam_area(fwhm))
+    found = profiles(maps, grid.distance(centre), areas, max(pixel, width / 2), beam_area(width))
     noisy = [plane for plane in (a, b) if plane.noise is not None and not plane.quiet]
-    figures = figures_of(
+    values = values_of(
         planes["reference"],
         planes["map"],
         [plane.noise for plane in noisy],
         weights,
         _places(a, centre),
     )
-    figures["pixels"] = float(np.count_nonzero(both & (weights > 0)))
-    figures["median fidelity where the reference is above 10 % of its peak"] = _median_fidelity(
+    values["pixels"] = float(np.count_nonzero(both & (weights > 0)))
+    values["median fidelity where the reference is above 10 % of its peak"] = _median_fidelity(
         planes
     )
-    if "chi2" in figures:
-        figures["chi2 values"] = min(
-            figures["chi2 pixels"], *(plane.independent(both) for plane in noisy)
+    if "chi2" in values:
+        values["chi2 values"] = min(
+            values["chi2 pixels"], *(plane.independent(both) for plane in noisy)
         )
-    noise = {}
-    for name, plane, of in (("snr", b, "map"), ("reference_snr", a, "reference")):
-        if name in planes:
-            noise[name] = plane.noise_in_words, plane.factor
-            notes.append(f"noise of the {of}: {plane.noise_in_words}")
     header = a.header
     if a.pixels is not None:
         header, planes = on_a_plane(a.pixels, planes)
         maps = {name: planes[name] for name in maps}
     flat = image_grid(header, planes["map"].shape)
     cell, known = cell_of(flat), np.isfinite(planes["map"])
-    spectra = radial_spectra(
-        maps, tapered(known, cell), cell, ring_edges(known.shape, cell, settings.bins)
-    )
+    spectra = radial_spectra(maps, tapered(known, cell), cell, ring_edges(known.shape, cell, bins))
     areas = np.broadcast_to(flat.areas, flat.shape)[known & np.isfinite(flat.areas)]
     if areas.size and areas.max() > (1 + UNEVEN) * areas.min():
         notes.append(
             "solid angles of the pixels: they differ by a factor of"
             f" {areas.max() / areas.min():.3g}; scales of spectra are the middle's"
         )
-    about = header, a.unit, fwhm, pixel
-    return Comparison(names, planes, *about, figures, spectra, found, notes, centre, label, noise)
+    about = header, a.unit, width, pixel
+    return Comparison(names, planes, *about, values, spectra, found, notes, centre, label, noise)
 
 
 def _cropped(a: Plane, b: Plane) -> tuple[Plane, Plane]:
@@ -249,7 +248,7 @@ def _centre(plane: Plane) -> tuple[float, float]:
     return float(longitude), float(latitude)
 
 
-def figures_of(
+def values_of(
     a: Floats,
     b: Floats,
     noise: Sequence[Floats | None] = (None, None),

@@ -105,10 +105,10 @@ def test_the_input_with_the_beam_is_the_reference(tmp_path, products):
     run = data(tmp_path, products)
     CompareMaps().finalize(run)
     found = run.products["comparison"]
-    assert found.figures["gain"] == pytest.approx(0.8, abs=4e-3)
+    assert found.values["gain"] == pytest.approx(0.8, abs=4e-3)
     assert found.fwhm == pytest.approx(np.sqrt(2) * BEAM * ARCSEC)
     CompareMaps(map="noiseless/map", name="filtered").finalize(run)
-    assert run.products["filtered"].figures["gain"] == pytest.approx(0.8, abs=1e-3)
+    assert run.products["filtered"].values["gain"] == pytest.approx(0.8, abs=1e-3)
     with fits.open(tmp_path / "comparison.fits") as hdus:
         names = [hdu.name for hdu in hdus]
         assert names == ["REFERENCE", "MAP", "DIFFERENCE", "FIDELITY", "SNR"]
@@ -116,7 +116,7 @@ def test_the_input_with_the_beam_is_the_reference(tmp_path, products):
         assert hdus[0].header["BUNIT"] == "K"
         assert hdus[0].header["BMAJ"] * 3600 == pytest.approx(np.sqrt(2) * BEAM)
     table = Table.read(tmp_path / "comparison_spectra.ecsv")
-    assert table.meta["GAIN"] == pytest.approx(found.figures["gain"], rel=1e-6)
+    assert table.meta["GAIN"] == pytest.approx(found.values["gain"], rel=1e-6)
     np.testing.assert_allclose(table["difference"], found.spectra.power["difference"], rtol=1e-8)
     assert {"radius", "map", "map_error"} <= set(
         Table.read(tmp_path / "comparison_profiles.ecsv").colnames
@@ -146,8 +146,8 @@ def test_a_file_as_reference(tmp_path, products):
     hdu.writeto(path)
     run = data(None, products)
     CompareMaps(map="noiseless/map", file=str(path)).finalize(run)
-    assert run.products["comparison"].figures["gain"] == pytest.approx(1.0, abs=1e-9)
-    assert run.products["comparison"].figures["rms difference"] < 1e-15
+    assert run.products["comparison"].values["gain"] == pytest.approx(1.0, abs=1e-9)
+    assert run.products["comparison"].values["rms difference"] < 1e-15
 
 
 def test_map_spectrum(tmp_path, products):
@@ -291,6 +291,6 @@ def test_chi2_against_a_map_without_noise_is_one(tmp_path, binned):
     assert not noisy.quiet
     found.append(compare(reference, noisy))
     for each in found:
-        error = np.sqrt(2 / each.figures["chi2 values"])
-        assert each.figures["chi2"] / each.figures["chi2 pixels"] == pytest.approx(1, abs=4 * error)
+        error = np.sqrt(2 / each.values["chi2 values"])
+        assert each.values["chi2"] / each.values["chi2 pixels"] == pytest.approx(1, abs=4 * error)
         assert 4 * error < 0.4

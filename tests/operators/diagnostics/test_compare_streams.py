@@ -11,7 +11,7 @@ import zonda
 from tests.scenes import in_blocks
 from zonda.core.errors import ZondaError
 from zonda.core.numerics.smooth import SmoothField
-from zonda.operators.diagnostics.compare_streams import FIGURES, StreamComparison, figures, pair
+from zonda.operators.diagnostics.compare_streams import VALUES, StreamComparison, pair, values_of
 from zonda.operators.diagnostics.plot_operators import Plots, pictures
 from zonda.operators.diagnostics.power_spectrum import PowerSpectrum, Welch
 from zonda.plugins.checks import scenes
@@ -108,7 +108,7 @@ def test_the_errors_hold_for_coloured_noise():
     found, welch = [], Welch(8000, RATE, LENGTH)
     for _ in range(400):
         y, e = scipy.signal.lfilter(*poles, rng.normal(size=(2, 8000)))
-        found.append(figures(pair(0.7 * y + 0.5 * e, y, welch), RATE / LENGTH, welch.independent))
+        found.append(values_of(pair(0.7 * y + 0.5 * e, y, welch), RATE / LENGTH, welch.independent))
     values, errors = (np.array(rows) for rows in zip(*found, strict=True))
     scatter = values[:, 3:].std(axis=0, ddof=1)
     np.testing.assert_allclose(np.sqrt((errors[:, 3:] ** 2).mean(axis=0)), scatter, rtol=0.14)
@@ -155,7 +155,7 @@ def test_a_run_and_its_files(tmp_path):
     np.testing.assert_allclose(table["ratio"], found.power[0] / found.power[1], rtol=1e-7)
     assert str(table["power"].unit) == "K2 / Hz"
     detectors = Table.read(tmp_path / "stream_comparison_detectors.ecsv", format="ascii.ecsv")
-    np.testing.assert_allclose(detectors["gain"], found.values[:, FIGURES.index("gain")], rtol=1e-7)
+    np.testing.assert_allclose(detectors["gain"], found.values[:, VALUES.index("gain")], rtol=1e-7)
     assert list(detectors["detector"]) == found.names
     emission = data.products["emission"]
     assert (

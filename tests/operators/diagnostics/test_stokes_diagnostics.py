@@ -107,13 +107,13 @@ def test_each_plane_is_compared_with_its_own(made):
     for which in ("", "_Q", "_U"):
         found = data[f"comparison{which}"]
         assert found.names == (f"input{which}", f"given/map{which}")
-        assert found.figures["gain"] == pytest.approx(1, abs=0.02)
-        assert found.figures["correlation"] > 0.995
+        assert found.values["gain"] == pytest.approx(1, abs=0.02)
+        assert found.values["correlation"] > 0.995
         assert (folder / f"comparison{which}.fits").exists()
         assert (folder / f"comparison{which}.png").exists()
     peak = np.nanmax(np.abs(data["comparison_U"].planes["reference"]))
-    assert peak == pytest.approx(np.abs(data["comparison_U"].figures["peak reference"]))
-    assert data["comparison_U"].figures["peak reference"] < 0
+    assert peak == pytest.approx(np.abs(data["comparison_U"].values["peak reference"]))
+    assert data["comparison_U"].values["peak reference"] < 0
     told = {what for who, what, _ in data.log.told() if who == "CompareMaps"}
     assert {"gain of the map", "Q: gain of the map", "U: gain of the map"} <= told
 
@@ -159,8 +159,8 @@ def test_a_map_in_galactic_axes_is_compared_with_the_input_in_those(tmp_path):
     """
     data = pipeline(zonda.CompareMaps(map="given/map"), frame="galactic").run(scene(), threads=1)
     for which in ("", "_Q", "_U"):
-        assert data[f"comparison{which}"].figures["gain"] == pytest.approx(1, abs=0.03)
-        assert data[f"comparison{which}"].figures["correlation"] > 0.99
+        assert data[f"comparison{which}"].values["gain"] == pytest.approx(1, abs=0.03)
+        assert data[f"comparison{which}"].values["correlation"] > 0.99
 
 
 def cube(path: Path, values, **cards):

@@ -11,7 +11,7 @@ from zonda.core.errors import InputError
 from zonda.core.figures import Choice, measure
 from zonda.operators.diagnostics.comparison.planes import Plane
 from zonda.operators.diagnostics.comparison.radial import RadialSpectra
-from zonda.operators.diagnostics.comparison.statistics import Settings, compare
+from zonda.operators.diagnostics.comparison.statistics import compare
 from zonda.operators.diagnostics.map_spectra import MapSpectra
 from zonda.plugins.checks import scenes
 
@@ -42,9 +42,7 @@ def test_fidelity_of_a_fainter_source(gain, at_peak):
     """1 / |1 - g|: at the peak, and wherever the difference exceeds the threshold (0.7 times its
     rms, here 18 % of the peak).
     """
-    found = data(
-        comparison=compare(plane(blob(), "a"), plane(gain * blob(), "b"), Settings(12 * ARCSEC))
-    )
+    found = data(comparison=compare(plane(blob(), "a"), plane(gain * blob(), "b"), 12 * ARCSEC))
     assert measure(found, "fidelity", least="100 %").value == pytest.approx(at_peak, rel=1e-6)
     assert measure(found, "fidelity", least="50 %").value == pytest.approx(at_peak, rel=1e-6)
     assert "peak" in measure(found, "fidelity", least="100 %").description
@@ -53,7 +51,7 @@ def test_fidelity_of_a_fainter_source(gain, at_peak):
 def test_fidelity_names_what_is_missing():
     with pytest.raises(InputError, match="there is no comparison 'other'"):
         measure(data(), "fidelity", comparison="other")
-    empty = compare(plane(0 * blob(), "a"), plane(blob(), "b"), Settings(12 * ARCSEC))
+    empty = compare(plane(0 * blob(), "a"), plane(blob(), "b"), 12 * ARCSEC)
     with pytest.raises(InputError, match="the reference is empty"):
         measure(data(comparison=empty), "fidelity")
 

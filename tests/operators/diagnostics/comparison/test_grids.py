@@ -19,7 +19,7 @@ from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.numerics.sphere import separation, unit_vectors
 from zonda.operators.diagnostics.comparison.files import in_unit, read_planes
 from zonda.operators.diagnostics.comparison.planes import cell_of
-from zonda.operators.diagnostics.comparison.statistics import Settings, compare
+from zonda.operators.diagnostics.comparison.statistics import compare
 
 LON = 75.0
 NSIDE = 32768
@@ -142,10 +142,10 @@ def test_a_gaussian_is_smoothed_to_what_it_is_on_the_sky(tmp_path, name):
         del GRIDS["control"]
     sky = replace(a.planes["I"], fwhm=0.0)
     for reference, other in ((sky, b.planes["I"]), (b.planes["I"], sky)):
-        found = compare(reference, other, Settings(bins=8))
-        assert found.figures["gain"] == pytest.approx(1.0, abs=4e-3)
-        assert found.figures["peak ratio"] == pytest.approx(1.0, abs=4e-3)
-        assert found.figures["rms difference"] < 4e-3 * found.figures["rms reference"]
+        found = compare(reference, other, bins=8)
+        assert found.values["gain"] == pytest.approx(1.0, abs=4e-3)
+        assert found.values["peak ratio"] == pytest.approx(1.0, abs=4e-3)
+        assert found.values["rms difference"] < 4e-3 * found.values["rms reference"]
         # a profile in rings of 15 arcsec: the mean of the Gaussian over a ring's solid angle
         edges, p = np.arange(5) * 15.0, found.profiles
         cumulative = 1 - np.exp(-4 * np.log(2) * (edges / wide) ** 2)
@@ -240,14 +240,14 @@ def test_white_noise_has_a_chi2_of_one(tmp_path, name, smooth):
     finally:
         del GRIDS["finer"]
     same = read_planes(put(tmp_path / "s.fits", name, {"I": sky}, beam=20.0)).planes["I"]
-    settings = Settings(25 * ARCSEC if smooth else None, bins=8)
+    wide = 25 * ARCSEC if smooth else None
     for reference in (truth, same):
         values = sky + noise * rng.standard_normal(sky.shape)
         seen = read_planes(
             put(tmp_path / "m.fits", name, {"I": values, "NOISE": noise}, beam=20.0)
         ).planes["I"]
-        found = compare(reference, seen, settings)
-        f = found.figures
+        found = compare(reference, seen, wide, bins=8)
+        f = found.values
         ratio, error = f["chi2"] / f["chi2 pixels"], np.sqrt(2 / f["chi2 values"])
         assert abs(ratio - 1) < 3.5 * error, (ratio, error)
         assert error < 0.2
@@ -270,7 +270,7 @@ def test_the_spectrum_of_white_noise_is_its_level(tmp_path, name):
         plane = read_planes(
             put(tmp_path / "m.fits", name, {"I": rng.standard_normal(areas.shape)})
         ).planes["I"]
-        drawn.append(compare(plane, plane, Settings(bins=6)).spectra)
+        drawn.append(compare(plane, plane, bins=6).spectra)
     middle = areas[areas.shape[0] // 2, areas.shape[1] // 2]
     ratio, modes = np.mean([s.power["map"] for s in drawn], axis=0) / middle, drawn[0].modes
     good = modes > 2

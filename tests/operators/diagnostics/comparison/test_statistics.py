@@ -13,7 +13,7 @@ from zonda.operators.diagnostics.comparison.radial import (
     ring_edges,
     tapered,
 )
-from zonda.operators.diagnostics.comparison.statistics import Settings, compare, figures_of
+from zonda.operators.diagnostics.comparison.statistics import compare, values_of
 
 from .test_planes import gaussian, header
 
@@ -22,7 +22,7 @@ def test_a_known_difference():
     """B = 0.8 A + 3: gain and offset are exact, the difference is 3 - 0.2 A, all are in phase."""
     a = np.random.default_rng(1).standard_normal((40, 50))
     a[0, :5] = np.nan
-    found = figures_of(a, 0.8 * a + 3.0)
+    found = values_of(a, 0.8 * a + 3.0)
     assert found["gain"] == pytest.approx(0.8, abs=1e-12)
     assert found["offset"] == pytest.approx(3.0, abs=1e-12)
     assert found["gain error"] < 1e-12
@@ -46,7 +46,7 @@ def test_errors_of_the_fit_are_its_scatter():
     for seed in range(60):
         rng = np.random.default_rng(seed)
         a, g = rng.standard_normal((2, 48, 48))
-        found = figures_of(a, 0.7 * a + 0.5 * g + 1.0)
+        found = values_of(a, 0.7 * a + 0.5 * g + 1.0)
         scores.append((found["gain"] - 0.7) / found["gain error"])
         assert found["gain error"] == pytest.approx(
             0.5 / 48, rel=0.45
@@ -59,10 +59,10 @@ def test_chi2_of_known_noise():
     rng = np.random.default_rng(5)
     noise = rng.uniform(0.5, 2.0, (40, 40))
     a = rng.standard_normal((40, 40))
-    found = figures_of(a, a + noise * rng.standard_normal((40, 40)), (None, noise))
+    found = values_of(a, a + noise * rng.standard_normal((40, 40)), (None, noise))
     assert found["chi2 pixels"] == 1600
     assert abs(found["chi2"] - 1600) < 4 * np.sqrt(2 * 1600)
-    both = figures_of(a, a + noise * rng.standard_normal((40, 40)), (noise, noise))
+    both = values_of(a, a + noise * rng.standard_normal((40, 40)), (noise, noise))
     assert both["chi2"] == pytest.approx(800, abs=4 * np.sqrt(2 * 1600) / 2)
 
 
@@ -70,9 +70,7 @@ def test_fidelity_is_its_equation():
     a = gaussian(61, 2.0, 30.0)
     b = a * 0.9
     b[30, 30] += 0.1 * a.max()
-    found = compare(
-        Plane("a", a, header(61, 2.0)), Plane("b", b, header(61, 2.0)), Settings(threshold=0.5)
-    )
+    found = compare(Plane("a", a, header(61, 2.0)), Plane("b", b, header(61, 2.0)), threshold=0.5)
     floor = 0.5 * np.sqrt(np.mean((b - a) ** 2))
     np.testing.assert_allclose(
         found.planes["fidelity"], np.abs(a) / np.maximum(np.abs(b - a), floor), rtol=1e-12
@@ -85,7 +83,7 @@ def test_equal_maps_have_infinite_fidelity():
     a = gaussian(41, 2.0, 30.0)
     found = compare(Plane("a", a, header(41, 2.0)), Plane("b", a, header(41, 2.0)))
     assert np.isinf(found.planes["fidelity"]).all()
-    assert found.figures["gain"] == pytest.approx(1.0)
+    assert found.values["gain"] == pytest.approx(1.0)
 
 
 def test_what_is_not_common_is_cut_away():
