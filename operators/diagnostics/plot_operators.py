@@ -175,7 +175,7 @@ def draw_map(
     other = f"Map of signal {signal}", "A part of the components, filtered and binned."
     title, meaning = titles.get(signal, other)
     title, how = _named(title, key), _how(product, shown)
-    text = f"{meaning} {how[0].upper()}{how[1:]}.{_resolution(shown)}"
+    text = f"{meaning} {how[0].upper()}{how[1:]}"
     head = _titled(title, shown)
     if snr is not None:
         head += f"; contours: S/N, {noise_text(snr[1], short=True)}"
@@ -195,7 +195,7 @@ def draw_noise(
     comes first, and ``source_free``.
     """
     panels: list[tuple[Flat, AnyFloats, str]] = []
-    figures, limits, how, window = [], [], "", None
+    values, limits, how, window = [], [], "", None
     first = next(iter(sources.values()))[0]
     diameter = central_diameter(first.fwhm, first.pixel, style.central_diameter)
     for of, (product, plane) in sources.items():
@@ -211,15 +211,15 @@ def draw_noise(
         limits.append(flat.limit(plane, 99.7))
         rms = shown.rms(diameter / 2, of=plane)
         if math.isfinite(rms):
-            figures.append(f"{words} {rms * 1e6:.4g} µK_RJ")
+            values.append(f"{words} {rms * 1e6:.4g} µK_RJ")
     axes = _panels(panels, shown.resolution, max((x for x in limits if x), default=None))
     place = axes[0].wcs.wcs_world2pix([np.degrees(first.centre)], 0)[0]
     for ax in axes:
         plot_circle(ax, panels[0][1].shape, place, diameter)
-    text = f"Noise maps on one scale, {how}.{_resolution(shown)}"
-    if figures:
+    text = f"Noise maps on one scale, {how}"
+    if values:
         wide = f"{np.degrees(diameter) * 60:.3g}′{in_beams(diameter, first.fwhm)}"
-        text += f" Weighted rms within the dotted circle of {wide}: {', '.join(figures)}."
+        text += f" Weighted rms within the dotted circle of {wide}: {', '.join(values)}."
     return [Sketch(file, _named("Noise", file, "noise"), text, axes[0])]
 
 
@@ -265,24 +265,14 @@ def draw_plane(file: str, product: MapProduct, name: str) -> list[Sketch]:
 
 
 def _how(product: MapProduct, shown: MapProduct) -> str:
-    """Smoothing of a map for its picture, in words."""
-    if not shown.smoothed_by:
-        return "not smoothed"
-    text = f"smoothed by {angle_text(shown.smoothed_by)}"
-    return text if product.smoothed_by else f"{text} for this picture"
-
-
-def _resolution(shown: MapProduct) -> str:
-    """Meaning of the circle in a map's corner."""
-    if not shown.fwhm:
-        return ""
+    """Smoothing of a map for its picture, and the meaning of the circle in its corner, in words."""
     beam, smoothing = angle_text(shown.fwhm), angle_text(shown.smoothed_by)
-    if not shown.smoothed_by:
-        return f" Resolution {beam} FWHM, the beam's."
-    return (
-        f" Resolution {angle_text(shown.resolution)} FWHM: the beam's {beam} and the smoothing's"
-        f" {smoothing}, added in quadrature."
-    )
+    text, circle = "not smoothed", f" Resolution {beam} FWHM, the beam's."
+    if shown.smoothed_by:
+        text = f"smoothed by {smoothing}{'' if product.smoothed_by else ' for this picture'}"
+        both = f"the beam's {beam} and the smoothing's {smoothing}, added in quadrature"
+        circle = f" Resolution {angle_text(shown.resolution)} FWHM: {both}."
+    return f"{text}.{circle if shown.fwhm else ''}"
 
 
 def _named(title: str, key: str, shows: str = "") -> str:
@@ -314,8 +304,6 @@ def _panels(
     return axes
 
 
-__all__ = ["Picture", "Plots", "pictures"]
-
 DRAWN = frozenset(
     [
         "map",
@@ -330,11 +318,8 @@ DRAWN = frozenset(
     ]
 )
 """Products with pictures."""
-FILES: dict[type, tuple[str, str]] = {
-    Spectrum: ("spectrum", "power_spectra"),
-    TimeStream: ("time_streams", "tod"),
-}
-"""Names of products and of their pictures, where these differ."""
+FILES: dict[type, str] = {Spectrum: "power_spectra", TimeStream: "tod"}
+"""Names of pictures, where these are not those of the products."""
 
 
 class Plots(Output):
@@ -457,9 +442,8 @@ def _of_series(data: Data, style: Plots) -> Iterator[Sketch]:
     for name, product in data.products.items():
         file, label = _file(name), getattr(product, "label", "")
         band = next((b for b in bands if name.endswith(b)), "")
-        usual, stem = FILES.get(type(product), ("", ""))
-        if stem:
-            file = f"{stem}{band if name == f'{usual}{band}' else f'_{file}'}"
+        if stem := FILES.get(type(product)):
+            file = f"{stem}{band if name == f'{product.usual}{band}' else f'_{file}'}"
         if isinstance(product, Comparison):
             yield from draw_comparison(file, product, style.contours)
         where = f"after {before[label]}" if before.get(label) else f"at step {label}"
