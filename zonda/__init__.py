@@ -46,7 +46,7 @@ _WHERE = {
     "Planning": "zonda.core.plan.planning",
     "Figure": "zonda.core.figures",
     "FigureMetric": "zonda.core.figures",
-    "Knob": "zonda.core.knobs",
+    "Knob": "zonda.core.plan.planning",
     "NoiseModel": "zonda.operators.noise.models",
     "register": "zonda.core.registry",
     "operator": "zonda.core.function_operator",
@@ -100,7 +100,6 @@ if TYPE_CHECKING:
     from zonda.core.instrument import Band as Band
     from zonda.core.instrument import Instrument as Instrument
     from zonda.core.instrument import Telescope as Telescope
-    from zonda.core.knobs import Knob as Knob
     from zonda.core.mapmaker import MapMaker as MapMaker
     from zonda.core.numerics.random import normals as normals
     from zonda.core.numerics.random import uniforms as uniforms
@@ -109,6 +108,7 @@ if TYPE_CHECKING:
     from zonda.core.output import StreamOutput as StreamOutput
     from zonda.core.pipeline import Pipeline as Pipeline
     from zonda.core.plan.planner import plan as plan
+    from zonda.core.plan.planning import Knob as Knob
     from zonda.core.plan.planning import Planning as Planning
     from zonda.core.product import Product as Product
     from zonda.core.registry import register as register

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..configuration import yaml_places
 from ..configuration.diagnostics import nearest
 from ..errors import InputError
-from ..knobs import PRECISION, Knob
-from ..plan.planning import planning_of
+from ..plan.planning import PRECISION, Knob, planning_of
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, cast
+
+from pydantic import BaseModel, TypeAdapter
 
 from ..function_operator import FunctionOperator
-from ..knobs import Knob
 from ..mapmaker import filters
 from ..operator import Operator
 from ..registry import RegistryError, planning
@@ -14,6 +16,55 @@ from .bounds import Cost, Estimate, Traits
 if TYPE_CHECKING:
     from ..data import Observation
     from .bounds import Context
+
+
+@dataclass(frozen=True)
+class Knob:
+    """One parameter that trades accuracy for time; `Planning.knobs` lists them, `zonda accuracy`
+    turns them, `zonda plan` chooses among the rungs that `Planning.estimate` bounds.
+
+    Attributes
+    ----------
+    parameter
+        Name of the field.
+    ladder
+        Its values as they stand in YAML, from coarse and cheap to fine and dear; at least two. The
+        last one is what the others are judged by.
+    approximates
+        What a coarser value does to the result: half a line, for tables.
+    redraws
+        True where another value draws other random numbers. Two runs then differ by more than the
+        approximation, so that only means over seeds compare, and the knob is left out of joint
+        searches.
+    """
+
+    parameter: str
+    ladder: tuple[str | int | float, ...]
+    approximates: str
+    redraws: bool = False
+
+    def values(self, model: type[BaseModel]) -> list[Any]:
+        """The ladder as values of the model's field. Raises pydantic's ValidationError for one that
+        the field refuses.
+        """
+        field = model.model_fields[self.parameter]
+        adapter: TypeAdapter[Any] = TypeAdapter(
+            cast(Any, Annotated[field.annotation, self.parameter, *field.metadata])
+        )
+        return [adapter.validate_python(value) for value in self.ladder]
+
+    def coarser(self, model: BaseModel) -> list[Any]:
+        """The rungs that are coarser than the model's own value, the finest of them first."""
+        rungs, own = self.values(type(model)), getattr(model, self.parameter)
+        if own in rungs:
+            return rungs[: rungs.index(own)][::-1]
+        rising = rungs[0] < rungs[-1]
+        return [rung for rung in reversed(rungs) if (rung < own) == rising]
+
+
+PRECISION = Knob("precision", ("float32", "float64"), "rounding of the time streams")
+"""The one knob that belongs to a pipeline, not to an operator."""
+
 
 O = TypeVar("O", bound=Operator)  # noqa: E741
 
@@ -32,7 +83,7 @@ class Planning(Generic[O]):
     cost
         Accepted from planning classes of before, and not used: times are measured.
     knobs
-        The parameters that trade accuracy for time, each with its ladder of values (`core.knobs`).
+        The parameters that trade accuracy for time, each with its ladder of values (`Knob`).
     reads_streams
         It makes a product of the time streams themselves (spectra, files), in which errors of a
         sample count.

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from zonda.core.instrument import Band
-from zonda.core.knobs import Knob
 from zonda.core.observation import Observation
 from zonda.core.plan.bounds import (
     OTHER_MODES,
@@ -35,7 +34,7 @@ from zonda.core.plan.bounds import (
     exact,
     full,
 )
-from zonda.core.plan.planning import Planning
+from zonda.core.plan.planning import Knob, Planning
 from zonda.core.types import Floats
 
 from .drawing import bytes_of_units, in_time_order

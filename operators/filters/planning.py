@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from zonda.core.knobs import Knob
 from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.observation import Observation
 from zonda.core.plan.bounds import (
@@ -21,7 +20,7 @@ from zonda.core.plan.bounds import (
     full,
     single,
 )
-from zonda.core.plan.planning import Planning
+from zonda.core.plan.planning import Knob, Planning
 
 from .common_mode import CommonModeFilter
 from .gram import MOST_COPIED

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from zonda.core.knobs import Knob
 from zonda.core.numerics.chunks import TILE_DETECTORS
 from zonda.core.observation import Observation, WhiteLevel
 from zonda.core.plan.bounds import (
@@ -19,7 +18,7 @@ from zonda.core.plan.bounds import (
     Traits,
     full,
 )
-from zonda.core.plan.planning import Planning
+from zonda.core.plan.planning import Knob, Planning
 from zonda.core.types import Floats
 
 from .one_over_f import PowerLawFilter

@@ -12,10 +12,9 @@ from typing import ClassVar
 import numpy as np
 
 from zonda.core.data import Observation
-from zonda.core.knobs import Knob
 from zonda.core.operator import Operator
 from zonda.core.plan.bounds import Context, Estimate, evenly, exact, not_simulated, single
-from zonda.core.plan.planning import Planning
+from zonda.core.plan.planning import Knob, Planning
 from zonda.core.types import AnyFloats
 
 from .base import Pointing

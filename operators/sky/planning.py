@@ -9,7 +9,6 @@ import numpy as np
 
 from zonda.core.data import Observation
 from zonda.core.instrument import Band
-from zonda.core.knobs import Knob
 from zonda.core.plan.bounds import (
     Bound,
     Choice,
@@ -23,7 +22,7 @@ from zonda.core.plan.bounds import (
     not_simulated,
     single,
 )
-from zonda.core.plan.planning import Planning
+from zonda.core.plan.planning import Knob, Planning
 
 from .convolved import conversion
 from .gridding import Grid, extremes

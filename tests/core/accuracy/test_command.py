@@ -14,7 +14,7 @@ import numpy as np
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band, Instrument, Telescope
-from zonda.core.knobs import Knob
+from zonda.core.plan.planning import Knob
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
 from zonda.core.site import Site

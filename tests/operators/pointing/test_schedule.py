@@ -22,8 +22,7 @@ from zonda.core.numerics.quaternions import conjugate, from_angles, multiply
 from zonda.core.pipeline import Pipeline
 from zonda.core.registry import instruments
 from zonda.core.scene import Scene
-from zonda.operators.pointing.schedule import PointingSchedule
-from zonda.operators.pointing.schedule_files import read_schedule
+from zonda.operators.pointing.schedule import PointingSchedule, read_schedule
 from zonda.operators.pointing.sweep import Nod, Sweep
 
 ROWS = [
