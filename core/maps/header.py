@@ -31,7 +31,14 @@ _NUMBERS = re.compile(
 )
 """Cards of world coordinates that are numbers: astropy takes a default for one that is none."""
 _OBSERVED = re.compile("DATE|MJD-|REST")
-_IN_DEGREES = {"rad": math.degrees(1.0), "arcmin": 1 / 60, "arcsec": 1 / 3600, "mas": 1 / 3.6e6}
+ANGLES = {
+    **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
+    **dict.fromkeys(("rad", "radian", "radians"), "rad"),
+    **dict.fromkeys(("arcmin", "arcminute", "arcminutes"), "arcmin"),
+    **dict.fromkeys(("arcsec", "arcsecond", "arcseconds", "asec"), "arcsec"),
+    "mas": "mas",
+}
+"""Values of CUNIT that are read, as FITS has them."""
 _EQUATORIAL = ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH")
 
 
@@ -70,6 +77,10 @@ class FileHeader:
             raise self.error(f"{key} = {value!r} is no text", f"write {key} in quotes")
         return value.strip()
 
+    def no_angle(self, key: str, written: str) -> InputError:
+        """An error about a card that is no unit of an angle, to be raised."""
+        return self.error(f"{key} = '{written}' is no angle", f"set {key} to 'deg' or 'rad'")
+
     def _value(self, key: str) -> Any:
         """The value of a card; None without a card or a value: astropy has an object of its own for
         it.
@@ -96,6 +107,27 @@ def marked_bad(values: AnyFloats, header: FileHeader) -> NDArray[np.bool_]:
     return found
 
 
+def is_celestial(header: Any, axis: int | str) -> bool:
+    """True if an axis is a longitude or a latitude on the sky, by its CTYPE."""
+    kind = str(header.get(f"CTYPE{axis}", "")).strip().upper()
+    return re.match(r"RA--|DEC-|[GESH]L(ON|AT)|HP(LN|LT)|[A-Z]{2}L[NT]", kind) is not None
+
+
+def with_known_units(header: Any, place: str) -> Any:
+    """A copy of an image's header whose celestial axes have units that FITS knows. Raises
+    InputError for units that are no angles.
+    """
+    about = FileHeader(header.copy(), place)
+    for axis in "12":
+        key = f"CUNIT{axis}"
+        written = about.text(key)
+        if written.lower() in ANGLES:
+            about.header[key] = ANGLES[written.lower()]
+        elif written and is_celestial(header, axis):
+            raise about.no_angle(key, written)
+    return about.header
+
+
 def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
     """A copy of an image's header whose RADESYS is one of `FRAMES`, or absent, and a note where
     another one was read as that.
@@ -106,18 +138,18 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
     ------
     InputError
         RADESYS is none that is known, or no text; cards of the world coordinates are no numbers,
-        units no texts.
+        units no angles.
     """
-    about = FileHeader(header.copy(), place)
+    from astropy.units import Unit
+
+    about = FileHeader(with_known_units(header, place), place)
     made = about.header
     for key in list(made):
         if _NUMBERS.fullmatch(key) and about.number(key) is None:
             made.remove(key, ignore_missing=True)
-        elif key in ("CUNIT1", "CUNIT2"):
-            about.text(key)
     for axis in "12":
         key, unit = f"CRVAL{axis}", about.text(f"CUNIT{axis}") or "deg"
-        if abs(about.number(key) or 0.0) * _IN_DEGREES.get(unit.lower(), 1.0) > 720.0:
+        if abs(about.number(key) or 0.0) * Unit(ANGLES.get(unit, "deg")).to("deg") > 720.0:
             cure = f"correct {key}, or the unit CUNIT{axis}"
             raise about.error(f"{key} = {made[key]:g} {unit} is no longitude or latitude", cure)
     kinds = {str(header.get(f"CTYPE{axis}", "")).strip().upper()[:4] for axis in "12"}

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Floats
-from .header import FileHeader, marked_bad
+from .header import FileHeader, is_celestial, marked_bad
 
 Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
 """Names of frames as astropy has them."""
@@ -160,13 +160,6 @@ def _kind(hdu: Any) -> str:
 # planes of cubes
 
 
-def is_celestial(ctype: str) -> bool:
-    """True for the CTYPE of a longitude or a latitude on the sky."""
-    return (
-        re.match(r"(RA--|DEC-|[GESH]L(ON|AT)|HP(LN|LT)|[A-Z]{2}L[NT])", ctype.upper()) is not None
-    )
-
-
 class Cube(FileHeader):
     """The planes of an image of ``shape`` (slowest axis first): it has axes before the last two, or
     none.
@@ -203,10 +196,11 @@ class Cube(FileHeader):
             A cube without a wanted plane, or one that is not there; no I; axes of the sky that are
             not the first two.
         """
-        if stray := [f"{axis} ({name})" for axis, name in self.names.items() if is_celestial(name)]:
+        stray = [axis for axis in sorted(self.names) if is_celestial(self.header, axis)]
+        if stray:
             raise self.error(
                 "the axes of the sky are not the first two of the cube, but"
-                f" {', '.join(sorted(stray))}",
+                f" {', '.join(f'{axis} ({self.names[axis]})' for axis in stray)}",
                 "transpose it, so that axes 1 and 2 are longitude and latitude",
             )
         numbers, planes = self._numbers(wanted), []

@@ -13,8 +13,7 @@ from astropy.wcs import WCS
 
 from zonda.core.configuration.target import Target
 from zonda.core.errors import InputError
-from zonda.core.maps.header import with_known_frame
-from zonda.core.maps.map_reading import is_celestial
+from zonda.core.maps.header import ANGLES, is_celestial, with_known_frame, with_known_units
 from zonda.core.numerics.projection import pixel_matrix, wcs_frame_rotation
 from zonda.core.numerics.sphere import angle_between, angles, local_axes, unit_vectors
 from zonda.core.storage.files import first_line
@@ -95,14 +94,6 @@ def position(ra: float, dec: float) -> str:
     return f"{np.degrees(ra):.5f} deg {np.degrees(dec):.5f} deg"
 
 
-ANGLES = {
-    **dict.fromkeys(("deg", "degree", "degrees"), u.deg),
-    **dict.fromkeys(("rad", "radian", "radians"), u.rad),
-    **dict.fromkeys(("arcmin", "arcminute", "arcminutes"), u.arcmin),
-    **dict.fromkeys(("arcsec", "arcsecond", "arcseconds", "asec"), u.arcsec),
-    "mas": u.mas,
-}
-"""Values of CUNIT that are read."""
 ROUNDED = 1e-12
 """rad by which a map that is moved along is not turned."""
 FARTHEST = 1e9
@@ -118,7 +109,7 @@ class ImageHeader(MapHeader):
         """`ImageMap`'s ``wcs`` and ``placeless`` of an image of ``shape`` (..., ny, nx), or the
         error that says what is missing.
         """
-        header, wanted = self._with_known_units(), self.wanted
+        header, wanted = with_known_units(self.header, self.place), self.wanted
         scaled = any(f"CD{i}_{j}" in header for i in (1, 2) for j in (1, 2)) or all(
             f"CDELT{k}" in header for k in (1, 2)
         )
@@ -126,7 +117,7 @@ class ImageHeader(MapHeader):
         if not scaled and wanted.pixel_size is None:
             cure = f"set the header keys CDELT1, CDELT2, {UNITS}, {or_size}"
             raise self.error("the pixel size is missing", cure)
-        if not all(_celestial(header, axis) for axis in "12"):
+        if not all(is_celestial(header, axis) for axis in "12"):
             if wanted.pixel_size is None and not header.get("CUNIT1"):
                 cure = f"set the header keys {UNITS}, {or_size}"
                 raise self.error("the unit of the pixel size is missing", cure)
@@ -167,21 +158,6 @@ class ImageHeader(MapHeader):
                 f"set the header keys {', '.join(absent)}, or the operator's parameter centre"
                 " (a position, or 'target')",
             )
-
-    def _with_known_units(self) -> Any:
-        """A copy of the header whose celestial axes have units that FITS knows."""
-        header = self.header.copy()
-        for axis in "12":
-            key = f"CUNIT{axis}"
-            written = self.text(key)
-            if written and written.lower() in ANGLES:
-                header[key] = ANGLES[written.lower()].name
-            elif written and _celestial(header, axis):
-                raise self._no_angle(key, written)
-        return header
-
-    def _no_angle(self, key: str, written: str) -> InputError:
-        return self.error(f"{key} = '{written}' is no angle", f"set {key} to 'deg' or 'rad'")
 
     def _with_frame(self, header: Any) -> Any:
         """`with_known_frame`; axes that are neither equatorial nor Galactic are refused."""
@@ -229,9 +205,9 @@ class ImageHeader(MapHeader):
         units = [str(header.get(f"CUNIT{k}") or header.get("CUNIT1")).strip() for k in (1, 2)]
         for k, written in enumerate(units, 1):
             if written not in ANGLES:
-                raise self._no_angle(f"CUNIT{k}", written)
+                raise self.no_angle(f"CUNIT{k}", written)
         sides = np.linalg.norm(self._wcs(header)[1], axis=0)
-        sides = np.degrees(sides * [ANGLES[written].to("rad") for written in units])
+        sides = np.degrees(sides * [u.Unit(ANGLES[written]).to("rad") for written in units])
         self.check_sides(sides, "check CDELT1 and CDELT2")
         return np.asarray(sides)
 
@@ -247,10 +223,6 @@ def rescaled(wcs: Any, matrix: Floats) -> Any:
     made.wcs.pc = matrix
     made.wcs.set()
     return made
-
-
-def _celestial(header: Any, axis: str) -> bool:
-    return is_celestial(str(header.get(f"CTYPE{axis}", "")))
 
 
 def is_plain_tan(wcs: Any) -> bool:
