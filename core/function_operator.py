@@ -12,6 +12,7 @@ import traceback
 import warnings
 import zlib
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, Literal, cast, overload
 
 import numpy as np
@@ -90,7 +91,11 @@ class FunctionOperator(Operator):
 
     def _act(self, block: Block) -> None:
         """See `exec`."""
-        before = {name: _bits(block.detdata[name]) for name in self.provides & block.detdata.keys()}
+
+        def bits() -> dict[str, int]:
+            return {k: _bits(block.detdata[k]) for k in self.provides & block.detdata.keys()}
+
+        before = bits()
         try:
             made = self._call(block)
         except (ZondaError, MemoryError):
@@ -104,36 +109,21 @@ class FunctionOperator(Operator):
             raise PipelineError(
                 text, place=self.label, cure=f"mend it: {_where(err) or self.source}"
             ) from err
+        self._idle = self._idle is not False and made is None and before == bits()
         if made is None:
-            after = {
-                name: _bits(block.detdata[name]) for name in self.provides & block.detdata.keys()
-            }
-            if before != after:
-                self._idle = False
-            elif self._idle is None:
-                self._idle = True
             return
-        self._idle = False
-        values = np.asarray(made)
-        if len(self.provides) != 1 or values.dtype.kind not in "fiu" or values.shape != block.shape:
-            what = (
-                f"an array of shape {values.shape}"
-                if values.dtype.kind in "fiu"
-                else f"{made!r:.40}"
-            )
-            wanted = (
-                f"nothing: it provides {len(self.provides) or 'no'} streams; several stand in"
-                " block.detdata"
-            )
-            if len(self.provides) == 1:
-                wanted = (
-                    f"nothing, or the stream {next(iter(self.provides))}, an array of shape"
-                    f" {block.shape}"
-                )
+        values, only = np.asarray(made), len(self.provides) == 1
+        numbers, name = values.dtype.kind in "fiu", next(iter(self.provides), "")
+        if not only or not numbers or values.shape != block.shape:
+            what = f"an array of shape {values.shape}" if numbers else f"{made!r:.40}"
+            wanted = f", or the stream {name}, an array of shape {block.shape}"
+            if not only:
+                number = len(self.provides) or "no"
+                wanted = f": it provides {number} streams; several stand in block.detdata"
             raise PipelineError(
-                f"the function returned {what}", place=self.label, cure=f"return {wanted}"
+                f"the function returned {what}", place=self.label, cure=f"return nothing{wanted}"
             )
-        block.new(next(iter(self.provides)), zero=False)[...] = values
+        block.new(name, zero=False)[...] = values
 
 
 EMISSION = "atmosphere"
@@ -200,30 +190,20 @@ def operator(
         return lambda made: operator(
             made, name=name, requires=requires, provides=provides, couples=couples, linear=linear
         )
-    place = "zonda.operator"
+    refused = partial(PipelineError, place="zonda.operator")
     if not callable(function) or isinstance(function, type | Operator):
-        raise PipelineError(
-            f"expected a function of a block, got {function!r:.60}",
-            place=place,
-            cure="write lambda block: ...",
-        )
+        text = f"expected a function of a block, got {function!r:.60}"
+        raise refused(text, cure="write lambda block: ...")
     for what, names in (("requires", requires), ("provides", provides)):
         if isinstance(names, str) or not all(isinstance(one, str) for one in names):
-            raise PipelineError(
-                f"{what} is a list of names, not {names!r:.60}",
-                place=place,
-                cure=f"write {what}=['signal']",
-            )
+            text = f"{what} is a list of names, not {names!r:.60}"
+            raise refused(text, cure=f"write {what}=['signal']")
     if couples not in ("sample", "detectors", "time", "all"):
         cure = "choose from 'sample', 'detectors', 'time', 'all'"
-        raise PipelineError(f"a function cannot couple {couples!r:.40}", place=place, cure=cure)
+        raise refused(f"a function cannot couple {couples!r:.40}", cure=cure)
     if couples == "all" and (len(set(requires)) != 1 or not set(provides) <= set(requires)):
-        cure = "write requires=['signal'], and the same or nothing as provides"
-        raise PipelineError(
-            "a function of a whole scan reads one stream, and provides that or nothing",
-            place=place,
-            cure=cure,
-        )
+        text = "a function of a whole scan reads one stream, and provides that or nothing"
+        raise refused(text, cure="write requires=['signal'], and the same or nothing as provides")
     own = getattr(function, "__name__", type(function).__name__)
     label = name or ("function" if own == "<lambda>" else own)
     given = {
