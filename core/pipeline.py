@@ -103,8 +103,9 @@ class Pipeline:
             cures = dict.fromkeys(p.cure for p in problems if p.cure)
             raise PipelineError("\n".join(lines), place=self.name, cure="\n".join(cures))
         self._pointed: list[Band] = []
-        self._asked = arguments.runs(runs, name)
-        self.signals = Signals(self.operators, self._asked, self.only, self.name)
+        self.asked = arguments.runs(runs, name)
+        """The signals beside the complete one that were asked for, by name."""
+        self.signals = Signals(self.operators, self.asked, self.only, self.name)
 
     @property
     def runs(self) -> dict[str, Signal]:

@@ -30,6 +30,8 @@ _WHERE = {
     "load": "zonda.core.configuration.pipeline_file",
     "plan": "zonda.core.plan.planner",
     "campaign": "zonda.core.campaign.function",
+    "Variant": "zonda.core.experiment.variant",
+    "Experiment": "zonda.core.experiment.experiment",
     "measure": "zonda.core.figures",
     "sensitivity": "zonda.plugins.forecast.sensitivity",
     "hookimpl": "zonda.core.hooks",
@@ -91,6 +93,8 @@ if TYPE_CHECKING:
     from zonda.core.data import Data as Data
     from zonda.core.data import Observation as Observation
     from zonda.core.errors import ZondaError as ZondaError
+    from zonda.core.experiment.experiment import Experiment as Experiment
+    from zonda.core.experiment.variant import Variant as Variant
     from zonda.core.figures import Figure as Figure
     from zonda.core.figures import FigureMetric as FigureMetric
     from zonda.core.figures import measure as measure

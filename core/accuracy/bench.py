@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from ..errors import InputError, ZondaError
-from ..experiment.variant import Variant
+from ..experiment.variant import FileVariant
 from .measure import TimedRun
 from .metrics import Metric
 from .settings import Setting, overrides
@@ -69,10 +69,10 @@ class Setup:
                 cure="e.g. 1 %",
             )
 
-    def variant(self, setting: Setting) -> Variant:
+    def variant(self, setting: Setting) -> FileVariant:
         """The pipeline with a setting applied."""
         given = (*self.settings, *overrides(self.shorter), *overrides(setting))
-        return Variant(self.pipeline, given)
+        return FileVariant(self.pipeline, given)
 
 
 @dataclass

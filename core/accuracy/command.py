@@ -126,8 +126,8 @@ def accuracy(
     it with the Pareto front found so far.
     """
     from ..campaign.campaign_file import plural
-    from ..campaign.engines import engine
     from ..configuration.pipeline_file import load
+    from ..experiment.engines import engine
     from .bench import Setup
     from .metrics import get
     from .settings import knobs_of, shortened

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ..errors import InputError
-from ..experiment.variant import Variant
+from ..experiment.variant import FileVariant
 from ..output import Output
 from ..plan.planning import planning_of
 from ..storage.files import write_text
@@ -276,7 +276,9 @@ def achieved(
     measures.check(file.operators, file.runs)
 
     def found(given: Sequence[str]) -> Any:
-        return measures.measure(Variant(pipeline, tuple(given)).run([measures], threads=threads))
+        return measures.measure(
+            FileVariant(pipeline, tuple(given)).run([measures], threads=threads)
+        )
 
     added = len(measures.steps(list(file.operators))) > len(file.operators)
     enough = data is not None and not added and not measures.signals(file.runs)
@@ -304,7 +306,7 @@ def retest(
     base = (*overrides(front.shorter), f"seed={front.seed}")
 
     def found(setting: dict[str, str]) -> Any:
-        variant = Variant(pipeline, (*base, *overrides(setting)))
+        variant = FileVariant(pipeline, (*base, *overrides(setting)))
         return metric.measure(variant.run([metric], threads=1))
 
     reference = found(front.reference)

@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import ZondaError
-from ..experiment.variant import Variant, run_file, steps_for
+from ..experiment.variant import FileVariant
 from ..faults import faults_named
 
 if TYPE_CHECKING:
-    from ..campaign.engines import Pool
     from ..data import Data
+    from ..experiment.engines import Pool
 
 REST = "(rest)"
 """CPU seconds that no operator's stage accounts for."""
@@ -61,7 +61,7 @@ class TimedRun:
         return sum(self.steps.values())
 
 
-def run_in(pool: Pool, variant: Variant, *how: Any) -> TimedRun:
+def run_in(pool: Pool, variant: FileVariant, *how: Any) -> TimedRun:
     """Make a `timed_run` in the process of a pool.
 
     Raises `ZondaError` as the run does, or where the process dies; another one takes its place.
@@ -83,7 +83,7 @@ _warm = False
 
 
 def timed_run(
-    variant: Variant, metric: str, threads: int | None, seed: int | None, alone: bool
+    variant: FileVariant, metric: str, threads: int | None, seed: int | None, alone: bool
 ) -> TimedRun:
     """Run a variant in this process.
 
@@ -103,10 +103,10 @@ def timed_run(
         measures = metric_of(variant.file, metric)
 
         def run() -> tuple[Data, float]:
-            start, file = time.process_time(), replace(variant).file
-            own = steps_for(file, [measures]) if alone else None
+            start, own = time.process_time(), replace(variant).variant
+            steps = own.steps([measures]) if alone else None
             added = () if alone else [measures]
-            data = run_file(file, added, operators=own, seed=seed, threads=threads)
+            data = own.run(added, operators=steps, seed=seed, threads=threads)
             return data, time.process_time() - start
 
         first = run()[1] if alone and not _warm else 0.0
@@ -118,8 +118,8 @@ def timed_run(
             if not (alone and compiled.buffer):
                 break
             del data
-        memory, own = peak_memory(), steps_for(variant.file, [measures])
-        adds = measures.signals(variant.file.runs) or len(measures.steps(list(own))) > len(own)
+        memory, own = peak_memory(), variant.variant.steps([measures])
+        adds = measures.signals(variant.file.runs) or len(measures.steps(own)) > len(own)
         found = None if alone and adds else measures.measure(data)
         return TimedRun(found, by_step(data, seconds), memory, first)
 

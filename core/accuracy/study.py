@@ -17,8 +17,8 @@ from .settings import PipelineKnob
 from .sweep import Sweep, sweep, tightest
 
 if TYPE_CHECKING:
-    from ..campaign.engines import Pool
     from ..configuration.pipeline_file import PipelineFile
+    from ..experiment.engines import Pool
 
 
 JOINT = 40

@@ -16,8 +16,8 @@ from ..command_types import on_engine
 
 if TYPE_CHECKING:
     from ..command_types import RunRequest
+    from ..experiment.engines import Pool
     from .campaign_file import Job, Task
-    from .engines import Pool
     from .folder import TaskRow
     from .prepare import CampaignFile
     from .settings import Campaign
@@ -112,10 +112,10 @@ def status(folder: Path, listed: bool, as_json: bool) -> None:
 
 def source(pipeline: str, settings: tuple[str, ...], several: bool) -> CampaignFile:
     """A pipeline file as part of a campaign, with the knobs that its ``accuracy`` asks for."""
-    from ..experiment import Variant
+    from ..experiment.variant import FileVariant
     from .prepare import CampaignFile
 
-    variant = Variant(pipeline, settings)
+    variant = FileVariant(pipeline, settings)
     if (target := variant.file.header.accuracy) is not None:
         from ..accuracy.fronts import settings_for
 
@@ -130,8 +130,8 @@ def _working(campaign: Campaign, folder: Path, given: Any) -> Iterator[Pool]:
     """An engine as the options say (``given``, `on_engine`), else as the campaign does. A worker
     of MPI ends here when it has done its part.
     """
+    from ..experiment.engines import engine
     from ..storage.files import check_output_folder
-    from .engines import engine
 
     name = given.engine or ("dask" if given.scheduler else campaign.engine)
     dask = name == "dask"

@@ -24,7 +24,8 @@ from ..configuration.files import InMemory
 from ..configuration.loaded import PipelineFile, Step
 from ..configuration.parameters import Parameters
 from ..errors import PipelineError, ZondaError
-from ..experiment import Variant
+from ..experiment.engines import engine
+from ..experiment.variant import FileVariant
 from ..operator import Operator
 from ..output import Output, may_write
 from ..pipeline import Pipeline
@@ -34,7 +35,6 @@ from ..storage.files import check_output_folder, product_path
 from ..storage.lock import lock
 from . import run
 from .campaign_file import FILE, INPUTS, Job
-from .engines import engine
 from .folder import check_free
 from .prepare import CampaignFile, Pruning
 from .section import CampaignHeader
@@ -224,7 +224,7 @@ def _source(
     )
     named = {"site": _named(scene.site, sites), "instrument": _named(scene.instrument, instruments)}
     text = PipelineFile(header, named, tuple(map(Step, keys, steps)), PLACE, scene).resolved_yaml()
-    variant = Variant(PLACE, text=text)
+    variant = FileVariant(PLACE, text=text)
     file = variant.file
     pairs = [
         ("the scene", scene, file.scene()),

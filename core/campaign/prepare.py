@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..configuration.files import paths_in
 from ..errors import InputError, within
-from ..experiment import Variant
+from ..experiment.variant import FileVariant
 from ..scene import WithScene
 from ..storage.files import product_path
 from . import parts
@@ -43,7 +43,7 @@ class CampaignFile:
     further variants.
     """
 
-    variant: Variant
+    variant: FileVariant
     name: str = ""
     """Folder of its products where there are several files, else ''."""
 

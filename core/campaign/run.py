@@ -7,10 +7,10 @@ from pathlib import Path
 
 from .. import hooks
 from ..errors import InputError, OutputError, PipelineError, ZondaError
+from ..experiment.engines import Pool, share_out
 from ..storage.files import check_output_folder
 from . import parts, table
 from .campaign_file import FILE, Job, Say, Task, digest_of_text, layout_path, plural
-from .engines import Pool, share_out
 from .folder import (
     RESOLVED,
     Record,
@@ -172,7 +172,7 @@ def _work(record: Record, pool: Pool, watch: Watch, tasks: Sequence[Task]) -> Ca
         _tell(result, watch.say)
     incomplete = {task.combination for task in job.tasks if task.number not in record.done}
     ready = [n for n in range(len(job.combinations)) if n not in incomplete | set(record.combined)]
-    Combinations(record, result, pool).run(ready)
+    Combinations(record, result, pool).carry_out(ready)
     clean(folder)  # of workers that were killed while they wrote
     _fail(result, len(job.tasks))
     if missing := len(job.tasks) - len(record.done):

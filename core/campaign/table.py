@@ -17,7 +17,7 @@ import numpy as np
 
 from ..canvas import SEQUENCE, new_axes
 from ..configuration.units import factor_to
-from ..experiment import Values
+from ..experiment.experiment import Values
 from ..storage.files import atomic_path, write_text
 from ..tables import Table, render
 

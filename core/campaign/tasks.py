@@ -26,14 +26,15 @@ from zonda import __version__
 from .. import hooks
 from ..data import Data
 from ..errors import InputError, OutputError, PipelineError, PointingError, ZondaError
+from ..experiment.engines import Pool
+from ..experiment.experiment import Lost, Work
+from ..experiment.variant import Variant
 from ..faults import faults_named
 from ..figures import Figures
 from ..pipeline import Part
 from ..storage.files import check_output_folder, discard
 from . import machines, parts
-from .calls import Lost, Work
 from .campaign_file import Job, PlannedEntry, Task, layout_path, plural
-from .engines import Pool, engine_failed
 from .folder import Record, clean
 from .machines import Watch
 from .partial import NotCombined, Partial
@@ -121,11 +122,12 @@ def perform(order: Order) -> Outcome:
 def _run(order: Order, host: str, begin: float) -> tuple[float, str]:
     """Write the product of a task; wall time since ``begin``, and the machine."""
     task, folder, file = order.task, order.folder, pipeline_of(order.pipeline, order.folder)
+    variant = Variant(file.pipeline(), order.entry.scene(file))
     layouts = layouts_in(layout_path(folder, task.combination), order.layout)
     part = Part(task.scans, layouts, f"{task.entry:06d}-")
-    data = file.pipeline().run_part(
-        order.entry.scene(file),
-        part,
+    data = variant.run(
+        operators=variant.pipeline.operators,
+        part=part,
         output=folder / "entries" / f"{task.entry:06d}",  # the time streams of one entry together
         threads=order.threads,
         ceiling=order.memory,
@@ -257,8 +259,8 @@ class Tasks(Work[Task, Outcome]):
     """The tasks of a campaign. ``watch`` compares the machines that they run on."""
 
     def __init__(self, record: Record, pool: Pool, watch: Watch) -> None:
-        super().__init__(record.folder, pool)
-        self.job, self.record, self.watch = record.job, record, watch
+        super().__init__(pool, str(record.folder), f"zonda resume {record.folder}")
+        self.folder, self.job, self.record, self.watch = record.folder, record.job, record, watch
         self.result = CampaignResult(record.folder)
         self._failures = 0
 
@@ -330,15 +332,9 @@ class Combinations(Work[int, Combined]):
     """
 
     def __init__(self, record: Record, result: CampaignResult, pool: Pool) -> None:
-        super().__init__(record.folder, pool)
-        self.job, self.record, self.result = record.job, record, result
-        self._error: Exception | None = None
-
-    def run(self, numbers: Sequence[int]) -> None:
-        """Combine these. Raises the first error, when what was at work has ended."""
-        self.carry_out(numbers)
-        if self._error is not None:
-            raise self._error
+        cure, retries = f"zonda resume {record.folder}", record.job.retries
+        super().__init__(pool, str(record.folder), cure, retries)
+        self.folder, self.job, self.record, self.result = record.folder, record.job, record, result
 
     def call(self, item: int) -> tuple[Callable[..., Combined], Path, int]:
         """See `Work.call`."""
@@ -346,21 +342,11 @@ class Combinations(Work[int, Combined]):
 
     def ended(self, item: int, result: Combined | Lost) -> bool:
         """Record that products are written, and remove their parts."""
-        if not isinstance(result, Lost):
-            self.record.combine(item, result.figures)
-            name = self.job.combinations[item].name
-            self.result.log += [(name, *row) for row in result.log]
-            if not self.job.keep_tasks:
-                self.record.discard_parts(item)
-            return False
-        error = result.error
-        if engine_failed(error):
-            if self.attempts[item] <= self.job.retries:
-                return True
-            error = PipelineError(
-                f"the engine failed when it combined the maps: {result}",
-                place=str(self.folder),
-                cure=f"zonda resume {self.folder}",
-            )
-        self._error, self.stop = self._error or error, True
+        if isinstance(result, Lost):
+            return self.again(item, result)
+        self.record.combine(item, result.figures)
+        name = self.job.combinations[item].name
+        self.result.log += [(name, *row) for row in result.log]
+        if not self.job.keep_tasks:
+            self.record.discard_parts(item)
         return False

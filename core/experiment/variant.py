@@ -1,4 +1,4 @@
-"""A pipeline file with some of its values changed, and a run of it at a seed."""
+"""A pipeline and its scene, or a pipeline file with some of its values changed; and a run of it."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..configuration.files import paths_in
+from ..output import Output
+from ..pipeline import Part, Pipeline
+from ..scene import Scene
 
 if TYPE_CHECKING:
     from ..accuracy.metrics import Metric
@@ -22,9 +25,83 @@ if TYPE_CHECKING:
     from ..operator import Operator
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Variant:
-    """A pipeline with changed values.
+    """A pipeline, and the scene that it observes.
+
+    Attributes
+    ----------
+    name
+        Shown for it; the pipeline's own name where it is empty.
+    keep
+        Streams that metrics read, as for `Pipeline.run`.
+    """
+
+    pipeline: Pipeline
+    scene: Scene
+    name: str = ""
+    keep: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return self.name or self.pipeline.name
+
+    @property
+    def variant(self) -> Variant:
+        """Itself, as a `FileVariant` has one."""
+        return self
+
+    def steps(self, metrics: Sequence[Metric]) -> list[Operator]:
+        """The steps without what acts at the end, but for those whose products metrics read."""
+        read = frozenset[str]().union(*(getattr(metric, "reads", ()) for metric in metrics))
+        whole = any(metric.needs_end for metric in metrics)
+        every = self.pipeline.operators
+        return [o for o in every if whole or not isinstance(o, Output) or o.provides & read]
+
+    def run(
+        self,
+        metrics: Sequence[Metric] = (),
+        *,
+        seed: int | None = None,
+        operators: Sequence[Operator] | None = None,
+        output: Path | None = None,
+        part: Part | None = None,
+        **how: Any,
+    ) -> Data:
+        """Run it with the steps and signals that metrics need beside its own.
+
+        Parameters
+        ----------
+        seed
+            That of the scene; None: the variant's.
+        operators
+            Steps in place of the pipeline's; None: `steps` for the metrics.
+        output
+            Folder of products; None: one that is gone afterwards.
+        part
+            Some of the scans, whose products stay unfinished: `Pipeline.run_part`.
+        how
+            Further arguments of `Pipeline.run`.
+        """
+        whole, scene = self.pipeline, self.scene
+        steps, runs = list(self.steps(metrics) if operators is None else operators), whole.asked
+        for number, metric in enumerate(metrics):
+            steps = metric.steps(steps)
+            for name, signal in metric.signals(whole.asked).items():
+                runs = {**runs, (name if name not in runs else f"{name}_{number}"): signal}
+        about = {"name": whole.name, "description": whole.description}
+        pipeline = Pipeline(steps, runs=runs, only=whole.only, precision=whole.precision, **about)
+        if seed is not None:
+            scene = scene.model_copy(update={"seed": seed})
+        folder = nullcontext(output) if output else tempfile.TemporaryDirectory(prefix="zonda-run-")
+        with folder as place:
+            if part is not None:
+                return pipeline.run_part(scene, part, output=place, **how)
+            return pipeline.run(scene, output=place, keep=self.keep, **how)
+
+
+@dataclass(frozen=True)
+class FileVariant:
+    """A pipeline file with changed values; it is read where it is needed, also in workers.
 
     Attributes
     ----------
@@ -42,9 +119,9 @@ class Variant:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave the file that was read out of the pickle."""
-        return Variant, (self.pipeline, self.overrides, self.text)
+        return FileVariant, (self.pipeline, self.overrides, self.text)
 
-    def changed(self, overrides: Sequence[str]) -> Variant:
+    def changed(self, overrides: Sequence[str]) -> FileVariant:
         """The variant with further changes."""
         return replace(self, overrides=(*self.overrides, *overrides))
 
@@ -59,6 +136,11 @@ class Variant:
         if self.text is None:
             return load(self.pipeline, self.overrides)
         return parse(self.text, name=str(self.pipeline), overrides=self.overrides)
+
+    @property
+    def variant(self) -> Variant:
+        """Pipeline and scene of the file."""
+        return Variant(self.file.pipeline(), self.file.scene(), str(self))
 
     @cached_property
     def key(self) -> str:
@@ -78,54 +160,5 @@ class Variant:
         return found.hexdigest()
 
     def run(self, metrics: Sequence[Metric] = (), **how: Any) -> Data:
-        """Run the variant; ``how`` are the arguments of `run_file`."""
-        return run_file(self.file, metrics, **how)
-
-
-def run_file(
-    file: PipelineFile,
-    metrics: Sequence[Metric] = (),
-    *,
-    seed: int | None = None,
-    operators: Sequence[Operator] | None = None,
-    threads: int | None = None,
-    output: Path | None = None,
-) -> Data:
-    """Run a pipeline file with the steps and signals that metrics need beside its own.
-
-    Parameters
-    ----------
-    seed
-        That of the scene; None: the file's.
-    operators
-        Steps in place of the file's; None: `steps_for` the metrics.
-    output
-        Folder of products; None: one that is gone afterwards.
-    """
-    from ..pipeline import Pipeline
-
-    steps, runs = list(steps_for(file, metrics) if operators is None else operators), file.runs
-    for number, metric in enumerate(metrics):
-        steps = metric.steps(steps)
-        for name, signal in metric.signals(file.runs).items():
-            runs = {**runs, (name if name not in runs else f"{name}_{number}"): signal}
-    header, scene = file.header, file.scene()
-    pipeline = Pipeline(
-        steps, runs=runs, only=header.only, name=header.name, precision=header.precision
-    )
-    if seed is not None:
-        scene = scene.model_copy(update={"seed": seed})
-    folder = nullcontext(output) if output else tempfile.TemporaryDirectory(prefix="zonda-run-")
-    with folder as place:
-        return pipeline.run(scene, output=place, threads=threads)
-
-
-def steps_for(file: PipelineFile, metrics: Sequence[Metric]) -> list[Operator]:
-    """The steps of a file without what acts at its end, but for those whose products metrics
-    read.
-    """
-    from ..output import Output
-
-    read = frozenset[str]().union(*(getattr(metric, "reads", ()) for metric in metrics))
-    whole = any(metric.needs_end for metric in metrics)
-    return [o for o in file.operators if whole or not isinstance(o, Output) or o.provides & read]
+        """Run the variant; the arguments are those of `Variant.run`."""
+        return self.variant.run(metrics, **how)

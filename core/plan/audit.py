@@ -28,8 +28,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..accuracy.metrics import Metric
 from ..configuration.pipeline_file import PipelineFile
+from ..data import Data
 from ..errors import PipelineError
+from ..experiment.experiment import AnyVariant, Experiment
+from ..experiment.variant import Variant
 from ..mapmaker import made_by
 from ..signal import Signal
 from ..tables import aligned
@@ -223,21 +227,29 @@ def audit(
         return Audit(tuple(rows), words)
     stated = {d.name: d for d in plan.decided}
     same = [s for d in chosen if (s := _on_slice(d, stated)) is not None]
-    reference = _run(_with_sky_given(planned()), threads)
-    for d in same:
-        rows += _compare(d.name, d.choice, reference, _run(planned(d), threads), plan.context)
-    if fewer != whole and reference.map is not None:
-        bare = _Result([], _run(planned(structure=fewer), threads).map)
+    reference = _variant(_with_sky_given(planned()))
+    others: dict[AnyVariant, Choice] = {_variant(planned(d), d.name): d.choice for d in same}
+    if fewer != whole:
         nothing = Choice("dropped", "what no output depends on", bound={"map_rms": 0.0})
-        rows += _compare("structure", nothing, reference, bare, plan.context)
+        others[_variant(planned(structure=fewer), "structure")] = nothing
     if len(same) > 1:
         bound: dict[str, float] = {}
         for d in same:
             # what is bounded for the sky alone is in the stream and the map too
             sky = d.choice.bound.get("peak", 0.0)
             bound = add(bound, {"tod": sky, "map_rms": sky, **d.choice.bound})
-        result, together = _run(planned(*same), threads), Choice("coarse", "", bound=bound)
-        rows += _compare("all together", together, reference, result, plan.context)
+        others[_variant(planned(*same), "all together")] = Choice("coarse", "", bound=bound)
+    full: list[_Result] = []
+
+    def take(variant: AnyVariant, number: int, found: Mapping[str, _Result]) -> None:
+        (result,) = found.values()
+        if variant is reference:
+            full.append(result)
+        else:
+            choice = others[variant]
+            rows.extend(_compare(str(variant), choice, full[0], result, plan.context))
+
+    Experiment([reference, *others], 1, [_StreamsAndMaps()], threads=threads).run(take=take)
     return Audit(tuple(rows), words)
 
 
@@ -256,7 +268,7 @@ def _noise(part: PipelineFile, made: Plan, threads: int | None) -> list[Checked]
     runs |= {"air": Signal(only=air, filters="none")} if air else {}
     part = dataclasses.replace(part, header=part.header.model_copy(update={"runs": runs}))
     try:
-        products = part.pipeline().run(part.scene(), threads=threads).products
+        products = Variant(part.pipeline(), part.scene()).run(threads=threads).products
     except PipelineError as err:
         if "too large for the map's fixed-point sums" not in err.message:
             raise
@@ -308,16 +320,23 @@ class _Result:
     own: Any = None
 
 
-def _run(file: PipelineFile, threads: int | None) -> _Result:
+class _StreamsAndMaps(Metric):
+    """Streams and maps of a run."""
+
+    def measure(self, data: Data) -> _Result:
+        signal = [
+            np.asarray(o.detdata["signal"][o.good_detectors][:, o.good_samples], np.float64)
+            for o in data.observations
+            if "signal" in o.detdata
+        ]
+        runs = ("", "sky_alone/", f"{GIVEN}/", "sky_with_own_modes/")
+        return _Result(signal, *(_map_of(data.products, run) for run in runs))
+
+
+def _variant(file: PipelineFile, name: str = "") -> Variant:
+    """The variant that a file is, whose signal is kept if it makes one."""
     made = any("signal" in s.operator.provides for s in file.steps)
-    data = file.pipeline().run(file.scene(), threads=threads, keep=["signal"] if made else ())
-    signal = [
-        np.asarray(o.detdata["signal"][o.good_detectors][:, o.good_samples], np.float64)
-        for o in data.observations
-        if "signal" in o.detdata
-    ]
-    runs = ("", "sky_alone/", f"{GIVEN}/", "sky_with_own_modes/")
-    return _Result(signal, *(_map_of(data.products, run) for run in runs))
+    return Variant(file.pipeline(), file.scene(), name, ("signal",) if made else ())
 
 
 def _map_of(products: Mapping[str, Any], run: str) -> Any:

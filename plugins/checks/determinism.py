@@ -12,6 +12,7 @@ import numpy as np
 
 from zonda.core.checks import Family
 from zonda.core.data import Data
+from zonda.core.experiment.variant import Variant
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
@@ -47,7 +48,8 @@ def steps(*, filters: bool = True) -> list[Operator]:
 
 
 def _run(threads: int = 1, memory: int = 1 << 30, *, filters: bool = True) -> Data:
-    return Pipeline(steps(filters=filters)).run(scene(camera(37)), threads=threads, memory=memory)
+    variant = Variant(Pipeline(steps(filters=filters)), scene(camera(37)))
+    return variant.run(threads=threads, memory=memory)
 
 
 @cache

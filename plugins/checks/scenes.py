@@ -14,6 +14,7 @@ from pydantic import PrivateAttr
 
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Block, Data, Observation
+from zonda.core.experiment.variant import Variant
 from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.numerics.quaternions import from_angles
 from zonda.core.operator import Operator
@@ -138,9 +139,9 @@ def run(
     points, gives = Points(), Gives()
     points._observation, gives._signal = observation, signal
     steps = [points, *([gives] if signal is not None else []), *operators]
-    return Pipeline(steps, precision=precision).run(
-        scene(observation.instrument), keep=keep, **{"threads": 1, **settings}
-    )
+    pipeline = Pipeline(steps, precision=precision)
+    variant = Variant(pipeline, scene(observation.instrument), keep=keep)
+    return variant.run(operators=pipeline.operators, **{"threads": 1, **settings})
 
 
 @contextmanager

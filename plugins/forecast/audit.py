@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -10,10 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zonda.core.accuracy.metrics import Metric
+from zonda.core.data import Data
 from zonda.core.errors import InputError
-from zonda.core.experiment import run_file
+from zonda.core.experiment.experiment import Experiment
+from zonda.core.experiment.variant import Variant
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.pipeline import Pipeline
 from zonda.core.signal import product_name, stream_of
 from zonda.core.tables import aligned
 from zonda.operators.maps.bin_map import BinMap
@@ -115,9 +118,12 @@ def audit(
             f"{seeds} simulation has no standard error", place="--audit", cure="ask for 2 or more"
         )
     every = list(dict.fromkeys(p for f in forecasts.values() for p in f.parts("I")))
-    made = [
-        _maps(file, every, list(forecasts), file.scene().seed + k, threads) for k in range(seeds)
-    ]
+    first, made = file.scene().seed, list[dict[str, dict[str, MapProduct]]]()
+    variant = _signals(file, every)
+    name = next(o.product for o in variant.pipeline.operators if isinstance(o, BinMap))
+    metrics = [_Maps(every, list(forecasts), name)]
+    experiment = Experiment([variant], range(first, first + seeds), metrics, threads=threads)
+    experiment.run(take=lambda _, number, found: made.extend(found.values()))
     return {band: _audited(of, [one[band] for one in made]) for band, of in forecasts.items()}
 
 
@@ -151,31 +157,36 @@ def _audited(of: Forecasted, made: list[dict[str, MapProduct]]) -> Audited:
     return Audited(tuple(rows))
 
 
-def _maps(
-    file: PipelineFile, parts: Sequence[str], bands: Sequence[str], seed: int, threads: int | None
-) -> dict[str, dict[str, MapProduct]]:
-    """Maps of each part, and of the total noise, by band."""
+def _signals(file: PipelineFile, parts: Sequence[str]) -> Variant:
+    """The pipeline with a signal of each part of the noise."""
     operators = [
         o.model_copy(update={"smooth": None, "half_difference": False})
         if isinstance(o, BinMap)
         else o
         for o in steps_of(file).operators
     ]
-    runs = (
-        {f"only_{COMPONENTS[p]}": {"only": [COMPONENTS[p]], "modes": "full"} for p in parts}
+    runs = {
+        f"only_{COMPONENTS[p]}": {"only": [COMPONENTS[p]], "modes": "full"}
+        for p in parts
         if len(parts) > 1
-        else {}
-    )
-    header = file.header.model_copy(update={"runs": runs, "only": []})
-    bare = dataclasses.replace(file, header=header)
-    products = run_file(bare, seed=seed, operators=operators, threads=threads).products
-    name = next(o.product for o in operators if isinstance(o, BinMap))
-    found = {}
-    for band in bands:
-        plain = f"{name}_{band}" if band else name
-        found[band] = {
-            p: products[product_name(stream_of(f"only_{COMPONENTS[p]}"), plain) if runs else plain]
-            for p in parts
-        }
-        found[band][TOGETHER] = products[plain]
-    return found
+    }
+    header = file.header
+    pipeline = Pipeline(operators, runs=runs, name=header.name, precision=header.precision)
+    return Variant(pipeline, file.scene())
+
+
+class _Maps(Metric):
+    """Maps of each part, and of the total noise, by band ("" where there is one)."""
+
+    def __init__(self, parts: Sequence[str], bands: Sequence[str], name: str) -> None:
+        self.parts, self.bands, self.name = parts, bands, name
+
+    def measure(self, data: Data) -> dict[str, dict[str, MapProduct]]:
+        found = {}
+        for band in self.bands:
+            plain = f"{self.name}_{band}" if band else self.name
+            found[band] = {TOGETHER: data.products[plain]}
+            for part in self.parts:
+                name = product_name(stream_of(f"only_{COMPONENTS[part]}"), plain)
+                found[band][part] = data.products[name if len(self.parts) > 1 else plain]
+        return found

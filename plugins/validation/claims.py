@@ -16,7 +16,7 @@ from zonda.core.configuration.locate import read as read_text
 from zonda.core.configuration.parameters import Parameters
 from zonda.core.configuration.steps import Mistakes
 from zonda.core.configuration.yaml_places import Source, Span
-from zonda.core.experiment import Values
+from zonda.core.experiment.experiment import Values
 
 from .calculations import Amount, Calculation
 from .verdict import Of, Relation, Stated, clears, compare

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from zonda.core.experiment import Values
+    from zonda.core.experiment.experiment import Values
 
     from .rows import CounterResult, Row
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from zonda import __version__
-from zonda.core.experiment import Values
+from zonda.core.experiment.experiment import Values
 from zonda.core.storage.files import atomic_path, write_text
 from zonda.core.tables import Table, render
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zonda.core.errors import within
-from zonda.core.experiment import Values
+from zonda.core.experiment.experiment import Values
 from zonda.core.storage.files import check_output_folder
 
 from .calculations import Amount

@@ -10,11 +10,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from zonda.core import experiment as core
 from zonda.core.campaign.entries import setting
 from zonda.core.configuration.locate import locate
 from zonda.core.errors import InputError, ZondaError
-from zonda.core.experiment import Values
+from zonda.core.experiment.experiment import SECONDS, Values
+from zonda.core.experiment.experiment import Experiment as Tasks
+from zonda.core.experiment.variant import FileVariant
 from zonda.core.figures import Choice
 from zonda.core.registry import operators
 from zonda.core.storage.files import atomic_path, write_text
@@ -71,7 +72,7 @@ class Runs:
 
     def __init__(self, folder: Path, base: Path, say: Say = lambda text: None) -> None:
         self.folder, self.base, self.say = folder, base, say
-        self.experiment = core.Experiment(folder, say)
+        self.experiment = Tasks(folder=folder, say=say)
 
     def want(self, experiment: Experiment) -> None:
         """Note what an experiment needs. Raises `ZondaError` for a pipeline, key or metric that
@@ -87,13 +88,13 @@ class Runs:
         if experiment.calculate is not None:
             return Values((experiment.calculate.value,))
         choice, seeds = self._choice(experiment), experiment.seeds or 1
-        name = choice.name if choice else core.SECONDS
-        columns = [self.experiment.values(v, name, seeds) for v in self._variants(experiment)]
-        single = [[value for value, _ in column] for column in columns]
-        error = columns[0][0][1] if seeds == 1 and experiment.statistic is None else 0.0
+        name = choice.name if choice else SECONDS
+        columns = [self.experiment.figures(v, name)[:seeds] for v in self._variants(experiment)]
+        single = [[figure.value for figure in column] for column in columns]
+        error = columns[0][0].error if seeds == 1 and experiment.statistic is None else 0.0
         return Values(*combined(experiment.statistic, single, error if error == error else 0.0))
 
-    def pictured(self, claim: Claim) -> core.Variant:
+    def pictured(self, claim: Claim) -> FileVariant:
         """The variant that a claim's pictures show: its own first run, or the pipeline that
         `pictures` names. Raises `ZondaError`.
         """
@@ -102,7 +103,7 @@ class Runs:
         )
         return self._variants(claim.model_copy(update=named))[0]
 
-    def draw(self, variant: core.Variant, folder: Path) -> None:
+    def draw(self, variant: FileVariant, folder: Path) -> None:
         """Write the PNG files of a variant's first realization to a folder, unless they are there;
         those of one run are copied.
         """
@@ -132,7 +133,7 @@ class Runs:
 
     def _choice(self, experiment: Experiment) -> Choice | None:
         """The metric of an experiment; None: the seconds of a run."""
-        if experiment.metric == core.SECONDS:
+        if experiment.metric == SECONDS:
             return None
         from pydantic_core import PydanticCustomError
 
@@ -143,13 +144,13 @@ class Runs:
                 err.message(), place="metric", cure=str((err.context or {}).get("help", ""))
             ) from None
 
-    def _variants(self, experiment: Experiment) -> list[core.Variant]:
+    def _variants(self, experiment: Experiment) -> list[FileVariant]:
         assert experiment.pipeline is not None
         path, changes = self._path(experiment.pipeline), [experiment.change]
         if experiment.versus is not None:
             changes.append({**experiment.change, **experiment.versus})
         return [
-            core.Variant(path, tuple(setting(key, value) for key, value in change.items()))
+            FileVariant(path, tuple(setting(key, value) for key, value in change.items()))
             for change in changes
         ]
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-from zonda.core.experiment import Values
+from zonda.core.experiment.experiment import Values
 
 LIMIT = 2.0
 """Largest distance that counts as agreement, in standard deviations."""

@@ -129,10 +129,10 @@ def _campaign(
     folder: Path, executor: Executor, workers: int, *, again: bool = False
 ) -> dict[str, bytes]:
     """Run or resume the campaign; its map."""
-    from zonda.core.campaign.engines import Pool
     from zonda.core.campaign.prepare import CampaignFile
     from zonda.core.campaign.run import begin, resume
-    from zonda.core.experiment import Variant
+    from zonda.core.experiment.engines import Pool
+    from zonda.core.experiment.variant import FileVariant
 
     path = folder.parent / "campaign.yaml"
     path.write_text(CAMPAIGN)
@@ -141,7 +141,7 @@ def _campaign(
         resume(folder, pool, lambda text: None)
     else:
         begin(
-            [CampaignFile(Variant(path))],
+            [CampaignFile(FileVariant(path))],
             folder,
             "zonda run campaign.yaml",
             pool,
@@ -159,7 +159,7 @@ def _bytes_that_differ(one: dict[str, bytes], other: dict[str, bytes]) -> float:
 
 @cache
 def _campaign_once() -> dict[str, bytes]:
-    from zonda.core.campaign.engines import SerialExecutor
+    from zonda.core.experiment.engines import SerialExecutor
 
     with TemporaryDirectory(prefix="zonda-check-") as folder:
         return _campaign(Path(folder) / "out", SerialExecutor(), 1)
@@ -186,7 +186,7 @@ def resumed() -> Measured:
     """bytes of a campaign's map that differ when it is broken off after 7 of 16 tasks, a product
     cut short, and resumed
     """
-    from zonda.core.campaign.engines import SerialExecutor
+    from zonda.core.experiment.engines import SerialExecutor
 
     with TemporaryDirectory(prefix="zonda-check-") as folder:
         out = Path(folder) / "out"

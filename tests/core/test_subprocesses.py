@@ -14,8 +14,8 @@ import pytest
 
 from zonda.core import machine
 from zonda.core.accuracy.measure import run_in
-from zonda.core.campaign.engines import engine
-from zonda.core.experiment import Variant
+from zonda.core.experiment.engines import engine
+from zonda.core.experiment.variant import FileVariant
 
 from ..scenes import camera
 
@@ -130,7 +130,7 @@ def test_a_study_of_accuracy(hostile: Path, monkeypatch: pytest.MonkeyPatch) -> 
     path.write_text(CAMPAIGN.replace("campaign: {nights: 2}\n", ""))
     monkeypatch.chdir(hostile)
     with engine("processes", workers=1, threads=1) as pool:
-        run = run_in(pool, Variant(path), "map_rms", 1, None, False)
+        run = run_in(pool, FileVariant(path), "map_rms", 1, None, False)
     assert run.found
     assert not (hostile.parent / "sprung").exists()
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from zonda.core.campaign import engines
-from zonda.core.campaign.engines import engine
 from zonda.core.errors import PipelineError
+from zonda.core.experiment import engines
+from zonda.core.experiment.engines import engine
 
 
 def test_dask_cluster_of_two_workers(undisturbed, bench):
@@ -312,8 +312,8 @@ def test_one_mpi_process_is_not_enough(capsys):
 
 
 def test_cores_and_memory_are_shared_among_workers(monkeypatch):
-    monkeypatch.setattr("zonda.core.campaign.engines.available_threads", lambda: 8)
-    monkeypatch.setattr("zonda.core.campaign.engines.available_memory", lambda: 16_000)
+    monkeypatch.setattr("zonda.core.experiment.engines.available_threads", lambda: 8)
+    monkeypatch.setattr("zonda.core.experiment.engines.available_memory", lambda: 16_000)
     with engine("processes", workers=4) as pool:
         assert (pool.workers, pool.threads, pool.memory) == (4, 2, 2000)
     with engine("processes") as pool:
@@ -325,7 +325,7 @@ def test_ctrl_c_does_not_reach_workers_that_start():
     traceback.
     """
     code = (
-        "import os, signal, sys, time\nfrom zonda.core.campaign.engines import engine\nif __name__"
+        "import os, signal, sys, time\nfrom zonda.core.experiment.engines import engine\nif __name__"
         " == '__main__':\n    with engine('processes', workers=2) as pool:\n        futures ="
         " [pool.executor.submit(time.sleep, 0) for _ in range(2)]\n        for process in"
         " pool.executor._processes.values():\n            for _ in range(3):\n               "

@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from zonda.core.campaign import engines
-from zonda.core.campaign.engines import engine, share_out
 from zonda.core.errors import PipelineError
+from zonda.core.experiment import engines
+from zonda.core.experiment.engines import engine, share_out
 
 MB = 1_000_000
 NEED = 500 * MB
@@ -17,9 +17,8 @@ NEED = 500 * MB
 @pytest.fixture(autouse=True)
 def machine(monkeypatch):
     """8 CPUs, 16 GB free, and a main process of 300 MB."""
-    for module in ("engines",):
-        monkeypatch.setattr(f"zonda.core.campaign.{module}.available_memory", lambda: 16_000 * MB)
-    monkeypatch.setattr("zonda.core.campaign.engines.available_threads", lambda: 8)
+    monkeypatch.setattr("zonda.core.experiment.engines.available_memory", lambda: 16_000 * MB)
+    monkeypatch.setattr("zonda.core.experiment.engines.available_threads", lambda: 8)
     monkeypatch.setattr(engines, "resident_memory", lambda: 300 * MB)
 
 

@@ -12,12 +12,12 @@ from dataclasses import replace
 
 import h5py
 
-from zonda.core.campaign import calls
 from zonda.core.campaign import tasks as campaign
 from zonda.core.campaign.campaign_file import Job
-from zonda.core.campaign.engines import Pool, SerialExecutor
 from zonda.core.campaign.folder import Record
 from zonda.core.campaign.tasks import Outcome, perform
+from zonda.core.experiment import experiment as calls
+from zonda.core.experiment.engines import Pool, SerialExecutor
 
 SERIAL = ("--engine", "serial", "--threads", 1)
 
@@ -70,10 +70,10 @@ def test_processes_give_the_same_bits(undisturbed, bench):
 def test_any_order_of_completion_gives_the_same_bits(undisturbed, bench, monkeypatch):
     for seed in (1, 2):
         monkeypatch.setattr(
-            "zonda.core.campaign.engines.SerialExecutor", lambda seed=seed: Shuffled(12, seed)
+            "zonda.core.experiment.engines.SerialExecutor", lambda seed=seed: Shuffled(12, seed)
         )
         monkeypatch.setattr(
-            "zonda.core.campaign.engines.Pool", lambda ex, *rest, **more: Pool(ex, 12, 0, 1, None)
+            "zonda.core.experiment.engines.Pool", lambda ex, *rest, **more: Pool(ex, 12, 0, 1, None)
         )
         out = bench.run(bench.CAMPAIGN, *SERIAL)
         assert bench.planes(out) == bench.planes(undisturbed)

@@ -9,7 +9,7 @@ from astropy.table import Table
 from zonda.core.campaign.table import Point, draw
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
-from zonda.core.experiment import Values
+from zonda.core.experiment.experiment import Values
 from zonda.core.figures import measure
 
 from ...scenes import camera

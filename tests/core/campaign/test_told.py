@@ -12,7 +12,7 @@ from functools import partial
 import pytest
 
 import zonda
-from zonda.core.campaign import engines
+from zonda.core.experiment import engines
 
 ONE = {"band": {"name": "f090", "low": "77 GHz", "high": "106 GHz"}, "net": "1 mK s(1/2)"}
 TWO = {

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+import signal
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from zonda.core.campaign.engines import engine
+import zonda
+from zonda.core.accuracy.metrics import Metric
+from zonda.core.data import Data
 from zonda.core.errors import PipelineError
-from zonda.core.experiment import SECONDS, Experiment, Variant, run_file
+from zonda.core.experiment.engines import engine
+from zonda.core.experiment.experiment import SECONDS, Experiment
+from zonda.core.experiment.variant import FileVariant, Variant
 from zonda.core.figures import Choice
 
 from ...scenes import camera, write_sky
@@ -33,57 +41,97 @@ def pipeline(tmp_path: Path) -> Path:
     return tmp_path / "p.yaml"
 
 
-def wanted(pipeline: Path, folder: Path, seeds: int = 2) -> tuple[Experiment, list[Variant]]:
-    made = Experiment(folder)
-    variants = [Variant(pipeline), Variant(pipeline, ("BinMap.pixel=4 arcsec",))]
-    return made, [made.want(variant, RMS, seeds) for variant in variants]
+def of(pipeline: Path, folder: Path | None, seeds: int = 2) -> Experiment:
+    """A plain variant and one of smaller pixels."""
+    variants = [FileVariant(pipeline), FileVariant(pipeline, ("BinMap.pixel=4 arcsec",))]
+    return Experiment(variants, seeds, [RMS], folder=folder)
 
 
 def test_a_variant_is_known_by_what_its_values_depend_on(pipeline: Path) -> None:
-    plain, same = Variant(pipeline), Variant(pipeline, ("seed=1",))
-    assert plain.key == Variant(pipeline).key == pickle.loads(pickle.dumps(plain)).key
+    plain, same = FileVariant(pipeline), FileVariant(pipeline, ("seed=1",))
+    assert plain.key == FileVariant(pipeline).key == pickle.loads(pickle.dumps(plain)).key
     assert (same.key == plain.key) == (plain.file.scene().seed == 1)
-    assert Variant(pipeline, ("seed=99",)).key != plain.key
-    assert Variant(pipeline, ("BinMap.pixel=4 arcsec",)).key != plain.key
+    assert FileVariant(pipeline, ("seed=99",)).key != plain.key
+    assert FileVariant(pipeline, ("BinMap.pixel=4 arcsec",)).key != plain.key
     (pipeline.parent / "sky.fits").unlink()
     write_sky(pipeline.parent / "sky.fits", 21, 0.004, 2e-3)
-    assert Variant(pipeline).key != plain.key  # another input
+    assert FileVariant(pipeline).key != plain.key  # another input
 
 
 def test_values_are_the_same_on_any_executor_and_are_kept(pipeline: Path, tmp_path: Path) -> None:
-    serial, variants = wanted(pipeline, tmp_path / "serial")
-    serial.run()
-    parallel, _ = wanted(pipeline, tmp_path / "processes")
+    serial, parallel = of(pipeline, tmp_path / "serial"), of(pipeline, tmp_path / "processes")
+    found = serial.run().records()
     with engine("processes", workers=2, threads=1) as pool:
-        parallel.run(pool.executor)
-    found = [serial.values(variant, RMS.name, 2) for variant in variants]
-    assert found == [parallel.values(variant, RMS.name, 2) for variant in variants]
-    assert len({value for pairs in found for value, _ in pairs}) == 4  # variants and seeds differ
+        assert parallel.run(pool).records() == found
+    with ThreadPoolExecutor(2) as threads:
+        assert of(pipeline, None).run(threads).records() == found
+    assert len({row["value"] for row in found}) == 4  # variants and seeds differ
+    assert [row["seed"] for row in found[:2]] == [row["seed"] for row in found[2:]]
     assert (serial.made, parallel.made) == (4, 4)
 
-    again, _ = wanted(pipeline, tmp_path / "serial", seeds=3)
-    again.run()
+    again = of(pipeline, tmp_path / "serial", seeds=3)
+    rows = again.run().records()
     assert again.made == 2  # the third seed of each
-    assert [again.values(variant, RMS.name, 2) for variant in variants] == found
+    assert [rows[k] for k in (0, 1, 3, 4)] == found
     for path in (tmp_path / "serial" / "runs").iterdir():
         path.write_text(path.read_text()[:-20])
-    damaged, _ = wanted(pipeline, tmp_path / "serial")
-    damaged.run()
+    damaged = of(pipeline, tmp_path / "serial")
+    assert damaged.run().records() == found
     assert damaged.made == 4
-    assert [damaged.values(variant, RMS.name, 2) for variant in variants] == found
+
+
+def test_pipelines_and_scenes_of_python_give_the_values_of_their_file(pipeline: Path) -> None:
+    file = FileVariant(pipeline).file
+    variant = zonda.Variant(file.pipeline(), file.scene(), "mine")
+    table = zonda.Experiment([variant], 2, ["central_rms(radius=30 arcsec)"]).run()
+    rows, of_file = table.records(), of(pipeline, None).run().records()
+    assert [row["variant"] for row in rows] == ["mine", "mine"]
+    assert [row["value"] for row in rows] == [row["value"] for row in of_file[:2]]
+    seeds = [row["seed"] for row in rows]
+    assert zonda.Experiment([variant], seeds, [RMS]).run().records() == rows
 
 
 def test_the_seconds_of_a_run_are_a_metric(pipeline: Path, tmp_path: Path) -> None:
-    made = Experiment(tmp_path / "out")
-    variant = made.want(Variant(pipeline), None, 1)
+    made, variant = Experiment(folder=tmp_path / "out"), FileVariant(pipeline)
+    made.want(variant, None, 1)
     made.run()
-    assert made.values(variant, SECONDS, 1)[0][0] > 0
+    assert made.figures(variant, SECONDS)[0].value > 0
 
 
 def test_a_metric_that_a_variant_cannot_have(pipeline: Path, tmp_path: Path) -> None:
     pipeline.write_text(TEXT.replace("  - BinMap: {pixel: 8 arcsec}\n  - SaveMap\n", ""))
     with pytest.raises(PipelineError, match="needs map"):
-        Experiment(tmp_path).want(Variant(pipeline), RMS, 1)
+        of(pipeline, tmp_path)
+
+
+class Killed(Metric):
+    """Kills its process at the first run, and at every run of a pipeline called ``bad``."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def measure(self, data: Data) -> Any:
+        if data.provenance["name"] == "bad" or not self.mark.exists():
+            self.mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return data.scene.seed
+
+
+def test_a_run_whose_worker_was_killed_is_made_again(pipeline: Path, tmp_path: Path) -> None:
+    found: list[tuple[str, int]] = []
+    with engine("processes", workers=2, threads=1) as pool:
+        made = Experiment([FileVariant(pipeline)], [3, 4, 5], [Killed(tmp_path / "mark")])
+        made.run(pool, lambda v, n, values: found.extend((str(v), s) for s in values.values()))
+    assert sorted(found) == [("p", 3), ("p", 4), ("p", 5)]
+
+
+@pytest.mark.nightly
+def test_a_run_that_kills_its_worker_each_time_is_an_error(pipeline: Path, tmp_path: Path) -> None:
+    bad = FileVariant(pipeline, ("name=bad",))
+    with engine("processes", workers=1, threads=1) as pool:
+        made = Experiment([bad], 1, [Killed(tmp_path / "mark")])
+        with pytest.raises(PipelineError, match="was killed"):
+            made.run(pool)
 
 
 def test_a_run_leaves_no_products_where_it_is_made(
@@ -91,11 +139,10 @@ def test_a_run_leaves_no_products_where_it_is_made(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     before = set(tmp_path.rglob("*"))
-    data = run_file(Variant(pipeline).file, [RMS.metric], seed=5)
+    variant: Variant = FileVariant(pipeline).variant
+    data = variant.run([RMS.metric], seed=5)
     assert data.scene.seed == 5
     assert "map" in data.products
     assert set(tmp_path.rglob("*")) == before
-    run_file(
-        Variant(pipeline).file, operators=Variant(pipeline).file.operators, output=tmp_path / "out"
-    )
+    variant.run(operators=variant.pipeline.operators, output=tmp_path / "out")
     assert (tmp_path / "out" / "map.fits").exists()

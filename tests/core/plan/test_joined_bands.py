@@ -12,7 +12,7 @@ import zonda
 from zonda.core.accuracy.metrics import metric_of
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import PipelineError
-from zonda.core.experiment import run_file
+from zonda.core.experiment.variant import Variant
 from zonda.core.plan.audit import Audit, audit_of_bands
 from zonda.core.plan.result import Plan
 
@@ -103,7 +103,7 @@ def test_accuracy_is_measured_of_the_bands_together() -> None:
     """What is measured is the map of a run, which is that of the joined bands."""
     file = parse(TEXT)
     metric = metric_of(file, "map_rms")
-    data = run_file(file, [metric], threads=1)
+    data = Variant(file.pipeline(), file.scene()).run([metric], threads=1)
     run, by_band = (
         f.pipeline().run(f.scene(), output=Path(), threads=1).products
         for f in (file, parse(TEXT, overrides=[BY_BAND]))

@@ -7,8 +7,8 @@ from astropy.table import Table
 
 from tests.scenes import camera
 from zonda.core.cli import main
-from zonda.core.experiment import Variant
 from zonda.core.experiment import experiment as tasks
+from zonda.core.experiment.variant import FileVariant
 from zonda.plugins.validation.claims import SHIPPED, read
 
 PIPELINE = (
@@ -66,19 +66,19 @@ def claims(tmp_path):
 @pytest.fixture
 def runs(monkeypatch):
     made = []
-    run, draw = tasks.measured, Variant.run
+    run, draw = tasks.measured, FileVariant.run
 
-    def counted(variant, number, choices):
-        made.append((variant.overrides, number))
-        return run(variant, number, choices)
+    def counted(variant, *how):
+        made.append((variant.overrides, "measured"))
+        return run(variant, *how)
 
     def drawn(self, metrics=(), **how):
         if "output" in how:
-            made.append((self.overrides, 0))
+            made.append((self.overrides, "drawn"))
         return draw(self, metrics, **how)
 
     monkeypatch.setattr(tasks, "measured", counted)
-    monkeypatch.setattr(Variant, "run", drawn)
+    monkeypatch.setattr(FileVariant, "run", drawn)
     return made
 
 
@@ -127,7 +127,7 @@ def test_what_is_missing_is_run_and_nothing_else(claims, tmp_path, runs):
             path.write_text(json.dumps(stored))
     runs.clear()
     validate(claims(), folder, "noise")
-    assert runs == [((), 2)]
+    assert [overrides for overrides, _ in runs] == [()]
     assert Table.read(folder / "claims.ecsv")["zonda"][0] == first
     for path in (folder / "runs").glob("*.json"):
         path.write_text("{")  # damaged: measured anew
@@ -171,9 +171,8 @@ def test_pictures_of_another_pipeline(claims, tmp_path, runs, capsys):
     path.write_text(path.read_text().replace("    seeds: 4\n", row + "    pictures: seen\n", 1))
     folder = tmp_path / "out"
     validate(path, folder, "noise")
-    assert (
-        runs.count((('WhiteNoise.net="3 mK s(1/2)"',), 0)) == 2
-    )  # measured once, drawn once with the same change
+    change = ('WhiteNoise.net="3 mK s(1/2)"',)
+    assert [runs.count((change, what)) for what in ("measured", "drawn")] == [4, 1]
     found = {file.name for file in (folder / "noise").glob("*.png")}
     assert {"values.png", "map.png", "power_spectra.png"} <= found
     assert not list(folder.rglob("*.fits"))  # of the other pipeline only pictures are kept

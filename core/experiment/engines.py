@@ -28,12 +28,15 @@ from concurrent.futures import (
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from .. import machine
 from ..errors import PipelineError
 from ..machine import available_memory, available_threads, one_blas_thread, resident_memory
-from .settings import Engine, Tls
+
+if TYPE_CHECKING:
+    from ..campaign.settings import Engine, Tls
+
 
 SCHEDULER_FILE_WAIT = 20.0
 """Seconds [s] for which a scheduler file that is not there, or not whole, is waited for."""
