@@ -26,6 +26,11 @@ STRIP, TALL = 8.0, 4.0
 """Width over height, and height over width, beyond which an image is stretched."""
 WIDE = 2.2
 """Width over height from which an image has its colour bar below."""
+LEFT, INNER, BELOW, ABOVE = 1.15, 0.35, 0.7, 0.5
+"""Margins of an image, in: with latitudes, without, with longitudes, with a title of two lines."""
+BAR, NEAR, FAR_OFF, TEXT = 0.14, 0.12, 0.8, 1.3
+"""Width of a colour bar; its distance from the image, and that with a second scale between; space
+for its numbers and label, in."""
 SHOWN = 99.95
 """Per cent of the pixels of a noise-free map that its colour scale covers."""
 ONE_SIDED = 0.05
@@ -38,25 +43,42 @@ zero.
 """
 
 
-def map_axes(shape: tuple[int, ...], wcs: WCS, count: int = 1, figure: Any = None) -> list[Any]:
+def map_axes(
+    shape: tuple[int, ...], wcs: WCS, count: int = 1, figure: Any = None, gap: float = NEAR
+) -> list[Any]:
     """World axes of a new figure (or ``figure``) for ``count`` images (ny, nx): strips one below
-    the other, others side by side, with their latitudes written once.
+    the other, others side by side, with their latitudes written once. ``gap``: between an image and
+    its colour bar, in; `bar_place` of the axes has the place of that.
     """
-    import astropy.visualization.wcsaxes  # noqa: F401  (before subplots take a WCS)
+    from astropy.visualization.wcsaxes import WCSAxes
     from matplotlib.figure import Figure
 
     width, height, _ = _proportions(wcs, shape)
     strip = width > WIDE * height
     scale = min((LONG if strip else IMAGE) / width, IMAGE / height)
-    size = scale * width + 2, scale * height + 1.5
-    rows, columns = (count, 1) if strip else (1, count)
+    width, height = scale * width, scale * height
+    if strip:
+        below = BELOW + gap + BAR + BELOW
+        step = 0.0, ABOVE + height + below
+        size = LEFT + width + INNER, count * step[1]
+    else:
+        below, step = BELOW, (width + gap + BAR + TEXT + INNER, 0.0)
+        size = LEFT - INNER + count * step[0], ABOVE + height + below
     figure = Figure(dpi=DPI) if figure is None else figure
-    figure.set_size_inches(columns * size[0], rows * size[1])
-    figure.set_layout_engine("compressed")
-    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": wcs}).ravel()
-    for ax in () if strip else axes[1:]:
-        ax.inner = True
-    return list(axes)
+    figure.set_size_inches(*size)
+
+    def part(x: float, y: float, wide: float, high: float) -> list[float]:
+        return [x / size[0], y / size[1], wide / size[0], high / size[1]]
+
+    axes = []
+    for k in range(count):
+        x, y = LEFT + k * step[0], below + (count - 1 - k) * step[1]
+        ax = figure.add_axes(WCSAxes(figure, part(x, y, width, height), wcs=wcs))
+        ax.inner = k > 0 and not strip
+        beside = (x + width + gap, y, BAR, height)
+        ax.bar_place = part(*((x, y - BELOW - gap - BAR, width, BAR) if strip else beside))
+        axes.append(ax)
+    return axes
 
 
 def _proportions(wcs: WCS, shape: tuple[int, ...]) -> tuple[float, float, float]:
@@ -234,8 +256,10 @@ def plot_coverage(
     label, head = "samples per pixel", "Samples per pixel"
     if per_beam is not None:
         label, head = "integration time of all detectors [s per beam]", "Integration time per beam"
-    ax = _show(None, wcs, shown, label, title or head, "cividis", norm)
-    if per_beam is not None and float(factor.max()) <= 1.01 * float(factor.min()):
+    two = per_beam is not None and float(factor.max()) <= 1.01 * float(factor.min())
+    ax = map_axes(hits.shape, wcs, gap=FAR_OFF if two else NEAR)[0]
+    _show(ax, wcs, shown, label, title or head, "cividis", norm)
+    if two:
         _count_samples(ax.images[0].colorbar, float(factor.mean()))
     return ax  # type: ignore[no-any-return]
 
@@ -341,17 +365,18 @@ def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, 
         (values < low - spare).any() is np.True_,
         (values > high + spare).any() is np.True_,
     )
+    place = getattr(ax, "bar_place", None)
     bar = ax.figure.colorbar(
         picture,
         ax=ax,
+        cax=ax.figure.add_axes(place) if place else None,
         extend={(1, 1): "both", (1, 0): "min", (0, 1): "max"}.get((below, above), "neither"),
         location="bottom" if width > WIDE * height else "right",
-        aspect=30,
     )
     if bar.long_axis.get_scale() == "log":
         log_labels(bar.long_axis)
-    bar.set_label(label)
-    ax.set_title(title)
+    bar.set_label(label, wrap=True)
+    ax.set_title(title, wrap=True)
     return ax
 
 
