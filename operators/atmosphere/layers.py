@@ -29,9 +29,9 @@ from zonda.core.observation import Observation
 from zonda.core.plausibility import PWV, doubt
 
 from .closed_form import closed_form
-from .drawing import draw, state_drawn
 from .fluctuations import AtNodes, OfDetectors
 from .model import AtmosphereModel, ExpectedLoad, LayerParameters, Models
+from .realization import draw, state_drawn
 from .weather.radiative_transfer import ELEVATION_MIN
 
 

@@ -37,9 +37,9 @@ from zonda.core.plan.bounds import (
 from zonda.core.plan.planning import Knob, Planning
 from zonda.core.types import Floats
 
-from .drawing import bytes_of_units, in_time_order
 from .layers import AtmosphereLayers
 from .model import AtmosphereModel, absorption_of
+from .realization import bytes_of_units, in_time_order
 from .turbulence.geometry import axes, crossing, rays
 from .turbulence.levels import FIDELITIES
 from .turbulence.nodes import Layer, differential_rms, spread_evenly

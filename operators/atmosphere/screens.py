@@ -31,8 +31,8 @@ from zonda.core.storage.fits_files import header_of, write_image
 from zonda.core.storage.table_files import Column, write_ecsv
 from zonda.core.types import Floats
 
-from .drawing import drifting_layers, height_of_vapour
 from .model import AtmosphereModel, ExpectedLoad
+from .realization import drifting_layers, height_of_vapour
 from .response import airmass
 from .turbulence.lines_of_sight import LinesOfSight
 
