@@ -135,59 +135,35 @@ class DriftingLayers:
 
         The plain sums have the same bits with such weights and without.
         """
-        bands, stop, n_xi = [self, *others], first + count, len(xi)
-        total, sine = np.zeros((len(bands), n_xi, count)), np.empty((n_xi, count))
-        weighted = [np.zeros((len(band.weights), n_xi, count)) for band in bands]
+        bands, stop = [self, *others], first + count
+        total, sine = np.zeros((len(bands), len(xi), count)), np.empty((len(xi), count))
+        weighted = [np.zeros((len(band.weights), len(xi), count)) for band in bands]
         for own in sorted(set().union(*(band.paths for band in bands))):
-            path = next(band.paths[own] for band in bands if own in band.paths)
-            ratio, groups = own // self._step, _groups(bands, own)
-            low, high = (first, stop) if ratio == 1 else _coarse(first, stop, ratio)
-            values = total if ratio == 1 else np.empty((len(bands), n_xi, high - low))
-            others_of = (
-                weighted
-                if ratio == 1
-                else [np.empty((len(band.weights), n_xi, high - low)) for band in bands]
-            )
-            for start in range(low, high, TIMES_AT_ONCE):
-                end = min(start + TIMES_AT_ONCE, high)
-                x, y, up = path(xi, eta, start, end - start)
-                part, boxes = np.zeros((len(bands), *x.shape)), boxes_of(x, y)
-                parts = [np.zeros((len(band.weights), *x.shape)) for band in bands]
-                for n, which in groups:
-                    one = bands[which[0]]
-                    matrix, i, j = one._places[n]
-                    i, j = (
-                        i[start - path.first : end - path.first],
-                        j[start - path.first : end - path.first],
-                    )
-                    cover = one._tilings[n].cover(
-                        tuple(bands[k]._band for k in which), matrix, boxes, i, j
-                    )
-                    where = *cover.sides, *cover.origin, cover.width, cover.addresses
-                    alone = np.zeros_like(part) if any(len(parts[k]) for k in which) else part
-                    interpolate(matrix, x, y, i, j, *where, one._constants[n], which, alone)
-                    for k in which if alone is not part else ():
-                        part[k] += alone[k]
-                        for row, weight in zip(
-                            parts[k], bands[k].weights[:, n].tolist(), strict=True
-                        ):
-                            row += weight * alone[k]
-                values[:, :, start - low : end - low] = part
-                for whole, piece in zip(others_of, parts, strict=True):
-                    whole[:, :, start - low : end - low] = piece
-                if ratio == 1:
-                    sine[:, start - low : end - low] = up
-            for k in sorted({k for _, which in groups for k in which}) if ratio > 1 else ():
-                # Coefficient 0 stands at coarse time low + SPLINE_MARGIN, where DetectorField has
-                # its time -PAD.
-                offset = first - (low + SPLINE_MARGIN + PAD) * ratio
-                for coarse, into in (
-                    (values[k], total[k]),
-                    *zip(others_of[k], weighted[k], strict=True),
-                ):
-                    fine = DetectorField(spline_coefficients(coarse), ratio, (high - low) * ratio)
-                    into += fine.evaluate(slice(0, n_xi), slice(offset, offset + count))
+            if own == self._step:
+                _sums_at(bands, own, xi, eta, first, total, weighted, sine)
+            else:
+                _add_coarse(bands, own, xi, eta, (first, stop), total, weighted)
         return total, weighted, sine
+
+    def _add_layer(
+        self,
+        n: int,
+        bands: tuple[int, ...],
+        which: tuple[int, ...],
+        x: Floats,
+        y: Floats,
+        boxes: Floats,
+        at: slice,
+        out: Floats,
+    ) -> None:
+        """Add layer ``n`` at positions x, y of the times ``at`` to out[k], k of ``which``: as the
+        ``bands`` of its tiles see it.
+        """
+        matrix, i, j = self._places[n]
+        i, j = i[at], j[at]
+        cover = self._tilings[n].cover(bands, matrix, boxes, i, j)
+        where = *cover.sides, *cover.origin, cover.width, cover.addresses
+        interpolate(matrix, x, y, i, j, *where, self._constants[n], which, out)
 
     def looks_as(self, other: DriftingLayers) -> bool:
         """True if another band looks along the same lines at the same times, at layers that drift
@@ -234,6 +210,67 @@ class DriftingLayers:
             Swept(box, min(number, points_of(box)))
             for box, number in zip(whole, cells, strict=True)
         ]
+
+
+def _sums_at(
+    bands: Sequence[DriftingLayers],
+    step: int,
+    xi: Floats,
+    eta: Floats,
+    first: int,
+    total: Floats,
+    weighted: Sequence[Floats],
+    sine: Floats,
+) -> None:
+    """Overwrite what `DriftingLayers.sums` returns with the layers that take this ``step``, at its
+    own times from ``first`` on.
+    """
+    path = next(band.paths[step] for band in bands if step in band.paths)
+    groups, count = _groups(bands, step), sine.shape[1]
+    for start in range(0, count, TIMES_AT_ONCE):
+        now = slice(start, min(start + TIMES_AT_ONCE, count))
+        x, y, sine[:, now] = path(xi, eta, first + start, now.stop - start)
+        at = slice(first + start - path.first, first + now.stop - path.first)
+        part, boxes = np.zeros((len(bands), *x.shape)), boxes_of(x, y)
+        parts = [np.zeros((len(band.weights), *x.shape)) for band in bands]
+        for n, which in groups:
+            alone = np.zeros_like(part) if any(len(parts[k]) for k in which) else part
+            numbers = tuple(bands[k]._band for k in which)
+            bands[which[0]]._add_layer(n, numbers, which, x, y, boxes, at, alone)
+            for k in which if alone is not part else ():
+                part[k] += alone[k]
+                for row, weight in zip(parts[k], bands[k].weights[:, n].tolist(), strict=True):
+                    row += weight * alone[k]
+        total[:, :, now] = part
+        for whole, piece in zip(weighted, parts, strict=True):
+            whole[:, :, now] = piece
+
+
+def _add_coarse(
+    bands: Sequence[DriftingLayers],
+    step: int,
+    xi: Floats,
+    eta: Floats,
+    span: tuple[int, int],
+    total: Floats,
+    weighted: Sequence[Floats],
+) -> None:
+    """Add the layers that take this coarser ``step``, interpolated in time to the common one over
+    ``span``.
+    """
+    (first, stop), ratio = span, step // bands[0]._step
+    low, high = _coarse(first, stop, ratio)
+    shape = len(xi), high - low
+    values = np.empty((len(bands), *shape))
+    others = [np.empty((len(band.weights), *shape)) for band in bands]
+    _sums_at(bands, step, xi, eta, low, values, others, np.empty(shape))
+    # Coefficient 0 stands at coarse time low + SPLINE_MARGIN, the time -PAD of DetectorField.
+    offset = first - (low + SPLINE_MARGIN + PAD) * ratio
+    where = slice(0, len(xi)), slice(offset, offset + stop - first)
+    for k in (k for k, band in enumerate(bands) if step in band.paths):
+        for coarse, into in ((values[k], total[k]), *zip(others[k], weighted[k], strict=True)):
+            fine = DetectorField(spline_coefficients(coarse), ratio, (high - low) * ratio)
+            into += fine.evaluate(*where)
 
 
 def _groups(bands: Sequence[DriftingLayers], step: int) -> list[tuple[int, tuple[int, ...]]]:
