@@ -49,7 +49,7 @@ class CompareMaps(Output):
     Both are brought to one beam (the wider one) and one grid (that of the map with the smaller
     pixels), see `comparison.planes`. Fidelity is \\|reference\\| / max(\\|difference\\|,
     `threshold` x rms of the difference), as for ALMA. Of maps of I, Q and U each plane is compared,
-    Q and U from the meridians of the map's frame (`comparison.stokes`): ``comparison_Q`` and
+    Q and U from the meridians of the map's frame (`comparison.files`): ``comparison_Q`` and
     ``comparison_U`` stand beside ``comparison``, which is of I. Where one of the two has no Q and
     U, I alone is compared.
 
