@@ -24,10 +24,9 @@ from zonda.core.types import AnyFloats, Floats
 
 from .angle_checks import warn_after
 from .grid import Grid
-from .halves import DIFFERENCES
 from .intensity_kernel import VALUE, WEIGHT
 from .map_sums import MapSums, PixelSums
-from .parameters import MapParameters
+from .parameters import DIFFERENCES, MapParameters
 from .stokes_kernel import PLACES
 
 AT_ONCE = 1 << 14

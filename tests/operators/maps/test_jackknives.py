@@ -13,8 +13,8 @@ from astropy.io import fits
 from zonda.core.errors import ZondaError
 from zonda.core.maps.map_file import write_map
 from zonda.operators.maps.bin_map import BinMap
-from zonda.operators.maps.halves import DIFFERENCES, halves_of
 from zonda.operators.maps.map_sums import MapSums
+from zonda.operators.maps.parameters import DIFFERENCES, halves_of
 from zonda.testing import check_operator
 
 N_DET, N = 37, 12000

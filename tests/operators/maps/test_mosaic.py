@@ -17,7 +17,7 @@ import zonda
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.numerics.sphere import local_axes, separation
 from zonda.core.registry import instruments
-from zonda.operators.maps.mosaic import whole_of
+from zonda.operators.maps.map_layout import whole_of
 from zonda.plugins.checks.scenes import sky_file
 
 ARCMIN = math.radians(1 / 60)
