@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
 from .configuration.diagnostics import mistake, refusal
-from .configuration.files import InputPath
+from .configuration.input_paths import InputPath
 from .configuration.parameters import Parameters, named, named_or_written
 from .configuration.units import Angle, Fraction, Hertz, KelvinRootSecond, RadioFrequency
 from .errors import InputError

@@ -228,7 +228,7 @@ class Registry:
         """The component of a file that holds one."""
         from pydantic_core import PydanticCustomError
 
-        from .configuration.files import find_in
+        from .configuration.input_paths import find_in
 
         try:
             path = find_in(folder, name)

@@ -23,7 +23,7 @@ from pydantic_core import PydanticCustomError
 from .array_table import OF_INSTRUMENT, ArrayTable, read_array, stated_by
 from .band import NO_BAND, PER_BAND, SPEED_OF_LIGHT, Band, BandOfCamera, CameraBand
 from .configuration.diagnostics import mistake, nearest, refusal
-from .configuration.files import InputPath, find
+from .configuration.input_paths import InputPath, find
 from .configuration.parameters import Parameters, named, named_or_written, quantity
 from .configuration.units import (
     Angle,

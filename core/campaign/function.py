@@ -20,7 +20,7 @@ import numpy as np
 
 from ..assembly import arguments
 from ..components import SESSION
-from ..configuration.files import InMemory
+from ..configuration.input_paths import InMemory
 from ..configuration.loaded import PipelineFile, Step
 from ..configuration.parameters import Parameters
 from ..errors import PipelineError, ZondaError

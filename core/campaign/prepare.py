@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..configuration.files import paths_in
+from ..configuration.input_paths import paths_in
 from ..errors import InputError, within
 from ..experiment.variant import FileVariant
 from ..scene import WithScene

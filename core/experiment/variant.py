@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..configuration.files import paths_in
+from ..configuration.input_paths import paths_in
 from ..output import Output
 from ..pipeline import Part, Pipeline
 from ..scene import Scene

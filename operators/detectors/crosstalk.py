@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import model_validator
 
 from zonda.core.block import Block
-from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.data import Data

@@ -23,7 +23,7 @@ from astropy.wcs import WCS
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.parameters import Parameters
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle

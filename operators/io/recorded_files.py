@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Discriminator, Field, PrivateAttr, Tag, field_serializer, field_validator
 
 from zonda.core import flags
-from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Fraction, RadioFrequency

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core import flags
-from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Fraction, Seconds

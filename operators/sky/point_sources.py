@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.block import Block
-from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.units import RadioFrequency
 from zonda.core.data import Data
 from zonda.core.errors import InputError

@@ -29,7 +29,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, PrivateAttr, ValidationInfo, model_validator
 
 from zonda.core.configuration.diagnostics import nearest
-from zonda.core.configuration.files import find
+from zonda.core.configuration.input_paths import find
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band

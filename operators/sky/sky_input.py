@@ -13,7 +13,7 @@ from typing import Any, Literal, Self, TypeVar, cast
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Kelvin
@@ -193,8 +193,9 @@ class SkyInput(Operator):
         return self.map.with_wcs(self.wcs) if self.map and self.wcs else self.map
 
     def in_files(self, path: Path) -> Self:
-        """The map in memory as a file at ``path`` (`core.configuration.files.InMemory`). Raises
-        `OutputError`.
+        """The map in memory as a file at ``path`` (`core.configuration.input_paths.InMemory`).
+
+        Raises `OutputError`.
         """
         if (array := self.array()) is None:
             return self

@@ -12,7 +12,7 @@ import pytest
 from pydantic import Field
 
 from zonda.core import discovery, hooks, registry
-from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularSpeed, Hertz, Seconds
 from zonda.core.instrument import Band, Instrument, Telescope

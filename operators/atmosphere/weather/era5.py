@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.input_paths import InputPath
 from zonda.core.errors import InputError, placed
 from zonda.core.types import Floats
 from zonda.core.weather import Column, WeatherSource

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from zonda.core.configuration.files import InputPath
+from zonda.core.configuration.input_paths import InputPath
 from zonda.core.storage import table_files
 from zonda.core.types import Floats
 from zonda.core.weather import Column, WeatherSource
