@@ -95,6 +95,7 @@ from zonda.core.cli import complete
 )
 def sensitivity(
     pipeline: str | None,
+    radius: str | None,
     settings: tuple[str, ...],
     reach: str | None,
     audit: int | None,
@@ -126,7 +127,7 @@ def sensitivity(
 
     if output is not None:
         check_output_folder(output)
-    found = forecast(pipeline, settings=settings, **asked)
+    found = forecast(pipeline, radius=radius, settings=settings, **asked)
     each = [*found.bands.values()] if isinstance(found, SensitivityOfBands) else [found]
     needed = [] if reach is None else [one.reach(reach) for one in each]
     if audit is not None:
@@ -145,7 +146,8 @@ def sensitivity(
         click.echo(json.dumps(text, indent=2))
         return
     if pipeline is None:
-        click.echo(default_pipeline.shown(asked, settings))
+        made = default_pipeline.text(**asked).rstrip()
+        click.echo("\n".join(["# the pipeline:", made, *(f"# --set {s}" for s in settings), ""]))
     click.echo(str(found))
     for one, seconds in zip(each, needed, strict=False):
         click.echo(f"\n{reached(one, str(reach), seconds)}")

@@ -31,7 +31,7 @@ from zonda.core.site import Site
 from zonda.core.weather import Pwv
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from zonda.core.configuration.loaded import PipelineFile
     from zonda.core.types import Floats
@@ -61,10 +61,42 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Asked:
-    """An observer's request, as text with units; None: not stated.
+class Daisy:
+    """Equations (1) and (2): rad, rad/s, Hz, s."""
 
-    Attributes
+    radius: float
+    speed: float
+    cut: float
+    duration: float
+    scans: int
+
+
+def make(settings: Sequence[str] = (), **asked: Any) -> PipelineFile:
+    """The pipeline for an observer's request (see `text`), with changes as `zonda run --set` takes
+    them.
+
+    Raises ZondaError for names that are not registered, contradictions, and targets that are not
+    up.
+    """
+    from zonda.core.configuration.pipeline_file import parse
+
+    return parse(text(**asked), name="the pipeline of zonda sensitivity", overrides=settings)
+
+
+def text(
+    instrument: str,
+    site: str,
+    pwv: str | None = None,
+    month: int | None = None,
+    quantile: float | None = None,
+    elevation: str | None = None,
+    target: str | None = None,
+    area: str | None = None,
+    time: str | None = None,
+) -> str:
+    """The pipeline as YAML, of an observer's request: text with units; None: not stated.
+
+    Parameters
     ----------
     instrument, site
         Registered names.
@@ -79,117 +111,53 @@ class Asked:
         said.
     time
         Integration time.
+
+    Raises
+    ------
+    ZondaError
+        As `make`.
     """
-
-    instrument: str
-    site: str
-    pwv: str | None = None
-    month: int | None = None
-    quantile: float | None = None
-    elevation: str | None = None
-    target: str | None = None
-    area: str | None = None
-    time: str | None = None
-
-    def check(self) -> None:
-        """Raise InputError for what contradicts itself or is beyond limits."""
-        month, quantile = self.month, self.quantile
-        for wrong, text, place, cure in (
-            (
-                self.pwv is not None and quantile is not None,
-                "the PWV is given twice, as a value and as a quantile",
-                PLACE,
-                "give --pwv or --quantile",
-            ),
-            (
-                self.elevation is not None and self.target is not None,
-                "a target has an elevation of its own",
-                PLACE,
-                "give --target or --elevation",
-            ),
-            (
-                month is not None and not 1 <= month <= 12,
-                f"there is no month {month}",
-                "--month",
-                "give 1 to 12",
-            ),
-            (
-                quantile is not None and not 0 < quantile < 1,
-                f"a quantile of {quantile} is outside the limits, above 0 and below 1",
-                "--quantile",
-                "",
-            ),
-        ):
-            if wrong:
-                raise InputError(text, place=place, cure=cure)
-
-
-@dataclass(frozen=True)
-class Daisy:
-    """Equations (1) and (2): rad, rad/s, Hz, s."""
-
-    radius: float
-    speed: float
-    cut: float
-    duration: float
-    scans: int
-
-
-def make(asked: Asked, settings: Sequence[str] = ()) -> PipelineFile:
-    """The pipeline for an observer's request, with changes as `zonda run --set` takes them.
-
-    Raises ZondaError for names that are not registered, contradictions, and targets that are not
-    up.
-    """
-    from zonda.core.configuration.pipeline_file import parse
-
-    return parse(text(asked), name="the pipeline of zonda sensitivity", overrides=settings)
-
-
-def shown(asked: Mapping[str, Any], settings: Sequence[str]) -> str:
-    """The pipeline that is made for an observer's words, and the changes to it."""
-    made = text(Asked(**{k: v for k, v in asked.items() if v is not None}))
-    return "\n".join(["# the pipeline:", made.rstrip(), *(f"# --set {s}" for s in settings), ""])
-
-
-def text(asked: Asked) -> str:
-    """The pipeline as YAML. Raises as `make`."""
-    asked.check()
-    instrument = registry.instruments.create(asked.instrument)
-    site = registry.sites.create(asked.site)
-    elevation = positive("--elevation", Unit("rad", "60 deg"), asked.elevation, ELEVATION)
-    if elevation > math.pi / 2:
-        raise InputError(
-            f"an elevation of {asked.elevation} is outside the limits, 0 to 90 deg",
-            place="--elevation",
-        )
-    wanted = positive("--time", Unit("s", "3 h"), asked.time, 3600.0)
-    usual = min(2 * max(instrument.field_of_view, 10 * instrument.beam_fwhm), WIDEST)
-    scan = daisy(instrument, elevation, positive("--area", Unit("rad"), asked.area, usual), wanted)
+    if pwv is not None and quantile is not None:
+        wrong = "the PWV is given twice, as a value and as a quantile"
+        raise InputError(wrong, place=PLACE, cure="give --pwv or --quantile")
+    if elevation is not None and target is not None:
+        wrong, cure = "a target has an elevation of its own", "give --target or --elevation"
+        raise InputError(wrong, place=PLACE, cure=cure)
+    if month is not None and not 1 <= month <= 12:
+        raise InputError(f"there is no month {month}", place="--month", cure="give 1 to 12")
+    if quantile is not None and not 0 < quantile < 1:
+        wrong = f"a quantile of {quantile} is outside the limits, above 0 and below 1"
+        raise InputError(wrong, place="--quantile")
+    camera, place = registry.instruments.create(instrument), registry.sites.create(site)
+    height = positive("--elevation", Unit("rad", "60 deg"), elevation, ELEVATION)
+    if height > math.pi / 2:
+        wrong = f"an elevation of {elevation} is outside the limits, 0 to 90 deg"
+        raise InputError(wrong, place="--elevation")
+    wanted = positive("--time", Unit("s", "3 h"), time, 3600.0)
+    usual = min(2 * max(camera.field_of_view, 10 * camera.beam_fwhm), WIDEST)
+    scan = daisy(camera, height, positive("--area", Unit("rad"), area, usual), wanted)
     if not scan.duration <= DAY:
-        raise InputError(
-            f"at an elevation of {math.degrees(elevation):.6g} deg the azimuth axis lets the beam"
-            f" scan with {math.degrees(scan.speed) * 3600:.3g} arcsec/s at most",
-            place="--elevation",
-            cure="give a lower one",
+        wrong = (
+            f"at an elevation of {math.degrees(height):.6g} deg the azimuth axis lets the beam scan"
+            f" with {math.degrees(scan.speed) * 3600:.3g} arcsec/s at most"
         )
-    middle = _midnight(site, asked.month)
-    if asked.target is None:
-        target = _culminating(site, middle, elevation)
+        raise InputError(wrong, place="--elevation", cure="give a lower one")
+    middle = _midnight(place, month)
+    if target is None:
+        centre = _culminating(place, middle, height)
     else:
-        target = parsed("--target", Target.parse, asked.target)
-        middle = _culmination(site, middle, target)
+        centre = parsed("--target", Target.parse, target)
+        middle = _culmination(place, middle, centre)
     start = middle.shifted(-(scan.scans * (scan.duration + 30) - 30) / 2)
-    pwv = asked.pwv
-    if pwv is None and asked.quantile is not None:
-        pwv = f"{100 * asked.quantile:.12g} %"
+    if quantile is not None:
+        pwv = f"{100 * quantile:.12g} %"
     angle, rate = Unit("rad"), Unit("rad / s")
     lines = [
-        f"name: sensitivity_{asked.instrument}",
-        f"site: {asked.site}",
-        f"instrument: {asked.instrument}",
+        f"name: sensitivity_{instrument}",
+        f"site: {site}",
+        f"instrument: {instrument}",
         f"time: {start}",
-        f"target: {target}",
+        f"target: {centre}",
         "" if pwv is None else f"weather: {{pwv: {parsed('--pwv', Pwv.parse, pwv)}}}",
         "operators:",
         "  - PointingDaisy:",
@@ -202,8 +170,8 @@ def text(asked: Asked) -> str:
         "  - PinkNoise",
         "  - Efficiency",
         f"  - HighpassFilter: {{frequency: {scan.cut:.3g} Hz}}",
-        "  - CommonModeFilter" if instrument.detectors > 1 else "",
-        f"  - BinMap: {{pixel: {_in(angle, instrument.beam_fwhm / 4, 'arcsec', 'arcmin')}}}",
+        "  - CommonModeFilter" if camera.detectors > 1 else "",
+        f"  - BinMap: {{pixel: {_in(angle, camera.beam_fwhm / 4, 'arcsec', 'arcmin')}}}",
         "  - SaveMap",
     ]
     return "".join(f"{line}\n" for line in lines if line)

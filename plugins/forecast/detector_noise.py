@@ -82,87 +82,36 @@ def combs(survey: Survey, radius: float, probes: int, most: int = 8) -> list[Com
     return found
 
 
-def kernel_sums(
-    track: Track, comb: Comb, offsets: Floats, sizes: tuple[float, float], thin: int
-) -> Floats:
-    """(n, n, 2): for each probe the sums of K and K^2 over detectors at ``offsets`` (n_det, 2) and
-    all samples of a scan, from every ``thin``-th instant. ``sizes``: the beam's standard deviation
-    and the radius of the focal plane, rad."""
-    total = np.zeros((*comb.inside.shape, 2))
-    sigma, radius = sizes
-    far = 1.05 * radius + math.sqrt(2 * FAR) * sigma
-    _near_sums(
-        track.matrices,
-        track.centre,
-        offsets,
-        comb.origin,
-        comb.spacing,
-        comb.inside,
-        sigma**2,
-        far,
-        thin,
-        total,
-    )
-    return total * (thin * track.step)
-
-
-def kernel_series(
-    survey: Survey, track: Track, comb: Comb, factors: Floats, offsets: Floats
-) -> NDArray[np.float32]:
-    """(n_det, n_instant): factor K of the nearest probe, for detectors at ``offsets`` (n_det,
-    2).
-    """
-    out = np.zeros((len(offsets), len(track.index)), np.float32)
-    _series(track.matrices, offsets, comb.origin, comb.spacing, factors, survey.sigma**2, out)
-    return out
-
-
 @kernel
-def _near_sums(  # type: ignore[no-untyped-def]
-    matrices, centre, offsets, origin, spacing, inside, variance, far, thin, total
+def _near(  # type: ignore[no-untyped-def]
+    matrices, offsets, origin, spacing, factors, variance, far, thin, sums, series
 ):
-    number = inside.shape[0]
+    """K of the nearest probe with a factor, of detectors at ``offsets`` (n_det, 2): of all instants
+    the factor times K, in ``series`` (n_det, n_instant). Where that is empty, of every ``thin``-th
+    instant K and K^2 are added to ``sums`` (n, n, 2); a boresight beyond ``far`` [rad] sees none.
+    """
+    number = factors.shape[0]
     low, high = origin - far, origin + far + spacing * (number - 1)
     for t in range(thin // 2, len(matrices), thin):
-        if (
-            centre[t, 0] < low[0]
-            or centre[t, 0] > high[0]
-            or centre[t, 1] < low[1]
-            or centre[t, 1] > high[1]
-        ):
-            continue
         h = matrices[t]
+        x, y = h[2] / h[8], h[5] / h[8]
+        if x < low[0] or x > high[0] or y < low[1] or y > high[1]:
+            continue
         for d in range(len(offsets)):
             a, b = offsets[d, 0], offsets[d, 1]
             scale = 1.0 / (h[6] * a + h[7] * b + h[8])
             x = (h[0] * a + h[1] * b + h[2]) * scale - origin[0]
             y = (h[3] * a + h[4] * b + h[5]) * scale - origin[1]
             i, j = math.floor(x / spacing + 0.5), math.floor(y / spacing + 0.5)
-            if 0 <= i < number and 0 <= j < number and inside[i, j]:
-                u, v = x - i * spacing, y - j * spacing
-                r = (u * u + v * v) / (2 * variance)
-                if r < FAR:
-                    g = math.exp(-r)
-                    total[i, j, 0] += g
-                    total[i, j, 1] += g * g
-
-
-@kernel
-def _series(  # type: ignore[no-untyped-def]
-    matrices, offsets, origin, spacing, factors, variance, out
-):
-    number = factors.shape[0]
-    for d in range(len(offsets)):
-        a, b = offsets[d, 0], offsets[d, 1]
-        for t in range(len(matrices)):
-            h = matrices[t]
-            scale = 1.0 / (h[6] * a + h[7] * b + h[8])
-            x = (h[0] * a + h[1] * b + h[2]) * scale - origin[0]
-            y = (h[3] * a + h[4] * b + h[5]) * scale - origin[1]
-            i, j = math.floor(x / spacing + 0.5), math.floor(y / spacing + 0.5)
             if 0 <= i < number and 0 <= j < number and factors[i, j] != 0.0:
                 u, v = x - i * spacing, y - j * spacing
-                out[d, t] = factors[i, j] * math.exp(-(u * u + v * v) / (2 * variance))
+                r = (u * u + v * v) / (2 * variance)
+                if len(series):
+                    series[d, t] = factors[i, j] * math.exp(-r)
+                elif r < FAR:
+                    g = math.exp(-r)
+                    sums[i, j, 0] += g
+                    sums[i, j, 1] += g * g
 
 
 PROBES, DETECTORS = 16, 24
@@ -232,13 +181,15 @@ def _sums(survey: Survey, chosen: list[Comb]) -> tuple[Floats, bool]:
         offsets = np.ascontiguousarray(
             offsets[np.sort(np.random.default_rng(4).permutation(len(offsets))[:fewer])]
         )
-    far = float(np.hypot(*survey.offsets.T).max())
-    rows = [
-        np.concatenate(
-            [kernel_sums(t, c, offsets, (survey.sigma, far), thin)[c.inside] for c in chosen]
-        )
-        for t in tracks
-    ]
+    far = 1.05 * float(np.hypot(*survey.offsets.T).max()) + math.sqrt(2 * FAR) * survey.sigma
+
+    def near(t: Track, c: Comb) -> Floats:
+        found, series = np.zeros((*c.inside.shape, 2)), np.zeros((0, 0), np.float32)
+        place, variance = (c.origin, c.spacing, c.inside.astype(np.float64)), survey.sigma**2
+        _near(t.matrices, offsets, *place, variance, far, thin, found, series)
+        return found[c.inside] * (thin * t.step)
+
+    rows = [np.concatenate([near(t, c) for c in chosen]) for t in tracks]
     return np.array(rows) * (len(survey.offsets) / fewer), fewer < len(survey.offsets)
 
 
@@ -264,7 +215,13 @@ def _signed(survey: Survey, chosen: list[Comb], total: Floats) -> list[Series]:
 def _kernels(
     survey: Survey, comb: Comb, factors: Floats, track: Track, few: NDArray[np.intp]
 ) -> AnyFloats:
-    return kernel_series(survey, track, comb, factors, survey.offsets[few])
+    """(n_det, n_instant): factor times K of the nearest probe."""
+    found, place = np.zeros((len(few), len(track.index)), np.float32), (comb.origin, comb.spacing)
+    variance, none = survey.sigma**2, np.zeros((0, 0, 2))
+    _near(
+        track.matrices, survey.offsets[few], *place, factors, variance, math.inf, 1, none, found
+    )
+    return found
 
 
 class Filtered:

@@ -100,7 +100,7 @@ def sensitivity(
         pipeline that is made.
     asked
         ``time``, and without a pipeline ``instrument``, ``site``, ``pwv``, ``month``, ``quantile``,
-        ``elevation``, ``target``, ``area`` (`default_pipeline.Asked`).
+        ``elevation``, ``target``, ``area`` (`default_pipeline.text`).
 
     Raises
     ------
@@ -142,7 +142,7 @@ def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> P
     """The pipeline that is named, or one that is made for an instrument and a site."""
     from zonda.core.configuration.pipeline_file import PipelineFile, load
 
-    unknown = sorted(asked.keys() - default_pipeline.Asked.__dataclass_fields__.keys())
+    unknown = sorted(asked.keys() - default_pipeline.text.__annotations__.keys())
     if unknown:
         raise TypeError(f"sensitivity() got an unexpected keyword argument {unknown[0]!r}")
     given = {key: value for key, value in asked.items() if value is not None}
@@ -161,5 +161,5 @@ def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> P
     if text:
         raise InputError(text, place=default_pipeline.PLACE, cure=cure)
     if pipeline is None:
-        return default_pipeline.make(default_pipeline.Asked(**given), settings)
+        return default_pipeline.make(settings, **given)
     return pipeline if isinstance(pipeline, PipelineFile) else load(pipeline, settings)

@@ -52,6 +52,8 @@ def test_of_an_instrument_with_files(tmp_path, capsys):
             *MEAN,
             "--set",
             "PinkNoise.shared=0.8",
+            "--radius",
+            "0.6 arcmin",
             "--output",
             out,
         )

@@ -9,7 +9,7 @@ import pytest
 from zonda.core import registry
 from zonda.core.errors import PointingError, ZondaError
 from zonda.core.numerics.angles import ARCMIN, ARCSEC
-from zonda.plugins.forecast.default_pipeline import Asked, daisy, make, text
+from zonda.plugins.forecast.default_pipeline import daisy, make, text
 
 M2 = {"instrument": "mustang2", "site": "green_bank", "month": 11}
 
@@ -51,7 +51,7 @@ def test_short_and_long_times():
     ("site", "elevation"), [("green_bank", 45), ("llano_de_chajnantor", 70), ("south_pole", 50)]
 )
 def test_the_target_culminates_at_the_elevation(site, elevation):
-    file = make(Asked("atlast", site, month=6, elevation=f"{elevation} deg", time="10 min"))
+    file = make(instrument="atlast", site=site, month=6, elevation=f"{elevation} deg", time="10 min")
     pipeline = file.pipeline()
     o = pipeline.point(file.scene(), {}, Path()).observations[0]
     assert np.degrees(o.elevation[o.n_samples // 2]) == pytest.approx(
@@ -65,7 +65,7 @@ def test_the_target_culminates_at_the_elevation(site, elevation):
 
 
 def test_a_target_is_observed_when_it_culminates():
-    file = make(Asked(**M2, target="83.633 deg 22.014 deg", time="20 min"))
+    file = make(**M2, target="83.633 deg 22.014 deg", time="20 min")
     first, last = file.pipeline().point(file.scene(), {}, Path()).observations
     # 90 - 38.43 + 22.01 at culmination, found on a grid of 5 min: 0.3 deg
     assert np.degrees(first.elevation.max()) == pytest.approx(73.6, abs=0.5)
@@ -73,15 +73,15 @@ def test_a_target_is_observed_when_it_culminates():
 
 
 def test_weather():
-    dry, wet = (make(Asked(**M2, quantile=q)).scene().weather.pwv for q in (0.1, 0.9))
+    dry, wet = (make(**M2, quantile=q).scene().weather.pwv for q in (0.1, 0.9))
     assert (dry.quantile, wet.quantile) == (0.1, 0.9)
-    assert make(Asked(**M2, pwv="7.7 mm")).scene().weather.pwv.metres == pytest.approx(7.7e-3)
-    assert make(Asked(**M2)).scene().weather is None
-    assert make(Asked(**M2)).scene().time.datetime.month == 11
+    assert make(**M2, pwv="7.7 mm").scene().weather.pwv.metres == pytest.approx(7.7e-3)
+    assert make(**M2).scene().weather is None
+    assert make(**M2).scene().time.datetime.month == 11
 
 
 def test_settings_change_it():
-    file = make(Asked(**M2), ["PinkNoise.shared=0.8", "PointingDaisy.scans=2"])
+    file = make(["PinkNoise.shared=0.8", "PointingDaisy.scans=2"], **M2)
     assert operator(file, "PinkNoise").shared == 0.8
     assert operator(file, "PointingDaisy").scans == 2
     assert operator(file, "BinMap").pixel == pytest.approx(8.5 * ARCSEC / 4, rel=5e-3)
@@ -90,7 +90,7 @@ def test_settings_change_it():
 def test_one_detector_has_no_common_mode(monkeypatch):
     single = registry.instruments.create("mustang2").model_copy(update={"detectors": 1})
     monkeypatch.setattr(registry.instruments, "create", lambda name: single)
-    assert "CommonModeFilter" not in text(Asked(**M2))
+    assert "CommonModeFilter" not in text(**M2)
 
 
 @pytest.mark.parametrize(
@@ -114,9 +114,9 @@ def test_one_detector_has_no_common_mode(monkeypatch):
 )
 def test_refusals(asked, words):
     with pytest.raises(ZondaError, match=words):
-        make(Asked(**{**M2, **asked}))
+        make(**{**M2, **asked})
 
 
 def test_a_target_that_never_rises():
     with pytest.raises(PointingError, match="never rises"):
-        make(Asked(**M2, target="0 deg -80 deg"))
+        make(**M2, target="0 deg -80 deg")
