@@ -18,9 +18,10 @@ from zonda.core.configuration.parameters import Parameters
 from zonda.core.errors import PointingError
 from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.sphere import angles, unit_vectors
+from zonda.core.plan.bounds import evenly
 from zonda.core.types import Floats
 
-from .motion import LargestDerivative, Quantity, rate_text
+from .motion import QUANTITIES, LargestDerivative, Quantity, rate_text
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
@@ -72,74 +73,37 @@ def when_up(
     low, high = telescope.elevation_min, telescope.elevation_max
     if target.frame == "horizontal":
         return f"choose an elevation from {_range(low, high)}, with room for the scan"
-    site, start = transform.site, transform.start
+    centre, site, start = unit_vectors(*target.icrs()), transform.site, transform.start
+    samples = evenly(len(horizontal), 1000)
+    step = transform.duration / max(len(horizontal) - 1, 1)
+    _, along = angles(transform.horizontal(centre, samples.astype(np.float64) * step))
+    below = along - angles(horizontal[samples])[1]  # how far the boresight is below its target
     seconds = np.arange(0.0, DAY + 1, 60.0)
-    day = CelestialTransform(site, start, DAY, 1e-6).horizontal(
-        unit_vectors(*target.icrs()), seconds
-    )
-    _, elevation = angles(day)
-    below, above = _span(horizontal, transform, target)
-    within = (elevation >= low + below) & (
-        elevation <= (high - above if high < np.pi / 2 else np.pi)
-    )
+    _, day = angles(CelestialTransform(site, start, DAY, 1e-6).horizontal(centre, seconds))
+    least = low + max(float(below.max()), 0.0)
+    most = high + min(float(below.min()), 0.0) if high < np.pi / 2 else np.pi
+    within = (day >= least) & (day <= most)
     if not within.any():
-        if elevation.max() < low + below:
-            highest = f"highest {np.degrees(elevation.max()):.2f} deg"
-            never = (
-                f"at {site.name} it never rises far enough above {np.degrees(low):g} deg"
-                f" ({highest})"
-            )
-            return f"{never}: choose another target or site"
-        return (
-            f"at {site.name} it is within the limits at no time of the next 24 h: choose another"
-            " target or site"
-        )
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], within.astype(np.int8), [0]])))
-    spans = [
-        f"{start.shifted(seconds[a]).datetime:%Y-%m-%dT%H:%M:%SZ} to"
-        f" {start.shifted(seconds[b - 1]).datetime:%Y-%m-%dT%H:%M:%SZ}"
-        for a, b in edges.reshape(-1, 2)
-    ]
-    need = (
-        f"the scans take {total / 60:.1f} min"
-        if total < 7200
-        else f"the scans take {total / 3600:.1f} h"
-    )
-    return (
-        f"within the next 24 h it is up (UTC) from {' and from '.join(spans)}: start then ({need})"
-    )
+        never = "is within the limits at no time of the next 24 h"
+        if day.max() < least:
+            highest = f"(highest {np.degrees(day.max()):.2f} deg)"
+            never = f"never rises far enough above {np.degrees(low):g} deg {highest}"
+        return f"at {site.name} it {never}: choose another target or site"
+    edges = np.flatnonzero(np.diff(within, prepend=False, append=False)).reshape(-1, 2) - [0, 1]
+    times = [[f"{start.shifted(seconds[k]).datetime:%Y-%m-%dT%H:%M:%SZ}" for k in e] for e in edges]
+    spans = " and from ".join(map(" to ".join, times))
+    need = f"{total / 60:.1f} min" if total < 7200 else f"{total / 3600:.1f} h"
+    return f"within the next 24 h it is up (UTC) from {spans}: start then (the scans take {need})"
 
 
-def _span(horizontal: Floats, transform: CelestialTransform, target: Target) -> tuple[float, float]:
-    """Distances below and above its target to which the boresight (n, 3) goes in elevation, over at
-    most 1000 samples.
-    """
-    n = len(horizontal)
-    looked = np.unique(np.linspace(0, n - 1, min(n, 1000)).astype(int))
-    centre = transform.horizontal(
-        unit_vectors(*target.icrs()), looked * (transform.duration / max(n - 1, 1))
-    )
-    lower = np.arcsin(np.clip(centre[:, 2], -1, 1)) - np.arcsin(
-        np.clip(horizontal[looked, 2], -1, 1)
-    )
-    return max(float(lower.max()), 0.0), max(float(-lower.min()), 0.0)
+WORDS = {1: "speed", 2: "acceleration", 3: "jerk"}
 
-
-LIMITS: dict[Quantity, str] = {
-    ("azimuth", 1): "azimuth_speed_max",
-    ("azimuth", 2): "azimuth_acceleration_max",
-    ("azimuth", 3): "azimuth_jerk_max",
-    ("elevation", 1): "elevation_speed_max",
-    ("elevation", 2): "elevation_acceleration_max",
-    ("elevation", 3): "elevation_jerk_max",
-    ("sky", 1): "speed_max",
-    ("sky", 2): "acceleration_max",
+LIMITS = {
+    (axis, order): f"{axis}_{WORDS[order]}_max".removeprefix("sky_") for axis, order in QUANTITIES
 }
 """Fields of a `Telescope`."""
 
 SLOWER = "lower speed or acceleration, or set check_limits: warn"
-
-WORDS = {1: "speed", 2: "acceleration", 3: "jerk"}
 
 STEPS = 2048
 """Of a factor of 1000, by which parameters are changed to find a scan that fits."""
@@ -157,18 +121,6 @@ def excess(
     ratio = {q: found[q].figure / limit for q, limit in limits.items() if q in found}
     over = {q: r for q, r in ratio.items() if r > 1 + ROUNDING}
     return dict(sorted(over.items(), key=lambda item: -(item[1] ** (1 / item[0][1]))))
-
-
-def lower_elevation(
-    found: Mapping[Quantity, LargestDerivative], over: Mapping[Quantity, float]
-) -> float | None:
-    """Elevation [rad] at which the scan would fit, where only the azimuth axis is too fast: it
-    turns by 1 / cos(elevation).
-    """
-    if any(axis != "azimuth" for axis, _ in over):
-        return None
-    cosine = min(1.0, max(r * math.cos(found[q].elevation) for q, r in over.items()))
-    return math.acos(cosine) if cosine < 0.99 else None
 
 
 class LargestMotion:
@@ -212,19 +164,17 @@ class LargestMotion:
         self, quantity: Quantity, found: dict[Quantity, LargestDerivative], name: str = "the scan"
     ) -> str:
         """The message about a limit that the scan exceeds."""
-        (axis, order), peak = quantity, found[quantity]
-        word = WORDS[order]
+        (axis, order), peak, word = quantity, found[quantity], WORDS[quantity[1]]
+        whose = f"{word} {'on the sky' if axis == 'sky' else f'of the {axis} axis'}"
+        reaches = f"{'an' if order == 2 else 'a'} {whose} of {rate_text(peak.figure, order)}"
         where = (
             f"{peak.second:.4g} s after its start, at elevation"
             f" {np.degrees(peak.elevation):.2f} deg"
         )
-        whose = "on the sky" if axis == "sky" else f"of the {axis} axis"
-        reaches = (
-            f"{name} reaches {'an' if word == 'acceleration' else 'a'} {word} {whose} of"
-            f" {rate_text(peak.figure, order)}"
+        limit = f"{self.telescope.name}'s largest {whose} is"
+        return (
+            f"{name} reaches {reaches} ({where}); {limit} {rate_text(self.limits[quantity], order)}"
         )
-        limit = rate_text(self.limits[quantity], order)
-        return f"{reaches} ({where}); {self.telescope.name}'s largest {word} {whose} is {limit}"
 
     def warnings(self) -> list[str]:
         """Each limit that is exceeded (with ``check_limits: warn``)."""
@@ -242,19 +192,17 @@ class LargestMotion:
                 if peak is not None and (limit or axis != "sky"):
                     figure = peak.figure if peak.figure > STILL else 0.0
                     share = (
-                        f" ({100 * figure / limit:.3g} % of {rate_text(limit, order)})"
-                        if limit
-                        else ""
+                        limit and f" ({100 * figure / limit:.3g} % of {rate_text(limit, order)})"
                     )
-                    parts.append(f"{axis} {rate_text(figure, order)}{share}")
+                    parts.append(f"{axis} {rate_text(figure, order)}{share or ''}")
             if parts:
                 none = "" if self.limits else f"; {self.telescope.name} states no limits"
                 said.append((f"largest {WORDS[order]} of the axes", ", ".join(parts) + none))
-        for (axis, order), text in zip(
-            excess(self._found, self.limits), self.warnings(), strict=True
-        ):
-            said.append((f"over the limit of {axis} {WORDS[order]} (check_limits: warn)", text))
-        return said
+        over = (
+            f"over the limit of {axis} {WORDS[order]} (check_limits: warn)"
+            for axis, order in excess(self._found, self.limits)
+        )
+        return [*said, *zip(over, self.warnings(), strict=True)]
 
 
 def _range(low: float, high: float) -> str:
@@ -273,12 +221,15 @@ def what_fits(
 
     ``found`` are its largest derivatives, ``over`` those beyond their limits (`limits.excess`).
     """
-    alone = [_slower(scan, {name: slows[name]}, fits) for name in slows]
-    cures = [text for text in alone if text] or [
-        text for text in (_slower(scan, slows, fits),) if text
-    ]
-    if (elevation := lower_elevation(found, over)) is not None:
-        cures.append(f"an elevation below {math.floor(10 * math.degrees(elevation)) / 10:g} deg")
+    alone = [{name: by} for name, by in slows.items()]
+    cures = [text for some in alone if (text := _slower(scan, some, fits))]
+    cures = cures or [text for text in [_slower(scan, slows, fits)] if text]
+    # the azimuth axis turns by 1 / cos(elevation)
+    cosine = max(r * math.cos(found[q].elevation) for q, r in over.items())
+    if all(axis == "azimuth" for axis, _ in over) and cosine < 0.99:
+        cures.append(
+            f"an elevation below {math.floor(10 * math.degrees(math.acos(cosine))) / 10:g} deg"
+        )
     other = "scan more slowly, or in larger curves" if slows else "choose another target or time"
     fitting = f"this would fit: {', or '.join(cures)}" if cures else other
     return f"{fitting} (check_limits: warn simulates it as it is)"

@@ -218,9 +218,7 @@ def _kernels(
     """(n_det, n_instant): factor times K of the nearest probe."""
     found, place = np.zeros((len(few), len(track.index)), np.float32), (comb.origin, comb.spacing)
     variance, none = survey.sigma**2, np.zeros((0, 0, 2))
-    _near(
-        track.matrices, survey.offsets[few], *place, factors, variance, math.inf, 1, none, found
-    )
+    _near(track.matrices, survey.offsets[few], *place, factors, variance, math.inf, 1, none, found)
     return found
 
 

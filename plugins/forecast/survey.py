@@ -202,17 +202,9 @@ class Survey:
         psi add up to zero.
         """
         plane, good = self.focalplane, self.observations[0].good_detectors
-        seen = np.stack(
-            [
-                plane.xi,
-                plane.eta,
-                plane.fwhm,
-                plane.main_beam_efficiency,
-                plane.illumination_efficiency,
-            ],
-            axis=1,
-        )
-        places, which = np.unique(seen[good], axis=0, return_inverse=True)
+        names = ("xi", "eta", "fwhm", "main_beam_efficiency", "illumination_efficiency")
+        seen = np.stack([getattr(plane, name)[good] for name in names], axis=1)
+        places, which = np.unique(seen, axis=0, return_inverse=True)
         angles = (plane.polarization_efficiency * np.exp(2j * plane.polarization_angle))[good]
         sums = np.zeros(len(places), complex)
         np.add.at(sums, which.ravel(), angles)
@@ -341,15 +333,13 @@ def _check_scans(observations: Sequence[Observation], name: str) -> None:
         )
     first = observations[0].focalplane.names
     for o in observations:
-        text, cure = "", BY_SEEDS
+        if o.focalplane.names != first:
+            cure = "forecast them one by one"
+            raise PipelineError("scans with other detectors", place=o.name, cure=cure)
         unused = 1 - o.good_samples.mean() * o.good_detectors.mean()
         if unused > FLAGGED:
-            share = f"{100 * unused:.3g} % of the samples"
-            text = f"{share} are flagged, which the forecast does not cover"
-        if o.focalplane.names != first:
-            text, cure = "scans with other detectors", "forecast them one by one"
-        if text:
-            raise PipelineError(text, place=o.name, cure=cure)
+            text = f"{100 * unused:.3g} % of the samples are flagged, which the forecast does not cover"
+            raise PipelineError(text, place=o.name, cure=BY_SEEDS)
 
 
 def _noises(steps: Steps, observation: Observation) -> tuple[Noise, ...]:
