@@ -1,8 +1,9 @@
-"""Arguments that several commands take: places and times."""
+"""Arguments that several commands take: places, times and files of pictures."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -56,6 +57,27 @@ def checked(what: str, make: Any) -> Any:
         raise click.BadParameter(text, param_hint=what) from None
     except PydanticCustomError as err:
         raise click.BadParameter(err.message(), param_hint=what) from None
+
+
+def picture(text: str) -> Any:
+    """The option ``--output`` of a picture, PNG, PDF or SVG; ``text``: its help."""
+
+    def check(_context: Any, _option: Any, path: Path | None) -> Path | None:
+        if path is not None and path.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise click.BadParameter(f"{path} does not end in .png, .pdf or .svg")
+        return path
+
+    kind = click.Path(path_type=Path)
+    return click.option("--output", type=kind, callback=check, metavar="FILE.png", help=text)
+
+
+def draw(figure: Any, path: Path, err: bool = False) -> None:
+    """Write a figure, and print its path; ``err``: to stderr."""
+    from zonda.core.storage.files import atomic_path
+
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary)
+    click.echo(f"\n{path}", err=err)
 
 
 LIMITS = {"latitude": "-90 to 90 deg", "longitude": "-360 to 360 deg", "altitude": "-500 to 9000 m"}

@@ -121,8 +121,7 @@ def sensitivity(
     from zonda.core.storage.files import check_output_folder
     from zonda.plugins.forecast import default_pipeline
     from zonda.plugins.forecast.depth import duration
-    from zonda.plugins.forecast.result import reached
-    from zonda.plugins.forecast.sensitivity import SensitivityOfBands
+    from zonda.plugins.forecast.sensitivity import SensitivityOfBands, reached
     from zonda.plugins.forecast.sensitivity import sensitivity as forecast
 
     if output is not None:

@@ -13,6 +13,8 @@ import click
 
 from zonda.core.cli import complete
 
+from .arguments import draw, picture
+
 if TYPE_CHECKING:
     from zonda.core.instrument import Instrument
 
@@ -24,31 +26,21 @@ def show() -> None:
 
 @show.command()
 @click.argument("name", shell_complete=complete.instruments)
-@click.option(
-    "--output",
-    type=click.Path(path_type=Path),
-    metavar="FILE.png",
-    help="The picture.  [default: out/show/NAME.png]",
-)
+@picture("The picture.  [default: out/show/NAME.png]")
 def instrument(name: str, output: Path | None) -> None:
     """Print what an instrument is, and draw its focal plane (also as PDF or SVG).
 
     NAME is a registered name (`zonda plugins`), or a YAML file that describes an instrument or a
     pipeline.
     """
-    from zonda.core.storage.files import atomic_path, product_path
+    from zonda.core.storage.files import product_path
 
     from .instrument_plots import focal_plane_figure, lines
 
-    if output is not None and output.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise click.BadParameter(f"{output} is no .png, .pdf or .svg", param_hint="'--output'")
     camera = _instrument(name)
     plane = camera.focalplane()
     click.echo("\n".join(lines(camera, plane)))
-    path = product_path("out/show", camera.name, ".png") if output is None else output
-    with atomic_path(path) as temporary:
-        focal_plane_figure(camera, plane).savefig(temporary)
-    click.echo(f"\n{path}")
+    draw(focal_plane_figure(camera, plane), output or product_path("out/show", camera.name, ".png"))
 
 
 def _instrument(name: str) -> Instrument:

@@ -14,7 +14,7 @@ import click
 
 from zonda.core.cli import complete
 
-from .arguments import checked, instant_of, place_of
+from .arguments import checked, draw, instant_of, picture, place_of
 
 
 class WithDefault(click.Group):
@@ -22,11 +22,8 @@ class WithDefault(click.Group):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Put ``show`` before what names no command."""
-        if (
-            args
-            and args[0] not in self.commands
-            and not (len(args) == 1 and args[0] in ctx.help_option_names)
-        ):
+        known = self.commands.keys() | (ctx.help_option_names if len(args) == 1 else ())
+        if args and args[0] not in known:
             args = ["show", *args]
         return super().parse_args(ctx, args)
 
@@ -90,41 +87,30 @@ _time = click.option(
     help="Of the line of sight.",
 )
 @click.option("--seed", default=0, show_default=True, help="Of a random PWV.")
-@click.option(
-    "--output",
-    type=click.Path(path_type=Path),
-    metavar="FILE.png",
-    help="The figure.  [default: out/weather/SITE.png]",
-)
+@picture("The figure.  [default: out/weather/SITE.png]")
 def show(
     site: str,
     time: str | None,
     instruments: tuple[str, ...],
-    pwv: str | None,
-    file: str | None,
-    table: str | None,
     elevation: str,
     seed: int,
     output: Path | None,
+    **source: str | None,
 ) -> None:
     """Print the profile, the PWV by month and hour, and what bands see; draw them (also as PDF or
     SVG).
     """
     from zonda.core import registry, weather
     from zonda.core.configuration.units import Unit
-    from zonda.core.storage.files import atomic_path, product_path
+    from zonda.core.storage.files import product_path
     from zonda.operators.atmosphere.weather import summary
     from zonda.operators.atmosphere.weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
     from zonda.operators.atmosphere.weather.sources import profile_of
 
     place, when = place_of(site), instant_of(time)
-    given = {
-        key: value
-        for key, value in (("pwv", pwv), ("file", file), ("table", table))
-        if value is not None
-    }
+    given = {key: value for key, value in source.items() if value is not None}
     cls, values = weather.resolve(given)
-    source = checked("weather", lambda: cls.model_validate(values))
+    model = checked("weather", lambda: cls.model_validate(values))
     angle = checked("--elevation", lambda: Unit("rad", "60 deg").parse(elevation))
     if not ELEVATION_MIN <= angle <= ELEVATION_MAX:
         limits = f"{math.degrees(ELEVATION_MIN):g} deg to 90 deg"
@@ -137,13 +123,10 @@ def show(
         for camera in registry.instruments.create(name).cameras.values()
     )
     bands = list(dict.fromkeys(camera.band for camera in cameras))
-    air = profile_of(source, place, when, seed)
-    water = (
-        summary.pwv_by_month(place, when.datetime.year) if place.climatology is not None else None
-    )
-
-    parts = [summary.place_lines(place, when, air), summary.profile_lines(air)]
-    if water is not None:
+    air = profile_of(model, place, when, seed)
+    parts, water = [summary.place_lines(place, when, air), summary.profile_lines(air)], None
+    if place.climatology is not None:
+        water = summary.pwv_by_month(place, when.datetime.year)
         parts.append(summary.pwv_lines(water))
     if bands:
         parts.append(summary.band_lines(air, bands, angle))
@@ -151,13 +134,9 @@ def show(
 
     from zonda.plugins.commands.weather_plots import weather_figure
 
-    path = product_path("out/weather", place.name, ".png") if output is None else output
-    _check_suffix(path)
-    with atomic_path(path) as temporary:
-        weather_figure(
-            f"{place.name}, {when}, PWV {air.pwv * 1e3:.3g} mm", air, water, angle, bands
-        ).savefig(temporary)
-    click.echo(f"\n{path}")
+    title = f"{place.name}, {when}, PWV {air.pwv * 1e3:.3g} mm"
+    figure = weather_figure(title, air, water, angle, bands)
+    draw(figure, output or product_path("out/weather", place.name, ".png"))
 
 
 @weather.command(context_settings=SIGNS)
@@ -190,10 +169,3 @@ def fetch(site: str, time: str | None, hours: int, output: Path) -> None:
     with atomic_path(output) as temporary:
         retrieve(place, when, hours, temporary)
     click.echo(f"{output}")
-
-
-def _check_suffix(path: Path) -> None:
-    if path.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise click.BadParameter(
-            f"'{path}' does not end in .png, .pdf or .svg", param_hint="'--output'"
-        )

@@ -15,7 +15,7 @@ import click
 
 from zonda.core.cli import complete
 
-from .arguments import checked, instant_of, place_of
+from .arguments import checked, draw, instant_of, place_of
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
@@ -76,7 +76,7 @@ def when(
     """
     from zonda.core import registry
     from zonda.core.configuration.units import Unit
-    from zonda.core.storage.files import atomic_path, check_output_folder, product_path
+    from zonda.core.storage.files import check_output_folder, product_path
 
     for part in target:
         if part.startswith("--"):
@@ -101,8 +101,7 @@ def when(
         for name, camera in of.items()
     }
 
-    from .visibility import months, night_of
-    from .when_text import Seen, as_dict, lines
+    from .visibility import Seen, as_dict, lines, months, night_of
 
     seen = Seen(name, place, moment, night_of(place, moment, subject, limit), bands)
     year = list(months(place, moment.datetime.year, subject, limit))
@@ -117,9 +116,7 @@ def when(
     from .when_plots import when_figure
 
     path = product_path(output or "out/when", f"{name}_{place.name}", ".png")
-    with atomic_path(path) as temporary:
-        when_figure(seen, year).savefig(temporary)
-    click.echo(f"\n{path}", err=as_json)
+    draw(when_figure(seen, year), path, err=as_json)
 
 
 def target_of(text: str) -> Target | str:
@@ -127,8 +124,7 @@ def target_of(text: str) -> Target | str:
     from pydantic_core import PydanticCustomError
 
     from zonda.core.configuration.target import Target
-
-    from .visibility import BODIES
+    from zonda.core.numerics.bodies import BODIES
 
     if (body := text.strip().lower()) in BODIES:
         return body

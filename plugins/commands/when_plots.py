@@ -14,8 +14,7 @@ from zonda.core.canvas import SEQUENCE, log_labels, new_figure
 from zonda.core.types import Floats
 from zonda.operators.atmosphere.weather.summary import MONTHS
 
-from .visibility import HORIZON, HOUR, Month, solar_offset
-from .when_text import Seen
+from .visibility import HORIZON, HOUR, Month, Seen, solar_offset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -21,8 +21,8 @@ from zonda.core.signal import product_name, stream_of
 from zonda.core.tables import aligned
 from zonda.operators.maps.bin_map import BinMap
 
-from .covered import steps_of
 from .depth import PARTS, Depth, prefixed, scatter
+from .survey import steps_of
 
 if TYPE_CHECKING:
     from zonda.core.configuration.loaded import PipelineFile

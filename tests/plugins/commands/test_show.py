@@ -125,4 +125,4 @@ def test_mistakes(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["show", "instrument", "mustang"]) == 2
     assert "did you mean 'mustang2'" in capsys.readouterr().err
     assert cli.main(["show", "instrument", "mustang2", "--output", "x.txt"]) == 2
-    assert "x.txt is no .png, .pdf or .svg" in capsys.readouterr().err
+    assert "x.txt does not end in .png, .pdf or .svg" in capsys.readouterr().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from calendar import monthrange
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from click.testing import CliRunner
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import OutputError
+from zonda.core.numerics.bodies import BODIES
 from zonda.core.registry import sites
 from zonda.core.site import Site
 from zonda.plugins.commands.visibility import (
-    BODIES,
     DAY,
     HORIZON,
     Track,
@@ -109,7 +110,8 @@ def test_at_the_pole_a_star_keeps_its_elevation(recwarn: pytest.WarningsRecorder
     assert below.dark == []
     assert below.hours == (0, 0)
     year = list(months(SOUTH_POLE, 2024, Target.parse("05h -40d"), THIRTY))
-    assert [month.hours for month in year] == pytest.approx([24 * month.days for month in year])
+    days = [monthrange(2024, k)[1] for k in range(1, 13)]
+    assert [month.hours for month in year] == pytest.approx([24 * n for n in days])
     assert year[5].hours_at_night == pytest.approx(24 * 30)
     assert year[11].hours_at_night == 0
 

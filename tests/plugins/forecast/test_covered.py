@@ -5,7 +5,7 @@ import pytest
 import zonda
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import PipelineError, ZondaError
-from zonda.plugins.forecast.covered import steps_of
+from zonda.plugins.forecast.survey import steps_of
 
 HEAD = """
 site: green_bank

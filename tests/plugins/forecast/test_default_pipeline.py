@@ -51,7 +51,9 @@ def test_short_and_long_times():
     ("site", "elevation"), [("green_bank", 45), ("llano_de_chajnantor", 70), ("south_pole", 50)]
 )
 def test_the_target_culminates_at_the_elevation(site, elevation):
-    file = make(instrument="atlast", site=site, month=6, elevation=f"{elevation} deg", time="10 min")
+    file = make(
+        instrument="atlast", site=site, month=6, elevation=f"{elevation} deg", time="10 min"
+    )
     pipeline = file.pipeline()
     o = pipeline.point(file.scene(), {}, Path()).observations[0]
     assert np.degrees(o.elevation[o.n_samples // 2]) == pytest.approx(
