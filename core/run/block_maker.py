@@ -12,6 +12,7 @@ import copy
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from ..numerics.chunks import TILE_SAMPLES
 from ..operator import Operator
 from ..signal import Formed, is_stream
 from ..types import AnyFloats
-from .means import exec_whole, knows_means, means_of, names_of
+from .means import knows_means, means_of, names_of, take_whole, whole_block
 from .schedule import Schedule
 from .segments import Segment, pieces, trimmed, within
 from .settings import Timer
@@ -233,30 +234,26 @@ class BlockMaker:
         block.take(signal.stream, seen)
 
     def _act(self, step: Operator, block: Block, state: Any) -> None:
-        """`Operator.exec`, and a look at what it left."""
-        label = self._labels[id(step)]
-
-        def work(block: Block) -> None:
-            before = dict(block.detdata)
-            if (lost := step.exec(block, state)) is not None:  # type: ignore[func-returns-value]
-                text = (
-                    f"exec returned {type(lost).__name__}, which nobody takes: a step changes"
-                    " block.detdata in place"
-                )
-                raise PipelineError(
-                    text,
-                    place=label,
-                    cure='write block.detdata["signal"][...] = ..., and return nothing',
-                )
-            block.check(before, step.provides, self._due[label], lambda: whose(step))
-
-        fields = {}
+        """`Operator.exec`, on a block with the means in it where the step does not know of them;
+        and a look at what it left.
+        """
+        label, fields, seen = self._labels[id(step)], {}, block
         if names := self._declared.get(label, frozenset()) & block.detdata.keys():
             fields = means_of(self._observation, block.means, names)
         if fields:
-            exec_whole(block, step, fields, self._local.__dict__.setdefault("whole", {}), work)
-        else:
-            work(block)
+            buffers = self._local.__dict__.setdefault("whole", {})
+            seen = whole_block(block, step, fields, buffers)
+        before = dict(seen.detdata)
+        if (lost := step.exec(seen, state)) is not None:  # type: ignore[func-returns-value]
+            raise PipelineError(
+                f"exec returned {type(lost).__name__}, which nobody takes: a step changes"
+                " block.detdata in place",
+                place=label,
+                cure='write block.detdata["signal"][...] = ..., and return nothing',
+            )
+        seen.check(before, step.provides, self._due[label], partial(whose, step))
+        if fields:
+            take_whole(block, seen, step, fields)
 
     # ---- what is in a block
 

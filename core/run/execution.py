@@ -14,6 +14,10 @@ detectors of one band, counted from the band's first row, and a step is given th
 the scan. Where the detectors of all bands look through the same pixels, each block is worked on
 with all bands before those steps that map all bands act once. A step that measures all bands
 together is given the stream of all rows; a band does then not have the bits that it has alone.
+
+From a run to a step's `exec`: `Execution.run` takes segment after segment (`_act`), `_sweep` its
+blocks, on several threads, `_on_block` the bands of a block. `BlockMaker.make` makes the block of a
+band and takes step after step (`BlockMaker._exec`); `BlockMaker._act` calls ``step.exec``.
 """
 
 from __future__ import annotations
@@ -83,6 +87,8 @@ class Execution:
         self._ahead = Ahead(False)
         self._stop = threading.Event()
         self._store = Store(settings)
+        self._made: dict[str, AnyFloats] = {}
+        """Arrays of the streams that the segment at work passes on."""
         self._source, self._begun = Source(), list[tuple[Operator, Observation]]()
         self._first = views[0].observation
         row = 0
@@ -231,11 +237,31 @@ class Execution:
 
     def _worked_through(self, segment: Segment) -> Source:
         """The streams that a segment passes on, once it has worked on all blocks."""
-        before, made, seen = segment.source.arrays, dict[str, AnyFloats](), set[str]()
-        means = {view.number: dict[str, SmoothField]() for view in self.views}
+        before, self._made = segment.source.arrays, self._room_for(segment)
+        found = Source(means={view.number: {} for view in self.views})
+        working = (o for o in segment.operators if type(o).exec is not Operator.exec)
+        labels = ", ".join(o.label for o in working)
+        together = self.schedule.at_once > 1
+        for views in [self.views] if together else [[view] for view in self.views]:
+            scan = self._first.name_of_all_bands if together else views[0].observation.name
+            self._sweep(segment, views, found, f"{scan}: {labels}")
+        segment.has_been_swept(self.views)
+        for maker in self._makers:
+            maker.release()
+        found.names, held = frozenset(found.arrays), set(map(id, found.arrays.values()))
+        every = (*before.values(), *self._made.values())
+        self._store.release([a for a in every if id(a) not in held])
+        self._made = {}
+        return found
+
+    def _room_for(self, segment: Segment) -> dict[str, AnyFloats]:
+        """Arrays for the streams that a segment passes on: new ones, or those that it changes in
+        place.
+        """
+        before, made = segment.source.arrays, dict[str, AnyFloats]()
         for name in sorted(segment.wanted):
             if name in before and not segment.halo:
-                made[name] = before[name]  # changed in place
+                made[name] = before[name]
                 continue
             shape = self.views[-1].rows.stop, self._first.n_samples
             made[name] = self._store.allocate(name, shape, segment.how == "kept")
@@ -244,66 +270,16 @@ class Execution:
                     what = f"stream {name} spilled to disk"
                     size = f"{made[name][view.rows].nbytes / 1e9:.2f} GB"
                     view.observation.log.state("Execution", what, size)
+        return made
 
-        def work(view: View, detectors: slice, samples: slice, due: list[Due] | None) -> None:
-            maker = self._makers[view.number]
-            block = maker.make(segment, detectors, samples, made, again=False, due=due)
-            for name in made.keys() & block.detdata.keys():
-                seen.add(name)
-                if block.detdata[name] is not block.places.get(name):
-                    made[name][view.rows][detectors, samples] = block.detdata[name]
-            means[view.number].update(block.means)  # the same fields in every block
-            for array in (*made.values(), *before.values()):
-                forget_pages(array)
-
-        working = (o for o in segment.operators if type(o).exec is not Operator.exec)
-        labels = ", ".join(o.label for o in working)
-        together = self.schedule.at_once > 1
-        for views in [self.views] if together else [[view] for view in self.views]:
-            scan = self._first.name_of_all_bands if together else views[0].observation.name
-            sweep = partial(self._on_block, views, work, bool(segment.split()[1]))
-            self._sweep(sweep, self.schedule.blocks(segment, views[0]), f"{scan}: {labels}")
-        segment.has_been_swept(self.views)
-        for maker in self._makers:
-            maker.release()
-        kept = {name: array for name, array in made.items() if name in seen}
-        held = set(map(id, kept.values()))
-        gone = [a for a in (*before.values(), *made.values()) if id(a) not in held]
-        self._store.release(gone)
-        return Source(kept, None, frozenset(kept), means)
-
-    def _on_block(
-        self,
-        views: Sequence[View],
-        work: Callable[..., None],
-        whole: bool,
-        detectors: slice,
-        samples: slice,
-    ) -> None:
-        """Work on a block of a band; or on one of several, piece by piece unless a step needs the
-        ``whole``, and let the steps that map all bands act once.
-        """
-        if len(views) == 1:
-            work(views[0], detectors, samples, None)
-            return
-        for part in [(detectors, samples)] if whole else pieces(detectors, samples):
-            every: list[list[Due]] = [[] for _ in views]
-            for view, due in zip(views, every, strict=True):
-                work(view, *part, due)
-            for together in zip(*every, strict=True):
-                step, start = together[0].step, time.thread_time()
-                step.exec_bands([due.block for due in together], [due.state for due in together])
-                self.timer.add(step.label, "exec", time.thread_time() - start)
-
-    def _sweep(
-        self, work: Callable[[slice, slice], None], blocks: list[tuple[slice, slice]], what: str
-    ) -> None:
+    def _sweep(self, segment: Segment, views: Sequence[View], found: Source, what: str) -> None:
         """Work on every block, on several threads; the first error stops all of them."""
         settings, stop, failed = self.settings, self._stop.set, list[BaseException]()
+        blocks = self.schedule.blocks(segment, views[0])
 
         def one(detectors: slice, samples: slice) -> None:
             try:
-                work(detectors, samples)
+                self._on_block(segment, views, found, detectors, samples)
             except (
                 BaseException
             ) as error:  # also StopIteration, which a generator turns into RuntimeError
@@ -314,6 +290,50 @@ class Execution:
             if failed:
                 raise failed[0]
             settings.progress(done, len(blocks), what)
+
+    def _on_block(
+        self,
+        segment: Segment,
+        views: Sequence[View],
+        found: Source,
+        detectors: slice,
+        samples: slice,
+    ) -> None:
+        """Work on a block of a band; or on one of several, piece by piece unless a step needs all
+        of it, and let the steps that map all bands act once.
+        """
+        if len(views) == 1:
+            self._of_band(segment, views[0], found, detectors, samples, None)
+            return
+        whole = segment.split()[1]
+        for part in [(detectors, samples)] if whole else pieces(detectors, samples):
+            every: list[list[Due]] = [[] for _ in views]
+            for view, due in zip(views, every, strict=True):
+                self._of_band(segment, view, found, *part, due)
+            for together in zip(*every, strict=True):
+                step, start = together[0].step, time.thread_time()
+                step.exec_bands([due.block for due in together], [due.state for due in together])
+                self.timer.add(step.label, "exec", time.thread_time() - start)
+
+    def _of_band(
+        self,
+        segment: Segment,
+        view: View,
+        found: Source,
+        detectors: slice,
+        samples: slice,
+        due: list[Due] | None,
+    ) -> None:
+        """Let the steps act on a block of one band, and put what it passes on into ``found``."""
+        made, maker = self._made, self._makers[view.number]
+        block = maker.make(segment, detectors, samples, made, again=False, due=due)
+        for name in made.keys() & block.detdata.keys():
+            found.arrays[name] = made[name]
+            if block.detdata[name] is not block.places.get(name):
+                made[name][view.rows][detectors, samples] = block.detdata[name]
+        found.means[view.number].update(block.means)  # the same fields in every block
+        for array in (*made.values(), *segment.source.arrays.values()):
+            forget_pages(array)
 
     def _keep(self) -> None:
         """Keep the streams that the user asked for, whole, in float64."""

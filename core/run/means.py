@@ -70,14 +70,13 @@ def means_of(
     return found
 
 
-def exec_whole(
+def whole_block(
     block: Block,
     operator: Operator,
     fields: Mapping[str, SmoothField],
     buffers: dict[str, AnyFloats],
-    work: Callable[[Block], None],
-) -> None:
-    """Equation (1) on one block.
+) -> Block:
+    """The block with x + M of equation (1), which the step may change.
 
     Parameters
     ----------
@@ -85,15 +84,12 @@ def exec_whole(
         M, by stream (`means_of`), of streams that are in the block.
     buffers
         float64 memory, reused from block to block.
-    work
-        f, which changes the block that it is given.
     """
-    means = {name: field for name, field in block.means.items() if name not in fields}
     whole = Block(
         block.observation,
         block.detectors,
         block.samples,
-        means=means,
+        means={name: field for name, field in block.means.items() if name not in fields},
         dtype=np.float64,
         buffers=buffers,
         again=block.again,
@@ -109,7 +105,13 @@ def exec_whole(
                 copy += stream
             else:
                 copy[...] = stream
-    work(whole)
+    return whole
+
+
+def take_whole(
+    block: Block, whole: Block, operator: Operator, fields: Mapping[str, SmoothField]
+) -> None:
+    """Put what a step made of the whole block into the block: equation (1)."""
     for name in operator.provides & (block.detdata.keys() | whole.detdata.keys()):
         if name not in whole.detdata:  # the step took it away
             del block.detdata[name]
@@ -122,7 +124,7 @@ def exec_whole(
             )
         else:
             block.new(name, zero=False)[...] = whole.detdata[name]
-    for name in means.keys() - whole.means.keys():
+    for name in block.means.keys() - whole.means.keys() - fields.keys():
         del block.means[name]
     block.means.update(whole.means)
 
