@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zonda.core.campaign import parts
+from zonda.core.campaign import trees
 from zonda.core.campaign.campaign_file import FILE, TASKS, Job
 from zonda.core.configuration.pipeline_file import load
 
@@ -219,7 +219,7 @@ def check_whole(folder: Path) -> None:
             continue  # hidden names are temporary files and the lock
         if path.parent.name == TASKS:
             if path.name in keys or path.name.startswith("layout"):
-                parts.read(path, keys.get(path.name, "layout"))
+                trees.read(path, keys.get(path.name, "layout"))
             else:
                 json.loads(path.read_text())
         elif path.name.endswith(".yaml"):

@@ -22,7 +22,7 @@ COMMANDS = {
     "sensitivity": "zonda.plugins.commands.sensitivity:sensitivity",
     "show": "zonda.plugins.commands.show:show",
     "status": "zonda.core.campaign.command:status",
-    "validate": "zonda.plugins.commands.validate:validate",
+    "validate": "zonda.plugins.validation.command:validate",
     "weather": "zonda.plugins.commands.weather:weather",
     "when": "zonda.plugins.commands.when:when",
 }

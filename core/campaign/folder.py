@@ -20,7 +20,7 @@ from typing import Any
 
 from ..errors import InputError, OutputError, ZondaError
 from ..storage.files import discard, put, temporary_sibling, write_text, writing
-from . import machines, parts
+from . import machines, trees
 from .campaign_file import FILE, RECORD, TASKS, Job, OtherFormat, Say, Task, plural
 
 RESOLVED = "resolved.yaml"
@@ -157,7 +157,7 @@ class Record:
         self._attempts = Counter[int]()
         for number in range(len(job.combinations)):
             try:
-                tree = parts.read(job.record(folder, number), job.identity(number))
+                tree = trees.read(job.record(folder, number), job.identity(number))
                 rows = [dict(zip(COLUMNS, row, strict=True)) for row in tree["tasks"]]
                 found = [
                     TaskRow(**row | {"machine": tree["machines"][row["machine"]]}) for row in rows
@@ -210,7 +210,7 @@ class Record:
         made_on = list(dict.fromkeys(row.machine for row in rows))
         table = [(*astuple(row)[:-1], made_on.index(row.machine)) for row in rows]
         tree = {"machines": made_on, "tasks": table, "figures": figures}
-        parts.write(self.job.record(self.folder, number), self.job.identity(number), tree)
+        trees.write(self.job.record(self.folder, number), self.job.identity(number), tree)
         self.combined[number] = figures
 
     def finish(self) -> None:
@@ -218,7 +218,7 @@ class Record:
         if not self.job.keep_tasks:
             shutil.rmtree(self.folder / TASKS, ignore_errors=True)
 
-    def discard_parts(self, number: int) -> None:
+    def discard_partials(self, number: int) -> None:
         """Remove the partial products of a combination."""
         for task in self.job.tasks_of[number]:
             discard(task.path(self.folder))
@@ -234,7 +234,7 @@ class Record:
         for task in tasks:
             path = task.path(self.folder)
             try:
-                parts.read(path, task.key)
+                trees.read(path, task.key)
                 found.append((task, done_row(task, self.folder)))
             except InputError:
                 missing.append(task)
@@ -267,7 +267,7 @@ def done_row(task: Task, folder: Path) -> TaskRow:
     """The row of a task whose partial product is there. Raises `InputError` where it is not, or its
     head is damaged.
     """
-    made, failure = parts.head(task.path(folder), task.key), _failure(task, folder)
+    made, failure = trees.head(task.path(folder), task.key), _failure(task, folder)
     try:
         host, seconds, machine = str(made["host"]), float(made["seconds"]), str(made["machine"])
     except (KeyError, TypeError, ValueError) as err:

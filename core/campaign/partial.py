@@ -19,7 +19,7 @@ from ..log import Log
 from ..observation import Observation
 from ..product import Product
 from ..scene import Scene
-from . import parts
+from . import trees
 
 POINTS = 512
 """Boresight directions that are kept of a scan for pictures and tables; of those beyond `SCANS`,
@@ -103,18 +103,18 @@ class Partial:
         return self
 
     def write(self, path: Path, identity: str, made: Mapping[str, Any]) -> None:
-        """Write it to a file; ``made``: how it was made (`parts.head`)."""
+        """Write it to a file; ``made``: how it was made (`trees.head`)."""
         products = {
             label: {"kind": p.identity(), "arrays": p.arrays()}
             for label, p in self.products.items()
         }
         tree = {"products": products, "scans": self.scans, "tally": _rows(self.log)}
-        parts.write(path, identity, tree, made)
+        trees.write(path, identity, tree, made)
 
     @classmethod
     def read(cls, path: Path, identity: str) -> Partial:
         """Read it from a file. Raises `InputError` where that is missing or damaged."""
-        tree = parts.read(path, identity)
+        tree = trees.read(path, identity)
         products = {}
         for label, product in tree["products"].items():
             kind = Product.kinds.get(product["kind"])

@@ -15,7 +15,7 @@ from ..errors import InputError, within
 from ..experiment.variant import FileVariant
 from ..scene import WithScene
 from ..storage.files import product_path
-from . import parts
+from . import trees
 from .campaign_file import (
     INPUTS,
     Combination,
@@ -189,8 +189,8 @@ class _Draft:
             self.need = max(self.need, pipeline.least_memory(data.observations))
         name, subfolder = _names(source, first, self.combinations)
         path = layout_path(self._folder, len(self.combinations))
-        parts.write(path, "layout", {"layouts": layouts})
-        layout, before = parts.digest_of(path), 0
+        trees.write(path, "layout", {"layouts": layouts})
+        layout, before = trees.digest_of(path), 0
         self.combinations.append(Combination(name, subfolder, layout, first.combination))
         for (number, entry), samples in zip(entries.items(), scans, strict=True):
             every = tuple(range(len(samples)))
@@ -319,8 +319,8 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
     numbers = dict.fromkeys(task.entry for task in job.tasks_of[number])
     files = [parse(text, name="campaign", folder=folder) for text in job.pipelines]
     path, entries = layout_path(folder, number), [job.entries[entry] for entry in numbers]
-    parts.write(path, "layout", {"layouts": common_layouts(entries, files, folder)[0]})
-    if parts.digest_of(path) != job.combinations[number].layout:
+    trees.write(path, "layout", {"layouts": common_layouts(entries, files, folder)[0]})
+    if trees.digest_of(path) != job.combinations[number].layout:
         raise InputError(
             "differs from the layout that was planned",
             place=str(path),
@@ -380,7 +380,7 @@ def _stamp(path: Path, kind: str) -> str:
         if kind == "text":
             return f"text:{digest_of_text(path.read_text(encoding='utf-8', errors='replace'))}"
         if kind == "bytes":
-            return f"bytes:{parts.digest_of(path)}"
+            return f"bytes:{trees.digest_of(path)}"
         stat = path.stat()
     except OSError:
         return "missing"

@@ -9,7 +9,7 @@ from .. import hooks
 from ..errors import InputError, OutputError, PipelineError, ZondaError
 from ..experiment.engines import Pool, share_out
 from ..storage.files import check_output_folder
-from . import parts, table
+from . import table, trees
 from .campaign_file import FILE, Job, Say, Task, digest_of_text, layout_path, plural
 from .folder import (
     RESOLVED,
@@ -89,7 +89,7 @@ def resume(
     record = Record(job, folder)
     for number, combination in enumerate(job.combinations):
         layout = layout_path(folder, number)
-        if number not in record.combined and parts.digest_of(layout) != combination.layout:
+        if number not in record.combined and trees.digest_of(layout) != combination.layout:
             restore_layout(job, folder, number)
     waiting = [task for task in job.tasks if task.combination not in record.combined]
     missing = record.verify(waiting, say, strict)

@@ -1,11 +1,11 @@
 """Tasks of a campaign, on workers: one runs scans of an entry and writes their partial product; one
 adds up the partial products of a set.
 
-The bits of a task do not depend on where and when it runs. The parts of a set are numbered in the
-order of their scans and added up in a fixed tree: runs of `FAN` parts from left to right, the sums
-likewise, until one is left. So the bits are the same for any engine, any number of workers, any
-order of completion. Sums of maps are integers and exact anyway; means of spectra are floats and owe
-their bits to the tree.
+The bits of a task do not depend on where and when it runs. The partial products of a set are
+numbered in the order of their scans and added up in a fixed tree: runs of `FAN` of them from left
+to right, the sums likewise, until one is left. So the bits are the same for any engine, any number
+of workers, any order of completion. Sums of maps are integers and exact anyway; means of spectra
+are floats and owe their bits to the tree.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from ..faults import faults_named
 from ..figures import Figures
 from ..pipeline import Part
 from ..storage.files import check_output_folder, discard
-from . import machines, parts
+from . import machines, trees
 from .campaign_file import Job, PlannedEntry, Task, layout_path, plural
 from .folder import Record, clean
 from .machines import Watch
@@ -153,18 +153,18 @@ def pipeline_of(text: str, folder: Path) -> PipelineFile:
 @lru_cache(4)
 def layouts_in(path: Path, digest: str) -> Mapping[str, Any]:
     """The layouts in a file, by label. Raises InputError where it is not the one meant."""
-    if parts.digest_of(path) != digest:
+    if trees.digest_of(path) != digest:
         raise InputError(
             "cannot be used: it is missing, damaged or another campaign's",
             place=str(path),
             cure="can this worker see the campaign's folder?",
         )
-    layouts: Mapping[str, Any] = parts.read(path, "layout")["layouts"]
+    layouts: Mapping[str, Any] = trees.read(path, "layout")["layouts"]
     return layouts
 
 
 FAN = 32
-"""Parts that are added up at once."""
+"""Partial products that are added up at once."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class Combined:
 
 
 def combine(folder: Path, number: int) -> Combined:
-    """Add up one combination's parts, finish its products and write them."""
+    """Add up one combination's partial products, finish its products and write them."""
     data = combined(Job.read(folder), folder, number)
     counts = {(who, what) for who, what, _ in data.log.counts()}
     measured = [product for product in data.products.values() if isinstance(product, Figures)]
@@ -190,7 +190,9 @@ def combine(folder: Path, number: int) -> Combined:
 
 @faults_named()
 def combined(job: Job, folder: Path, number: int) -> Data:
-    """Finished data of `combine`. Raises `InputError` if a part is missing or damaged."""
+    """Finished data of `combine`. Raises `InputError` if a partial product is missing or
+    damaged.
+    """
     combination, tasks = job.combinations[number], job.tasks_of[number]
     first = job.entry_of(tasks[0])
     file = pipeline_of(job.pipelines[first.pipeline], folder)
@@ -216,7 +218,7 @@ def combined(job: Job, folder: Path, number: int) -> Data:
 
 
 def _sum(tasks: Sequence[Task], folder: Path, first: int, level: int) -> Partial:
-    """Sum of ``FAN**level`` parts from the ``first`` on; one sum is held for each level."""
+    """Sum of ``FAN**level`` partial products from the ``first`` on, one held for each level."""
     if level == 0:
         task = tasks[first]
         return Partial.read(task.path(folder), task.key)
@@ -341,12 +343,12 @@ class Combinations(Work[int, Combined]):
         return combine, self.folder.resolve(), item
 
     def ended(self, item: int, result: Combined | Lost) -> bool:
-        """Record that products are written, and remove their parts."""
+        """Record that products are written, and remove their partial products."""
         if isinstance(result, Lost):
             return self.again(item, result)
         self.record.combine(item, result.figures)
         name = self.job.combinations[item].name
         self.result.log += [(name, *row) for row in result.log]
         if not self.job.keep_tasks:
-            self.record.discard_parts(item)
+            self.record.discard_partials(item)
         return False

@@ -216,7 +216,7 @@ def test_tries_are_bounded_and_resume_goes_on(undisturbed, bench, monkeypatch, c
     monkeypatch.setattr(campaign, "perform", perform)
     before = {p.name: p.stat().st_mtime_ns for p in (out / "tasks").iterdir()}
     monkeypatch.setattr(Record, "finish", lambda *a: None)
-    monkeypatch.setattr(Record, "discard_parts", lambda *a: None)
+    monkeypatch.setattr(Record, "discard_partials", lambda *a: None)
     assert bench.command("resume", out, *SERIAL) == 0
     after = {p.name: p.stat().st_mtime_ns for p in (out / "tasks").iterdir()}
     for name in before.keys() & {f"{number:06d}.npz" for number in range(12)}:

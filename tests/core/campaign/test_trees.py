@@ -7,7 +7,7 @@ import contextlib
 import numpy as np
 import pytest
 
-from zonda.core.campaign import parts
+from zonda.core.campaign import trees
 from zonda.core.errors import InputError
 
 TREE = {
@@ -18,26 +18,26 @@ TREE = {
 
 
 def test_what_is_written_is_read(tmp_path):
-    parts.write(tmp_path / "p.npz", "me", TREE, {"host": "here"})
-    found = parts.read(tmp_path / "p.npz", "me")
+    trees.write(tmp_path / "p.npz", "me", TREE, {"host": "here"})
+    found = trees.read(tmp_path / "p.npz", "me")
     assert found["c"] == TREE["c"]
     assert np.array_equal(found["a"]["b"], np.arange(5))
     assert found["d"].shape == (2, 0)
     assert found["d"].dtype == np.float32
-    assert parts.head(tmp_path / "p.npz", "me") == {"host": "here"}
+    assert trees.head(tmp_path / "p.npz", "me") == {"host": "here"}
 
 
 def test_the_same_product_is_the_same_bytes(tmp_path):
     for name in ("a", "b"):
-        parts.write(tmp_path / name, "me", TREE)
+        trees.write(tmp_path / name, "me", TREE)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-    assert parts.digest_of(tmp_path / "a") == parts.digest_of(tmp_path / "b") != ""
-    assert parts.digest_of(tmp_path / "c") == ""
+    assert trees.digest_of(tmp_path / "a") == trees.digest_of(tmp_path / "b") != ""
+    assert trees.digest_of(tmp_path / "c") == ""
 
 
 def test_every_damage_is_noticed(tmp_path):
     path = tmp_path / "p.npz"
-    parts.write(path, "me", TREE)
+    trees.write(path, "me", TREE)
     whole = path.read_bytes()
     for at in range(0, len(whole), 7):
         damaged = bytearray(whole)
@@ -46,25 +46,25 @@ def test_every_damage_is_noticed(tmp_path):
         with contextlib.suppress(
             InputError
         ):  # bits of the archive's own bookkeeping that nobody reads may change
-            found = parts.read(path, "me")
+            found = trees.read(path, "me")
             assert np.array_equal(found["a"]["b"], np.arange(5))
             assert found["c"] == TREE["c"]
     for length in range(0, len(whole), 11):
         path.write_bytes(whole[:length])
         with pytest.raises(InputError):
-            parts.read(path, "me")
+            trees.read(path, "me")
 
 
 def test_the_product_of_another_task_is_refused(tmp_path):
-    parts.write(tmp_path / "p.npz", "me", TREE)
+    trees.write(tmp_path / "p.npz", "me", TREE)
     with pytest.raises(InputError, match="another task"):
-        parts.read(tmp_path / "p.npz", "you")
+        trees.read(tmp_path / "p.npz", "you")
     with pytest.raises(InputError, match="another task"):
-        parts.head(tmp_path / "p.npz", "you")
+        trees.head(tmp_path / "p.npz", "you")
 
 
 def test_objects_are_neither_written_nor_read(tmp_path):
     for value in ({"x": object()}, {"x": np.array([{}])}, {(1, 2): "x"}):
         with pytest.raises((TypeError, ValueError)):
-            parts.write(tmp_path / "p.npz", "me", value)
+            trees.write(tmp_path / "p.npz", "me", value)
     assert list(tmp_path.iterdir()) == []

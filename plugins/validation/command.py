@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from zonda.plugins.validation.claims import Claim
-    from zonda.plugins.validation.rows import Row
+    from .claims import Claim
+    from .rows import Row
 
 UNDECIDED = 1
 """Exit status where a claim differs and nothing explains it."""
@@ -47,7 +47,8 @@ def validate(
     and no counter-experiment explains it.
     """
     from zonda.core.tables import aligned
-    from zonda.plugins.validation.claims import SHIPPED, read
+
+    from .claims import SHIPPED, read
 
     path = SHIPPED if path is None else path
     file = read(path)
@@ -63,8 +64,9 @@ def validate(
     one_blas_thread()
     from zonda.core.storage.files import check_output_folder
     from zonda.core.storage.lock import lock
-    from zonda.plugins.validation.page import summary, write
-    from zonda.plugins.validation.rows import measured
+
+    from .page import summary, write
+    from .rows import measured
 
     check_output_folder(output)
     with lock(output):
@@ -92,7 +94,7 @@ def _chosen(claims: list[Claim], ids: tuple[str, ...]) -> list[Claim]:
 
 def _cells(row: Row) -> tuple[str, ...]:
     """Cells of a line: the claim, the paper's value, zonda's value, the verdict."""
-    from zonda.plugins.validation.page import stated
+    from .page import stated
 
     claim = row.claim
     found = stated(row.values, claim.paper.factor, claim.paper.unit) if row.values.values else "-"
