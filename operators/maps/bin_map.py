@@ -27,13 +27,12 @@ from zonda.core.types import Floats
 from .angle_checks import check_polarized, warn_before
 from .binning import BandBlock, Binning, Weights, add_blocks, binnings, weights_of
 from .coverage import COUNTS, Coverage, Directions
-from .grid import Grid
+from .grid import Cells, Grid, Looking
 from .intensity_kernel import FLAGGED, NOT_FINITE, OUTSIDE, TOO_LARGE, Sums
 from .map_from_sums import MapFromSums
 from .map_layout import MapLayout
 from .map_sums import MapSums
 from .parameters import MapParameters
-from .pixels import Cells, Looking
 
 NO_WHITE = "what the detectors' NET would make; this scene has no white noise"
 """Said of the noise that the map of such a scene states."""

@@ -43,9 +43,9 @@ from zonda.core.types import AnyFloats, Floats
 
 from . import intensity_kernel as intensity
 from . import stokes_kernel as stokes
+from .grid import Cells, Looking, fingerprint, tiles
 from .intensity_kernel import FLAGGED, OUTSIDE, WEIGHT, Sums, add_intensity, move
 from .parameters import Split, halves_of
-from .pixels import Cells, Looking, fingerprint, tiles
 from .stokes_kernel import add_stokes
 
 LOCK = threading.Lock()

@@ -35,9 +35,8 @@ from zonda.core.kernels import kernel
 from zonda.core.maps.planes import Plane
 from zonda.core.types import Floats
 
-from .grid import PixelGrid
+from .grid import Cells, Looking, PixelGrid, tiles
 from .intensity_kernel import WEIGHT, Sums
-from .pixels import Cells, Looking, tiles
 
 SLOWEST = 1e-10
 """Radians per sample below which a detector does not move: far below sidereal motion, far above the

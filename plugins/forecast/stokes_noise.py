@@ -32,9 +32,8 @@ from zonda.core.numerics.transforms import convolved, gaussian_taps
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.maps.binning import BandBlock, Binning, Weights, add_blocks
-from zonda.operators.maps.grid import TangentGrid
+from zonda.operators.maps.grid import Cells, Looking, TangentGrid
 from zonda.operators.maps.intensity_kernel import WEIGHT
-from zonda.operators.maps.pixels import Cells, Looking
 from zonda.operators.maps.stokes_kernel import MATRIX, PLACES
 
 from .detector_noise import SIGNS, Comb, Filtered, Series, combs

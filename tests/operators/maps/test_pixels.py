@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 import zonda
 from zonda.operators.maps import binning
-from zonda.operators.maps.grid import HealpixGrid
-from zonda.operators.maps.pixels import Looking
+from zonda.operators.maps.grid import HealpixGrid, Looking
 from zonda.plugins.checks.scenes import scan
 
 FOOTPRINT = np.arange(int(12 * 1024**2 * 0.32), int(12 * 1024**2 * 0.34))
