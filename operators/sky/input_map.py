@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 NEIGHBOURS = 24
 """Points in each local fit: of HEALPix pixels, two rings and a few more."""
-AT_ONCE = 16384
+FITTED_AT_ONCE = 16384
 """Positions that are fitted together."""
 
 
@@ -48,7 +48,7 @@ def local_fit(points: Floats, data: Floats, at: Floats) -> tuple[Floats, int]:
     tree: Any = cKDTree(points)
     poor = 0
     found = np.empty((len(data), len(at)))
-    for part in chunks(len(at), AT_ONCE):
+    for part in chunks(len(at), FITTED_AT_ONCE):
         distance, index = tree.query(at[part], np.arange(1, min(NEIGHBOURS, tree.n) + 1))
         scale = np.maximum(distance[:, -1:], 1e-300)
         u, v = np.moveaxis((points[index] - at[part, None, :]) / scale[:, :, None], 2, 0)
