@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
+from pydantic_core import PydanticCustomError
 
 from .accuracy.metrics import Metric, OfFunction, get
 from .configuration.diagnostics import TextValue, mistake, refusal
@@ -196,6 +197,16 @@ class Choice(TextValue):
             f"cannot read {value!r:.60} as a metric; write its name, or {{name: {{parameter:"
             " value}}"
         )
+
+    @classmethod
+    def of(cls, value: Any) -> Self:
+        """As `parse`, outside a file. Raises InputError."""
+        try:
+            return cls.parse(value)
+        except PydanticCustomError as err:
+            told, message = err.context or {}, err.message().removeprefix("metric: ")
+            cure = str(told.get("help") or told.get("label", ""))
+            raise InputError(message, place="metric", cure=cure) from None
 
     def __str__(self) -> str:
         return self.name

@@ -239,7 +239,7 @@ class Experiment:
         for variant in variants:
             for metric in metrics:
                 if isinstance(metric, str | FigureMetric):
-                    metric = Choice.parse(metric)
+                    metric = Choice.of(metric)
                 self.want(variant, metric, seeds if isinstance(seeds, int) else len(seeds))
 
     def want(self, variant: AnyVariant, metric: Choice | Metric | None, seeds: int) -> None:
@@ -266,14 +266,14 @@ class Experiment:
         ``take``: is given the variant, the number of the realization and what was measured as each
         run ends, in place of the table: for metrics that are no numbers and large.
         """
+        items = [(v, n) for v, wanted in self._wanted.items() for n in range(max(wanted.values()))]
         if executor is None:
             pool = Pool(SerialExecutor(), 1)
         elif isinstance(executor, Pool):
             pool = executor
-        else:
-            workers = getattr(executor, "_max_workers", 1)
+        else:  # MPI's and Dask's do not say how many workers they have
+            workers = getattr(executor, "_max_workers", 0) or max(1, len(items))
             pool = Pool(executor, workers, workers)
-        items = [(v, n) for v, wanted in self._wanted.items() for n in range(max(wanted.values()))]
         missing = {
             (variant, number): found
             for variant, number in items
@@ -362,7 +362,8 @@ class _Runs(Work[Item, Found]):
         missing: Mapping[Item, list[str]],
         take: Callable[[AnyVariant, int, Found], None] | None,
     ) -> None:
-        super().__init__(pool, "experiment")
+        cure = "run it again on another executor; runs that a folder holds are not repeated"
+        super().__init__(pool, "experiment", cure)
         self.whole, self.items, self.missing = whole, list(items), missing
         self.take = take or whole.keep
 

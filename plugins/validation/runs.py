@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from zonda.core.campaign.entries import setting
 from zonda.core.configuration.locate import locate
-from zonda.core.errors import InputError, ZondaError
+from zonda.core.errors import ZondaError
 from zonda.core.experiment.experiment import SECONDS, Values
 from zonda.core.experiment.experiment import Experiment as Tasks
 from zonda.core.experiment.variant import FileVariant
@@ -133,16 +133,7 @@ class Runs:
 
     def _choice(self, experiment: Experiment) -> Choice | None:
         """The metric of an experiment; None: the seconds of a run."""
-        if experiment.metric == SECONDS:
-            return None
-        from pydantic_core import PydanticCustomError
-
-        try:
-            return Choice.parse(experiment.metric)
-        except PydanticCustomError as err:
-            raise InputError(
-                err.message(), place="metric", cure=str((err.context or {}).get("help", ""))
-            ) from None
+        return None if experiment.metric == SECONDS else Choice.of(experiment.metric)
 
     def _variants(self, experiment: Experiment) -> list[FileVariant]:
         assert experiment.pipeline is not None

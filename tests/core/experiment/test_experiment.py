@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import pytest
 import zonda
 from zonda.core.accuracy.metrics import Metric
 from zonda.core.data import Data
-from zonda.core.errors import PipelineError
+from zonda.core.errors import InputError, PipelineError
 from zonda.core.experiment.engines import engine
 from zonda.core.experiment.experiment import SECONDS, Experiment
 from zonda.core.experiment.variant import FileVariant, Variant
@@ -102,6 +102,38 @@ def test_a_metric_that_a_variant_cannot_have(pipeline: Path, tmp_path: Path) -> 
     pipeline.write_text(TEXT.replace("  - BinMap: {pixel: 8 arcsec}\n  - SaveMap\n", ""))
     with pytest.raises(PipelineError, match="needs map"):
         of(pipeline, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("metric", "words"),
+    [
+        ("central_rsm", "metric: unknown metric 'central_rsm'.*central_rms"),
+        ("map_rms", "metric: map_rms is an error of one run against another.*central_rms"),
+        ("central_rms(radius=3)", "radius: 3 has no unit"),
+    ],
+)
+def test_a_metric_that_there_is_not(pipeline: Path, metric: str, words: str) -> None:
+    with pytest.raises(InputError, match=f"(?s){words}"):
+        Experiment([FileVariant(pipeline)], metrics=[metric])
+
+
+class Silent(Executor):
+    """Does not tell how many workers it has, as MPI's and Dask's, and begins when it has three."""
+
+    def __init__(self) -> None:
+        self.waiting: list[tuple[Future[Any], Any, Any]] = []
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.waiting.append((Future(), fn, args))
+        if len(self.waiting) == 3:
+            for future, call, given in self.waiting:
+                future.set_result(call(*given))
+        return self.waiting[-1][0]
+
+
+def test_an_executor_that_does_not_tell_its_workers_is_given_all_runs(pipeline: Path) -> None:
+    executor, made = Silent(), Experiment([FileVariant(pipeline)], 3, [RMS])
+    assert len(made.run(executor).records()) == 3
 
 
 class Killed(Metric):
