@@ -212,9 +212,9 @@ def audit(
     words = f"the first {size.seconds:.3g} s of 1 scan"
     if size.every > 1:
         words += f", every {size.every}th detector"
-    if made.context.joined:
+    if made.joined:
         words += (
-            f", this band alone: with the others, which {made.context.joined} joins, the bounds"
+            f", this band alone: with the others, which {made.joined} joins, the bounds"
             " need not hold"
         )
 

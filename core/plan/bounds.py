@@ -93,7 +93,7 @@ class Choice:
 
     @property
     def sets(self) -> tuple[Mapping[str, Any], bool]:
-        """What it does to the pipeline."""
+        """Settings, and if the operator is left out."""
         return self.settings, self.leave_out
 
 

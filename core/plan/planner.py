@@ -109,7 +109,7 @@ def plan(
     made = Plan(
         structure,
         {
-            name: PlanOfBand(tuple(own), allowed, context)
+            name: PlanOfBand(tuple(own), allowed, context, joined)
             for name, own, allowed, context in zip(names, decided, limited, contexts, strict=True)
         },
         memory_of(contexts, Settings(threads or available_threads(), free, dtype)),

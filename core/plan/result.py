@@ -101,11 +101,15 @@ class PlanOfBand:
         The budget by metric.
     context
         Scans, noise and coverage, without the operators that are dropped as a whole.
+    joined
+        Steps that join the bands (`Context.joined`), also where they are dropped: errors of that
+        are bounded for this band alone.
     """
 
     decided: tuple[Decided, ...]
     limits: Mapping[str, float]
     context: Context
+    joined: str = ""
 
     @property
     def spent(self) -> dict[str, float]:
@@ -136,7 +140,7 @@ class PlanOfBand:
         return {
             "noise": {"sample": sample, "map_pixel": pixel, "samples_per_pixel": hits},
             "budget": {m: {"limit": v, "spent": self.spent[m]} for m, v in self.limits.items()},
-            "joins_bands": self.context.joined,
+            "joins_bands": self.joined,
             "effects": [self._effect(d) for d in self.decided],
         }
 
@@ -158,7 +162,7 @@ class PlanOfBand:
     def text(self, omitted: Sequence[Row]) -> str:
         """Noise, budget and effects. ``omitted``: what is left out by structure."""
         said = [f"noise: {self._noise()}"]
-        if joined := self.context.joined:
+        if joined := self.joined:
             said.append(
                 f"{joined} joins the bands: the bounds are of this band alone and need not hold, so"
                 " that nothing is coarsened"
@@ -255,6 +259,11 @@ class Plan:
     def context(self) -> Context:
         """Scans of the first band."""
         return self._first.context
+
+    @property
+    def joined(self) -> str:
+        """Steps that join the bands."""
+        return self._first.joined
 
     @property
     def noise(self) -> tuple[float, float, float]:

@@ -77,6 +77,15 @@ def test_a_plan_coarsens_nothing_where_bands_are_joined() -> None:
     ] * 2
 
 
+def test_a_plan_that_drops_what_joins_the_bands_says_that_bounds_need_not_hold() -> None:
+    made = zonda.plan(parse(TEXT), drop=["CommonModeFilter"], threads=1)
+    assert "CommonModeFilter" not in made.operators
+    assert [one["joins_bands"] for one in made.as_dict()["bands"].values()] == [
+        "CommonModeFilter"
+    ] * 2
+    assert str(made).count("CommonModeFilter joins the bands: the bounds are of this band") == 2
+
+
 def test_what_is_dropped_all_the_same_is_audited_of_each_band_alone() -> None:
     file = parse(TEXT)
     made = zonda.plan(file, drop=["high-pass decimation"], threads=1)
