@@ -90,7 +90,7 @@ def one(file: Path, memory: int | None) -> None:
     labels = {*forecast.setup, *forecast.growing}
     found = {
         "cpu": used, "run": run, "steps": steps, "forecast": forecast.total,
-        "bytes": made.summary.memory.bytes, "expected": {k: forecast.of(k) for k in labels},
+        "bytes": made.memory, "expected": {k: forecast.of(k) for k in labels},
         "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }  # fmt: skip
     print(json.dumps(found))

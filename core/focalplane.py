@@ -151,18 +151,6 @@ class Focalplane:
         return bool((self.polarization_efficiency > 0).any())
 
     @property
-    def bands_alike(self) -> int:
-        """Number of bands, where the detectors of all of them look through the same pixels, else
-        1.
-        """
-        first, *others = (self.of_band(number) for number in np.unique(self.band).tolist())
-        alike = all(
-            np.array_equal(first.xi, other.xi) and np.array_equal(first.eta, other.eta)
-            for other in others
-        )
-        return 1 + len(others) if alike else 1
-
-    @property
     def radius(self) -> float:
         """Largest distance of a detector from the boresight, tan(rad)."""
         return float(np.hypot(self.xi, self.eta).max()) if len(self) else 0.0

@@ -288,7 +288,7 @@ class Experiment:
         return [kept[number][metric] for number in range(self._wanted[variant][metric])]
 
     def table(self) -> Table:
-        """All figures that were measured, in the order of variants, seeds and metrics."""
+        """Figures that were measured, in the order of variants, seeds and metrics."""
         rows = [
             {
                 "variant": str(variant),
@@ -323,7 +323,7 @@ class Experiment:
         return self.folder / "runs" / f"{variant.key}.json"
 
     def _values(self, variant: AnyVariant) -> dict[int, Found]:
-        """What is known of a variant, by realization; a damaged file counts as none."""
+        """Known values of a variant, by realization; a damaged file counts as none."""
         if variant not in self._kept:
             self._kept[variant], path = {}, self._path(variant)
             with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -394,7 +394,7 @@ def measured(
     metrics: Mapping[str, Choice | Metric | None],
     threads: int | None = None,
 ) -> Found:
-    """What metrics measure of a variant at a seed."""
+    """Run a variant at a seed, and measure its metrics."""
     known = {name: metric for name, metric in metrics.items() if metric is not None}
     begin = time.perf_counter()
     data = variant.run([_measures(m) for m in known.values()], seed=seed, threads=threads)
