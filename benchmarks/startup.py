@@ -59,18 +59,18 @@ def stages(folder: str, pipeline: str) -> dict[str, Any]:
     from zonda.core.output import Output
     from zonda.core.pipeline import Pipeline
     from zonda.core.plan import planner
-    from zonda.core.run import execute
+    from zonda.core.run import execution
 
     mark("import zonda, numpy, numba, pydantic")
     after(planner, "for_run", "plan")
-    usual = execute.run
+    usual = execution.run
 
     def observe(*arguments: Any) -> None:
         mark("point the telescope, lay out the map")
         usual(*arguments)
         mark("observe")
 
-    execute.run = observe
+    execution.run = observe
     timed = Pipeline._timed
 
     def finish(self: Any, timer: Any, operator: Any, stage: str, *arguments: Any) -> None:

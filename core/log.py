@@ -51,12 +51,12 @@ class Log:
         return iter(sorted(rows))
 
     def counts(self) -> list[tuple[str, str, int]]:
-        """All counts (who, what, number), sorted."""
+        """Counts (who, what, number), sorted."""
         with self._lock:
             return sorted((*k, v) for k, v in self._counts.items())
 
     def figures(self) -> list[tuple[str, str, str]]:
-        """All statements (who, what, text), sorted."""
+        """Statements (who, what, text), sorted."""
         with self._lock:
             return sorted((*k, v) for k, v in self._figures.items())
 

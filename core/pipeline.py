@@ -23,7 +23,7 @@ from .observation import Observation
 from .operator import Operator, labels
 from .output import Output
 from .run.budget import least_memory
-from .run.execute import execute
+from .run.execution import execute
 from .run.settings import Settings, Timer
 from .run.views import Band, View
 from .scene import Scene, WithScene

@@ -17,8 +17,8 @@ from zonda.core.flags import (
     SUN_CLOSE,
     SUN_UP,
     TURNAROUND,
+    samples_in,
 )
-from zonda.core.intervals import samples_in
 from zonda.core.numerics.earth_orientation import orientation
 from zonda.core.types import Floats
 from zonda.core.versions import needed

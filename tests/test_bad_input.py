@@ -166,7 +166,7 @@ def test_what_the_map_lacks(here, capsys, command, cards, words):
 def test_what_a_cube_and_a_polarized_map_lack(here, capsys, command):
     (here / "map.fits").unlink()
     write_map(here / "map.fits", np.ones((3, 11, 11)))
-    assert "set the operator's parameter plane" in refused(capsys, command)
+    assert "plane: 1 in a pipeline file" in refused(capsys, command)
     (here / "map.fits").unlink()
     write_map(
         here / "map.fits", np.ones((3, 11, 11)), CTYPE3="STOKES", CRPIX3=1.0, CRVAL3=1.0, CDELT3=1.0

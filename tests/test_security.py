@@ -214,7 +214,7 @@ def test_a_soft_link_stays_in_the_file(tmp_path: Path) -> None:
 def test_a_table_of_air_is_numbers_only(tmp_path: Path) -> None:
     from zonda.core.configuration.time import Instant
     from zonda.core.site import Site
-    from zonda.operators.atmosphere.weather.table import Table
+    from zonda.operators.atmosphere.weather.sources import Table
 
     (tmp_path / "air.csv").write_text(
         "height [m], pressure [hPa], temperature [K], relative humidity [%]\n__import__('os'), 1,"

@@ -130,8 +130,8 @@ def accuracy(
     from ..experiment.engines import engine
     from .bench import Setup
     from .metrics import get
+    from .pareto import most_runs, study
     from .settings import knobs_of, shortened
-    from .study import most_runs, study
 
     file = load(pipeline, settings)
     get(metric)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
     from ..data import Data
     from ..operator import Operator
-    from .study import Study
+    from .pareto import Study
 
 
 FORMAT = 2

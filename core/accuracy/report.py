@@ -12,9 +12,8 @@ from typing import Any
 from ..canvas import SEQUENCE, new_axes
 from ..tables import aligned
 from .bench import differences
-from .pareto import Point, least
+from .pareto import Point, Study, least
 from .settings import overrides
-from .study import Study
 from .sweep import Alone
 
 LONGEST = 88

@@ -26,8 +26,7 @@ from .campaign_file import (
     layout_path,
     plural,
 )
-from .entries import Entry, entries
-from .settings import MOST_TASKS, Campaign
+from .settings import MOST_TASKS, Campaign, Entry, entries
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile

@@ -13,8 +13,7 @@ from ..configuration.diagnostics import Diagnostic
 from ..configuration.loaded import KEYS, Header
 from ..configuration.steps import Mistakes
 from ..registry import declared, makers, operators, operators_that
-from .entries import setting
-from .settings import MOST_TASKS, Campaign, Sweep
+from .settings import MOST_TASKS, Campaign, Sweep, setting
 
 if TYPE_CHECKING:
     from ..configuration.yaml_places import Document

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from ..accuracy.metrics import Metric
-from ..campaign.entries import separate
+from ..campaign.settings import separate
 from ..errors import PipelineError
 from ..figures import Choice, Figure, FigureMetric
 from ..storage.files import write_text

@@ -226,8 +226,8 @@ class Cube(FileHeader):
         if wanted is None:
             if not asked:
                 return {}
-            cure = f"choose its plane ({ranges}): --plane {ones.replace(' ', '')} of zonda compare,"
-            cure += f" plane: {example} of a step"
+            cure = f"choose the plane ({ranges}): plane: {example} in a pipeline file,"
+            cure += f" --plane {ones.replace(' ', '')} of zonda compare"
             if not all(self.names[axis] for axis in asked):
                 cure += ", or CTYPE3 to STOKES if its planes are I, Q, U"
             raise self.error(f"the image is a cube of {self.sides} pixels, not a map", cure)
@@ -346,8 +346,8 @@ class HealpixTable(FileHeader):
             raise self.error(
                 f"the coordinate system of the HEALPix map is {what}",
                 "set the header key COORDSYS to C, G or E, or give coordsys: icrs, galactic or"
-                " ecliptic (WMAP's and Planck's maps are galactic); zonda compare takes --coordsys"
-                " C (ICRS), G or E",
+                " ecliptic in a pipeline file, --coordsys C, G or E to zonda compare (WMAP's and"
+                " Planck's maps are galactic)",
             )
         found = _FRAMES[system]
         if given is not None and _FRAMES.get(written, found) != found:

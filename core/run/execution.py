@@ -36,6 +36,7 @@ import numpy as np
 
 from ..discovery import RAISED
 from ..errors import PipelineError
+from ..hooks import manager
 from ..log import Log
 from ..machine import resident_memory
 from ..mapmaker import filters, joins
@@ -46,14 +47,43 @@ from ..signal import MAIN, Formed, is_signal
 from ..stream import Stream, forget_pages, in_order, whole
 from ..types import AnyFloats
 from .block_maker import BlockMaker, Due
-from .budget import memory_of
+from .budget import divide, memory_of
 from .means import MeansOfBands, WholeStream, knows_means, means_of
 from .prefetch import Ahead
 from .schedule import Schedule, schedule
 from .segments import Segment, Source, least_block, pieces
 from .settings import Settings, Timer
 from .streams import Store, StreamMadeAgain
-from .views import View
+from .views import Band, View
+
+
+def execute(bands: Sequence[Band], settings: Settings, timer: Timer) -> None:
+    """Run all scans in order; the next one is prepared while one is executed."""
+    hooks = manager().hook.zonda_before_operator, manager().hook.zonda_after_operator
+    heard = any(
+        hook.get_hookimpls() for hook in hooks
+    )  # who listens hears of one observation after the other
+    several = len(bands) + len(bands[0].data.observations) > 2
+    ahead = Ahead(settings.threads > 1 and several and not heard)
+    groups = divide(bands, settings, ahead)
+    turns = [
+        (these, Execution([View(b.chain, b.data.observations[k], b.data) for b in these], own,
+                          timer, *hooks))
+        for k in range(len(bands[0].data.observations))
+        for these, own in groups
+    ]  # fmt: skip
+    following = [*(execution for _, execution in turns[1:]), None]
+    try:
+        for (these, execution), after in zip(turns, following, strict=True):
+            execution.run(ahead, after)
+            for band, view in zip(these, execution.views, strict=True):
+                band.data.log.update(view.observation.log)
+                if band is bands[-1] and view.observation.common is not None:
+                    view.observation.common.clear()  # the last that may need it
+                band.watch("scan")
+    finally:
+        ahead.close()
+
 
 ELSEWHERE = "samples flagged as those of another band are: nothing is measured there"
 """A count of the log."""

@@ -17,12 +17,11 @@ from zonda.core.configuration.diagnostics import refusal
 from zonda.core.configuration.parameters import Parameters, quantity
 from zonda.core.configuration.units import Angle, Fraction, Metres, MetresPerSecond
 from zonda.core.data import Data
-from zonda.core.emission import LoadSpectra
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.smooth import SmoothField
-from zonda.core.observation import Observation
+from zonda.core.observation import LoadSpectra, Observation
 from zonda.core.operator import Operator
 from zonda.core.registry import spectra
 from zonda.core.types import Floats

@@ -45,7 +45,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.storage.table_files import Column
-from zonda.core.stream_names import AnyStream, check_signals
+from zonda.core.stream import AnyStream, check_signals
 from zonda.core.tables import html_table
 from zonda.core.types import Floats
 

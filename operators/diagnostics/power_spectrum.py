@@ -15,7 +15,7 @@ from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.flags import has_a_signal
 from zonda.core.signal import BUILT_IN, MAIN, TRANSMISSION, Component
-from zonda.core.stream_names import StreamName
+from zonda.core.stream import StreamName
 from zonda.core.types import Floats
 
 from .series import OfStreams, Spectrum, count_flagged, no_stream, spread_evenly

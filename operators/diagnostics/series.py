@@ -21,7 +21,7 @@ from zonda.core.product import Record
 from zonda.core.signal import is_stream
 from zonda.core.storage.files import product_path
 from zonda.core.storage.table_files import Column, write_ecsv
-from zonda.core.stream_names import UNITS, StreamName, streams_asked, streams_needed
+from zonda.core.stream import UNITS, StreamName, streams_asked, streams_needed
 from zonda.core.tables import html_table
 from zonda.core.types import Floats
 

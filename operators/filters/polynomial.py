@@ -24,8 +24,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Data, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.flags import TRIMMED, has_a_signal
-from zonda.core.intervals import ranges
+from zonda.core.flags import TRIMMED, has_a_signal, ranges
 from zonda.core.numerics.smooth import product
 from zonda.core.types import Floats
 
@@ -45,7 +44,7 @@ Part = Literal[
     "scan_leftright",
     "scan_rightleft",
 ]
-"""The whole scan, or one of TOAST's names of intervals (`core.intervals`)."""
+"""The whole scan, or one of TOAST's names of intervals (`core.flags`)."""
 
 
 class Detrend(LinearFilter):

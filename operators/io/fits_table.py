@@ -19,7 +19,7 @@ from zonda.core.errors import InputError
 from zonda.core.maps.map_file import ascii_text
 from zonda.core.storage.files import UNPACKED_MAX, is_packed, unpacked, writing
 from zonda.core.storage.fits_files import check_size, opened, table_bytes
-from zonda.core.stream_names import UNITS
+from zonda.core.stream import UNITS
 from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
 

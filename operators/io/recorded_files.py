@@ -20,7 +20,7 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Fraction, RadioFrequency
 from zonda.core.errors import InputError
-from zonda.core.intervals import Intervals, runs
+from zonda.core.flags import Intervals, runs
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 

@@ -20,7 +20,7 @@ from zonda.core.flags import DETECTOR_MASK
 from zonda.core.output import StreamOutput, output_folder
 from zonda.core.product import Record
 from zonda.core.storage.files import atomic_path, check_memory, product_path
-from zonda.core.stream_names import UNITS, StreamName, streams_asked, streams_needed
+from zonda.core.stream import UNITS, StreamName, streams_asked, streams_needed
 
 from . import fits_table, toast_hdf5
 from .recorded_stream import kelvin_per

@@ -19,11 +19,13 @@ from zonda.core.flags import (
     TRIMMED,
     TRIMMED_INTERVALS,
     Flags,
+    Intervals,
     from_file,
     in_file,
     of_before,
+    runs,
+    samples_in,
 )
-from zonda.core.intervals import Intervals, runs, samples_in
 from zonda.core.numerics.quaternions import detector_quaternions, directions
 from zonda.core.numerics.sphere import angles
 from zonda.core.storage.files import writing
@@ -99,7 +101,7 @@ class TimeOrderedData:
         (n_det, n_samp) arrays; K_RJ, but for what is no temperature. NaN: a single sample that is
         not to be used.
     intervals
-        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.intervals`).
+        By TOAST's names: (start, stop) of parts of the scan, s since ``start`` (`core.flags`).
         In those called `TRIMMED_INTERVALS` *processing* means that a filter of zonda trimmed the
         samples.
     weather

@@ -23,7 +23,7 @@ from zonda.core.errors import InputError
 from zonda.core.flags import INVALID, Flags
 from zonda.core.storage.files import reading, writing
 from zonda.core.storage.hdf5_files import Disk, check_size, checked
-from zonda.core.stream_names import UNITS
+from zonda.core.stream import UNITS
 from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
 

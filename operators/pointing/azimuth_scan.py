@@ -10,7 +10,7 @@ import numpy as np
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
 from zonda.core.errors import PointingError
-from zonda.core.intervals import Intervals
+from zonda.core.flags import Intervals
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import series
 from zonda.core.numerics.sphere import unit_vectors

@@ -17,7 +17,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle, Fraction, SampleRate, Seconds
 from zonda.core.errors import PointingError
-from zonda.core.intervals import Intervals
+from zonda.core.flags import Intervals
 from zonda.core.numerics.celestial import Boresight, CelestialTransform
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import series

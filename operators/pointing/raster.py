@@ -30,7 +30,7 @@ from pydantic import Discriminator, Field, Tag
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
-from zonda.core.intervals import Intervals, runs
+from zonda.core.flags import Intervals, runs
 from zonda.core.numerics.celestial import Boresight
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import series

@@ -16,7 +16,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Fraction, Seconds
 from zonda.core.errors import InputError
-from zonda.core.intervals import part
+from zonda.core.flags import part
 from zonda.core.numerics.quaternions import directions, middle
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator

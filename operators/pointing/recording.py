@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
-from zonda.core.flags import EXCLUDE_SAMPLE, NOT_RECORDED
-from zonda.core.intervals import Intervals
+from zonda.core.flags import EXCLUDE_SAMPLE, NOT_RECORDED, Intervals
 from zonda.core.types import Floats
 
 UNEVEN = 0.25

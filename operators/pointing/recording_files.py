@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from zonda.core import flags
 from zonda.core.configuration.time import SECOND, Instant
 from zonda.core.errors import InputError
-from zonda.core.intervals import Intervals
+from zonda.core.flags import Intervals
 from zonda.core.storage import fits_files, hdf5_files
 from zonda.core.storage.files import reading
 from zonda.core.storage.table_files import Table, read_table, read_text

@@ -24,8 +24,7 @@ from zonda.core.configuration.units import (
     SampleRate,
 )
 from zonda.core.errors import InputError, PointingError
-from zonda.core.flags import IRREGULAR
-from zonda.core.intervals import runs
+from zonda.core.flags import IRREGULAR, runs
 from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.quaternions import multiply
 from zonda.core.numerics.sphere import angles, separation, unit_vectors

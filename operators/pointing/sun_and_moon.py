@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.flags import SUN_CLOSE, SUN_UP
-from zonda.core.intervals import Intervals, runs
+from zonda.core.flags import SUN_CLOSE, SUN_UP, Intervals, runs
 from zonda.core.numerics.bodies import Track, tracks
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import directions

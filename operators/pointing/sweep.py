@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.intervals import Intervals, runs
+from zonda.core.flags import Intervals, runs
 from zonda.core.types import Floats
 
 

@@ -19,7 +19,7 @@ from zonda.operators.atmosphere.weather.bands import BandAtmosphere
 from zonda.operators.atmosphere.weather.climatology import profile
 from zonda.operators.atmosphere.weather.profiles import Profile
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
-from zonda.operators.atmosphere.weather.table import Table
+from zonda.operators.atmosphere.weather.sources import Table
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.noise.white import WhiteNoise

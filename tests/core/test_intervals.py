@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zonda.core.intervals import part, runs, samples_in
+from zonda.core.flags import part, runs, samples_in
 
 
 @given(st.lists(st.booleans(), min_size=2, max_size=60), st.integers(0, 2**31))

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from zonda.core import machine
-from zonda.core.accuracy.measure import run_in
+from zonda.core.accuracy.bench import run_in
 from zonda.core.experiment.engines import engine
 from zonda.core.experiment.variant import FileVariant
 

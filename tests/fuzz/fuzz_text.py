@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from engine import ROOT, fuzz, guided_by, scratch, told
 
 with guided_by(
-    "zonda.operators.atmosphere.weather.table",
+    "zonda.operators.atmosphere.weather.sources",
     "zonda.core.instrument",
     "zonda.core.accuracy.fronts",
 ):
@@ -24,7 +24,7 @@ with guided_by(
     from zonda.core.errors import ZondaError
     from zonda.core.instrument import Band
     from zonda.core.site import Site
-    from zonda.operators.atmosphere.weather.table import Table
+    from zonda.operators.atmosphere.weather.sources import Table
 
 FILE = scratch(".txt")
 SITE = Site(name="here", latitude="40.6 deg", longitude="10.1 deg", altitude="500 m")

@@ -8,11 +8,11 @@ import pytest
 from zonda.core.assembly.checks import run_checks
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.configuration.time import Instant
-from zonda.core.emission import LoadSpectra
 from zonda.core.errors import ZondaError
 from zonda.core.instrument import Band
 from zonda.core.numerics.radiation import BOLTZMANN, PLANCK, T_CMB, rayleigh_jeans
 from zonda.core.numerics.smooth import SmoothField
+from zonda.core.observation import LoadSpectra
 from zonda.core.registry import sites
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere
 from zonda.operators.atmosphere.weather.climatology import profile

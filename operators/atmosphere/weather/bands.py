@@ -21,10 +21,10 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike
 
-from zonda.core.emission import LoadSpectra
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import rayleigh_jeans
+from zonda.core.observation import LoadSpectra
 from zonda.core.types import AnyFloats, Floats
 
 from .absorption import AbsorptionTable, CrossSections

@@ -7,8 +7,7 @@ from itertools import product
 
 import pytest
 
-from zonda.core.accuracy.bench import Bench, Setup
-from zonda.core.accuracy.measure import TimedRun
+from zonda.core.accuracy.bench import Bench, Setup, TimedRun
 from zonda.core.accuracy.metrics import Metric
 from zonda.core.accuracy.settings import PipelineKnob
 from zonda.core.accuracy.sweep import tightest

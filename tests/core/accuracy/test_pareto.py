@@ -2,7 +2,7 @@
 
 import pytest
 
-from zonda.core.accuracy.measure import TimedRun
+from zonda.core.accuracy.bench import TimedRun
 from zonda.core.accuracy.pareto import Point, cheapest, pareto, search
 from zonda.core.accuracy.sweep import sweep
 

@@ -9,9 +9,9 @@ import zonda
 from zonda.core.accuracy import fronts as store
 from zonda.core.accuracy.bench import Setup
 from zonda.core.accuracy.fronts import Retest
+from zonda.core.accuracy.pareto import study
 from zonda.core.accuracy.report import lines
 from zonda.core.accuracy.settings import knobs_of
-from zonda.core.accuracy.study import study
 from zonda.core.errors import InputError
 
 TEXT = """
@@ -36,7 +36,7 @@ def toy_run(setting, seed, alone):
     """A map whose difference from the reference is known: no process, no scan."""
     import numpy as np
 
-    from zonda.core.accuracy.measure import TimedRun
+    from zonda.core.accuracy.bench import TimedRun
 
     coarse = 1 / float(setting.get("HighpassFilter.oversampling", 24))
     loose = float(setting.get("CommonModeFilter.residual", 1e-6))

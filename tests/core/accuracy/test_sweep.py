@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zonda.core.accuracy.bench import Measured
-from zonda.core.accuracy.measure import TimedRun
+from zonda.core.accuracy.bench import Measured, TimedRun
 from zonda.core.accuracy.pareto import search
 from zonda.core.accuracy.sweep import convergence, sweep, tightest
 from zonda.core.errors import ZondaError

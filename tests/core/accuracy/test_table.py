@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from zonda.core.accuracy.measure import TimedRun
-from zonda.core.accuracy.pareto import Point
+from zonda.core.accuracy.bench import TimedRun
+from zonda.core.accuracy.pareto import Point, Study
 from zonda.core.accuracy.report import lines
-from zonda.core.accuracy.study import Study
 from zonda.core.accuracy.sweep import Alone, Rung, Sweep, sweep, tightest
 
 from .conftest import Value, setup_of

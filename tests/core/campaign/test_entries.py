@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from zonda.core.campaign.entries import TURN, entries, separate
-from zonda.core.campaign.settings import Campaign
+from zonda.core.campaign.settings import TURN, Campaign, entries, separate
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.configuration.time import Instant

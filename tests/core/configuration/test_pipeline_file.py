@@ -793,11 +793,11 @@ def test_a_list_of_a_thousand_steps_is_not_too_long() -> None:
 def test_a_campaign_too_large_is_refused_before_a_step_is_made(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from zonda.core.campaign import entries
+    from zonda.core.campaign import settings
     from zonda.core.configuration import pipeline_file, steps
 
     monkeypatch.setattr(steps, "_step", lambda *a: pytest.fail("a step was made"))
-    monkeypatch.setattr(entries, "Entry", lambda *a: pytest.fail("an entry was made"))
+    monkeypatch.setattr(settings, "Entry", lambda *a: pytest.fail("an entry was made"))
     axis = ", ".join(map(str, range(430)))
     text = (
         f"operators: [A, B]\ncampaign:\n  grid:\n    seed: [{axis}]\n    time: [{axis}]\n   "

@@ -12,8 +12,7 @@ from scipy import signal as scipy_signal
 import zonda
 import zonda.testing
 from zonda.core.errors import PipelineError
-from zonda.core.flags import INVALID, TRIMMED
-from zonda.core.intervals import ranges
+from zonda.core.flags import INVALID, TRIMMED, ranges
 from zonda.operators.filters.polynomial import Detrend, Pieces, PolynomialFilter
 from zonda.operators.filters.rows import Rows
 from zonda.plugins.checks import scenes

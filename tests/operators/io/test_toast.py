@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.core.intervals import samples_in
+from zonda.core.flags import samples_in
 from zonda.core.operator import Operator
 from zonda.core.polarization import PolarizationAngles
 from zonda.operators.io.load_tod import LoadTOD

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from zonda.core.data import Data
 from zonda.core.errors import PointingError
-from zonda.core.flags import TURNAROUND
-from zonda.core.intervals import samples_in
+from zonda.core.flags import TURNAROUND, samples_in
 from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth

@@ -16,8 +16,7 @@ from zonda.core.configuration.parameters import ParameterError
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PointingError
-from zonda.core.flags import IRREGULAR, TURNAROUND
-from zonda.core.intervals import samples_in
+from zonda.core.flags import IRREGULAR, TURNAROUND, samples_in
 from zonda.core.numerics.quaternions import conjugate, from_angles, multiply
 from zonda.core.pipeline import Pipeline
 from zonda.core.registry import instruments

@@ -11,8 +11,7 @@ from astropy.coordinates import AltAz, EarthLocation, get_sun
 from astropy.time import Time
 
 from zonda.core.data import Data
-from zonda.core.flags import EXCLUDE_SAMPLE, SUN_CLOSE, SUN_UP
-from zonda.core.intervals import samples_in
+from zonda.core.flags import EXCLUDE_SAMPLE, SUN_CLOSE, SUN_UP, samples_in
 from zonda.core.scene import Scene
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth
 

@@ -234,7 +234,7 @@ def test_the_list_runs_nothing(claims, tmp_path, capsys, runs):
 
 
 def test_the_shipped_rows_name_pipelines_keys_and_metrics_that_there_are(tmp_path):
-    from zonda.plugins.validation.runs import Runs
+    from zonda.plugins.validation.rows import Runs
 
     runs = Runs(tmp_path, SHIPPED.parent)
     for claim in read(SHIPPED).claims:
@@ -247,9 +247,8 @@ def test_the_quick_rows_are_decided(tmp_path):
 
 
 def test_a_counter_of_another_quantity_has_axes_of_its_own(claims, tmp_path):
-    from zonda.plugins.validation.figure import draw
-    from zonda.plugins.validation.rows import Row
-    from zonda.plugins.validation.runs import Runs
+    from zonda.plugins.validation.page import draw
+    from zonda.plugins.validation.rows import Row, Runs
 
     path = claims()
     claim, runs = read(path).claims[0], Runs(tmp_path / "out", path.parent)
@@ -264,7 +263,7 @@ def test_a_counter_of_another_quantity_has_axes_of_its_own(claims, tmp_path):
 
 def test_the_atmosphere_of_a_site_is_drawn(tmp_path):
     from zonda.core.configuration.pipeline_file import load
-    from zonda.plugins.validation.runs import atmosphere_figure
+    from zonda.plugins.validation.rows import atmosphere_figure
 
     emission, transmission = atmosphere_figure(
         load(SHIPPED.parent / "mustang2.yaml", ()).scene()

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from zonda.core.errors import ZondaError
 from zonda.core.experiment.experiment import Values
-from zonda.plugins.validation.runs import combined
+from zonda.plugins.validation.rows import combined
 from zonda.plugins.validation.verdict import (
     LIMIT,
     Stated,

@@ -23,8 +23,7 @@ from zonda.operators.atmosphere.weather import air as measures
 from zonda.operators.atmosphere.weather.climatology import profile
 from zonda.operators.atmosphere.weather.era5 import Era5
 from zonda.operators.atmosphere.weather.profiles import PwvDistribution
-from zonda.operators.atmosphere.weather.sources import Climatology, Standard, profile_of
-from zonda.operators.atmosphere.weather.table import Table
+from zonda.operators.atmosphere.weather.sources import Climatology, Standard, Table, profile_of
 
 _spec = importlib.util.spec_from_file_location(
     "era5_files", Path(__file__).with_name("era5_files.py")
