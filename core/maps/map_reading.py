@@ -229,7 +229,7 @@ class Cube(FileHeader):
             cure = f"choose the plane ({ranges}): plane: {example} in a pipeline file,"
             cure += f" --plane {ones.replace(' ', '')} of zonda compare"
             if not all(self.names[axis] for axis in asked):
-                cure += ", or CTYPE3 to STOKES if its planes are I, Q, U"
+                cure += "; or set CTYPE3 to STOKES if its planes are I, Q, U"
             raise self.error(f"the image is a cube of {self.sides} pixels, not a map", cure)
         long = sorted(axis for axis, length in lengths.items() if length > 1) or sorted(lengths)
         numbered = next((some for some in (long, asked) if len(some) == len(wanted)), None)
