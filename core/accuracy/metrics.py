@@ -145,6 +145,7 @@ class OfBands(Metric):
         self.each = each
         self.says = f"{each.says}; the largest of all bands"  # type: ignore[misc]
         self.needs_end = each.needs_end  # type: ignore[misc]
+        self.reads = each.reads  # type: ignore[misc]
 
     def check(self, operators: Sequence[Operator], runs: Mapping[str, Signal]) -> None:
         self.each.check(operators, runs)

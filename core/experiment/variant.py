@@ -52,7 +52,7 @@ class Variant:
 
     def steps(self, metrics: Sequence[Metric]) -> list[Operator]:
         """The steps without what acts at the end, but for those whose products metrics read."""
-        read = frozenset[str]().union(*(getattr(metric, "reads", ()) for metric in metrics))
+        read = frozenset[str]().union(*(metric.reads for metric in metrics))
         whole = any(metric.needs_end for metric in metrics)
         every = self.pipeline.operators
         return [o for o in every if whole or not isinstance(o, Output) or o.provides & read]

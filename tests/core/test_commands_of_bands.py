@@ -228,6 +228,16 @@ def test_metrics_of_bands(path: Path, tmp_path: Path) -> None:
     assert rms.floor(rms.measure(data)) == 1.0
 
 
+def test_a_metric_of_each_band_keeps_the_step_whose_product_it_reads(path: Path) -> None:
+    path.write_text(path.read_text() + "  - MapSpectrum\n")
+    file = zonda.load(path)
+    metric = metric_of(file, "map_power(of=map, smallest=1 arcmin, largest=30 arcmin)")
+    assert isinstance(metric, OfBands)
+    steps = zonda.Variant(file.pipeline(), file.scene()).steps([metric])
+    assert "MapSpectrum" in {o.label for o in steps}
+    assert "SaveMap" not in {o.label for o in steps}
+
+
 def test_accuracy_on_the_command_line(
     path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
