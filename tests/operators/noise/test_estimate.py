@@ -15,6 +15,8 @@ def made(rng, net, knee, slope):
     """(N,) noise of the one-sided density 2 NET^2 (1 + (knee / f)^slope), cut out of four times as
     much.
     """
+    if knee == 0:
+        return net * np.sqrt(RATE) * rng.normal(size=N)
     f = np.fft.rfftfreq(4 * N, 1 / RATE)
     density = 2 * net**2 * (1 + (knee / np.maximum(f, 1e-3)) ** slope)
     waves = np.sqrt(density * RATE * N) * (rng.normal(size=f.size) + 1j * rng.normal(size=f.size))

@@ -106,12 +106,13 @@ def test_tiles_and_blocks_change_nothing(made, save, tmp_path, monkeypatch, kind
 
 
 @pytest.mark.parametrize("kind", ["healpix", "CAR"])
-def test_blocks_are_told(made, save, tmp_path, kind):
+def test_blocks_are_told(made, save, tmp_path, monkeypatch, kind):
     """The progress bar hears of every block, and of the end."""
     from zonda.operators.sky.read import read_map
 
+    monkeypatch.setattr(regions, "BLOCK", 2 * TILE)
     told = []
-    target = tangent_grid_wcs(*CENTRE, (-512, 512, -512, 512), ARCMIN)
+    target = tangent_grid_wcs(*CENTRE, (-2 * TILE, 2 * TILE, -2 * TILE, 2 * TILE), ARCMIN)
     if kind == "healpix":
         healpy.write_map(
             tmp_path / "h.fits",
@@ -130,8 +131,8 @@ def test_blocks_are_told(made, save, tmp_path, kind):
         header["CTYPE1"], header["CTYPE2"] = "RA---CAR", "DEC--CAR"
         image = read_map(save(np.ones((18, 36)), header))
         interpolated(image, target, progress=lambda done, total: told.append((done, total)))
-    assert [done for done, _ in told] == [k * 512**2 for k in range(5)]
-    assert {total for _, total in told} == {1024**2}
+    assert [done for done, _ in told] == [k * (2 * TILE) ** 2 for k in range(5)]
+    assert {total for _, total in told} == {(4 * TILE) ** 2}
 
 
 def test_planning_interpolates_nothing(made, tmp_path, monkeypatch):
