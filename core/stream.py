@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -23,12 +23,6 @@ from .numerics.smooth import SmoothField
 from .observation import Observation
 from .signal import BUILT_IN, MAIN, Component, is_signal
 from .types import AnyFloats, Floats
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from .observation import Observation
-
 
 StreamName = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 """A name that a parameter ``streams`` may list: ``signal``, a component (``sky``, or one of a

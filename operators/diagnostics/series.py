@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,6 @@ from zonda.core.storage.table_files import Column, write_ecsv
 from zonda.core.stream import UNITS, StreamName, streams_asked, streams_needed
 from zonda.core.tables import html_table
 from zonda.core.types import Floats
-
-if TYPE_CHECKING:
-    from zonda.core.data import Data, Observation
 
 
 class OfStreams(Operator):

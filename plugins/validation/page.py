@@ -18,16 +18,11 @@ from zonda.core.storage.files import atomic_path, write_text
 from zonda.core.tables import Table, render
 
 from .claims import ClaimsFile
-from .rows import Row
+from .rows import CounterResult, Row
 from .verdict import LIMIT
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from zonda.core.experiment.experiment import Values
-
-    from .rows import CounterResult, Row
-
 
 LINE = 0.42
 """Height of a line, in."""

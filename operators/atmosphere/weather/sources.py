@@ -35,10 +35,6 @@ if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.scene import Scene
     from zonda.core.site import Site
-if TYPE_CHECKING:
-    from zonda.core.configuration.time import Instant
-    from zonda.core.site import Site
-
 
 HIGHEST = 8e3
 """m above sea level that a table must reach: nearly all water lies below."""
