@@ -200,7 +200,7 @@ class Choice(TextValue):
 
     @classmethod
     def of(cls, value: Any) -> Self:
-        """As `parse`, outside a file. Raises InputError."""
+        """A choice outside a file: `parse` that raises InputError."""
         try:
             return cls.parse(value)
         except PydanticCustomError as err:

@@ -184,7 +184,7 @@ Item = tuple[AnyVariant, int]
 """A variant, and the number of a realization, counted from 0."""
 
 Found = dict[str, Any]
-"""By metric, what was measured: a `Figure`, or whatever a metric gives that is no number."""
+"""Measurements by metric: a `Figure`, or whatever a metric gives that is no number."""
 
 COLUMNS = {
     "variant": "what was changed",

@@ -32,7 +32,7 @@ REACH = 23
 """Decay times after which a pulse counts no more: e^-23 = 1e-10."""
 
 Pulses = list[tuple[Floats, Floats]]
-"""Of each detector of a scan times (n,) [s since the start], rising, and amplitudes (n,) [K]."""
+"""Times (n,) [s since the start], rising, and amplitudes (n,) [K] for each detector of a scan."""
 
 
 class Glitches(Operator):

@@ -118,7 +118,7 @@ def _pictures(shown: Sequence[Picture], bands: Sequence[str]) -> list[dict[str, 
 
 
 def _scene(data: Data) -> dict[str, Any]:
-    """What the scene is called, and what it is."""
+    """Text about the scene by name; what is empty is not shown."""
     scene = data.scene
     instrument, site, telescope = scene.instrument, scene.site, scene.instrument.telescope
     cameras, target = instrument.cameras, scene.target
@@ -222,7 +222,7 @@ def _timings(data: Data) -> dict[str, Counter[str]]:
 
 
 def _provenance(known: Mapping[str, Any], seed: int) -> dict[str, Any]:
-    """Where the numbers come from: seed, command, versions, signals."""
+    """Origin of the numbers: seed, command, versions, signals; what is empty is not shown."""
     rows = {"seed": seed, "command": known.get("command"), **known.get("versions", {})}
     rows["precision"] = known.get("precision")
     for name, run in known.get("runs", {}).items():
