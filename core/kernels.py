@@ -102,11 +102,16 @@ class CacheLock(event.Listener):  # type: ignore[misc]
 
     numba numbers the files of a kernel in an index. Two processes that compile at the same time
     could give one number to two signatures, and later runs would then load the wrong machine code.
+    A forked process has a lock of its own.
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = filelock.FileLock(path, thread_local=False, fallback_to_soft=False)
         self._path = path
+        self._begin()
+        os.register_at_fork(after_in_child=self._begin)
+
+    def _begin(self) -> None:
+        self._file = filelock.FileLock(self._path, thread_local=False, fallback_to_soft=False)
         self._guard = threading.Lock()
         self._depth = 0
 

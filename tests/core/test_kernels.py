@@ -151,6 +151,25 @@ def test_the_users_cache_folder_unless_numba_is_told_another(
     assert kernels.folder.__wrapped__() == tmp_path / "numba" / "zonda-kernels"
 
 
+FORK = """
+import os, sys
+from zonda.core.kernels import CacheLock
+
+lock = CacheLock(sys.argv[1])
+lock.on_start(None)
+child = os.fork()
+if child:
+    lock.on_end(None)
+    sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+lock.on_start(None)  # when the other process has released it
+lock.on_end(None)
+"""
+
+
+def test_a_forked_process_has_a_lock_of_its_own(tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "-c", FORK, str(tmp_path / "lock")], check=True)
+
+
 def test_the_lock_is_held_while_a_kernel_is_compiled(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
