@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -135,9 +136,9 @@ class Table:
 
 
 def cell_text(value: Any, digits: int = 5) -> str:
-    """A text as it is, a number to ``digits``; empty for None and NaN."""
-    if isinstance(value, str):
-        return value
+    """A text or a whole number as it is, another one to ``digits``; empty for None and NaN."""
+    if isinstance(value, str | Integral):
+        return str(value)
     return "" if value is None or math.isnan(value) else f"{value:.{digits}g}"
 
 

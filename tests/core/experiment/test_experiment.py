@@ -86,6 +86,7 @@ def test_pipelines_and_scenes_of_python_give_the_values_of_their_file(pipeline: 
     table = zonda.Experiment([variant], 2, ["central_rms(radius=30 arcsec)"]).run()
     rows, of_file = table.records(), of(pipeline, None).run().records()
     assert [row["variant"] for row in rows] == ["mine", "mine"]
+    assert all(str(row["seed"]) in line for row, line in zip(rows, table.lines()[1:], strict=True))
     assert [row["value"] for row in rows] == [row["value"] for row in of_file[:2]]
     seeds = [row["seed"] for row in rows]
     assert zonda.Experiment([variant], seeds, [RMS]).run().records() == rows
