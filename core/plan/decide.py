@@ -145,6 +145,8 @@ def decide(
         if not d.simulated:
             over = [m for m, v in d.choice.bound.items() if v > left.get(m, math.inf)]
             return f"above the budget: {', '.join(over)}" if over else "within the budget"
+        if d.name in forced and coarser and not taken.get(d.name, [d])[0].chosen:
+            return "--drop: the bands have no coarser form in common"
         if d.name in stated or d.name in taken:
             return stated.get(d.name, "within the budget")
         if joined and coarser:

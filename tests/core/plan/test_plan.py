@@ -95,6 +95,10 @@ def test_a_form_of_several_bands_is_the_finest_that_one_of_them_needs():
     assert [[d.chosen for d in band] for band in found] == [[0, 0], [0]]
     found = deciding.decide(bands, [{"map_rms": 1.0}, {"map_rms": 3.0}])
     assert [[d.chosen for d in band] for band in found] == [[2, 0], [2]]
+    found = deciding.decide(bands, [{"map_rms": 1.0}] * 2, forced={"A.one", "A.other"})
+    assert [[d.chosen for d in band] for band in found] == [[2, 0], [2]]
+    assert found[0][0].reason == found[1][0].reason == "--drop"
+    assert found[0][1].reason == "--drop: the bands have no coarser form in common"
 
 
 def test_no_saving_no_error():
