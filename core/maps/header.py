@@ -94,6 +94,10 @@ UNSEEN = -1.6375e30
 """Value of pixels that HEALPix's tools did not see."""
 
 
+NARROWEST = 1e-6
+"""arcsec of a pixel; the finest interferometer resolves ten times as much."""
+
+
 def marked_bad(values: AnyFloats, header: FileHeader) -> NDArray[np.bool_]:
     """True for values that a map's file marks as not observed: `UNSEEN`, and that of the card
     BAD_DATA. NaN is not among them.
@@ -152,6 +156,12 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
         if abs(about.number(key) or 0.0) * Unit(ANGLES.get(unit, "deg")).to("deg") > 720.0:
             cure = f"correct {key}, or the unit CUNIT{axis}"
             raise about.error(f"{key} = {made[key]:g} {unit} is no longitude or latitude", cure)
+        width, key = abs(about.number(f"CDELT{axis}") or 1.0), f"CDELT{axis}"
+        if rows := [about.number(f"CD{row}_{axis}") for row in "12" if f"CD{row}_{axis}" in made]:
+            width, key = math.hypot(*(each or 0.0 for each in rows)), f"CD1_{axis}, CD2_{axis}"
+        narrowest = NARROWEST / Unit(ANGLES.get(unit, "deg")).to("arcsec")
+        if is_celestial(made, axis) and width < narrowest:
+            raise about.error(f"{key}: pixels of {width:.3g} {unit} are none", f"correct {key}")
     kinds = {str(header.get(f"CTYPE{axis}", "")).strip().upper()[:4] for axis in "12"}
     if kinds == {"GLON", "GLAT"}:
         for key in _EQUATORIAL:

@@ -211,7 +211,16 @@ def too_large(message: str, place: str) -> InputError:
     )
 
 
+def check_kind(path: str | os.PathLike[str]) -> None:
+    """Raise ValueError for a pipe or a device, which would be waited for, and OSError for a path
+    that leads nowhere."""
+    mode = os.stat(path).st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise ValueError("it is a pipe or a device, not a file")
+
+
 def _opener(path: str | os.PathLike[str]) -> Any:
+    check_kind(path)
     with open(path, "rb") as file:
         magic = file.read(4)
     return next((opener for begin, opener in OPENERS.items() if magic.startswith(begin)), open)

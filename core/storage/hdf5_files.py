@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from ..errors import InputError
-from .files import check_memory, reading
+from .files import check_kind, check_memory, reading
 
 COMPRESSION_MAX = 1100
 """Bytes in memory per byte of the file: deflate, the densest filter in use, reaches 1032."""
@@ -36,6 +36,7 @@ def checked(path: str | os.PathLike[str], place: str) -> Any:
     """
     import h5py
 
+    check_kind(path)
     file = h5py.File(path, "r")
     try:
         _refuse_other_files(file, place)

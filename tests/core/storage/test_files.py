@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 
 import pytest
 
-from zonda.core.errors import OutputError
+from zonda.core.errors import InputError, OutputError
+from zonda.core.storage import fits_files, hdf5_files, table_files
 from zonda.core.storage.files import (
     atomic_path,
     check_output_folder,
@@ -15,6 +17,18 @@ from zonda.core.storage.files import (
     product_path,
     write_text,
 )
+
+
+def fits_opened(path):
+    return fits_files.opened(path, "here", "mend it")
+
+
+def hdf5_opened(path):
+    return hdf5_files.opened(path, "here", "HDF5", "mend it")
+
+
+def reading_a_table(path):
+    return contextlib.nullcontext(table_files.read_table(path, "here"))
 
 
 def left(folder):
@@ -138,3 +152,11 @@ def test_product_names_never_leave_the_folder(tmp_path, name, file):
 def test_a_name_without_letters_is_refused(tmp_path, name):
     with pytest.raises(OutputError, match="cannot name a file"):
         product_path(tmp_path, name)
+
+
+@pytest.mark.parametrize("opened", [fits_opened, hdf5_opened, reading_a_table])
+def test_pipes_and_devices_are_not_waited_for(tmp_path, opened):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="a pipe or a device") as told:
+        opened(tmp_path / "pipe").__enter__()
+    assert told.value.place == "here"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import healpy
 import numpy as np
 import pytest
@@ -371,3 +373,21 @@ def test_jansky_per_pixel_and_per_beam_are_brightness(tmp_path, values, capsys):
             )  # of the pixel nearest to the source
     assert compare(a, c, "--output", tmp_path / "o", "--unit", "Jy/pixel") == 2
     assert "Jy/pixel depends on the pixel" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("cards", [{"CDELT1": 1e-300}, {"CD1_1": -1e-12, "CD2_1": 0.0}])
+def test_pixels_without_width(tmp_path, values, capsys, cards):
+    a, b = write(tmp_path / "a.fits", values), write(tmp_path / "b.fits", values, **cards)
+    for first, second in ((a, b), (b, a)):
+        assert compare(first, second, "--output", tmp_path / "o") == 2
+        assert next(iter(cards)) in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("suffix", [".fits", ".csv", ".h5"])
+def test_a_pipe_is_not_waited_for(tmp_path, values, capsys, suffix):
+    pipe = tmp_path / f"pipe{suffix}"
+    os.mkfifo(pipe)
+    a = write(tmp_path / "a.fits", values)
+    assert compare(pipe, a, "--output", tmp_path / "o") == 2
+    assert str(pipe) in capsys.readouterr().err
