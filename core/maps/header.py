@@ -161,7 +161,8 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
             width, key = math.hypot(*(each or 0.0 for each in rows)), f"CD1_{axis}, CD2_{axis}"
         narrowest = NARROWEST / Unit(ANGLES.get(unit, "deg")).to("arcsec")
         if is_celestial(made, axis) and width < narrowest:
-            raise about.error(f"{key}: pixels of {width:.3g} {unit} are none", f"correct {key}")
+            text = f"{width:g} {unit} is no size of a pixel, which is 1e-6 arcsec or more"
+            raise about.error(f"{key}: {text}", f"check {key}, and its unit")
     kinds = {str(header.get(f"CTYPE{axis}", "")).strip().upper()[:4] for axis in "12"}
     if kinds == {"GLON", "GLAT"}:
         for key in _EQUATORIAL:
