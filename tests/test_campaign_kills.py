@@ -322,6 +322,7 @@ def workers_of(pid: int) -> list[int]:
     return found
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the workers in /proc")
 def test_workers_killed_at_random_moments(place: Path, nursery: Nursery, whole_run: Any) -> None:
     """The campaign goes on without them; where they die too often it says so, and resumes."""

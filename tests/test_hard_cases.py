@@ -40,8 +40,8 @@ def result(check: Check) -> Result:
     return check.run()
 
 
-SLOW = ("dispatch.another_instruction_set",)
-"""Checks that compile every kernel again: .ci/nightly and `zonda doctor` run them."""
+SLOW = ("dispatch.another_instruction_set", "determinism.compiled_at_once")
+"""Checks that compile kernels again: .ci/nightly and `zonda doctor` run them."""
 
 
 @pytest.mark.parametrize(

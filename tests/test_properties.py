@@ -249,6 +249,7 @@ def test_blocks_and_threads_change_no_bit(threads: int, megabytes_each: int, see
     )
 
 
+@pytest.mark.nightly
 @few
 @given(workers=st.integers(1, 7))
 def test_workers_change_no_bit_of_a_campaign(workers: int) -> None:

@@ -36,6 +36,7 @@ TOO_FAST = ("50 arcsec/s", "500 arcsec/s")
 """For the sample rate: planning and tasks warn of it."""
 
 
+@pytest.mark.nightly
 def test_workers_of_dask_leave_their_warnings_to_the_main_process(bench, capfd, recwarn):
     distributed = pytest.importorskip(
         "distributed", reason="distributed is not installed: pip install 'zonda[dask]'"
@@ -134,6 +135,7 @@ def in_a_shell(arguments, **variables):
     return done.returncode, done.stderr
 
 
+@pytest.mark.nightly
 def test_dask_with_tls_by_its_own_configuration(
     undisturbed, bench, certificates, encrypted, tmp_path
 ):
@@ -320,6 +322,7 @@ def test_cores_and_memory_are_shared_among_workers(monkeypatch):
         assert (pool.workers, pool.threads) == (8, 1)
 
 
+@pytest.mark.nightly
 def test_ctrl_c_does_not_reach_workers_that_start():
     """A Ctrl-C of the terminal goes to all processes; one that is still importing would show a
     traceback.

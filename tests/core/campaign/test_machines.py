@@ -41,6 +41,7 @@ def status(bench, out, capsys):
     return found, capsys.readouterr().out
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "engine", [SERIAL, ("--engine", "processes", "--workers", 2)], ids=["serial", "processes"]
 )

@@ -11,6 +11,7 @@ from concurrent.futures import Executor, Future
 from dataclasses import replace
 
 import h5py
+import pytest
 
 from zonda.core.campaign import tasks as campaign
 from zonda.core.campaign.campaign_file import Job
@@ -288,6 +289,7 @@ def test_a_campaign_into_the_folder_of_a_plain_run_says_so(undisturbed, bench, c
     assert (out / "of-mine.txt").exists()
 
 
+@pytest.mark.nightly
 def test_a_killed_worker_does_not_lose_the_campaign(undisturbed, bench, monkeypatch):
     submit, killed = calls._submit, []
 

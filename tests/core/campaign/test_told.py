@@ -69,6 +69,7 @@ def test_tasks_count_their_own_scans(bands, tmp_path):
     )
 
 
+@pytest.mark.nightly
 def test_workers_leave_their_warnings_to_the_main_process(bench, capfd, recwarn):
     """The pointing is too fast for the sample rate: planning and both tasks warn of it."""
     bench.run(

@@ -440,6 +440,7 @@ def test_flagged_and_not_finite_samples_are_dropped_and_counted():
     np.testing.assert_allclose(product.polarization.q[solved], Q, rtol=0, atol=1e-5)
 
 
+@pytest.mark.nightly
 def test_a_campaign_of_two_workers_gives_the_bits_of_one_run(tmp_path):
     """With everything that a map of I, Q and U consists of."""
     camera = zonda.Instrument(
