@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import os
+import importlib
 import pickle
-import signal
+import sys
+from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,6 @@ import pytest
 
 import zonda
 from zonda.core.accuracy.metrics import Metric
-from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.experiment.engines import engine
 from zonda.core.experiment.experiment import SECONDS, Experiment
@@ -137,32 +137,50 @@ def test_an_executor_that_does_not_tell_its_workers_is_given_all_runs(pipeline: 
     assert len(made.run(executor).records()) == 3
 
 
-class Killed(Metric):
-    """Kills its process at the first run, and at every run of a pipeline called ``bad``."""
+KILLED = """
+import os
+import signal
 
-    def __init__(self, mark: Path) -> None:
+from zonda.core.figures import Metric
+
+
+class Killed(Metric):
+    \"\"\"Kills its process at the first run, and at every run of a pipeline called ``bad``.\"\"\"
+
+    def __init__(self, mark):
         self.mark = mark
 
-    def measure(self, data: Data) -> Any:
+    def measure(self, data):
         if data.provenance["name"] == "bad" or not self.mark.exists():
             self.mark.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return data.scene.seed
+"""
 
 
-def test_a_run_whose_worker_was_killed_is_made_again(pipeline: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Metric]:
+    """A metric in a module that workers find, wherever pytest was started."""
+    (tmp_path / "metric_that_kills.py").write_text(KILLED)
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("metric_that_kills")
+    yield module.Killed(tmp_path / "mark")
+    del sys.modules["metric_that_kills"]
+
+
+def test_a_run_whose_worker_was_killed_is_made_again(pipeline: Path, killed: Metric) -> None:
     found: list[tuple[str, int]] = []
     with engine("processes", workers=2, threads=1) as pool:
-        made = Experiment([FileVariant(pipeline)], [3, 4, 5], [Killed(tmp_path / "mark")])
+        made = Experiment([FileVariant(pipeline)], [3, 4, 5], [killed])
         made.run(pool, lambda v, n, values: found.extend((str(v), s) for s in values.values()))
     assert sorted(found) == [("p", 3), ("p", 4), ("p", 5)]
 
 
 @pytest.mark.nightly
-def test_a_run_that_kills_its_worker_each_time_is_an_error(pipeline: Path, tmp_path: Path) -> None:
+def test_a_run_that_kills_its_worker_each_time_is_an_error(pipeline: Path, killed: Metric) -> None:
     bad = FileVariant(pipeline, ("name=bad",))
     with engine("processes", workers=1, threads=1) as pool:
-        made = Experiment([bad], 1, [Killed(tmp_path / "mark")])
+        made = Experiment([bad], 1, [killed])
         with pytest.raises(PipelineError, match="was killed"):
             made.run(pool)
 
