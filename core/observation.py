@@ -452,8 +452,8 @@ class Observation:
 
     @property
     def mean_emission(self) -> dict[str, float]:
-        """Mean emission of the atmosphere, K_RJ: ``atmosphere`` as it is, ``scan`` calibrated
-        (`core.emission`); empty if there is none.
+        """Mean emission of the atmosphere, K_RJ: ``atmosphere`` as it is, ``scan`` calibrated;
+        empty if there is none.
         """
         return mean_emission(self.smooth, self.focalplane, self.good_detectors, self.n_samples)
 

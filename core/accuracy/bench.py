@@ -173,7 +173,7 @@ REFERENCE_RUNS = 2
 """Timed runs of the reference at the least: their spread is that of all single runs."""
 
 Run = Callable[[Setting, int | None, bool], TimedRun]
-"""Runs a setting at a seed; the last argument is ``alone`` of `measure.timed_run`."""
+"""Runs a setting at a seed; the last argument is ``alone`` of `timed_run`."""
 
 
 @dataclass(frozen=True)

@@ -207,8 +207,8 @@ class Experiment:
     variants
         What is run: `Variant` or `FileVariant`.
     seeds
-        Number of realizations of each variant, from its scene's seed on (`entries.separate`); or
-        the seeds themselves.
+        Number of realizations of each variant, from its scene's seed on
+        (`campaign.settings.separate`); or the seeds themselves.
     metrics
         What is measured: names such as ``central_rms(radius=30 arcsec)``, or metrics.
     folder

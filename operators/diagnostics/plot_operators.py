@@ -319,7 +319,7 @@ DRAWN = frozenset(
 )
 """Products with pictures."""
 FILES: dict[type, str] = {Spectrum: "power_spectra", TimeStream: "tod"}
-"""Names of pictures, where these are not those of the products."""
+"""File names of pictures that are not named as their product."""
 
 
 class Plots(Output):

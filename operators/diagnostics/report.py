@@ -1,4 +1,4 @@
-"""One self-contained page that shows what a run made and says how; the layout is the template's."""
+"""HTML report of a run: one page that needs no other file, laid out by its template."""
 
 from __future__ import annotations
 
@@ -238,8 +238,8 @@ PREFIXES = ((1.0, ""), (1e3, "m"), (1e6, "µ"))
 
 
 def scaled(value: float, unit: str, least: float = 1.0) -> str:
-    """Three figures, in the unit or the first of its thousandth and millionth in which the value is
-    at least ``least``.
+    """``value`` with three digits and a prefix: none, m or µ, the first with which it is at least
+    ``least``.
     """
     if not math.isfinite(value):
         return "unknown"
@@ -292,7 +292,7 @@ def readable(text: str) -> str:
 
 
 Card = tuple[str, str]
-"""A figure, and what it is."""
+"""Text of a value, and its meaning."""
 
 
 def brightness(kelvin: float) -> str:

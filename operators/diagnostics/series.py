@@ -1,5 +1,5 @@
-"""Base of steps that look at time streams, and their products: power spectra, modes, the streams of
-a few detectors.
+"""Base of steps that measure time streams, and their products: power spectra, modes, the streams of
+a few detectors; the step `TimeStreams`.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from zonda.core.types import Floats
 
 
 class OfStreams(Operator):
-    """Base of steps that look at streams; what they add up is one of the products below, and tells
-    its tables itself.
+    """Base of steps that measure time streams. Each adds up a `Series` over the scans, which states
+    its own tables and lines of the log.
     """
 
     def asked(self) -> Sequence[str] | None:
-        """Streams that it looks at; None: `signal` and all components."""
+        """Streams that the step reads; None: `signal` and all components."""
         return ("signal",)
 
     @property
@@ -74,11 +74,11 @@ class Series(Record):
     usual
         Name among the products of one whose step has no name of its own.
     left_out
-        How the log calls scans that are not `alike`; empty: each is in the product.
+        Words of the log for the number of scans that are not `alike`; empty: all scans are.
     means
         Names of fields, arrays or mappings of arrays, that are means over the scans.
     observations, of_another_length
-        How many scans are in the means; scans that are not, since they are not `alike`.
+        Number of scans in the means, and of those left out because they are not `alike`.
     """
 
     usual: ClassVar[str]
@@ -114,7 +114,7 @@ class Series(Record):
         return []
 
     def tables(self) -> dict[str, list[Column]]:
-        """Tables that are written, by what stands behind the product's name."""
+        """Tables to write, by what is appended to the product's name in the name of the file."""
         return {}
 
     def meta(self) -> dict[str, Any]:

@@ -107,7 +107,7 @@ class Nod:
         return sum(2 * ramp + coast for _, _, ramp, coast in self._moves())
 
     def path(self, seconds: Floats) -> Floats:
-        """Elevation (n,) [rad] above the first stop at ``seconds`` (n,), then the last stop's."""
+        """Elevation (n,) above the first stop [rad] at ``seconds`` (n,); the last stop is kept."""
         found, begin = np.zeros(len(seconds)), 0.0
         for start, way, ramp, coast in self._moves():
             u, v = np.clip(seconds - begin, 0.0, 2 * ramp + coast), self.acceleration * ramp

@@ -1,5 +1,5 @@
-"""The picture of ``zonda show instrument``: the focal plane, and its middle with beams and
-polarization angles.
+"""Text and picture of ``zonda show instrument``: bands and sources of the numbers; the focal plane,
+and its middle with beams and polarization angles.
 """
 
 from __future__ import annotations
@@ -22,15 +22,14 @@ if TYPE_CHECKING:
 
 
 STAND_IN = "stand-in: "
-"""What begins a part of `provenance` (parts end with a semicolon) that says which number is not
-published.
-"""
+"""Beginning of a part of `provenance` that names a number which is not published; parts end with a
+semicolon."""
 HEAD = ("band", "GHz", "detectors", "FWHM", "NET [mK_RJ sqrt(s)]", "knee [Hz]", "slope")
 WIDTH = 100
 
 
 def lines(instrument: Instrument, plane: Focalplane) -> list[str]:
-    """The instrument, its bands, where its numbers come from and which are stand-ins."""
+    """Text of an instrument: its bands, the sources of its numbers, and which are stand-ins."""
     telescope = instrument.telescope
     rows = [
         (

@@ -94,7 +94,9 @@ def text(
     area: str | None = None,
     time: str | None = None,
 ) -> str:
-    """The pipeline as YAML, of an observer's request: text with units; None: not stated.
+    """YAML of the pipeline for an observer's request.
+
+    Values are text with units; None: not stated.
 
     Parameters
     ----------

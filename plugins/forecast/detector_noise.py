@@ -86,9 +86,12 @@ def combs(survey: Survey, radius: float, probes: int, most: int = 8) -> list[Com
 def _near(  # type: ignore[no-untyped-def]
     matrices, offsets, origin, spacing, factors, variance, far, thin, sums, series
 ):
-    """K of the nearest probe with a factor, of detectors at ``offsets`` (n_det, 2): of all instants
-    the factor times K, in ``series`` (n_det, n_instant). Where that is empty, of every ``thin``-th
-    instant K and K^2 are added to ``sums`` (n, n, 2); a boresight beyond ``far`` [rad] sees none.
+    """Beam K between detectors at ``offsets`` (n_det, 2) and the nearest probe, at every
+    ``thin``-th instant. Probes (n, n) whose factor is 0 do not count, nor do instants whose
+    boresight is farther than ``far`` [rad] from all probes.
+
+    ``series`` (n_det, n_instant) is set to the factor times K. If it is empty, K and K^2 are added
+    to ``sums`` (n, n, 2).
     """
     number = factors.shape[0]
     low, high = origin - far, origin + far + spacing * (number - 1)

@@ -1,5 +1,5 @@
 """The scans of a pipeline as the forecast needs them: where detectors look on the map, how noisy
-they are, what the filters cut. What of a pipeline the forecast covers, and its steps that matter.
+they are, what the filters cut. `steps_of` refuses pipelines that the forecast does not cover.
 
 The telescope is pointed and levels of noise are resolved by the pipeline's own steps
 (`Operator.observe`, `Operator.configure`).

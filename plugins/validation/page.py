@@ -31,8 +31,8 @@ OWN, GOOD, BAD = "#0072B2", "#009E73", "#b3261e"
 
 
 def draw(row: Row) -> Figure:
-    """A figure of its own. Counter-experiments of another quantity or unit than the claim's have
-    axes of their own below.
+    """Draw a claim: the paper's value, zonda's values and the counter-experiments. Those of another
+    quantity or unit than the claim's have axes of their own below.
     """
     from matplotlib.figure import Figure
 

@@ -1,5 +1,5 @@
-"""From claims to verdicts: run the pipelines whose values are missing, compare, write the
-table and the pictures.
+"""From claims to verdicts: run the pipelines whose values are missing, compare with the paper, draw
+the pictures of runs.
 """
 
 from __future__ import annotations

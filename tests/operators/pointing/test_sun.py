@@ -68,7 +68,7 @@ def test_it_rises_and_is_near_as_astropy_says(target, close):
     assert (0 < near.mean() < 1) == close
     for name, inside in (("sun_up", up), ("sun_close", near)):
         found = samples_in(observation.intervals.get(name, []), observation.seconds)
-        assert np.count_nonzero(found != inside) <= 1  # the last sample (see core.intervals)
+        assert np.count_nonzero(found != inside) <= 1  # the last sample (see core.flags)
     assert not (observation.flags & EXCLUDE_SAMPLE).any()
     assert observation.good_samples.all()
 
