@@ -51,8 +51,8 @@ from zonda.core.types import Floats
 
 from .power_spectrum import Chosen, Welch, welch_of
 from .series import (
-    OfStreams,
     Series,
+    StreamDiagnostic,
     count_flagged,
     spread_evenly,
     unit_of_stream,
@@ -68,7 +68,7 @@ SHARED = 35 / 18
 """Neighbouring frequencies behind a Hann window: 1 + 2 (2/3)^2 + 2 (1/6)^2."""
 
 
-class CompareStreams(OfStreams):
+class CompareStreams(StreamDiagnostic):
     """Comparison of a stream with another at this step: rms, correlation, gain, ratio of spectra
     and coherence.
 

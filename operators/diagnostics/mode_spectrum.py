@@ -36,7 +36,7 @@ from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.stream import Stream, forget_pages
 from zonda.core.types import Floats
 
-from .series import Modes, OfStreams, spread_evenly
+from .series import Modes, StreamDiagnostic, spread_evenly
 
 
 @dataclass
@@ -160,7 +160,7 @@ KEPT = 64
 """Singular values that are kept of each scan."""
 
 
-class ModeSpectrum(OfStreams):
+class ModeSpectrum(StreamDiagnostic):
     """Singular values of the matrix detectors x time of `signal` at this step, their shares, and
     the leading modes.
 

@@ -18,7 +18,7 @@ from zonda.core.signal import BUILT_IN, MAIN, TRANSMISSION, Component
 from zonda.core.stream import StreamName
 from zonda.core.types import Floats
 
-from .series import OfStreams, Spectrum, count_flagged, no_stream, spread_evenly
+from .series import Spectrum, StreamDiagnostic, count_flagged, no_stream, spread_evenly
 
 ORDER = ("signal", "atmosphere", "pink", "white", "sky", "transmission")
 """Of spectra in pictures."""
@@ -112,7 +112,7 @@ class Chosen:
                     yield int(detector), {n: on_sky(block, int(detector), n, gain) for n in names}
 
 
-class PowerSpectrum(OfStreams):
+class PowerSpectrum(StreamDiagnostic):
     """Mean one-sided power spectra of the streams at this step, in K_RJ^2/Hz on the calibrated sky.
 
     Components at the detector are divided as the calibration divides them: `atmosphere` times

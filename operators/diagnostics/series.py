@@ -26,7 +26,7 @@ from zonda.core.tables import html_table
 from zonda.core.types import Floats
 
 
-class OfStreams(Operator):
+class StreamDiagnostic(Operator):
     """Base of steps that measure time streams. Each adds up a `Series` over the scans, which states
     its own tables and lines of the log.
     """
@@ -464,7 +464,7 @@ class Modes(Series):
         return html_table(f"Modes of {self.detectors} detectors", rows)
 
 
-class TimeStreams(OfStreams):
+class TimeStreams(StreamDiagnostic):
     """Streams of a few detectors of one scan at this step, for a picture: product ``time_streams``.
 
     Components (`sky`, `white`, those of plugins ...) are at the detector, before the calibration;
