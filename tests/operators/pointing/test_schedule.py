@@ -345,17 +345,7 @@ def test_it_keeps_the_contract(tmp_path):
 
 
 def change(number, **values):
-    names = [
-        "start_time",
-        "stop_time",
-        "boresight_angle",
-        "name",
-        "azmin",
-        "azmax",
-        "el",
-        "scan_index",
-        "subscan_index",
-    ]
+    names = HEAD.splitlines()[-1].split()
     rows = [list(row) for row in ROWS]
     for name, value in values.items():
         rows[number][names.index(name)] = value
