@@ -68,7 +68,7 @@ class Seen:
     @cached_property
     def pwv_by_month(self) -> Floats:
         """(12, 24, 3) quantiles of the PWV [m] at each hour (UTC) on the 15th of each month."""
-        from scipy.interpolate import interp1d
+        from scipy.interpolate import make_interp_spline
 
         year, hours = self.when.datetime.year, range(0, 24, CELL)
         dates = [f"{year:04d}-{month:02d}-15T" for month in range(1, 13)]
@@ -77,7 +77,7 @@ class Seen:
         )
         # periodic and smooth: two harmonics of the day
         closed = np.concatenate([found, found[:, :1]], axis=1)
-        return np.asarray(interp1d([*hours, 24], closed, axis=1)(np.arange(24)))
+        return np.asarray(make_interp_spline([*hours, 24], closed, k=1, axis=1)(np.arange(24)))
 
     def pwv_of_month(self, number: int, month: Month) -> Floats | None:
         """(3,) quantiles of the PWV [m] in the hours in which the target is up at night; None where
