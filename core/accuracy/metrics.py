@@ -138,8 +138,61 @@ class OfFunction(Metric):
         return np.asarray(self.function(data), np.float64)
 
 
-class OfBands(Metric):
-    """A metric of each band. What was found is by the band's name."""
+class OfParts(Metric):
+    """Base of metrics whose `measure` finds something of each part, by its name: planes of a map,
+    bands of a camera. The largest error of the parts counts.
+
+    A subclass has `floor_of` of one part, and `summary` or both of `between` and `mean_between`;
+    `counted`, where not all parts of a reference count.
+    """
+
+    def error(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> float:
+        return max(self._each(found, reference).values())
+
+    def errors(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> Mapping[str, float]:
+        each = self._each(found, reference)
+        return each if len(each) > 1 else {}
+
+    def mean_error(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:
+        every = [*map(self.counted, reference), *found]
+        return max(
+            self.mean_between([one[part] for one in found], [one[part] for one in reference])
+            for part in self.counted(reference[0])
+            if all(part in counted for counted in every)
+        )
+
+    def floor(self, reference: Mapping[str, Any]) -> float | None:
+        """The lowest of all parts; None where one has none."""
+        floors = [self.floor_of(reference[part]) for part in self.counted(reference)]
+        known = [floor for floor in floors if floor is not None]
+        return min(known) if len(known) == len(floors) else None
+
+    def counted(self, reference: Mapping[str, Any]) -> Sequence[str]:
+        """The parts of a reference in which errors are looked for."""
+        return list(reference)
+
+    def between(self, found: Any, reference: Any) -> float:
+        """`error` of one part."""
+        return super().error(found, reference)
+
+    def mean_between(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:
+        """`mean_error` of one part."""
+        return super().mean_error(found, reference)
+
+    def floor_of(self, reference: Any) -> float | None:
+        """`floor` of one part."""
+        raise NotImplementedError
+
+    def _each(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> dict[str, float]:
+        return {
+            part: self.between(found[part], reference[part])
+            for part in self.counted(reference)
+            if part in found
+        }
+
+
+class OfBands(OfParts):
+    """A metric of each band of a camera."""
 
     def __init__(self, each: Metric) -> None:
         self.each = each
@@ -159,21 +212,14 @@ class OfBands(Metric):
     def measure(self, data: Data) -> dict[str, Any]:
         return {band: self.each.measure(own) for band, own in data.bands.items()}
 
-    def errors(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> dict[str, float]:
-        return {band: self.each.error(one, reference[band]) for band, one in found.items()}
+    def between(self, found: Any, reference: Any) -> float:
+        return self.each.error(found, reference)
 
-    def error(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> float:
-        return max(self.errors(found, reference).values())
+    def mean_between(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:
+        return self.each.mean_error(found, reference)
 
-    def mean_error(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:
-        bands = ([[one[band] for one in runs] for runs in (found, reference)] for band in found[0])
-        return max(self.each.mean_error(*both) for both in bands)
-
-    def floor(self, reference: Mapping[str, Any]) -> float | None:
-        """The lowest of all bands; None where one has none."""
-        floors = [self.each.floor(one) for one in reference.values()]
-        known = [floor for floor in floors if floor is not None]
-        return min(known) if len(known) == len(floors) else None
+    def floor_of(self, reference: Any) -> float | None:
+        return self.each.floor(reference)
 
 
 def metric_of(file: PipelineFile, name: str) -> Metric:

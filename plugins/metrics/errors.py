@@ -47,18 +47,17 @@ taken off, is known to within
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.accuracy.metrics import Metric
+from zonda.core.accuracy.metrics import Metric, OfParts
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.planes import IQU
 from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.operator import Operator
 from zonda.core.signal import Signal
@@ -67,61 +66,6 @@ from zonda.operators.diagnostics.series import Spectrum, TimeStreams
 from zonda.operators.diagnostics.transfer_function import compare
 
 from .common import COVERED, as_seen, at_beam, covered, extreme, input_of, needs_tan
-
-
-class OfPlanes(Metric):
-    """Base of metrics whose `measure` finds something of each plane: by its name, ``I`` alone or
-    ``I``, ``Q`` and ``U``.
-
-    A subclass has `summary` and `floor_of` of one plane; `between`, where its error is another;
-    `counted`, where not all planes of a reference count.
-    """
-
-    def error(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> float:
-        return max(self._each(found, reference).values())
-
-    def errors(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> Mapping[str, float]:
-        each = self._each(found, reference)
-        return each if len(each) > 1 else {}
-
-    def mean_error(self, found: Sequence[Any], reference: Sequence[Any]) -> tuple[float, float]:
-        planes = [
-            p
-            for p in IQU
-            if all(p in self.counted(one) for one in reference) and all(p in one for one in found)
-        ]
-        return max(
-            super(OfPlanes, self).mean_error(
-                [one[p] for one in found], [one[p] for one in reference]
-            )
-            for p in planes
-        )
-
-    def floor(self, reference: Mapping[str, Any]) -> float | None:
-        """The lowest of all planes; None where one has none."""
-        floors = [self.floor_of(reference[plane]) for plane in self.counted(reference)]
-        known = [floor for floor in floors if floor is not None]
-        return min(known) if len(known) == len(floors) else None
-
-    def counted(self, reference: Mapping[str, Any]) -> Sequence[str]:
-        """The planes of a reference in which errors are looked for."""
-        return list(reference)
-
-    def between(self, found: Any, reference: Any) -> float:
-        """`error` of one plane."""
-        return super().error(found, reference)
-
-    def floor_of(self, reference: Any) -> float | None:
-        """`floor` of one plane."""
-        raise NotImplementedError
-
-    def _each(self, found: Mapping[str, Any], reference: Mapping[str, Any]) -> dict[str, float]:
-        return {
-            plane: self.between(found[plane], reference[plane])
-            for plane in self.counted(reference)
-            if plane in found
-        }
-
 
 RINGS, BINS, LAGS, SEPARATIONS = 8, 24, 12, 6
 POLARIZED = 1e-3
@@ -134,7 +78,7 @@ INSTANTS = 4096
 TRACE = "accuracy-structure"
 
 
-class MapRms(OfPlanes):
+class MapRms(OfParts):
     """Rms of the difference from the reference map over the map's noise, equation (1)."""
 
     says: ClassVar[str] = "rms of the difference map / the map's instrument noise"
@@ -174,7 +118,7 @@ class MapRms(OfPlanes):
         return _mean_square(values, of["weights"], np.isfinite(values)) or 1.0
 
 
-class Peak(OfPlanes):
+class Peak(OfParts):
     """Relative change of the extreme value of the beam-smoothed map, equation (2)."""
 
     says: ClassVar[str] = "relative change of the beam-smoothed map's extreme value"
@@ -211,7 +155,7 @@ class Peak(OfPlanes):
         return float(value) if math.isfinite(value) else None
 
 
-class Transfer(OfPlanes):
+class Transfer(OfParts):
     """Rms error of the transfer function over angular scales, equation (3)."""
 
     says: ClassVar[str] = (
