@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..cli import complete
+from ..command_options import set_option
 
 if TYPE_CHECKING:
     from ..configuration.pipeline_file import PipelineFile
@@ -37,13 +38,7 @@ NOT_MET = 1
     metavar="ERROR",
     help="Error that the metric may have.",
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Change one value of the file, as for `zonda run`.",
-)
+@set_option
 @click.option(
     "--knob",
     "knobs",

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..command_types import on_engine
+from ..command_options import on_engine
 
 if TYPE_CHECKING:
-    from ..command_types import RunRequest
+    from ..command_options import RunRequest
     from ..experiment.engines import Pool
     from .campaign_file import Job, Task
     from .folder import TaskRow

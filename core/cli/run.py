@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..command_types import RunRequest, Share, on_engine
+from ..command_options import (
+    RunRequest,
+    Share,
+    drop_option,
+    keep_option,
+    on_engine,
+    only_option,
+    set_option,
+)
 from . import complete
 
 if TYPE_CHECKING:
@@ -28,28 +36,10 @@ if TYPE_CHECKING:
     required=True,
     shell_complete=complete.pipelines,
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Change one value, e.g. Step.parameter='0.5 Hz' or seed=8.",
-)
-@click.option(
-    "--keep",
-    multiple=True,
-    metavar="NAME",
-    help="Simulate this effect or operator in full, see `zonda plan`.",
-)
-@click.option(
-    "--drop",
-    multiple=True,
-    metavar="NAME",
-    help="Leave this effect or operator out, whatever that costs.",
-)
-@click.option(
-    "--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone."
-)
+@set_option
+@keep_option
+@drop_option
+@only_option
 @click.option(
     "--prune/--no-prune",
     default=None,
@@ -245,13 +235,7 @@ def compile_kernels(names: tuple[str, ...]) -> None:
 
 @click.command()
 @click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Change one value, as for `zonda run`.",
-)
+@set_option
 def check(pipeline: str, settings: tuple[str, ...]) -> None:
     """Check a pipeline file without running it.
 

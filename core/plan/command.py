@@ -5,29 +5,15 @@ from __future__ import annotations
 import click
 
 from ..cli import complete
+from ..command_options import drop_option, keep_option, only_option, set_option
 
 
 @click.command()
 @click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Change one value, as for `zonda run`.",
-)
-@click.option(
-    "--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full."
-)
-@click.option(
-    "--drop",
-    multiple=True,
-    metavar="NAME",
-    help="Leave this effect or operator out, whatever that costs.",
-)
-@click.option(
-    "--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone."
-)
+@set_option
+@keep_option
+@drop_option
+@only_option
 @click.option("--no-prune", is_flag=True, help="Leave nothing out.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option(

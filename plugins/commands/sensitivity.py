@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from zonda.core.cli import complete
+from zonda.core.command_options import set_option
 
 
 @click.command()
@@ -65,13 +66,7 @@ from zonda.core.cli import complete
     metavar="ANGLE",
     help="Of the circle that the depth is averaged over.  [default: 0.5 arcmin or two beams]",
 )
-@click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Change one value, as for `zonda run`.",
-)
+@set_option
 @click.option(
     "--reach",
     metavar="DEPTH",

@@ -15,7 +15,7 @@ import pytest
 
 from zonda import __version__
 from zonda.core import cli
-from zonda.core.command_types import Bytes
+from zonda.core.command_options import Bytes
 
 HEAVY = ("numpy", "astropy", "numba", "healpy", "scipy", "matplotlib", "h5py", "pydantic")
 RUN = [

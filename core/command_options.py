@@ -1,4 +1,4 @@
-"""Types of command-line options that commands share, and the request of ``zonda run``.
+"""Options that commands share, types of options, and the request of ``zonda run``.
 
 Only click is imported with this module.
 """
@@ -117,6 +117,26 @@ class Share(_Anything):
             )
         return int(first), int(second)
 
+
+set_option = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change one value, e.g. Step.parameter='0.5 Hz' or seed=8.",
+)
+keep_option = click.option(
+    "--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full."
+)
+drop_option = click.option(
+    "--drop",
+    multiple=True,
+    metavar="NAME",
+    help="Leave this effect or operator out, whatever that costs.",
+)
+only_option = click.option(
+    "--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone."
+)
 
 _ON_ENGINE = (
     click.option(
