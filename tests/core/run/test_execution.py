@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from zonda.core.assembly.chain import Chain
-from zonda.core.data import Block, Data, Observation
+from zonda.core.data import Block, Data
 from zonda.core.errors import PipelineError
-from zonda.core.instrument import Band, Instrument, Telescope
 from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.operator import Operator
@@ -24,35 +23,11 @@ from zonda.core.run.segments import PIECE, cut
 from zonda.core.run.settings import Settings, Timer
 from zonda.core.run.streams import Store
 from zonda.core.run.views import View
+from zonda.plugins.checks.scenes import scan
 
 
 def observation(n_det=101, n_samp=9 * TILE_SAMPLES + 123):
-    instrument = Instrument(
-        name="test",
-        telescope=Telescope(name="t", diameter="6 m"),
-        band=Band(name="b", low="140 GHz", high="160 GHz"),
-        detectors=n_det,
-        field_of_view="1 deg",
-        main_beam_efficiency=1,
-        illumination_efficiency=1,
-        net="1 mK s(1/2)",
-        sample_rate="100 Hz",
-    )
-    pointing = np.tile([0.0, 0, 0, 1], (n_samp, 1))
-    return Observation(
-        "scan",
-        0,
-        None,
-        instrument,
-        instrument.focalplane(),
-        None,
-        np.arange(n_samp) / 100.0,
-        100.0,
-        pointing,
-        pointing,
-        (0, 0),
-        1,
-    )
+    return scan(n_det, n_samp)
 
 
 class Source(Operator):
