@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -55,37 +55,6 @@ class LoadSpectra:
 
 INSTANTS = 64
 """Instants, evenly over a scan, that the mean is taken of: the emission follows the elevation."""
-
-
-def mean_emission(
-    smooth: Mapping[str, SmoothField], plane: Focalplane, good: NDArray[np.bool_], n: int
-) -> dict[str, float]:
-    """Means over instants and detectors that are not flagged, K_RJ; empty where the scan has no
-    atmosphere.
-
-    ``atmosphere`` is <T_atm>, before any efficiency, and ``scan`` the same on the calibrated scale,
-    eps illumination and zeta main-beam efficiency:
-
-        T_scan = < eps T_atm / (zeta e^-tau) >.                                                  (1)
-
-    ``smooth`` and ``plane`` are those of a scan of ``n`` samples, ``good`` (n_det,) its detectors
-    that are not flagged.
-    """
-    if not ({"atmosphere", "transmission"} <= smooth.keys() and good.any()):
-        return {}
-    every = slice(0, len(plane))
-    found = {"atmosphere": 0.0, "scan": 0.0}
-    instants = np.unique(((np.arange(INSTANTS) + 0.5) * n / INSTANTS).astype(int))
-    for t in instants:
-        at = slice(int(t), int(t) + 1)
-        level = smooth["atmosphere"].evaluate(every, at)[:, 0].astype(np.float64)
-        transmission = smooth["transmission"].evaluate(every, at)[:, 0]
-        calibrated = level * (
-            plane.illumination_efficiency / (plane.main_beam_efficiency * transmission)
-        )
-        for name, values in (("atmosphere", level), ("scan", calibrated)):
-            found[name] += float(values[good].mean()) / len(instants)
-    return found
 
 
 T = TypeVar("T")
@@ -452,10 +421,30 @@ class Observation:
 
     @property
     def mean_emission(self) -> dict[str, float]:
-        """Mean emission of the atmosphere, K_RJ: ``atmosphere`` as it is, ``scan`` calibrated;
+        """Mean emission of the atmosphere over instants and detectors that are not flagged, K_RJ;
         empty if there is none.
+
+        ``atmosphere`` is <T_atm>, before any efficiency, and ``scan`` the same on the calibrated
+        scale, eps illumination and zeta main-beam efficiency:
+
+            T_scan = < eps T_atm / (zeta e^-tau) >.                                              (1)
         """
-        return mean_emission(self.smooth, self.focalplane, self.good_detectors, self.n_samples)
+        smooth, plane, good = self.smooth, self.focalplane, self.good_detectors
+        if not ({"atmosphere", "transmission"} <= smooth.keys() and good.any()):
+            return {}
+        every = slice(0, len(plane))
+        found = {"atmosphere": 0.0, "scan": 0.0}
+        instants = np.unique(((np.arange(INSTANTS) + 0.5) * self.n_samples / INSTANTS).astype(int))
+        for t in instants:
+            at = slice(int(t), int(t) + 1)
+            level = smooth["atmosphere"].evaluate(every, at)[:, 0].astype(np.float64)
+            transmission = smooth["transmission"].evaluate(every, at)[:, 0]
+            calibrated = level * (
+                plane.illumination_efficiency / (plane.main_beam_efficiency * transmission)
+            )
+            for name, values in (("atmosphere", level), ("scan", calibrated)):
+                found[name] += float(values[good].mean()) / len(instants)
+        return found
 
     def __repr__(self) -> str:
         return (
