@@ -33,7 +33,7 @@ import numpy as np
 from ..errors import InputError, ZondaError
 from ..experiment.variant import FileVariant
 from ..faults import faults_named
-from .metrics import Metric
+from .metrics import Metric, metric_of
 from .settings import Setting, overrides
 
 if TYPE_CHECKING:
@@ -103,8 +103,6 @@ def timed_run(
     """
     global _warm
     from numba.core.event import install_recorder
-
-    from .metrics import metric_of
 
     with (
         open(os.devnull, "w") as nothing,

@@ -78,7 +78,7 @@ class Study:
 
     @property
     def chosen(self) -> Point | None:
-        """The point that meets the target, see `pareto.cheapest`; None where none does."""
+        """The point that meets the target, see `cheapest`; None where none does."""
         return cheapest(self.points, self.setup.target, self.sweep.left)
 
 

@@ -30,9 +30,17 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from .. import machine
 from ..errors import PipelineError
-from ..machine import available_memory, available_threads, one_blas_thread, resident_memory
+from ..machine import (
+    SAFE,
+    available_memory,
+    available_threads,
+    one_blas_thread,
+    resident_memory,
+    restore,
+    safe_path,
+    without_script,
+)
 
 if TYPE_CHECKING:
     from ..campaign.settings import Engine, Tls
@@ -96,8 +104,8 @@ class ProcessPool(Pool):
         self.stop()
         self.workers = workers or self.workers
         self.threads = self._asked_threads or max(1, available_threads() // self.workers)
-        safe = os.environ.get(machine.SAFE)
-        with machine.safe_path():  # its queues start a process that counts them
+        safe = os.environ.get(SAFE)
+        with safe_path():  # its queues start a process that counts them
             self.executor = _Workers(
                 self.workers,
                 mp_context=get_context("spawn"),
@@ -120,7 +128,7 @@ class _Workers(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """See `Executor.submit`."""
-        with machine.safe_path(), machine.without_script(), _ctrl_c_held_back():
+        with safe_path(), without_script(), _ctrl_c_held_back():
             return super().submit(fn, *args, **kwargs)
 
 
@@ -164,7 +172,7 @@ def engine(
     threads, memory
         Threads for each task, and memory of the whole campaign on this machine (with MPI and Dask:
         of each process); default: the machine's CPUs, and half of its free memory, shared among the
-        workers. `memory.share_out` divides and checks it.
+        workers. `share_out` divides and checks it.
 
     Raises
     ------
@@ -216,7 +224,7 @@ def begin_worker(safe: str | None = None) -> None:
 
     ``safe``: ``PYTHONSAFEPATH`` of the main process.
     """
-    machine.restore(safe)
+    restore(safe)
     keep()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
