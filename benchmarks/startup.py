@@ -1,9 +1,7 @@
 """From the command to the maps: what a first and a second `zonda run mustang2_cluster` take, stage
 by stage.
 
-python benchmarks/startup.py             first run with empty caches, then the best of three further
-runs, and of
-                                         three that have the compiled kernels but plan anew
+    python benchmarks/startup.py    # first run with empty caches, then the best of three further runs
 """
 
 from __future__ import annotations
@@ -56,21 +54,21 @@ def stages(folder: str, pipeline: str) -> dict[str, Any]:
 
     after(run, "load", "read the pipeline file")
     mark("Python and the command line")
+    from zonda.core import pipeline as framework
     from zonda.core.output import Output
     from zonda.core.pipeline import Pipeline
     from zonda.core.plan import planner
-    from zonda.core.run import execution
 
     mark("import zonda, numpy, numba, pydantic")
     after(planner, "for_run", "plan")
-    usual = execution.run
+    usual = framework.execute
 
     def observe(*arguments: Any) -> None:
         mark("point the telescope, lay out the map")
         usual(*arguments)
         mark("observe")
 
-    execution.run = observe
+    framework.execute = observe
     timed = Pipeline._timed
 
     def finish(self: Any, timer: Any, operator: Any, stage: str, *arguments: Any) -> None:
