@@ -136,7 +136,7 @@ class PowerSpectrum(StreamDiagnostic):
     Shortened to a number of samples that has no prime factor above 5."""
 
     def asked(self) -> Sequence[str] | None:
-        """The list."""
+        """Streams of the parameter `streams`."""
         return self.streams
 
     def prepare(self, observation: Observation) -> Chosen:

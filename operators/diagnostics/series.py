@@ -118,7 +118,7 @@ class Series(Record):
         return {}
 
     def meta(self) -> dict[str, Any]:
-        """Cards of the tables."""
+        """Metadata of the tables."""
         return {}
 
 
@@ -484,7 +484,7 @@ class TimeStreams(StreamDiagnostic):
     """Which scan, counted from 0."""
 
     def asked(self) -> list[str]:
-        """The list."""
+        """Streams of the parameter `streams`."""
         return self.streams
 
     def check(self, data: Data) -> list[str]:

@@ -96,7 +96,8 @@ def compare(
     bins: int = 24,
     label: str = "compare",
 ) -> Comparison:
-    """Compare a map with a reference. Raises InputError where they cannot be: `planes.common`.
+    """Compare a map with a reference. Raises InputError for maps that cannot be compared
+    (`planes.common`).
 
     Parameters
     ----------
