@@ -69,7 +69,7 @@ def entries(
         own = {k: v for k, v in values.items() if k not in ("observation", "seed")}
         settings = tuple(setting(k, v) for k, v in own.items())
         first = time_of(settings)
-        base = int(values.get("seed", seed))
+        base, anew = int(values.get("seed", seed)), _drawn_anew(campaign, values)
         for night, moment in _nights(campaign.nights, first):
             for realization in range(campaign.realizations):
                 place = dict(values)
@@ -77,19 +77,8 @@ def entries(
                     place["night"] = night
                 if campaign.realizations > 1:
                     place["realization"] = realization
-                combination = tuple(
-                    (k, v) for k, v in place.items() if not _combined(campaign, k, values)
-                )
-                alike = (
-                    _plain(
-                        tuple(
-                            item
-                            for item in combination
-                            if item[0] not in _drawn_anew(campaign, values)
-                        )
-                    ),
-                    base,
-                )
+                combination = tuple((k, v) for k, v in place.items() if not _combined(campaign, k))
+                alike = _plain(tuple((k, v) for k, v in combination if k not in anew)), base
                 same = used.get(alike, 0)
                 used[alike] = same + 1
                 found.append(Entry(place, settings, separate(base, same), moment, combination))
@@ -151,7 +140,7 @@ def _nights(nights: Nights | None, first: Instant) -> Iterator[tuple[int, Instan
         yield k, first.shifted(k * TURN)
 
 
-def _combined(campaign: Campaign, axis: str, values: dict[str, Any]) -> bool:
+def _combined(campaign: Campaign, axis: str) -> bool:
     """``observation`` stands for all keys of the list, and each of them for it."""
     if campaign.combine == "all":
         return True
