@@ -39,6 +39,8 @@ ANGLES = {
     "mas": "mas",
 }
 """Values of CUNIT that are read, as FITS has them."""
+SMALLEST_PIXEL = 1e-6 / 3600
+"""Side of a pixel, deg; the finest interferometer resolves ten times as much."""
 _EQUATORIAL = ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH")
 
 
@@ -92,10 +94,6 @@ class FileHeader:
 
 UNSEEN = -1.6375e30
 """Value of pixels that HEALPix's tools did not see."""
-
-
-NARROWEST = 1e-6
-"""arcsec of a pixel; the finest interferometer resolves ten times as much."""
 
 
 def marked_bad(values: AnyFloats, header: FileHeader) -> NDArray[np.bool_]:
@@ -153,14 +151,14 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
             made.remove(key, ignore_missing=True)
     for axis in "12":
         key, unit = f"CRVAL{axis}", about.text(f"CUNIT{axis}") or "deg"
-        if abs(about.number(key) or 0.0) * Unit(ANGLES.get(unit, "deg")).to("deg") > 720.0:
+        degrees = Unit(ANGLES.get(unit, "deg")).to("deg")
+        if abs(about.number(key) or 0.0) * degrees > 720.0:
             cure = f"correct {key}, or the unit CUNIT{axis}"
             raise about.error(f"{key} = {made[key]:g} {unit} is no longitude or latitude", cure)
         width, key = abs(about.number(f"CDELT{axis}") or 1.0), f"CDELT{axis}"
         if rows := [about.number(f"CD{row}_{axis}") for row in "12" if f"CD{row}_{axis}" in made]:
             width, key = math.hypot(*(each or 0.0 for each in rows)), f"CD1_{axis}, CD2_{axis}"
-        narrowest = NARROWEST / Unit(ANGLES.get(unit, "deg")).to("arcsec")
-        if is_celestial(made, axis) and width < narrowest:
+        if is_celestial(made, axis) and width * degrees < SMALLEST_PIXEL:
             text = f"{width:g} {unit} is no size of a pixel, which is 1e-6 arcsec or more"
             raise about.error(f"{key}: {text}", f"check {key}, and its unit")
     kinds = {str(header.get(f"CTYPE{axis}", "")).strip().upper()[:4] for axis in "12"}

@@ -12,7 +12,7 @@ import numpy as np
 
 from zonda.core.errors import InputError
 from zonda.core.maps.beams import check_width, size_text
-from zonda.core.maps.header import FileHeader
+from zonda.core.maps.header import SMALLEST_PIXEL, FileHeader
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
 from zonda.core.numerics.angles import ARCSEC, angle_text
 from zonda.core.types import Floats
@@ -23,8 +23,8 @@ LARGEST = 1e30
 """Value of a pixel, in any unit."""
 BRIGHTEST = 1e15
 """Brightness, K_RJ: the square of it is a float32."""
-SMALLEST_PIXEL, LARGEST_PIXEL = 1e-6 / 3600, 360.0
-"""Side of a pixel, and width of a beam, deg."""
+LARGEST_PIXEL = 360.0
+"""Side of a pixel, and width of a beam, deg; the least of both is `SMALLEST_PIXEL`."""
 MANY = 60.0
 """Pixels per FWHM of a map's beam beyond which that is doubted."""
 OBLONG = 20.0
