@@ -198,7 +198,7 @@ class Record:
         self._write()
 
     def put_off(self, tasks: Iterable[Task] = ()) -> None:
-        """Mark tasks at work as waiting; these get all their attempts again."""
+        """Mark tasks at work as waiting; give ``tasks`` all their attempts again."""
         for task in tasks:
             discard(_failed_path(task, self.folder))
         self._at_work.clear()

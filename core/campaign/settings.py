@@ -36,7 +36,7 @@ class Entry:
     seed, time
         Root of its random numbers; start.
     combination
-        Axes over which nothing is co-added, with their values: entries with the same are co-added.
+        Axes that are not co-added, with their values: entries with the same ones are added up.
     """
 
     values: dict[str, Any]
@@ -91,8 +91,8 @@ def entries(
 
 
 def separate(seed: int, number: int) -> int:
-    """Seed of the ``number``-th of those that are co-added and have the same ``seed``: its own is
-    the first one's.
+    """Seed of the ``number``-th of the entries that are co-added and have the same ``seed``: the
+    first one keeps it.
 
     The others have 63 bits of a hash of both (`core.numerics.random.stream_key`): seed + 1 would be
     another user's seed.
@@ -141,7 +141,9 @@ def _nights(nights: Nights | None, first: Instant) -> Iterator[tuple[int, Instan
 
 
 def _combined(campaign: Campaign, axis: str) -> bool:
-    """``observation`` stands for all keys of the list, and each of them for it."""
+    """True if an axis is co-added. ``observation`` stands for all keys of the list of
+    observations, and each of them for it.
+    """
     if campaign.combine == "all":
         return True
     listed = {"observation", *(k for entry in campaign.observations for k in entry)}
@@ -149,9 +151,11 @@ def _combined(campaign: Campaign, axis: str) -> bool:
 
 
 def _drawn_anew(campaign: Campaign, values: dict[str, Any]) -> set[str]:
-    """The axes along which random numbers are others whether or not it is co-added over them: other
-    observations, made at another time or of another target. A seed that is given stays as it is;
-    `observation` counts what its keys say."""
+    """Axes along which random numbers differ even if they are not co-added: observations at
+    another time or of another target.
+
+    A seed that is given stays as it is; `observation` counts what its keys say.
+    """
     found = {"realization", "observation"}
     if not campaign.paired:
         found |= {"night"} if "seed" in values else {"night", "time", "target"}

@@ -218,7 +218,7 @@ def combined(job: Job, folder: Path, number: int) -> Data:
 
 
 def _sum(tasks: Sequence[Task], folder: Path, first: int, level: int) -> Partial:
-    """Sum of ``FAN**level`` partial products from the ``first`` on, one held for each level."""
+    """Sum of ``FAN**level`` partial products from the ``first`` on; each level holds one."""
     if level == 0:
         task = tasks[first]
         return Partial.read(task.path(folder), task.key)

@@ -45,7 +45,7 @@ _EQUATORIAL = ("RADESYS", "RADECSYS", "EQUINOX", "EPOCH")
 
 
 class FileHeader:
-    """A header of the file ``place``, as messages call it, with checked cards."""
+    """Header of the FITS file that messages call ``place``; cards are checked as they are read."""
 
     def __init__(self, header: Any, place: str) -> None:
         self.header, self.place = header, place

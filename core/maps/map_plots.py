@@ -48,7 +48,7 @@ def map_axes(
 ) -> list[Any]:
     """World axes of a new figure (or ``figure``) for ``count`` images (ny, nx): strips one below
     the other, others side by side, with their latitudes written once. ``gap``: between an image and
-    its colour bar, in; `bar_place` of the axes has the place of that.
+    its colour bar, in. `bar_place` of the axes is the rectangle for the colour bar.
     """
     from astropy.visualization.wcsaxes import WCSAxes
     from matplotlib.figure import Figure

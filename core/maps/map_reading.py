@@ -1,8 +1,8 @@
 """Maps in FITS files: the extension, the planes of its cube or the pixels of its HEALPix table, and
 which of them are I, Q and U.
 
-The one reader below `SkyMap` and all that compares maps. Nothing is guessed: if a file leaves a
-choice, the error lists the possible ones.
+`SkyMap` and comparisons of maps read with it. Nothing is guessed: if a file leaves a choice, the
+error lists the possible ones.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
 STOKES = "Stokes parameters"
 """Key of the note about Stokes parameters that are not used."""
 Index = tuple[int, ...]
-"""Of a plane, among the axes of an image before the last two."""
+"""Index of a plane, along the axes of an image before the last two."""
 _FRAMES: dict[str, Frame] = {
     **dict.fromkeys(("C", "Q", "EQ", "ICRS", "CELESTIAL", "EQUATORIAL"), "icrs"),
     **dict.fromkeys(("G", "GALACTIC"), "galactic"),
@@ -69,7 +69,9 @@ def polarized_letter(name: str) -> str:
 
 
 def unused(what: str, names: Sequence[str], read: int | None = None) -> dict[str, str]:
-    """The note about Stokes parameters among ``names`` beside ``what`` is read as I."""
+    """A note that ``what`` is read as I, and that Stokes parameters among ``names`` are not used;
+    ``read``: the number of ``what`` among them.
+    """
     beside = [name for k, name in enumerate(names) if k != read and polarized_letter(name)]
     return {STOKES: f"{what} is read as I; {_not_used(beside)}"} if beside else {}
 
@@ -161,8 +163,8 @@ def _kind(hdu: Any) -> str:
 
 
 class Cube(FileHeader):
-    """The planes of an image of ``shape`` (slowest axis first): it has axes before the last two, or
-    none.
+    """Header of an image of ``shape`` (slowest axis first), and the choice of its planes, along the
+    axes before the last two, if it has such.
     """
 
     def __init__(self, header: Any, place: str, shape: Sequence[int]) -> None:

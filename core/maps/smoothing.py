@@ -48,13 +48,15 @@ take as long.
 LARGEST_NSIDE = 2048
 """Of HEALPix maps that are smoothed by harmonics: beyond, a whole sphere takes gigabytes."""
 DIRECT = 1e9
-"""Pairs of pixels of an image under a kernel up to which each is looked at: some 3 s. Of CAR images
-a hundredth.
+"""Pairs of pixels of an image under a kernel up to which each is looked at: some 3 s. For CAR
+images the limit is a hundredth of this.
 """
 TILE = 64
 """Pixels on a side of a tile up to which it is halved until one kernel serves it."""
 MOST_DIRECT = 3e11
-"""Such pairs beyond which an image is refused: some 15 minutes."""
+"""Pairs of pixels under a kernel, each looked at, beyond which an image is refused: some 15
+minutes.
+"""
 SKEW = 1e-2
 """Skewness of pixels below which the kernel is that of pixels at right angles: right to half of it,
 of the kernel's peak.

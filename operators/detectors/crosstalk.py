@@ -68,8 +68,8 @@ class Crosstalk(Operator):
         return []
 
     def prepare(self, observation: Observation) -> Any:
-        """C, a `scipy.sparse.csr_array`. Raises InputError for a file that does not suit the focal
-        plane.
+        """C of equation (1), a `scipy.sparse.csr_array`. Raises InputError for a file that does not
+        suit the focal plane.
         """
         found = self.shares(observation)
         observation.log.state(self.label, "pairs of detectors with crosstalk", f"{found.nnz}")

@@ -81,7 +81,7 @@ class ThreadSums(NamedTuple):
     Attributes
     ----------
     sums
-        In pixels; columns as in `intensity_kernel` or `stokes_kernel`.
+        Sums in pixels; columns as in `intensity_kernel` or `stokes_kernel`.
     dropped
         (4,) samples that were dropped, by the reason.
     largest
@@ -102,9 +102,10 @@ class Binning:
     detectors, samples
         (n_det,), (n_samp,) uint8: which of them count.
     signals
-        Which of the observation's signals.
+        The observation's signals that are added up.
     own_noise
-        Of I: weights and noise have sums, as detectors differ. Of I, Q and U: N is not A.
+        True for maps of I whose detectors differ: weights and noise have sums; for maps of I, Q
+        and U where N is not A.
     scatter
         Inverse of the reference variance [K^-2] where the noise is that of the samples' scatter;
         else 0.
@@ -153,7 +154,7 @@ class Binning:
         return np.zeros(self.shape, np.int64)
 
     def columns(self, signals: Sequence[str]) -> dict[str, list[tuple[int, int]]]:
-        """Columns of a thread's sums, and factors, that make those of `MapSums.columns`."""
+        """Columns of a thread's sums that are added to each of `MapSums.columns`, with factors."""
         n, end = len(signals), self.shape[1]
         if self.angles is None:
             first, hits = end - n + 1, intensity.HITS

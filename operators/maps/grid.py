@@ -1,8 +1,8 @@
 """Pixel grids: tangent-plane (TAN) and plate carrée (CAR) images and HEALPix, and which of their
 pixels a sample falls in.
 
-They are found tile by tile. Two bands take one another's where each would make the same bits by
-itself: `Looking.key` is a fingerprint of all numbers that pixels are made of.
+Pixels are found tile by tile. Two bands share them where each alone would find the same bits:
+`Looking.key` is a fingerprint of all numbers that pixels are computed from.
 """
 
 from __future__ import annotations

@@ -61,9 +61,9 @@ class MapSums(Product):
     sums
         (2, n_pixels, columns) of each half.
     columns
-        Of the hits, the ``weights`` (1 or 6), the ``data NAME`` of each signal (1 or 3), and the
-        ``noise NAME`` (1 or 6) of signals with noise of their own; under the name of the first
-        signal that of all, where it is not that of the weights.
+        Columns by name: the ``hits``, the ``weights`` (1 or 6), the ``data NAME`` of each signal
+        (1 or 3), and the ``noise NAME`` (1 or 6) of each signal if ``scatter``, else of the first
+        one for all; no such columns where the noise is that of the weights.
     scans, rates
         Names of the observations, and their sample rates, Hz.
     unknown_variance
@@ -247,7 +247,7 @@ class MapSums(Product):
         return made
 
     def subtract(self, stream: str, parts: Sequence[str]) -> None:
-        """The data are subtracted, exactly, where they are asked for."""
+        """See `Product.subtract`. The data are subtracted, exactly, when they are read."""
         self._rests[stream] = (self.first, *parts)
         self.signals += (stream,)
         self._check(stream, (len(parts) + 1) / 2)  # the first and one of them fit in 2^63
@@ -258,7 +258,9 @@ class MapSums(Product):
         self._largest = np.maximum(self._largest, largest)
 
     def _check(self, place: str, terms: float = 1.0) -> None:
-        """Raise PipelineError where a sum, or so many of the data, may have overflowed."""
+        """Raise PipelineError where a sum, or ``terms`` sums of data together, may have
+        overflowed.
+        """
         largest = float(max(self._largest[0], terms * self._largest[1]))
         if sum(self._deepest) * largest < MOST:
             return

@@ -86,7 +86,7 @@ class PinkPlanning(Planning[PinkNoise]):
         return Traits(rms=rms, faster=faster)
 
     def estimate(self, context: Context) -> Estimate:
-        """Error of leaving the step out, the error of no pink noise."""
+        """Error of leaving the step out."""
         pink, o = self.operator, context.lowest
         spectrum = PinkSpectrum.of(pink, o)
         if spectrum is None:

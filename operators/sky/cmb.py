@@ -52,8 +52,8 @@ PLAUSIBLE = 1.0, 3000.0
 few.
 """
 FALLS = 0.1
-"""Of l (l + 1) C_l about l = 200 over that about l = 15: it is 5 in the CMB; below, the column is
-C_l itself, with 0.03.
+"""Least ratio of l (l + 1) C_l about l = 200 to that about l = 15. The CMB has 5; 0.03 is found
+where the column holds C_l itself.
 """
 CURE = (
     "give columns of text: l, TT or l, TT, EE, BB, TE, as l (l + 1) C_l / (2 pi) in uK^2 (as CAMB"
@@ -70,7 +70,7 @@ class Spectrum:
     values
         C_l [K^2], (4, lmax + 1): TT, EE, BB, TE from l = 0; zero where the file has none.
     text
-        What was taken for what.
+        Columns, unit and factor as they were read.
     """
 
     values: Floats

@@ -60,7 +60,10 @@ class Conversion:
 
 
 def conversion(grid: Grid, band: Band, spectral_index: float) -> Conversion:
-    """Averaged over ``band``. Raises InputError as `core.numerics.radiation.to_kelvin_rj`."""
+    """Conversion of the map of a grid, averaged over ``band``.
+
+    Raises InputError as `core.numerics.radiation.to_kelvin_rj`.
+    """
     source = grid.source
     total = to_kelvin_rj(source.unit, band, 1.0, spectral_index, source.beam_solid_angle)
     if source.unit != "Jy/pixel":
@@ -96,7 +99,7 @@ def tangent_areas(matrix: Floats, shape: tuple[int, int]) -> Floats:
 
 @dataclass(frozen=True)
 class Brightness:
-    """A map in K_RJ on its grid.
+    """A map in K_RJ on the points of a `Grid`.
 
     Attributes
     ----------
@@ -122,7 +125,9 @@ class Brightness:
         return self.planes.nbytes + self.covered.nbytes
 
     def image(self, label: str, grid: Grid) -> Image:
-        """For pictures and comparisons; NaN where nothing is known. ``label``: the operator's."""
+        """The map for pictures and comparisons; NaN where nothing is known. ``label``: the
+        operator's.
+        """
         header = exact_header(grid.wcs)
         header["BUNIT"], header["TEMPSCAL"], header["OPERATOR"] = "K", "K_RJ", label
         if self.resolution:
@@ -248,9 +253,7 @@ class ConvolvedSky(SkyInput):
         return self._cache.get((*grid.key, gridding), make)
 
     def _on_own_pixels(self, grid: Grid, found: Conversion) -> Brightness:
-        """The values of a TAN image times `scale`. Raises InputError where it is brighter than
-        anything.
-        """
+        """The values of a TAN image times `scale`. Raises InputError as `check_brightness`."""
         source = grid.source
         planes = [source.values * found.factor * self.scale]
         if source.polarization is not None:

@@ -262,8 +262,8 @@ FLAT = 1e-3
 """Relative difference of solid angles up to which pixels of a TAN image count as equal (1.5 deg).
 """
 FINER = 1.25
-"""Points of a grid over which pixels are spread, in those that are asked for: 5 per FWHM err by
-6e-4 of a peak, 4 by 2e-3.
+"""Factor by which a grid over which pixels are spread is finer than asked for: 5 points per FWHM
+err by 6e-4 of a peak, 4 by 2e-3.
 """
 CLOSED = 1.3
 """Pixels per FWHM, where they are looked at, from which a sum over them leaves no gaps: a uniform
@@ -277,7 +277,7 @@ class Grid:
     Attributes
     ----------
     key
-        Of what is computed there.
+        Key in the cache of what is computed there.
     wcs
         TAN, two-dimensional.
     shape

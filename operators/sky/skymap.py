@@ -65,8 +65,8 @@ class ScanSampler:
     index
         (n_det,) number of each detector's beam.
     angles
-        Of the detectors on the sky, from the meridians of the grid's Q and U; None: there are no Q
-        and U.
+        Polarization angles of the detectors on the sky, from the meridians of the grid's Q and U;
+        None: there are no Q and U.
     """
 
     grid: Grid
@@ -236,7 +236,9 @@ Nside = Annotated[int, Field(ge=16, le=8192), AfterValidator(_power_of_two)]
 
 
 class FullSky(Operator):
-    """A step whose maps a `SkyMap` samples: that and what it knows of the scan are the state."""
+    """Base of steps that make HEALPix maps of the whole sky, which a `SkyMap` samples: the state is
+    that `SkyMap` and its own state.
+    """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"sky"})

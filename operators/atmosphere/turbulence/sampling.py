@@ -156,8 +156,8 @@ class DriftingLayers:
         at: slice,
         out: Floats,
     ) -> None:
-        """Add layer ``n`` at positions x, y of the times ``at`` to out[k], k of ``which``: as the
-        ``bands`` of its tiles see it.
+        """Add layer ``n`` at positions x, y and times ``at`` to out[k] of each k in ``which``, as
+        these ``bands`` of its tiles see it.
         """
         matrix, i, j = self._places[n]
         i, j = i[at], j[at]
@@ -222,8 +222,8 @@ def _sums_at(
     weighted: Sequence[Floats],
     sine: Floats,
 ) -> None:
-    """Overwrite what `DriftingLayers.sums` returns with the layers that take this ``step``, at its
-    own times from ``first`` on.
+    """Write the sums over the layers that take this ``step`` in time into the arrays that
+    `DriftingLayers.sums` returns, at times of that step from ``first`` on.
     """
     path = next(band.paths[step] for band in bands if step in band.paths)
     groups, count = _groups(bands, step), sine.shape[1]
@@ -255,8 +255,8 @@ def _add_coarse(
     total: Floats,
     weighted: Sequence[Floats],
 ) -> None:
-    """Add the layers that take this coarser ``step``, interpolated in time to the common one over
-    ``span``.
+    """Add the layers that take this coarser ``step`` in time, interpolated to the common one over
+    ``span`` (first, stop).
     """
     (first, stop), ratio = span, step // bands[0]._step
     low, high = _coarse(first, stop, ratio)
