@@ -39,22 +39,21 @@ _NAMES = {1: "I", 2: "Q", 3: "U", 4: "V"}
 _POLARIZED = re.compile(r"(STOKES[ _-]?)?([QUV])([ _-].*)?", re.IGNORECASE)
 """Names of columns and extensions: Q_POLARISATION (healpy), Q_STOKES (Planck), STOKES_Q, Q."""
 _INTENSITY = re.compile(
-    r"(STOKES[ _-]?)?[IT]|[IT][ _-]?STOKES|I["
-    r" _-]POL[A-Z]*|TEMP(ERATURE)?|INTENSITY|SIGNAL|BRIGHTNESS|T[ _-]?B",
+    r"(STOKES[ _-]?)?[IT]|[IT][ _-]?STOKES|I[ _-]POL[A-Z]*"
+    r"|TEMP(ERATURE)?|INTENSITY|SIGNAL|BRIGHTNESS|T[ _-]?B",
     re.IGNORECASE,
 )
 """Names of columns of a brightness: I_STOKES (Planck), TEMPERATURE (healpy), SIGNAL (zonda,
 HEALPix's own tools).
 """
 _PIXEL = re.compile(
-    r"(I?PIX(EL|ELS|NUM|NO|ID)?|PIXEL?[ _-]?(INDEX|NUMBER|NUM|ID)|INDEX|HPX["
-    r" _-]?(PIXEL|INDEX|ID)|HEALPIX|HPIX)",
+    r"(I?PIX(EL|ELS|NUM|NO|ID)?|PIXEL?[ _-]?(INDEX|NUMBER|NUM|ID)|INDEX"
+    r"|HPX[ _-]?(PIXEL|INDEX|ID)|HEALPIX|HPIX)",
     re.IGNORECASE,
 )
 _OTHER = re.compile(
-    r"(.*[ _-])?(N?[ _-]?HITS?|N[ _-]?OBS(ERVATIONS)?|N["
-    r" _-]?SAMP(LES)?|COUNTS?|WEIGHTS?|WGTS?|COV(ARIANCE|ERAGE)?|"
-    r"STD(DEV)?|STDEV|SIGMA|RMS|ERR(ORS?)?|VAR(IANCE)?|NOISE|[TPIQU]?MASK|R?COND(ITION)?"
+    r"(.*[ _-])?(N?[ _-]?HITS?|N[ _-]?OBS(ERVATIONS)?|N[ _-]?SAMP(LES)?"
+    r"|COUNTS?|WEIGHTS?|WGTS?|COV(ARIANCE|ERAGE)?|STD(DEV)?|STDEV|SIGMA|RMS|ERR(ORS?)?|VAR(IANCE)?|NOISE|[TPIQU]?MASK|R?COND(ITION)?"
     r"|EXPOSURE|TIME|FLAGS?|RA|DEC|GLON|GLAT|LON|LAT)"
     r"([ _-].*|\d+)?|[IQUV][IQUV]",
     re.IGNORECASE,
