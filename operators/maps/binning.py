@@ -104,8 +104,8 @@ class Binning:
     signals
         The observation's signals that are added up.
     own_noise
-        True for maps of I whose detectors differ: weights and noise have sums; for maps of I, Q
-        and U where N is not A.
+        Of I: weights and noise have sums of their own; False: all detectors weigh the same, and
+        both follow from the hits. Of I, Q and U: N is not A, and is added up.
     scatter
         Inverse of the reference variance [K^-2] where the noise is that of the samples' scatter;
         else 0.
