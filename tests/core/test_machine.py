@@ -1,9 +1,11 @@
-"""The user's cache folder."""
+"""The user's cache folder, and what identifies a processor."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
+
+import pytest
 
 from zonda.core import machine
 
@@ -17,3 +19,19 @@ def test_where(monkeypatch, tmp_path):
         "darwin": Path.home() / "Library/Caches/zonda",
     }
     assert machine.cache_folder() == expected.get(sys.platform, tmp_path / "zonda")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE"],
+)
+def test_what_is_remembered_of_a_processor_knows_its_restraints(monkeypatch, name):
+    monkeypatch.delenv(name, raising=False)
+    machine.processor.cache_clear()
+    assert f" {name}=" not in machine.processor()
+    monkeypatch.setenv(name, "less")
+    machine.processor.cache_clear()
+    try:
+        assert f" {name}=less" in machine.processor()
+    finally:
+        machine.processor.cache_clear()

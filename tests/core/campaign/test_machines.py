@@ -150,21 +150,3 @@ def test_an_unknown_machine_is_not_compared(tmp_path):
     assert watch.meet("", "task 2") == ""
     assert watch.meet('{"cpu": "b"}', "task 3")
     assert not said
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE"],
-)
-def test_what_is_remembered_of_a_processor_knows_its_restraints(monkeypatch, name):
-    from zonda.core import machine
-
-    monkeypatch.delenv(name, raising=False)
-    machine.processor.cache_clear()
-    assert f" {name}=" not in machine.processor()
-    monkeypatch.setenv(name, "less")
-    machine.processor.cache_clear()
-    try:
-        assert f" {name}=less" in machine.processor()
-    finally:
-        machine.processor.cache_clear()

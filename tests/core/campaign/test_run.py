@@ -17,7 +17,7 @@ from zonda.core.campaign import tasks as campaign
 from zonda.core.campaign.campaign_file import Job
 from zonda.core.campaign.folder import Record
 from zonda.core.campaign.tasks import Outcome, perform
-from zonda.core.experiment import experiment as calls
+from zonda.core.experiment import experiment
 from zonda.core.experiment.engines import Pool, SerialExecutor
 
 SERIAL = ("--engine", "serial", "--threads", 1)
@@ -291,7 +291,7 @@ def test_a_campaign_into_the_folder_of_a_plain_run_says_so(undisturbed, bench, c
 
 @pytest.mark.nightly
 def test_a_killed_worker_does_not_lose_the_campaign(undisturbed, bench, monkeypatch):
-    submit, killed = calls._submit, []
+    submit, killed = experiment._submit, []
 
     def and_kill(pool, function, *arguments):
         future = submit(pool, function, *arguments)
@@ -301,7 +301,7 @@ def test_a_killed_worker_does_not_lose_the_campaign(undisturbed, bench, monkeypa
                 os.kill(process.pid, signal.SIGKILL)
         return future
 
-    monkeypatch.setattr(calls, "_submit", and_kill)
+    monkeypatch.setattr(experiment, "_submit", and_kill)
     out = bench.run(bench.CAMPAIGN, "--engine", "processes", "--workers", 2)
     assert killed
     rows = read(out)
