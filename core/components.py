@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar, overload
 
-from .discovery import API_VERSION, RAISED, Found, described, discover, is_file, names_in
+from .discovery import API_VERSION, RAISED, Found, component_in, discover, is_yaml_file, names_in
 from .errors import ZondaError
 
 T = TypeVar("T")
@@ -208,7 +208,7 @@ class Registry:
         Raises `RegistryError` as `get`, and if the call fails or returns another kind of thing;
         `ConfigurationError` for mistakes in the file.
         """
-        if is_file(name) and self.base and not self.classes:
+        if is_yaml_file(name) and self.base and not self.classes:
             return self._of_file(name, folder)
         found = self._only(name)
         component = self.load(found)
@@ -242,7 +242,7 @@ class Registry:
                 place=str(path),
                 cure=f"keep one {self.kind} in the file",
             )
-        return described(path, inside[0], self._class, self.create)
+        return component_in(path, inside[0], self._class, self.create)
 
     def load(self, found: Found) -> Any:
         """Import one candidate. Raises `RegistryError` where that fails or it is written for
@@ -265,7 +265,7 @@ class Registry:
         from .configuration.diagnostics import ConfigurationError
 
         try:
-            return described(Path(found.file), found.name, self._class, self.create)
+            return component_in(Path(found.file), found.name, self._class, self.create)
         except ConfigurationError as err:
             first, *others = err.diagnostics
             cures = [first.help, *(f"{other.place}: {other.message}" for other in others)]

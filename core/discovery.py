@@ -83,7 +83,7 @@ class Found(NamedTuple):
 
         return [
             self._replace(name=name, reference=f"{self.reference}/{path.name}", file=str(path))
-            for path in files_of(self.reference)
+            for path in yaml_files_of(self.reference)
             for name in names_in(path)
         ] or [self]
 
@@ -170,12 +170,12 @@ def refresh() -> None:
 SUFFIXES = (".yaml", ".yml")
 
 
-def is_file(name: str) -> bool:
+def is_yaml_file(name: str) -> bool:
     """True for the path of a YAML file, which a name is not."""
     return name.endswith(SUFFIXES)
 
 
-def files_of(package: str) -> list[Path]:
+def yaml_files_of(package: str) -> list[Path]:
     """The YAML files in the folder of a package, which is not imported; empty if there are none."""
     root, *rest = package.split(".")
     try:
@@ -184,11 +184,11 @@ def files_of(package: str) -> list[Path]:
         return []
     folders = [] if spec is None else spec.submodule_search_locations or []
     found = (path for folder in folders for path in Path(folder, *rest).glob("*"))
-    return sorted(path for path in found if is_file(path.name))
+    return sorted(path for path in found if is_yaml_file(path.name))
 
 
 def names_in(path: Path) -> list[str]:
-    """Names of the components of a file; its own name if it cannot be read, for `described`."""
+    """Names of the components of a file; its own name if it cannot be read, for `component_in`."""
     try:
         root = yaml.compose(_text(path), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except (InputError, yaml.YAMLError):
@@ -198,7 +198,7 @@ def names_in(path: Path) -> list[str]:
     return [str(key.value) for key, _ in root.value if not str(key.value).startswith("x-")]
 
 
-def described(path: Path, name: str, base: type[Any], create: Callable[[str], Any]) -> Any:
+def component_in(path: Path, name: str, base: type[Any], create: Callable[[str], Any]) -> Any:
     """The component ``name`` of a file, an instance of ``base``.
 
     ``create`` makes the component that ``like`` names. Raises `ConfigurationError` with every

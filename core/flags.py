@@ -30,7 +30,7 @@ Intervals = dict[str, list[tuple[float, float]]]
 """Intervals by name: (start, stop) [s], in order and disjoint."""
 
 
-def runs(inside: NDArray[np.bool_], seconds: AnyFloats) -> list[tuple[float, float]]:
+def intervals_of(inside: NDArray[np.bool_], seconds: AnyFloats) -> list[tuple[float, float]]:
     """The intervals of those samples (n,) that are ``inside``, taken at ``seconds`` (n,).
 
     A run of the last sample alone has no length, and is left out: TOAST's rule gives that sample to
@@ -42,7 +42,7 @@ def runs(inside: NDArray[np.bool_], seconds: AnyFloats) -> list[tuple[float, flo
     return [(start, stop) for start, stop in spans if stop > start]
 
 
-def ranges(spans: list[tuple[float, float]], seconds: AnyFloats) -> list[slice]:
+def slices_in(spans: list[tuple[float, float]], seconds: AnyFloats) -> list[slice]:
     """The samples of each of the intervals ``spans``."""
     found = np.searchsorted(seconds, np.reshape(spans, (-1, 2))).tolist()
     return [slice(first, last + (last == len(seconds) - 1)) for first, last in found]
@@ -51,12 +51,14 @@ def ranges(spans: list[tuple[float, float]], seconds: AnyFloats) -> list[slice]:
 def samples_in(spans: list[tuple[float, float]], seconds: AnyFloats) -> NDArray[np.bool_]:
     """(n,) True for the samples in any of the intervals ``spans``."""
     inside = np.zeros(len(seconds), bool)
-    for samples in ranges(spans, seconds):
+    for samples in slices_in(spans, seconds):
         inside[samples] = True
     return inside
 
 
-def part(intervals: Mapping[str, list[tuple[float, float]]], begin: float, end: float) -> Intervals:
+def cut_intervals(
+    intervals: Mapping[str, list[tuple[float, float]]], begin: float, end: float
+) -> Intervals:
     """Parts of intervals between ``begin`` and ``end`` [s], counted from ``begin``; names without
     any part are kept.
     """

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .flags import DEAD, EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, Intervals, good, runs
+from .flags import DEAD, EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, Intervals, good, intervals_of
 from .focalplane import Focalplane
 from .log import Log
 from .numerics.random import stream_key
@@ -200,7 +200,7 @@ class Observation:
         if not self.detector_flags.size:
             self.detector_flags = np.where(self.focalplane.dead != 0, DEAD, 0).astype(np.uint8)
         if not self.intervals:
-            self.intervals = {"scanning": runs(np.ones(self.n_samples, bool), self.seconds)}
+            self.intervals = {"scanning": intervals_of(np.ones(self.n_samples, bool), self.seconds)}
 
     @property
     def n_samples(self) -> int:

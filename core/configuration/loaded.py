@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from zonda import __version__
 
 from ..assembly.checks import looks, run_checks, warn_of_nothing_saved
-from ..discovery import is_file
+from ..discovery import is_yaml_file
 from ..errors import ZondaError
 from ..operator import Operator
 from ..pipeline import Pipeline
@@ -242,7 +242,9 @@ class PipelineFile:
         named = {
             kind: scene[kind]
             for kind, value in given.items()
-            if value is None or is_variant(value) or (isinstance(value, str) and not is_file(value))
+            if value is None
+            or is_variant(value)
+            or (isinstance(value, str) and not is_yaml_file(value))
         }
         values = header | scene | {kind: given[kind] for kind in named}
         values = {

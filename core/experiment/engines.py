@@ -225,7 +225,7 @@ def begin_worker(safe: str | None = None) -> None:
     ``safe``: ``PYTHONSAFEPATH`` of the main process.
     """
     restore(safe)
-    keep()
+    keep_warnings()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -422,14 +422,14 @@ def here() -> str:
     return f"{platform.node()} {os.getpid()}"
 
 
-def keep() -> None:
+def keep_warnings() -> None:
     """In a new worker process: keep warnings for the main process instead of writing them to
     stderr.
     """
-    warnings.showwarning = _keep
+    warnings.showwarning = _keep_warning
 
 
-def call(main: str, function: Callable[..., R], *arguments: Any) -> tuple[R, list[Warned]]:
+def with_warnings(main: str, function: Callable[..., R], *arguments: Any) -> tuple[R, list[Warned]]:
     """The result of a call, and the warnings that this process has kept; none in ``main`` (`here`),
     which shows them itself.
     """
@@ -450,7 +450,7 @@ def _kept_during() -> Iterator[None]:
     """
     with _lock:
         _at_work.append(warnings.showwarning)
-        keep()
+        keep_warnings()
     try:
         yield
     finally:
@@ -460,7 +460,7 @@ def _kept_during() -> Iterator[None]:
                 warnings.showwarning = before
 
 
-def show(found: Sequence[Warned], shown: Registry) -> None:
+def show_warnings(found: Sequence[Warned], shown: Registry) -> None:
     """Warn here. ``shown``: a registry of what was shown; a text in it is not shown again, unless
     the user's filters say so.
     """
@@ -468,7 +468,7 @@ def show(found: Sequence[Warned], shown: Registry) -> None:
         warnings.warn_explicit(text, category, file, line, registry=shown)
 
 
-def _keep(
+def _keep_warning(
     message: Warning | str,
     category: type[Warning],
     filename: str,

@@ -30,7 +30,16 @@ from ..errors import PipelineError
 from ..figures import Choice, Figure, FigureMetric
 from ..storage.files import write_text
 from ..tables import Table
-from .engines import Pool, Registry, SerialExecutor, Warned, call, engine_failed, here, show
+from .engines import (
+    Pool,
+    Registry,
+    SerialExecutor,
+    Warned,
+    engine_failed,
+    here,
+    show_warnings,
+    with_warnings,
+)
 from .variant import FileVariant, Variant
 
 T = TypeVar("T")
@@ -155,7 +164,7 @@ class Work(ABC, Generic[T, R]):
             # of the call, or of the engine: a Dask worker that died again and again, a task that
             # cannot be sent
             return Lost(err)
-        show(found, self._shown)
+        show_warnings(found, self._shown)
         return result
 
     def _gone(self) -> PipelineError:
@@ -167,7 +176,7 @@ def _submit(
 ) -> Future[tuple[R, list[Warned]]]:
     assert pool.executor is not None
     try:
-        return pool.executor.submit(call, here(), function, *arguments)
+        return pool.executor.submit(with_warnings, here(), function, *arguments)
     except Exception as err:
         future: Future[tuple[R, list[Warned]]] = Future()
         future.set_exception(

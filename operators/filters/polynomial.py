@@ -24,7 +24,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Data, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.flags import TRIMMED, has_a_signal, ranges
+from zonda.core.flags import TRIMMED, has_a_signal, slices_in
 from zonda.core.numerics.smooth import product
 from zonda.core.types import Floats
 
@@ -138,7 +138,7 @@ class PolynomialFilter(LinearFilter):
         """The intervals of a scan. Raises PipelineError where there are none of that name."""
         if self.interval == "whole":
             return [slice(0, observation.n_samples)]
-        spans = ranges(observation.intervals.get(self.interval, []), observation.seconds)
+        spans = slices_in(observation.intervals.get(self.interval, []), observation.seconds)
         found = [p for p in spans if p.stop > p.start]
         if not found:
             there = [name for name, spans in observation.intervals.items() if spans]

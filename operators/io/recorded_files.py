@@ -20,7 +20,7 @@ from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Fraction, RadioFrequency
 from zonda.core.errors import InputError
-from zonda.core.flags import Intervals, runs
+from zonda.core.flags import Intervals, intervals_of
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
@@ -81,7 +81,7 @@ class File:
     def of(cls, band: RecordedBand, mask: int) -> File:
         """``mask``: bits of the flags that exclude a sample."""
         tod, rows = band.tod, {band.tod.names[row]: row for row in band.rows.tolist()}
-        every = {"scanning": runs(np.ones(tod.n_samples, bool), tod.seconds)}
+        every = {"scanning": intervals_of(np.ones(tod.n_samples, bool), tod.seconds)}
         said = tod.sample_flags(mask), tod.scan_intervals or every, tod.weather, tod.hwp_angle
         return cls(band.path, rows, *said, band.noise)
 

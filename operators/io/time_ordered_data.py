@@ -22,8 +22,8 @@ from zonda.core.flags import (
     Intervals,
     from_file,
     in_file,
+    intervals_of,
     of_before,
-    runs,
     samples_in,
 )
 from zonda.core.numerics.quaternions import detector_quaternions, directions
@@ -200,13 +200,13 @@ class TimeOrderedData:
         self.flags = of_before(self.flags, samples=True)
         self.detector_flags = of_before(self.detector_flags, samples=False)
         processed = (self.flags & np.uint8(PROCESSING)) != 0
-        self.intervals[TRIMMED_INTERVALS] = runs(processed, self.seconds)
+        self.intervals[TRIMMED_INTERVALS] = intervals_of(processed, self.seconds)
 
     def take_flags(self, observation: Observation) -> None:
         """Take the flags that a scan has now, and its intervals."""
         self.flags = in_file(observation.flags, SAMPLE_FLAGS)
         self.detector_flags = in_file(observation.detector_flags, DETECTOR_FLAGS)
-        trimmed = runs(
+        trimmed = intervals_of(
             (observation.flags & np.uint8(TRIMMED | PROCESSING)) == TRIMMED, observation.seconds
         )
         self.intervals = {

@@ -30,7 +30,7 @@ from pydantic import Discriminator, Field, Tag
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
-from zonda.core.flags import Intervals, runs
+from zonda.core.flags import Intervals, intervals_of
 from zonda.core.numerics.celestial import Boresight
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import series
@@ -234,7 +234,10 @@ class PointingRaster(RasterParameters):
 
     def intervals(self, seconds: Floats) -> Intervals:
         turning = self.rows.turning(seconds)
-        return {"scanning": runs(~turning, seconds), "turnaround": runs(turning, seconds)}
+        return {
+            "scanning": intervals_of(~turning, seconds),
+            "turnaround": intervals_of(turning, seconds),
+        }
 
     def check(self, data: Data) -> list[str]:
         first, lines = len(data.observations), super().check(data)

@@ -16,7 +16,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Fraction, Seconds
 from zonda.core.errors import InputError
-from zonda.core.flags import part
+from zonda.core.flags import cut_intervals
 from zonda.core.numerics.quaternions import directions, middle
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
@@ -153,7 +153,9 @@ class PointingRecorded(Operator):
             boresight_radec=radec,
             centre=centre,
             flags=scan.flags.copy(),
-            intervals=part(recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1])),
+            intervals=cut_intervals(
+                recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1])
+            ),
         )
         state_times(self.label, observation)
         if recording.frame == "azel":

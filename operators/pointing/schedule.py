@@ -24,7 +24,7 @@ from zonda.core.configuration.units import (
     SampleRate,
 )
 from zonda.core.errors import InputError, PointingError
-from zonda.core.flags import IRREGULAR, runs
+from zonda.core.flags import IRREGULAR, intervals_of
 from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.quaternions import multiply
 from zonda.core.numerics.sphere import angles, separation, unit_vectors
@@ -440,7 +440,7 @@ class PointingSchedule(ScheduleParameters):
             for name, spans in sweep.intervals(seconds - delay, scanning).items()
         }
         if ahead:
-            intervals["elnod"] = runs(~scanning, seconds)
+            intervals["elnod"] = intervals_of(~scanning, seconds)
         observation = observed(
             self.label,
             scene,

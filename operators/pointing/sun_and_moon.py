@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.flags import SUN_CLOSE, SUN_UP, Intervals, runs
+from zonda.core.flags import SUN_CLOSE, SUN_UP, Intervals, intervals_of
 from zonda.core.numerics.bodies import Track, tracks
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import directions
@@ -50,7 +50,7 @@ def sunlit(
         above[part] = towards[:, 2] > 0
         near[part] = Track(looking(azel[part])).distance(Track(towards)) < close
     flags = np.where(above, SUN_UP, 0) | np.where(near, SUN_CLOSE, 0)
-    found = {"sun_up": runs(above, seconds), "sun_close": runs(near, seconds)}
+    found = {"sun_up": intervals_of(above, seconds), "sun_close": intervals_of(near, seconds)}
     return flags.astype(np.uint8), {name: spans for name, spans in found.items() if spans}
 
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.flags import Intervals, runs
+from zonda.core.flags import Intervals, intervals_of
 from zonda.core.types import Floats
 
 
@@ -83,9 +83,9 @@ class Sweep:
         )
         found: Intervals = {}
         for way, after, going in (("leftright", first, throw), ("rightleft", ~first, ~throw)):
-            found[f"throw_{way}"] = runs(inside & going, seconds)
-            found[f"scan_{way}"] = runs(inside & ~turning & after, seconds)
-            found[f"turn_{way}"] = runs(inside & turning & after, seconds)
+            found[f"throw_{way}"] = intervals_of(inside & going, seconds)
+            found[f"scan_{way}"] = intervals_of(inside & ~turning & after, seconds)
+            found[f"turn_{way}"] = intervals_of(inside & turning & after, seconds)
         for name, part in (("throw", "throw"), ("scanning", "scan"), ("turnaround", "turn")):
             found[name] = sorted(found[f"{part}_leftright"] + found[f"{part}_rightleft"])
         return found

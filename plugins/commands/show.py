@@ -45,10 +45,10 @@ def instrument(name: str, output: Path | None) -> None:
 
 def _instrument(name: str) -> Instrument:
     from zonda.core.configuration.pipeline_file import load
-    from zonda.core.discovery import is_file, names_in
+    from zonda.core.discovery import is_yaml_file, names_in
     from zonda.core.registry import instruments
 
-    if is_file(name) and "operators" in names_in(Path(name)):
+    if is_yaml_file(name) and "operators" in names_in(Path(name)):
         return load(name).scene().instrument
     found: Instrument = instruments.create(name)
     return found

@@ -98,18 +98,18 @@ def test_warnings_of_a_worker_are_sent_with_the_results_and_shown_once(recwarn):
 
     warnings.simplefilter("always")
     with ThreadPoolExecutor(2) as threads:
-        results = list(threads.map(partial(engines.call, "another process", work), (1, 2)))
+        results = list(threads.map(partial(engines.with_warnings, "another process", work), (1, 2)))
     assert [result for result, _ in results] == [1, 2]
     assert sorted(len(found) for _, found in results) == [0, 2]
     assert not recwarn.list
     warnings.simplefilter("default")
     shown = {}
     for _, found in results:
-        engines.show(found, shown)
+        engines.show_warnings(found, shown)
     assert [str(one.message) for one in recwarn.list] == ["it is late"]
 
 
 def test_the_main_process_shows_its_warnings_at_once(recwarn):
     """Of the tasks of the engine `serial`, and of Dask's workers that are threads of it."""
-    assert engines.call(engines.here(), warnings.warn, "it is late") == (None, [])
+    assert engines.with_warnings(engines.here(), warnings.warn, "it is late") == (None, [])
     assert [str(one.message) for one in recwarn.list] == ["it is late"]

@@ -12,7 +12,7 @@ from scipy import signal as scipy_signal
 import zonda
 import zonda.testing
 from zonda.core.errors import PipelineError
-from zonda.core.flags import INVALID, TRIMMED, ranges
+from zonda.core.flags import INVALID, TRIMMED, slices_in
 from zonda.operators.filters.polynomial import Detrend, Pieces, PolynomialFilter
 from zonda.operators.filters.rows import Rows
 from zonda.plugins.checks import scenes
@@ -48,7 +48,7 @@ def test_it_keeps_the_contract(interval):
 
 def test_polynomials_of_each_throw_go_to_rounding(bench):
     observation = scan(bench)
-    parts = ranges(observation.intervals["throw"], observation.seconds)
+    parts = slices_in(observation.intervals["throw"], observation.seconds)
     x = polynomials(parts, 4, 3, 1)
     found = bench.run(
         [PolynomialFilter(order=4, interval="throw")],
@@ -87,7 +87,7 @@ def test_white_noise_loses_its_degrees_of_freedom(bench):
         {"signal": x},
         precision="float64",
     )
-    parts = ranges(PASSES, observation.seconds)
+    parts = slices_in(PASSES, observation.seconds)
     lost = n_det * len(parts) * (order + 1)
     total = sum(float((x[:, p] ** 2).sum() - (found.signal[:, p] ** 2).sum()) for p in parts)
     assert abs(total / lost - 1) < 4 * np.sqrt(2 / lost)
@@ -107,7 +107,7 @@ def test_between_passes_goes_a_straight_line_and_the_samples_are_flagged(bench):
         precision="float64",
     )
     inside = np.zeros(N, bool)
-    for p in ranges(PASSES, t):
+    for p in slices_in(PASSES, t):
         inside[p] = True
     assert np.abs(found.signal[:, :5500]).max() < 1e-11  # the line itself
     assert np.abs(found.signal[:, 5500:]).max() == pytest.approx(
@@ -122,7 +122,7 @@ def test_between_passes_goes_a_straight_line_and_the_samples_are_flagged(bench):
 def test_flagged_samples_are_not_used(bench):
     observation = scan(bench)
     observation.flags[100:160] = INVALID
-    x = polynomials(ranges(observation.intervals["throw"], observation.seconds), 2, 3, 4)
+    x = polynomials(slices_in(observation.intervals["throw"], observation.seconds), 2, 3, 4)
     x[:, 100:160] += 1e6
     found = bench.run(
         [PolynomialFilter(order=2, interval="throw")],
@@ -137,7 +137,7 @@ def test_flagged_samples_are_not_used(bench):
 
 def test_samples_that_are_not_finite_are_bridged_and_stay(bench):
     observation = scan(bench)
-    x = polynomials(ranges(PASSES, observation.seconds), 2, 3, 5)
+    x = polynomials(slices_in(PASSES, observation.seconds), 2, 3, 5)
     x[1, [0, 700, 1499]] = np.nan
     found = bench.run(
         [PolynomialFilter(order=2, interval="scanning")],
@@ -146,7 +146,7 @@ def test_samples_that_are_not_finite_are_bridged_and_stay(bench):
         precision="float64",
     ).signal
     assert np.isnan(found[1, [0, 700, 1499]]).all()
-    for p in ranges(PASSES, observation.seconds):
+    for p in slices_in(PASSES, observation.seconds):
         assert np.nanmax(np.abs(found[:, p])) < 1e-11
 
 
@@ -200,7 +200,7 @@ def test_on_an_azimuth_scan_turnarounds_are_in_no_map():
             np.r_[
                 tuple(
                     np.arange(p.start, p.stop)
-                    for p in ranges(observation.intervals["turnaround"], observation.seconds)
+                    for p in slices_in(observation.intervals["turnaround"], observation.seconds)
                 )
             ],
         )
