@@ -1,4 +1,5 @@
-"""Sums of samples in pixels, in fixed point.
+"""Sums of samples in the pixels of maps of I, in fixed point, and the kernel that moves the sums of
+threads, also of I, Q and U, to those of the run.
 
     D_p = sum_i rint(2^36 w_i d_i),   H_p = sum_i 1,   W_p = sum_i rint(2^30 w_i),
     N_p = sum_i rint(2^30 n_i)         (1)

@@ -26,7 +26,7 @@ DIFFERENCES: dict[Split, str] = {
     "directions": "rising - falling azimuth",
     "radii": "inner - outer detectors",
 }
-"""What is subtracted from what."""
+"""Halves of the samples, of which the second is subtracted from the first."""
 
 Mask = NDArray[np.bool_]
 

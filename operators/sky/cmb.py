@@ -1,4 +1,4 @@
-"""The cosmic microwave background, drawn from its power spectra.
+"""The cosmic microwave background, drawn from its power spectra, and the files of these.
 
     a^T = sqrt(C^TT) g_T,   a^E = C^TE / sqrt(C^TT) g_T + sqrt(C^EE - (C^TE)^2 / C^TT) g_E,
     a^B = sqrt(C^BB) g_B,   (1)

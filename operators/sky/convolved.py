@@ -1,4 +1,6 @@
-"""The map of a `SkyMap` on its grid, in K_RJ and convolved with beams, each made once and kept."""
+"""The map of a `SkyMap` converted to K_RJ, brought onto its grid and convolved with beams; each is
+made once and kept.
+"""
 
 from __future__ import annotations
 

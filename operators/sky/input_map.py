@@ -1,5 +1,5 @@
-"""Input maps of the sky: images of any projection and HEALPix maps, whose pixels are looked up by
-directions.
+"""Input maps of the sky: images of any projection and HEALPix maps. Their pixels are looked up by
+directions; values between the pixels of HEALPix maps are local fits of third degree.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The parameters of `SkyMap`, its map, read once and kept by the step, and what the map's header
-alone says of its place.
+"""The parameters of `SkyMap`, its map, read once and kept by the step, the place of the map by its
+header alone, and the cache of what is computed of a map.
 """
 
 from __future__ import annotations
