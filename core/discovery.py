@@ -1,8 +1,9 @@
-"""Entry points of every installed distribution, read as metadata only; one broken distribution
-never hides the rest; and components that YAML files of a package describe: instruments, sites and
-bands.
+"""Plugins that are installed: entry points of every distribution, and the instruments, sites and
+bands that YAML files of a package describe.
 
-A file holds components by their names, each the mapping of keys that its class takes. ``{like:
+Entry points are read as metadata only. One broken distribution never hides the rest.
+
+A YAML file holds components by their names, each the mapping of keys that its class takes. ``{like:
 NAME}`` is another name for a component. Keys that begin with ``x-`` are no components: they hold
 what several share, by YAML's anchors. Relative paths are looked for beside the file.
 """
@@ -171,7 +172,7 @@ SUFFIXES = (".yaml", ".yml")
 
 
 def is_yaml_file(name: str) -> bool:
-    """True for the path of a YAML file, which a name is not."""
+    """True if a text is the path of a YAML file, by its ending, and not the name of a component."""
     return name.endswith(SUFFIXES)
 
 

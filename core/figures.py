@@ -200,7 +200,7 @@ class Choice(TextValue):
 
     @classmethod
     def of(cls, value: Any) -> Self:
-        """A choice outside a file: `parse` that raises InputError."""
+        """A choice that is given in Python: `parse`, but raises InputError."""
         try:
             return cls.parse(value)
         except PydanticCustomError as err:

@@ -1,4 +1,5 @@
-"""The flags of samples and of detectors: one table of bits, TOAST's where TOAST has one.
+"""Flags of samples and of detectors, one table of bits (TOAST's where TOAST has one); and named
+intervals of a scan.
 
 TOAST calls flags of samples *shared*. Its map-making leaves out samples with a bit of 15 and
 detectors with a bit of 7 ("non-science"). zonda leaves out these and its own, `OPAQUE`,

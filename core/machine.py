@@ -55,7 +55,7 @@ RESTRAINTS = (
     "OPENBLAS_CORETYPE",
     "GLIBC_TUNABLES",
 )
-"""Variables with which other instructions are chosen than the processor's own."""
+"""Environment variables that forbid some instructions of the processor."""
 
 
 def cache_folder() -> Path:
@@ -73,7 +73,7 @@ def cache_folder() -> Path:
 
 @cache
 def processor() -> str:
-    """This machine's processor, as the system calls it, and what the environment forbids it."""
+    """Name of the processor, and the environment's `RESTRAINTS` on its instructions."""
     return " ".join(
         [_name(), *(f"{name}={os.environ[name]}" for name in RESTRAINTS if os.environ.get(name))]
     )

@@ -54,7 +54,7 @@ class LoadSpectra:
 
 
 INSTANTS = 64
-"""Instants, evenly over a scan, that the mean is taken of: the emission follows the elevation."""
+"""Instants of the mean emission, evenly over a scan: it changes with the elevation."""
 
 
 T = TypeVar("T")

@@ -1,5 +1,5 @@
-"""Streams: the samples of whole observations, as steps that measure read them, and what a step that
-changes a whole stream at once made of it.
+"""Streams of whole observations: their names in parameters, the samples that steps read which
+measure, and the result of a step that changes a whole stream at once (`Changed`).
 """
 
 from __future__ import annotations

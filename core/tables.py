@@ -1,4 +1,4 @@
-"""Tables as aligned text, ECSV files, JSON records and HTML."""
+"""Tables as aligned text, ECSV files and JSON records; HTML from jinja2 templates."""
 
 from __future__ import annotations
 

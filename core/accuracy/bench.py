@@ -52,7 +52,7 @@ class TimedRun:
     Attributes
     ----------
     found
-        Value of the metric; None where the run had not all that the metric needs.
+        Value of the metric; None if the run lacked a step or a signal that the metric needs.
     steps
         CPU seconds of each step (label); `REST` is what else the process used.
     memory

@@ -33,7 +33,7 @@ class Metric:
     Class attributes
     ----------------
     says
-        What the error is, half a line.
+        Meaning of the error, half a line.
     needs_end
         True where `measure` reads products of an `Output` (plots, reports); these are left out
         otherwise.
@@ -122,7 +122,7 @@ class Metric:
 
     @classmethod
     def own_name(cls) -> str:
-        """The class's name as metrics are written: ``CentralRms`` is ``central_rms``."""
+        """Name of the class in snake case: ``CentralRms`` is ``central_rms``."""
         return "".join(
             f"_{c.lower()}" if c.isupper() and k else c.lower() for k, c in enumerate(cls.__name__)
         )

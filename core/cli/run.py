@@ -242,7 +242,7 @@ def check(pipeline: str, settings: tuple[str, ...]) -> None:
     Every mistake in the file is shown at once, with its place. The telescope is pointed at some
     instants of the scans: whether the target is up, how near they come to the telescope's speed and
     acceleration, how many samples there are in a beam; and whether it is on the input maps. Files
-    are read by the code with which a run reads them, which begins with the same look.
+    are read as a run reads them, and a run begins with the same checks.
     """
     file = load(pipeline, settings)
     from ..scene import elsewhere

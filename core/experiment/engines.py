@@ -1,9 +1,9 @@
 """Engines that run tasks: anything with the interface of `concurrent.futures.Executor`.
 
 Warnings of worker processes are kept there, sent with the results, and shown by the main process as
-its own. The budget of ``--memory`` is divided among workers before the campaign starts; with MPI
-and Dask, whose processes are started by others, and for a job of an array (``--task``) it is that
-of one process or job.
+its own. The budget of ``--memory`` is divided among workers before the campaign starts. With MPI
+and Dask, whose processes are started by others, each process has the whole budget, and so has a job
+of an array (``--task``).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 SCHEDULER_FILE_WAIT = 20.0
-"""Seconds [s] for which a scheduler file that is not there, or not whole, is waited for."""
+"""Longest wait for a scheduler file that is missing or incomplete, s."""
 
 
 @dataclass
@@ -87,7 +87,7 @@ class Pool:
 
 
 class ProcessPool(Pool):
-    """Worker processes of this one.
+    """Worker processes that this process starts.
 
     ``fixed``: the user asked for this number of workers.
     """
@@ -219,8 +219,8 @@ def _ctrl_c_held_back() -> Iterator[None]:
 
 
 def begin_worker(safe: str | None = None) -> None:
-    """In a new worker process: leave Ctrl-C and warnings to the main process, and end when that is
-    gone, however it went.
+    """Prepare a new worker process: it leaves Ctrl-C and warnings to the main process, and ends
+    with it.
 
     ``safe``: ``PYTHONSAFEPATH`` of the main process.
     """
@@ -409,12 +409,12 @@ Warned = tuple[str, type[Warning], str, int]
 """Text, category, file and line of a warning."""
 
 Registry = dict[str | tuple[str, type[Warning], int], int]
-"""What was shown, as `warnings` notes it."""
+"""Warnings that were shown, as `warnings` records them in a module."""
 
 _kept: list[Warned] = []
 _lock = threading.Lock()
 _at_work: list[Any] = []
-"""How this process showed warnings before it kept them, once for each call at work in it."""
+"""Functions that showed warnings before this process kept them, one for each call at work in it."""
 
 
 def here() -> str:
@@ -423,9 +423,7 @@ def here() -> str:
 
 
 def keep_warnings() -> None:
-    """In a new worker process: keep warnings for the main process instead of writing them to
-    stderr.
-    """
+    """Keep the warnings of this process for the main process; they are not written to stderr."""
     warnings.showwarning = _keep_warning
 
 
@@ -445,8 +443,8 @@ def with_warnings(main: str, function: Callable[..., R], *arguments: Any) -> tup
 
 @contextlib.contextmanager
 def _kept_during() -> Iterator[None]:
-    """Keep the warnings of all threads; as before when the last call in this process is done
-    (Dask's may have several).
+    """Keep the warnings of all threads until the last call in this process has ended (a process of
+    Dask may work on several).
     """
     with _lock:
         _at_work.append(warnings.showwarning)
@@ -461,8 +459,8 @@ def _kept_during() -> Iterator[None]:
 
 
 def show_warnings(found: Sequence[Warned], shown: Registry) -> None:
-    """Warn here. ``shown``: a registry of what was shown; a text in it is not shown again, unless
-    the user's filters say so.
+    """Show warnings of another process. ``shown``: those that were shown already; they are not
+    shown again, unless the user's filters say so.
     """
     for text, category, file, line in found:
         warnings.warn_explicit(text, category, file, line, registry=shown)
@@ -487,7 +485,7 @@ MAIN = 320_000_000
 workers.
 """
 GROWTH = 20_000_000
-"""Bytes more than it holds now that it may come to hold."""
+"""Bytes by which the main process may still grow."""
 
 
 def share_out(pool: Pool, need: int, place: str) -> None:
@@ -523,9 +521,9 @@ def share_out(pool: Pool, need: int, place: str) -> None:
 
 
 def _each(pool: Pool, need: int, place: str) -> None:
-    """Budgets where every process has one of its own."""
+    """Check the budget of processes that have one each; take it back where nobody asked for it."""
     if pool.memory is not None and pool.memory < need and pool.asked is None:
-        pool.memory = None  # half of a share: the task may have more, if that is free where it runs
+        pool.memory = None  # no explicit budget: the worker may use its own free memory
     if pool.memory is not None and pool.memory < need:
         raise PipelineError(
             f"a task needs {_megabytes(need)}; the memory budget of each process is"

@@ -1,5 +1,6 @@
-"""Many runs as tasks on an executor, also where workers are killed: the realizations of variants
-with their metrics, and whatever else is a list of calls.
+"""Experiments: variants of a pipeline at several seeds, measured by metrics, on an executor.
+
+`Work` makes the calls, also those of a campaign. A call whose worker was killed is made again.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Lost:
-    """The result of a call that did not end: its worker was killed, or the engine could not send
-    it; or the call raised ``error``.
+    """Result of a call that failed: its worker was killed, the engine could not send it, or it
+    raised ``error``.
     """
 
     error: Exception
@@ -72,7 +73,7 @@ class Work(ABC, Generic[T, R]):
     place, cure
         For the error where the engine has stopped for good.
     retries
-        How often a call is tried again whose worker was killed.
+        Largest number of times that a call is made again whose worker was killed.
     """
 
     def __init__(self, pool: Pool, place: str, cure: str = "", retries: int = 2) -> None:
@@ -80,7 +81,7 @@ class Work(ABC, Generic[T, R]):
         self.stop = False
         """Set to begin no more of them."""
         self.attempts = Counter[T]()
-        """How often each was begun."""
+        """Number of times that each was begun."""
         self._shown: Registry = {}
         self._error: Exception | None = None
 
@@ -197,7 +198,7 @@ Found = dict[str, Any]
 
 COLUMNS = {
     "variant": "what was changed",
-    "seed": "of the random numbers",
+    "seed": "seed of the random numbers",
     "metric": "metric and parameters",
     "value": "in unit",
     "error": "standard error that the metric states; nan: not known",

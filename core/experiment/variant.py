@@ -1,4 +1,4 @@
-"""A pipeline and its scene, or a pipeline file with some of its values changed; and a run of it."""
+"""Variants: a pipeline with its scene, or a pipeline file with changed values; and their runs."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class Variant:
 
     @property
     def variant(self) -> Variant:
-        """Itself, as a `FileVariant` has one."""
+        """The variant itself: both kinds have this attribute."""
         return self
 
     def steps(self, metrics: Sequence[Metric]) -> list[Operator]:
-        """The steps without what acts at the end, but for those whose products metrics read."""
+        """The steps without outputs, except those whose products the metrics read."""
         read = frozenset[str]().union(*(metric.reads for metric in metrics))
         whole = any(metric.needs_end for metric in metrics)
         every = self.pipeline.operators

@@ -90,7 +90,7 @@ def _inside(samples: int, dtype: str) -> AnyFloats:
 
 
 def _limits(samples: slice, n: int) -> tuple[int, int]:
-    """First and last sample of a block. Raises ValueError where they are not among ``n``."""
+    """Start and stop of a block. Raises ValueError where they are not within 0 and ``n``."""
     start, stop = samples.start, samples.stop
     if not 0 <= start <= stop <= n:
         raise ValueError(f"samples {start}:{stop} outside 0:{n}")

@@ -334,7 +334,7 @@ class _StreamsAndMaps(Metric):
 
 
 def _variant(file: PipelineFile, name: str = "") -> Variant:
-    """The variant that a file is, whose signal is kept if it makes one."""
+    """Variant of a file; its signal is kept if a step makes it."""
     made = any("signal" in s.operator.provides for s in file.steps)
     return Variant(file.pipeline(), file.scene(), name, ("signal",) if made else ())
 

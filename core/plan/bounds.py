@@ -93,7 +93,7 @@ class Choice:
 
     @property
     def sets(self) -> tuple[Mapping[str, Any], bool]:
-        """Settings, and if the operator is left out."""
+        """Settings, and True if the operator is left out."""
         return self.settings, self.leave_out
 
 

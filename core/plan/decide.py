@@ -167,8 +167,8 @@ def decide(
 
 
 def _forms(bands: Sequence[Sequence[Decided]]) -> list[list[Decided]]:
-    """The forms that an effect has in all bands, each as one `Decided` of every band: those with
-    the same settings.
+    """Forms that an effect has in all bands: those with the same settings. Each is a list with one
+    `Decided` for each band.
     """
     found, (first, *others) = [], bands
     for d in first:

@@ -1,4 +1,6 @@
-"""`zonda.plan`: effects that are simulated, coarsened or dropped within an error budget."""
+"""`zonda.plan`, and the plan of a run: effects that are simulated, coarsened or dropped within an
+error budget.
+"""
 
 from __future__ import annotations
 

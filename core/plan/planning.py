@@ -1,4 +1,6 @@
-"""Planning classes, one for each operator: error bounds, coarser forms and memory."""
+"""Planning classes, one for each operator: error bounds, coarser forms, memory, and knobs
+(parameters that trade accuracy for time).
+"""
 
 from __future__ import annotations
 
@@ -81,7 +83,7 @@ class Planning(Generic[O]):
         The class of the operator, or ``module:class`` where it need not be imported for the
         planning of others; classes derived from it inherit its planning.
     cost
-        Accepted from planning classes of before, and not used: times are measured.
+        Not used, since times are measured; planning classes of earlier versions state it.
     knobs
         The parameters that trade accuracy for time, each with its ladder of values (`Knob`).
     reads_streams

@@ -67,7 +67,7 @@ def memory_of(contexts: Sequence[Context], settings: Settings) -> float:
         joined or (Schedule(views, rest).at_once > 1 and does_the_same(views, rest, alone))
     ):
         return BASE + max(sum(held) + schedule(views, rest).bytes, *outputs)
-    # band after band: what the others have added up stays
+    # band after band: the products of the other bands stay in memory
     each = zip(held, alone, outputs, products, strict=True)
     return BASE + sum(products) + max(max(h + one.bytes, out) - own for h, one, out, own in each)
 

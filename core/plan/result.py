@@ -90,8 +90,7 @@ def unplanned(structure: Structure, why: str) -> PlanSummary:
 
 @dataclass(frozen=True)
 class PlanOfBand:
-    """Errors of a plan in one band, and its decisions as they stand there: all bands have the same
-    forms.
+    """Decisions of a plan with their errors in one band. All bands have the same forms.
 
     Attributes
     ----------
@@ -102,8 +101,8 @@ class PlanOfBand:
     context
         Scans, noise and coverage, without the operators that are dropped as a whole.
     joined
-        Steps that join the bands (`Context.joined`), also where they are dropped: errors of that
-        are bounded for this band alone.
+        Steps that join the bands (`Context.joined`), dropped ones too: the bounds hold for this
+        band alone.
     """
 
     decided: tuple[Decided, ...]

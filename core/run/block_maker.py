@@ -234,8 +234,8 @@ class BlockMaker:
         block.take(signal.stream, seen)
 
     def _act(self, step: Operator, block: Block, state: Any) -> None:
-        """`Operator.exec`, on a block with the means in it where the step does not know of them;
-        and a look at what it left.
+        """Let a step act on a block, and check the streams that it leaves. A step that does not
+        know of means is given a block with the means added.
         """
         label, fields, seen = self._labels[id(step)], {}, block
         if names := self._declared.get(label, frozenset()) & block.detdata.keys():

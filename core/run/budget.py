@@ -56,7 +56,7 @@ def divide(
 def _groups(
     bands: Sequence[Band], settings: Settings, ahead: Ahead
 ) -> list[tuple[Sequence[Band], Settings]]:
-    """Memory of the bands as `divide` finds it, without entries in the log."""
+    """Groups of bands for `divide`, with their settings; nothing is warned of."""
     views = [band.longest for band in bands]
     every = [o for band in bands for o in band.data.observations]
     kept = 8 * len(bands[0].chain.keep) * sum(o.n_detectors * o.n_samples for o in every)

@@ -1,5 +1,5 @@
-"""Runs the steps over one scan, with one band or with several together, in blocks of detectors x
-samples inside a memory budget.
+"""Runs all scans in order (`execute`): the steps over one scan, with one band or with several
+together, in blocks of detectors x samples inside a memory budget (`Execution`).
 
 The steps are cut into segments where the coupling changes (see `Operator.couples`). A segment works
 through the scan in blocks; operators that couple nothing work through a block in pieces of
@@ -60,9 +60,8 @@ from .views import Band, View
 def execute(bands: Sequence[Band], settings: Settings, timer: Timer) -> None:
     """Run all scans in order; the next one is prepared while one is executed."""
     hooks = manager().hook.zonda_before_operator, manager().hook.zonda_after_operator
-    heard = any(
-        hook.get_hookimpls() for hook in hooks
-    )  # who listens hears of one observation after the other
+    # a plugin that listens is told of one observation after the other
+    heard = any(hook.get_hookimpls() for hook in hooks)
     several = len(bands) + len(bands[0].data.observations) > 2
     ahead = Ahead(settings.threads > 1 and several and not heard)
     groups = divide(bands, settings, ahead)
@@ -310,9 +309,8 @@ class Execution:
         def one(detectors: slice, samples: slice) -> None:
             try:
                 self._on_block(segment, views, found, detectors, samples)
-            except (
-                BaseException
-            ) as error:  # also StopIteration, which a generator turns into RuntimeError
+            except BaseException as error:
+                # StopIteration too, which a generator would turn into RuntimeError
                 failed.append(error)
                 stop()
 

@@ -1,1 +1,1 @@
-"""Files: whole or not at all, from elsewhere with suspicion, locked while they change."""
+"""Atomic writes, checks of untrusted files, locks."""

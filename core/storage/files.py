@@ -1,5 +1,5 @@
-"""Reading and writing files: a product is there whole or not at all, and a failure says what to do
-about it; compressed files from elsewhere are unpacked into memory up to a stated size.
+"""Atomic writes, errors of files with a cure, and compressed files, which are unpacked into memory
+up to a stated size.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ OPENERS: dict[bytes, Any] = {
     b"\xfd7z": lzma.open,
     b"PK\x03\x04": _only_member,
 }
-"""By how a file begins: what opens it."""
+"""Functions that open a file, by its first bytes."""
 
 
 def too_large(message: str, place: str) -> InputError:
@@ -212,8 +212,9 @@ def too_large(message: str, place: str) -> InputError:
 
 
 def check_kind(path: str | os.PathLike[str]) -> None:
-    """Raise ValueError for a pipe or a device, which would be waited for, and OSError for a path
-    that leads nowhere."""
+    """Raise ValueError for a pipe or a device, whose reader might wait for ever, and OSError for a
+    path that leads nowhere.
+    """
     mode = os.stat(path).st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise ValueError("it is a pipe or a device, not a file")

@@ -50,7 +50,7 @@ def lock(folder: str | os.PathLike[str], part: str = "") -> Iterator[None]:
 
 @contextlib.contextmanager
 def _held(path: Path) -> Iterator[None]:
-    """Hold one lock file, which is removed behind the body."""
+    """Hold one lock file, which is removed after the body."""
     holder = ""
     if os.path.lexists(path):  # read before it is locked, which may empty it
         with (

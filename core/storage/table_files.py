@@ -28,7 +28,7 @@ AS_TEXT = "give ECSV, or text whose heading names the columns, with their units 
 MOST_COLUMNS = 999
 """Columns of a table, as of one in FITS."""
 MOST_VALUES = 100_000
-"""Values that the header of an ECSV table unfolds to: aliases multiply."""
+"""Largest number of values in the header of an ECSV table, with its aliases expanded."""
 MOST_TOLD = 12
 """Mistakes that are told one by one; the others are counted."""
 BRACKETED = re.compile(r"(.*?)\s*(?:\[(.*)\]|\((degs?|degrees?|°|rad|radians?|s|secs?|seconds?)\))")
@@ -261,13 +261,13 @@ def read_table(path: Path, place: str = "", text: str | None = None) -> Table:
 
 
 def _unfolded(node: Any, sizes: dict[int, float]) -> float:
-    """Number of values below a YAML node, each as often as aliases repeat it."""
+    """Number of values below a YAML node, with aliases expanded; infinite for one inside itself."""
     if isinstance(node, tuple):
         return sum(_unfolded(each, sizes) for each in node)
     if not isinstance(node, yaml.CollectionNode):
         return 1.0
     if id(node) not in sizes:
-        sizes[id(node)] = math.inf  # stands while it is counted: an alias of what it stands in
+        sizes[id(node)] = math.inf  # for an alias of this node inside it
         sizes[id(node)] = 1.0 + sum(_unfolded(each, sizes) for each in node.value)
     return sizes[id(node)]
 

@@ -84,7 +84,7 @@ def test_the_form_that_saves_most_of_those_that_fit():
 
 
 def test_a_form_of_several_bands_is_the_finest_that_one_of_them_needs():
-    """Forms are found by what they set; one that a band does not have is none."""
+    """Forms are matched by their settings; one that a band lacks is not offered."""
     low, high = effect("one", (0.1, 0.01), (0.2, 0.5)), effect("one", (0.1, 0.01), (2.0, 0.5))
     alone = effect("other", (0.1, 0.5))
     bands = [[Decided("A", low), Decided("A", alone)], [Decided("A", high)]]
