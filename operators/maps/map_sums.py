@@ -166,7 +166,8 @@ class MapSums(Product):
             _, n_pixels, end = self.sums.shape
             sums = zeros(n_pixels, end + 6)
             if self.scans:
-                sums[..., :end], sums[..., end:] = self.sums, self.sums[..., 1:7]
+                weights = self.sums[..., self.columns["weights"]]
+                sums[..., :end], sums[..., end:] = self.sums, weights
             self.sums, self.columns[f"noise {self.first}"] = sums, slice(end, end + 6)
 
     def in_pixels(self, stream: str, pixels: slice, half: int | None = None) -> PixelSums:
