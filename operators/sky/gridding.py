@@ -349,9 +349,8 @@ class Grid:
         """Samples more than 90 deg from the tangent point, of detectors at offsets (n_det,) about
         boresights (n, 4).
         """
-        along = np.einsum(
-            "nij,i->nj", rotation_matrices(quaternions), self.matrix[2]
-        )  # the tangent point in the boresight's frame
+        # the tangent point in the boresight's frame
+        along = np.einsum("nij,i->nj", rotation_matrices(quaternions), self.matrix[2])
         return int((along @ np.array([-eta, -xi, np.ones(len(xi))]) <= 0).sum())
 
     @property

@@ -123,9 +123,8 @@ def emission(
                 found = np.atleast_2d(
                     component.get_emission(frequencies, weights).to_value(pysm3.units.uK_RJ)
                 )
-                total[: len(found)] += (
-                    1e-6 * found
-                )  # a sum of PySM's own would add I alone to Q and U as well
+                # a sum of PySM's own would add I alone to Q and U as well
+                total[: len(found)] += 1e-6 * found
         except URLError as err:
             raise _lacks(str(err.reason).partition(" was supposed")[0], place, download) from None
         except Exception as err:  # of any kind, also mistakes of PySM's own

@@ -104,9 +104,8 @@ class ScanSampler:
                 continue
             kind = out.dtype.type
             key = block.samples.start, block.samples.stop, number, kind
-            chunks = self._chunks.get(
-                key, partial(beam.pointing, block, kind)
-            )  # detectors share it
+            # detectors share it
+            chunks = self._chunks.get(key, partial(beam.pointing, block, kind))
             found = beam.add(0, chunks, Rows(rows, xi[rows], eta[rows]), out, linear, over)
             beyond, behind = beyond + found[0], behind + found[1]
             rows = rows[efficiency[rows] > 0]
