@@ -373,13 +373,6 @@ class Instrument(Parameters):
             for b in self.bands
         }
 
-    def check_one_band(self, what: str) -> None:
-        """Raise `InputError` about ``what``, which is of one band, where there are several."""
-        if self.bands:
-            names = [band.name for band in self.bands]
-            text = f"{self.name} has the bands {', '.join(names)}; this is of one of them"
-            raise InputError(text, place=what, cure=f"choose it: --set instrument.band={names[0]}")
-
     @property
     def _arrays(self) -> tuple[Floats, Floats, float]:
         """Centres of the arrays of separate bands, and their radius, in units of the radius of the

@@ -374,7 +374,8 @@ class _Runs(Work[Item, Found]):
     ) -> None:
         cure = "run it again on another executor; runs that a folder holds are not repeated"
         super().__init__(pool, "experiment", cure)
-        self.whole, self.items, self.missing = whole, list(items), missing
+        self.whole, self.missing = whole, missing
+        self.place_of = {item: place for place, item in enumerate(items, 1)}
         self.take = take or whole.keep
 
     def call(self, item: Item) -> tuple[Callable[..., Found], *tuple[Any, ...]]:
@@ -387,8 +388,8 @@ class _Runs(Work[Item, Found]):
     def began(self, items: list[Item]) -> None:
         """See `Work.began`."""
         for item in items:
-            place, (variant, number) = self.items.index(item) + 1, item
-            self.whole.say(f"run {place} of {len(self.items)}: {variant}, realization {number + 1}")
+            place, (variant, number) = f"{self.place_of[item]} of {len(self.place_of)}", item
+            self.whole.say(f"run {place}: {variant}, realization {number + 1}")
 
     def ended(self, item: Item, result: Found | Lost) -> bool:
         """See `Work.ended`."""
