@@ -77,46 +77,55 @@ def plan(
     whole = [label for label in structure.operators if label in drop]
     remaining = _without(pipeline, structure, whole) if whole else structure
     names = [band.name for band in scene.instrument.bands] or [""]
-    limited: list[Mapping[str, float]] = []
-    bands: list[list[Decided]] = []
-    contexts: list[Context] = []
-    joined = ""
-    for name in names:
-        context = context_of(file.pipeline(), file.scene(), structure, name)
-        budget = limits(file.header.budget, context.map_noise, context.depth.sample)
-        limited.append({m: v for m, v in budget.items() if m in context.metrics})
-        estimates = {o.label: planning_of(o).estimate(context) for o in context.operators}
-        found = [Decided(o, e) for o, estimate in estimates.items() for e in estimate.effects]
-        found.append(Decided("pipeline", _precision(pipeline.precision, context)))
-        check_droppable(drop, found, labels)
-        joined = context.joined
-        if whole:
-            left = context_of(file.pipeline(), file.scene(), remaining, name)
-            found = [d for d in found if d.operator not in whole]
-            found += [Decided(o, _everything_of(o, estimates, context, left)) for o in whole]
-            context = left
-        bands.append(found)
-        contexts.append(context)
-    every = [d for found in bands for d in found]
+    bands = {name: _in_band(name, file, drop, structure, remaining) for name in names}
+    every = [d for band in bands.values() for d in band.decided]
     decided = decide(
-        bands,
-        limited,
+        [band.decided for band in bands.values()],
+        [band.limits for band in bands.values()],
         kept=named(keep, every, labels),
         forced={d.name for d in every if d.effect.name == NAME or any(map(d.means, drop))},
         prune_all=prune_all,
-        joined=joined,
+        joined=bands[names[0]].joined,
     )
+    contexts = [band.context for band in bands.values()]
     dtype = np.float64 if pipeline.precision == "float64" else np.float32
     free = memory or available_memory() // 2
     made = Plan(
         structure,
         {
-            name: PlanOfBand(tuple(own), allowed, context, joined)
-            for name, own, allowed, context in zip(names, decided, limited, contexts, strict=True)
+            name: replace(bands[name], decided=tuple(own))
+            for name, own in zip(names, decided, strict=True)
         },
         memory_of(contexts, Settings(threads or available_threads(), free, dtype)),
     )
     return replace(made, timing=_measured(made.apply(file), contexts)) if measure else made
+
+
+def _in_band(
+    name: str,
+    file: PipelineFile,
+    drop: Sequence[str],
+    structure: Structure,
+    remaining: Structure,
+) -> PlanOfBand:
+    """Effects in one band, all in full, and the budget. ``remaining``: the structure without the
+    operators that are dropped as a whole.
+    """
+    pipeline = file.pipeline()
+    context = context_of(pipeline, file.scene(), structure, name)
+    joined = context.joined
+    budget = limits(file.header.budget, context.map_noise, context.depth.sample)
+    allowed = {m: v for m, v in budget.items() if m in context.metrics}
+    estimates = {o.label: planning_of(o).estimate(context) for o in context.operators}
+    found = [Decided(o, e) for o, estimate in estimates.items() for e in estimate.effects]
+    found.append(Decided("pipeline", _precision(pipeline.precision, context)))
+    check_droppable(drop, found, [o.label for o in pipeline.operators])
+    if whole := [label for label in structure.operators if label in drop]:
+        left = context_of(file.pipeline(), file.scene(), remaining, name)
+        found = [d for d in found if d.operator not in whole]
+        found += [Decided(o, _everything_of(o, estimates, context, left)) for o in whole]
+        context = left
+    return PlanOfBand(tuple(found), allowed, context, joined)
 
 
 def for_run(
