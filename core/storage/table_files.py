@@ -215,32 +215,10 @@ def read_table(path: Path, place: str = "", text: str | None = None) -> Table:
     if text.startswith("# %ECSV"):
         cure = "write it with astropy: table.write(path, format='ascii.ecsv')"
         with reading(place, "ECSV", cure):
-            header = [line[2:] for _, line in written if line.startswith("# ")]
-            if _unfolded(yaml.compose("\n".join(header)), {}) > MOST_VALUES:
-                raise ValueError(f"its aliases unfold to more than {MOST_VALUES} values")
-            head = get_header_from_yaml(header)
-            numbers, rows = _cells(body, str(head.get("delimiter", " ")))
-            described = {column["name"]: str(column.get("unit", "")) for column in head["datatype"]}
-            named = [(name, described[name]) for name in rows[0]]
-            meta = head["meta"] if isinstance(head.get("meta"), Mapping) else {}
+            numbers, rows, named, meta = _ecsv(written, body)
     else:
         with reading(place, "a table", AS_TEXT):  # a quote that is not closed
-            first = body[0][1] if body else ""
-            mark = max(",;\t|", key=first.count)
-            mark = mark if mark in first else " "
-            numbers, rows = _cells(body, mark)
-            if rows and any(math.isfinite(_number(cell)) for cell in rows[0]):
-                above = [(k, line.lstrip("# ")) for k, line in written if k < body[0][0]]
-                fitting = [
-                    both
-                    for both in zip(*_cells(above, mark), strict=True)
-                    if len(both[1]) == len(rows[0])
-                ]
-                fitting.sort(key=lambda both: any("[" in cell for cell in both[1]))
-                for number, heading in fitting[-1:]:
-                    numbers, rows = [number, *numbers], [heading, *rows]
-        found = [(word, BRACKETED.fullmatch(word)) for word in (rows[0] if rows else [])]
-        named = [(m[1], m[2] or m[3] or "") if m else (word, "") for word, m in found]
+            numbers, rows, named = _plain_text(written, body)
     names = [name for name, _ in named]
     table = Table(place, {}, [*numbers[1:], *(numbers[:1] or [1])], meta)
     if len(names) > MOST_COLUMNS:
@@ -258,6 +236,43 @@ def read_table(path: Path, place: str = "", text: str | None = None) -> Table:
     columns = [list(column) for column in zip(*rows[1:], strict=True)]
     table.columns = {n: (c, unit) for (n, unit), c in zip(named, columns, strict=True)}
     return table
+
+
+Lines = Sequence[tuple[int, str]]
+"""Lines of a text, each with its number."""
+
+
+def _ecsv(
+    written: Lines, body: Lines
+) -> tuple[list[int], list[list[str]], list[tuple[str, str]], Mapping[str, Any]]:
+    """Line numbers, rows (the heading first), names with units, and meta of an ECSV table."""
+    header = [line[2:] for _, line in written if line.startswith("# ")]
+    if _unfolded(yaml.compose("\n".join(header)), {}) > MOST_VALUES:
+        raise ValueError(f"its aliases unfold to more than {MOST_VALUES} values")
+    head = get_header_from_yaml(header)
+    numbers, rows = _cells(body, str(head.get("delimiter", " ")))
+    described = {column["name"]: str(column.get("unit", "")) for column in head["datatype"]}
+    named = [(name, described[name]) for name in rows[0]]
+    return numbers, rows, named, head["meta"] if isinstance(head.get("meta"), Mapping) else {}
+
+
+def _plain_text(
+    written: Lines, body: Lines
+) -> tuple[list[int], list[list[str]], list[tuple[str, str]]]:
+    """Line numbers, rows (the heading first), and names with units of a table of other text."""
+    first = body[0][1] if body else ""
+    mark = max(",;\t|", key=first.count)
+    mark = mark if mark in first else " "
+    numbers, rows = _cells(body, mark)
+    if rows and any(math.isfinite(_number(cell)) for cell in rows[0]):
+        above = [(k, line.lstrip("# ")) for k, line in written if k < body[0][0]]
+        every = zip(*_cells(above, mark), strict=True)
+        fitting = [both for both in every if len(both[1]) == len(rows[0])]
+        fitting.sort(key=lambda both: any("[" in cell for cell in both[1]))
+        for number, heading in fitting[-1:]:
+            numbers, rows = [number, *numbers], [heading, *rows]
+    found = [(word, BRACKETED.fullmatch(word)) for word in (rows[0] if rows else [])]
+    return numbers, rows, [(m[1], m[2] or m[3] or "") if m else (word, "") for word, m in found]
 
 
 def _unfolded(node: Any, sizes: dict[int, float]) -> float:
@@ -280,7 +295,7 @@ def read_text(path: Path, place: str) -> str:
         return unpacked_text(path, place, LARGEST)
 
 
-def _cells(lines: Sequence[tuple[int, str]], mark: str) -> tuple[list[int], list[list[str]]]:
+def _cells(lines: Lines, mark: str) -> tuple[list[int], list[list[str]]]:
     """Cells of numbered lines, and the number of the line of each row."""
     texts = (line.strip(" ") for _, line in lines)
     if mark == " ":  # a unit in brackets belongs to the name before it
