@@ -257,12 +257,11 @@ def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
             place="engine mpi",
             cure="start at least two: mpiexec -n 8 zonda run FILE --engine mpi",
         )
-    here = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).Get_size()  # processes on this machine
+    beside = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).Get_size()  # on this machine
     with MPICommExecutor(MPI.COMM_WORLD, root=0) as executor:
-        mine = max(1, here - 1) if size == here else here
-        bound = available_threads() < (
-            os.cpu_count() or 1
-        )  # each process has CPUs of its own, as srun gives them
+        mine = max(1, beside - 1) if size == beside else beside
+        # true if each process has CPUs of its own, as srun gives them
+        bound = available_threads() < (os.cpu_count() or 1)
         threads = threads or (available_threads() if bound else max(1, available_threads() // mine))
         yield Pool(
             cast(Executor | None, executor),
@@ -290,9 +289,8 @@ def _dask(
         "tornado",
         "tornado.application",
     ):
-        logging.getLogger(logger).setLevel(
-            logging.CRITICAL
-        )  # errors are reported without Dask's traceback
+        # errors are reported without Dask's traceback
+        logging.getLogger(logger).setLevel(logging.CRITICAL)
     if scheduler is None:
         raise PipelineError(
             "no Dask scheduler is named",
@@ -335,9 +333,8 @@ def _dask(
                 "the Dask scheduler has had no worker for ten minutes", place=scheduler
             ) from None
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
-        count = max(
-            1, sum(int(w["nthreads"]) for w in workers)
-        )  # a Dask worker does as many tasks at once as it has threads
+        # a Dask worker does as many tasks at once as it has threads
+        count = max(1, sum(int(w["nthreads"]) for w in workers))
         limits = [
             int(w["memory_limit"]) // int(w["nthreads"]) for w in workers if w.get("memory_limit")
         ]
@@ -383,9 +380,8 @@ def _check_certificates(security: Any, address: str) -> None:
     ]:
         if not path and name != "key":  # which may be in the same file as cert
             raise PipelineError(f"no {name} for TLS is named", place=address, cure=cure)
-        if (
-            path and "\n" not in path and not Path(path).is_file()
-        ):  # Dask takes the text of a certificate, too
+        # Dask takes the text of a certificate, too
+        if path and "\n" not in path and not Path(path).is_file():
             raise PipelineError(f"{name} of TLS: there is no file {path}", place=address, cure=cure)
     try:
         security.get_connection_args("client")
@@ -474,9 +470,8 @@ def _keep_warning(
     *more: Any,
     **others: Any,
 ) -> None:
-    known = (
-        category if category.__module__ == "builtins" else UserWarning
-    )  # others may not be importable there
+    # others may not be importable in the main process
+    known = category if category.__module__ == "builtins" else UserWarning
     _kept.append((str(message), known, filename, lineno))
 
 

@@ -180,9 +180,8 @@ def _submit(
         return pool.executor.submit(with_warnings, here(), function, *arguments)
     except Exception as err:
         future: Future[tuple[R, list[Warned]]] = Future()
-        future.set_exception(
-            err if isinstance(err, BrokenExecutor) else CancelledError()
-        )  # a worker was killed; all is gone
+        # a worker was killed; else the engine is gone
+        future.set_exception(err if isinstance(err, BrokenExecutor) else CancelledError())
         return future
 
 
