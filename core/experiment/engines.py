@@ -41,6 +41,7 @@ from ..machine import (
     safe_path,
     without_script,
 )
+from ..storage.files import first_line
 
 if TYPE_CHECKING:
     from ..campaign.settings import Engine, Tls
@@ -250,6 +251,9 @@ def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
         from mpi4py.futures import MPICommExecutor
     except ImportError as err:
         raise _missing("mpi4py", "mpi", err) from None
+    except RuntimeError as err:  # mpi4py is there, the library is not
+        text, cure = f"MPI cannot be loaded: {first_line(err)}", "install Open MPI or MPICH"
+        raise PipelineError(text, place="engine mpi", cure=cure) from None
     size = MPI.COMM_WORLD.Get_size()
     if size < 2:
         raise PipelineError(

@@ -235,11 +235,12 @@ class Experiment:
         seeds: int | Sequence[int] = 1,
         metrics: Sequence[str | Choice | Metric] = (),
         *,
-        folder: Path | None = None,
+        folder: str | Path | None = None,
         say: Callable[[str], None] = lambda text: None,
         threads: int | None = None,
     ) -> None:
-        self.folder, self.say, self.threads = folder, say, threads
+        self.folder = None if folder is None else Path(folder)
+        self.say, self.threads = say, threads
         self.seeds = None if isinstance(seeds, int) else tuple(seeds)
         self.made = 0
         self._wanted: dict[AnyVariant, dict[str, int]] = {}

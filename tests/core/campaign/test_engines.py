@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import os
 import shutil
 import subprocess
@@ -309,8 +310,28 @@ def test_a_scheduler_file_that_never_comes(monkeypatch, tmp_path, text, why):
 
 def test_one_mpi_process_is_not_enough(capsys):
     pytest.importorskip("mpi4py", reason="mpi4py is not installed")
+    try:
+        importlib.import_module("mpi4py.MPI")
+    except RuntimeError:
+        pytest.skip("there is no library of MPI")
     with pytest.raises(PipelineError, match="leaves no worker"), engine("mpi"):
         pass
+
+
+def test_mpi4py_without_a_library_of_mpi(monkeypatch):
+    class Without:
+        def find_spec(self, name, path=None, target=None):
+            if name == "mpi4py.MPI":
+                raise RuntimeError("cannot load MPI library\nlibmpi.so: no such file")
+
+    pytest.importorskip("mpi4py", reason="mpi4py is not installed")
+    for name in [name for name in sys.modules if name.startswith("mpi4py")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "meta_path", [Without(), *sys.meta_path])
+    with pytest.raises(PipelineError, match="cannot load MPI library") as told, engine("mpi"):
+        pass
+    assert told.value.place == "engine mpi"
+    assert "MPICH" in told.value.cure
 
 
 def test_cores_and_memory_are_shared_among_workers(monkeypatch):
