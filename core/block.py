@@ -79,7 +79,10 @@ class Block:
         return sorted(c for c in self.components if c.enters == where and c in self.detdata)
 
     def alone(
-        self, stream: str, components: frozenset[Component], others: Collection[str]
+        self,
+        stream: str,
+        components: frozenset[Component],
+        others: Collection[str],
     ) -> Block:
         """The block as a step sees it that knows one signal: under the name ``signal``, with its
         mean and its components alone.

@@ -111,7 +111,12 @@ class Family:
         self._checks: list[Check] = []
 
     def add(
-        self, case: Case, *, reference: str, limit: float, unit: str = ""
+        self,
+        case: Case,
+        *,
+        reference: str,
+        limit: float,
+        unit: str = "",
     ) -> Callable[[Callable[[], Measured]], Callable[[], Measured]]:
         """Decorator: add a function that returns the figure; the first paragraph of its docstring
         says what it measures.

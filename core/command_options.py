@@ -105,7 +105,10 @@ class Share(_Anything):
     name = "K/N"
 
     def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+        self,
+        value: Any,
+        param: click.Parameter | None,
+        ctx: click.Context | None,
     ) -> tuple[int, int]:
         """(K, N); fails with what was expected."""
         first, _, second = str(value).partition("/")

@@ -69,7 +69,13 @@ class Registry:
     """
 
     def __init__(
-        self, kind: str, groups: str, base: str = "", *, classes: bool = False, exact: bool = False
+        self,
+        kind: str,
+        groups: str,
+        base: str = "",
+        *,
+        classes: bool = False,
+        exact: bool = False,
     ) -> None:
         self.kind, self.groups, self.base, self.classes, self.exact = (
             kind,

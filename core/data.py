@@ -239,7 +239,10 @@ class Data:
         return kept(one_scan(self.observations, scan), stream)
 
     def blocks(
-        self, stream: str = "signal", scan: str | int | None = None, detectors: int = 64
+        self,
+        stream: str = "signal",
+        scan: str | int | None = None,
+        detectors: int = 64,
     ) -> Iterator[tuple[Observation, slice, NDArray[np.float64]]]:
         """(observation, detectors, part of `tod`) of one scan, or of all, at most so many
         ``detectors`` at a time.

@@ -58,7 +58,9 @@ def samples_in(spans: list[tuple[float, float]], seconds: AnyFloats) -> NDArray[
 
 
 def cut_intervals(
-    intervals: Mapping[str, list[tuple[float, float]]], begin: float, end: float
+    intervals: Mapping[str, list[tuple[float, float]]],
+    begin: float,
+    end: float,
 ) -> Intervals:
     """Parts of intervals between ``begin`` and ``end`` [s], counted from ``begin``; names without
     any part are kept.

@@ -188,7 +188,12 @@ def operator(
     """
     if function is None:
         return lambda made: operator(
-            made, name=name, requires=requires, provides=provides, couples=couples, linear=linear
+            made,
+            name=name,
+            requires=requires,
+            provides=provides,
+            couples=couples,
+            linear=linear,
         )
     refused = partial(PipelineError, place="zonda.operator")
     if not callable(function) or isinstance(function, type | Operator):

@@ -57,7 +57,10 @@ class Hooks:
 
     @hookspec
     def zonda_before_operator(
-        self, operator: Operator, observation: Observation | None, stage: str
+        self,
+        operator: Operator,
+        observation: Observation | None,
+        stage: str,
     ) -> None:
         """Before a stage of an operator (``observe``, ``prepare``, ``exec``, ``collect``,
         ``finalize`` ...).
@@ -65,7 +68,11 @@ class Hooks:
 
     @hookspec
     def zonda_after_operator(
-        self, operator: Operator, observation: Observation | None, stage: str, seconds: float
+        self,
+        operator: Operator,
+        observation: Observation | None,
+        stage: str,
+        seconds: float,
     ) -> None:
         """After a stage of an operator, which took so many seconds."""
 
@@ -77,7 +84,13 @@ class Hooks:
 
     @hookspec
     def zonda_campaign_progress(
-        self, done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float
+        self,
+        done: int,
+        total: int,
+        failed: int,
+        samples: int,
+        all_samples: int,
+        seconds: float,
     ) -> None:
         """``done`` of ``total`` tasks of a campaign are finished, with ``samples`` of
         ``all_samples``, after ``seconds``; and ``failed`` attempts have failed."""

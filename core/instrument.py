@@ -171,7 +171,10 @@ class Instrument(Parameters):
     @model_validator(mode="wrap")
     @classmethod
     def _or_variant(
-        cls, value: Any, validate: ModelWrapValidatorHandler[Instrument], info: ValidationInfo
+        cls,
+        value: Any,
+        validate: ModelWrapValidatorHandler[Instrument],
+        info: ValidationInfo,
     ) -> Instrument:
         made: Instrument = variant(value, info.context) if is_variant(value) else validate(value)
         return made

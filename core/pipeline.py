@@ -278,7 +278,12 @@ class Pipeline:
 
     @faults_named(exceptions=False)
     def point(
-        self, scene: Scene, layouts: Mapping[str, Any], output: Path, *, laid_out: bool = False
+        self,
+        scene: Scene,
+        layouts: Mapping[str, Any],
+        output: Path,
+        *,
+        laid_out: bool = False,
     ) -> Data:
         """The observations of a scene, and ``layouts`` extended to them, or taken as they are where
         all is ``laid_out``.
@@ -396,7 +401,11 @@ class Pipeline:
                 self._timed(timer, operator, "finalize", data)
 
     def _timed(
-        self, timer: Timer, operator: Operator, stage: Literal["observe", "finalize"], data: Data
+        self,
+        timer: Timer,
+        operator: Operator,
+        stage: Literal["observe", "finalize"],
+        data: Data,
     ) -> None:
         """Call an operator with all data and time it; hooks are called around ``finalize``."""
         hooks = manager().hook
@@ -408,7 +417,10 @@ class Pipeline:
         timer.add(operator.label, stage, used)
         if stage == "finalize":
             hooks.zonda_after_operator(
-                operator=operator, observation=None, stage=stage, seconds=used
+                operator=operator,
+                observation=None,
+                stage=stage,
+                seconds=used,
             )
 
     def provenance(self, scene: Scene) -> dict[str, Any]:

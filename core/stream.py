@@ -113,7 +113,8 @@ class Stream:
         return self.array.dtype
 
     def sweep(
-        self, work: Callable[[slice, slice, AnyFloats], Any]
+        self,
+        work: Callable[[slice, slice, AnyFloats], Any],
     ) -> Iterator[tuple[slice, slice, Any]]:
         """(detectors, samples, result) of ``work(detectors, samples, part)`` over blocks that cover
         the stream once.

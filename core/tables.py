@@ -98,7 +98,10 @@ class Table:
 
     @classmethod
     def of(
-        cls, records: Sequence[Mapping[str, Any]], about: Mapping[str, str], meta: Mapping[str, Any]
+        cls,
+        records: Sequence[Mapping[str, Any]],
+        about: Mapping[str, str],
+        meta: Mapping[str, Any],
     ) -> Table:
         """A table of mappings that have the same keys; ``about``: descriptions of the columns."""
         from .storage.table_files import Column  # with astropy's tables

@@ -165,7 +165,9 @@ def given_signal(observation: Observation, factor: float) -> NDArray[np.float32]
 
 
 def check_operator(
-    operator: Operator, *, expected_failures: Mapping[str, str] | None = None
+    operator: Operator,
+    *,
+    expected_failures: Mapping[str, str] | None = None,
 ) -> None:
     """Run every check that applies; raise AssertionError with all that fail.
 
@@ -435,7 +437,11 @@ def _products(
     keep = sorted(_streams_of(operator))
     with tempfile.TemporaryDirectory() as folder:
         data = Pipeline(steps, precision=precision).run(
-            made_up_scene(), threads=threads, memory=memory, keep=keep, output=folder
+            made_up_scene(),
+            threads=threads,
+            memory=memory,
+            keep=keep,
+            output=folder,
         )
     found: dict[str, Any] = {}
     for observation in data.observations:
@@ -454,7 +460,11 @@ def _products(
 
 
 def _stream(
-    observation: Observation, array: Any, state: Any, signal: str = "signal", name: str = "signal"
+    observation: Observation,
+    array: Any,
+    state: Any,
+    signal: str = "signal",
+    name: str = "signal",
 ) -> Stream:
     """A whole stream for a step that measures."""
     return Stream(name, observation, array, {}, 1, signal=signal, state=state)

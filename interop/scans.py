@@ -94,7 +94,8 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
 
 
 def _read(
-    path: str | os.PathLike[str], stream: str
+    path: str | os.PathLike[str],
+    stream: str,
 ) -> tuple[TimeOrderedData, NDArray[np.float64], NDArray[np.bool_] | None]:
     """Read a file without its other streams, and the single samples that it flags."""
     opened = reader(path)

@@ -159,7 +159,9 @@ def sight_line(source: Source, *, scan: str | int | None = None, stream: str = "
 
 
 def _moved_by_the_pole(
-    site: tuple[str, float, float, float], x: float, y: float
+    site: tuple[str, float, float, float],
+    x: float,
+    y: float,
 ) -> tuple[float, float, float]:
     """Longitude and latitude of a site about the celestial pole, and the azimuth of its north
     there, rad.

@@ -33,7 +33,11 @@ for _part in ("io", "ops", "traits"):
 
 
 def to_toast(
-    source: Source, stream: str = "signal", *, scan: str | int | None = None, comm: Any = None
+    source: Source,
+    stream: str = "signal",
+    *,
+    scan: str | int | None = None,
+    comm: Any = None,
 ) -> Any:
     """A scan as a `toast.Observation`: what TOAST reads from a file of `SaveTOD`.
 

@@ -132,7 +132,9 @@ class Wafers:
 
 
 def _lat(
-    pixels: Callable[[int, float], Rotation], size: float, tubes: Iterable[Rotation]
+    pixels: Callable[[int, float], Rotation],
+    size: float,
+    tubes: Iterable[Rotation],
 ) -> Wafers:
     """Tubes of the SO LAT with three wafers each, ``size`` and spacing in mm."""
     radius = 128.4 * LAT / 2
@@ -162,7 +164,10 @@ def _sat(pixels: Callable[[int, float], Rotation], size: float) -> Wafers:
 
 
 def _s4(
-    pixels: Callable[[int, float], Rotation], size: float, tubes: Iterable[int], turn: float = 0.0
+    pixels: Callable[[int, float], Rotation],
+    size: float,
+    tubes: Iterable[int],
+    turn: float = 0.0,
 ) -> Wafers:
     """Tubes of a Chilean LAT of CMB-S4 with one wafer each, ``size`` in mm; tubes by TOAST's
     numbers of places.

@@ -139,7 +139,11 @@ class BackgroundLimited(NoiseModel):
         )
 
     def _net(
-        self, sky: _Moments, epsilon: Floats, warm: Floats, polarization_efficiency: Floats
+        self,
+        sky: _Moments,
+        epsilon: Floats,
+        warm: Floats,
+        polarization_efficiency: Floats,
     ) -> Floats:
         """Equations (2) and (3) of the load epsilon x sky + warm."""
         polarized = polarization_efficiency > 0

@@ -53,7 +53,13 @@ class Progress:
 
     @hookimpl
     def zonda_campaign_progress(
-        self, done: int, total: int, failed: int, samples: int, all_samples: int, seconds: float
+        self,
+        done: int,
+        total: int,
+        failed: int,
+        samples: int,
+        all_samples: int,
+        seconds: float,
     ) -> None:
         """One line: ``tasks 12 of 100 [##........] 12 %, 3.1e+06 samples/s, 80 s left``."""
         with self._lock:

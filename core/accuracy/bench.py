@@ -95,7 +95,11 @@ _warm = False
 
 
 def timed_run(
-    variant: FileVariant, metric: str, threads: int | None, seed: int | None, alone: bool
+    variant: FileVariant,
+    metric: str,
+    threads: int | None,
+    seed: int | None,
+    alone: bool,
 ) -> TimedRun:
     """Run a variant in this process.
 

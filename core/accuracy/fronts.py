@@ -288,7 +288,10 @@ def achieved(
 
 
 def retest(
-    front: StoredFront, file: PipelineFile, pipeline: str, points: int | None = None
+    front: StoredFront,
+    file: PipelineFile,
+    pipeline: str,
+    points: int | None = None,
 ) -> list[Retest]:
     """Measure the errors of a stored Pareto front again (of the ``points`` with the largest
     errors): errors only, never times, and therefore in this process.

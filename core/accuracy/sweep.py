@@ -180,7 +180,8 @@ def sweep(bench: Bench, knobs: Sequence[PipelineKnob]) -> Sweep:
 
 
 def _in_order(
-    knobs: Sequence[PipelineKnob], bench: Bench
+    knobs: Sequence[PipelineKnob],
+    bench: Bench,
 ) -> Iterator[tuple[PipelineKnob, str, float]]:
     """Knobs, values, and the runs to leave for others: what claims rest on first, then the other
     rungs of all knobs in turn, fine to coarse.

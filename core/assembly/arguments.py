@@ -95,7 +95,11 @@ def precision(given: Any, name: str) -> Any:
 
 
 def check_run(
-    scene: Any, output: Any, numbers: Mapping[str, Any], keep: Any, name: str
+    scene: Any,
+    output: Any,
+    numbers: Mapping[str, Any],
+    keep: Any,
+    name: str,
 ) -> tuple[int | None, int | None, int | None]:
     """The threads, the memory and the ceiling of a run as whole numbers, None where they are
     absent. Raises PipelineError.

@@ -47,7 +47,9 @@ def warn_of_nothing_saved(pipeline: Pipeline) -> None:
 
 
 def looks(
-    operators: Sequence[Operator | None], scene: Scene, say: Callable[[str], None] | None = None
+    operators: Sequence[Operator | None],
+    scene: Scene,
+    say: Callable[[str], None] | None = None,
 ) -> tuple[list[list[str]], list[tuple[int, ZondaError]]]:
     """Lines that each operator's `check` returns, and every error, with the number of its step.
 

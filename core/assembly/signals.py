@@ -296,7 +296,9 @@ def acting_steps(operators: Sequence[Operator]) -> list[Operator]:
 
 
 def note_signals(
-    observations: Iterable[Observation], components: Iterable[str], formed: Iterable[Formed]
+    observations: Iterable[Observation],
+    components: Iterable[str],
+    formed: Iterable[Formed],
 ) -> None:
     """Note in observations which components there are and which signals are formed."""
     formed = list(formed)

@@ -113,7 +113,10 @@ class _Draft:
     """A campaign that is being planned, one pipeline file after the other."""
 
     def __init__(
-        self, folder: Path, pruning: Pruning, say: Callable[[int, int, str], None]
+        self,
+        folder: Path,
+        pruning: Pruning,
+        say: Callable[[int, int, str], None],
     ) -> None:
         self._folder, self._pruning, self._say = folder, pruning, say
         self.pipelines: list[str] = []
@@ -173,7 +176,10 @@ class _Draft:
         return len(self.pipelines) - 1
 
     def _combine(
-        self, source: CampaignFile, first: Entry, entries: Mapping[int, PlannedEntry]
+        self,
+        source: CampaignFile,
+        first: Entry,
+        entries: Mapping[int, PlannedEntry],
     ) -> None:
         """One set of products: the layout of all that is co-added, and its tasks."""
         from zonda import __version__
@@ -280,7 +286,9 @@ def changed(job: Job, folder: Path) -> list[str]:
 
 
 def common_layouts(
-    entries: Sequence[PlannedEntry], files: Sequence[PipelineFile], folder: Path
+    entries: Sequence[PlannedEntry],
+    files: Sequence[PipelineFile],
+    folder: Path,
 ) -> tuple[dict[str, Mapping[str, Any]], list[tuple[int, ...]]]:
     """The layouts of all scans of a combination; and the samples (detectors x samples) of each
     entry's scans.

@@ -67,7 +67,12 @@ def begin(
 
 
 def resume(
-    folder: Path, pool: Pool, say: Say, *, anyway: bool = False, same_machine: bool | None = None
+    folder: Path,
+    pool: Pool,
+    say: Say,
+    *,
+    anyway: bool = False,
+    same_machine: bool | None = None,
 ) -> CampaignResult:
     """Go on with a campaign: what is done is verified, what is missing is run. The caller holds the
     folder's lock.

@@ -170,7 +170,9 @@ def _takes_schedule(kind: type[Operator]) -> bool:
 
 
 def _mistakes(
-    document: Document, campaign: Campaign, check: Callable[[Document], list[Diagnostic]]
+    document: Document,
+    campaign: Campaign,
+    check: Callable[[Document], list[Diagnostic]],
 ) -> list[Diagnostic]:
     """Mistakes in the keys and values of ``grid`` and ``observations``, each at its place in the
     file.

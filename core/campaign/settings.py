@@ -47,7 +47,9 @@ class Entry:
 
 
 def entries(
-    campaign: Campaign, seed: int, time_of: Callable[[tuple[str, ...]], Instant]
+    campaign: Campaign,
+    seed: int,
+    time_of: Callable[[tuple[str, ...]], Instant],
 ) -> list[Entry]:
     """Entries of the campaign, the first axis slowest.
 

@@ -23,7 +23,10 @@ ARRAY = "\0array"
 
 
 def write(
-    path: Path, identity: str, tree: Mapping[str, Any], made: Mapping[str, Any] | None = None
+    path: Path,
+    identity: str,
+    tree: Mapping[str, Any],
+    made: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a tree atomically. ``identity``: of what it is the product, checked by `read`;
     ``made``: how it was made, for `head`.

@@ -66,7 +66,9 @@ class Commands(click.Group):
         return super().get_command(ctx, name)
 
     def resolve_command(
-        self, ctx: click.Context, args: list[str]
+        self,
+        ctx: click.Context,
+        args: list[str],
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find a command as click does; an unknown command names the nearest one, and a pipeline
         file the command to use.
@@ -206,7 +208,11 @@ def _plain_warnings() -> Iterator[None]:
     shown: set[str] = set()
 
     def one_line(
-        message: Any, category: Any, filename: str, lineno: int, line: str | None = None
+        message: Any,
+        category: Any,
+        filename: str,
+        lineno: int,
+        line: str | None = None,
     ) -> str:
         return f"warning: {message}\n"
 

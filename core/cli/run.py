@@ -184,7 +184,10 @@ def _show(data: Data, verbose: bool) -> None:
 
 
 def _verify(
-    file: PipelineFile, request: RunRequest, settings: tuple[str, ...], data: Data | None
+    file: PipelineFile,
+    request: RunRequest,
+    settings: tuple[str, ...],
+    data: Data | None,
 ) -> None:
     """Measure the error of a run; ``data``: what it made, if that is the whole pipeline."""
     from ..accuracy.fronts import achieved

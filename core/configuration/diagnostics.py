@@ -31,7 +31,9 @@ class TextValue:
 
     @classmethod
     def __get_pydantic_core_schema__(
-        cls, source: Any, handler: GetCoreSchemaHandler
+        cls,
+        source: Any,
+        handler: GetCoreSchemaHandler,
     ) -> core_schema.CoreSchema:
         return core_schema.no_info_plain_validator_function(
             cls.parse,
@@ -42,7 +44,9 @@ class TextValue:
 
     @classmethod
     def __get_pydantic_json_schema__(
-        cls, schema: Any, handler: GetJsonSchemaHandler
+        cls,
+        schema: Any,
+        handler: GetJsonSchemaHandler,
     ) -> dict[str, Any]:
         return cls.json_schema
 

@@ -260,7 +260,8 @@ def _limit(e: Any, unit: Unit | None, document: Document, path: Path) -> str:
 
 
 def _field(
-    model: type[BaseModel], loc: Iterable[Any]
+    model: type[BaseModel],
+    loc: Iterable[Any],
 ) -> tuple[type[BaseModel] | None, FieldInfo | None]:
     """The model and the field at ``loc``: what a value there is checked against."""
     owner: type[BaseModel] | None = model

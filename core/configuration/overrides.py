@@ -35,7 +35,11 @@ def apply(document: Document, text: str, keys: list[str]) -> list[Diagnostic]:
 
 
 def put(
-    document: Document, key: str, value: Document, place: Span, keys: list[str]
+    document: Document,
+    key: str,
+    value: Document,
+    place: Span,
+    keys: list[str],
 ) -> list[Diagnostic]:
     """Apply a value that was read already; see `apply`. ``place``: place of the key."""
     parts = key.split(".")

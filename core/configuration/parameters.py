@@ -51,7 +51,9 @@ class ParameterError(ConfigurationError, ValueError):
 
 
 def mistakes_of(
-    error: ValidationError, model: type[BaseModel], given: Mapping[str, Any]
+    error: ValidationError,
+    model: type[BaseModel],
+    given: Mapping[str, Any],
 ) -> ParameterError:
     """``error``, which a call ``model(**given)`` met, as what a user reads."""
     document = _as_document(model.__name__, given)
@@ -115,7 +117,10 @@ def _short(value: Any) -> str:
 
 
 def without_a_type(
-    name: str, bases: tuple[type, ...], namespace: Mapping[str, Any], error: Exception
+    name: str,
+    bases: tuple[type, ...],
+    namespace: Mapping[str, Any],
+    error: Exception,
 ) -> ZondaError:
     """A class ``name`` of parameters, one of whose attributes pydantic cannot take."""
     typed, kinds = (
@@ -249,7 +254,10 @@ class Parameters(BaseModel, metaclass=_Shown):
     """
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False
+        extra="forbid",
+        frozen=True,
+        validate_default=True,
+        allow_inf_nan=False,
     )
 
     if not TYPE_CHECKING:  # a type checker sees the fields
@@ -323,7 +331,9 @@ class Parameters(BaseModel, metaclass=_Shown):
 
     @classmethod
     def __get_pydantic_json_schema__(
-        cls, schema: Any, handler: GetJsonSchemaHandler
+        cls,
+        schema: Any,
+        handler: GetJsonSchemaHandler,
     ) -> dict[str, Any]:
         made = handler(schema)
         resolved = handler.resolve_ref_schema(made)

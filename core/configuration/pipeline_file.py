@@ -102,7 +102,11 @@ class _Check(Mistakes):
     """Turns a document into a `PipelineFile`, gathering mistakes on the way."""
 
     def __init__(
-        self, document: Document, name: str, folder: str | Path | None, found: list[Diagnostic]
+        self,
+        document: Document,
+        name: str,
+        folder: str | Path | None,
+        found: list[Diagnostic],
     ) -> None:
         super().__init__(document, folder, found)
         self.name, self.band_unknown = name, False

@@ -34,7 +34,10 @@ class Mistakes:
     """
 
     def __init__(
-        self, document: Document, folder: str | Path | None, found: list[Diagnostic]
+        self,
+        document: Document,
+        folder: str | Path | None,
+        found: list[Diagnostic],
     ) -> None:
         self.document, self.found = document, found
         self.context = {"folder": folder}
@@ -44,7 +47,12 @@ class Mistakes:
         self.found.append(Diagnostic(message, span, label, help))
 
     def validate(
-        self, model: type[P], value: Any, at: Place, who: str, keys: Iterable[str] = ()
+        self,
+        model: type[P],
+        value: Any,
+        at: Place,
+        who: str,
+        keys: Iterable[str] = (),
     ) -> P | None:
         """Validated ``value`` at ``at``, or None if it is mistaken. ``who`` and ``keys`` are those
         of `explain`.

@@ -212,7 +212,9 @@ class Target(TextValue):
 
     @classmethod
     def __get_pydantic_json_schema__(
-        cls, schema: Any, handler: GetJsonSchemaHandler
+        cls,
+        schema: Any,
+        handler: GetJsonSchemaHandler,
     ) -> dict[str, Any]:
         pairs = [
             {

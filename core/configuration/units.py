@@ -218,7 +218,9 @@ class Unit:
         return mistake(message, f"add a unit, e.g. {number} {self.example.split(' ', 1)[1]}")
 
     def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
+        self,
+        source: Any,
+        handler: GetCoreSchemaHandler,
     ) -> core_schema.CoreSchema:
         write = (lambda v: v) if self.unit == "" else self.write
         written = core_schema.plain_serializer_function_ser_schema(write, when_used="json")
@@ -227,7 +229,9 @@ class Unit:
         )
 
     def __get_pydantic_json_schema__(
-        self, schema: Any, handler: GetJsonSchemaHandler
+        self,
+        schema: Any,
+        handler: GetJsonSchemaHandler,
     ) -> dict[str, Any]:
         text = {
             "type": "string",

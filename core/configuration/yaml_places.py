@@ -473,7 +473,12 @@ class _Reader:
             self.faults.append(Fault(reason, Span(self.source, line, column, line, column + 1)))
 
     def build(
-        self, loader: Any, node: Any, path: Path, key: Span | None, above: tuple[int, ...]
+        self,
+        loader: Any,
+        node: Any,
+        path: Path,
+        key: Span | None,
+        above: tuple[int, ...],
     ) -> Any:
         span = self.span(node)
         if id(node) in above:

@@ -279,7 +279,10 @@ def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
 
 @contextlib.contextmanager
 def _dask(
-    scheduler: str | None, tls: Tls | None, threads: int | None, memory: int | None
+    scheduler: str | None,
+    tls: Tls | None,
+    threads: int | None,
+    memory: int | None,
 ) -> Iterator[Pool]:
     try:
         import dask.config

@@ -44,7 +44,11 @@ zero.
 
 
 def map_axes(
-    shape: tuple[int, ...], wcs: WCS, count: int = 1, figure: Any = None, gap: float = NEAR
+    shape: tuple[int, ...],
+    wcs: WCS,
+    count: int = 1,
+    figure: Any = None,
+    gap: float = NEAR,
 ) -> list[Any]:
     """World axes of a new figure (or ``figure``) for ``count`` images (ny, nx): strips one below
     the other, others side by side, with their latitudes written once. ``gap``: between an image and
@@ -357,7 +361,12 @@ def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, 
         _label(ax, values.shape, stretched)
     cmap = mpl.colormaps[colours].with_extremes(bad="0.85")
     picture = ax.imshow(
-        values, origin="lower", interpolation="nearest", aspect=aspect, cmap=cmap, norm=norm
+        values,
+        origin="lower",
+        interpolation="nearest",
+        aspect=aspect,
+        cmap=cmap,
+        norm=norm,
     )
     low, high = picture.get_clim()
     spare = 1e-6 * (high - low)  # of rounding

@@ -48,7 +48,12 @@ class MapProduct(MapArrays):
         return self.smoothed(smoothing_width(fwhm, self.fwhm))
 
     def plot(
-        self, ax: Any = None, *, plane: str = "signal", title: str = "", limit: float | None = None
+        self,
+        ax: Any = None,
+        *,
+        plane: str = "signal",
+        title: str = "",
+        limit: float | None = None,
     ) -> Any:
         """Draw a plane; the matplotlib Axes.
 

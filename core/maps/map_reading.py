@@ -411,7 +411,9 @@ class HealpixTable(FileHeader):
         return (known or may_be)[0]
 
     def read(
-        self, columns: Mapping[str, int], header_alone: bool = False
+        self,
+        columns: Mapping[str, int],
+        header_alone: bool = False,
     ) -> tuple[dict[str, Floats], NDArray[np.int64] | None, int]:
         """Values (n,) of ``columns``, the first of which is I, in the order of their pixels; the
         pixels' numbers (None: value k is pixel k); nside.

@@ -96,7 +96,9 @@ def noise_alone(
 
 
 def noise_stated(
-    maps: Mapping[str, MapProduct], name: str, runs: Mapping[str, Any] | None = None
+    maps: Mapping[str, MapProduct],
+    name: str,
+    runs: Mapping[str, Any] | None = None,
 ) -> dict[str, tuple[float | None, str]]:
     """Known noise of I, and of Q and U if they are there, of a map among ``maps`` (`maps_of`).
 
@@ -123,7 +125,8 @@ def is_quiet(runs: Mapping[str, Any], name: str) -> bool:
 
 
 def noise_sources(
-    maps: Mapping[str, MapProduct], name: str
+    maps: Mapping[str, MapProduct],
+    name: str,
 ) -> dict[Noise, tuple[MapProduct, Literal["signal", "half_difference"]]]:
     """For a map of ``signal``: which product's which plane holds noise alone; nothing for maps of
     other signals.

@@ -14,7 +14,9 @@ from .map_arrays import MapArrays
 
 
 def on_plane(
-    product: MapArrays, planes: Mapping[str, AnyFloats], size: int = 400
+    product: MapArrays,
+    planes: Mapping[str, AnyFloats],
+    size: int = 400,
 ) -> tuple[dict[str, AnyFloats], Any]:
     """``planes`` of a TAN map and its astropy WCS; of others on a grid of at most ``size`` x
     ``size`` points of a plane about its centre.

@@ -108,7 +108,11 @@ def weighted_mean(convolve: Smoother, values: Floats, weights: Floats) -> tuple[
 
 
 def error_of_mean(
-    convolve: Smoother, noise: Floats, weights: Floats, known: NDArray[np.bool_], total: Floats
+    convolve: Smoother,
+    noise: Floats,
+    weights: Floats,
+    known: NDArray[np.bool_],
+    total: Floats,
 ) -> Floats:
     """Equation (3): standard error of `weighted_mean` for independent ``noise`` in the pixels; NaN
     where the mean is not ``known``, or the noise. ``total``: the convolved ``weights``.
@@ -121,7 +125,10 @@ def error_of_mean(
 
 
 def smoothed(
-    grid: MapGrid, values: Floats, fwhm: float, noise: Floats | None = None
+    grid: MapGrid,
+    values: Floats,
+    fwhm: float,
+    noise: Floats | None = None,
 ) -> tuple[Floats, Floats | None]:
     """(values, noise) of `weighted_mean` and `error_of_mean`. Weights are solid angles: values are
     points of a brightness.
@@ -256,7 +263,9 @@ def _even_steps(grid: ImagePixels) -> tuple[float, float] | None:
 
 
 def _directly(
-    grid: ImagePixels, sigma: float, where: NDArray[np.bool_] = np.ones((1, 1), np.bool_)
+    grid: ImagePixels,
+    sigma: float,
+    where: NDArray[np.bool_] = np.ones((1, 1), np.bool_),
 ) -> Smoother:
     """Equation (2) as it stands, of the pixels ``where`` (others are 0): each with its own kernel.
     InputError beyond `MOST_DIRECT` pairs.

@@ -100,7 +100,11 @@ class CelestialTransform:
     """
 
     def __init__(
-        self, site: Site, start: Instant, duration: float, tolerance: float = 1e-9
+        self,
+        site: Site,
+        start: Instant,
+        duration: float,
+        tolerance: float = 1e-9,
     ) -> None:
         self.site, self.start, self.duration = site, start, duration
         self.source, self.orientation_known = "", True

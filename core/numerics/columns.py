@@ -24,7 +24,14 @@ def make_array(kind: Any) -> Any:
 
 @intrinsic
 def spline_of_four(
-    typing_context: Any, f: Any, stride: Any, place: Any, weights: Any, size: Any, t: Any, out: Any
+    typing_context: Any,
+    f: Any,
+    stride: Any,
+    place: Any,
+    weights: Any,
+    size: Any,
+    t: Any,
+    out: Any,
 ) -> Any:
     """out[s] = sum_i sum_j x_i[s] y_j[s] f[place[s] + j stride + i], i, j = 0 .. 3, for the four
     samples s = t .. t + 3.
@@ -315,7 +322,14 @@ def lanes_of(n: int) -> int:
 
 @intrinsic
 def add_change(
-    typing_context: Any, f: Any, at: Any, sums: Any, run: Any, data: Any, fields: Any, less: Any
+    typing_context: Any,
+    f: Any,
+    at: Any,
+    sums: Any,
+    run: Any,
+    data: Any,
+    fields: Any,
+    less: Any,
 ) -> Any:
     """f[at + k] += sums[L run + j] - sums[L run - L + j] - less, with j = k for k = 0 .. 4, and j =
     data + k - 5 for k = 5 .. 7.

@@ -98,7 +98,10 @@ def _finals(first: int, last: int) -> Floats | None:
 
 
 def _rows(
-    file: str, first: int, last: int, fields: Callable[[bytes], list[bytes]]
+    file: str,
+    first: int,
+    last: int,
+    fields: Callable[[bytes], list[bytes]],
 ) -> Floats | None:
     """The rows of ``first`` to ``last`` of a file with one line per day, or None where it does not
     hold them all.

@@ -122,7 +122,11 @@ def _rotation_into(frame: Any, called: str, place: str) -> Floats:
     from astropy.coordinates import SkyCoord
 
     axes = SkyCoord(
-        x=[1, 0, 0], y=[0, 1, 0], z=[0, 0, 1], representation_type="cartesian", frame="icrs"
+        x=[1, 0, 0],
+        y=[0, 1, 0],
+        z=[0, 0, 1],
+        representation_type="cartesian",
+        frame="icrs",
     ).transform_to(frame)
     matrix: Floats = np.array(axes.cartesian.xyz.value, dtype=np.float64)
     if not np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=1e-12):
@@ -191,7 +195,9 @@ def some_directions(quaternions: Floats, xi: Floats, eta: Floats) -> Floats:
 
 
 def share_outside(
-    scans: Iterable[tuple[Floats, Floats, Floats]], matrix: Floats, shape: tuple[int, int]
+    scans: Iterable[tuple[Floats, Floats, Floats]],
+    matrix: Floats,
+    shape: tuple[int, int],
 ) -> float:
     """About what share of all samples lies beyond an image (ny, nx) whose `pixel_matrix` is
     ``matrix``.

@@ -99,7 +99,11 @@ def uniforms(
 
 
 def lattice_normals(
-    key: NDArray[np.uint32], i0: int, i1: int, j0: int, j1: int
+    key: NDArray[np.uint32],
+    i0: int,
+    i1: int,
+    j0: int,
+    j1: int,
 ) -> NDArray[np.float32]:
     """Standard normal deviates at the points (i0 .. i1 - 1, j0 .. j1 - 1) of an unbounded integer
     lattice.
@@ -114,7 +118,11 @@ def lattice_normals(
 
 
 def _target(
-    start: int, stop: int, stream: int, out: NDArray[Any] | None, dtype: type
+    start: int,
+    stop: int,
+    stream: int,
+    out: NDArray[Any] | None,
+    dtype: type,
 ) -> NDArray[Any]:
     if stop < start:
         raise ValueError(f"reversed range {start}:{stop}")

@@ -194,7 +194,11 @@ def audit_of_bands(file: PipelineFile, made: Plan, *, threads: int | None = None
 
 
 def audit(
-    file: PipelineFile, made: Plan, *, threads: int | None = None, seconds: float | None = None
+    file: PipelineFile,
+    made: Plan,
+    *,
+    threads: int | None = None,
+    seconds: float | None = None,
 ) -> Audit:
     """Compare every decision of ``made`` with the full simulation of a slice of ``file``, chosen by
     cost (`extent`) where no ``seconds`` are given."""
@@ -357,7 +361,11 @@ def _with_sky_given(file: PipelineFile) -> PipelineFile:
 
 
 def _compare(
-    name: str, choice: Choice, full: _Result, other: _Result, context: Context
+    name: str,
+    choice: Choice,
+    full: _Result,
+    other: _Result,
+    context: Context,
 ) -> list[Checked]:
     rows = []
 

@@ -214,7 +214,12 @@ def exact(name: str, size: Bound, formula: str, what: str = "exact") -> Effect:
 
 
 def single(
-    name: str, size: Bound, formula: str, what: str = "exact", *, without: Bound | None = None
+    name: str,
+    size: Bound,
+    formula: str,
+    what: str = "exact",
+    *,
+    without: Bound | None = None,
 ) -> Estimate:
     """Estimate of an operator with one effect, which has no coarser form."""
     return Estimate((exact(name, size, formula, what),), without=without)

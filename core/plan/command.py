@@ -64,7 +64,12 @@ def plan(
         file = alone(file, only)
     file.look()
     made = make(
-        file, keep=keep, drop=drop, prune_all=not no_prune, threads=threads, measure=not audit
+        file,
+        keep=keep,
+        drop=drop,
+        prune_all=not no_prune,
+        threads=threads,
+        measure=not audit,
     )
     if not audit:
         import json

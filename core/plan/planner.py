@@ -209,7 +209,10 @@ def _without(pipeline: Pipeline, structure: Structure, dropped: Sequence[str]) -
 
 
 def _everything_of(
-    label: str, estimates: Mapping[str, Estimate], context: Context, left: Context
+    label: str,
+    estimates: Mapping[str, Estimate],
+    context: Context,
+    left: Context,
 ) -> Effect:
     """The effects of an operator as one, that is there or not: their sizes, and the part of other
     operators (noise whose level depends on the load) at another level without it. ``left``: without

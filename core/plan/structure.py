@@ -130,7 +130,9 @@ def _wanted(pipeline: Pipeline, name: str) -> frozenset[str]:
 
 
 def _in_place_of_complete(
-    pipeline: Pipeline, needed: Mapping[str, Collection[str]], keep: Collection[str]
+    pipeline: Pipeline,
+    needed: Mapping[str, Collection[str]],
+    keep: Collection[str],
 ) -> str:
     """A signal whose components hold those of all other needed ones, where nothing reads what the
     complete one makes; else empty."""
@@ -174,7 +176,9 @@ def _useless(steps: Sequence[Operator], found: Collection[str], wanted: frozense
 
 
 def _walk(
-    steps: Sequence[Operator], wanted: frozenset[str], keep: Collection[str]
+    steps: Sequence[Operator],
+    wanted: frozenset[str],
+    keep: Collection[str],
 ) -> tuple[set[str], dict[str, str]]:
     """Labels of the steps of a signal that are needed, going back from its end, and why each of the
     others is omitted.

@@ -29,7 +29,9 @@ FEWER = "keep fewer streams, of fewer or shorter scans"
 
 
 def divide(
-    bands: Sequence[Band], settings: Settings, ahead: Ahead
+    bands: Sequence[Band],
+    settings: Settings,
+    ahead: Ahead,
 ) -> list[tuple[Sequence[Band], Settings]]:
     """Bands that are executed together, and the settings with their memory.
 
@@ -54,7 +56,9 @@ def divide(
 
 
 def _groups(
-    bands: Sequence[Band], settings: Settings, ahead: Ahead
+    bands: Sequence[Band],
+    settings: Settings,
+    ahead: Ahead,
 ) -> list[tuple[Sequence[Band], Settings]]:
     """Groups of bands for `divide`, with their settings; nothing is warned of."""
     views = [band.longest for band in bands]
@@ -77,7 +81,11 @@ def _groups(
 
 
 def _shared(
-    views: Sequence[View], settings: Settings, ahead: Ahead, kept: int, others: int = 0
+    views: Sequence[View],
+    settings: Settings,
+    ahead: Ahead,
+    kept: int,
+    others: int = 0,
 ) -> Settings:
     """Divide the memory of bands that are executed together; ``kept``, ``others``: as in
     `divided`.
@@ -171,7 +179,11 @@ def least_memory(views: Sequence[View], settings: Settings) -> int:
 
 
 def _refuse(
-    chain: Chain, parts: Mapping[str, int], blocks: int, budget: int, settings: Settings
+    chain: Chain,
+    parts: Mapping[str, int],
+    blocks: int,
+    budget: int,
+    settings: Settings,
 ) -> None:
     threads = settings.threads
     need, free = sum(parts.values()) + blocks, available_memory() + resident_memory()

@@ -418,7 +418,11 @@ class Execution:
         return [signals[0] if names == [MAIN] else Formed(names[0], frozenset())]
 
     def _stream(
-        self, views: Sequence[View], step: Operator, signal: Formed, lent: list[AnyFloats]
+        self,
+        views: Sequence[View],
+        step: Operator,
+        signal: Formed,
+        lent: list[AnyFloats],
     ) -> Stream:
         """A stream for a step that measures: under the name that it knows, with its own mean
         alone. ``lent`` takes the arrays that are to be given back.
@@ -475,7 +479,10 @@ class Execution:
         signals = [signal] if swept and signal in self.schedule.chain.signals else None
 
         def one(
-            view: View, first: int, detectors: slice, samples: slice
+            view: View,
+            first: int,
+            detectors: slice,
+            samples: slice,
         ) -> tuple[slice, slice, Any]:
             maker = self._makers[view.number]
             block = maker.make(segment, detectors, samples, {}, again=False, signals=signals)

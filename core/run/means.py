@@ -59,7 +59,9 @@ def may_have_means(operators: Sequence[Operator]) -> frozenset[str]:
 
 
 def means_of(
-    observation: Observation, means: Mapping[str, SmoothField], names: frozenset[str]
+    observation: Observation,
+    means: Mapping[str, SmoothField],
+    names: frozenset[str],
 ) -> dict[str, SmoothField]:
     """The means of those of the streams ``names`` that have one; ``means``: `Block.means` or
     `Stream.means`.
@@ -109,7 +111,10 @@ def whole_block(
 
 
 def take_whole(
-    block: Block, whole: Block, operator: Operator, fields: Mapping[str, SmoothField]
+    block: Block,
+    whole: Block,
+    operator: Operator,
+    fields: Mapping[str, SmoothField],
 ) -> None:
     """Put what a step made of the whole block into the block: equation (1)."""
     for name in operator.provides & (block.detdata.keys() | whole.detdata.keys()):
@@ -166,7 +171,10 @@ class WholeStream(Stream):
     """
 
     def __init__(
-        self, stream: Stream, field: SmoothField, allocate: Callable[[tuple[int, int]], AnyFloats]
+        self,
+        stream: Stream,
+        field: SmoothField,
+        allocate: Callable[[tuple[int, int]], AnyFloats],
     ) -> None:
         vars(self).update((name, v) for name, v in vars(stream).items() if name != "array")
         self.means = {name: other for name, other in stream.means.items() if name != stream.name}
@@ -188,7 +196,8 @@ class WholeStream(Stream):
         return np.dtype(np.float64)
 
     def sweep(
-        self, work: Callable[[slice, slice, AnyFloats], Any]
+        self,
+        work: Callable[[slice, slice, AnyFloats], Any],
     ) -> Iterator[tuple[slice, slice, Any]]:
         """See `Stream.sweep`."""
 

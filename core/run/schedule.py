@@ -171,7 +171,12 @@ class Schedule:
         return held + size <= min(self.settings.memory // 2, self.settings.memory - least)
 
     def _where(
-        self, segment: Segment, new: list[str], size: int, held: int, later: list[Segment]
+        self,
+        segment: Segment,
+        new: list[str],
+        size: int,
+        held: int,
+        later: list[Segment],
     ) -> tuple[Held, str]:
         """Decide about streams that do not fit in memory beside ``held`` bytes, and say why.
 

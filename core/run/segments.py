@@ -149,7 +149,10 @@ def block_share(budget: int, whole: int, part: int) -> int:
 
 
 def blocks(
-    span: str, in_time_order: bool, shape: tuple[int, int], share: int
+    span: str,
+    in_time_order: bool,
+    shape: tuple[int, int],
+    share: int,
 ) -> Iterator[tuple[slice, slice]]:
     """Blocks of at most ``share`` samples (or the least) that cover the observation, detectors
     first.

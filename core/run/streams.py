@@ -66,7 +66,8 @@ class StreamMadeAgain(Stream):
         return self._dtype
 
     def sweep(
-        self, work: Callable[[slice, slice, AnyFloats], Any]
+        self,
+        work: Callable[[slice, slice, AnyFloats], Any],
     ) -> Iterator[tuple[slice, slice, Any]]:
         """See `Stream.sweep`."""
         return self._sweeper(work)
@@ -97,7 +98,11 @@ class Store:
         return self._in_use + size <= self._room
 
     def allocate(
-        self, name: str, shape: tuple[int, int], in_memory: bool = True, dtype: Any = None
+        self,
+        name: str,
+        shape: tuple[int, int],
+        in_memory: bool = True,
+        dtype: Any = None,
     ) -> AnyFloats:
         """An array of anything; a memory map of a file where it does not fit or is not wanted in
         memory.

@@ -68,7 +68,10 @@ def joined(*headers: fits.Header) -> fits.Header:
 
 
 def write_image(
-    file: IO[bytes], header: fits.Header, values: NDArray[Any], dtype: Any = None
+    file: IO[bytes],
+    header: fits.Header,
+    values: NDArray[Any],
+    dtype: Any = None,
 ) -> None:
     """Append an image to an open file: the primary one, or an extension.
 
@@ -100,7 +103,10 @@ def table_bytes(table: fits.BinTableHDU) -> bytes:
 
 @contextlib.contextmanager
 def opened(
-    path: str | os.PathLike[str], place: str, cure: str, kind: str = "FITS"
+    path: str | os.PathLike[str],
+    place: str,
+    cure: str,
+    kind: str = "FITS",
 ) -> Iterator[Any]:
     """An `astropy.io.fits.HDUList` to read from; each failure of the body is an `InputError` about
     ``place``.

@@ -107,7 +107,10 @@ class Table:
         self._mistakes.append((0 if row is None else self.lines[row], message, cure))
 
     def note_rows(
-        self, wrong: NDArray[np.bool_], message: str | Callable[[int], str], cure: str
+        self,
+        wrong: NDArray[np.bool_],
+        message: str | Callable[[int], str],
+        cure: str,
     ) -> None:
         """Note a mistake in each ``wrong`` row (n,)."""
         for row in np.flatnonzero(wrong).tolist():
@@ -243,7 +246,8 @@ Lines = Sequence[tuple[int, str]]
 
 
 def _ecsv(
-    written: Lines, body: Lines
+    written: Lines,
+    body: Lines,
 ) -> tuple[list[int], list[list[str]], list[tuple[str, str]], Mapping[str, Any]]:
     """Line numbers, rows (the heading first), names with units, and meta of an ECSV table."""
     header = [line[2:] for _, line in written if line.startswith("# ")]
@@ -257,7 +261,8 @@ def _ecsv(
 
 
 def _plain_text(
-    written: Lines, body: Lines
+    written: Lines,
+    body: Lines,
 ) -> tuple[list[int], list[list[str]], list[tuple[str, str]]]:
     """Line numbers, rows (the heading first), and names with units of a table of other text."""
     first = body[0][1] if body else ""

@@ -87,7 +87,8 @@ def _along(layer: Layer) -> Callable[[Floats], Floats]:
 
 
 def closed_form(
-    model: AtmosphereModel, observation: Observation
+    model: AtmosphereModel,
+    observation: Observation,
 ) -> Callable[[Floats], Floats] | None:
     """The spectrum of ``atmosphere`` on the calibrated sky, K_RJ^2/Hz, as a function of the
     frequency [Hz].
@@ -113,7 +114,9 @@ def closed_form(
 
 
 def between_knots(
-    law: Callable[[Floats], Floats], frequency: Floats, number: int = KNOTS
+    law: Callable[[Floats], Floats],
+    frequency: Floats,
+    number: int = KNOTS,
 ) -> Floats:
     """A spectrum that is smooth in log-log at frequencies (n,) >= 0 [Hz], evaluated at ``number``
     of them if there are more.

@@ -267,7 +267,10 @@ class OfDetectors:
             yield k, number
 
     def _draw(
-        self, others: Sequence[DriftingLayers], unit: int, number: int
+        self,
+        others: Sequence[DriftingLayers],
+        unit: int,
+        number: int,
     ) -> tuple[Floats, list[Floats], Floats]:
         """`DriftingLayers.sums` for the detectors and times of a unit."""
         rows = slice(unit * UNIT_DETECTORS, (unit + 1) * UNIT_DETECTORS)
@@ -277,7 +280,11 @@ class OfDetectors:
         )
 
     def _make(
-        self, key: tuple[int, int], g: Floats, weighted: Floats, sine: Floats
+        self,
+        key: tuple[int, int],
+        g: Floats,
+        weighted: Floats,
+        sine: Floats,
     ) -> dict[str, AnyFloats]:
         own = _own(g.shape[1])
         with self._lock:  # what is made again is not counted again

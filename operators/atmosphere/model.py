@@ -451,7 +451,9 @@ class Models:
         return made
 
     def weather(
-        self, parameters: LayerParameters, observation: Observation
+        self,
+        parameters: LayerParameters,
+        observation: Observation,
     ) -> tuple[Profile, BandAtmosphere]:
         """One weather for the run: the scene's at its start; and the band's response to it."""
         time, band = self._time or observation.start, observation.instrument.band

@@ -108,7 +108,8 @@ def _of_bands(models: Sequence[AtmosphereModel], label: str) -> dict[str, Drifti
 
 
 def drifting_layers(
-    model: AtmosphereModel, points: tuple[Floats, Floats] | None = None
+    model: AtmosphereModel,
+    points: tuple[Floats, Floats] | None = None,
 ) -> DriftingLayers:
     """The layers that are simulated, over the whole scan, to be looked at from focal-plane
     ``points``, by default the nodes.

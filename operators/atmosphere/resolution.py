@@ -160,7 +160,11 @@ def _slope(emission: Emission, elevation: Floats) -> Floats:
 
 
 def _mean_nodes(
-    xi: Floats, eta: Floats, emission: Emission, elevations: Floats, allowed: float
+    xi: Floats,
+    eta: Floats,
+    emission: Emission,
+    elevations: Floats,
+    allowed: float,
 ) -> Nodes:
     """The coarsest grid from which the mean emission is within ``allowed`` [K_RJ] at some
     elevations of the boresight.
@@ -184,7 +188,11 @@ class _Timing:
     """Errors of steps in time, for each layer."""
 
     def __init__(
-        self, path: _Path, observation: Observation, plane: ScanPlane, layers: Sequence[Layer]
+        self,
+        path: _Path,
+        observation: Observation,
+        plane: ScanPlane,
+        layers: Sequence[Layer],
     ) -> None:
         self._path, self._observation, self._plane, self._layers = path, observation, plane, layers
         self._speeds = _speeds(path, plane, layers)
@@ -253,7 +261,9 @@ class _Timing:
 
 
 def layer_speeds(
-    observation: Observation, plane: ScanPlane, layers: Sequence[Layer]
+    observation: Observation,
+    plane: ScanPlane,
+    layers: Sequence[Layer],
 ) -> list[Floats]:
     """Speeds [m/s] of the line of sight of the boresight through each layer, 64 quantiles over the
     scan.

@@ -92,7 +92,10 @@ def grid(observation: Observation, fastest: float) -> tuple[int, int, int]:
 
 
 def drifts(
-    observation: Observation, label: str, amplitude: Floats, layout: tuple[int, int]
+    observation: Observation,
+    label: str,
+    amplitude: Floats,
+    layout: tuple[int, int],
 ) -> DetectorField:
     """Equation (1), less 1: ``amplitude`` (K,) of the waves' spline coefficients; ``layout``: step
     and nodes of `grid`.

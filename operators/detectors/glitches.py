@@ -86,7 +86,10 @@ class Glitches(Operator):
         observation.log.count(self.label, "detectors with glitches", hit, observation.n_detectors)
 
     def _of_detector(
-        self, observation: Observation, detector: int, span: float
+        self,
+        observation: Observation,
+        detector: int,
+        span: float,
     ) -> tuple[Floats, Floats]:
         """(arrival times within ``span``, uniform deviates of the amplitudes): waiting times are
         exponential.

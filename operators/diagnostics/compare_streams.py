@@ -234,7 +234,11 @@ class StreamComparison(Series):
 
     @classmethod
     def of_pairs(
-        cls, step: CompareStreams, pairs: Sequence[Pair], welch: Welch, names: list[str]
+        cls,
+        step: CompareStreams,
+        pairs: Sequence[Pair],
+        welch: Welch,
+        names: list[str],
     ) -> StreamComparison:
         """Comparison of one scan, from the spectra of each detector."""
         f, segments = welch.frequency, welch.independent

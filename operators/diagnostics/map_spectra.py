@@ -60,7 +60,11 @@ def on_the_plane(product: MapProduct, q_and_u: Floats) -> Floats:
 
 
 def sphere_spectra(
-    name: str, product: MapProduct, bins: int, least: float, place: str
+    name: str,
+    product: MapProduct,
+    bins: int,
+    least: float,
+    place: str,
 ) -> RadialSpectra:
     """Equation (1) of a HEALPix map: of I, and of E and B (``NAME_E``, ``NAME_B``) of a polarized
     one.
@@ -136,7 +140,10 @@ def _windowed(plane: MapProduct, window: Floats, mean: bool) -> Floats:
 
 
 def _white(
-    names: list[str], planes: list[MapProduct], window: Floats, area: float
+    names: list[str],
+    planes: list[MapProduct],
+    window: Floats,
+    area: float,
 ) -> dict[str, float]:
     """Levels of white noise of maps that are not smoothed and whose noise is known; E and B have
     the mean of Q and U.

@@ -117,7 +117,11 @@ class Lagged:
 
 
 def components(
-    lagged: Lagged, modes: int, *, center: bool = True, normalize: bool = False
+    lagged: Lagged,
+    modes: int,
+    *,
+    center: bool = True,
+    normalize: bool = False,
 ) -> Components:
     """Equation (2). ``center``: subtract the rows' means; ``normalize``: divide rows by their rms,
     so that each counts alike.

@@ -189,7 +189,9 @@ def draw_map(
 
 
 def draw_noise(
-    file: str, sources: Mapping[Noise, tuple[MapProduct, str]], style: Plots
+    file: str,
+    sources: Mapping[Noise, tuple[MapProduct, str]],
+    style: Plots,
 ) -> list[Sketch]:
     """Maps of noise alone, with the plane that holds it: ``half_difference`` of the map, which
     comes first, and ``source_free``.
@@ -293,7 +295,9 @@ def _titled(title: str, shown: MapProduct) -> str:
 
 
 def _panels(
-    panels: Sequence[tuple[Flat, AnyFloats, str]], fwhm: float, limit: float | None
+    panels: Sequence[tuple[Flat, AnyFloats, str]],
+    fwhm: float,
+    limit: float | None,
 ) -> list[Any]:
     """Axes of maps side by side with their titles, where the first map is well covered."""
     first = panels[0][0]
@@ -480,7 +484,10 @@ def _noise_of(maps: Mapping[str, MapProduct], name: str) -> tuple[Floats, str] |
 
 
 def _snr(
-    product: MapProduct, style: Plots, maps: Mapping[str, MapProduct], name: str
+    product: MapProduct,
+    style: Plots,
+    maps: Mapping[str, MapProduct],
+    name: str,
 ) -> tuple[AnyFloats, str] | None:
     """SNR of a map as it is shown, on its own grid, and what its noise is, in words; None where it
     is not known.

@@ -99,7 +99,10 @@ class Chosen:
     found: dict[int, Any] = field(default_factory=dict)
 
     def streams(
-        self, block: Block, names: Sequence[str], place: str
+        self,
+        block: Block,
+        names: Sequence[str],
+        place: str,
     ) -> Iterator[tuple[int, dict[str, Floats]]]:
         """Each detector of a block with its streams on the calibrated sky, `on_sky`."""
         for name in names:

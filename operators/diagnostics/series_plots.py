@@ -37,7 +37,9 @@ MODES = 4
 
 
 def _binned(
-    frequency: AnyFloats, psd: AnyFloats, per_decade: int = 24
+    frequency: AnyFloats,
+    psd: AnyFloats,
+    per_decade: int = 24,
 ) -> tuple[AnyFloats, AnyFloats]:
     """Means of a spectrum in logarithmic bins (each at least one frequency wide)."""
     position = np.floor(np.log10(frequency / frequency[0]) * per_decade).astype(int)

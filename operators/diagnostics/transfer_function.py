@@ -209,7 +209,10 @@ def compare(before: Floats, after: Floats, window: Floats, pixel: float, edges: 
 
 
 def window_of(
-    product: MapProduct, radius: float | None = None, taper: float | None = None, least: float = 0.1
+    product: MapProduct,
+    radius: float | None = None,
+    taper: float | None = None,
+    least: float = 0.1,
 ) -> Floats:
     """`comparison.radial.tapered`, (ny, nx).
 

@@ -241,7 +241,9 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
 
 
 def _sums(
-    modes: AnyFloats, spread: AnyFloats, response: AnyFloats
+    modes: AnyFloats,
+    spread: AnyFloats,
+    response: AnyFloats,
 ) -> tuple[tuple[AnyFloats, AnyFloats], ...]:
     """For what is even and what is odd about the middle, matrices A (h, k) and B (k, h), h the half
     of the M + 3 knots: (s_j +- s_(M - j)) A B is that part of c, where equation (2) is written out
@@ -286,7 +288,11 @@ def _groups(n: int, knots: int) -> tuple[NDArray[np.int64], int]:
 
 
 def _weights(
-    n: int, knots: int, first: NDArray[np.int64], taps: int, kind: np.dtype[Any]
+    n: int,
+    knots: int,
+    first: NDArray[np.int64],
+    taps: int,
+    kind: np.dtype[Any],
 ) -> AnyFloats:
     """See `HighpassPlan.weights`."""
     found: AnyFloats = empty((first.size, taps * GROUP), kind).reshape(first.size, taps, GROUP)

@@ -313,7 +313,10 @@ class Gram(Usable):
             tile[rows] = np.where(masked, unit[rows, None] * mean, tile[rows])
 
     def _pass(
-        self, q: Floats, rows: NDArray[np.intp], moments: bool = False
+        self,
+        q: Floats,
+        rows: NDArray[np.intp],
+        moments: bool = False,
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """(A 1, squares, G q, A^T q), the first two (n_det,) only where wanted: one reading of the
         stream.
@@ -340,7 +343,12 @@ class Gram(Usable):
                 self._on_tile(
                     samples,
                     partial(
-                        _products, q=q, rows=rows, v=times[samples], moments=moments, out=part[None]
+                        _products,
+                        q=q,
+                        rows=rows,
+                        v=times[samples],
+                        moments=moments,
+                        out=part[None],
                     ),
                 )
             return parts

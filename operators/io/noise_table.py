@@ -108,7 +108,11 @@ there is no estimate.
 
 
 def noise_of(
-    path: Path, signal: str, estimate: Estimate, *, subtract_mean: bool
+    path: Path,
+    signal: str,
+    estimate: Estimate,
+    *,
+    subtract_mean: bool,
 ) -> tuple[TimeOrderedData, dict[str, Any]]:
     """Everything but the streams of a file, and the noise of each unflagged detector by name; None:
     no estimate.
@@ -169,7 +173,10 @@ def _mean(stream: RecordedStream, n_detectors: int, n_samples: int) -> Floats:
 
 
 def write_noise(
-    path: Path, tod: TimeOrderedData, found: Mapping[str, Any], meta: Mapping[str, Any]
+    path: Path,
+    tod: TimeOrderedData,
+    found: Mapping[str, Any],
+    meta: Mapping[str, Any],
 ) -> Path:
     """Write the table that `LoadTOD` reads (``noise:``): a row for each detector with an
     estimate.

@@ -261,7 +261,10 @@ class RecordedFiles(Operator):
         ]
 
     def _noise(
-        self, tod: TimeOrderedData, path: Path, rows: NDArray[np.intp]
+        self,
+        tod: TimeOrderedData,
+        path: Path,
+        rows: NDArray[np.intp],
     ) -> tuple[dict[str, Floats], str]:
         """Columns with the noise of the table, for the detectors ``rows``, of a model of the file
         or the file's own, and which of these it is in words.
@@ -317,7 +320,10 @@ def _head(path: Path, stamp: tuple[int, int]) -> tuple[TimeOrderedData, Mapping[
 
 @lru_cache(maxsize=NEW_SCANS)
 def _fitted(
-    path: Path, stamp: tuple[int, int], model: str | None, mask: int
+    path: Path,
+    stamp: tuple[int, int],
+    model: str | None,
+    mask: int,
 ) -> Mapping[str, Floats]:
     """The noise of a model of a file, of detectors without a bit of ``mask``."""
     opened = reader(path)

@@ -256,7 +256,10 @@ def _known(name: str, values: Floats, used: NDArray[np.bool_]) -> Floats:
 
 
 def _band(
-    tod: TimeOrderedData, columns: Mapping[str, Floats], given: Instrument | None, place: str
+    tod: TimeOrderedData,
+    columns: Mapping[str, Floats],
+    given: Instrument | None,
+    place: str,
 ) -> Band:
     """The passband: flat, of the file's centre and width. It has the name that a file of zonda
     states, or f150 at 150 GHz.

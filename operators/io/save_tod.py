@@ -226,7 +226,9 @@ def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
 
 
 def reader(
-    path: str | os.PathLike[str], *, whole: bool = False
+    path: str | os.PathLike[str],
+    *,
+    whole: bool = False,
 ) -> fits_table.Reader | toast_hdf5.Reader:
     """An open file, whose streams are read in rectangles; ``whole``: it may be compressed. Raises
     InputError when it cannot be read as such.

@@ -36,7 +36,10 @@ def models(file: Any) -> list[str]:
 
 
 def columns_of_model(
-    group: Any, detectors: list[str], unused: NDArray[np.bool_], place: str
+    group: Any,
+    detectors: list[str],
+    unused: NDArray[np.bool_],
+    place: str,
 ) -> dict[str, Floats]:
     """NET [K sqrt(s)], knee, minimum_frequency [Hz] and slope (n_det,) of the spectra of an open
     noise model.

@@ -42,7 +42,10 @@ def check_polarized(observation: Observation, place: str) -> None:
 
 
 def warn_before(
-    observations: Sequence[Observation], frame: str, condition_limit: float, place: str
+    observations: Sequence[Observation],
+    frame: str,
+    condition_limit: float,
+    place: str,
 ) -> None:
     """Warn where the samples of all scans, taken together, do not determine I, Q and U of ``frame``
     within ``condition_limit``.

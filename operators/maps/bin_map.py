@@ -211,7 +211,11 @@ class BinMap(MapParameters):
         return weights, seen
 
     def _note_beams(
-        self, observation: Observation, sums: MapSums, weight: Floats, binned: int
+        self,
+        observation: Observation,
+        sums: MapSums,
+        weight: Floats,
+        binned: int,
     ) -> None:
         """Note the beams of an observation's detectors, with what they weigh in the map: ``binned``
         samples, as many of each.

@@ -230,7 +230,11 @@ def binnings(
 
 
 def weights_of(
-    observation: Observation, reference: float, inverse: bool, window: Floats | None, place: str
+    observation: Observation,
+    reference: float,
+    inverse: bool,
+    window: Floats | None,
+    place: str,
 ) -> Weights:
     """Weights in units of the inverse of the variance ``reference`` [K^2]; ``inverse``: w is the
     inverse variance, else 1.

@@ -153,7 +153,8 @@ class PixelCount(ABC):
     @staticmethod
     @abstractmethod
     def of_scan(
-        hits: Sums | None, directions: Directions | None
+        hits: Sums | None,
+        directions: Directions | None,
     ) -> Iterator[tuple[NDArray[np.int64], Sums]]:
         """Pixels, and what a scan with ``hits`` (n_pixels,) adds there, (n, columns)."""
 
@@ -172,7 +173,8 @@ class Crosslinking(PixelCount):
 
     @staticmethod
     def of_scan(
-        hits: Sums | None, directions: Directions | None
+        hits: Sums | None,
+        directions: Directions | None,
     ) -> Iterator[tuple[NDArray[np.int64], Sums]]:
         assert directions is not None
         for sums in directions.parts.values():
@@ -211,7 +213,8 @@ class Visits(PixelCount):
 
     @staticmethod
     def of_scan(
-        hits: Sums | None, directions: Directions | None
+        hits: Sums | None,
+        directions: Directions | None,
     ) -> Iterator[tuple[NDArray[np.int64], Sums]]:
         assert hits is not None
         pixels = np.flatnonzero(hits)

@@ -217,7 +217,10 @@ Grid = TangentGrid | PlateCarreeGrid | HealpixGrid
 
 
 def tangent_wcs(
-    centre: tuple[float, float], pixel: float, shape: tuple[int, int], frame: str = "icrs"
+    centre: tuple[float, float],
+    pixel: float,
+    shape: tuple[int, int],
+    frame: str = "icrs",
 ) -> WCS:
     """World coordinates of a TAN image: (ny, nx) pixels of side ``pixel`` [rad] around ``centre``
     [rad, in ``frame``].
@@ -247,7 +250,9 @@ def in_frame(icrs: tuple[float, float], frame: str) -> tuple[float, float]:
 
 
 def covering_extent(
-    observations: Sequence[Observation], centre: tuple[float, float], frame: str
+    observations: Sequence[Observation],
+    centre: tuple[float, float],
+    frame: str,
 ) -> tuple[float, float]:
     """Half-width and half-height [rad, on the tangent plane] of the TAN image around ``centre``
     that holds every sample.
@@ -288,7 +293,10 @@ def _extent(observation: Observation, samples: slice, matrix: Floats) -> Floats:
 
 
 def covered_healpix(
-    observations: Sequence[Observation], nside: int, nest: bool, frame: str
+    observations: Sequence[Observation],
+    nside: int,
+    nest: bool,
+    frame: str,
 ) -> NDArray[np.int64]:
     """Pixels that any sample may hit: discs of the field of view's radius around the boresights.
     Sorted.
@@ -378,7 +386,11 @@ class Cells:
         self._left = MOST_BYTES
 
     def of(
-        self, looking: Looking, which: NDArray[np.intp], start: int, stop: int
+        self,
+        looking: Looking,
+        which: NDArray[np.intp],
+        start: int,
+        stop: int,
     ) -> NDArray[np.int32]:
         """`Looking.pixels`. Read only."""
         key = looking.key or id(looking), which.tobytes(), start, stop

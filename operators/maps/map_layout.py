@@ -105,7 +105,9 @@ class MapLayout:
     parameters: MapParameters
 
     def common(
-        self, observations: Sequence[Observation], before: Mapping[str, Any] | None
+        self,
+        observations: Sequence[Observation],
+        before: Mapping[str, Any] | None,
     ) -> Mapping[str, Any] | None:
         """Centre, extent and units of the sums: about the middle of all observations, and wide
         enough for them.
@@ -143,7 +145,9 @@ class MapLayout:
         return found | self.place(observations, found)
 
     def place(
-        self, observations: Sequence[Observation], before: Mapping[str, Any]
+        self,
+        observations: Sequence[Observation],
+        before: Mapping[str, Any],
     ) -> dict[str, Any]:
         """Fields of the targets, middle and extent of the map: ``half`` [rad] of a TAN image, the
         ``box`` of a CAR one, or HEALPix ``pixels``. ``before``: the layout of those before.
@@ -165,7 +169,9 @@ class MapLayout:
         return found
 
     def fields(
-        self, observations: Sequence[Observation], before: Sequence[Sequence[float]]
+        self,
+        observations: Sequence[Observation],
+        before: Sequence[Sequence[float]],
     ) -> list[list[float]]:
         """Each target's field, (longitude, latitude, half its width, half its height) [rad, on its
         own tangent plane].

@@ -129,7 +129,10 @@ class MapSums(Product):
         return len(self.scans) % 2 if self.of_scans else 0
 
     def add(
-        self, observation: Observation, halves: Sequence[Sequence[Binning]], place: str
+        self,
+        observation: Observation,
+        halves: Sequence[Sequence[Binning]],
+        place: str,
     ) -> tuple[int, Sums]:
         """Add one observation, the binnings of either half of its samples or of all of them:
         (samples binned, dropped (4,)). Raises PipelineError where a sum may have overflowed.

@@ -109,7 +109,10 @@ def median_bias(segments: int) -> float:
 
 
 def spectrum(
-    row: Floats, good: NDArray[np.bool_], rate: float, length: int
+    row: Floats,
+    good: NDArray[np.bool_],
+    rate: float,
+    length: int,
 ) -> tuple[Floats, Floats, int]:
     """Frequencies [Hz] without zero, one-sided power spectral density [K^2 / Hz], number of
     segments used (0: too few are good).

@@ -126,7 +126,11 @@ class Amplitude:
     """
 
     def __init__(
-        self, label: str, level: WhiteLevel, observation: Observation, factor: float | Floats = 1.0
+        self,
+        label: str,
+        level: WhiteLevel,
+        observation: Observation,
+        factor: float | Floats = 1.0,
     ) -> None:
         self.label, self.level, self.factor = label, level, factor
         self._means, self._lock = dict(observation.smooth), threading.Lock()

@@ -351,7 +351,9 @@ def _of_squares(root: Complexes) -> Complexes:
 
 
 def _least_squares(
-    misfit: Callable[[Floats], Floats], jacobian: Callable[[Floats], Floats], x: Floats
+    misfit: Callable[[Floats], Floats],
+    jacobian: Callable[[Floats], Floats],
+    x: Floats,
 ) -> Floats:
     """Levenberg-Marquardt (Nielsen's damping, Madsen et al. 2004, algorithm 3.16): argmin
     |misfit|^2 from ``x``.

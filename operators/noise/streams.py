@@ -54,7 +54,10 @@ class Streams:
     """
 
     def __init__(
-        self, law: PowerLawFilter, key: NDArray[np.uint32], start_key: NDArray[np.uint32]
+        self,
+        law: PowerLawFilter,
+        key: NDArray[np.uint32],
+        start_key: NDArray[np.uint32],
     ) -> None:
         self.law, self.key, self.start_key = law, key, start_key
         padding = (

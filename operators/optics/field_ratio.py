@@ -20,7 +20,9 @@ TOLERANCE = 1e-7
 
 
 def field_ratio(
-    above: SmoothField, below: SmoothField, use: NDArray[np.intp]
+    above: SmoothField,
+    below: SmoothField,
+    use: NDArray[np.intp],
 ) -> tuple[SmoothField, float]:
     """The smooth field above / max(below, `LEAST_TRANSMISSION`), and its largest error over the
     detectors ``use``.
@@ -105,7 +107,11 @@ def _ratio(above: SmoothField, below: SmoothField, step: int, rows: NDArray[np.i
 
 
 def _error(
-    field: SmoothField, above: SmoothField, below: SmoothField, step: int, use: NDArray[np.intp]
+    field: SmoothField,
+    above: SmoothField,
+    below: SmoothField,
+    step: int,
+    use: NDArray[np.intp],
 ) -> float:
     """Largest difference between ``field`` and above / below at the cells' midpoints, over the
     detectors ``use``.

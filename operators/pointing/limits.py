@@ -115,7 +115,8 @@ none too fast.
 
 
 def excess(
-    found: dict[Quantity, LargestDerivative], limits: dict[Quantity, float]
+    found: dict[Quantity, LargestDerivative],
+    limits: dict[Quantity, float],
 ) -> dict[Quantity, float]:
     """Factors > 1 by which limits are exceeded, the worst first."""
     ratio = {q: found[q].figure / limit for q, limit in limits.items() if q in found}
@@ -161,7 +162,10 @@ class LargestMotion:
                 self._found[q], self._where[q] = peak, name
 
     def too_fast(
-        self, quantity: Quantity, found: dict[Quantity, LargestDerivative], name: str = "the scan"
+        self,
+        quantity: Quantity,
+        found: dict[Quantity, LargestDerivative],
+        name: str = "the scan",
     ) -> str:
         """The message about a limit that the scan exceeds."""
         (axis, order), peak, word = quantity, found[quantity], WORDS[quantity[1]]

@@ -123,7 +123,10 @@ def _peaks(track: Floats, step: float) -> dict[Quantity, LargestDerivative]:
 
 
 def _derivatives(
-    azimuth: Floats, elevation: Floats, lag: int, step: float
+    azimuth: Floats,
+    elevation: Floats,
+    lag: int,
+    step: float,
 ) -> dict[Quantity, Floats]:
     """Magnitudes of difference quotients over ``lag`` steps, (n - order lag,) each; without those
     of no points.

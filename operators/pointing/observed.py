@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 
 
 def transform_of(
-    scene: Scene, start: Instant, duration: float, interpolation_error: float
+    scene: Scene,
+    start: Instant,
+    duration: float,
+    interpolation_error: float,
 ) -> CelestialTransform:
     """The celestial transformation of a scan; its error as a fraction of the smallest beam."""
     beam = float(scene.instrument.focalplane().fwhm.min())
@@ -76,7 +79,9 @@ def observed(
 
 
 def centre_of(
-    transform: CelestialTransform, target: Target, seconds: Floats
+    transform: CelestialTransform,
+    target: Target,
+    seconds: Floats,
 ) -> tuple[float, float]:
     """ICRS (ra, dec) of a target; of an az/el one where it points to in the middle of the scan."""
     if target.frame != "horizontal":
@@ -87,7 +92,10 @@ def centre_of(
 
 
 def mark_turnarounds(
-    label: str, observation: Observation, turning: NDArray[np.bool_], flagged: bool
+    label: str,
+    observation: Observation,
+    turning: NDArray[np.bool_],
+    flagged: bool,
 ) -> None:
     """Count the samples ``turning`` (n,), and flag them if that is asked for."""
     what = "samples in turnarounds" + (", flagged" if flagged else ", used")

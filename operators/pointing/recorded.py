@@ -218,7 +218,10 @@ def _summary(scan: Scan, frame: str) -> str:
 
 
 def _state_celestial(
-    label: str, observation: Observation, computed: Floats, good: NDArray[np.bool_]
+    label: str,
+    observation: Observation,
+    computed: Floats,
+    good: NDArray[np.bool_],
 ) -> None:
     """State which directions on the sky are used, and how far recorded ones are from those that
     follow from az and el.

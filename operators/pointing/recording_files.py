@@ -356,7 +356,10 @@ def _within(spans: list[tuple[float, float]], seconds: Floats) -> NDArray[np.boo
 
 
 def _flags(
-    number: Floats, bits: str, mask: int | None, trimmed: NDArray[np.bool_]
+    number: Floats,
+    bits: str,
+    mask: int | None,
+    trimmed: NDArray[np.bool_],
 ) -> NDArray[np.uint8]:
     """Flags in bits of `core.flags`. A value that is not a number excludes the sample."""
     whole = np.where(np.isfinite(number), number, 255).astype(np.int64)
@@ -371,7 +374,10 @@ def _flags(
 
 
 def _intervals(
-    given: Mapping[str, Floats], times: Floats, seconds: Floats, place: str
+    given: Mapping[str, Floats],
+    times: Floats,
+    seconds: Floats,
+    place: str,
 ) -> Intervals:
     """Intervals that count as ``times`` (n,), in order and in ``seconds``; of times that samples
     have to the last bit.

@@ -473,7 +473,10 @@ class PointingSchedule(ScheduleParameters):
 
 
 def _centre(
-    scene: Scene, row: Row, transform: CelestialTransform, delay: float
+    scene: Scene,
+    row: Row,
+    transform: CelestialTransform,
+    delay: float,
 ) -> tuple[float, float]:
     """ICRS (ra, dec) of the scene's target; of the middle of the scan where it has none, or one
     fixed on the ground.
@@ -486,7 +489,10 @@ def _centre(
 
 
 def _motion(
-    track: Track, begin: float, end: float, limits: dict[Quantity, float]
+    track: Track,
+    begin: float,
+    end: float,
+    limits: dict[Quantity, float],
 ) -> dict[Quantity, LargestDerivative]:
     """The largest derivatives of a part of the track, from begin to end [s].
 

@@ -33,7 +33,11 @@ LOOKED_AT = 256
 
 
 def sunlit(
-    site: Site, start: Instant, seconds: Floats, azel: Floats, close: float = CLOSE
+    site: Site,
+    start: Instant,
+    seconds: Floats,
+    azel: Floats,
+    close: float = CLOSE,
 ) -> tuple[NDArray[np.uint8], Intervals]:
     """Flags (n,) and intervals of samples at ``seconds`` (n,) with boresights ``azel`` (n, 4).
 

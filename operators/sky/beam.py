@@ -171,7 +171,11 @@ def _spline(values: Floats, axis: int) -> Floats:
 
 
 def convolve_evenly(
-    values: Floats, step: float, variance: float, outside: float, linear: bool = False
+    values: Floats,
+    step: float,
+    variance: float,
+    outside: float,
+    linear: bool = False,
 ) -> Convolved:
     """``values`` (ny, nx) on a grid of ``step`` [rad], convolved with a Gaussian of ``variance``
     [rad^2] of either axis.
@@ -191,7 +195,10 @@ def convolve_evenly(
 
 
 def _check_size(
-    shape: tuple[int, ...], width: Floats, across: Floats, steps: tuple[int, int]
+    shape: tuple[int, ...],
+    width: Floats,
+    across: Floats,
+    steps: tuple[int, int],
 ) -> None:
     """Refuse a map whose margins, a beam wide, do not fit the memory: pixels far smaller than the
     beam (`InputError`).

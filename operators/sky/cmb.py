@@ -155,7 +155,10 @@ def read(
 
 
 def _names(
-    number: int, comments: Sequence[str], given: Sequence[str], place: str
+    number: int,
+    comments: Sequence[str],
+    given: Sequence[str],
+    place: str,
 ) -> tuple[list[str], str]:
     """Names of the columns behind l, and who says so."""
     names, who = [_plain(name) for name in given], "as given"

@@ -189,7 +189,13 @@ class Beam:
         return pointing(quaternions, self.matrix, shape, first.bounds, kind)
 
     def add(
-        self, plane: int, chunks: Chunks, rows: Rows, out: AnyFloats, linear: bool, over: bool
+        self,
+        plane: int,
+        chunks: Chunks,
+        rows: Rows,
+        out: AnyFloats,
+        linear: bool,
+        over: bool,
     ) -> tuple[int, int]:
         """Add the plane of this number to ``out``, see `sampling.sample`; ``chunks`` by
         `pointing`.

@@ -187,7 +187,10 @@ def interpolated(
 
 
 def extremes(
-    source: InputMap, target: Any, tiles: NDArray[np.bool_] | None, per_area: bool = False
+    source: InputMap,
+    target: Any,
+    tiles: NDArray[np.bool_] | None,
+    per_area: bool = False,
 ) -> tuple[float, float]:
     """Least and largest value of the map's pixels under a grid, from a thinned set of its points;
     (0, 0) where there are none.

@@ -175,7 +175,10 @@ class InputMap:
         raise NotImplementedError
 
     def interpolated(
-        self, block: Block, axis: Floats | None, per_area: bool
+        self,
+        block: Block,
+        axis: Floats | None,
+        per_area: bool,
     ) -> tuple[NDArray[np.bool_], Floats, int]:
         """The points of a block that the map covers; its planes (k, n) there, interpolated; and for
         how many of them a mean is taken instead.
@@ -365,7 +368,10 @@ class ImageMap(InputMap):
         return self._pixels(*self._for_splines(block)[3])
 
     def interpolated(
-        self, block: Block, axis: Floats | None, per_area: bool
+        self,
+        block: Block,
+        axis: Floats | None,
+        per_area: bool,
     ) -> tuple[NDArray[np.bool_], Floats, int]:
         """See `InputMap.interpolated`: by cubic B-splines.
 
@@ -551,7 +557,10 @@ class HealpixMap(InputMap):
         return seen, near
 
     def interpolated(
-        self, block: Block, axis: Floats | None, per_area: bool
+        self,
+        block: Block,
+        axis: Floats | None,
+        per_area: bool,
     ) -> tuple[NDArray[np.bool_], Floats, int]:
         """See `InputMap.interpolated`: by `local_fit`, whatever the orientation of the pixels."""
         seen, near = self._near(block)

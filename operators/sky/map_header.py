@@ -259,7 +259,9 @@ def odd_pixels(sides: Floats, shape: tuple[int, ...], beam: float) -> str:
 
 
 def seen_twice(
-    beam: tuple[float, float] | None, given: float | None, telescope: Floats
+    beam: tuple[float, float] | None,
+    given: float | None,
+    telescope: Floats,
 ) -> tuple[str, str]:
     """Statement about a map that was made with a ``beam`` (major, minor) [rad], and the warning;
     either may be empty.

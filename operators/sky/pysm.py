@@ -51,7 +51,9 @@ process.
 
 
 def configuration(
-    models: Sequence[str], components: Mapping[str, Any], place: str
+    models: Sequence[str],
+    components: Mapping[str, Any],
+    place: str,
 ) -> dict[str, Any]:
     """Presets and components as PySM takes them. Raises InputError: it is not installed, or has no
     such preset.
@@ -97,7 +99,11 @@ def band_weights(band: Band) -> tuple[Floats, Floats]:
 
 
 def emission(
-    config: Mapping[str, Any], nside: int, band: Band, download: bool, place: str
+    config: Mapping[str, Any],
+    nside: int,
+    band: Band,
+    download: bool,
+    place: str,
 ) -> Floats:
     """The sum of PySM's components over a band: (3, n_pix) I, Q and U in COSMO's convention,
     Galactic, K_RJ, ring order.

@@ -107,7 +107,12 @@ def _image(hdu: Any, hdus: Any, header: ImageHeader) -> ImageMap:
     beam = header.beam(unit)
     wcs, placeless = header.geometry(shape)
     image = ImageMap(
-        values=planes[0], unit=unit, beam=beam, notes=notes, wcs=wcs, placeless=placeless
+        values=planes[0],
+        unit=unit,
+        beam=beam,
+        notes=notes,
+        wcs=wcs,
+        placeless=placeless,
     )
     header.check_beam(image, float((image.sides[::-1] * image.shape).max()))
     sign = header.sign_of_u(True) if len(planes) > 1 else 1.0

@@ -75,7 +75,11 @@ class Region:
 
 
 def region(
-    observation: Observation, step: float, reach: float, disc: Disc | None, place: str
+    observation: Observation,
+    step: float,
+    reach: float,
+    disc: Disc | None,
+    place: str,
 ) -> Region:
     """Region of the lattice of ``step`` [rad] about the observation's centre; one tile that is not
     reached where there is none.
@@ -236,7 +240,10 @@ class Block:
 
 
 def blocks(
-    target: Any, tiles: NDArray[np.bool_] | None, progress: Progress, thin: int = 1
+    target: Any,
+    tiles: NDArray[np.bool_] | None,
+    progress: Progress,
+    thin: int = 1,
 ) -> Iterator[Block]:
     """The points of the TAN grid ``target`` in squares of `BLOCK`; of the ``tiles`` that are True,
     where given.

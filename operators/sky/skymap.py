@@ -247,7 +247,10 @@ class FullSky(Operator):
         state[0].exec(block, state[1])
 
     def collect(
-        self, data: Data, observation: Observation, state: tuple[SkyMap, ScanSampler]
+        self,
+        data: Data,
+        observation: Observation,
+        state: tuple[SkyMap, ScanSampler],
     ) -> None:
         """See `SkyMap`."""
         state[0].collect(data, observation, state[1])

@@ -36,7 +36,11 @@ TARGET = (75.0, 20.0)
 
 
 def camera(
-    detectors: int = 37, *, field: str = "4.2 arcmin", low: str = "78 GHz", high: str = "108 GHz"
+    detectors: int = 37,
+    *,
+    field: str = "4.2 arcmin",
+    low: str = "78 GHz",
+    high: str = "108 GHz",
 ) -> Instrument:
     """A camera on a 100 m dish."""
     return Instrument(

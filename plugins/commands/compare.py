@@ -263,7 +263,11 @@ def _name(path: Path, paths: tuple[Path, Path]) -> str:
 
 
 def _in_one_unit(
-    reference: Plane, other: Plane, unit: str | None, frequency: float | None, beam: float
+    reference: Plane,
+    other: Plane,
+    unit: str | None,
+    frequency: float | None,
+    beam: float,
 ) -> tuple[Plane, Plane]:
     """Convert both maps to ``unit``, or to that of the reference: to brightness if that is per
     pixel, per common ``beam`` [rad] if it is per beam.

@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path), metavar="FILE")
 @click.option(
-    "--signal", default="signal", show_default=True, metavar="NAME", help="Name of the stream."
+    "--signal",
+    default="signal",
+    show_default=True,
+    metavar="NAME",
+    help="Name of the stream.",
 )
 @click.option(
     "--segment",
@@ -37,7 +41,11 @@ if TYPE_CHECKING:
     help="The table.  [default: FILE with .noise.ecsv]",
 )
 def noise(
-    file: Path, signal: str, segment: str | None, subtract_mean: bool, output: Path | None
+    file: Path,
+    signal: str,
+    segment: str | None,
+    subtract_mean: bool,
+    output: Path | None,
 ) -> None:
     """Estimate the noise of each detector from a file of time-ordered data (HDF5 in TOAST's layout,
     FITS of SaveTOD).

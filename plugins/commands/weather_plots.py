@@ -94,7 +94,11 @@ def plot_pwv(ax: Any, water: PwvByMonth) -> None:
 
 
 def plot_spectrum(
-    ax: Any, air: Profile, elevation: float, bands: Sequence[Band], which: str
+    ax: Any,
+    air: Profile,
+    elevation: float,
+    bands: Sequence[Band],
+    which: str,
 ) -> None:
     """Emission (``brightness``) or ``transmission`` from 1 to 1000 GHz for several PWVs; bands are
     shaded, lines named above.

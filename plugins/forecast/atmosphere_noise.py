@@ -232,7 +232,11 @@ def _expected(survey: Survey, found: Calibrated) -> list[Floats]:
 
 
 def _drawn(
-    found: Calibrated, layer: int, share: Floats, number: int, rng: np.random.Generator
+    found: Calibrated,
+    layer: int,
+    share: Floats,
+    number: int,
+    rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
     """Waves (n, 2) [rad/m], and the weight of each in the integral of equation (1)."""
     chance = share / share.sum()
@@ -246,7 +250,11 @@ def _drawn(
 
 
 def _of_waves(
-    survey: Survey, scans: list[_Scan], some: Floats, model: Layer, waves: Floats
+    survey: Survey,
+    scans: list[_Scan],
+    some: Floats,
+    model: Layer,
+    waves: Floats,
 ) -> Floats:
     """(n_scan, n_wave) the square in equation (1) over (sum g)^2, after each scan, averaged over
     probes.
@@ -271,7 +279,12 @@ def _of_waves(
 
 
 def _covariance(
-    survey: Survey, scan: _Scan, some: Floats, model: Layer, waves: Floats, weights: Floats
+    survey: Survey,
+    scan: _Scan,
+    some: Floats,
+    model: Layer,
+    waves: Floats,
+    weights: Floats,
 ) -> tuple[Floats, Floats]:
     """(n, n) covariance [K^2] of a layer in the filtered samples of some detectors over a scan;
     spectrum of what they have in common."""

@@ -105,7 +105,10 @@ class Forecasted:
 
 
 def audit(
-    file: PipelineFile, forecasts: Mapping[str, Forecasted], seeds: int, threads: int | None = None
+    file: PipelineFile,
+    forecasts: Mapping[str, Forecasted],
+    seeds: int,
+    threads: int | None = None,
 ) -> dict[str, Audited]:
     """Simulate a pipeline with ``seeds`` seeds, from its own on, and compare the noise of its maps
     with the ``forecasts``.

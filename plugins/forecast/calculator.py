@@ -76,7 +76,11 @@ class Calculated:
 
 
 def calculate(
-    layers: Layers, band: Band, diameter: float, elevation: float, seconds: float
+    layers: Layers,
+    band: Band,
+    diameter: float,
+    elevation: float,
+    seconds: float,
 ) -> Calculated:
     """Equations (1) to (5) for an atmosphere, a passband, a dish of ``diameter`` [m] at an
     elevation [rad], and a time [s].
@@ -107,7 +111,11 @@ def calculate(
 
 
 def system_flux(
-    nu: Floats, opacity: Floats, zenith: Floats, diameter: float, elevation: float
+    nu: Floats,
+    opacity: Floats,
+    zenith: Floats,
+    diameter: float,
+    elevation: float,
 ) -> Floats:
     """SEFD of (1) to (4), W m^-2 Hz^-1, at frequencies [Hz] with zenith opacity [neper] and zenith
     brightness [K_RJ].

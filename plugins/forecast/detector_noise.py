@@ -216,7 +216,11 @@ def _signed(survey: Survey, chosen: list[Comb], total: Floats) -> list[Series]:
 
 
 def _kernels(
-    survey: Survey, comb: Comb, factors: Floats, track: Track, few: NDArray[np.intp]
+    survey: Survey,
+    comb: Comb,
+    factors: Floats,
+    track: Track,
+    few: NDArray[np.intp],
 ) -> AnyFloats:
     """(n_det, n_instant): factor times K of the nearest probe."""
     found, place = np.zeros((len(few), len(track.index)), np.float32), (comb.origin, comb.spacing)

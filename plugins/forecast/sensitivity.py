@@ -103,7 +103,11 @@ class Sensitivity:
         return f"{name}, band {self.band}" if self.band else name
 
     def rms(
-        self, seconds: float | None = None, unit: str = "K_RJ", part: str = "", stokes: str = "I"
+        self,
+        seconds: float | None = None,
+        unit: str = "K_RJ",
+        part: str = "",
+        stokes: str = "I",
     ) -> float:
         """The depth after an integration time [s] in a unit (`depth.UNITS`): of a part
         (`depth.PARTS`), or of all; ``stokes``: of which plane of the map. NaN of a part that is not
@@ -216,7 +220,9 @@ class Sensitivity:
 
 
 def audited(
-    each: Sequence[Sensitivity], seeds: int, threads: int | None = None
+    each: Sequence[Sensitivity],
+    seeds: int,
+    threads: int | None = None,
 ) -> list[Sensitivity]:
     """Forecasts of all bands, each with the depth that simulations find."""
     forecasts = {one.band: Forecasted(one.planes, one.radius, one.survey.fwhm) for one in each}
@@ -529,7 +535,10 @@ def sensitivity(
 
 
 def _forecast(
-    file: PipelineFile, radius: str | float | None, asked: Mapping[str, Any], band: str = ""
+    file: PipelineFile,
+    radius: str | float | None,
+    asked: Mapping[str, Any],
+    band: str = "",
 ) -> Sensitivity:
     """The depth of one band's map."""
     survey = survey_of(file, band)

@@ -135,7 +135,11 @@ def _scans(survey: Survey, grid: TangentGrid) -> Iterator[Floats]:
 
 
 def _smoothed(
-    solved: Floats, noise: Floats, grid: TangentGrid, taps: Floats, radius: float
+    solved: Floats,
+    noise: Floats,
+    grid: TangentGrid,
+    taps: Floats,
+    radius: float,
 ) -> Floats:
     """(3, n_noise) equation (2) in the circle; ``solved``: A^-1, ``noise`` (n_noise, n_pixels, 6):
     N.
@@ -189,7 +193,12 @@ class _Looks:
 
 
 def _signed(
-    looks: _Looks, grid: TangentGrid, row: Floats, weight: Floats, taps: Floats, chosen: list[Comb]
+    looks: _Looks,
+    grid: TangentGrid,
+    row: Floats,
+    weight: Floats,
+    taps: Floats,
+    chosen: list[Comb],
 ) -> list[Series]:
     """Same as `detector_noise._signed`, from ``row`` (n_pixels, 3), (A^-1)_S, and ``weight`` (ny,
     nx), w.

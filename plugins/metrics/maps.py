@@ -317,7 +317,9 @@ class CentralRms(_OfSmoothMap):
 
 
 def central_rms(
-    product: MapProduct, radius: float, of: Literal["signal", "half_difference"] = "signal"
+    product: MapProduct,
+    radius: float,
+    of: Literal["signal", "half_difference"] = "signal",
 ) -> tuple[float, float]:
     """Equation (7) of a map as it is, within ``radius`` [rad], and its standard error. InputError
     where no pixel is there.

@@ -168,7 +168,10 @@ def diffraction_fwhm(aperture: Metres, frequency: RadioFrequency, factor: Fracti
 
 @_register
 def beam_shift(
-    aperture: Metres, frequency: RadioFrequency, distance: Metres, factor: Fraction = 1.0
+    aperture: Metres,
+    frequency: RadioFrequency,
+    distance: Metres,
+    factor: Fraction = 1.0,
 ) -> float:
     """Separation of the lines of sight of detectors that are factor lambda / D apart, at a
     distance, m.
@@ -178,7 +181,10 @@ def beam_shift(
 
 @_register
 def disc_overlap(
-    aperture: Metres, frequency: RadioFrequency, distance: Metres, factor: Fraction = 1.0
+    aperture: Metres,
+    frequency: RadioFrequency,
+    distance: Metres,
+    factor: Fraction = 1.0,
 ) -> float:
     """Share of area that two discs of the beam's FWHM have in common, their centres `beam_shift`
     apart.
@@ -191,7 +197,10 @@ def disc_overlap(
 
 @_register
 def gaussian_overlap(
-    aperture: Metres, frequency: RadioFrequency, distance: Metres, factor: Fraction = 1.0
+    aperture: Metres,
+    frequency: RadioFrequency,
+    distance: Metres,
+    factor: Fraction = 1.0,
 ) -> float:
     """Common volume of two Gaussian beams of unit volume, erfc(d / (sqrt(8) sigma)), d the
     `beam_shift`.
@@ -214,7 +223,10 @@ def overlap_of_smaller(shared: Fraction, large: Metres, small: Metres) -> float:
 
 @_register
 def atmosphere_in_scan(
-    atmosphere: Kelvin, illumination: Fraction, efficiency: Fraction, transmission: Fraction = 1.0
+    atmosphere: Kelvin,
+    illumination: Fraction,
+    efficiency: Fraction,
+    transmission: Fraction = 1.0,
 ) -> float:
     """Atmosphere alone in the paper's T_scan, eps T_atm / (zeta e^-tau), K_RJ."""
     return illumination * atmosphere / (efficiency * transmission)
@@ -299,7 +311,10 @@ def white_noise_of_daisy(
 
 @_register
 def calculator_of_atlast(
-    pwv: Metres, elevation: Angle, seconds: Seconds, at: str = "centre"
+    pwv: Metres,
+    elevation: Angle,
+    seconds: Seconds,
+    at: str = "centre",
 ) -> float:
     """Point-source sensitivity of AtLAST's camera by the formula of the sensitivity calculator,
     with zonda's atmosphere (2022-08-01T23:00, Llano de Chajnantor): ``at`` the band's centre, or

@@ -38,7 +38,11 @@ UNDECIDED = 1
     help="A claims file of your own.",
 )
 def validate(
-    ids: tuple[str, ...], output: Path, quick: bool, listed: bool, path: Path | None
+    ids: tuple[str, ...],
+    output: Path,
+    quick: bool,
+    listed: bool,
+    path: Path | None,
 ) -> int:
     """Measure the claims of the paper that zonda follows, all of them or those named.
 

@@ -60,7 +60,10 @@ def draw(row: Row) -> Figure:
 
 
 def _draw_lines(
-    ax: Any, lines: Sequence[tuple[str, Values, str]], factor: float, across: str | None
+    ax: Any,
+    lines: Sequence[tuple[str, Values, str]],
+    factor: float,
+    across: str | None,
 ) -> None:
     """A line for each result: realizations as strokes, their mean with its standard error."""
     for k, (_, values, colour) in enumerate(lines):

@@ -171,7 +171,9 @@ def _text_of(path: Path) -> str:
 
 
 def combined(
-    statistic: str | None, columns: list[list[float]], error: float
+    statistic: str | None,
+    columns: list[list[float]],
+    error: float,
 ) -> tuple[tuple[float, ...], float]:
     """Values and the error of a single one; that of a paired significance S of n pairs is ((1 + S^2
     / 2) / n)^(1/2).
@@ -266,7 +268,10 @@ class Row:
 
 
 def measured(
-    claims: Sequence[Claim], folder: Path, base: Path, say: Say = lambda text: None
+    claims: Sequence[Claim],
+    folder: Path,
+    base: Path,
+    say: Say = lambda text: None,
 ) -> list[Row]:
     """Measure claims, and draw their pictures in a folder for each.
 

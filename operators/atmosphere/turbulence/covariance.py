@@ -74,7 +74,10 @@ def _tail(x: Floats) -> Floats:
 
 
 def mixture(
-    outer_scale: float, sigma: float, step: float = 0.25, depth: float = 1e-19
+    outer_scale: float,
+    sigma: float,
+    step: float = 0.25,
+    depth: float = 1e-19,
 ) -> tuple[Floats, Floats]:
     """Nodes e = s + sigma^2 [m2] and weights of equation (4), sigma > 0: C(r; sigma) = sum weight
     exp(-r^2 / 4e).
@@ -119,7 +122,11 @@ def beam_structure(r: ArrayLike, outer_scale: float, sigma: float) -> Floats:
 
 
 def mixture_between(
-    outer_scale: float, sigma: float, low: float, high: float, nodes: int = 32
+    outer_scale: float,
+    sigma: float,
+    low: float,
+    high: float,
+    nodes: int = 32,
 ) -> tuple[Floats, Floats]:
     """The part of the mixture with low <= e < high [m2]: nodes e and weights w(s) ds (m2, equation
     3), Gauss-Legendre in ln s.

@@ -252,7 +252,11 @@ class ScanPlane:
         )
 
     def positions(
-        self, crossings: Floats, seconds: Floats, height: float, wind: Floats
+        self,
+        crossings: Floats,
+        seconds: Floats,
+        height: float,
+        wind: Floats,
     ) -> tuple[Floats, Floats]:
         """(across, along) the wind, m, of crossings X (2, m, n) at ``seconds`` (n,) after the
         start. Equation (2).

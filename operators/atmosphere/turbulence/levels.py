@@ -85,7 +85,10 @@ class Level:
 
 @lru_cache(maxsize=256)
 def gaussian_levels(
-    outer_scale: float, sigma: float, lattice: float, fidelity: str
+    outer_scale: float,
+    sigma: float,
+    lattice: float,
+    fidelity: str,
 ) -> tuple[Level, ...]:
     """The finest first, behind a Gaussian beam."""
     f = FIDELITIES[fidelity]
@@ -105,7 +108,10 @@ def gaussian_levels(
 
 @lru_cache(maxsize=64)
 def aperture_levels(
-    outer_scale: float, aperture: Aperture, lattice: float, fidelity: str
+    outer_scale: float,
+    aperture: Aperture,
+    lattice: float,
+    fidelity: str,
 ) -> tuple[Level, ...]:
     """Levels as `gaussian_levels`: `Aperture.gaussians` see the mixture beyond s_0 = sigma^2, the
     finest level all else.
@@ -132,7 +138,11 @@ def aperture_levels(
 
 
 def _aperture_kernel(
-    outer_scale: float, aperture: Aperture, split: float, spacing: float, f: Fidelity
+    outer_scale: float,
+    aperture: Aperture,
+    split: float,
+    spacing: float,
+    f: Fidelity,
 ) -> Field:
     """The finest level behind an aperture: B^2 P for s < split, and what equation (3) of `beams`
     leaves for s > split.
@@ -157,7 +167,12 @@ def _aperture_kernel(
 
 
 def _kernel(
-    outer_scale: float, sigma: float, low: float, high: float, spacing: float, radius: int
+    outer_scale: float,
+    sigma: float,
+    low: float,
+    high: float,
+    spacing: float,
+    radius: int,
 ) -> Field:
     """Quadrant (R + 1, R + 1) of the kernel whose power is the aliased spectrum of low <= e < high,
     cut at R cells.

@@ -69,7 +69,12 @@ class LinesOfSight:
     """
 
     def __init__(
-        self, observation: Observation, plane: ScanPlane, step: int, first: int, count: int
+        self,
+        observation: Observation,
+        plane: ScanPlane,
+        step: int,
+        first: int,
+        count: int,
     ) -> None:
         self.step, self.first, self.count = step, first, count
         index = step * (first + np.arange(count, dtype=np.int64))
@@ -94,7 +99,11 @@ class LinesOfSight:
         self._linear = np.ascontiguousarray(np.moveaxis(rows.reshape(count, 9), 0, 1))  # (9, n)
 
     def __call__(
-        self, xi: Floats, eta: Floats, first: int, count: int
+        self,
+        xi: Floats,
+        eta: Floats,
+        first: int,
+        count: int,
     ) -> tuple[Floats, Floats, Floats]:
         """(x, y) on the plane per metre of height, and sines of the elevation, each (len(xi),
         count), from time ``first``.
@@ -192,7 +201,9 @@ def _about_the_boresight(linear: Floats, cone: Cone) -> tuple[Floats, Floats]:
 
 
 def _polynomial(
-    function: Callable[[Floats], Floats], low: float, high: float
+    function: Callable[[Floats], Floats],
+    low: float,
+    high: float,
 ) -> tuple[Floats, tuple[float, float], float]:
     """Coefficients, highest first, in z = (x - m) w, (m, w), and the error: `_ERROR` over [low,
     high], or more.

@@ -155,7 +155,12 @@ def _sides(xi: Floats, eta: Floats, n: int) -> list[Floats]:
 
 
 def grid_error(
-    x: Floats, y: Floats, xi: Floats, eta: Floats, layers: Sequence[Layer], stretch: float = 1.0
+    x: Floats,
+    y: Floats,
+    xi: Floats,
+    eta: Floats,
+    layers: Sequence[Layer],
+    stretch: float = 1.0,
 ) -> float:
     """Expected rms error of the interpolation from nodes x times y to detectors at (xi, eta), in
     units of the fluctuation before the beam.
@@ -170,7 +175,8 @@ def grid_error(
 
 
 def _weights_and_nearness(
-    layers: Sequence[Layer], components: Sequence[tuple[Floats, Floats]]
+    layers: Sequence[Layer],
+    components: Sequence[tuple[Floats, Floats]],
 ) -> tuple[Floats, Floats]:
     """a_l^2 w and z^2 / 4e of the components of all layers."""
     weight = np.concatenate(
@@ -195,7 +201,10 @@ def _separable(nodes: Floats, points: Floats, nearness: Floats) -> tuple[Floats,
 
 
 def differential_rms(
-    xi: Floats, eta: Floats, layers: Sequence[Layer], stretch: float = 1.0
+    xi: Floats,
+    eta: Floats,
+    layers: Sequence[Layer],
+    stretch: float = 1.0,
 ) -> float:
     """Expected rms of the fluctuation minus its focal-plane mean, in units of the fluctuation
     before the beam.

@@ -127,7 +127,12 @@ class DriftingLayers:
         return np.asarray(total, np.float64), sine
 
     def sums(
-        self, others: Sequence[DriftingLayers], xi: Floats, eta: Floats, first: int, count: int
+        self,
+        others: Sequence[DriftingLayers],
+        xi: Floats,
+        eta: Floats,
+        first: int,
+        count: int,
     ) -> tuple[Floats, list[Floats], Floats]:
         """Sums (1 + len(others), len(xi), count) of the layers of this band and of ``others`` that
         look as it does, whose lines of sight are found once; for each band its weighted sums, (k,

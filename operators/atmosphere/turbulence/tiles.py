@@ -195,7 +195,11 @@ class Tiling:
     """
 
     def __init__(
-        self, tiles: Tiles, number: int, fields: Mapping[int, Turbulence], swept: Swept
+        self,
+        tiles: Tiles,
+        number: int,
+        fields: Mapping[int, Turbulence],
+        swept: Swept,
     ) -> None:
         self._tiles, self._number, self.fields = tiles, number, fields
         low, high, begin, end = swept.box

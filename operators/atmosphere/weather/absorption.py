@@ -106,7 +106,10 @@ class AbsorptionTable:
         )
 
     def cross_sections(
-        self, pressure: Floats, temperature: Floats, cells: slice = slice(None)
+        self,
+        pressure: Floats,
+        temperature: Floats,
+        cells: slice = slice(None),
     ) -> CrossSections:
         """Cross-sections of layers at ``pressure`` [Pa] and ``temperature`` [K], both (n_layer,),
         in some cells.
@@ -160,7 +163,10 @@ class AbsorptionTable:
         return below, np.minimum((x - grid[below]) / step, PRESSURE_MARGIN)
 
     def _temperature_weights(
-        self, pressure: Floats, temperature: Floats, row: NDArray[np.intp]
+        self,
+        pressure: Floats,
+        temperature: Floats,
+        row: NDArray[np.intp],
     ) -> Floats:
         """Lagrange weights in 1/temperature on the nodes of each layer's row. (n_temperature,
         n_layer).

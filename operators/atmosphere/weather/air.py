@@ -183,7 +183,9 @@ def standard_column(site: Site) -> Column:
 
 
 def upper_levels(
-    top_height: float, top_pressure: float, top_temperature: float
+    top_height: float,
+    top_pressure: float,
+    top_temperature: float,
 ) -> tuple[Floats, Floats, Floats]:
     """(height, pressure, temperature) above a source's highest level up to 31 km, with the standard
     lapse rates.

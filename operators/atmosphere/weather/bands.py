@@ -131,7 +131,10 @@ class BandAtmosphere:
         return self._difference(0, pwv, dpwv, elevation)
 
     def log_transmission_difference(
-        self, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike
+        self,
+        pwv: ArrayLike,
+        dpwv: ArrayLike,
+        elevation: ArrayLike,
     ) -> Floats:
         """log_transmission(pwv + dpwv) - log_transmission(pwv), to float64 precision of the
         difference.
@@ -194,7 +197,11 @@ class BandAtmosphere:
         return self._contract(which, basis, elevation)
 
     def _difference(
-        self, which: int, pwv: ArrayLike, dpwv: ArrayLike, elevation: ArrayLike
+        self,
+        which: int,
+        pwv: ArrayLike,
+        dpwv: ArrayLike,
+        elevation: ArrayLike,
     ) -> Floats:
         pwv, dpwv, elevation = np.broadcast_arrays(
             *(np.asarray(a, np.float64) for a in (pwv, dpwv, elevation))

@@ -211,7 +211,11 @@ class NetCdf:
         return np.atleast_1d(out)
 
     def interpolated(
-        self, key: str, axes: dict[str, Axis], weights: dict[str, dict[int, float]], log: bool
+        self,
+        key: str,
+        axes: dict[str, Axis],
+        weights: dict[str, dict[int, float]],
+        log: bool,
     ) -> Floats:
         """(n_level,) of a quantity, SI."""
         name, quantity = self._names[key], QUANTITIES[key]
@@ -261,7 +265,10 @@ class NetCdf:
         return one - zero, zero
 
     def _axis(
-        self, names: tuple[str, ...], standard: str, convert: Callable[[str], Floats] | None = None
+        self,
+        names: tuple[str, ...],
+        standard: str,
+        convert: Callable[[str], Floats] | None = None,
     ) -> Axis:
         found = self._found(names, standard)
         if found is None:

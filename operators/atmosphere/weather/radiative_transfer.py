@@ -276,7 +276,11 @@ def emission_slopes(slant_opacity: Floats, source: Floats) -> Floats:
 
 
 def spectrum(
-    layers: Layers, elevation: float, *, low: float | None = None, high: float | None = None
+    layers: Layers,
+    elevation: float,
+    *,
+    low: float | None = None,
+    high: float | None = None,
 ) -> Spectrum:
     """Opacity and brightness between two frequencies [Hz] (default: the whole table) at an
     elevation [rad].

@@ -206,7 +206,11 @@ what a millimetre does.
 
 
 def profile_of(
-    weather: WeatherSource | None, site: Site, time: Instant, seed: int, pwv: float | None = None
+    weather: WeatherSource | None,
+    site: Site,
+    time: Instant,
+    seed: int,
+    pwv: float | None = None,
 ) -> Profile:
     """The profile of a scene; its ``stated`` says what was used, and why.
 

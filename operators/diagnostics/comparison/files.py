@@ -57,7 +57,8 @@ SAME = 1e-12
 
 
 def products_of(
-    product: MapProduct | Image, name: str
+    product: MapProduct | Image,
+    name: str,
 ) -> dict[str, tuple[str, MapProduct | Image]]:
     """(name, product) of I, and of Q and U where there are some: ``name``, ``name_Q``,
     ``name_U``.
@@ -417,7 +418,9 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
 
 
 def plane_of(
-    product: MapProduct | Image, name: str, alone: tuple[Floats, str] | None = None
+    product: MapProduct | Image,
+    name: str,
+    alone: tuple[Floats, str] | None = None,
 ) -> Plane:
     """A map of a run as the plane to be compared, with its noise. The input image has no beam, but
     where its pixels were spread (BMAJ).

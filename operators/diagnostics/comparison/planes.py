@@ -324,7 +324,9 @@ def _same_pixels(a: Any, b: Any) -> bool:
 
 
 def common(
-    reference: Plane, other: Plane, fwhm: float | None = None
+    reference: Plane,
+    other: Plane,
+    fwhm: float | None = None,
 ) -> tuple[Plane, Plane, list[str]]:
     """The two maps with one beam and on one grid, and notes of the changes.
 
@@ -369,7 +371,8 @@ def common(
 
 
 def on_a_plane(
-    pixels: HealpixPixels, planes: Mapping[str, Floats]
+    pixels: HealpixPixels,
+    planes: Mapping[str, Floats],
 ) -> tuple[Any, dict[str, Floats]]:
     """Planes of HEALPix pixels as images about their middle, with points as far apart as the pixels
     are and the value of the pixel that each lies in: header, and planes. For pictures and

@@ -320,7 +320,11 @@ class Profiles:
 
 
 def profiles(
-    maps: Mapping[str, Floats], distance: Floats, areas: Floats, width: float, beam_area: float
+    maps: Mapping[str, Floats],
+    distance: Floats,
+    areas: Floats,
+    width: float,
+    beam_area: float,
 ) -> Profiles:
     """Mean of each map in rings of ``width`` [rad], over the solid angle: pixels count with their
     ``areas`` [sr].
