@@ -62,6 +62,7 @@ def test_products(undisturbed):
         assert "nights:" in "".join(str(card) for card in file[0].header["HISTORY"])
 
 
+@pytest.mark.nightly
 def test_processes_give_the_same_bits(undisturbed, bench):
     out = bench.run(bench.CAMPAIGN, "--engine", "processes", "--workers", 3)
     assert bench.planes(out) == bench.planes(undisturbed)

@@ -67,16 +67,16 @@ def test_unusual_slopes_are_within_the_stated_bound(
 
 @pytest.mark.parametrize("f_min", [1e-8, 1e-5, 1e-3, 0.1, 0.43])
 @pytest.mark.parametrize("slope", [1.0, 1.5, 2.0, 2.5, 3.0])
-@pytest.mark.parametrize("poles", [8, 10, 16])
+@pytest.mark.parametrize("poles", [8, 16])
 def test_the_variance_is_that_of_a_spectrum_that_is_flat_below_the_minimum(
     f_min: float, slope: float, poles: int
 ) -> None:
     """It was 2.4 times as large for slope 2 and 8 poles, 6.3 to 7.5 times for slope 3."""
     law = power_law_filter(f_min, slope, poles)
-    f = np.geomspace(f_min, 0.5, 100_001)
+    f = np.geomspace(f_min, 0.5, 20_001)
     stated = 2 * (f_min + np.trapezoid((f / f_min) ** -slope, f))
     assert law.gain * law.variance == pytest.approx(stated, rel=0.1)
-    below = np.r_[np.linspace(0, f_min, 20_000, endpoint=False), f]
+    below = np.r_[np.linspace(0, f_min, 4_000, endpoint=False), f]
     assert 2 * np.trapezoid(law.response(below), below) == pytest.approx(
         law.gain * law.variance, rel=1e-3
     )
