@@ -99,6 +99,12 @@ class Row:
     rotation: float
 
     @property
+    def width(self) -> float:
+        """Throw, rad; 0: a stare, as in TOAST where the limits are within 1e-10."""
+        low, high = self.azimuth
+        return high - low if high - low >= 1e-10 else 0.0
+
+    @property
     def label(self) -> str:
         """TOAST's name of the observation."""
         return "-".join([self.name, *self.number])
@@ -120,9 +126,22 @@ def read_schedule(path: Path, nods: float = 0.0) -> tuple[list[Row], SchedulesSi
     ``nods``: seconds before each scan in which the telescope nods. Raises InputError for a file
     that is none, and for a row that makes no sense.
     """
-    text = read_text(path, str(path))
+    text = _without_special(read_text(path, str(path)), str(path))
     table = read_table(path, text=text) if text.startswith("# %ECSV") else _of_text(text, str(path))
     return _rows(table, nods), _site(table)
+
+
+def _without_special(text: str, place: str) -> str:
+    """The text with rows of SPECIAL (cooler cycles) left empty: as in TOAST they are no scans."""
+    lines = text.splitlines()
+    special = [k for k, line in enumerate(lines) if "SPECIAL" in line and line[:1] != "#"]
+    if special:
+        told = f"{len(special)} row{'s' if len(special) > 1 else ''} with SPECIAL (cooler cycles)"
+        first = f"line {special[0] + 1}{', ...' if len(special) > 1 else ''}"
+        warnings.warn(f"{place}: {told} left out: {first}", stacklevel=2)
+    for k in special:
+        lines[k] = ""
+    return "\n".join(lines)
 
 
 def _site(table: Table) -> SchedulesSite | None:
@@ -156,23 +175,15 @@ def _degrees(value: Any) -> float:
 
 def _of_text(text: str, place: str) -> Table:
     """The table of a text schedule: a line about the site, then the fields of a row a line, between
-    bars or blanks.
-
-    Rows that are SPECIAL (cooler cycles) are no scans; as in TOAST they are left out.
+    bars, commas, semicolons, tabs or blanks.
     """
-    lines, rows, special = [], [], []
+    lines, rows = [], []
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.startswith("#"):
-            fields = [f.strip() for f in line.split("|")] if "|" in line else line.split()
-            if fields[0].startswith("SPECIAL"):
-                special.append(number)
-                continue
+            mark = max("|,;\t", key=line.count)
+            fields = [f.strip() for f in line.split(mark)] if mark in line else line.split()
             lines.append(number)
             rows.append(fields)
-    if special:
-        more = f"(line {special[0]}{', ...' * (len(special) > 1)}): they are left out"
-        told = f"{place}: {len(special)} rows are SPECIAL, no scans {more}"
-        warnings.warn(told, stacklevel=2)
     if len(rows) < 2 or len(rows[0]) != 5:
         cause = "is no schedule: there is no line about the site, or none behind it"
         raise InputError(cause, place=place, cure=CURE)
@@ -217,23 +228,29 @@ def _rows(table: Table, nods: float) -> list[Row]:
         found.append(row)
     _note_overlaps(found, nods, table)
     table.check()
-    return found
+    if empty := [k for k, row in enumerate(found) if row.duration == 0]:
+        told = ", ".join(f"{found[k].label} (line {table.lines[k]})" for k in empty[:3])
+        more = ", ..." if len(empty) > 3 else ""
+        warnings.warn(
+            f"{table.place}: stop_time is start_time in {told}{more}: left out", stacklevel=2
+        )
+    if len(empty) == len(found):
+        table.note(None, "has no row that lasts", "give rows whose stop_time is later")
+        table.check()
+    return [row for row in found if row.duration]
 
 
 def _what_is_wrong(row: Row, stated: float) -> tuple[str, str] | None:
     """Cause and cure. ``stated``: azmax as it is written [rad]."""
     cure = "mend or remove that row"
-    if row.duration <= 0:
-        return "stop_time is not later than start_time", cure
+    if row.duration < 0:
+        return "stop_time is earlier than start_time", cure
     if not 0 < row.elevation <= np.pi / 2:
         return f"el is {np.degrees(row.elevation):g} deg, not between 0 and 90 deg", cure
     low, high = row.azimuth
     text = f"azmin is {np.degrees(low):g} deg and azmax {np.degrees(stated):g} deg"
     if high - low > 2 * np.pi * (1 + 1e-12):
         return "azmin and azmax are more than a turn apart", cure
-    if high - low < 1e-12:
-        cure = "give limits that differ, or remove that row"
-        return f"{text}: there is no sweep between them", cure
     if stated < low and high - low > WIDEST_WRAP * (1 + 1e-12):
         wide = f"azmax: {np.degrees(high):g} deg where the sweep is as wide"
         sweep = f"that is a sweep of {np.degrees(high - low):g} deg through north"
@@ -281,7 +298,8 @@ class ScheduleParameters(Scans):
     """Parameters that all scans of a schedule share."""
 
     schedule: InputPath
-    """Version 5 (ECSV) or versions 4 to 1 (text) of TOAST's schedules."""
+    """Version 5 (ECSV) or 4 to 1 (text between bars, commas, semicolons, tabs or blanks) of
+    TOAST's schedules."""
     speed: AngularSpeed = quantity("1 deg/s", gt=0)
     """Constant speed on the sky between the limits."""
     acceleration: AngularAcceleration = quantity("1 deg/s2", gt=0)
@@ -327,8 +345,10 @@ class PointingSchedule(ScheduleParameters):
     Azimuth limits and `acceleration` are those of the mount, `speed` is on the sky (the mount turns
     1 / cos(elevation) as fast): as in TOAST's `SimGround`, whose turnarounds, flags and intervals
     are the default. A scan begins at the lesser azimuth, towards larger ones, and has as many whole
-    samples as fit. Its name ends with the patch, scan and subscan of the row. A schedule that
-    states its site is compared with the scene's: 5 km apart are a warning, 100 km an error.
+    samples as fit. Its name ends with the patch, scan and subscan of the row. A row whose azmin is
+    its azmax is a stare; rows with SPECIAL (cooler cycles) and rows without duration are left out,
+    and told. A schedule that states its site is compared with the scene's: 5 km apart are a
+    warning, 100 km an error.
     """
 
     def every(self) -> Sequence[Row]:
@@ -342,7 +362,7 @@ class PointingSchedule(ScheduleParameters):
         if len(scans) <= MOST_LOOKED_AT:
             return list(scans)
         found = {round(k) for k in np.linspace(0, len(scans) - 1, MOST_LOOKED_AT - 6)}
-        sizes = [(row.elevation, row.azimuth[1] - row.azimuth[0], row.duration) for row in scans]
+        sizes = [(row.elevation, row.width, row.duration) for row in scans]
         found.update(np.argmin(sizes, axis=0).tolist(), np.argmax(sizes, axis=0).tolist())
         return [scans[k] for k in sorted(found)]
 
@@ -353,6 +373,8 @@ class PointingSchedule(ScheduleParameters):
         end = max(row.start.shifted(row.duration) for row in scans)
         total = sum(row.duration for row in scans) / 3600
         several = f"{len(scans)} scan{'s' if len(scans) > 1 else ''}"
+        if stares := sum(not row.width for row in scans):
+            several += f", {stares} of them stares (azmin is azmax),"
         return f"{several} from {scans[0].start} to {end}, {total:.3g} h in all"
 
     def maker(self, data: Data) -> Callable[[Row, float, LargestMotion], Observation]:
@@ -404,9 +426,9 @@ class PointingSchedule(ScheduleParameters):
     def _observation(self, data: Data, row: Row, rate: float, moved: LargestMotion) -> Observation:
         """The observation of a row, sampled at ``rate`` [Hz]."""
         scene, place = data.scene, f"{self.label}, {self.schedule}, {row.label}"
-        mount, width = self.speed / math.cos(row.elevation), row.azimuth[1] - row.azimuth[0]
+        mount = self.speed / math.cos(row.elevation) if row.width else 0.0
         smooth = self.turnaround == "smooth"
-        sweep = Sweep(width, mount, self.acceleration, smooth)
+        sweep = Sweep(row.width, mount, self.acceleration, smooth)
         nod = self.nod
         ahead = math.ceil(nod.duration * rate * (1 - 1e-12))
         seconds = np.arange(ahead + max(int(row.duration * rate * (1 + 1e-12)), 1)) / rate

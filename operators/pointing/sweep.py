@@ -28,7 +28,7 @@ class Sweep:
     """Back and forth over ``width`` [rad] at ``speed`` [rad/s], turned round with at most
     ``acceleration`` [rad/s^2].
 
-    ``smooth``: equation (2). ``begin``: where the width begins, rad.
+    ``smooth``: equation (2). ``begin``: where the width begins, rad. Width and speed 0: a stare.
     """
 
     width: float
@@ -40,7 +40,7 @@ class Sweep:
     @property
     def leg(self) -> float:
         """Duration of the part at constant speed, s."""
-        return self.width / self.speed
+        return self.width / self.speed if self.width else math.inf
 
     @property
     def turnaround(self) -> float:
@@ -75,19 +75,23 @@ class Sweep:
         """TOAST's intervals of the samples ``inside`` (n,). Left to right is towards larger values;
         a turnaround has the direction of the scan before it.
 
-        A throw goes from the middle of a turnaround to that of the next.
+        A throw goes from the middle of a turnaround to that of the next. A stare is one throw, in
+        no direction.
         """
         cycle, turning = self.leg + self.turnaround, self.turning(seconds)
         first, throw = (
             np.floor(t / cycle) % 2 == 0 for t in (seconds, seconds + self.turnaround / 2)
         )
         found: Intervals = {}
+        moving = inside & np.full(len(seconds), bool(self.width))
         for way, after, going in (("leftright", first, throw), ("rightleft", ~first, ~throw)):
-            found[f"throw_{way}"] = intervals_of(inside & going, seconds)
-            found[f"scan_{way}"] = intervals_of(inside & ~turning & after, seconds)
+            found[f"throw_{way}"] = intervals_of(moving & going, seconds)
+            found[f"scan_{way}"] = intervals_of(moving & ~turning & after, seconds)
             found[f"turn_{way}"] = intervals_of(inside & turning & after, seconds)
         for name, part in (("throw", "throw"), ("scanning", "scan"), ("turnaround", "turn")):
             found[name] = sorted(found[f"{part}_leftright"] + found[f"{part}_rightleft"])
+        if not self.width:
+            found["throw"] = found["scanning"] = intervals_of(inside & first, seconds)
         return found
 
 

@@ -356,22 +356,14 @@ def change(number, **values):
     ("rows", "match"),
     [
         (
-            change(1, stop_time=ROWS[1][0]),
-            "line 21: patch-0-1: stop_time is not later than start_time",
+            change(1, stop_time=ROWS[0][1]),
+            "line 21: patch-0-1: stop_time is earlier than start_time",
         ),
         (change(0, el=91.0), "el is 91 deg, not between 0 and 90 deg"),
         (change(0, azmax=600.0), "more than a turn apart"),
         (
             change(1, azmin=82.0, azmax=73.0),
             "line 21: patch-0-1: azmin is 82 deg and azmax 73 deg: that is a sweep of 351 deg",
-        ),
-        (
-            change(1, azmin=15.0, azmax=15.0),
-            "line 21: patch-0-1: azmin is 15 deg and azmax 15 deg: there is no sweep",
-        ),
-        (
-            change(1, azmin=360.0, azmax=0.0),
-            "line 21: patch-0-1: azmin is 360 deg and azmax 0 deg: there is no sweep",
         ),
         (
             change(1, start_time="2025-03-01T06:01:30+00:00"),
@@ -405,7 +397,7 @@ def test_rows_that_cannot_be_are_told_together(tmp_path):
         ("2025-03-01T06:00:00", "2025-03-01T06:10:00", 0.0, "a", 120.0, 150.0, 50.0, 0, 0),
         ("2025-03-01T06:01:00", "2025-03-01T06:02:00", 0.0, "b", 120.0, 150.0, 50.0, 0, 0),
         ("2025-03-01T06:05:00", "2025-03-01T06:12:00", 0.0, "c", 82.0, 73.0, 50.0, 0, 0),
-        ("2025-03-01T06:12:00", "2025-03-01T06:13:00", 0.0, "d", 82.0, 82.0, 50.0, 0, 0),
+        ("2025-03-01T06:12:00", "2025-03-01T06:13:00", 0.0, "d", 82.0, 83.0, 92.0, 0, 0),
     ]
     with pytest.raises(InputError) as caught:
         read_schedule(version_5(tmp_path / "bad.ecsv", rows))
@@ -414,7 +406,7 @@ def test_rows_that_cannot_be_are_told_together(tmp_path):
     assert "line 21: b-0-0: begins 540 s before a-0-0 (line 20) stops" in message
     assert "sweep of 351 deg through north; exchange them, or write azmax: 433 deg" in message
     assert "line 22: c-0-0: begins 300 s before a-0-0 (line 20) stops" in message
-    assert "line 23: d-0-0: azmin is 82 deg and azmax 82 deg" in message
+    assert "line 23: d-0-0: el is 92 deg" in message
 
 
 @pytest.mark.parametrize(
@@ -666,14 +658,65 @@ def test_every_version_of_text(version, tmp_path):
     )
 
 
-def test_special_rows_are_left_out_and_told(tmp_path):
+@pytest.mark.parametrize("mark", [",", ";", "\t", "|"])
+def test_every_separator(mark, tmp_path):
+    """`toast_ground_schedule --field-separator` puts it in place of each blank of its format."""
     path = tmp_path / "s.txt"
-    path.write_text(
-        f"{HEAD_OF_TEXT}{TEXTS['version 4']}\nSPECIAL|2027-06-23 08:11:00|2027-06-23"
-        " 09:00:00|0.0|cooler|100|125|48|0|0\n"
-    )
-    with pytest.warns(UserWarning, match=r"1 rows are SPECIAL, no scans \(line 4\)"):
-        assert len(read_schedule(path)[0]) == 1
+    site, row = ("ATACAMA SAT -22.958 -67.786 5200.0", TEXTS["version 4"].split(" | "))
+    path.write_text(f"#Site\n{site.replace(' ', mark)}\n{mark.join(row)}\n")
+    (row,), stated = read_schedule(path)
+    assert (stated.name, row.label, row.duration) == ("ATACAMA", "field_a-21-3", 600)
+
+
+@pytest.mark.parametrize("version", [4, 5])
+def test_special_rows_are_left_out_and_told(tmp_path, version):
+    """Wherever the word stands in the row, as in TOAST; the lines of others keep their numbers."""
+    made = (version_4 if version == 4 else version_5)(tmp_path / "s")
+    *head, first, second = made.read_text().splitlines()
+    special = ["SPECIAL|" + first, first.replace("patch", "SPECIAL_cooler")][version - 4]
+    made.write_text("\n".join([*head, first, special, second]))
+    with pytest.warns(UserWarning, match=rf"1 row with SPECIAL .* line {len(head) + 2}"):
+        assert len(read_schedule(made)[0]) == 2
+    made.write_text("\n".join([*head, special, second.replace("55.0", "95.0")]))
+    with (
+        pytest.warns(UserWarning, match="SPECIAL"),
+        pytest.raises(InputError, match=f"line {len(head) + 2}: patch-0-1: el is 95 deg"),
+    ):
+        read_schedule(made)
+
+
+@pytest.mark.parametrize("limits", [(15.0, 15.0), (15.0, 15.0 + 4e-9), (360.0, 0.0)])
+def test_rows_of_equal_limits_are_stares(tmp_path, limits):
+    """TOAST takes limits within 1e-10 rad (5.7e-9 deg) as a stare. It has no turnaround, and is one
+    throw for filters."""
+    path = version_5(tmp_path / "a.ecsv", change(1, azmin=limits[0], azmax=limits[1]))
+    one, two = scans(path, elevation_nods=["1 deg", "0 deg"])
+    ahead = 4 * 40
+    assert (two.n_samples, one.n_samples) == (2920 + ahead, 4800 + ahead)
+    apart = np.angle(np.exp(1j * (two.azimuth - np.radians(limits[0]))))
+    np.testing.assert_allclose(apart, 0, atol=1e-12)
+    np.testing.assert_allclose(np.degrees(two.elevation[ahead:]), 55, atol=1e-9)
+    assert not (two.flags & TURNAROUND).any()
+    assert (one.flags & TURNAROUND).any()
+    for name in ("throw", "scanning"):
+        inside = samples_in(two.intervals[name], two.seconds)
+        assert inside[ahead:].all()
+        assert not inside[: ahead - 1].any()
+    assert two.intervals["throw_leftright"] == two.intervals["turnaround"] == []
+    lines, _ = check(path, check_limits="error")
+    assert "2 scans, 1 of them stares (azmin is azmax), from" in lines[0]
+
+
+def test_rows_without_duration_are_left_out_and_told(tmp_path):
+    path = version_5(tmp_path / "a.ecsv", change(1, stop_time=ROWS[1][0]))
+    with pytest.warns(UserWarning, match=r"stop_time is start_time in patch-0-1 \(line 21\)"):
+        assert [row.label for row in read_schedule(path)[0]] == ["patch-0-0"]
+    empty = [(*row[:1], row[0], *row[2:]) for row in ROWS]
+    with (
+        pytest.warns(UserWarning, match="patch-0-0"),
+        pytest.raises(InputError, match="has no row that lasts"),
+    ):
+        read_schedule(version_5(path, empty))
 
 
 def test_rows_of_no_version(tmp_path):
