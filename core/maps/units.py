@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from dataclasses import replace
 from typing import Any, TypeVar
 
+from astropy.units import UnitBase
 from pydantic_core import PydanticCustomError
 
-from ..configuration.units import Unit
+from ..configuration.units import Unit, read_unit
 from ..errors import InputError
 from ..numerics.radiation import SURFACE_BRIGHTNESS_UNITS, to_kelvin_rj
 from ..types import Floats
@@ -75,83 +77,145 @@ def smoothing_width(given: Any, beam: float) -> float:
 
 KNOWN_UNITS = "Jy/pixel, Jy/beam, MJy/sr, K_RJ, K_CMB or y (Compton-y)"
 _PREFIXES = {"": 1.0, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6}
-_PER = {
-    "pixel": "Jy/pixel",
-    "pix": "Jy/pixel",
-    "px": "Jy/pixel",
-    "beam": "Jy/beam",
-    "bm": "Jy/beam",
-    "sr": "MJy/sr",
-}
+_OF_KELVIN = {prefix: size for prefix, size in _PREFIXES.items() if size <= 1}
 _SCALES = {
-    "k_rj": "K_RJ",
-    "rj": "K_RJ",
-    "rayleigh-jeans": "K_RJ",
-    "k_cmb": "K_CMB",
-    "cmb": "K_CMB",
-    "thermodynamic": "K_CMB",
+    **dict.fromkeys(("rj", "rayleighjeans", "tb", "tmb", "trj"), "K_RJ"),
+    **dict.fromkeys(("cmb", "thermo", "thermodynamic", "tcmb"), "K_CMB"),
 }
+"""Temperature scales without blanks and dashes; the main-beam temperature is that of a map."""
+_COMPTON = re.compile(
+    r"y|y[_ -]?sz|(y[_ -])?compton([_ -]?y)?|compton[_ -]?(y[_ -]?)?parameter", re.IGNORECASE
+)
+_KELVIN = re.compile(
+    r"(?-i:([num]|))(?:K|Kelvins?)[\s_,]*\(?\s*"
+    r"(RJ|CMB|T_?CMB|T_?RJ|T_?M?B|Rayleigh[ -]Jeans|thermo(?:dynamic)?)?\s*\)?",
+    re.IGNORECASE,
+)
+_POWER_OF_TEN = re.compile(
+    r"(?:10\s*(?:\*\*|\^)\s*\(?([+-]?\d{1,2})\)?|10([+-]\d{1,2})"
+    r"|((?:\d{1,9}(?:\.\d{0,18})?|\.\d{1,18})(?:E[+-]?\d{1,2})?))(?![\d.])",
+    re.IGNORECASE,
+)
+"""A number before a unit: 10**-3, 10^(-3), 10-3 (FITS 4.0, section 4.3), 1e-3, 0.001."""
+_WORDS = {
+    **dict.fromkeys(("jy", "jansky", "janskys", "janskies"), "Jy"),
+    **dict.fromkeys(("beam", "beams", "bm"), "beam"),
+    **dict.fromkeys(("pixel", "pixels", "pix", "px"), "pix"),
+    **dict.fromkeys(("sr", "ster", "steradian", "steradians"), "sr"),
+    **dict.fromkeys(("arcsec", "asec", "arcsecond", "arcseconds"), "arcsec"),
+    **dict.fromkeys(("arcmin", "amin", "arcminute", "arcminutes"), "arcmin"),
+    **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
+}
+"""Names of units, whatever their case, as astropy has them."""
+_WORD = re.compile(
+    rf"(sq(?:uare)?[\s._]*)?(?-i:([numkM]?))({'|'.join(_WORDS)})(?![a-z])", re.IGNORECASE
+)
+_BASES = {"Jy/pixel": "Jy / pix", "Jy/beam": "Jy / beam", "MJy/sr": "MJy / sr"}
 
 
 def parse_unit(text: str, *, place: str, temperature_scale: str | None = None) -> tuple[str, float]:
     """(unit, factor) with value * factor in ``unit``, one of `KNOWN_UNITS`: ``mK_CMB`` is ("K_CMB",
-    1e-3).
+    1e-3), ``10**-3 beam-1 Jy`` ("Jy/beam", 1e-3), ``mJy/arcsec^2`` ("MJy/sr", 42.5).
 
-    ``temperature_scale`` (the header key TEMPSCAL: K_RJ or K_CMB) tells what a plain kelvin is.
-    Raises InputError.
+    Intensities may be written in any way that astropy reads, names of units in any case.
+    ``temperature_scale`` (the header key TEMPSCAL: K_RJ or K_CMB) tells what a plain kelvin is;
+    K (Tb) and K (Tmb) are K_RJ. Raises InputError.
     """
-    plain = text.strip().replace("\N{MICRO SIGN}", "u").replace("\N{GREEK SMALL LETTER MU}", "u")
-    if re.fullmatch(
-        r"(y|y[_ -]?sz|(y[_ -])?compton([_ -]?y)?|compton[_ -]?(y[_ -]?)?parameter)",
-        plain,
-        re.IGNORECASE,
-    ):
-        return "y", 1.0
-    match = re.fullmatch(
-        r"(?-i:([num]?))(?:K|Kelvin)\s*[_ ]?\s*\(?(RJ|CMB|thermodynamic)?\)?", plain, re.IGNORECASE
-    )
-    if match and match[1] in _PREFIXES:
-        scale = match[2] or temperature_scale
-        if scale is None or not scale.strip():
-            raise InputError(
-                f"the unit '{text}' does not say on which temperature scale",
-                place=place,
-                cure=(
-                    "set the header key TEMPSCAL to 'K_RJ' or 'K_CMB', or the operator's parameter"
-                    " unit: K_RJ"
-                ),
-            )
-        if scale.strip().lower() not in _SCALES:
-            raise InputError(
-                f"unknown temperature scale TEMPSCAL = '{scale}'",
-                place=place,
-                cure="use K_RJ or K_CMB",
-            )
-        return _SCALES[scale.strip().lower()], _PREFIXES[match[1]]
-    match = re.fullmatch(
-        r"(?-i:([numkM]?))Jy\s*(?:/|\s|\*|\.)?\s*(pixel|pix|px|beam|bm|sr)"
-        r"\s*(?:(?:\^|\*\*)?\(?-1\)?)?",
-        plain,
-        re.IGNORECASE,
-    )
-    if match and match[1] in _PREFIXES:
-        unit = _PER[match[2].lower()]
-        return unit, _PREFIXES[match[1]] * (1e-6 if unit == "MJy/sr" else 1.0)
-    raise InputError(
-        f"unknown unit '{text}'",
-        place=place,
-        cure=f"set the header key BUNIT or the operator's parameter unit to {KNOWN_UNITS}",
-    )
+    number, plain = _number_before(_plain(text))
+    found: tuple[str, float] | None
+    if _COMPTON.fullmatch(plain):
+        found = "y", 1.0
+    elif match := _KELVIN.fullmatch(plain):
+        found = _scale(text, match[2] or temperature_scale, place), _PREFIXES[match[1]]
+    else:
+        found = _intensity(plain)
+    if found is not None and 0 < (factor := number * found[1]) < math.inf:
+        return found[0], factor
+    cure = f"set the header key BUNIT or the operator's parameter unit to {KNOWN_UNITS}"
+    if re.fullmatch(r".*\bT_?a\b.*", plain, re.IGNORECASE):
+        cure = "divide the map by the main-beam efficiency (Tmb = Ta* / efficiency): K (Tmb)"
+        raise InputError(f"'{text:.60}' is an antenna temperature", place=place, cure=cure)
+    raise InputError(f"unknown unit '{text:.60}'", place=place, cure=cure)
+
+
+def _scale(text: str, scale: str | None, place: str) -> str:
+    """K_RJ or K_CMB of the unit ``text``. Raises InputError where it is neither, or not stated."""
+    if scale is None or not scale.strip():
+        raise InputError(
+            f"the unit '{text}' does not say on which temperature scale",
+            place=place,
+            cure=(
+                "set the header key TEMPSCAL to 'K_RJ' or 'K_CMB', or the operator's parameter"
+                " unit: K_RJ"
+            ),
+        )
+    known = _SCALES.get(re.sub(r"^k_?(?=rj|cmb)|[\s_-]", "", scale.strip().lower()))
+    if known is None:
+        raise InputError(
+            f"unknown temperature scale TEMPSCAL = '{scale}'", place=place, cure="use K_RJ or K_CMB"
+        )
+    return known
+
+
+def _plain(text: str) -> str:
+    """The text with ASCII signs for micro, minus, dots, raised digits and brackets, without
+    brackets around all of it; empty if it is too long for a unit."""
+    powers = re.sub(r"([⁺⁻]?[⁰¹²³⁴-⁹]+)", r"^\1", text if len(text) < 100 else "")
+    plain = unicodedata.normalize("NFKC", powers).translate(_SIGNS).strip()
+    plain = re.sub(r"^\(([^()]*)\)$", r"\1", plain).strip()
+    for prefix, words in (("u", "mu|micro"), ("m", "milli")):
+        plain = re.sub(rf"\b(?:{words})(?=\s?(K|J))", prefix, plain, flags=re.IGNORECASE)
+    return plain
+
+
+_SIGNS = str.maketrans("μ−·⋅×{}[]", "u-..*()()")
+
+
+def _number_before(text: str) -> tuple[float, str]:
+    """A factor before a unit (1 without one), and the rest."""
+    if (match := _POWER_OF_TEN.match(text)) is None:
+        return 1.0, text
+    power = match[1] or match[2]
+    number = 10.0 ** int(power) if power else float(match[3])
+    return number, text[match.end() :].lstrip(" *")
+
+
+def _intensity(text: str) -> tuple[str, float] | None:
+    """A unit of `_BASES` and the factor to it; None for a text that is none."""
+
+    def known(word: re.Match[str]) -> str:
+        square, prefix, name = word.groups()
+        found = _WORDS[name.lower()]
+        if prefix and found != "Jy":
+            return word[0]
+        return f" {prefix}{found}{'2 ' if square else ''}"
+
+    first, *others = re.sub(r"\bper\b", "/", text).split("/")
+    if len(others) > 1 and "(" not in text:  # astropy warns of several
+        others = [f"({' '.join(others)})"]
+    words = _WORD.sub(known, "/".join([first, *others]))
+    words = re.sub(r"(Jy)\s*(beam|pix|sr)$", r"\1 / \2", words)  # "Jy beam"
+    try:
+        unit = read_unit(words)
+        for name, base in _BASES.items():
+            if isinstance(unit, UnitBase) and unit.is_equivalent(base):
+                return name, float(unit.to(base))
+    except (ValueError, ZeroDivisionError):
+        pass
+    return None
 
 
 def written_unit(text: str, *, place: str, temperature_scale: str | None = None) -> str:
-    """The unit as it is written in products: ``uK_CMB`` for ``uK (CMB)``. Raises InputError as
-    `parse_unit`.
+    """The unit as it is written in products: ``uK_CMB`` for ``uK (CMB)``, ``mJy/beam`` for ``10**-3
+    beam-1 Jy``. Raises InputError as `parse_unit`.
     """
     unit, factor = parse_unit(text, place=place, temperature_scale=temperature_scale)
-    if unit in ("K_RJ", "K_CMB"):
-        return next(prefix for prefix, size in _PREFIXES.items() if size == factor) + unit
-    return unit if factor == 1.0 else "".join(text.split())
+    plain, size = ("Jy/sr", factor * 1e6) if unit == "MJy/sr" else (unit, factor)
+    prefixes = _PREFIXES if "Jy" in unit else {"": 1.0} if unit == "y" else _OF_KELVIN
+    for prefix, value in prefixes.items():
+        if math.isclose(size, value, rel_tol=1e-12):
+            return prefix + plain
+    return " ".join(text.split()) if "Jy" in unit else f"{factor:g} {unit}"
 
 
 def scale_of(unit: str) -> tuple[str, str]:

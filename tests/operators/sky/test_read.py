@@ -6,7 +6,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
-from zonda.core.maps.units import parse_unit
+from zonda.core.maps.units import parse_unit, written_unit
 from zonda.core.numerics.projection import pixel_matrix
 from zonda.operators.sky.geometry import placed
 from zonda.operators.sky.input_map import HealpixMap, ImageMap
@@ -53,7 +53,33 @@ def refused(path, *words, **options):
         ("MJy sr**-1", ("MJy/sr", 1)),
         ("Jy/sr", ("MJy/sr", 1e-6)),
         ("kJy/sr", ("MJy/sr", 1e-3)),
+        ("beam-1 Jy", ("Jy/beam", 1)),  # astropy's text of a FITS unit
+        ("sr-1 MJy", ("MJy/sr", 1)),
+        ("mJy/arcsec^2", ("MJy/sr", 1e-9 * (648000 / np.pi) ** 2)),  # SCUBA-2
+        ("Jy/(arcsec**2)", ("MJy/sr", 1e-6 * (648000 / np.pi) ** 2)),
+        ("mJy/sq.arcsec", ("MJy/sr", 1e-9 * (648000 / np.pi) ** 2)),
+        ("W/m2/Hz/sr", ("MJy/sr", 1e20)),
+        ("erg s-1 cm-2 Hz-1 sr-1", ("MJy/sr", 1e17)),
+        ("10**-3 Jy/beam", ("Jy/beam", 1e-3)),
+        ("10^(-3) Jy beam^{-1}", ("Jy/beam", 1e-3)),
+        ("10-3 Jy/beam", ("Jy/beam", 1e-3)),  # FITS 4.0, section 4.3.1
+        ("10+6 Jy/sr", ("MJy/sr", 1)),
+        ("1e-3 Jy beam-1", ("Jy/beam", 1e-3)),
+        ("0.001*Jy/beam", ("Jy/beam", 1e-3)),
+        ("(mJy per beam)", ("Jy/beam", 1e-3)),
+        (
+            "\N{GREEK SMALL LETTER MU}Jy\N{DOT OPERATOR}beam\N{SUPERSCRIPT MINUS}"
+            "\N{SUPERSCRIPT ONE}",
+            ("Jy/beam", 1e-6),
+        ),
+        ("muJy/beam", ("Jy/beam", 1e-6)),
+        ("K (Tb)", ("K_RJ", 1)),
+        ("K (TMB)", ("K_RJ", 1)),
+        ("muK_CMB", ("K_CMB", 1e-6)),
+        ("mK,thermodynamic", ("K_CMB", 1e-3)),  # WMAP
+        ("10**-6 K_CMB", ("K_CMB", 1e-6)),
         ("y", ("y", 1)),
+        ("1e-6 y", ("y", 1e-6)),
         ("Compton-y", ("y", 1)),
         ("compton", ("y", 1)),
         ("y_compton", ("y", 1)),
@@ -66,11 +92,39 @@ def test_units(text, expected):
 
 
 @pytest.mark.parametrize(
-    "text", ["W/m2", "furlong", "Jy", "K/s", "K_XX", "counts", "Jy/px/beam", "K_", "MK_RJ", "1"]
+    "text",
+    [
+        *("W/m2", "furlong", "Jy", "K/s", "K_XX", "counts", "Jy/px/beam", "K_", "MK_RJ", "1", ""),
+        *("Jy/beam km/s", "K km/s", "mK_CMB^2", "mag(Jy/beam)", "0 Jy/beam", "-1 Jy/beam"),
+        # numbers that would be computed to millions of digits
+        *("10**9999999 deg", "10**9999999 Jy/beam", "1e999 Jy/beam", "Jy**9999999/beam"),
+        "(" * 5000 + "Jy/beam",
+    ],
 )
 def test_unknown_units(text):
     with pytest.raises(InputError, match=r"unknown unit|temperature scale"):
         parse_unit(text, place="map")
+
+
+def test_an_antenna_temperature_is_not_that_of_the_sky():
+    with pytest.raises(InputError, match=r"antenna temperature(.|\n)*main-beam efficiency"):
+        parse_unit("K (Ta*)", place="map")
+
+
+@pytest.mark.parametrize(
+    ("text", "written"),
+    [
+        ("10**-3 beam-1 Jy", "mJy/beam"),
+        ("1e-3 MJy sr-1", "kJy/sr"),
+        ("muK_CMB", "uK_CMB"),
+        ("10**-2 K (Tb)", "0.01 K_RJ"),
+        ("1e-6 y", "1e-06 y"),
+        ("mJy arcsec-2", "mJy arcsec-2"),
+    ],
+)
+def test_units_are_written_so_that_they_are_read_back(text, written):
+    assert written_unit(text, place="map") == written
+    assert parse_unit(written, place="map") == pytest.approx(parse_unit(text, place="map"))
 
 
 @pytest.mark.parametrize(
