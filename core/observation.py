@@ -419,6 +419,17 @@ class Observation:
         """(n_samp,) rad, ICRS."""
         return self.derotate("boresight_radec")[1]
 
+    def detector_positions(self) -> tuple[Floats, Floats]:
+        """(n_det, n_samp) right ascension and declination of each detector, rad, ICRS, as
+        recorded.
+        """
+        from .numerics.projection import directions
+        from .numerics.sphere import angles
+
+        plane = self.focalplane
+        longitude, dec = angles(directions(self.boresight_radec, plane.xi, plane.eta))
+        return longitude % (2 * np.pi), dec
+
     @property
     def mean_emission(self) -> dict[str, float]:
         """Mean emission of the atmosphere over instants and detectors that are not flagged, K_RJ;

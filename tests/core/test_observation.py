@@ -3,7 +3,9 @@
 import dataclasses
 
 import numpy as np
+from astropy.coordinates import SkyCoord
 
+import zonda
 from zonda.plugins.checks.scenes import scan
 
 
@@ -20,3 +22,23 @@ def test_a_thinned_scan_has_every_array_of_samples_at_these_alone() -> None:
             if isinstance(one, np.ndarray) and len(one) == n:
                 np.testing.assert_array_equal(getattr(thin, field.name), one[at])
         np.testing.assert_array_equal(thin.sky_boresight, whole.sky_boresight[at])
+
+
+def test_positions_of_detectors_are_those_that_a_map_counts() -> None:
+    scene = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T07:00", target="05h +20d"
+    )
+    steps = [
+        zonda.PointingDaisy(scan_duration="5 s", radius="4 arcmin"),
+        zonda.BinMap(contents="hits", pixel="10 arcsec"),
+    ]
+    data = zonda.Pipeline(steps).run(scene)
+    product = data["map"]
+    ra, dec = data.observations[0].detector_positions()
+    assert ra.shape == (data.observations[0].n_detectors, data.observations[0].n_samples)
+    x, y = product.wcs.world_to_pixel(SkyCoord(ra.ravel(), dec.ravel(), unit="rad"))
+    hits = np.zeros_like(product.hits)
+    np.add.at(hits, (np.rint(y).astype(int), np.rint(x).astype(int)), 1)
+    # a sample within rounding of an edge of a pixel may be counted on its other side
+    assert np.abs(hits - product.hits).sum() <= 4
+    assert product.hits.sum() == ra.size
