@@ -94,6 +94,17 @@ class Band(Parameters):
         """Equivalent width, integral of the (peak-normalized) transmission, Hz."""
         return float(np.trapezoid(self.transmission, self.frequency))
 
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the passband with its centre and width into ``ax`` (default: a new figure), and
+        return the matplotlib Axes.
+        """
+        from .canvas import shown_axes
+        from .plots import draw_passband
+
+        ax = shown_axes(ax)
+        draw_passband(ax, self)
+        return ax
+
 
 GIGAHERTZ_MIN, GIGAHERTZ_MAX = 0.5, 1e5
 """Beyond, a column that was meant to be in GHz is in THz, or in Hz."""

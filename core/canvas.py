@@ -78,13 +78,27 @@ def new_axes(size: tuple[float, float] = (7.2, 5.0), above: float = 0.45, **grid
     return figure.subplots(**grid)
 
 
-def new_figure(title: str, size: tuple[float, float]) -> Any:
-    """Figure of ``size`` [in] that matplotlib lays out, for axes of a known content."""
-    from matplotlib.figure import Figure
+def new_figure(title: str, size: tuple[float, float], notebook: bool = False) -> Any:
+    """Figure of ``size`` [in] that matplotlib lays out, for axes of a known content; for a
+    ``notebook`` one of pyplot, which is shown there.
+    """
+    style: dict[str, Any] = {"figsize": size, "dpi": DPI, "layout": "constrained"}
+    if notebook:
+        from matplotlib import pyplot as plt
 
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
-    figure.suptitle(title)
+        figure: Any = plt.figure(**style)
+    else:
+        from matplotlib.figure import Figure
+
+        figure = Figure(**style)
+    if title:
+        figure.suptitle(title)
     return figure
+
+
+def shown_axes(ax: Any, size: tuple[float, float] = (7.2, 4.2)) -> Any:
+    """``ax``; where it is None, axes of a new figure that notebooks show."""
+    return new_figure("", size, notebook=True).subplots() if ax is None else ax
 
 
 def finish(ax: Any, across: str, up: str, title: str = "", **legend: Any) -> None:
@@ -100,6 +114,12 @@ def finish(ax: Any, across: str, up: str, title: str = "", **legend: Any) -> Non
             log_labels(axis)
     if legend:
         ax.legend(**{"frameon": False, "fontsize": 8} | legend)
+
+
+def wide_legend(ax: Any, **style: Any) -> None:
+    """A legend whose lines are wide enough for their colours to be told apart."""
+    for line in ax.legend(fontsize=8, **style).get_lines():
+        line.set_linewidth(2)
 
 
 def axis_above(ax: Any, product: float, name: str) -> None:

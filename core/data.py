@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .block import STREAMS, Block
-from .errors import PipelineError
+from .canvas import shown_axes
+from .configuration.diagnostics import nearest
+from .errors import InputError, PipelineError
 from .log import Log, percent
 from .observation import Observation
 from .product import Product
-from .results import kept, one_scan, product_of
-from .stream import Stream, in_order
+from .stream import Stream, in_order, unit_of_stream
 from .tables import html_table
 
 if TYPE_CHECKING:
@@ -218,9 +219,9 @@ class Data:
         """Names of the products."""
         return iter(self.products)
 
-    def tod(self, stream: str = "signal", scan: str | int | None = None) -> NDArray[np.float64]:
+    def tod(self, stream: str = "signal", scan: str | int | None = None) -> KeptStream:
         """(n_det, n_samp) float64: all of a stream that ``Pipeline.run(..., keep=["signal"])``
-        kept, its mean emission included.
+        kept, its mean emission included. ``data.tod("signal").plot()`` draws it.
 
         Parameters
         ----------
@@ -236,7 +237,10 @@ class Data:
         InputError
             For a scan or a stream that there is not; the message says what was kept.
         """
-        return kept(one_scan(self.observations, scan), stream)
+        observation = one_scan(self.observations, scan)
+        found = kept(observation, stream).view(KeptStream)
+        found.stream, found.scan = stream, observation
+        return found
 
     def blocks(
         self,
@@ -269,3 +273,115 @@ class Data:
             [(o.name, f"{o.n_detectors} x {o.n_samples}") for o in self.observations]
             + [("products", ", ".join(sorted(self.products)))],
         )
+
+
+class KeptStream(np.ndarray[Any, np.dtype[np.float64]]):
+    """A stream (n_det, n_samp) of a run: a numpy array that can be drawn. Its parts, and what is
+    computed of it, are plain arrays.
+
+    Attributes
+    ----------
+    stream, scan
+        Its name, and the scan that it belongs to.
+    """
+
+    stream = ""
+    scan: Observation | None = None
+
+    def plot(self, detectors: int | Sequence[int] = 3, ax: Any = None) -> Any:
+        """Draw some detectors (their numbers, or how many, chosen evenly) into ``ax`` (default: a
+        new figure), and return the matplotlib Axes. Raises InputError for a detector that there is
+        not.
+        """
+        from .plots import draw_stream
+
+        scan, n = self.scan, len(self)
+        if scan is None:
+            cure = "draw data.tod(...) itself"
+            raise InputError("a copy of a stream does not know its scan", place="plot", cure=cure)
+        given = np.atleast_1d(detectors)
+        if isinstance(detectors, int | np.integer):
+            given = np.unique(np.linspace(0, n - 1, min(max(int(detectors), 1), n)).round())
+        rows = [int(k) for k in given]
+        if wrong := [k for k in rows if not -n <= k < n]:
+            cure = f"choose from 0 to {n - 1}"
+            raise InputError(f"there is no detector {wrong[0]}", place=scan.name, cure=cure)
+        ax, names = shown_axes(ax, (8.0, 4.0)), [scan.focalplane.names[k] for k in rows]
+        draw_stream(
+            ax,
+            self.stream,
+            unit_of_stream(self.stream),
+            scan.seconds,
+            self[rows],
+            names,
+            f"{self.stream}, {scan.name}",
+        )
+        return ax
+
+    def __getitem__(self, at: Any) -> Any:
+        return np.asarray(self)[at]
+
+    def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
+        return array if array is self else np.asarray(array)[()]
+
+
+EMISSION = "atmosphere"
+"""The component that is kept without its mean, which stands in `Observation.smooth`."""
+
+
+def product_of(products: Mapping[str, Any], name: str) -> Any:
+    """A product by its name. Raises InputError where there is none."""
+    if name not in products:
+        have = (
+            f"there are: {', '.join(sorted(products))}"
+            if products
+            else "the pipeline made none: add a step that makes one"
+        )
+        cure = "\n".join(filter(None, (nearest(name, products), have)))
+        raise InputError(f"there is no product {name!r}", place="data", cure=cure)
+    return products[name]
+
+
+def one_scan(observations: Sequence[Observation], scan: str | int | None) -> Observation:
+    """The scan of a name or number; None: the only one. Raises InputError."""
+    names = [observation.name for observation in observations]
+    listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+    if not names:
+        raise InputError("there is no scan", place="data.tod", cure="run a pipeline")
+    if scan is None:
+        if len(names) > 1:
+            cure = f"name one: scan={names[0]!r} or scan=0; data.blocks() goes through all"
+            raise InputError(f"there are {len(names)} scans: {listed}", place="data.tod", cure=cure)
+        return observations[0]
+    if isinstance(scan, str) and scan in names:
+        return observations[names.index(scan)]
+    if not isinstance(scan, str) and -len(names) <= scan < len(names):
+        return observations[scan]
+    cure = (nearest(scan, names) if isinstance(scan, str) else "") or f"there are: {listed}"
+    raise InputError(f"there is no scan {scan!r}", place="data.tod", cure=cure)
+
+
+def kept(observation: Observation, stream: str, rows: slice = slice(None)) -> NDArray[np.float64]:
+    """These detectors of a kept stream, with the mean that belongs to it. Raises InputError where
+    it was not kept.
+    """
+    if stream not in observation.detdata:
+        have = sorted(observation.detdata)
+        what = f"only {' and '.join(have)}" if have else "no stream was"
+        cure = (
+            f"run it again with pipeline.run(scene, keep={[*have, stream]!r}): 8 bytes for each"
+            " sample of each stream"
+        )
+        raise InputError(
+            f"the stream {stream!r} was not kept, {what}", place=observation.name, cure=cure
+        )
+    found = np.asarray(observation.detdata[stream][rows], np.float64)
+    if stream == EMISSION and EMISSION in observation.smooth:
+        first, stop, _ = rows.indices(observation.n_detectors)
+        return (
+            observation.smooth[EMISSION].evaluate(
+                slice(first, stop), slice(0, observation.n_samples)
+            )
+            + found
+        )
+    return found

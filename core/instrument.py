@@ -439,6 +439,18 @@ class Instrument(Parameters):
             **{key: np.full(n, value) for key, value in stated.items()},
         )
 
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the focal plane, and beside it the middle with beams and polarization angles; return
+        the matplotlib Axes of all of it. ``ax``: axes for the former alone.
+        """
+        from .plots import draw_focal_plane, focal_plane_figure
+
+        plane = self.focalplane()
+        if ax is None:
+            return focal_plane_figure(self, plane, notebook=True).axes[0]
+        draw_focal_plane(ax, self, plane)
+        return ax
+
     @property
     def notes(self) -> dict[str, str]:
         """Choices in reading the files that describe it, for the log and `zonda check`."""

@@ -457,6 +457,14 @@ class Observation:
                 found[name] += float(values[good].mean()) / len(instants)
         return found
 
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the boresight's track on the sky, and beside it in azimuth and elevation; return the
+        matplotlib Axes of the former. ``ax``: axes for that alone.
+        """
+        from .plots import plot_scans
+
+        return plot_scans([self], ax)
+
     def __repr__(self) -> str:
         return (
             f"<Observation {self.name}: {self.n_detectors} detectors x {self.n_samples} samples at"

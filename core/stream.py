@@ -40,6 +40,11 @@ UNITS = {"transmission": "", "opacity": "", "flags": "", "pwv": "m", "path_delay
 """Units of streams that are not in K."""
 
 
+def unit_of_stream(name: str) -> str:
+    """K_RJ; ``m`` or empty for streams of other kinds."""
+    return UNITS.get(name, "K_RJ")
+
+
 def streams_asked(streams: Iterable[str] | None) -> frozenset[str]:
     """Components of zonda's own and streams of signals among ``streams`` (None: all components),
     for `Operator.optional`: the executor keeps no stream that nobody reads (`core.run.execution`).

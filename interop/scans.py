@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.data import Data, Observation
+from zonda.core.data import Data, Observation, kept, one_scan
 from zonda.core.errors import InputError
 from zonda.core.flags import DETECTOR_MASK
-from zonda.core.results import kept, one_scan
 from zonda.operators.io.recorded_stream import RecordedStream
 from zonda.operators.io.save_tod import reader
 from zonda.operators.io.time_ordered_data import TimeOrderedData

@@ -81,8 +81,9 @@ class Image:
         return WCS(self.header, naxis=2)
 
     def plot(self, ax: Any = None, *, title: str = "", limit: float | None = None) -> Any:
-        """Draw the image, and return the matplotlib Axes. ``limit``: where the colours end;
-        default: what 99.95 % of the pixels stay below.
+        """Draw the image, and return the matplotlib Axes: ``ax``, or axes of the sky in place of
+        plain ones. ``limit``: where the colours end; default: what 99.95 % of the pixels stay
+        below.
         """
         from .map_plots import notebook_axes, plot_map
 

@@ -346,19 +346,18 @@ def _range_of(values: AnyFloats, limit: float | None) -> tuple[float, float, str
 
 
 def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, norm: Any) -> Any:
-    """Draw an image with its title and colour bar into ``ax`` or a new figure; the axes.
+    """Draw an image with its title and colour bar into ``ax`` or a new figure; the axes. Axes that
+    are not those of a sky are replaced.
 
     Pixels have the shape that they have on the sky in the middle of the image; the axes say where
     an image is stretched. The colour bar has a pointed end where values lie beyond it.
     """
     import matplotlib as mpl
 
-    ax = map_axes(values.shape, wcs)[0] if ax is None else ax
+    ax = map_axes(values.shape, wcs)[0] if ax is None else _on_the_sky(ax, wcs)
     width, height, stretched = _proportions(wcs, values.shape)
-    aspect: Any = "equal"
-    if hasattr(ax, "coords"):
-        aspect = height / values.shape[0] / (width / values.shape[1])
-        _label(ax, values.shape, stretched)
+    aspect = height / values.shape[0] / (width / values.shape[1])
+    _label(ax, values.shape, stretched)
     cmap = mpl.colormaps[colours].with_extremes(bad="0.85")
     picture = ax.imshow(
         values,
@@ -387,6 +386,17 @@ def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, 
     bar.set_label(label, wrap=True)
     ax.set_title(title, wrap=True)
     return ax
+
+
+def _on_the_sky(ax: Any, wcs: WCS) -> Any:
+    """World axes: ``ax`` itself, or new ones in the place of plain axes."""
+    if hasattr(ax, "coords"):
+        return ax
+    figure, place, spec = ax.figure, ax.get_position(), ax.get_subplotspec()
+    ax.remove()
+    if spec is None:
+        return figure.add_axes(place, projection=wcs)
+    return figure.add_subplot(spec, projection=wcs)
 
 
 def draw_beam(ax: Any, wcs: WCS, shape: tuple[int, ...], fwhm: float) -> None:

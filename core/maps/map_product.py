@@ -64,7 +64,8 @@ class MapProduct(MapArrays):
         Parameters
         ----------
         ax
-            Axes to draw into; default: a new figure with sky coordinates.
+            Axes to draw into; default: a new figure. Plain ones are replaced by axes with sky
+            coordinates, which are returned.
         limit
             Where the colours end, in the map's unit; default: what 99.95 % of the pixels stay
             below.

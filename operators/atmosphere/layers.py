@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import PrivateAttr
@@ -32,7 +32,12 @@ from .closed_form import closed_form
 from .fluctuations import AtNodes, OfDetectors
 from .model import AtmosphereModel, ExpectedLoad, LayerParameters, Models
 from .realization import draw, state_drawn
+from .screens import screens
 from .weather.radiative_transfer import ELEVATION_MIN
+
+if TYPE_CHECKING:
+    from zonda.core.operator import Operator
+    from zonda.core.scene import Scene
 
 
 class AtmosphereLayers(LayerParameters):
@@ -143,6 +148,18 @@ class AtmosphereLayers(LayerParameters):
         for name, stream in names.items():
             if block.detdata[stream] is not made[name]:
                 block.detdata[stream] += made[name]
+
+    def plot(self, scene: Scene, pointing: Operator, layer: int = 0, ax: Any = None) -> Any:
+        """Draw the water vapour of a layer (0: the lowest) as the first scan of a pointing step
+        sees it (`AtmosphereScreens`), and return the matplotlib Axes. Raises InputError for a layer
+        that there is not.
+        """
+        data = Data(scene)
+        pointing.observe(data)
+        scan = data.observations[0].of_each_band()[0]
+        own = self.model_copy()
+        own.observe(Data(scene, [scan]))
+        return screens(own.model(scan), None, 1, 4).plot(layer, ax)
 
     def collect(self, data: Data, observation: Observation, state: AtNodes | OfDetectors) -> None:
         """Report the mean and rms of the PWV that was drawn while the blocks were worked on."""

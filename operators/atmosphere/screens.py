@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from zonda.core.canvas import Sketch
+from zonda.core.canvas import Sketch, shown_axes
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Data
-from zonda.core.errors import PipelineError
+from zonda.core.errors import InputError, PipelineError
 from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.output import Output, Progress
 from zonda.core.storage.files import atomic_path, product_path
@@ -121,6 +121,17 @@ class Screens:
     side: float
     mean_pwv: float
     observation: str
+
+    def plot(self, layer: int = 0, ax: Any = None) -> Any:
+        """Draw a layer (0: the lowest) into ``ax`` (default: a new figure), and return the
+        matplotlib Axes. Raises InputError for a layer that there is not.
+        """
+        if not -len(self.layers) <= layer < len(self.layers):
+            cure = f"choose 0 (the lowest) to {len(self.layers) - 1}"
+            raise InputError(f"there is no layer {layer}", place="atmosphere", cure=cure)
+        ax = shown_axes(ax, (5.4, 4.6))
+        self.layers[layer].draw(ax)
+        return ax
 
     def sketches(self, name: str) -> list[Sketch]:
         """The layers, and the strip; see `core.canvas.Drawable`."""

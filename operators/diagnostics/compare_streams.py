@@ -45,7 +45,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.storage.table_files import Column
-from zonda.core.stream import AnyStream, check_signals
+from zonda.core.stream import AnyStream, check_signals, unit_of_stream
 from zonda.core.tables import html_table
 from zonda.core.types import Floats
 
@@ -55,7 +55,6 @@ from .series import (
     StreamDiagnostic,
     count_flagged,
     spread_evenly,
-    unit_of_stream,
 )
 
 LEAST_SEGMENTS = 8

@@ -21,7 +21,7 @@ from zonda.core.product import Record
 from zonda.core.signal import is_stream
 from zonda.core.storage.files import product_path
 from zonda.core.storage.table_files import Column, write_ecsv
-from zonda.core.stream import UNITS, StreamName, streams_asked, streams_needed
+from zonda.core.stream import StreamName, streams_asked, streams_needed
 from zonda.core.tables import html_table
 from zonda.core.types import Floats
 
@@ -253,11 +253,6 @@ def crossing(frequency: Floats, upper: Floats, lower: Floats) -> tuple[float, fl
     b, error = slope(f[near], ratio[near])
     scatter = error * float(np.std(f[near]))  # (c / n)^(1/2) s
     return math.exp(at), math.exp(at) * scatter / abs(b) if b else math.nan
-
-
-def unit_of_stream(name: str) -> str:
-    """K_RJ; ``m`` or empty for streams of other kinds."""
-    return UNITS.get(name, "K_RJ")
 
 
 @dataclass

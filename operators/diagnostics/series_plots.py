@@ -20,13 +20,14 @@ from zonda.core.canvas import (
     finish,
     new_axes,
     unit_of,
+    wide_legend,
 )
-from zonda.core.numerics.angles import ARCMIN, ARCSEC
-from zonda.core.numerics.projection import boresights
-from zonda.core.numerics.sphere import local_axes
+from zonda.core.numerics.angles import ARCSEC
+from zonda.core.plots import draw_stream, draw_tracks
+from zonda.core.stream import unit_of_stream
 from zonda.core.types import AnyFloats
 
-from .series import Modes, Spectrum, TimeStream, unit_of_stream
+from .series import Modes, Spectrum, TimeStream
 from .transfer_function import Transfer
 
 if TYPE_CHECKING:
@@ -162,12 +163,6 @@ def _mark_levels(ax: Any, level: float, knee: float | None) -> None:
         ax.annotate(text, (knee, 0.06), va="bottom", bbox=PALE, zorder=4, **place, **small)
 
 
-def _legend(ax: Any, **style: Any) -> None:
-    """A legend whose lines are wide enough for their colours to be told apart."""
-    for line in ax.legend(fontsize=8, **style).get_lines():
-        line.set_linewidth(2)
-
-
 @draw.register
 def draw_transfer(transfer: Transfer, file: str, where: str) -> list[Sketch]:
     """Share of each angular scale that the filters leave: T with its standard error, and S, the
@@ -222,79 +217,29 @@ def draw_streams(stream: TimeStream, file: str, where: str) -> list[Sketch]:
             meaning = "along the line of sight, without its mean"
         what = f"Stream {name} of {len(stream.names)} detectors {where}: {meaning}"
         caption = f"{what}. Pale: samples; dark: means over 1 s."
-        ax = _stream(stream, name, f"Time streams of {stream.observation} {where}")
+        ax, title = new_axes((7.2, 3.6)), f"Time streams of {stream.observation} {where}"
+        draw_stream(
+            ax,
+            name,
+            unit_of_stream(name),
+            stream.seconds,
+            stream.streams[name],
+            stream.names,
+            title,
+        )
         own = file if name == "signal" else f"{file}_{name}"
         made.append(Sketch(own, "Time streams", caption, ax))
     return made
 
 
-def _stream(stream: TimeStream, name: str, title: str) -> Any:
-    """Stream ``name`` of a few detectors against time: samples pale, means over one second dark."""
-    ax = new_axes(size=(7.2, 3.6))
-    values = stream.streams[name]
-    finite = values[np.isfinite(values)]
-    largest = float(np.abs(finite).max()) if finite.size else 1.0
-    factor, unit = unit_of(largest)
-    label = f"{name}, Rayleigh–Jeans [{unit}]"
-    if (kind := unit_of_stream(name)) != "K_RJ":
-        words = {
-            "transmission": "relative change of the transmission",
-            "opacity": "change of the opacity",
-            "pwv": "change of the line-of-sight PWV",
-            "path_delay": "change of the path",
-        }
-        factor, unit = (factor, f" [{unit.replace('K', 'm')}]") if kind == "m" else (1.0, "")
-        label = words.get(name, name) + unit
-    t = stream.seconds
-    step = float(np.median(np.diff(t))) if len(t) > 1 else 0.0  # samples need not be a comb
-    width = max(1, round(1.0 / step)) if step > 0 else 1
-    whole = values.shape[1] // width * width
-    centres = t[:whole].reshape(-1, width).mean(axis=1)
-    for k, (detector, row) in enumerate(zip(stream.names, values * factor, strict=True)):
-        colour = SEQUENCE[k % len(SEQUENCE)]
-        ax.plot(t, row, linewidth=0.4, alpha=0.2, color=colour)
-        means = row[:whole].reshape(-1, width).mean(axis=1)
-        ax.plot(centres, means, linewidth=0.9, color=colour, label=detector)
-    ax.margins(x=0)
-    if len(t) > 1:
-        ax.set_xlim(t[0], t[-1])
-    finish(ax, "time since the start of the scan [s]", label, title)
-    if len(values):
-        rows = -(-len(stream.names) // 6)
-        if rows <= 3:  # above the lines
-            low, high = ax.get_ylim()
-            ax.set_ylim(low, high + (high - low) * 0.08 * rows)
-        frame = {"frameon": rows > 3, "framealpha": 0.85, "edgecolor": "none"}
-        _legend(ax, **frame, ncols=min(6, len(stream.names)), loc="upper right")
-    return ax
-
-
 def draw_scan(observations: Sequence[Observation]) -> list[Sketch]:
-    """Track of the boresight about the centre of the first scan, tangent-plane offsets in arcmin or
-    deg, a line per scan, from at most 20 000 samples each.
-
-    Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
-    """
-    ax = new_axes(size=(5.7, 5.2 if len(observations) > 8 else 5.7))
-    tracks, axes = [], local_axes(*observations[0].centre)
-    for o in observations:
-        radec = o.boresight_radec[:: -(-o.n_samples // 20000)]
-        cosine, east, north = axes @ boresights(radec)
-        away = np.where(cosine > 0.1, cosine, np.nan)  # of the tangent plane
-        tracks.append(np.stack([east, north]) / away / ARCMIN)
-    known = np.concatenate(tracks, axis=1)
-    known = known[:, np.isfinite(known).all(axis=0)]
-    far = known.size > 0 and float(np.ptp(known, axis=1).max()) > 120
-    scale, unit = (60, "deg") if far else (1, "arcmin")
-    for k, (o, track) in enumerate(zip(observations, tracks, strict=True)):
-        width = 0.6 + 1.2 * (1 - (k + 1) / len(tracks))
-        ax.plot(*track / scale, linewidth=width, color=SEQUENCE[k % len(SEQUENCE)], label=o.name)
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.invert_xaxis()
-    finish(ax, f"RA offset [{unit}]", f"Dec offset [{unit}]", "Boresight track")
-    if len(tracks) <= 8:  # below the axes
+    """Track of the boresight about the centre of the first scan, a line per scan."""
+    many = len(observations) > 8
+    ax = new_axes(size=(5.7, 5.2 if many else 5.7))
+    draw_tracks(ax, observations)
+    if not many:  # below the axes
         ax.figure.subplots_adjust(bottom=0.2)
-        _legend(ax, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, frameon=False)
+        wide_legend(ax, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, frameon=False)
     text = "The boresight about the target, one line per scan."
     return [Sketch("scan", "Boresight track", text, ax)]
 
@@ -323,7 +268,7 @@ def draw_modes(modes: Modes, file: str, where: str) -> list[Sketch]:
     right.set_ylim(low, high + 0.12 * (high - low))
     up = f"mode / √rows [{unit}]" if unit else "mode / √rows"
     finish(right, f"time since the start of {modes.observation} [s]", up)
-    _legend(right, frameon=False, ncols=MODES, loc="upper right")
+    wide_legend(right, frameon=False, ncols=MODES, loc="upper right")
     what = f"{modes.detectors} detectors"
     what += f" at {modes.delays + 1} delays of {modes.delay:.3g} s" if modes.delays else ""
     shares = f"left, the share of the variance in each, mean of {scans(len(modes.values))}"

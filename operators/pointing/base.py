@@ -28,13 +28,14 @@ from zonda.core.types import Floats
 
 from .limits import LargestMotion, check_elevation, excess, what_fits, when_up
 from .motion import POINTS, LargestDerivative, Quantity, SamplesPerBeam, motion
-from .observed import centre_of, observed, report, state_times, transform_of
+from .observed import centre_of, observed, plot_step, report, state_times, transform_of
 from .sun_and_moon import distances
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant
     from zonda.core.data import Data, Observation
     from zonda.core.instrument import Instrument
+    from zonda.core.scene import Scene
 
 SCANS_LOOKED_AT, INSTANTS_LOOKED_AT = 12, 1 << 14
 """By `Pointing.check`: scans of a step, and instants of all of them."""
@@ -127,6 +128,10 @@ class Scans(Operator):
             *distances(made),
             *(f"{what}: {text}" for _, what, text in made[0].log if what.startswith(topics)),
         ]
+
+    def plot(self, scene: Scene, ax: Any = None) -> Any:
+        """Draw the scans of a scene, as `Observation.plot` does."""
+        return plot_step(self, scene, ax)
 
     def _rate(self, data: Data) -> float:
         """Read-out rate, Hz."""

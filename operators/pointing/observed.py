@@ -13,15 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.data import Observation
+from zonda.core.data import Data, Observation
 from zonda.core.flags import TURNAROUND
 from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.sphere import unit_vectors
+from zonda.core.plots import plot_scans
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target
     from zonda.core.configuration.time import Instant
+    from zonda.core.operator import Operator
     from zonda.core.scene import Scene
 
     from .limits import LargestMotion
@@ -37,6 +39,13 @@ def transform_of(
     """The celestial transformation of a scan; its error as a fraction of the smallest beam."""
     beam = float(scene.instrument.focalplane().fwhm.min())
     return CelestialTransform(scene.site, start, duration, interpolation_error * beam)
+
+
+def plot_step(pointing: Operator, scene: Scene, ax: Any) -> Any:
+    """Draw the scans that a pointing step alone makes of a scene (`plot_scans`)."""
+    data = Data(scene)
+    pointing.observe(data)
+    return plot_scans(data.observations, ax)
 
 
 def observed(

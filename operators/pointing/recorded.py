@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from zonda.core.types import Floats
 
 from .limits import check_elevation
 from .motion import SamplesPerBeam
-from .observed import centre_of, observed, report, state_times, transform_of
+from .observed import centre_of, observed, plot_step, report, state_times, transform_of
 from .recording import OUT_OF_ORDER, Comb, Recording, Scan, comb
 from .recording_files import Clock, read_recording
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from zonda.core.configuration.time import Instant
     from zonda.core.data import Data, Observation
+    from zonda.core.scene import Scene
 
 MOST_CHECKED = 100_000
 """Samples of a scan that `zonda check` looks at."""
@@ -111,6 +112,10 @@ class PointingRecorded(Operator):
         for what, number in found.counts.items():
             data.observations[first].log.count(self.label, what, number)
         report(self.label, data.observations[first:], sampled)
+
+    def plot(self, scene: Scene, ax: Any = None) -> Any:
+        """Draw the recorded scans, as `Observation.plot` does."""
+        return plot_step(self, scene, ax)
 
     def _read(self) -> tuple[Recording, Comb]:
         place = f"{self.label}, {self.file}"

@@ -33,9 +33,8 @@ def instrument(name: str, output: Path | None) -> None:
     NAME is a registered name (`zonda plugins`), or a YAML file that describes an instrument or a
     pipeline.
     """
+    from zonda.core.plots import focal_plane_figure, lines
     from zonda.core.storage.files import product_path
-
-    from .instrument_plots import focal_plane_figure, lines
 
     camera = _instrument(name)
     plane = camera.focalplane()

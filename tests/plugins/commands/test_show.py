@@ -11,8 +11,8 @@ from click.testing import CliRunner
 
 from zonda.core import cli
 from zonda.core.instrument import Instrument
+from zonda.core.plots import focal_plane_figure, lines, split_provenance
 from zonda.core.registry import instruments
-from zonda.plugins.commands.instrument_plots import focal_plane_figure, lines, split_provenance
 from zonda.plugins.commands.show import show
 
 

@@ -1,25 +1,28 @@
-"""Text and picture of ``zonda show instrument``: bands and sources of the numbers; the focal plane,
-and its middle with beams and polarization angles.
+"""Instruments as text; pictures of focal planes, passbands, scans and time streams.
+
+An `Instrument`, `Band` or `Observation` draws itself with these functions, whose arguments have no
+such types therefore: modules import each other one way.
 """
 
 from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zonda.core.canvas import SEQUENCE, new_figure
-from zonda.core.focalplane import Focalplane
-from zonda.core.instrument import Instrument
-from zonda.core.numerics.angles import angle_text
-from zonda.core.tables import aligned
-from zonda.core.types import Floats
+from .canvas import SEQUENCE, finish, new_figure, unit_of, wide_legend
+from .focalplane import Focalplane
+from .numerics.angles import ARCMIN, angle_text
+from .numerics.projection import boresights
+from .numerics.sphere import local_axes
+from .tables import aligned
+from .types import AnyFloats, Floats
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
 
 STAND_IN = "stand-in: "
 """Beginning of a part of `provenance` that names a number which is not published; parts end with a
@@ -28,7 +31,7 @@ HEAD = ("band", "GHz", "detectors", "FWHM", "NET [mK_RJ sqrt(s)]", "knee [Hz]", 
 WIDTH = 100
 
 
-def lines(instrument: Instrument, plane: Focalplane) -> list[str]:
+def lines(instrument: Any, plane: Focalplane) -> list[str]:
     """Text of an instrument: its bands, the sources of its numbers, and which are stand-ins."""
     telescope = instrument.telescope
     rows = [
@@ -70,7 +73,7 @@ def lines(instrument: Instrument, plane: Focalplane) -> list[str]:
     return found
 
 
-def split_provenance(instrument: Instrument) -> tuple[list[str], list[str]]:
+def split_provenance(instrument: Any) -> tuple[list[str], list[str]]:
     """Split sources of the numbers of an instrument and its bands from stand-ins."""
     bands = [
         (f"{name}: " if instrument.bands else "band: ", camera.band)
@@ -89,7 +92,7 @@ def split_provenance(instrument: Instrument) -> tuple[list[str], list[str]]:
     return [part for part in parts if not part.startswith(STAND_IN)], named
 
 
-def _detectors(instrument: Instrument, plane: Focalplane) -> str:
+def _detectors(instrument: Any, plane: Focalplane) -> str:
     how = f"{instrument.layout} layout"
     if instrument.focalplane_table is not None:
         how = f"from {instrument.focalplane_table.name}"
@@ -114,7 +117,7 @@ def _detectors(instrument: Instrument, plane: Focalplane) -> str:
     return ", ".join(filter(None, said))
 
 
-def _bands(instrument: Instrument, plane: Focalplane) -> list[str]:
+def _bands(instrument: Any, plane: Focalplane) -> list[str]:
     table = []
     for k, (name, camera) in enumerate(instrument.cameras.items()):
         rows = plane.of_band(k) if instrument.bands else plane
@@ -153,25 +156,31 @@ PLACES = 14
 """Places of pixels that the middle shows, at least; a beam more on either side."""
 
 
-def focal_plane_figure(instrument: Instrument, plane: Focalplane) -> Figure:
+def focal_plane_figure(instrument: Any, plane: Focalplane, notebook: bool = False) -> Figure:
     """Draw all detectors on the left, the middle on the right: circles are the FWHM to scale, ticks
-    the polarization angles.
+    the polarization angles. ``notebook``: in a figure of pyplot.
     """
     name = instrument.name if len(instrument.name) < 60 else f"{instrument.name[:57]}..."
     telescope = f"{instrument.telescope.name}, {instrument.telescope.diameter:g} m"
-    figure = new_figure(f"{name}: {len(plane)} detectors on {telescope}", (12.0, 6.4))
+    title = f"{name}: {len(plane)} detectors on {telescope}"
+    figure = new_figure(title, (12.0, 6.4), notebook)
     whole, middle = figure.subplots(1, 2)
-    largest = max(plane.radius + float(plane.fwhm.max()) / 2, 1e-9)
-    _draw(whole, instrument, plane, largest, (0.0, 0.0))
-    whole.legend(loc="upper right", frameon=True, fontsize=9, framealpha=0.8)
+    draw_focal_plane(whole, instrument, plane)
     centre, reach = _middle(plane)
     _draw(middle, instrument, plane, reach, centre, ticks=True)
-    outlined = ", wafers outlined" if _outlines(whole, plane, largest) else ""
-    whole.set_title(f"focal plane{outlined}", fontsize=10)
     inside = "inside a wafer" if len(np.unique(plane.wafer)) > 1 else "inside"
     angles = ", polarization angles" if plane.polarized else ""
     middle.set_title(f"{inside}: beams (FWHM) to scale{angles}", fontsize=10)
     return figure  # type: ignore[no-any-return]
+
+
+def draw_focal_plane(ax: Any, instrument: Any, plane: Focalplane) -> None:
+    """Draw all detectors, and the outlines of wafers."""
+    largest = max(plane.radius + float(plane.fwhm.max()) / 2, 1e-9)
+    _draw(ax, instrument, plane, largest, (0.0, 0.0))
+    ax.legend(loc="upper right", frameon=True, fontsize=9, framealpha=0.8)
+    outlined = ", wafers outlined" if _outlines(ax, plane, largest) else ""
+    ax.set_title(f"focal plane{outlined}", fontsize=10)
 
 
 def _middle(plane: Focalplane) -> tuple[tuple[float, float], float]:
@@ -190,7 +199,7 @@ def _middle(plane: Focalplane) -> tuple[tuple[float, float], float]:
 
 def _draw(
     ax: Any,
-    instrument: Instrument,
+    instrument: Any,
     plane: Focalplane,
     reach: float,
     centre: tuple[float, float],
@@ -271,3 +280,124 @@ def _unit(reach: float) -> tuple[float, str]:
     """rad of the unit for axes that reach so far, and its name."""
     least, name = next((least, name) for least, name in UNITS if reach >= least)
     return least or math.radians(1 / 3600), name
+
+
+def draw_passband(ax: Any, band: Any) -> None:
+    """Draw the relative transmission of a band over frequency, its centre, and its width about
+    it.
+    """
+    ghz, centre, half = band.frequency / 1e9, band.centre / 1e9, band.width / 2e9
+    spare = 0.15 * (ghz[-1] - ghz[0])
+    x = np.concatenate([[ghz[0] - spare, ghz[0]], ghz, [ghz[-1], ghz[-1] + spare]])
+    ax.plot(x, np.pad(band.transmission, 2), color=SEQUENCE[0], linewidth=1.4)
+    ax.axvline(
+        centre, color="black", linestyle=":", linewidth=1.0, label=f"centre {centre:.5g} GHz"
+    )
+    shade: dict[str, Any] = {"color": SEQUENCE[0], "alpha": 0.12, "linewidth": 0}
+    ax.axvspan(centre - half, centre + half, ymax=0.8, label=f"width {2 * half:.4g} GHz", **shade)
+    ax.set_xlim(x[0], x[-1])
+    ax.set_ylim(0, 1.25)
+    finish(ax, "frequency [GHz]", "relative transmission", band.name, loc="upper right")
+
+
+def draw_tracks(ax: Any, scans: Sequence[Any]) -> None:
+    """Draw the boresight about the centre of the first scan, tangent-plane offsets in arcmin or
+    deg, a line per scan, from at most 20 000 samples each.
+
+    Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
+    """
+    tracks, axes = [], local_axes(*scans[0].centre)
+    for o in scans:
+        cosine, east, north = axes @ boresights(o.boresight_radec[_thin(o)])
+        away = np.where(cosine > 0.1, cosine, np.nan)  # of the tangent plane
+        tracks.append(np.stack([east, north]) / away / ARCMIN)
+    known = np.concatenate(tracks, axis=1)
+    known = known[:, np.isfinite(known).all(axis=0)]
+    far = known.size > 0 and float(np.ptp(known, axis=1).max()) > 120
+    scale, unit = (60, "deg") if far else (1, "arcmin")
+    _lines(ax, scans, [track / scale for track in tracks])
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.invert_xaxis()
+    finish(ax, f"RA offset [{unit}]", f"Dec offset [{unit}]", "Boresight track")
+
+
+def plot_scans(scans: Sequence[Any], ax: Any = None) -> Any:
+    """Draw scans on the sky (`draw_tracks`), and beside it in azimuth and elevation; Axes of the
+    former. ``ax``: axes for that alone.
+    """
+    if ax is not None:
+        draw_tracks(ax, scans)
+        return ax
+    left, right = new_figure("", (11.0, 5.4), notebook=True).subplots(1, 2)
+    draw_tracks(left, scans)
+    tracks = []
+    for o in scans:
+        thin = _thin(o)
+        tracks.append(np.degrees([np.unwrap(o.azimuth[thin]), o.elevation[thin]]))
+    for track in tracks:  # all on the side of the first
+        track[0] -= 360 * round((track[0, 0] - tracks[0][0, 0]) / 360)
+    _lines(right, scans, tracks)
+    start = f"from {scans[0].start} at {scans[0].site.name}"
+    finish(right, "azimuth [deg]", "elevation [deg]", f"Azimuth and elevation\n{start}")
+    if len(scans) <= 8:
+        wide_legend(left, loc="best", frameon=False)
+    return left
+
+
+def _thin(scan: Any) -> slice:
+    return slice(None, None, -(-scan.n_samples // 20000))
+
+
+def _lines(ax: Any, scans: Sequence[Any], tracks: Sequence[AnyFloats]) -> None:
+    for k, (o, track) in enumerate(zip(scans, tracks, strict=True)):
+        width = 0.6 + 1.2 * (1 - (k + 1) / len(tracks))
+        ax.plot(*track, linewidth=width, color=SEQUENCE[k % len(SEQUENCE)], label=o.name)
+
+
+WORDS = {
+    "transmission": "relative change of the transmission",
+    "opacity": "change of the opacity",
+    "pwv": "change of the line-of-sight PWV",
+    "path_delay": "change of the path",
+}
+"""Streams that are no brightness."""
+
+
+def draw_stream(
+    ax: Any,
+    name: str,
+    kind: str,
+    seconds: Floats,
+    values: AnyFloats,
+    detectors: Sequence[str],
+    title: str,
+) -> None:
+    """Draw the stream ``name`` of a few detectors (n, n_samp) against time: samples pale, means
+    over one second dark. ``kind``: its unit (`core.stream.unit_of_stream`).
+    """
+    finite = values[np.isfinite(values)]
+    factor, unit = unit_of(float(np.abs(finite).max()) if finite.size else 1.0)
+    label = f"{name}, Rayleigh–Jeans [{unit}]"
+    if kind != "K_RJ":
+        factor, unit = (factor, f" [{unit.replace('K', 'm')}]") if kind == "m" else (1.0, "")
+        label = WORDS.get(name, name) + unit
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0  # they need not be even
+    width = max(1, round(1.0 / step)) if step > 0 else 1
+    whole = values.shape[1] // width * width
+    centres = seconds[:whole].reshape(-1, width).mean(axis=1)
+    for k, (detector, row) in enumerate(zip(detectors, values * factor, strict=True)):
+        colour = SEQUENCE[k % len(SEQUENCE)]
+        ax.plot(seconds, row, linewidth=0.4, alpha=0.2, color=colour)
+        means = row[:whole].reshape(-1, width).mean(axis=1)
+        ax.plot(centres, means, linewidth=0.9, color=colour, label=detector)
+    ax.margins(x=0)
+    if len(seconds) > 1:
+        ax.set_xlim(seconds[0], seconds[-1])
+    finish(ax, "time since the start of the scan [s]", label, title)
+    if len(values):
+        rows = -(-len(detectors) // 6)
+        if rows <= 3:  # above the lines
+            low, high = ax.get_ylim()
+            ax.set_ylim(low, high + (high - low) * 0.08 * rows)
+        frame = {"frameon": rows > 3, "framealpha": 0.85, "edgecolor": "none"}
+        wide_legend(ax, **frame, ncols=min(6, len(detectors)), loc="upper right")
