@@ -204,10 +204,11 @@ def read_array(path: Path) -> ArrayTable:
 
 @lru_cache(maxsize=4)
 def _read(path: Path, changed: int, size: int) -> ArrayTable:
-    from .storage.table_files import read_table  # most runs read no table
+    from .detector_files import read_detectors  # most runs read no table
+    from .storage.table_files import read_table
 
-    table = read_table(path)
-    notes = _rename(table)
+    table, notes = read_detectors(path) or (read_table(path), [])
+    notes += _rename(table)
     _check_columns(table)
     names = table.texts("name") if "name" in table.columns else []
     seen: dict[str, int] = {}

@@ -142,8 +142,9 @@ class Instrument(Parameters):
     wafers: int = Field(1, ge=1, le=1000)
     """Number of wafers, for `layout: wafers`."""
     focalplane_table: InputPath | None = Field(None, alias="focalplane")
-    """Table of detectors (ECSV or CSV) in place of a layout: columns `name`, `xi`, `eta`, and what
-    they have of their own. The number of detectors and the field of view follow from it."""
+    """Table of detectors in place of a layout: ECSV or CSV with columns `name`, `xi`, `eta`, and
+    what they have of their own; TOAST's focal plane (HDF5); or sotodlib's hardware (TOML). The
+    number of detectors and the field of view follow from it."""
     polarization: Literal["none", "pairs"] = "none"
     """`pairs`: each pixel has two detectors, A and B, polarized at right angles; A is at 0 and at
     45 deg in alternate pixels.

@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..band import SPEED_OF_LIGHT
 from ..errors import InputError
-from ..instrument import SPEED_OF_LIGHT
 from ..types import Floats
 
 if TYPE_CHECKING:
-    from ..instrument import Band
+    from ..band import Band
 
 PLANCK = 6.62607015e-34
 """J s (SI, exact)."""

@@ -61,6 +61,28 @@ def check_size(dataset: Any, place: str, *, whole: bool = True) -> None:
         check_memory(size, str(dataset.name), place)
 
 
+def read_columns(group: Any, name: str, place: str) -> Any:
+    """A table that astropy wrote into a group (`write_table_hdf5`), as a QTable.
+
+    Raises InputError for one that is larger than its file can hold, or whose header unfolds to more
+    values than any needs.
+    """
+    from astropy.io.misc.hdf5 import read_table_hdf5
+    from astropy.table import QTable
+
+    from .table_files import check_header
+
+    if name not in group:
+        raise KeyError(f"there is no table {group.name.rstrip('/')}/{name}")
+    header = group.get(f"{name}.__table_column_meta__")
+    for item in (group[name], header):
+        if item is not None:
+            check_size(item, place)
+    if header is not None:
+        check_header(b"\n".join(header[:]).decode())
+    return QTable(read_table_hdf5(group, path=name, character_as_bytes=False))
+
+
 def _check_chunks(dataset: Any, place: str) -> None:
     """Refuse chunks that unpack to more than they hold: libhdf5 unpacks whatever is stored, before
     it looks at the size.

@@ -251,8 +251,7 @@ def _ecsv(
 ) -> tuple[list[int], list[list[str]], list[tuple[str, str]], Mapping[str, Any]]:
     """Line numbers, rows (the heading first), names with units, and meta of an ECSV table."""
     header = [line[2:] for _, line in written if line.startswith("# ")]
-    if _unfolded(yaml.compose("\n".join(header)), {}) > MOST_VALUES:
-        raise ValueError(f"its aliases unfold to more than {MOST_VALUES} values")
+    check_header("\n".join(header))
     head = get_header_from_yaml(header)
     numbers, rows = _cells(body, str(head.get("delimiter", " ")))
     described = {column["name"]: str(column.get("unit", "")) for column in head["datatype"]}
@@ -278,6 +277,12 @@ def _plain_text(
             numbers, rows = [number, *numbers], [heading, *rows]
     found = [(word, BRACKETED.fullmatch(word)) for word in (rows[0] if rows else [])]
     return numbers, rows, [(m[1], m[2] or m[3] or "") if m else (word, "") for word, m in found]
+
+
+def check_header(text: str) -> None:
+    """Raise ValueError for YAML of more than `MOST_VALUES` values with its aliases expanded."""
+    if _unfolded(yaml.compose(text), {}) > MOST_VALUES:
+        raise ValueError(f"its aliases unfold to more than {MOST_VALUES} values")
 
 
 def _unfolded(node: Any, sizes: dict[int, float]) -> float:

@@ -22,7 +22,7 @@ from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.flags import INVALID, Flags
 from zonda.core.storage.files import reading, writing
-from zonda.core.storage.hdf5_files import Disk, check_size, checked
+from zonda.core.storage.hdf5_files import Disk, check_size, checked, read_columns
 from zonda.core.stream import UNITS
 from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
@@ -451,7 +451,7 @@ def _read(file: Any, place: str) -> TimeOrderedData:
 
     instrument, shared = file["instrument"], file["shared"]
     spans = file.get("intervals", {})
-    for dataset in (*shared.values(), *spans.values(), instrument["focalplane"]):
+    for dataset in (*shared.values(), *spans.values()):
         check_size(dataset, place)
     names = [str(d) for d in json.loads(file.attrs["observation_detectors"])]
     table, rows = _focalplane(instrument, names, place)
@@ -528,10 +528,7 @@ def offsets_of(table: Any, rows: NDArray[np.intp]) -> Floats | None:
 
 def _focalplane(instrument: Any, names: list[str], place: str) -> tuple[Any, NDArray[np.intp]]:
     """The table of detectors, and the rows of those that have data."""
-    from astropy.io.misc.hdf5 import read_table_hdf5
-    from astropy.table import QTable
-
-    table = QTable(read_table_hdf5(instrument, path="focalplane", character_as_bytes=False))
+    table = read_columns(instrument, "focalplane", place)
     every = [str(name) for name in np.asarray(table["name"]).astype(str)]
     order = {name: k for k, name in enumerate(every)}
     for what, of in ((names, "observation_detectors"), (every, "the focal plane")):

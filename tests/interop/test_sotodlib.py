@@ -239,3 +239,27 @@ def test_the_page_does_what_it_says(examples):
     np.testing.assert_allclose(
         names["signal"][same], ours.signal[same], rtol=0, atol=1e-6 * largest
     )
+
+
+def test_its_hardware_makes_cameras(tmp_path):
+    """`Hardware.dump` with the nominal bands; detectors as `sim_detectors_toast` writes them."""
+    from sotodlib.sim_hardware import sim_nominal
+
+    from zonda.core.array_table import read_array
+
+    hardware = sim_nominal()
+    gamma = np.radians([0.0, 90.0, 45.0, 135.0])
+    q = so3g.proj.quat.rotation_xieta(np.full(4, 0.01), np.full(4, -0.02), gamma)
+    for k, quat in enumerate(q):
+        of = {"wafer_slot": f"w{k // 2}", "band": ("SAT_f090", "SAT_f150")[k // 2], "fwhm": 30.0}
+        wxyz = [float(getattr(quat, letter)) for letter in "abcd"]
+        of |= {"quat": [*wxyz[1:], wxyz[0]], "gamma": float(np.degrees(gamma[k]))}
+        hardware.data["detectors"] = hardware.data.get("detectors", {}) | {f"d{k}": of}
+    hardware.dump(str(tmp_path / "hw.toml.gz"), compress=True)
+    found = read_array(tmp_path / "hw.toml.gz")
+    assert found.bands == ["f090", "f090", "f150", "f150"]
+    np.testing.assert_allclose(np.sin(np.arctan(found.reach)), np.hypot(0.01, 0.02), rtol=1e-12)
+    np.testing.assert_allclose(found.columns["xi"] / found.columns["eta"], -0.5, rtol=1e-12)
+    turned = np.exp(2j * (found.columns["polarization_angle"] - gamma))
+    np.testing.assert_allclose(turned, 1.0, rtol=0, atol=1e-12)
+    assert found.columns["wafer"].tolist() == [0, 0, 1, 1]

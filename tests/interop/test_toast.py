@@ -304,3 +304,44 @@ def test_published_layouts_are_those_that_toast_makes():
         np.testing.assert_allclose(
             np.sin(found.angle[own] - np.delete(gamma, pins)), 0, atol=1e-12
         )  # an axis, not a direction
+
+
+def test_its_focal_planes_make_cameras(tmp_path):
+    """`Focalplane.save_hdf5`: TOAST's own directions, angles and NETs are the camera's."""
+    import h5py
+    from toast.instrument_coords import quat_to_xieta
+    from toast.instrument_sim import fake_hexagon_focalplane
+
+    from zonda.core.array_table import read_array
+    from zonda.core.numerics.radiation import to_kelvin_rj
+
+    plane = fake_hexagon_focalplane(
+        n_pix=19,
+        width=6 * u.deg,
+        fwhm=10 * u.arcmin,
+        psd_net=300 * u.uK * u.s**0.5,
+        psd_fknee=50 * u.mHz,
+        sample_rate=50 * u.Hz,
+        bandcenter=150 * u.GHz,
+        bandwidth=40 * u.GHz,
+        epsilon=0.02,
+    )
+    with h5py.File(tmp_path / "plane.h5", "w") as file:
+        plane.save_hdf5(file)
+    found = read_array(tmp_path / "plane.h5")
+    theirs = plane.detector_data
+    xi, eta, gamma = quat_to_xieta(np.asarray(theirs["quat"]))  # sines
+    away = np.hypot(xi, eta)
+    tangent = np.tan(np.arcsin(away)) / np.where(away > 0, away, 1.0)
+    columns = found.columns
+    assert list(found.names) == list(theirs["name"])
+    np.testing.assert_allclose(columns["xi"], xi * tangent, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(columns["eta"], eta * tangent, rtol=0, atol=1e-12)
+    for angle in (gamma, theirs["gamma"].to_value("rad")):
+        turned = np.exp(2j * (columns["polarization_angle"] - angle))
+        np.testing.assert_allclose(turned, 1.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(columns["polarization_efficiency"], 0.98 / 1.02, rtol=1e-12)
+    band = zonda.Band(name="f150", low="130 GHz", high="170 GHz")
+    factor = to_kelvin_rj("K_CMB", band)
+    np.testing.assert_allclose(columns["net"], 300e-6 * factor, rtol=1e-9)
+    np.testing.assert_allclose(columns["knee"], 0.05, rtol=1e-12)

@@ -1,0 +1,219 @@
+"""Focal planes in files of others, as tables of detectors: HDF5 of TOAST (`Focalplane.save_hdf5`,
+or a whole observation) and TOML of sotodlib and s4sim (`Hardware.dump`).
+
+Both give each detector a quaternion, from the boresight's frame to the detector's. Their NETs are
+of the CMB's temperature: they become K_RJ with the mean of `cmb_slope` over the band that the file
+states, flat between its edges.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import InputError
+from .numerics.quaternions import directions
+from .numerics.radiation import cmb_slope
+from .storage.files import reading, unpacked_text
+from .storage.hdf5_files import opened, read_columns
+from .storage.table_files import LARGEST, Table
+
+HDF5 = b"\x89HDF\r\n\x1a\n"
+"""Begins every HDF5 file."""
+TOAST, HARDWARE = "a focal plane of TOAST", "hardware of sotodlib"
+TOAST_CURE = "write it with toast: focalplane.save_hdf5(h5py.File(path, 'w'))"
+HARDWARE_CURE = "write it with sotodlib: Hardware.dump(path), after detectors were simulated"
+UNITS = {
+    "fwhm": "rad",
+    "net": "K s(1/2)",
+    "knee": "Hz",
+    "pink_minimum_frequency": "Hz",
+    "slope": "",
+    "correction": "",
+    "centre": "Hz",
+    "width": "Hz",
+    "polarization_efficiency": "",
+    "pol_leakage": "",
+    "main_beam_efficiency": "",
+    "illumination_efficiency": "",
+}
+"""Numbers of detectors, and their units here."""
+OF_TOAST = {
+    "net": "psd_net",
+    "knee": "psd_fknee",
+    "pink_minimum_frequency": "psd_fmin",
+    "slope": "psd_alpha",
+    "correction": "net_corr",
+    "centre": "bandcenter",
+    "width": "bandwidth",
+    "polarization_efficiency": "pol_efficiency",
+}
+"""Names of columns in TOAST, in small letters, where they are not ours."""
+OF_HARDWARE = {
+    "fwhm": ("fwhm", np.pi / 180 / 60),
+    "net": ("NET", 1e-6),
+    "knee": ("fknee", 1e-3),
+    "pink_minimum_frequency": ("fmin", 1e-3),
+    "slope": ("alpha", 1.0),
+    "correction": ("NET_corr", 1.0),
+    "low": ("low", 1e9),
+    "high": ("high", 1e9),
+}
+"""Keys of a detector, or of its band, in arcmin, uK s(1/2), mHz and GHz."""
+STEEPEST = 3.0
+"""Largest slope of pink noise."""
+NO_ROTATION = 1e-6
+"""Least difference of a quaternion's square from 1 for which it is none."""
+
+
+def read_detectors(path: Path) -> tuple[Table, list[str]] | None:
+    """The detectors of a file of TOAST or sotodlib, and notes; None: it is neither.
+
+    Raises InputError for a file that cannot be read, and for a detector without a direction or with
+    a number that is none.
+    """
+    place = str(path)
+    with path.open("rb") as file:
+        begin = file.read(len(HDF5))
+    if begin == HDF5:
+        return _table(place, _of_toast(path, place))
+    return _of_hardware(path, place) if ".toml" in path.suffixes else None
+
+
+def _of_toast(path: Path, place: str) -> dict[str, Any]:
+    """Columns of a focal plane of TOAST, with ``quaternion``."""
+    with opened(path, place, TOAST, TOAST_CURE) as file:
+        found = read_columns(file.get("instrument", file), "focalplane", place)
+        there = {name.lower(): found[name] for name in found.colnames}
+        columns: dict[str, Any] = {"name": _texts(there["name"]), "quaternion": there["quat"]}
+        for own, unit in UNITS.items():
+            theirs = OF_TOAST.get(own, own)
+            if theirs in there and not (theirs == "pol_efficiency" and "pol_leakage" in there):
+                values = there[theirs]
+                columns[own] = values.to_value(unit) if unit else values
+        for theirs, own in {"band": "band", "wafer_number": "wafer", "wafer_slot": "wafer"}.items():
+            if theirs in there:
+                columns[own] = _texts(there[theirs])
+        if "tangent_xi" in there:  # a file of zonda, whose NET is in K_RJ
+            columns |= {"xi": there["tangent_xi"], "eta": there["tangent_eta"]}
+        if "centre" in columns:
+            centre, width = (np.array(columns.pop(key), float) for key in ("centre", "width"))
+            columns |= {"low": centre - width / 2, "high": centre + width / 2}
+            ghz = np.nan_to_num(centre / 1e9).round().astype(int).tolist()
+            if "band" not in columns and len(set(ghz)) > 1:
+                columns["band"] = [f"f{number:03d}" for number in ghz]
+    return columns
+
+
+def _texts(values: Any) -> list[str]:
+    return [str(value) for value in np.asarray(values).tolist()]
+
+
+def _of_hardware(path: Path, place: str) -> tuple[Table, list[str]]:
+    with reading(place, HARDWARE, HARDWARE_CURE):
+        found = tomllib.loads(unpacked_text(path, place, LARGEST))
+        if not found.get("detectors"):
+            raise KeyError("there are no detectors")
+        detectors, bands = dict(found["detectors"]), dict(found.get("bands", {}))
+    columns: dict[str, Any] = {key: [] for key in ("name", "band", "wafer", "quaternion")}
+    columns |= {key: [] for key in OF_HARDWARE}
+    for name, own in detectors.items():
+        with reading(f"{place}, detector {name}", HARDWARE, HARDWARE_CURE):
+            stated = {**bands.get(own["band"], {}), **own}
+            x, y, z, w = (float(value) for value in own["quat"])
+            numbers = [float(stated.get(key, np.nan)) for key, _ in OF_HARDWARE.values()]
+        wafer = own.get("wafer_slot", own.get("wafer", ""))
+        row = [name, str(own["band"]), str(wafer), (x, y, z, w), *numbers]
+        for column, value in zip(columns.values(), row, strict=True):
+            column.append(value)
+    for key, (_, unit) in OF_HARDWARE.items():
+        columns[key] = np.array(columns[key]) * unit
+        if np.isnan(columns[key]).all():
+            del columns[key]
+    return _table(place, columns)
+
+
+def _table(place: str, columns: dict[str, Any]) -> tuple[Table, list[str]]:
+    """The table of what was read: places and angles of the quaternions, NETs in K_RJ."""
+    notes = list[str]()
+    texts = {key: columns.pop(key) for key in ("name", "band", "wafer") if key in columns}
+    names = texts["name"]
+    with reading(place, "a focal plane", "write it again"):
+        numbers = {key: np.array(values, np.float64) for key, values in columns.items()}
+    shapes = dict.fromkeys(numbers, (len(names),)) | {"quaternion": (len(names), 4)}
+    wrong = [key for key, values in numbers.items() if values.shape != shapes[key]]
+    if wrong:
+        text = f"does not fit together: {', '.join(wrong)} for {len(names)} detectors"
+        raise InputError(text, place=place, cure="write it again")
+    if "low" in numbers:
+        sees = np.isfinite(numbers["low"]) & np.isfinite(numbers["high"])
+        numbers = {key: values[sees] for key, values in numbers.items()}
+        rows = np.flatnonzero(sees).tolist()
+        if dark := len(names) - len(rows):
+            notes.append(f"{dark} detectors without a band (dark ones) are left out")
+            texts = {key: [values[row] for row in rows] for key, values in texts.items()}
+    _check(place, texts["name"], numbers)
+    begins = {band.partition("_")[:2] for band in texts.get("band", [])}
+    if len(begins) == 1 and (begin := "".join(begins.pop())).endswith("_"):
+        texts["band"] = [band.removeprefix(begin) for band in texts["band"]]
+        notes.append(f"bands are called without {begin}")
+    q = numbers.pop("quaternion")
+    x, y, z = directions(q).T
+    found: dict[str, Any] = {"xi": -y / z, "eta": -x / z}
+    found["polarization_angle"] = 2 * np.arctan2(q[:, 2], q[:, 3]) % (2 * np.pi)
+    if "net" in numbers:
+        _convert_net(numbers, notes)
+    if "slope" in numbers:
+        if (numbers["slope"] > STEEPEST).any():
+            notes.append(f"slopes above {STEEPEST:g} are taken as {STEEPEST:g}")
+        white = numbers.get("knee", np.ones(1)) == 0  # TOAST's have slope 0, too
+        numbers["slope"] = np.where(white, 1.0, np.minimum(numbers["slope"], STEEPEST))
+    if "pink_minimum_frequency" in numbers:
+        numbers["pink_minimum_frequency"] = np.maximum(numbers["pink_minimum_frequency"], 1e-9)
+    found |= {key: v for key, v in numbers.items() if key not in ("low", "high", "correction")}
+    units = {"xi": "rad", "eta": "rad", "polarization_angle": "rad"} | UNITS
+    table = {key: (values, units.get(key, "")) for key, values in (texts | found).items()}
+    return Table(place, table, [0] * (len(texts["name"]) + 1)), notes
+
+
+def _check(place: str, names: list[str], numbers: Mapping[str, Any]) -> None:
+    """Raise InputError for no detectors, a number that is none, or a quaternion that is no rotation
+    of less than 90 deg.
+    """
+    cure = "mend the detector, or leave it out"
+    if not names:
+        raise InputError("has no detectors that see the sky", place=place, cure="write it again")
+    for key, values in numbers.items():
+        known = np.isfinite(values.reshape(len(names), -1)).all(axis=1)
+        for row in np.flatnonzero(~known)[:1]:
+            raise InputError(f"{key} of detector {names[row]} is no number", place=place, cure=cure)
+    q = numbers["quaternion"]
+    bad = (np.abs(np.sum(q**2, axis=1) - 1) > NO_ROTATION) | (directions(q)[:, 2] <= 0)
+    for row in np.flatnonzero(bad)[:1]:
+        text = f"the quaternion of detector {names[row]}, {q[row].tolist()}, is no rotation by less"
+        raise InputError(f"{text} than 90 deg", place=place, cure=cure)
+
+
+def _convert_net(numbers: dict[str, Any], notes: list[str]) -> None:
+    """Turn NETs from the CMB's temperature into K_RJ, those of a file of zonda excepted; without a
+    band there are none.
+
+    The correction for noise that detectors share is applied: noise here is independent, and maps
+    get the depth that the file's authors expect.
+    """
+    if "xi" in numbers:
+        return
+    if "low" not in numbers:
+        del numbers["net"]
+        notes.append("NETs are not used: without a band they cannot be turned into K_RJ")
+        return
+    x, weight = np.polynomial.legendre.leggauss(16)
+    low, high = numbers["low"][:, None], numbers["high"][:, None]
+    slope = cmb_slope(low + (high - low) * (1 + x) / 2) @ weight / 2
+    numbers["net"] = numbers["net"] * slope * numbers.get("correction", 1.0)
+    by = ", times NET_corr," if "correction" in numbers else ""
+    notes.append(f"NETs{by} are turned from K_CMB into K_RJ over the band of each detector")
