@@ -62,6 +62,7 @@ KINDS = {
     "m": Kind("a length", ("1.8 mm", "1 km"), ("m", "mm", "km"), 1e20),
     "m / s": Kind("a speed", ("10 m/s", "36 km/h"), ("m/s",), 1e15),
     "K": Kind("a temperature", ("150 mK", "270 K"), ("K", "mK", "uK"), 1e15),
+    "J": Kind("an energy k T", ("8 keV",), ("keV",), 1e15),
     "K s(1/2)": Kind(
         "a noise level",
         ("1.7 mK s(1/2)", "400 uK s(1/2)"),
@@ -273,6 +274,8 @@ MetresPerSecond = Annotated[float, Unit("m / s")]
 """m/s."""
 Kelvin = Annotated[float, Unit("K")]
 """K."""
+ThermalEnergy = Annotated[float, Unit("J")]
+"""J: k T of hot gas, written in keV."""
 KelvinRootSecond = Annotated[float, Unit("K s(1/2)")]
 """K s^(1/2): the rms of one second of integration."""
 Fraction = Annotated[float, Unit("")]

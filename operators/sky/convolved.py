@@ -26,7 +26,7 @@ from .input_map import ImageMap
 from .map_header import DOUBT, check_brightness, odd_pixels
 from .region import directions_on
 from .sampling import Chunks, Rows, pointing, sample
-from .sky_input import SkyInput
+from .sky_input import GAS, SkyInput
 
 if TYPE_CHECKING:
     from zonda.core.data import Data, Log, Observation
@@ -132,6 +132,8 @@ class Brightness:
         """
         header = exact_header(grid.wcs)
         header["BUNIT"], header["TEMPSCAL"], header["OPERATOR"] = "K", "K_RJ", label
+        if GAS in self.notes:
+            header["GASTEMP"] = self.notes[GAS]
         if self.resolution:
             header["BMAJ"] = header["BMIN"] = float(np.degrees(self.resolution))
         values = self.planes[0]
@@ -231,6 +233,7 @@ class ConvolvedSky(SkyInput):
         source, identity = self._input(observation.focalplane.polarized)
         band = observation.instrument.band
         key = (*identity, band.frequency.tobytes(), band.transmission.tobytes())
+        source = self._in_band(source, key, band)
         if isinstance(source, ImageMap):
             centre = self.centre.icrs() if isinstance(self.centre, Target) else None
             if self.centre == "target" or (centre is None and source.placeless):
@@ -387,8 +390,11 @@ class ConvolvedSky(SkyInput):
             for observation in whole.of_each_band():
                 grid = self.grid_of(observation)
                 found = conversion(grid, observation.instrument.band, self.spectral_index)
+                if (text := f"{GAS}: {grid.source.notes.get(GAS)}") not in lines and self.te:
+                    lines.append(text)
                 check_brightness(
-                    np.array([np.abs(source.values).max(initial=0.0)]) * found.typical * self.scale,
+                    np.abs(grid.source.values).max(initial=0.0, keepdims=True)
+                    * (found.typical * self.scale),
                     self.place,
                 )
         if not source.values.any() or not self.scale:

@@ -208,6 +208,10 @@ class InputMap:
         q_and_u = np.where(known, self.polarization[places], 0.0)
         return np.concatenate([intensity, turned_by(q_and_u, turn)])
 
+    def has_pixels_of(self, other: InputMap) -> bool:
+        """True if the pixels of an ``other`` map lie where those of this one do."""
+        raise NotImplementedError
+
     def sides_seen(self, observation: Observation) -> tuple[float, float]:
         """The shortest width and the longest side of pixels [rad] where an observation looks."""
         return float(self.sides.min()), float(self.sides.max())
@@ -241,6 +245,16 @@ class ImageMap(InputMap):
     @property
     def kind(self) -> str:
         return f"projection {', '.join(self.wcs.wcs.ctype)}"
+
+    def has_pixels_of(self, other: InputMap) -> bool:
+        """See `InputMap.has_pixels_of`; an image without a place has those of any of its size."""
+        if not isinstance(other, ImageMap) or other.shape != self.shape:
+            return False
+        rows, columns = (np.array([0.0, (n - 1) / 2, n - 1.0]) for n in self.shape)
+        at: Any = np.meshgrid(rows, columns, indexing="ij")
+        apart = np.linalg.norm(self.directions(at) - other.directions(at), axis=-1)
+        near = not (apart > 0.1 * self.sides.min()).any()  # NaN beyond the projection
+        return self.placeless or other.placeless or near
 
     @cached_property
     def grid(self) -> ImagePixels:
@@ -471,6 +485,13 @@ class HealpixMap(InputMap):
     @property
     def nbytes(self) -> int:
         return super().nbytes + (0 if self.pixels is None else self.pixels.nbytes)
+
+    def has_pixels_of(self, other: InputMap) -> bool:
+        if not isinstance(other, HealpixMap):
+            return False
+        own, others = ((m.nside, m.nest, m.frame, m.pixels is None) for m in (self, other))
+        listed = (np.zeros(0) if m.pixels is None else m.pixels for m in (self, other))
+        return own == others and np.array_equal(next(listed), next(listed))
 
     @property
     def kind(self) -> str:

@@ -10,11 +10,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from zonda.core.configuration.units import factor_to
 from zonda.core.errors import InputError
 from zonda.core.maps.beams import check_width, size_text
 from zonda.core.maps.header import SMALLEST_PIXEL, FileHeader
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
 from zonda.core.numerics.angles import ARCSEC, angle_text
+from zonda.core.numerics.radiation import BOLTZMANN
 from zonda.core.types import Floats
 
 from .input_map import InputMap
@@ -56,6 +58,8 @@ class Wanted:
         Of them: `SkyMap.polarization_convention`.
     column
         Of a HEALPix table, by name or counted from 1: the column of I.
+    temperature
+        True for a map of electron temperatures, in keV or K: it is read in J.
     header_alone
         True for a look at a large file: everything but its values is read and checked; they are
         zeros.
@@ -72,6 +76,7 @@ class Wanted:
     polarized: bool = False
     convention: Literal["cosmo", "iau"] | None = None
     column: int | str | None = None
+    temperature: bool = False
     header_alone: bool = False
 
 
@@ -97,6 +102,12 @@ class MapHeader(FileHeader):
         not that of I.
         """
         written, wanted = self.text(key), self.wanted.unit
+        if self.wanted.temperature:
+            for unit, joule in (("J", 1.0), ("K", BOLTZMANN)):
+                if written and (factor := factor_to(unit, written)):
+                    return "J", factor * joule
+            what = f"a map of electron temperatures is in keV or K, not '{written}'"
+            raise self.error(what, f"set the header key {key} to keV")
         if wanted is None and any(unit not in ("", written) for unit in others):
             units = ", ".join(unit or "(none)" for unit in (written, *others))
             raise self.error(

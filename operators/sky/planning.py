@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from zonda.core.data import Observation
 from zonda.core.instrument import Band
+from zonda.core.numerics.radiation import (
+    ELECTRON_REST_ENERGY,
+    HOTTEST_GAS,
+    sz_of_band,
+    sz_per_y,
+)
 from zonda.core.plan.bounds import (
     Bound,
     Choice,
@@ -26,6 +33,7 @@ from zonda.core.plan.planning import Knob, Planning
 
 from .convolved import conversion
 from .gridding import Grid, extremes
+from .sky_input import GAS
 from .skymap import SkyMap
 
 CUBIC = 3e-3
@@ -99,7 +107,7 @@ class SkyPlanning(Planning[SkyMap]):
             if step.beam != "gaussian":
                 fwhm, what = 0.0, "none"
         choices = (full(what), *self._without_beam(context, fwhm))
-        effects = (
+        effects: tuple[Effect, ...] = (
             Effect("beam convolution", choices, context.sky_error(1.0), "the sky's peak"),
             self._order(context, step.grid_of(o), fwhm),
             exact(
@@ -110,6 +118,14 @@ class SkyPlanning(Planning[SkyMap]):
             ),
             one_beam(context),
         )
+        if step.te is not None:
+            terms = sz_of_band(o.instrument.band)
+            hottest = HOTTEST_GAS if isinstance(step.te, Path) else step.te
+            last = terms[-1] * (hottest / ELECTRON_REST_ENERGY) ** (len(terms) - 1)
+            share = float(abs(last / sz_per_y(terms, hottest)))
+            text = "the series' last term over its sum, of the sky's peak"
+            what = f"to theta^5: {step.grid_of(o).source.notes[GAS]}"
+            effects += (exact("relativistic SZ", context.sky_error(share), text, what),)
         return Estimate(effects)
 
     def _without_beam(self, context: Context, fwhm: float) -> list[Choice]:

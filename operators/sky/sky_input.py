@@ -4,24 +4,28 @@ header alone, and the cache of what is computed of a map.
 
 from __future__ import annotations
 
+import re
 import threading
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, cast
 
-from pydantic import Field, PrivateAttr, model_validator
+import numpy as np
+from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 
 from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
-from zonda.core.configuration.units import Angle, Kelvin
+from zonda.core.configuration.units import Angle, Kelvin, ThermalEnergy, Unit
 from zonda.core.data import Data, percent
 from zonda.core.errors import InputError
 from zonda.core.hooks import manager
 from zonda.core.maps.map_reading import STOKES
 from zonda.core.numerics.projection import share_outside
+from zonda.core.numerics.radiation import HOTTEST_GAS, sz_of_band, sz_per_y
 from zonda.core.operator import Operator
 from zonda.core.storage.files import atomic_path
 from zonda.core.types import Floats
@@ -33,6 +37,9 @@ from .input_map import ImageMap, InputMap
 from .map_header import DOUBT, seen_twice
 from .read import read_map
 from .region import Progress, no_progress
+
+if TYPE_CHECKING:
+    from zonda.core.instrument import Band
 
 T = TypeVar("T")
 
@@ -74,6 +81,22 @@ class Cache:
         return Cache, (self._limit,)
 
 
+_A_QUANTITY = re.compile(r"[-+]?\.?\d[\d.eE+-]*\s*[a-zA-Z]*")
+GasTemperature = Annotated[
+    Annotated[ThermalEnergy, Field(ge=0, le=HOTTEST_GAS), Tag("value")]
+    | Annotated[InputPath, Tag("map")],
+    Discriminator(
+        lambda given: (
+            "map"
+            if isinstance(given, Path)
+            or (isinstance(given, str) and not _A_QUANTITY.fullmatch(given.strip()))
+            else "value"
+        )
+    ),
+]
+"""k T_e [J] of the gas of a map in y, or a FITS map of it."""
+GAS = "electron temperature"
+"""Key of the note about `SkyInput.te`."""
 LARGE = 1 << 26
 """Bytes of a file above which the progress bar shows that it is read."""
 
@@ -143,6 +166,10 @@ class SkyInput(Operator):
     """Slope of the flux density, S ~ frequency^index, within the band; for maps in Jy/pixel,
     Jy/beam and MJy/sr.
     """
+    te: GasTemperature | None = None
+    """Electron temperature k T_e of a map in y, up to 15 keV: a value (8 keV), or a FITS map in keV
+    on the pixels of the map, of the mean weighted by y. The thermal Sunyaev-Zel'dovich effect is
+    then relativistic (Itoh et al. 1998); default: non-relativistic, of cold gas."""
     pixels_per_fwhm: float = Field(PIXELS_PER_FWHM, ge=2, le=16)
     """Fewest points per FWHM between which the convolved map is interpolated; a finer input is used
     on its own pixels.
@@ -208,6 +235,55 @@ class SkyInput(Operator):
         key = (*self._identity(), *(["polarized"] if polarized else []))
         return self._cache.get(key, lambda: self.read_input(polarized)), key
 
+    def _in_band(self, source: InputMap, key: tuple[Hashable, ...], band: Band) -> InputMap:
+        """The map in K_RJ of the ``band`` where its gas has a temperature, otherwise as it is."""
+        if self.te is None:
+            return source
+        return self._cache.get((*key, "te"), lambda: self._of_hot_gas(source, band))
+
+    def _of_hot_gas(self, source: InputMap, band: Band) -> InputMap:
+        """A map in y times the relativistic thermal Sunyaev-Zel'dovich effect of its pixels' gas,
+        in K_RJ. Raises InputError if it is not in y.
+        """
+        if source.unit != "y":
+            message = f"te is for maps in y, and this one is in {source.unit}"
+            raise InputError(message, place=self.place, cure="remove te")
+        terms = sz_of_band(band)
+        if isinstance(self.te, Path):
+            weight, value = np.abs(source.values), self._temperatures(source, self.te)
+            mean = float(np.sum(value * weight) / max(weight.sum(), 1e-300))
+            factor, text = sz_per_y(terms, value), f"{self.te.name}, mean weighted by y "
+        else:
+            mean, text = cast(float, self.te), ""
+            factor = sz_per_y(terms, mean)
+        kev = Unit("J").write_in_unit_of(mean, "1 keV")
+        text += f"{kev}: {sz_per_y(terms, mean):.5g} K_RJ per y"
+        notes = source.notes | {GAS: f"{text} (cold gas {terms[0]:.5g})"}
+        q_and_u = None if source.polarization is None else source.polarization * factor
+        values = source.values * factor
+        return replace(source, values=values, polarization=q_and_u, unit="K_RJ", notes=notes)
+
+    def _temperatures(self, source: InputMap, path: Path) -> Floats:
+        """k T_e [J] of the pixels of ``source``.
+
+        Raises InputError for a map that cannot be read, of other pixels, or of temperatures that
+        `sz_terms` do not serve.
+        """
+        place = f"{self.label}, te {path}"
+        options = {name: getattr(self, name) for name in ("missing", "pixel_size", "coordsys")}
+        found = read_map(path, centred=self.centre is not None, temperature=True, **options)
+        if not source.has_pixels_of(found):
+            message = f"it has other pixels than {self.source}"
+            raise InputError(message, place=place, cure="give both maps on the same pixels")
+        low, high = (float(end(found.values, initial=0.0)) for end in (np.min, np.max))
+        if low < 0 or high > HOTTEST_GAS * (1 + 1e-6):  # float32 of 15 keV is served
+            ends = (Unit("J").write_in_unit_of(end, "1 keV") for end in (low, high))
+            message = (
+                f"its values are {' to '.join(ends)}; the relativistic series serves 0 to 15 keV"
+            )
+            raise InputError(message, place=place, cure="correct them, or the header's unit")
+        return found.values
+
     def read_input(self, polarized: bool = False, header_alone: bool = False) -> InputMap:
         """The map of the file or the array, with Q and U if the camera is ``polarized``; warns of
         what is doubtful.
@@ -263,10 +339,11 @@ class SkyInput(Operator):
 
     def _identity(self) -> tuple[Hashable, ...]:
         """Key of the map: an array's hash, a file's size and time of change."""
+        gas = self.te.stat().st_mtime_ns if isinstance(self.te, Path) else 0
         if (array := self.array()) is not None:
-            return ("array", array.digest)
+            return ("array", array.digest, gas)
         assert self.file is not None  # one of the two is given
-        return ("file", self._bytes and self.file.stat().st_mtime_ns, self._bytes)
+        return ("file", self._bytes and self.file.stat().st_mtime_ns, self._bytes, gas)
 
     def _header(self) -> InputMap:
         """The map without its values."""

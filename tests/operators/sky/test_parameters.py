@@ -58,7 +58,7 @@ STEPS = (
     ),
     Step(
         "SkyMap",
-        ignored=({"beam": "none", "fwhm": "9 arcsec"},),
+        ignored=({"beam": "none", "fwhm": "9 arcsec"}, {"te": "8 keV"}),
         changes={
             "file": ({}, {"file": "flux.fits"}),
             "map": (ARRAY, {"map": 2 * ARRAY["map"]}),
@@ -85,6 +85,7 @@ STEPS = (
             "scale": ({}, {"scale": 2.0}),
             "spectral_index": ({"file": "flux.fits"}, {"spectral_index": 3.0}),
             "pixels_per_fwhm": ({}, {"pixels_per_fwhm": 8.0}),
+            "te": ({"unit": "y"}, {"te": "8 keV"}),
             "interpolation": ({}, {"interpolation": "linear"}),
         },
         refused={"missing": "NaN"},

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from zonda.core.data import Data
 from zonda.core.errors import InputError, ZondaError
-from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.numerics.radiation import BOLTZMANN, sz_of_band, sz_per_y, to_kelvin_rj
 from zonda.operators.sky.skymap import InputImage, SkyMap
 
 ARCSEC = np.pi / 648000
@@ -406,6 +406,64 @@ def test_spectral_index(made, save):
     np.testing.assert_allclose(
         got, to_kelvin_rj("MJy/sr", made.BAND, spectral_index=3.5), rtol=1e-6
     )
+
+
+@pytest.mark.parametrize("projection", ["TAN", "SIN"])
+def test_each_pixel_has_the_spectrum_of_its_own_temperature(made, save, projection):
+    header = made.tan_header((150, 150), unit="y")
+    header["CTYPE1"], header["CTYPE2"] = f"RA---{projection}", f"DEC--{projection}"
+    y = save(np.full((150, 150), 2e-4), header)
+    kev = np.where(np.arange(150) < 75, 12.0, 3.0) * np.ones((150, 1))
+    header["BUNIT"] = "keV"
+    te = save(kev, header, name="te.fits")
+    cold = 2e-4 * to_kelvin_rj("y", made.BAND)
+    for side, value in ((40 * ARCSEC, 12.0), (-40 * ARCSEC, 3.0)):  # east is the first half
+        scan, _, _ = stare(made, 75.0 + np.degrees(side) / np.cos(np.radians(20)), 20.0, n=20)
+        want = 2e-4 * sz_per_y(sz_of_band(made.BAND), value * 1.602176634e-16)
+        assert abs(want / cold - 1) > 0.01
+        for gas in (te, f"{value} keV"):
+            got = made.look(SkyMap(file=y, te=gas), scan)
+            np.testing.assert_allclose(got, want, rtol=1e-5)
+            stated = next(text for _, what, text in scan.log if what == "electron temperature")
+            assert f"(cold gas {cold / 2e-4:.5g})" in stated
+        assert stated.startswith(f"{value:g} keV: {want / 2e-4:.5g} K_RJ per y")
+
+
+def test_temperatures_that_do_not_fit_are_refused(made, save):
+    header = made.tan_header((20, 20), unit="y")
+    y, scan = save(np.ones((20, 20)), header), stare(made, 75.0, 20.0, n=5)[0]
+
+    def refused(step, message):
+        with pytest.raises(InputError, match=message):
+            step.prepare(scan)
+
+    def hdr(**cards):
+        return fits.Header((dict(header) | {"BUNIT": "keV"} | cards).items())
+
+    refused(SkyMap(file=y, te=save(np.ones((20, 21)), hdr(), "a.fits")), "other pixels")
+    refused(SkyMap(file=y, te=save(np.ones((20, 20)), hdr(CRVAL2=20.01), "b.fits")), "other pixels")
+    refused(SkyMap(file=y, te=save(np.full((20, 20), 16.0), hdr(), "c.fits")), "0 keV to 16 keV")
+    refused(SkyMap(file=y, te=save(np.full((20, 20), -1.0), hdr(), "d.fits")), "-1 keV")
+    refused(SkyMap(file=y, te=save(np.ones((20, 20)), hdr(BUNIT="Jy"), "e.fits")), "keV or K")
+    refused(SkyMap(file=y, te=save(np.full((20, 20), np.nan), hdr(), "f.fits")), "NaN")
+    refused(SkyMap(file=y, unit="K_RJ", te="5 keV"), "te is for maps in y")
+    with pytest.raises(ZondaError, match="at most 15 keV"):
+        SkyMap(file=y, te="15.1 keV")
+
+
+def test_temperatures_in_kelvin_on_healpix(made, tmp_path):
+    import healpy
+
+    y, te = (tmp_path / name for name in ("y.fits", "te.fits"))
+    healpy.write_map(y, np.full(12 * 64**2, 1e-4), column_units="y", coord="C", dtype=float)
+    kelvin = np.full(12 * 64**2, 8 * 1.602176634e-16 / BOLTZMANN)
+    healpy.write_map(te, kelvin, column_units="K", coord="C", dtype=float)
+    scan, _, _ = stare(made, 75.0, 20.0, n=20, fwhm=7200.0)
+    got = made.look(SkyMap(file=y, te=te), scan)
+    np.testing.assert_allclose(got, made.look(SkyMap(file=y, te="8 keV"), scan), rtol=1e-6)
+    healpy.write_map(te, kelvin, column_units="K", coord="G", dtype=float, overwrite=True)
+    with pytest.raises(InputError, match="other pixels"):
+        SkyMap(file=y, te=te).prepare(scan)
 
 
 def test_jansky_per_pixel_keeps_the_flux_off_axis(made, save):
