@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ from .assembly import arguments
 from .assembly.chain import Chain
 from .assembly.order import check_order
 from .assembly.signals import Signals, acting_steps, note_signals, remainder
+from .configuration.input_paths import paths_in
 from .data import Data
 from .errors import PipelineError
 from .faults import faults_named
@@ -29,6 +31,7 @@ from .run.views import Band, View
 from .scene import Scene, WithScene
 from .signal import Signal, stream_of
 from .storage.files import check_output_folder
+from .storage.written import recording
 from .tables import html_table
 from .versions import versions
 
@@ -164,16 +167,19 @@ class Pipeline:
             provenance,
         )
         self.signals.check_kept(keep)
-        if data.output is not None:
-            check_output_folder(data.output)
-        hooks, timer = manager().hook, Timer()
-        hooks.zonda_pipeline_start(pipeline=self, data=data)
-        for operator in self.operators:
-            timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
-        bands = self._bands(data, keep)
-        self._observe(data, bands, timer)
-        self._execute(bands, settings, timer)
-        self._finish(data, bands, timer)
+        with contextlib.ExitStack() as stack:
+            if data.output is not None:
+                check_output_folder(data.output)
+                inputs = paths_in([scene, *self.operators])
+                stack.enter_context(recording(data.output, anew=True, inputs=inputs))
+            hooks, timer = manager().hook, Timer()
+            hooks.zonda_pipeline_start(pipeline=self, data=data)
+            for operator in self.operators:
+                timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
+            bands = self._bands(data, keep)
+            self._observe(data, bands, timer)
+            self._execute(bands, settings, timer)
+            self._finish(data, bands, timer)
         return data
 
     def _bands(self, data: Data, keep: Sequence[str] = ()) -> list[Band]:

@@ -43,7 +43,7 @@ operators:
 """
 SCAN = 217 * 200 * 8
 """Bytes of a scan's signal: MUSTANG-2's detectors, 2 s at 100 Hz, float64."""
-INPUTS = {"p.yaml", "map.fits", "small.yaml"}
+INPUTS = {"p.yaml", "map.fits", "small.yaml", "zonda-files.jsonl"}
 ZONDA = [sys.executable, "-m", "zonda"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 

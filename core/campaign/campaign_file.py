@@ -36,6 +36,9 @@ TASKS = "tasks"
 RECORD = "tasks.npz"
 """Record of the tasks of a set of products that is written."""
 
+ENTRIES = "entries"
+"""Folder of the time streams of each entry."""
+
 INPUTS = "inputs"
 """Folder of arrays that were given in Python."""
 

@@ -8,6 +8,7 @@ status` alone.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -21,9 +22,14 @@ from typing import Any
 from ..errors import InputError, OutputError, ZondaError
 from ..storage.files import discard, put, temporary_sibling, write_text, writing
 from . import machines, trees
-from .campaign_file import FILE, RECORD, TASKS, Job, OtherFormat, Say, Task, plural
+from .campaign_file import ENTRIES, FILE, INPUTS, RECORD, TASKS, Job, OtherFormat, Say, Task, plural
 
 RESOLVED = "resolved.yaml"
+
+TASK_FILE = re.compile(
+    r"\d{6}\.(npz|failed)|layout-\d{4}\.npz|at-work.*\.json|\..*\.\d+-[0-9a-f]{8}\.part.*"
+)
+"""Names of files in the folder of tasks."""
 
 PART = re.compile(r"\.\d+-[0-9a-f]{8}\.part")
 """In the names of `temporary_sibling`."""
@@ -39,6 +45,34 @@ def check_free(folder: Path) -> None:
         )
 
 
+def check_links(folder: Path, job: Job | None = None) -> None:
+    """Raise `OutputError` where a folder of the campaign, inside its output folder, is a link to
+    another one.
+    """
+    names = [TASKS, ENTRIES, INPUTS]
+    if job is not None:
+        names += [combination.folder for combination in job.combinations]
+        names += [f"{ENTRIES}/{k:06d}" for k in range(len(job.entries))]
+    root = folder.resolve()
+    for name in names:
+        if (root / name).resolve() != root / name:
+            raise OutputError(
+                "is reached through a link, and what it leads to may be somebody else's",
+                place=str(folder / name),
+                cure="remove the link, or choose another output folder",
+            )
+
+
+def _remove_tasks(folder: Path) -> None:
+    """Remove the files of tasks, and their folder unless it holds others."""
+    check_links(folder)
+    for path in (folder / TASKS).glob("*"):
+        if TASK_FILE.fullmatch(path.name):
+            discard(path)
+    with contextlib.suppress(OSError):
+        (folder / TASKS).rmdir()
+
+
 def make_way(folder: Path, job: Job | None = None) -> None:
     """Delete the files of an earlier campaign except its products, and the task records that
     ``job`` will write anew. The caller holds the folder's lock.
@@ -47,7 +81,7 @@ def make_way(folder: Path, job: Job | None = None) -> None:
     for old in (folder / FILE, folder / RECORD, *records):
         old.unlink(missing_ok=True)
     if job is None:
-        shutil.rmtree(folder / TASKS, ignore_errors=True)
+        _remove_tasks(folder)
 
 
 def finished(folder: Path) -> bool:
@@ -216,7 +250,7 @@ class Record:
     def finish(self) -> None:
         """Remove the folder of partial products: all combinations are written."""
         if not self.job.keep_tasks:
-            shutil.rmtree(self.folder / TASKS, ignore_errors=True)
+            _remove_tasks(self.folder)
 
     def discard_partials(self, number: int) -> None:
         """Remove the partial products of a combination."""

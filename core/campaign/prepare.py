@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..configuration.input_paths import paths_in
 from ..errors import InputError, within
 from ..experiment.variant import FileVariant
 from ..scene import WithScene
@@ -374,7 +373,7 @@ def _inputs(file: PipelineFile, folder: Path) -> dict[str, str]:
     """
     own, root = [Path(file.place).resolve()] if Path(file.place).is_file() else [], folder.resolve()
     arrays = root / INPUTS
-    inputs = [path for path in paths_in([file.scene(), *file.operators]) if path.is_file()]
+    inputs = file.inputs
     stamps = {str(p): _stamp(p, "file") for p in inputs if not p.is_relative_to(arrays)}
     stamps |= {
         str(p.relative_to(root)): _stamp(p, "bytes") for p in inputs if p.is_relative_to(arrays)

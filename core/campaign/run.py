@@ -8,6 +8,7 @@ from pathlib import Path
 from .. import hooks
 from ..errors import InputError, OutputError, PipelineError, ZondaError
 from ..experiment.engines import Pool, share_out
+from ..storage import written
 from ..storage.files import check_output_folder
 from . import table, trees
 from .campaign_file import FILE, Job, Say, Task, digest_of_text, layout_path, plural
@@ -15,6 +16,7 @@ from .folder import (
     RESOLVED,
     Record,
     check_free,
+    check_links,
     clean,
     make_way,
     publish,
@@ -46,7 +48,9 @@ def begin(
     """
     check_output_folder(folder)
     check_free(folder)
-    if (folder / RESOLVED).exists() and not (folder / FILE).exists():
+    check_links(folder)
+    old = written.earlier(folder, [path for source in sources for path in _read_by(source)])
+    if (folder / RESOLVED).exists() and not (old or (folder / FILE).exists()):
         say(
             f"{folder} holds products of an earlier run: those of the same names are replaced,"
             " others stay"
@@ -59,9 +63,14 @@ def begin(
         make_way(folder)  # of the layouts of a campaign that does not begin
         raise
     _describe(made, folder, say)
+    check_links(folder, made)
     make_way(folder, made)
-    write_sources(made, folder)
+    if old:
+        say(f"{folder}: {plural(len(old), 'file')} of an earlier run removed")
+    written.clear(folder, old)
     made.write(folder)
+    with written.recording(folder, anew=False):
+        write_sources(made, folder)
     record = Record(made, folder)
     return _work(record, pool, _watch(record, made.same_machine, say), made.tasks)
 
@@ -87,6 +96,7 @@ def resume(
         ``anyway``).
     """
     job = Job.read(folder)
+    check_links(folder, job)
     strict = job.same_machine if same_machine is None else same_machine
     check_unchanged(job, folder, anyway)
     share_out(pool, job.need, job.name)
@@ -118,10 +128,20 @@ def share(
     from zonda import __version__
 
     check_output_folder(folder)
+    check_links(folder)
     if not (folder / FILE).exists():
+        old = written.earlier(folder)
+        if old and not (folder / FILE).exists():  # nor did another job begin in between
+            raise OutputError(
+                f"holds {plural(len(old), 'file')} of an earlier run",
+                place=str(folder),
+                cure="remove them, or choose another output folder",
+            )
         made = prepare(sources, folder, command, pruning, _progress())
-        write_sources(made, folder)
+        check_links(folder, made)
         publish(made, folder)
+        with written.recording(folder, anew=False):
+            write_sources(made, folder)
     job = Job.read(folder)
     if (
         job.source != tuple(s.file.resolved_yaml(folder) for s in sources)
@@ -177,7 +197,8 @@ def _work(record: Record, pool: Pool, watch: Watch, tasks: Sequence[Task]) -> Ca
         _tell(result, watch.say)
     incomplete = {task.combination for task in job.tasks if task.number not in record.done}
     ready = [n for n in range(len(job.combinations)) if n not in incomplete | set(record.combined)]
-    Combinations(record, result, pool).carry_out(ready)
+    with written.recording(folder, anew=False):
+        Combinations(record, result, pool).carry_out(ready)
     clean(folder)  # of workers that were killed while they wrote
     _fail(result, len(job.tasks))
     if missing := len(job.tasks) - len(record.done):
@@ -185,9 +206,15 @@ def _work(record: Record, pool: Pool, watch: Watch, tasks: Sequence[Task]) -> Ca
             f"{missing} tasks were not run", place=str(folder), cure=f"zonda resume {folder}"
         )
     if job.figures:
-        table.write(record)
+        with written.recording(folder, anew=False):
+            table.write(record)
     record.finish()
     return result
+
+
+def _read_by(source: CampaignFile) -> list[Path]:
+    """Pipeline file and input files of a campaign."""
+    return [Path(source.file.place), *source.file.inputs]
 
 
 def _progress() -> Callable[[int, int, str], None]:

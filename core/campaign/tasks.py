@@ -33,8 +33,9 @@ from ..faults import faults_named
 from ..figures import Figures
 from ..pipeline import Part
 from ..storage.files import check_output_folder, discard
+from ..storage.written import recording
 from . import machines, trees
-from .campaign_file import Job, PlannedEntry, Task, layout_path, plural
+from .campaign_file import ENTRIES, Job, PlannedEntry, Task, layout_path, plural
 from .folder import Record, clean
 from .machines import Watch
 from .partial import NotCombined, Partial
@@ -125,14 +126,15 @@ def _run(order: Order, host: str, begin: float) -> tuple[float, str]:
     variant = Variant(file.pipeline(), order.entry.scene(file))
     layouts = layouts_in(layout_path(folder, task.combination), order.layout)
     part = Part(task.scans, layouts, f"{task.entry:06d}-")
-    data = variant.run(
-        operators=variant.pipeline.operators,
-        part=part,
-        output=folder / "entries" / f"{task.entry:06d}",  # the time streams of one entry together
-        threads=order.threads,
-        ceiling=order.memory,
-        provenance={"resolved_yaml": order.pipeline},
-    )
+    with recording(folder, anew=False):
+        data = variant.run(
+            operators=variant.pipeline.operators,
+            part=part,
+            output=folder / ENTRIES / f"{task.entry:06d}",  # the time streams of one entry together
+            threads=order.threads,
+            ceiling=order.memory,
+            provenance={"resolved_yaml": order.pipeline},
+        )
     partial = Partial.of(data, task.before, part.prefix)
     seconds, machine = time.monotonic() - begin, machines.here()
     made = {"host": host, "seconds": seconds, "machine": machine}
@@ -213,7 +215,8 @@ def combined(job: Job, folder: Path, number: int) -> Data:
     whole = _sum(tasks, folder, 0, depth)
     data.partial, data.log = whole.products, whole.log
     data.observations = whole.observations(scene)
-    pipeline.finish(data)
+    with recording(folder, anew=False):
+        pipeline.finish(data)
     return data
 
 

@@ -115,6 +115,7 @@ def _run_one(request: RunRequest, file: PipelineFile) -> None:
     from ..plan.planner import for_run
     from ..storage.files import check_output_folder, write_text
     from ..storage.lock import lock
+    from ..storage.written import recording
 
     pipeline, settings = request.pipelines[0], request.settings
     if request.only and request.verify:
@@ -128,6 +129,8 @@ def _run_one(request: RunRequest, file: PipelineFile) -> None:
     folder = file.output if request.output is None else request.output
     check_output_folder(folder)  # before anything is worked out
     click.get_current_context().with_resource(lock(folder))
+    read = [Path(file.place), *file.inputs]
+    click.get_current_context().with_resource(recording(folder, anew=True, inputs=read))
     campaign_there = (folder / "campaign.json").exists()
     if campaign_there:
         from ..campaign.folder import check_free, make_way

@@ -22,6 +22,7 @@ from ..signal import Signal
 from ..variants import is_variant, written
 from . import yaml_places
 from .diagnostics import ConfigurationError, Diagnostic, refused
+from .input_paths import paths_in
 from .parameters import Parameters, quantity
 from .units import Fraction, Kelvin
 from .yaml_places import Document
@@ -177,6 +178,11 @@ class PipelineFile:
         """Folder for products."""
         assert self.header.outputs is not None  # filled in by `parse`
         return self.header.outputs
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Input files that it names, those that are there."""
+        return [p for p in paths_in([self.scene(), *self.operators]) if p.is_file()]
 
     def scene(self) -> Scene:
         """Scene of the file: site, instrument, time, target, seed."""

@@ -49,6 +49,9 @@ _CURES = {
 MOST_AT_ONCE = 4
 """Files that are written at a time."""
 
+RECORDS: list[Any] = []
+"""Records (`written.Record`) of the output folders of runs at work."""
+
 
 def output_error(error: OSError, path: str | os.PathLike[str]) -> OutputError:
     """The `OutputError` that tells the user what an operating-system error on ``path`` means and
@@ -342,6 +345,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
             yield temporary
             _synchronize(temporary)
+            for record in tuple(RECORDS):
+                record.add(path, temporary)
             os.replace(temporary, path)
     except BaseException:
         discard(temporary)

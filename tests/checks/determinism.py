@@ -57,8 +57,8 @@ def interrupted() -> Measured:
         except KeyboardInterrupt:
             left = [p for p in again.rglob("*") if p.is_file()]
         Pipeline([*steps(), save]).run(scene(camera(37)), threads=1, output=again)
-        files = sorted(p.relative_to(whole) for p in whole.rglob("*") if p.is_file())
-        wrong = len(left) + abs(len(files) - len([p for p in again.rglob("*") if p.is_file()]))
+        files = sorted(p.relative_to(whole) for p in whole.rglob("*.fits"))
+        wrong = len(left) + abs(len(files) - len(list(again.rglob("*.fits"))))
         for path in files:
             one, other = ((root / path).read_bytes() for root in (whole, again))
             a, b = (np.frombuffer(x, np.uint8)[: min(len(one), len(other))] for x in (one, other))

@@ -53,7 +53,14 @@ def states(folder):
 
 def test_products(undisturbed):
     names = {p.name for p in undisturbed.iterdir()}
-    assert names == {"campaign.json", "tasks.npz", "map.fits", "noise_map.fits", "resolved.yaml"}
+    assert names == {
+        "zonda-files.jsonl",
+        "campaign.json",
+        "tasks.npz",
+        "map.fits",
+        "noise_map.fits",
+        "resolved.yaml",
+    }
     from astropy.io import fits
 
     with fits.open(undisturbed / "map.fits") as file:
@@ -282,12 +289,29 @@ def test_a_campaign_into_the_folder_of_a_plain_run_says_so(undisturbed, bench, c
     (out / "of-mine.txt").write_text("")
     capsys.readouterr()
     assert bench.command("run", bench.file(bench.CAMPAIGN), "--output", out, *SERIAL) == 0
-    assert (
-        f"{out} holds products of an earlier run: those of the same names are replaced, others stay"
-        in capsys.readouterr().err
-    )
+    assert f"{out}: 3 files of an earlier run removed" in capsys.readouterr().err
     assert bench.planes(out) == bench.planes(undisturbed)
     assert (out / "of-mine.txt").exists()
+
+
+@pytest.mark.parametrize("name", ["tasks", "entries"])
+def test_a_folder_of_a_campaign_that_is_a_link_is_refused(bench, capsys, tmp_path, name):
+    out, other = bench.new(), tmp_path / "of-others"
+    out.mkdir()
+    other.mkdir()
+    (other / "000000.npz").write_text("precious")
+    (out / name).symlink_to(other)
+    assert bench.command("run", bench.file(bench.CAMPAIGN), "--output", out, *SERIAL) == 2
+    assert f"error: {out / name}: is reached through a link" in capsys.readouterr().err
+    assert [p.name for p in other.iterdir()] == ["000000.npz"]
+
+
+def test_files_of_others_in_a_folder_called_tasks_stay(bench):
+    out = bench.new()
+    (out / "tasks").mkdir(parents=True)
+    (out / "tasks" / "notes.txt").write_text("precious")
+    assert bench.command("run", bench.file(bench.CAMPAIGN), "--output", out, *SERIAL) == 0
+    assert [p.name for p in (out / "tasks").iterdir()] == ["notes.txt"]
 
 
 @pytest.mark.nightly

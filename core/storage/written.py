@@ -1,0 +1,164 @@
+"""Record of the files that runs write into an output folder: a later run removes those of an
+earlier one, and no other file.
+
+`zonda-files.jsonl` holds a line of JSON for each file: its path in the folder, its size and its
+time of change. The line is written before the file gets its name: a run that is killed leaves no
+product that the next one does not know.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import stat
+import threading
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from ..errors import OutputError
+from . import files
+
+NAME = "zonda-files.jsonl"
+LONGEST = 64_000_000
+"""Bytes of a record that are read."""
+
+Stamp = tuple[int, int]
+"""Size [bytes] and time of change [ns] of a file."""
+
+
+def earlier(folder: Path, inputs: Iterable[Path] = ()) -> list[Path]:
+    """Files of earlier runs in an output folder, without the ``inputs`` of this one.
+
+    Raises
+    ------
+    OutputError
+        One of them was changed since, or the record is no regular file.
+    """
+    root, kept = folder.resolve(), {os.path.realpath(path) for path in inputs}
+    found = []
+    for name, stamps in _read(folder).items():
+        path = root / name
+        if os.path.realpath(path.parent) != str(path.parent) or str(path) in kept:
+            continue  # behind a link, or read by this run
+        try:
+            about = os.lstat(path)
+        except OSError:
+            continue  # removed since
+        if not stat.S_ISREG(about.st_mode) or (about.st_size, about.st_mtime_ns) not in stamps:
+            raise OutputError(
+                "was changed after the run that wrote it, and this run would replace or remove it",
+                place=str(folder / name),
+                cure="move or remove it, or choose another output folder",
+            )
+        found.append(path)
+    return found
+
+
+def clear(folder: Path, old: Iterable[Path]) -> None:
+    """Remove files that `earlier` found, the folders that this empties, and the record."""
+    root = folder.resolve()
+    with files.writing(folder):
+        for path in old:
+            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # the others are not empty
+                for parent in path.parents:
+                    if parent == root:
+                        break
+                    parent.rmdir()
+        (root / NAME).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def recording(folder: Path, *, anew: bool, inputs: Iterable[Path] = ()) -> Iterator[None]:
+    """Record what is written into an output folder while the body runs.
+
+    Parameters
+    ----------
+    anew
+        A new run begins: the files of earlier ones are removed before its first one is in place,
+        and a warning names those that it has not made again. Else the files belong to a run that
+        goes on.
+    inputs
+        Files that the run reads; they are not removed.
+
+    Raises
+    ------
+    OutputError
+        As `earlier`.
+    """
+    if any(record.folder == Path(os.path.abspath(folder)) for record in files.RECORDS):
+        yield  # of the caller
+        return
+    record = Record(folder, earlier(folder, inputs) if anew else None)
+    files.RECORDS.append(record)
+    try:
+        yield
+    finally:
+        files.RECORDS.remove(record)
+        record.close()
+
+
+class Record:
+    """The files that a run writes into a folder; `files.atomic_path` calls `add`.
+
+    Parameters
+    ----------
+    old
+        Files to remove before the first one is in place; None: the run goes on.
+    """
+
+    def __init__(self, folder: Path, old: list[Path] | None) -> None:
+        self.folder, self._old = Path(os.path.abspath(folder)), old
+        self._new: set[str] = set()
+        self._lock = threading.Lock()
+
+    def add(self, path: Path, temporary: Path) -> None:
+        """Note a file that is about to be renamed from ``temporary`` to ``path``."""
+        path = Path(os.path.abspath(path))
+        if not path.is_relative_to(self.folder):
+            return
+        name, about = path.relative_to(self.folder).as_posix(), os.lstat(temporary)
+        line = json.dumps([name, about.st_size, about.st_mtime_ns]) + "\n"
+        with self._lock:
+            if self._old is not None and not self._new:
+                clear(self.folder, self._old)
+            self._new.add(name)
+            opened = files.open_own(self.folder / NAME, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+            with open(opened, "ab", buffering=0) as file:
+                file.write(line.encode())
+
+    def close(self) -> None:
+        """Warn of the files of earlier runs that are gone; remove the record if no file came."""
+        root = self.folder.resolve()
+        if self._new and self._old is not None:
+            with contextlib.suppress(OSError):
+                if not any(os.path.lexists(root / name) for name in self._new):
+                    (root / NAME).unlink()
+        gone = [
+            name for p in self._old or () if (name := str(p.relative_to(root))) not in self._new
+        ]
+        if gone and self._new:
+            more = f" and {len(gone) - 6} more" if len(gone) > 6 else ""
+            text = f"removed {', '.join(gone[:6])}{more}: of an earlier run, this one makes none"
+            warnings.warn(f"{self.folder}: {text}", stacklevel=4)
+
+
+def _read(folder: Path) -> dict[str, set[Stamp]]:
+    """Files that the record of a folder names, each with the stamps that it had; lines that cannot
+    be read are left out.
+    """
+    found: dict[str, set[Stamp]] = {}
+    try:
+        with open(files.open_own(folder / NAME, os.O_RDONLY), "rb") as file:
+            lines = file.read(LONGEST).splitlines()
+    except FileNotFoundError:
+        return {}
+    for line in lines:
+        with contextlib.suppress(ValueError, TypeError, RecursionError):
+            name, size, changed = json.loads(line)
+            inside = isinstance(name, str) and "\0" not in name and not Path(name).is_absolute()
+            if inside and Path(name).parts and ".." not in Path(name).parts:
+                found.setdefault(name, set()).add((int(size), int(changed)))
+    return found
