@@ -51,6 +51,8 @@ class Data:
     provenance: dict[str, Any] = field(default_factory=dict)
     output: Any = None
     """Folder (Path) that products are written to; None: nothing is written."""
+    pipeline: Any = field(default=None, repr=False)
+    """The `Pipeline` that made all of it; None where several runs did."""
     threads: int = 1
     """Threads that the run may use."""
     band: str = ""
@@ -369,19 +371,16 @@ def kept(observation: Observation, stream: str, rows: slice = slice(None)) -> ND
         have = sorted(observation.detdata)
         what = f"only {' and '.join(have)}" if have else "no stream was"
         cure = (
-            f"run it again with pipeline.run(scene, keep={[*have, stream]!r}): 8 bytes for each"
+            f"run it again with pipeline.run(scene, keep={[*have, stream]!r}): 4 bytes for each"
             " sample of each stream"
         )
         raise InputError(
             f"the stream {stream!r} was not kept, {what}", place=observation.name, cure=cure
         )
-    found = np.asarray(observation.detdata[stream][rows], np.float64)
+    found = observation.detdata.rows(stream, rows)
     if stream == EMISSION and EMISSION in observation.smooth:
         first, stop, _ = rows.indices(observation.n_detectors)
-        return (
-            observation.smooth[EMISSION].evaluate(
-                slice(first, stop), slice(0, observation.n_samples)
-            )
-            + found
+        found += observation.smooth[EMISSION].evaluate(
+            slice(first, stop), slice(0, observation.n_samples)
         )
     return found

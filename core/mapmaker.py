@@ -101,16 +101,16 @@ class CalibratedSignal(Operator):
             block.means[MAIN] = self._means.of(fields)
 
 
-def place_of_signal(operators: Sequence[Operator]) -> int | None:
+def place_of_signal(operators: Sequence[Operator], wanted: bool = False) -> int | None:
     """Index of the first step that reads ``signal`` where what is calibrated makes up the signal,
-    else None.
+    else None. ``wanted``: the end, if no step reads it.
     """
     if any(forms(o) for o in operators):
         return None
     for index, operator in enumerate(operators):
         if MAIN in operator.requires:
             return index if _calibrated(operators[:index]) else None
-    return None
+    return len(operators) if wanted and _calibrated(operators) else None
 
 
 def _calibrated(operators: Sequence[Operator]) -> frozenset[str]:
@@ -129,9 +129,9 @@ def _calibrated(operators: Sequence[Operator]) -> frozenset[str]:
     return frozenset(made) if known else frozenset()
 
 
-def with_calibrated_signal(operators: Sequence[Operator]) -> list[Operator]:
-    """The steps, and a `CalibratedSignal` where it has its place."""
-    place = place_of_signal(operators)
+def with_calibrated_signal(operators: Sequence[Operator], wanted: bool = False) -> list[Operator]:
+    """The steps, and a `CalibratedSignal` where it has its place (`place_of_signal`)."""
+    place = place_of_signal(operators, wanted)
     if place is None:
         return list(operators)
     step = CalibratedSignal()

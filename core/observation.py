@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -77,6 +77,47 @@ class WhiteLevel(Protocol):
         """rms of one sample at the detector, K_RJ."""
 
 
+class KeptStreams(MutableMapping[str, AnyFloats]):
+    """Streams (n_det, n_samp) by name, whole, float64: each is made when it is asked for.
+
+    Attributes
+    ----------
+    parts
+        By name: the stream as it was simulated, and the mean that must be added to it, or None.
+    """
+
+    def __init__(self, parts: Mapping[str, tuple[AnyFloats, Any]] | None = None) -> None:
+        self.parts = dict(parts or {})
+
+    def rows(self, name: str, rows: slice) -> Floats:
+        """Some detectors of a stream."""
+        array, mean = self.parts[name]
+        found = np.array(array[rows], np.float64)
+        if mean is not None:
+            first, _, _ = rows.indices(len(array))
+            for k, each in enumerate(found, first):
+                each += mean.evaluate(slice(k, k + 1), slice(0, each.size))[0]
+        return found
+
+    def __getitem__(self, name: str) -> Floats:
+        return self.rows(name, slice(None))
+
+    def __setitem__(self, name: str, stream: AnyFloats) -> None:
+        self.parts[name] = stream, None
+
+    def __delitem__(self, name: str) -> None:
+        del self.parts[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.parts)
+
+    def __len__(self) -> int:
+        return len(self.parts)
+
+    def __repr__(self) -> str:
+        return f"<KeptStreams: {', '.join(self)}>"
+
+
 @dataclass
 class Observation:
     """One continuous scan.
@@ -116,7 +157,7 @@ class Observation:
         `SmoothField`. Set by operators in ``configure``, so that the levels which follow from them
         are known before any step is prepared.
     detdata
-        (n_det, n_samp) arrays that an output asked to keep.
+        (n_det, n_samp) streams that the run kept.
     expected_load
         Tells the atmosphere's mean emission [K_RJ] and transmission in the middle of the scan,
         before ``smooth`` is known; None: there is no atmosphere.
@@ -174,7 +215,7 @@ class Observation:
     intervals: Intervals = field(default_factory=dict)
     weather: GroundWeather | None = None
     smooth: dict[str, SmoothField] = field(default_factory=dict)
-    detdata: dict[str, AnyFloats] = field(default_factory=dict)
+    detdata: KeptStreams = field(default_factory=lambda: KeptStreams())
     noise_levels: dict[str, WhiteLevel] = field(default_factory=dict)
     closed_forms: dict[str, list[Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = field(
         default_factory=dict
@@ -267,7 +308,7 @@ class Observation:
             flags=np.bitwise_or.reduce([scan.flags for scan in scans]),
             detector_flags=np.concatenate([scan.detector_flags for scan in scans]),
             smooth={},
-            detdata={},
+            detdata=KeptStreams(),
             log=Log(),
         )
 
@@ -300,7 +341,7 @@ class Observation:
                 detector_flags=self.detector_flags[rows],
                 intervals=dict(self.intervals),
                 smooth={},
-                detdata={},
+                detdata=KeptStreams(),
                 noise_levels={},
                 closed_forms={},
                 windows={},

@@ -121,7 +121,7 @@ class Pipeline:
         return self._chain(self.operators)
 
     def _chain(self, operators: Sequence[Operator], keep: Sequence[str] = ()) -> Chain:
-        steps = acting_steps(operators)
+        steps = acting_steps(operators, keep)
         return Chain(steps, self.signals.formed, self.signals.components, tuple(keep))
 
     @faults_named(exceptions=False)
@@ -154,7 +154,7 @@ class Pipeline:
             what it holds now and half of the free memory. A run that would not fit is refused
             before it starts.
         keep
-            Streams to keep for `Data.tod`, as they stand after the last step: 8 bytes for each
+            Streams to keep for `Data.tod`, as they stand after the last step: 4 bytes for each
             sample of each scan, which count in the budget.
         provenance
             Entries added to ``data.provenance``.
@@ -180,6 +180,7 @@ class Pipeline:
             self._observe(data, bands, timer)
             self._execute(bands, settings, timer)
             self._finish(data, bands, timer)
+        data.pipeline = self
         return data
 
     def _bands(self, data: Data, keep: Sequence[str] = ()) -> list[Band]:

@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from .configuration.describe import described, source_is_known
 from .configuration.time import Instant
-from .data import STREAMS, Block, Data, Observation, Stream
+from .data import STREAMS, Block, Data, Observation, Stream, kept
 from .instrument import Band, Instrument, Telescope
 from .mapmaker import MapMaker, filters
 from .numerics.chunks import TILE_SAMPLES
@@ -445,12 +445,7 @@ def _products(
         )
     found: dict[str, Any] = {}
     for observation in data.observations:
-        if "atmosphere" in observation.detdata and "atmosphere" in observation.smooth:
-            whole = slice(0, observation.n_detectors), slice(0, observation.n_samples)
-            observation.detdata["atmosphere"] += observation.smooth["atmosphere"].evaluate(*whole)
-        found |= {
-            f"{observation.name} {name}": stream for name, stream in observation.detdata.items()
-        }
+        found |= {f"{observation.name} {n}": kept(observation, n) for n in observation.detdata}
         if pointing:
             found |= {
                 f"{observation.name} {name}": getattr(observation, name)

@@ -30,6 +30,7 @@ _WHERE = {
     "load": "zonda.core.configuration.pipeline_file",
     "plan": "zonda.core.plan.planner",
     "campaign": "zonda.core.campaign.function",
+    "map": "zonda.core.mapping",
     "Variant": "zonda.core.experiment.variant",
     "Experiment": "zonda.core.experiment.experiment",
     "measure": "zonda.core.figures",
@@ -105,6 +106,7 @@ if TYPE_CHECKING:
     from zonda.core.instrument import Instrument as Instrument
     from zonda.core.instrument import Telescope as Telescope
     from zonda.core.mapmaker import MapMaker as MapMaker
+    from zonda.core.mapping import map as map
     from zonda.core.numerics.random import normals as normals
     from zonda.core.numerics.random import uniforms as uniforms
     from zonda.core.operator import Operator as Operator

@@ -288,11 +288,11 @@ class Signals:
         )
 
 
-def acting_steps(operators: Sequence[Operator]) -> list[Operator]:
+def acting_steps(operators: Sequence[Operator], keep: Iterable[str] = ()) -> list[Operator]:
     """The operators that act on observations, and a `CalibratedSignal` where none of them forms a
-    signal.
+    signal that one reads or that is to be kept.
     """
-    return with_calibrated_signal([o for o in operators if acts(o)])
+    return with_calibrated_signal([o for o in operators if acts(o)], any(map(is_signal, keep)))
 
 
 def note_signals(

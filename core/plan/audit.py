@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ..accuracy.metrics import Metric
 from ..configuration.pipeline_file import PipelineFile
-from ..data import Data
+from ..data import Data, kept
 from ..errors import PipelineError
 from ..experiment.experiment import AnyVariant, Experiment
 from ..experiment.variant import Variant
@@ -329,7 +329,7 @@ class _StreamsAndMaps(Metric):
 
     def measure(self, data: Data) -> _Result:
         signal = [
-            np.asarray(o.detdata["signal"][o.good_detectors][:, o.good_samples], np.float64)
+            kept(o, "signal")[o.good_detectors][:, o.good_samples]
             for o in data.observations
             if "signal" in o.detdata
         ]

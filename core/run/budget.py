@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
+import numpy as np
+
 from ..assembly.chain import Chain
 from ..errors import PipelineError
 from ..machine import available_memory, resident_memory
@@ -63,7 +65,8 @@ def _groups(
     """Groups of bands for `divide`, with their settings; nothing is warned of."""
     views = [band.longest for band in bands]
     every = [o for band in bands for o in band.data.observations]
-    kept = 8 * len(bands[0].chain.keep) * sum(o.n_detectors * o.n_samples for o in every)
+    size = np.dtype(settings.dtype).itemsize
+    kept = size * len(bands[0].chain.keep) * sum(o.n_detectors * o.n_samples for o in every)
     if len(bands) > 1 and any(map(joins, bands[0].chain.steps)):
         return [(bands, _shared(views, settings, ahead, kept))]
     held = [memory_of([view], products=True) for view in views]

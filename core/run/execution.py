@@ -44,7 +44,7 @@ from ..numerics.smooth import SmoothField
 from ..observation import Observation
 from ..operator import Operator
 from ..signal import MAIN, Formed, is_signal
-from ..stream import Stream, forget_pages, in_order, whole
+from ..stream import Stream, forget_pages, in_order
 from ..types import AnyFloats
 from .block_maker import BlockMaker, Due
 from .budget import divide, memory_of
@@ -364,7 +364,7 @@ class Execution:
             forget_pages(array)
 
     def _keep(self) -> None:
-        """Keep the streams that the user asked for, whole, in float64."""
+        """Keep the streams that the user asked for, and the means that stand beside them."""
         for name in self.views[0].chain.keep:
             if name not in self._source.arrays:
                 raise PipelineError(
@@ -373,8 +373,7 @@ class Execution:
                 )
             for view in self.views:
                 array, means = self._source.arrays[name][view.rows], self._source.means[view.number]
-                stream = Stream(name, view.observation, array, means, 1)
-                view.observation.detdata[name] = whole(stream)
+                view.observation.detdata.parts[name] = np.array(array), means.get(name)
                 forget_pages(array)
 
     # ---- steps that measure whole streams
