@@ -109,8 +109,8 @@ class KeptSignals(Operator):
 
 
 def map(data: Data | Operator, steps: Iterable[Operator], **options: Any) -> Data:
-    """Filter and map streams that are there, as often as you like: a run with
-    ``keep=["signal"]``, or recorded data, ``zonda.LoadTOD(file=...)``.
+    """Filter and map streams that are there, as often as you like: those of a run with
+    ``keep=["signal"]``, or recorded ones.
 
     The maps have the bits that the same steps at the end of that run would have given them. Signals
     beside the complete one are mapped where they were kept (``signal/noiseless``), or are what the
@@ -138,7 +138,8 @@ def map(data: Data | Operator, steps: Iterable[Operator], **options: Any) -> Dat
         return Pipeline([data, *steps], name=PLACE).run(scene, **options)  # type: ignore[list-item]
     if not isinstance(data, Data) or data.pipeline is None:
         text = f"{type(data).__name__} has no streams" if not isinstance(data, Data) else "no run"
-        cure = "give what pipeline.run(scene, keep=['signal']) returned, or zonda.LoadTOD(file=...)"
+        run = "what pipeline.run(scene, keep=['signal']) returned"
+        cure = f"give {run}, or the step that reads recorded data"
         raise InputError(text, place=PLACE, cure=cure)
     pipeline = _pipeline(data, steps)
     known = data.provenance["operators"]

@@ -112,6 +112,6 @@ def test_mistakes() -> None:
     with pytest.raises(zonda.ZondaError, match="'signal' was not kept") as err:
         zonda.map(data, AGAIN)
     assert "keep=['signal', 'white']" in str(err.value)
-    with pytest.raises(zonda.ZondaError, match=r"a Path|PosixPath has no streams") as err:
+    with pytest.raises(zonda.ZondaError, match="Path has no streams") as err:
         zonda.map(Path("night.h5"), AGAIN)
-    assert "zonda.LoadTOD(file=...)" in str(err.value)
+    assert "the step that reads recorded data" in str(err.value)
