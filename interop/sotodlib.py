@@ -49,25 +49,23 @@ def to_axismanager(
     scan: str | int | None = None,
     dtype: Literal["float32", "float64"] = "float32",
 ) -> Any:
-    """A scan as a `sotodlib.core.AxisManager` with sotodlib's names.
+    """A scan as a `sotodlib.core.AxisManager` with sotodlib's names, angles in rad.
 
-    ========================
-    ==========================================================================================
-    signal                    (dets, samps) K_RJ, the atmosphere's mean emission included timestamps
-    (samps,) POSIX seconds boresight.az, el, roll    (samps,) rad; the azimuth without jumps of 360
-    deg boresight_equ.ra ...      ra, dec, psi (samps,) rad, ICRS: zonda's own pointing, which
-    sotodlib's maps use where it is there focal_plane.xi ...        xi, eta (sines, not zonda's
-    tangents) and gamma (dets,) rad flags                     FlagManager of RangesMatrix (dets,
-    samps): those of `FLAGS`; ``detectors``, whole rows; ``samples``,
-                              single samples that are not finite or flagged in the file;
-                              ``excluded``, all that no map uses. ``turnarounds``, ``left_scan``,
-                              ``right_scan``: Ranges (samps,); the last two where there are throws
-    det_info                  name, readout_id, det_id, band, wafer_slot, wafer.bandpass,
-    wafer.array and wafer.type (dets,) iir_params                empty: no filter of the read-out is
-    to be taken off obs_info                  obs_id, telescope, timestamp, start_time, stop_time,
-    duration hwp_angle                 (samps,) rad, where there is a half-wave plate
-    ========================
-    ==========================================================================================
+    - ``signal`` (dets, samps) K_RJ, the atmosphere's mean emission included.
+    - ``timestamps`` (samps,) POSIX seconds.
+    - ``boresight`` (samps,): az without jumps of 360 deg, el, roll.
+    - ``boresight_equ`` (samps,): ra, dec, psi, ICRS, zonda's own pointing, which maps of sotodlib
+      use where it is there.
+    - ``focal_plane`` (dets,): xi, eta (sines, not zonda's tangents) and gamma.
+    - ``flags``, a FlagManager of RangesMatrix (dets, samps): those of `FLAGS`; ``detectors``, whole
+      rows; ``samples``, single samples that are not finite or flagged in the file; ``excluded``,
+      all that no map uses. ``turnarounds``, ``left_scan`` and ``right_scan`` are Ranges (samps,);
+      the last two where there are throws.
+    - ``det_info`` (dets,): name, readout_id, det_id, band, wafer_slot; wafer.bandpass, array, type.
+    - ``iir_params``, empty: no filter of the read-out is to be taken off.
+    - ``obs_info``: obs_id, telescope, timestamp, start_time, stop_time, duration, site, latitude,
+      longitude [deg], altitude [m].
+    - ``hwp_angle`` (samps,), where there is a half-wave plate.
 
     Parameters
     ----------
@@ -285,7 +283,15 @@ def _obs_info(core: Any, tod: TimeOrderedData) -> Any:
         "timestamp": first,
         "start_time": first,
         "stop_time": last,
+        "duration": last - first,
+        **dict(zip(("site", "latitude", "longitude", "altitude"), _site(tod), strict=True)),
     }
-    for name, value in {**about, "duration": last - first}.items():
+    for name, value in about.items():
         info.wrap(name, value)
     return info
+
+
+def _site(tod: TimeOrderedData) -> tuple[str, float, float, float]:
+    """Name, latitude, longitude [deg] and altitude [m]."""
+    name, latitude, longitude, altitude = tod.site
+    return name, float(np.degrees(latitude)), float(np.degrees(longitude)), float(altitude)

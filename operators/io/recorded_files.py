@@ -33,7 +33,7 @@ from .recorded_scan import (
     rows_of_bands,
     site_of,
 )
-from .recorded_stream import RecordedStream
+from .recorded_stream import RecordedStream, kelvin_per, scale_of
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
 from .toast_noise import DEFAULT_MODEL
@@ -107,10 +107,14 @@ class RecordedFiles(Operator):
     """The parameters of `LoadTOD`."""
 
     file: Files
-    """HDF5 in TOAST's layout or FITS of `SaveTOD`; several files, [a.h5, b.h5], are the scans of
-    one run, in this order. Files with the same times and other bands are one scan."""
+    """HDF5 in TOAST's layout or of sotodlib's `AxisManager.save`, or FITS of `SaveTOD`; several
+    files, [a.h5, b.h5], are the scans of one run, in this order. Files with the same times and
+    other bands are one scan."""
     signal: str | None = "signal"
     """Name of the stream; none: no stream is read, the file's pointing alone is used."""
+    unit: str | None = None
+    """Unit of the stream, e.g. K_RJ, mK_RJ or K_CMB; absent: the file's. Most AxisManagers state
+    none. K is K_RJ."""
     band: RadioFrequency | None = Field(None, gt=0)
     """Centre of the only band whose detectors are used, e.g. 93 GHz; none: all bands, each with
     maps of its own.
@@ -153,6 +157,13 @@ class RecordedFiles(Operator):
             raise ValueError("give at least one file")
         return value
 
+    @field_validator("unit")
+    @classmethod
+    def _of_temperature(cls, unit: str | None) -> str | None:
+        if unit is not None and kelvin_per(scale_of(unit)[0]) is None:
+            raise ValueError("give a unit of temperature: K_RJ, mK_RJ, uK_CMB, ...")
+        return unit
+
     @field_validator("signal", mode="before")
     @classmethod
     def _none_in_words(cls, value: Any) -> Any:
@@ -182,7 +193,10 @@ class RecordedFiles(Operator):
         """
         from zonda.core.scene import Scene
 
-        return Scene(**{**self.own_scene(more.get("instrument")), **more})
+        given = more.get("instrument")
+        if given is not None:  # a name or a variant, too: as of any scene
+            given = Scene(site="cerro_toco", time="2000-01-01T00:00", instrument=given).instrument
+        return Scene(**{**self.own_scene(given), **more})
 
     @property
     def files(self) -> list[Path]:
@@ -204,7 +218,14 @@ class RecordedFiles(Operator):
                 flags.has_a_signal(file.flags),
             )
             return RecordedStream(
-                opened, self.signal, rows, np.uint8(self.detector_mask), good, usable
+                opened,
+                self.signal,
+                rows,
+                np.uint8(self.detector_mask),
+                good,
+                usable,
+                self.unit,
+                observation.instrument.band,
             )
         except BaseException:
             opened.close()

@@ -27,6 +27,8 @@ SAME_BAND = 1e-2
 """Relative difference of neighbouring centres up to which detectors are of one band."""
 NEAR_BAND = 0.05
 """Relative difference of centres up to which a band is the one that was named."""
+NAMED_BAND = 0.2
+"""The same for a centre that is a mere name, as of f030, whose mean is at 25.7 GHz."""
 
 DEFAULTS = {
     "fwhm": 0.0,
@@ -192,11 +194,22 @@ def _plain(name: str) -> str:
     return re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
 
 
-def band_of(instrument: Instrument | None, centre: float) -> Instrument | None:
-    """The camera, of one band, that ``instrument`` has nearest to ``centre`` [Hz]."""
+def band_of(
+    instrument: Instrument | None,
+    centre: float | None,
+    place: str,
+) -> Instrument | None:
+    """The camera, of one band, that ``instrument`` has nearest to ``centre`` [Hz].
+
+    Raises InputError where that is not known, and the instrument has several bands.
+    """
     if instrument is None or not instrument.bands:
         return instrument
-    return min(instrument.cameras.values(), key=lambda camera: abs(camera.band.centre - centre))
+    if centre is None:
+        cure = "choose one of the instrument's: instrument: {like: NAME, band: NAME}"
+        raise InputError("states no band, and the instrument has several", place=place, cure=cure)
+    known = float(centre)
+    return min(instrument.cameras.values(), key=lambda camera: abs(camera.band.centre - known))
 
 
 def instrument_of(
@@ -213,7 +226,8 @@ def instrument_of(
     InputError where neither states the beam, or a column of a used detector is not finite.
     """
     columns = {name: _known(name, values[rows], used) for name, values in tod.columns.items()}
-    given = band_of(given, float(np.median(columns.get("band_centre", np.zeros(1)))))
+    centre = float(np.median(columns["band_centre"])) if "band_centre" in columns else None
+    given = band_of(given, centre, place)
     plane = _focalplane(tod, columns, rows, given, place)
     band = _band(tod, columns, given, place)
     usual = {key: float(np.median(getattr(plane, key))) for key in DEFAULTS}
@@ -268,6 +282,13 @@ def _band(
         if given is None:
             cure = "give the scene an instrument with its band"
             raise InputError("states no band (bandcenter, bandwidth)", place=place, cure=cure)
+        stated = np.median(columns.get("band_centre", given.band.centre))
+        if abs(given.band.centre / stated - 1) > NAMED_BAND:
+            text = f"has detectors at {stated / 1e9:.4g} GHz, the instrument at"
+            cure = "give the scene an instrument with that band"
+            raise InputError(
+                f"{text} {given.band.centre / 1e9:.4g} GHz alone", place=place, cure=cure
+            )
         return given.band
     centre, width = (float(np.median(columns[name])) for name in ("band_centre", "band_width"))
     if (

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.band import Band
 from zonda.core.configuration.units import factor_to
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
+from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.smooth import SmoothField
 from zonda.core.types import AnyFloats, Floats
 
@@ -46,6 +48,8 @@ class RecordedStream:
     good, usable
         (n_samp,) which instants the file's flags leave, and those at which there is a signal that
         filters use; None: all.
+    unit, band
+        Unit of the stream, None: the file's; the band, for temperatures of the CMB.
     level
         (n_det,) K, constant, that stands beside the stream; ``mean``: the same as a field, None
         where it is zero.
@@ -57,11 +61,14 @@ class RecordedStream:
     mask: np.uint8
     good: NDArray[np.bool_] | None = None
     usable: NDArray[np.bool_] | None = None
+    unit: str | None = None
+    band: Band | None = None
     level: Floats = field(default_factory=lambda: np.zeros(0))
     mean: SmoothField | None = None
 
     def __post_init__(self) -> None:
-        self._factor = _kelvin(self.file.streams[self.name], self.name, self.file.place)
+        unit = self.unit or self.file.streams[self.name]
+        self._factor = _kelvin(unit, self.name, self.file.place, self.band)
 
     def levelled(self, n_detectors: int, n_samples: int) -> RecordedStream:
         """Itself, with the level of each detector; where that cannot be read the file is closed."""
@@ -174,12 +181,19 @@ def kelvin_per(unit: str) -> float | None:
     return factor_to("K", unit.replace("K_RJ", "K")) if unit.strip() else None
 
 
-def _kelvin(unit: str, name: str, place: str) -> float:
-    """Kelvin per unit of a stream."""
-    found = kelvin_per(unit)
-    if found is None:
-        cure = "calibrate it to a Rayleigh-Jeans temperature, and state its units, e.g. K"
+def scale_of(unit: str) -> tuple[str, bool]:
+    """A unit without its scale of temperature; True if that is the CMB's: mK, True of mK_CMB."""
+    name, _, scale = unit.strip().rpartition("_")
+    return (name, scale == "CMB") if scale in ("CMB", "RJ") else (unit, False)
+
+
+def _kelvin(unit: str, name: str, place: str, band: Band | None) -> float:
+    """Kelvin (Rayleigh-Jeans) per unit of a stream."""
+    plain, of_cmb = scale_of(unit)
+    found = kelvin_per(plain)
+    if found is None or (of_cmb and band is None):
+        cure = "calibrate it to a temperature, and state its unit, e.g. LoadTOD: {unit: K_CMB}"
         raise InputError(
             f"the stream {name} is in {unit or 'no unit'!r}, not in kelvin", place=place, cure=cure
         )
-    return found
+    return found * to_kelvin_rj("K_CMB", band) if of_cmb and band is not None else found

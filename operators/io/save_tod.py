@@ -22,7 +22,7 @@ from zonda.core.product import Record
 from zonda.core.storage.files import atomic_path, check_memory, product_path
 from zonda.core.stream import UNITS, StreamName, streams_asked, streams_needed
 
-from . import fits_table, toast_hdf5
+from . import axismanager, fits_table, toast_hdf5
 from .recorded_stream import kelvin_per
 from .time_ordered_data import TimeOrderedData, TodWriter
 
@@ -233,7 +233,11 @@ def reader(
     """An open file, whose streams are read in rectangles; ``whole``: it may be compressed. Raises
     InputError when it cannot be read as such.
     """
-    return fits_table.Reader(path, whole=whole) if is_fits(path) else toast_hdf5.Reader(path)
+    if is_fits(path):
+        return fits_table.Reader(path, whole=whole)
+    if axismanager.holds_axismanager(path):
+        return axismanager.Reader(path)
+    return toast_hdf5.Reader(path)
 
 
 def is_fits(path: str | os.PathLike[str]) -> bool:

@@ -12,8 +12,9 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -291,10 +292,6 @@ def _write_shared(file: Any, tod: TimeOrderedData) -> None:
 # --------------------------------------------------------------------------------------------------
 # reading
 
-KIND, CURE = (
-    "HDF5 in TOAST's layout",
-    "give an HDF5 file in TOAST's layout, whole, as SaveTOD writes it",
-)
 AGAIN = "save it again with TOAST 3.0 or later, or with SaveTOD"
 
 PARTS = {
@@ -324,34 +321,44 @@ class Reader:
         in it does not fit together.
     """
 
+    kind: ClassVar[str] = "HDF5 in TOAST's layout"
+    cure: ClassVar[str] = "give an HDF5 file in TOAST's layout, whole, as SaveTOD writes it"
+
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.place = f"time-ordered data {path}"
-        with reading(self.place, KIND, CURE):
+        with self._reading():
             self._file = checked(path, self.place)
         try:
-            with reading(self.place, KIND, CURE):
-                _check_parts(self._file, self.place)
-                self.tod = _read(self._file, self.place)
+            with self._reading():
+                self.tod, self._data = self._opened()
                 self.streams = self._streams()
             self.tod.check(self.place)
         except BaseException:
             self.close()
             raise
 
+    def _reading(self) -> AbstractContextManager[None]:
+        return reading(self.place, self.kind, self.cure)
+
+    def _opened(self) -> tuple[TimeOrderedData, Any]:
+        """Everything but the streams, and the group with the streams."""
+        _check_parts(self._file, self.place)
+        return _read(self._file, self.place), self._file["detdata"]
+
     def read(self, stream: str, detectors: NDArray[np.intp], samples: slice) -> AnyFloats:
         """(n, m) values of a stream: rows ``detectors`` (n,) of the file, in its own units and
         type.
         """
-        with reading(self.place, KIND, CURE):
-            found: AnyFloats = _rectangle(self._file["detdata"][stream], detectors, samples)
+        with self._reading():
+            found: AnyFloats = _rectangle(self._data[stream], detectors, samples)
             return found
 
     def flags(self, detectors: NDArray[np.intp], samples: slice) -> Flags | None:
         """(n, m) uint8, flags of each sample of each detector; None: the file has none."""
-        found = self._file["detdata"].get("flags")
+        found = self._data.get("flags")
         if found is None:
             return None
-        with reading(self.place, KIND, CURE):
+        with self._reading():
             return np.asarray(_rectangle(found, detectors, samples), np.uint8)
 
     def noise(self, model: str | None, mask: int) -> dict[str, Floats]:
@@ -369,7 +376,7 @@ class Reader:
             raise InputError(
                 f"has no noise model {model!r} (/metadata)", place=self.place, cure=cure
             )
-        with reading(self.place, KIND, CURE):
+        with self._reading():
             group, unused = (
                 self._file["metadata"][model or DEFAULT_MODEL],
                 (self.tod.detector_flags & np.uint8(mask)) != 0,
@@ -382,23 +389,28 @@ class Reader:
 
     def _streams(self) -> dict[str, str]:
         """Names and units; their shapes are checked."""
-        import h5py
-
-        shape, found = (self.tod.n_detectors, self.tod.n_samples), {}
-        for name, item in self._file["detdata"].items():
-            for dataset in [item] if isinstance(item, h5py.Dataset) else item.values():
-                if isinstance(dataset, h5py.Dataset):
-                    check_size(dataset, self.place, whole=False)
-            if isinstance(item, h5py.Dataset) and (
-                item.shape != shape or item.dtype.kind not in "fiu"
-            ):
-                what = f"detdata/{name} is {' x '.join(map(str, item.shape))} of {item.dtype}"
-                raise InputError(
-                    f"{what}, not {shape[0]} x {shape[1]} numbers", place=self.place, cure=AGAIN
-                )
+        found = {}
+        for name, item in self._data.items():
+            self._check_stream(item)
             if name != "flags":
                 found[name] = str(item.attrs.get("units", "K"))
         return found
+
+    def _check_stream(self, item: Any) -> None:
+        """Raise InputError for a data set, or a group with parts of one, of another shape or of no
+        numbers.
+        """
+        import h5py
+
+        shape = self.tod.n_detectors, self.tod.n_samples
+        for dataset in [item] if isinstance(item, h5py.Dataset) else item.values():
+            if isinstance(dataset, h5py.Dataset):
+                check_size(dataset, self.place, whole=False)
+        if isinstance(item, h5py.Dataset) and (item.shape != shape or item.dtype.kind not in "fiu"):
+            what = f"{item.name.lstrip('/')} is {' x '.join(map(str, item.shape))} of {item.dtype}"
+            raise InputError(
+                f"{what}, not {shape[0]} x {shape[1]} numbers", place=self.place, cure=AGAIN
+            )
 
 
 def _check_parts(file: Any, place: str) -> None:

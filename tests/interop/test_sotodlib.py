@@ -7,6 +7,7 @@ be skipped (ZONDA_SOTODLIB=required).
 import numpy as np
 import pytest
 
+import zonda
 from zonda.core.errors import InputError
 from zonda.core.numerics.quaternions import detector_quaternions, multiply
 from zonda.interop.sotodlib import sight_line, to_axismanager
@@ -263,3 +264,37 @@ def test_its_hardware_makes_cameras(tmp_path):
     turned = np.exp(2j * (found.columns["polarization_angle"] - gamma))
     np.testing.assert_allclose(turned, 1.0, rtol=0, atol=1e-12)
     assert found.columns["wafer"].tolist() == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize("encoding", [None, "flacarray"])
+def test_what_it_saves_is_loaded(survey, tmp_path, encoding):
+    """`AxisManager.save`, then LoadTOD: the pointing to rounding, flags, and the map of the run."""
+    paths = []
+    for band in ("f090", "f150"):
+        aman = to_axismanager(survey, scan=f"scan-000-{band}", dtype="float64")
+        paths.append(tmp_path / f"{band}.h5")
+        if encoding:
+            flac = {"signal": {"type": encoding, "args": {"quanta": 1e-10}}}
+            aman.save(str(paths[-1]), encodings=flac)
+        else:
+            aman.save(str(paths[-1]), group="obs", compression="gzip")
+    recorded = zonda.LoadTOD(file=paths, unit="K_RJ")
+    mapped = zonda.BinMap(projection="CAR", pixel="2 arcmin")
+    scene = recorded.scene(seed=1, instrument=survey.scene.instrument)
+    again = zonda.Pipeline([recorded, mapped]).run(scene)
+    found, ours = again.observations[1], survey.observations[1]
+    np.testing.assert_array_equal(found.detector_flags != 0, ours.detector_flags != 0)
+    np.testing.assert_array_equal(found.good_samples, ours.good_samples)
+    np.testing.assert_array_equal(found.flags & 4, ours.flags & 4)
+    assert set(found.intervals) >= {"throw_leftright", "throw_rightleft"}
+    for name in ("boresight_azel", "boresight_radec"):
+        one, other = getattr(found, name), getattr(ours, name)
+        np.testing.assert_allclose(np.abs((one * other).sum(axis=1)), 1, rtol=0, atol=1e-14)
+    for band in ("f090", "f150"):
+        own, other = survey.products[f"map_{band}"], again.products[f"map_{band}"]
+        assert own.hits.sum() == other.hits.sum()
+        moved = np.abs(own.hits - other.hits).sum() / own.hits.sum()
+        assert moved < 1e-4  # POSIX times, 0.24 us, move what lies on an edge of pixels
+        same = (own.hits == other.hits) & (own.hits > 0)
+        # FLAC rounds samples of 1e-2 K to 1e-10 K, float64 to 1e-18 K
+        np.testing.assert_allclose(other.signal[same], own.signal[same], rtol=0, atol=2e-10)

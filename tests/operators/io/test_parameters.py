@@ -17,6 +17,7 @@ STEPS = (
         changes={
             "file": ({}, {"file": "again.h5"}),
             "signal": ({}, {"signal": "none"}),
+            "unit": ({}, {"unit": "mK_RJ"}),
             "band": ({}, {"band": "150 GHz"}),
             "noise": ({}, {"noise": "noise.ecsv"}),
             "noise_model": ({}, {"noise_model": "el_noise"}),
