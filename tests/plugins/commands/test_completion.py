@@ -50,7 +50,7 @@ def completed(words: str, folder=None, code: str = RUN) -> list[str]:
 
 
 def test_instruments_are_completed_for_show():
-    assert completed("zonda show instrument so_lat_m") == ["so_lat_mf"]
+    assert completed("zonda show instrument act_pa") == ["act_pa4", "act_pa5", "act_pa6"]
 
 
 def test_names_are_completed(tmp_path):

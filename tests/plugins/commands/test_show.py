@@ -31,7 +31,7 @@ def test_a_camera_of_two_bands(tmp_path: Path) -> None:
         for line in text.splitlines()
         if line.startswith(("f090", "f150"))
     }
-    assert rows["f090"][:6] == ["f090", "80", "to", "116", "858", "2.1′"]
+    assert rows["f090"][:6] == ["f090", "80", "to", "116", "858", "2.24′"]
     assert rows["f150"][-2:] == ["0.1", "1"]
     assert "detectors     1716, hexagon layout, pixels shared, polarized" in text
     sources, stand_ins = text.split("stand-ins")
