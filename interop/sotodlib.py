@@ -38,6 +38,10 @@ FLAGS = {
 """Flags of samples by their names in the AxisManager, of all detectors; the turnarounds are one for
 all (`_scans`).
 """
+CALIBRATION = {"phase_to_pW": 1.0, "polarity": 1, "r_tes": 0.004, "r_n": 0.008, "r_frac": 0.5}
+"""Of every detector: factors that leave the signal in K_RJ, and stand-ins for the resistances [ohm]
+of a detector that is biased well, which zonda does not simulate.
+"""
 SCANS = {"left_scan": "rightleft", "right_scan": "leftright"}
 """Names of sotodlib: to the left is towards smaller azimuth; ends of the intervals' names."""
 
@@ -62,6 +66,8 @@ def to_axismanager(
       all that no map uses. ``turnarounds``, ``left_scan`` and ``right_scan`` are Ranges (samps,);
       the last two where there are throws.
     - ``det_info`` (dets,): name, readout_id, det_id, band, wafer_slot; wafer.bandpass, array, type.
+    - ``det_cal`` (dets,): bg, the wafer's number, -1 for detectors that no map uses; bandpass;
+      those of `CALIBRATION`.
     - ``iir_params``, empty: no filter of the read-out is to be taken off.
     - ``obs_info``: obs_id, telescope, timestamp, start_time, stop_time, duration, site, latitude,
       longitude [deg], altitude [m].
@@ -118,6 +124,7 @@ def to_axismanager(
         aman.wrap("hwp_angle", tod.hwp_angle, [(0, "samps")])
     aman.wrap("flags", _flags(core, aman, found))
     aman.wrap("det_info", _det_info(core, aman, tod))
+    aman.wrap("det_cal", _det_cal(core, aman, tod))
     aman.wrap("obs_info", _obs_info(core, tod))
     aman.wrap("iir_params", core.AxisManager())
     return aman
@@ -272,6 +279,19 @@ def _det_info(core: Any, aman: Any, tod: TimeOrderedData) -> Any:
         core, info, "wafer", "dets", {"bandpass": band, "array": slots, "type": np.full(n, "OPTC")}
     )
     return info
+
+
+def _det_cal(core: Any, aman: Any, tod: TimeOrderedData) -> Any:
+    """Calibration of the detectors: what sotodlib asks before it uses one."""
+    n = tod.n_detectors
+    dead = (tod.detector_flags & np.uint8(DETECTOR_MASK)) != 0
+    group = tod.columns.get("wafer", np.zeros(n)).astype(int)
+    cal = core.AxisManager(aman.dets)
+    cal.wrap("bg", np.where(dead, -1, group), [(0, "dets")])
+    cal.wrap("bandpass", aman.det_info.band, [(0, "dets")])
+    for name, value in CALIBRATION.items():
+        cal.wrap(name, np.full(n, value), [(0, "dets")])
+    return cal
 
 
 def _obs_info(core: Any, tod: TimeOrderedData) -> Any:
