@@ -1,8 +1,8 @@
 """Focal planes from tables: where detectors look, and what each has of its own.
 
-ECSV, or CSV whose first line names the columns, with units in brackets. A table has `name`, `xi`
-and `eta`; what else it may have is in `QUANTITIES` and `TEXTS`. What it does not have holds as the
-instrument or its band states it.
+ECSV, FITS, VOTable, IPAC, or CSV whose first line names the columns, with units in brackets. A
+table has `name`, `xi` and `eta`; what else it may have is in `QUANTITIES` and `TEXTS`. What it does
+not have holds as the instrument or its band states it.
 """
 
 from __future__ import annotations
@@ -252,9 +252,11 @@ def _read(path: Path, changed: int, size: int) -> ArrayTable:
 def _rename(table: Table) -> list[str]:
     """Give columns that others call otherwise (`ALIASES`) our names; notes of them."""
     columns, notes = dict[str, tuple[Sequence[str], str]](), list[str]()
-    there = {ALIASES.get(written.lower(), written) for written in table.columns}
+    there = {ALIASES.get(written.lower(), written.lower()) for written in table.columns}
     for written, column in table.columns.items():
-        own = written if written in KNOWN else ALIASES.get(written.lower(), written)
+        plain = written.lower()
+        own = plain if plain in KNOWN and plain not in table.columns else written
+        own = written if written in KNOWN else ALIASES.get(plain, own)
         if own != written and (own in table.columns or own in columns):
             if own == "name":
                 own = written  # of several names, one is enough

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,15 +15,13 @@ from .configuration.parameters import Parameters, named, named_or_written
 from .configuration.units import Angle, Fraction, Hertz, KelvinRootSecond, RadioFrequency
 from .errors import InputError
 from .registry import RegistryError, bands
-from .storage.files import unpacked_text
+from .storage.table_files import NUMBERED, read_table
 
 SPEED_OF_LIGHT = 299792458.0
 
 
 class Band(Parameters):
-    """A passband: flat between two edges, or tabulated in a file of two columns (frequency in GHz,
-    transmission).
-    """
+    """A passband: flat between two edges, or tabulated in a file (frequency, transmission)."""
 
     name: str
     """Registered name."""
@@ -33,7 +30,10 @@ class Band(Parameters):
     high: RadioFrequency | None = None
     """Upper edge of a flat band."""
     file: InputPath | None = None
-    """Table of two columns, frequency in GHz and transmission (any scale); `#` begins a comment."""
+    """Table with frequency (in GHz where it states no unit) or wavelength, and transmission (any
+    scale): two columns, or columns of these names; ECSV, CSV, IPAC, FITS or VOTable, in any order.
+    Slightly negative values, as of a Fourier spectrometer, are kept.
+    """
     provenance: str = ""
     """Source of these numbers."""
 
@@ -108,35 +108,62 @@ class Band(Parameters):
 
 GIGAHERTZ_MIN, GIGAHERTZ_MAX = 0.5, 1e5
 """Beyond, a column that was meant to be in GHz is in THz, or in Hz."""
+NEGATIVE_MAX = 0.1
+"""Largest negative transmission that is noise of a measurement, of the peak."""
+ALIASES = {
+    "frequency": ("frequency", "freq", "f", "nu", "bandpass_frequency", "frequencies", "freqs"),
+    "transmission": (
+        "transmission", "throughput", "trans", "bandpass_weight", "weight", "response", "passband",
+        "bandpass", "transmittance", "relative_response", "t", "efficiency",
+    ),
+    "wavelength": ("wavelength", "wl", "lambda", "wave"),
+}  # fmt: skip
+"""Names of columns in published passbands, in small letters."""
 
 
 def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    place, cure = f"passband file {path}", "write two columns: frequency in GHz and transmission"
-    try:
-        table = np.loadtxt(io.StringIO(unpacked_text(path, place)), ndmin=2)
-    except OSError:
-        raise InputError(
-            "no such file",
-            place=place,
-            cure="check the path; it is relative to the folder zonda runs in",
-        ) from None
-    except ValueError as err:
-        raise InputError(f"cannot be read as numbers: {err}", place=place, cure=cure) from None
-    if table.shape[1] != 2 or len(table) < 2:
-        raise InputError(
-            f"has {len(table)} rows of {table.shape[1]} columns", place=place, cure=cure
+    """Frequency [Hz], rising, and transmission of peak 1. Negative values are kept: the noise of a
+    spectrometer is as often below zero as above, and its mean must stay zero.
+    """
+    cure = "write two columns: frequency in GHz and transmission"
+    table = read_table(path, f"passband file {path}", names=NUMBERED)
+    table.rename(ALIASES)
+    if (
+        not {"frequency", "wavelength"} & table.columns.keys()
+        or "transmission" not in table.columns
+    ):
+        if len(table.columns) != 2:
+            there = f"has {len(table.columns)} columns, none of them frequency and transmission"
+            raise InputError(f"{there}: {', '.join(table.columns)}", place=table.place, cure=cure)
+        table.columns = dict(
+            zip(("frequency", "transmission"), table.columns.values(), strict=True)
         )
-    if not np.isfinite(table).all():
-        raise InputError("contains NaN or infinity", place=place, cure=cure)
-    if table[:, 0].max() > GIGAHERTZ_MAX:
-        raise InputError(f"has a frequency above {GIGAHERTZ_MAX:g} GHz", place=place, cure=cure)
-    if table[:, 0].max() < GIGAHERTZ_MIN:
-        raise InputError(f"has no frequency above {GIGAHERTZ_MIN:g} GHz", place=place, cure=cure)
-    nu, t = table[:, 0] * 1e9, table[:, 1]
-    if (np.diff(nu) <= 0).any() or nu[0] <= 0:
-        raise InputError("frequencies must be positive and increase", place=place, cure=cure)
-    if (t < 0).any() or t.max() <= 0:
-        raise InputError("transmission must be >= 0 and somewhere > 0", place=place, cure=cure)
+    if "frequency" in table.columns:
+        column, unit = table.columns["frequency"]
+        table.columns = {**table.columns, "frequency": (column, unit or "GHz")}
+        nu = table.numbers("frequency", "Hz")
+    else:
+        with np.errstate(divide="ignore"):
+            nu = SPEED_OF_LIGHT / table.numbers("wavelength", "m")
+    t = table.numbers("transmission")
+    table.check()
+    order = np.argsort(nu)
+    nu, t = nu[order], t[order]
+    most, least = GIGAHERTZ_MAX * 1e9, GIGAHERTZ_MIN * 1e9
+    for wrong, text in (
+        (len(nu) < 2, "has one row"),
+        (nu[-1] > most, f"has a frequency above {GIGAHERTZ_MAX:g} GHz"),
+        (nu[-1] < least, f"has no frequency above {GIGAHERTZ_MIN:g} GHz"),
+        (nu[0] <= 0, "frequencies must be positive"),
+        ((np.diff(nu) <= 0).any(), "has a frequency twice"),
+        (t.max() <= 0, "transmission must be somewhere > 0"),
+        (
+            t.min() < -NEGATIVE_MAX * t.max(),
+            f"transmission is {t.min():g}, more than {NEGATIVE_MAX:.0%} of the peak below zero",
+        ),
+    ):
+        if wrong:
+            raise InputError(text, place=table.place, cure=cure)
     return nu, t / t.max()
 
 

@@ -18,9 +18,9 @@ import numpy as np
 from .errors import InputError
 from .numerics.quaternions import directions
 from .numerics.radiation import cmb_slope
-from .storage.files import reading, unpacked_text
+from .storage.files import first_bytes, reading, unpacked
 from .storage.hdf5_files import opened, read_columns
-from .storage.table_files import LARGEST, Table
+from .storage.table_files import AS_TEXT, LARGEST, Table
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 """Begins every HDF5 file."""
@@ -77,8 +77,8 @@ def read_detectors(path: Path) -> tuple[Table, list[str]] | None:
     a number that is none.
     """
     place = str(path)
-    with path.open("rb") as file:
-        begin = file.read(len(HDF5))
+    with reading(place, "a table", AS_TEXT):
+        begin = first_bytes(path, len(HDF5))
     if begin == HDF5:
         return _table(place, _of_toast(path, place))
     return _of_hardware(path, place) if ".toml" in path.suffixes else None
@@ -115,7 +115,7 @@ def _texts(values: Any) -> list[str]:
 
 def _of_hardware(path: Path, place: str) -> tuple[Table, list[str]]:
     with reading(place, HARDWARE, HARDWARE_CURE):
-        found = tomllib.loads(unpacked_text(path, place, LARGEST))
+        found = tomllib.loads(unpacked(path, place, LARGEST).decode())
         if not found.get("detectors"):
             raise KeyError("there are no detectors")
         detectors, bands = dict(found["detectors"]), dict(found.get("bands", {}))

@@ -31,7 +31,7 @@ _KEYS: dict[Frame, tuple[str, str]] = {
     "horizontal": ("az", "el"),
 }
 
-_GALACTIC_TO_ICRS = (
+GALACTIC_TO_ICRS = (
     (-0.05487565771259218, +0.49410943719272665, -0.8676661375596585),
     (-0.8734370519556162, -0.4448297212232957, -0.19807633727300056),
     (-0.4838350736167156, +0.7469821839866677, +0.45598381368730206),
@@ -175,8 +175,8 @@ class Target(TextValue):
     @classmethod
     def _of(cls, frame: Frame, first: Any, second: Any) -> Target:
         names = _KEYS[frame]
-        longitude = _radians(first, names[0], hours=frame == "icrs", wrap=True)
-        latitude = _radians(second, names[1], hours=False)
+        longitude = radians(first, names[0], hours=frame == "icrs", wrap=True)
+        latitude = radians(second, names[1], hours=False)
         if not abs(latitude) <= math.pi / 2:
             raise mistake(f"{names[1]} must lie between -90 deg and 90 deg, got {second}")
         return cls(frame, longitude, latitude)
@@ -196,7 +196,7 @@ class Target(TextValue):
             math.sin(self.latitude),
         )
         x, y, z = (
-            sum(m * g for m, g in zip(row, galactic, strict=True)) for row in _GALACTIC_TO_ICRS
+            sum(m * g for m, g in zip(row, galactic, strict=True)) for row in GALACTIC_TO_ICRS
         )
         return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
 
@@ -238,7 +238,7 @@ class WithMap(Protocol):
         ...
 
 
-def _radians(value: Any, name: str, *, hours: bool, wrap: bool = False) -> float:
+def radians(value: Any, name: str, *, hours: bool, wrap: bool = False) -> float:
     """One angle in rad; ``hours``: colons count hours; ``wrap``: reduced to [0, 2 pi), exactly
     where it is in degrees.
     """

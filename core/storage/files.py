@@ -177,8 +177,6 @@ def check_memory(size: int, what: str, place: str) -> None:
 
 UNPACKED_MAX = 4_000_000_000
 """Bytes that a compressed FITS file, or the tiles of an image, may unpack to."""
-TEXT_MAX = 16_000_000
-"""Bytes of a table of numbers as text, unpacked."""
 
 
 def _only_member(path: str | os.PathLike[str], mode: Literal["rb"]) -> IO[bytes]:
@@ -235,6 +233,26 @@ def is_packed(path: str | os.PathLike[str]) -> bool:
     return _opener(path) is not open
 
 
+@contextlib.contextmanager
+def _unpacking(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
+    """A file to read from, unpacked if it is compressed. Raises ValueError for content that cannot
+    be unpacked, and OSError.
+    """
+    try:
+        with _opener(path)(path, "rb") as file:
+            yield file
+    except (EOFError, OSError, zlib.error, lzma.LZMAError, zipfile.BadZipFile) as error:
+        if isinstance(error, OSError) and error.errno is not None:  # the file, not its content
+            raise
+        raise ValueError(f"it cannot be unpacked ({error})") from error
+
+
+def first_bytes(path: str | os.PathLike[str], size: int = 9) -> bytes:
+    """The first bytes of a file's content, unpacked if it is compressed. Raises as `unpacked`."""
+    with _unpacking(path) as file:
+        return file.read(size)
+
+
 def unpacked(path: str | os.PathLike[str], place: str, most: int) -> bytes:
     """The content of a file, unpacked if it is compressed.
 
@@ -242,26 +260,12 @@ def unpacked(path: str | os.PathLike[str], place: str, most: int) -> bytes:
     that cannot be unpacked, and OSError.
     """
     most = min(most, machine.available_memory())
-    opener = _opener(path)
-    try:
-        with opener(path, "rb") as file:
-            content: bytes = file.read(most + 1)
-    except (EOFError, OSError, zlib.error, lzma.LZMAError, zipfile.BadZipFile) as error:
-        if isinstance(error, OSError) and error.errno is not None:  # the file, not its content
-            raise
-        raise ValueError(f"it cannot be unpacked ({error})") from error
+    with _unpacking(path) as file:
+        content = file.read(most + 1)
     if len(content) > most:
-        what = "has" if opener is open else "unpacks to"
+        what = "unpacks to" if is_packed(path) else "has"
         raise too_large(f"{what} more than {most / 1e6:g} MB, where reading stops", place)
     return content
-
-
-def unpacked_text(path: Path, place: str, most: int | None = None) -> str:
-    """The text of a table, unpacked.
-
-    Raises `InputError` for a text longer than ``most`` (`TEXT_MAX`), ValueError and OSError.
-    """
-    return unpacked(path, place, most or TEXT_MAX).decode("utf-8-sig")
 
 
 def temporary_sibling(path: str | os.PathLike[str]) -> Path:

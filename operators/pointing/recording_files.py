@@ -142,19 +142,11 @@ def read_recording(path: Path, clock: Clock, mask: int | None = None) -> Recordi
 
 
 def _text(path: Path, place: str) -> RecordedTable:
-    """Text: names as ``az [deg]``, ``Azimuth(deg)``, ``az_deg`` or ``az``; times as numbers or
-    dates.
+    """Text (CSV, ECSV, IPAC, VOTable): names as ``az [deg]``, ``Azimuth(deg)``, ``az_deg`` or
+    ``az``; times as numbers or dates.
     """
     table = read_table(path, place)
-    known = {name for names in ALIASES.values() for name in names}
-    columns: dict[str, tuple[Any, str]] = {}
-    for heading, column in table.columns.items():
-        name = heading.lower().replace(" ", "_")
-        short, _, unit = name.rpartition("_")
-        if short in known and name not in known:
-            name, column = short, (column[0], unit)
-        columns[name] = column
-    table.columns = columns
+    table.rename(ALIASES)
     return _dated(RecordedTable(table))
 
 
@@ -305,13 +297,14 @@ def _recording(given: RecordedTable, clock: Clock, mask: int | None, place: str)
             place=place,
             cure="name them time, az and el",
         )
-    factors = [table.factor(found[name], "rad") for name in which]
+    longitude, latitude = (
+        table.angles(found[name], hours=name == "ra", gaps=True) for name in which
+    )
     times: dict[str, Floats] = {}
     for name in {"time", "seconds"} & set(found):
         factor = 1.0 if clock == "mjd" else table.factor(found[name], "s", "s")
         times[name] = table.values(found[name]) * factor
     table.check()
-    longitude, latitude = (table.values(found[n]) * f for n, f in zip(which, factors, strict=True))
     _check_latitude(latitude, which[1], place)
     if start is not None and "seconds" in found:
         seconds = times["seconds"]

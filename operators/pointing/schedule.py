@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from zonda.core.configuration.units import (
     AngularSpeed,
     Fraction,
     SampleRate,
+    Unit,
 )
 from zonda.core.errors import InputError, PointingError
 from zonda.core.flags import IRREGULAR, intervals_of
@@ -160,17 +161,19 @@ def _site(table: Table) -> SchedulesSite | None:
 
 
 def _degrees(value: Any) -> float:
-    """Degrees of a number, or a text such as ``-22.96 deg``. Raises ValueError."""
-    from astropy.units import Quantity, UnitsError, deg, dimensionless_unscaled
-
+    """Degrees of a number, a text such as ``-22.96 deg``, or astropy's mapping of value and unit.
+    Raises ValueError.
+    """
+    if isinstance(value, Mapping):
+        unit = value.get("unit")
+        value = f"{value.get('value')} {unit.get('unit') if isinstance(unit, Mapping) else unit}"
     try:
-        found = Quantity(value)
-        degrees = found.value if found.unit == dimensionless_unscaled else found.to_value(deg)
-    except (TypeError, UnitsError) as err:
-        raise ValueError from err
+        degrees = float(str(value))
+    except ValueError:
+        degrees = math.degrees(Unit("rad").parse(str(value)))
     if not abs(degrees) <= 360:
         raise ValueError
-    return float(degrees)
+    return degrees
 
 
 def _of_text(text: str, place: str) -> Table:

@@ -19,7 +19,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,7 +31,7 @@ from zonda.core.errors import InputError
 from zonda.core.numerics.radiation import T_CMB
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.observation import Observation
-from zonda.core.storage.files import check_memory, reading
+from zonda.core.storage.table_files import NUMBERED, read_table
 from zonda.core.types import Floats
 
 from .skymap import FullSky, Nside, ScanSampler, SkyMap
@@ -99,20 +98,19 @@ def read(
         these spectra; the rms of the sky is not `PLAUSIBLE`, or the spectrum falls as C_l does,
         where no ``unit`` or ``scaling`` says so.
     """
-    with reading(place, "a power spectrum", CURE):
-        check_memory(4 * Path(place).stat().st_size, "the table", place)
-        try:
-            table = np.loadtxt(place, ndmin=2)
-        except ValueError as error:  # numpy's own cures are for those who call it
-            raise ValueError(str(error).partition("; use `")[0]) from None
-        with open(place, encoding="utf-8", errors="replace") as file:
-            lines = [line.strip() for line in islice(file, 100)]
-    comments = [line.strip("#! \t") for line in lines if line.startswith(("#", "!"))]
-    ell, stated = table[:, 0], " ".join(comments).lower()
-    if not np.isfinite(table).all():
-        row, column = np.argwhere(~np.isfinite(table))[0]
-        text = f"row {row + 1} of the numbers has {table[row, column]} in column {column + 1}"
-        raise InputError(text, place=place, cure="mend that row")
+    given = read_table(Path(place), place, names=NUMBERED)
+    for name in given.columns:
+        given.note_rows(
+            ~np.isfinite(given.values(name)),
+            f"has no number in column {name}",
+            f"mend that row; {CURE}",
+        )
+    given.check()
+    table = np.stack([given.values(name) for name in given.columns], axis=1)
+    comments = [line.lstrip("! ") for line in given.meta.get("comments", ())]
+    comments.append(" ".join(name.replace(" ", "_") for name in given.columns))
+    units = [unit for _, unit in given.columns.values()]
+    ell, stated = table[:, 0], " ".join([*comments, *units]).lower()
     rising = (ell == np.round(ell)).all() and (np.diff(ell) > 0).all()
     for wrong, text in (
         (table.shape[1] < 2, "has one column"),

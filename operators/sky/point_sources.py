@@ -23,6 +23,7 @@ from pydantic import Field
 
 from zonda.core.block import Block
 from zonda.core.configuration.input_paths import InputPath
+from zonda.core.configuration.target import GALACTIC_TO_ICRS
 from zonda.core.configuration.units import RadioFrequency
 from zonda.core.data import Data
 from zonda.core.errors import InputError
@@ -34,11 +35,26 @@ from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.plausibility import FLUX, doubt
-from zonda.core.storage.table_files import read_table
+from zonda.core.storage.table_files import SERIALIZED, read_table
 from zonda.core.types import Floats
 
 REACH = 6.0
 """Standard deviations of the beam beyond which a source is not seen."""
+
+ALIASES = {
+    "ra": ("ra", "_ra", "_raj2000", "ra_icrs", "_ra_icrs", "raj2000", "ra_j2000", "radeg",
+           "right_ascension", "alpha_j2000"),
+    "dec": ("dec", "_de", "_dec", "_dej2000", "de_icrs", "_de_icrs", "dec_icrs", "dej2000",
+            "decj2000", "dec_j2000", "de_j2000", "de", "dedeg", "decdeg", "declination", "decl",
+            "delta_j2000"),
+    "l": ("l", "glon", "gal_lon"),
+    "b": ("b", "glat", "gal_lat"),
+    "flux": ("flux", "flux_density", "fluxdensity", "flux_jy", "fnu", "f_nu", "s_nu", "snu", "s",
+             "total_flux", "int_flux", "integrated_flux", "fint", "sint"),
+    "spectral_index": ("spectral_index", "spindex", "sp_index", "spidx", "spix"),
+    "frequency": ("frequency", "freq", "nu", "ref_freq", "reference_frequency"),
+}  # fmt: skip
+"""Names of columns in catalogues, of VizieR, astropy and others, in small letters."""
 
 STEEPEST = 100.0
 """Largest spectral index of a source."""
@@ -51,9 +67,10 @@ class PointSources(Operator):
     """Point sources of a catalogue above the atmosphere (K_RJ), seen through Gaussian beams: part
     of the component ``sky``.
 
-    The catalogue is a table (ECSV or CSV) with the columns `ra` and `dec` (ICRS) and `flux`, with
-    units. Columns `spectral_index` (S ~ frequency^index; otherwise 0) and `frequency` (of the flux)
-    are optional.
+    The catalogue is a table (ECSV, CSV, IPAC, FITS, VOTable) with the columns `ra` and `dec` (ICRS,
+    in degrees or sexagesimal; or Galactic `l` and `b`) and `flux`, with units, by these names or
+    VizieR's. Columns `spectral_index` (S ~ frequency^index; otherwise 0) and `frequency` (of the
+    flux) are optional, as are their cells.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
@@ -123,38 +140,47 @@ class Catalogue:
         not.
         """
         table = read_table(step.catalogue)
-        units = {"ra": "rad", "dec": "rad", "flux": "Jy", "spectral_index": "", "frequency": "Hz"}
-        optional = {"spectral_index", "frequency"} & table.columns.keys()
-        found = {n: table.numbers(n, units[n]) for n in ("ra", "dec", "flux", *optional)}
-        ra, dec, flux = (found[name] for name in ("ra", "dec", "flux"))
+        table.rename(ALIASES)
+        frames = [
+            str(c.get("frame")) for c in table.meta.get(SERIALIZED, {}).values() if "frame" in c
+        ]
+        galactic = {"l", "b"} <= table.columns.keys() and "ra" not in table.columns
+        for frame in {*frames} - ({"galactic"} if galactic else {"icrs", "fk5"}):
+            table.note(-1, f"its positions are {frame}", "give ICRS: coord.icrs in astropy")
+        found = {"flux": table.numbers("flux", "Jy")}
+        for name, unit, empty in (("spectral_index", "", 0.0), ("frequency", "Hz", math.nan)):
+            if name in table.columns:
+                found[name] = table.numbers(name, unit, empty)
+        lon, lat = ("l", "b") if galactic else ("ra", "dec")
+        found["ra"] = ra = table.angles(lon, hours=not galactic)
+        found["dec"] = dec = table.angles(lat)
+        flux = found["flux"]
         for name, least, most, scale, unit in (
             ("ra", -360.0, 360.0, 180 / np.pi, " deg"),
             ("dec", -90.0, 90.0, 180 / np.pi, " deg"),
             ("spectral_index", -STEEPEST, STEEPEST, 1.0, ""),
             ("frequency", 1e-9, np.inf, 1.0, " Hz"),
         ):
-            for row, value in enumerate((found.get(name, flux[:0]) * scale).tolist()):
-                if value < least - 1e-10 or value > most + 1e-10:
-                    table.note(row, f"{name} is {value:g}{unit}", "mend that row, or its unit")
+            value = found.get(name, flux[:0]) * scale
+            for row in np.flatnonzero((value < least - 1e-10) | (value > most + 1e-10)).tolist():
+                text = f"{name} is {value[row]:g}{unit}"
+                table.note(row, text, "mend that row, or its unit")
         table.check()
         index = found.get("spectral_index", np.zeros(len(flux)))
-        if "frequency" in table.columns:
-            if step.frequency is not None:
+        frequency = found.get("frequency", np.full(len(flux), math.nan))
+        if step.frequency is not None:
+            if np.isfinite(frequency).any():
                 raise InputError(
                     "has a column frequency",
                     place=table.place,
                     cure=f"remove {step.label}.frequency, or the column",
                 )
-            frequency = found["frequency"]
-        else:
-            frequency = np.full(len(flux), math.nan if step.frequency is None else step.frequency)
-        return cls(
-            unit_vectors(ra, dec),
-            flux,
-            index,
-            frequency,
-            tuple(name for name in table.columns if name not in units),
-        )
+            frequency = np.full(len(flux), step.frequency)
+        directions = unit_vectors(ra, dec)
+        unused = tuple(name for name in table.columns if name not in (*found, lon, lat))
+        if galactic:
+            directions = directions @ np.array(GALACTIC_TO_ICRS).T
+        return cls(directions, flux, index, frequency, unused)
 
     def brightness(self, band: Band, scale: float) -> Floats:
         """(n,) S <...> of equation (1), K_RJ sr."""

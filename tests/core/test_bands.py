@@ -299,7 +299,7 @@ def written(net: str, passband: str) -> str:
             "1 mK s(1/2)",
             "file: bad.txt",
             "t.yaml:14:23",
-            "bands.1.file: passband file .*: contains NaN or infinity",
+            "bands.1.file: passband file .*: line 2: transmission is 'nan'",
         ),
     ],
 )

@@ -64,14 +64,55 @@ def test_passband_from_a_file(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("text", "lowest"),
+    [
+        ("160 0\n159 1\n141 1\n140 0\n", 0.0),
+        ("frequency,transmission\n140,0\n141,2\n159,2\n160,0\n", 0.0),
+        ("140 -0.01 # noise\n141 1\n159 1\n160 -0.01\n", -0.01),
+        ("# my band\n140\t0\n141\t1\n159\t1\n160\t0\n", 0.0),
+        ("Freq (Hz); err; Throughput\n140e9;1;0\n141e9;1;1\n159e9;1;1\n160e9;1;0\n", 0.0),
+        (
+            "|bandpass_frequency|bandpass_weight|\n|double|double|\n|GHz||\n"
+            " 140                0\n 141                1\n 159                1\n"
+            " 160                0\n",
+            0.0,
+        ),
+        (
+            "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: f, unit: GHz, datatype: float64}\n"
+            "# - {name: wl, unit: mm, datatype: float64}\n"
+            "# - {name: throughput, datatype: float64}\nf wl throughput\n140 2.14 0\n"
+            "141 2.12 1\n159 1.88 1\n160 1.87 0\n",
+            0.0,
+        ),
+    ],
+)
+def test_passbands_as_instruments_publish_them(tmp_path, text, lowest):
+    """Each is a trapezium about 150 GHz; noise below zero stays."""
+    (tmp_path / "band.txt").write_text(text)
+    band = zonda.Band(name="mine", file=tmp_path / "band.txt")
+    assert band.centre == pytest.approx(150e9)
+    assert (np.diff(band.frequency) > 0).all()
+    assert (band.transmission.min(), band.transmission.max()) == (lowest, 1.0)
+
+
+def test_a_passband_of_wavelengths(tmp_path):
+    c = 299792.458  # GHz um
+    rows = [f"{c / nu:.12g},{t}" for nu, t in ((140, 0), (141, 1), (159, 1), (160, 0))]
+    (tmp_path / "band.csv").write_text("\n".join(["wavelength [um],T", *rows]))
+    assert zonda.Band(name="mine", file=tmp_path / "band.csv").centre == pytest.approx(150e9)
+
+
+@pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("80 1\n", "has 1 rows"),
-        ("80 1 3\n90 1 3\n", "3 columns"),
-        ("80 one\n", "cannot be read as numbers"),
-        ("80 1\n80 1\n", "increase"),
-        ("80 nan\n90 1\n", "NaN"),
-        ("80 -1\n90 1\n", ">= 0"),
+        ("80 1\n", "has one row"),
+        ("80 1 3\n90 1 3\n", "has 3 columns, none of them frequency and transmission"),
+        ("80 one\n", "line 1: transmission is 'one', not a finite number"),
+        ("80 1\n80 1\n", "has a frequency twice"),
+        ("80 nan\n90 1\n", "line 1: transmission is 'nan'"),
+        ("80 -0.11\n90 1\n", "transmission is -0.11, more than 10% of the peak below zero"),
+        ("0 1\n90 1\n", "frequencies must be positive"),
+        ("f [K],t\n80,1\n90,1\n", "frequency has the unit 'K'"),
         ("80 0\n90 0\n", "somewhere > 0"),
     ],
 )

@@ -4,7 +4,6 @@ its source, site, time, PWV and seed.
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
@@ -82,10 +81,7 @@ class Table(WeatherSource):
             table that ends below 8 km.
         """
         place = f"table {self.table}"
-        text = table_files.read_text(self.table, place)
-        if not text.startswith("# %ECSV"):
-            text = re.sub(r"[ \t]*#.*", "", text)
-        table = table_files.read_table(self.table, place, text)
+        table = table_files.read_table(self.table, place, names=())
         table.columns = {
             " ".join(name.lower().replace("_", " ").split()): column
             for name, column in table.columns.items()

@@ -20,7 +20,7 @@ from astropy.io import fits
 
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.instrument import Band
-from zonda.core.storage import files, fits_files, hdf5_files
+from zonda.core.storage import files, fits_files, hdf5_files, table_files
 from zonda.operators.pointing.recording_files import read_recording
 from zonda.operators.sky.read import read_map
 
@@ -131,16 +131,21 @@ def test_tiles_that_unpack_to_much_are_refused(
 
 
 @pytest.mark.parametrize("kind", ["gz", "bz2", "xz"])
-def test_a_passband_that_unpacks_to_much_is_refused(kind: str, tmp_path: Path) -> None:
+def test_a_passband_that_unpacks_to_much_is_refused(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / f"band.txt.{kind}"
     PACK[kind](path, b"80 0\n90 1\n100 0\n")
     assert Band(name="a", file=path).centre == pytest.approx(90e9)
-    PACK[kind](path, b"80 0\n90 1\n" + b"\n" * files.TEXT_MAX)
+    PACK[kind](path, b"80 0\n90 1\n" + b"\n" * 16_000_000)
     assert path.stat().st_size < 30_000
+    with pytest.raises(ZondaError, match=r"has 16000003 lines, which need 7\.84 GB of memory"):
+        Band(name="a", file=path)
+    monkeypatch.setattr(table_files, "LARGEST", 16_000_000)
     with pytest.raises(ZondaError, match="unpacks to more than 16 MB, where reading stops"):
         Band(name="a", file=path)
     path.write_bytes(path.read_bytes()[:40])
-    with pytest.raises(ZondaError, match="cannot be read as numbers: it cannot be unpacked"):
+    with pytest.raises(ZondaError, match="cannot be read as a table: it cannot be unpacked"):
         Band(name="a", file=path)
 
 

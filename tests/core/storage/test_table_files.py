@@ -4,6 +4,9 @@ place.
 
 from __future__ import annotations
 
+import contextlib
+import gzip
+
 import numpy as np
 import pytest
 from astropy import units as u
@@ -156,3 +159,153 @@ def test_aliases_of_a_header_do_not_multiply(tmp_path):
         with pytest.raises(InputError, match="aliases unfold to more than") as told:
             read_table(tmp_path / "t.ecsv")
         assert "table.write" in told.value.cure
+
+
+POSITIONS = """#
+#Column RAJ2000 (a10)
+_RAJ2000\t_DEJ2000\tRAJ2000\tDEJ2000\tFlux
+deg\tdeg\t"h:m:s"\t"d:m:s"\tmJy
+--------\t--------\t----------\t---------\t----
+083.6331\t+22.0145\t05 34 31.94\t+22 00 52.2\t1.5
+"""
+
+
+@pytest.mark.parametrize("mark", ["\t", ";"])
+def test_tables_of_vizier(tmp_path, mark):
+    """Names, units and dashes; both positions are the Crab's, to the digits written."""
+    path = tmp_path / "vizier.tsv"
+    path.write_text(POSITIONS.replace("\t", mark))
+    table = read_table(path)
+    deg = np.degrees([table.angles("_RAJ2000"), table.angles("RAJ2000", hours=True)])
+    np.testing.assert_allclose(deg, 83.6331, atol=5e-5)
+    deg = np.degrees([table.angles("_DEJ2000"), table.angles("DEJ2000")])
+    np.testing.assert_allclose(deg, 22.0145, atol=5e-5)
+    assert table.numbers("Flux", "Jy") == pytest.approx([1.5e-3])
+    table.check()
+
+
+@pytest.mark.parametrize(
+    ("kind", "suffix"),
+    [("ascii.ecsv", "ecsv"), ("ascii.ipac", "tbl"), ("votable", "vot"), ("fits", "fits")],
+)
+@pytest.mark.parametrize("packed", [False, True])
+def test_formats_of_astropy(tmp_path, kind, suffix, packed):
+    """Names, units, empty cells, texts and rows are those of the table that was written."""
+    path = tmp_path / f"t.{suffix}"
+    made = AstropyTable(
+        {
+            "Name": ["one two", "three"],
+            "RA": [75.25, 359.5] * u.deg,
+            "flux": [1.0, 2.5] * u.mJy,
+            "index": np.ma.array([-0.7, 3.5], mask=[True, False]),
+            "count": [1, 3],
+            "good": [True, False],
+        }
+    )
+    if kind == "ascii.ipac":
+        made.remove_column("good")
+    made.write(path, format=kind)
+    if packed:
+        path.write_bytes(gzip.compress(path.read_bytes()))
+    table = read_table(path)
+    assert len(table) == 2
+    assert table.texts("Name") == ["one two", "three"]
+    np.testing.assert_allclose(table.angles("RA", hours=True), np.radians([75.25, 359.5]))
+    np.testing.assert_allclose(table.numbers("flux", "Jy"), [1e-3, 2.5e-3])
+    np.testing.assert_allclose(table.numbers("index", empty=-9.0), [-9.0, 3.5])
+    np.testing.assert_allclose(table.numbers("count"), [1, 3])
+    table.check()
+    table.numbers("index")
+    with pytest.raises(
+        InputError, match=r"(line|row) \d+: index is '(null|)', not a finite number"
+    ):
+        table.check()
+    if "good" in table.columns:
+        assert table.texts("good") in (["True", "False"], ["1", "0"])
+
+
+@pytest.mark.parametrize(
+    ("heading", "found"),
+    [
+        ("RA (deg),Freq_GHz", {"ra": "deg", "frequency": "GHz"}),
+        ("coord.ra,nu [Hz]", {"ra": "", "frequency": "Hz"}),
+        ("_RAJ2000 [deg],RA,freq", {"ra": "", "_RAJ2000": "deg", "frequency": ""}),
+        ("Ra J2000,FREQUENCY", {"ra": "", "frequency": ""}),
+        ("ra_error,frequency_of_what", {"ra_error": "", "frequency_of_what": ""}),
+    ],
+)
+def test_names_that_files_have(tmp_path, heading, found):
+    path = tmp_path / "t.csv"
+    path.write_text(f"{heading}\n{','.join('1' * len(heading.split(',')))}\n")
+    table = read_table(path)
+    table.rename({"ra": ("ra", "_raj2000", "ra_j2000"), "frequency": ("frequency", "freq", "nu")})
+    assert {name: unit for name, (_, unit) in table.columns.items()} == found
+
+
+@pytest.mark.parametrize(
+    ("unit", "cell", "degrees"),
+    [
+        ("", "05:00:00", 75.0),
+        ("", "05h00m00s", 75.0),
+        ("", "05 00 36.0", 75.15),
+        ("deg", "05:00:00", 5.0),
+        ("", "75d30m", 75.5),
+        ("hourangle", "5", 75.0),
+        ("h", "5.5", 82.5),
+        ("", "05:61:00", None),
+        ("", "05:00:00 x", None),
+    ],
+)
+def test_right_ascensions(tmp_path, unit, cell, degrees):
+    path = tmp_path / "t.csv"
+    path.write_text(f"ra [{unit}],n\n{cell},1\n")
+    table = read_table(path)
+    found = np.degrees(table.angles("ra", hours=True))
+    if degrees is None:
+        with pytest.raises(InputError, match="line 2: ra '05:"):
+            table.check()
+    else:
+        table.check()
+        np.testing.assert_allclose(found, degrees, rtol=1e-14)
+
+
+def test_names_for_numbers_without_a_heading(tmp_path):
+    path = tmp_path / "t.txt"
+    path.write_text("# two words\n\t1\t2  # here\n3 4\n")
+    table = read_table(path, names=("x", "y", "z"))
+    assert list(table.columns) == ["two", "words"], "a comment with as many words names them"
+    path.write_text("# a remark of more words\n1\t 2  # here\n3 4\n")
+    table = read_table(path, names=("x", "y", "z"))
+    np.testing.assert_allclose([table.numbers("x"), table.numbers("y")], [[1, 3], [2, 4]])
+    assert table.meta["comments"] == ["a remark of more words"]
+
+
+HARM = {
+    "a unit of a table's tag": (
+        "# %ECSV 1.0\n# ---\n# meta: {a: !astropy.units.Unit {unit: '10**999999999 m'}}\n"
+        "# datatype:\n# - {name: a, datatype: int64}\na\n1\n"
+    ),
+    "an object of another package": (
+        "# %ECSV 1.0\n# ---\n# meta: {a: !numpy.ndarray {shape: [9999999999], dtype: f8}}\n"
+        "# datatype:\n# - {name: a, datatype: int64}\na\n1\n"
+    ),
+    "blanks before a bracket": "a b" + " " * 300_000 + "c\n1 2 3\n",
+    "blanks within a name": "a" + " " * 100_000 + "b,c\n1,2\n",
+    "entities": '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><VOTABLE>&b;</VOTABLE>',
+    "a table elsewhere": (
+        "<VOTABLE><RESOURCE><TABLE><FIELD name='a'/><DATA><BINARY><STREAM href='file:///etc/passwd'"
+        "/></BINARY></DATA></TABLE></RESOURCE></VOTABLE>"
+    ),
+    "elements within elements": "<VOTABLE>" + "<a>" * 200_000,
+    "a long header": "# %ECSV 1.0\n# ---\n" + "# - a\n" * 60_000 + "a\n1\n",
+    "many lines": "\n" * 20_000_000,
+}
+
+
+@pytest.mark.parametrize("text", HARM.values(), ids=HARM)
+def test_tables_made_to_harm(tmp_path, text):
+    """Each is read, or refused, at once: nothing of it is evaluated, opened or unfolded."""
+    path = tmp_path / "harm"
+    path.write_text(text)
+    with contextlib.suppress(InputError):
+        assert len(read_table(path)) == 1

@@ -4,6 +4,8 @@ spectrum.
 
 from __future__ import annotations
 
+import gzip
+
 import healpy
 import numpy as np
 import pytest
@@ -153,8 +155,8 @@ def test_without_a_spectrum_it_is_refused():
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("2 1000\n3 x\n", "cannot be read as a power spectrum"),
-        ("2 1000 5\n3 1000\n", "the number of columns changed"),
+        ("2 1000\n3 x\n", "line 2: has no number in column 2"),
+        ("2 1000 5\n3 1000\n", "line 2: has 2 values, not 3"),
         ("2 1000 1\n3 1000 1\n", "has 3 columns, and no heading names them"),
         ("2 1e-10\n3 1e-10\n", r"dimensionless \(rms 22.9 uK\)"),
         ("2 1e-9\n3 1e-9\n", "unit: K\\^2"),
@@ -163,7 +165,7 @@ def test_without_a_spectrum_it_is_refused():
         ("# L EE BB\n2 30 1\n3 30 1\n", "no heading names them"),
         ("2 1000\n4 1000\n", "multipoles are missing"),
         ("3 1000\n2 1000\n", "no rising series"),
-        ("2 1000\n3 nan\n4 1000\n", "row 2 of the numbers has nan in column 2"),
+        ("2 1000\n3 nan\n4 1000\n", "line 2: has no number in column 2"),
         ("2\n3\n", "has one column"),
         ("2 -5\n3 1000\n", "no sky has this spectrum"),
         ("2 100 1 0 50\n3 100 1 0 5\n", "no sky has this spectrum"),
@@ -251,3 +253,30 @@ def test_the_rms_of_the_sky_is_told(tmp_path):
     step = CMBSky(spectrum=path, nside=512)
     assert step.sky(1, False)[1] == pytest.approx(step.read().rms, rel=0.05)
     assert f"rms {1e6 * step.read().rms:.4g} uK_CMB" in step.check(None)[0]
+
+
+@pytest.mark.parametrize("kind", ["ascii.ecsv", "ascii.csv", "fits", "votable"])
+def test_tables_with_names(tmp_path, kind):
+    """The spectrum of a table is that of plain text with the same columns."""
+    from astropy.table import Table
+
+    ell = np.arange(2, 40)
+    columns = {"ell": ell, "TT": 1000.0 + ell, "TE": 0.1 * ell, "EE": 10.0 + ell, "BB": 0.01 * ell}
+    made = Table(columns)
+    if kind != "ascii.csv":
+        for name in cmb.READ:
+            made[name].unit = "uK2"
+    made.write(tmp_path / "t", format=kind)
+    found = read(str(tmp_path / "t"))
+    heading = "L " + " ".join(list(columns)[1:])
+    np.savetxt(tmp_path / "t.txt", np.transpose(list(columns.values())), header=heading)
+    np.testing.assert_allclose(found.values, read(str(tmp_path / "t.txt")).values, rtol=1e-12)
+
+
+def test_a_packed_spectrum_is_unpacked_up_to_a_limit(tmp_path):
+    path = tmp_path / "cl.txt.gz"
+    path.write_bytes(gzip.compress(b"2 1000\n3 1000\n"))
+    assert read(str(path)).values.shape == (4, 4)
+    path.write_bytes(gzip.compress(b"2 1000\n3 1000\n" + b"\n" * 10_000_000))
+    with pytest.raises(InputError, match="GB of memory"):
+        read(str(path))

@@ -148,3 +148,48 @@ def test_catalogues_that_are_wrong(tmp_path, heading, row, match):
     )
     with pytest.raises(InputError, match=match):  # `zonda check` says so too
         PointSources(catalogue=path).check(zonda.Data(scene))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "ra,dec,flux [Jy]\n05:00:00,+20:00:00,1\n",
+        "RA (deg);DEC (deg);Flux (mJy)\n75;20;1000\n",
+        "ra [h]\tdec [deg]\tflux [Jy]\n5\t20\t1\n",
+        "ra [deg],dec [deg],flux [Jy],spectral_index,frequency [GHz]\n75,20,1,,\n",
+        'RAJ2000\tDEJ2000\tS\n"h:m:s"\t"d:m:s"\tJy\n---\t---\t---\n05 00 00\t+20 00 00\t1\n',
+        "RA_ICRS [deg],DE_ICRS [deg],s_nu [Jy]\n75,20,1\n",
+        "GLON [deg],GLAT [deg],flux [Jy]\n181.656842606,-13.583273125,1\n",
+    ],
+)
+def test_catalogues_as_people_have_them(tmp_path, text):
+    """1 Jy at 75 deg +20 deg; Galactic coordinates as astropy has them, to 0.1 arcsec."""
+    path = tmp_path / "c.txt"
+    path.write_text(text)
+    found = Catalogue.read(PointSources(catalogue=path))
+    ra, dec = np.radians([75, 20])
+    expected = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
+    np.testing.assert_allclose(found.directions[0], expected, atol=0.1 * ARCSEC)
+    assert (found.flux[0], found.index[0]) == (pytest.approx(1.0), 0.0)
+    assert np.isnan(found.frequency[0])
+    assert found.unused == ()
+
+
+@pytest.mark.parametrize("kind", ["ecsv", "fits"])
+@pytest.mark.parametrize("frame", ["icrs", "galactic", "fk4"])
+def test_positions_of_astropy(tmp_path, kind, frame):
+    from astropy import units as u
+    from astropy.coordinates import SkyCoord
+    from astropy.table import QTable
+
+    there = SkyCoord([75, 76] * u.deg, [20, -21] * u.deg).transform_to(frame)
+    path = tmp_path / f"c.{kind}"
+    QTable({"name": ["a", "b"], "where": there, "flux": [1.0, 2.0] * u.Jy}).write(path)
+    step = PointSources(catalogue=path)
+    if frame == "fk4":
+        with pytest.raises(InputError, match="its positions are fk4"):
+            Catalogue.read(step)
+        return
+    found = Catalogue.read(step).directions
+    # our Galactic axes are astropy's to 1e-16; rotations lose some of that
+    np.testing.assert_allclose(found, there.icrs.cartesian.xyz.value.T, atol=1e-13)
