@@ -77,6 +77,10 @@ class MapArrays:
         Hits of each scan (`BinMap: {scan_hits: true}`); None: not kept.
     band
         Band of the run, with which `to` converts units; None: not known.
+    origin
+        `map_file.Provenance`, what files state of the run that made it; None: of no run.
+    spectral_index
+        That of the flux density with which the map was converted to its `unit`; None: it was not.
     beams
         FWHM [rad] of the narrowest and the widest beam in the map; zeros: not known.
     """
@@ -101,6 +105,8 @@ class MapArrays:
     scan_hits: ScanHits | None = None
     band: Band | None = None
     beams: tuple[float, float] = (0.0, 0.0)
+    origin: Any = None
+    spectral_index: float | None = None
 
     signal = Rows[Floats]("signal")
     hits = Rows[NDArray[np.int64]]("hits")

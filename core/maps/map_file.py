@@ -4,7 +4,7 @@ from.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -14,18 +14,20 @@ from astropy.io import fits
 from astropy.io.fits import Header
 from numpy.typing import NDArray
 
+from ..configuration.time import SECOND
 from ..data import Data
 from ..errors import OutputError
 from ..storage.files import atomic_path
 from ..storage.fits_files import header_of, joined, table_bytes, write_image
 from .header import exact_header
 from .map_arrays import MapArrays
-from .measured_noise import stated
+from .measured_noise import ELSEWHERE, stated
 from .planes import Plane
 from .units import scale_of
 
 CONVENTION = "COSMO"
 """In which Q and U of maps are: angles from south to east."""
+MJD_OF_1970 = 40587.0
 LONGEST = 66
 """Letters of a text in a card."""
 _SCALES = {"K_RJ": "Rayleigh-Jeans brightness", "K_CMB": "temperature of the CMB"}
@@ -45,11 +47,17 @@ class Provenance:
     tables
         The resolved YAML (a row per line), the plan and the log: binary tables of text, as they
         stand at a file's end.
+    product
+        Name of the map among those of its run.
+    quiet
+        True for a map of a signal without noise (`Signal.is_quiet`).
     """
 
     cards: Cards
     history: list[str] = field(default_factory=list)
     tables: bytes = b""
+    product: str = "map"
+    quiet: bool = False
 
     @classmethod
     def of_a_map(cls, product: MapArrays) -> Provenance:
@@ -59,20 +67,23 @@ class Provenance:
         return cls([*_origin(__version__), ("NSCANS", len(product.scans), "scans")])
 
     @classmethod
-    def of(cls, data: Data) -> Provenance:
-        """Provenance of a run that has ended: cards of its origin; the command and the resolved
-        YAML as history.
+    def of(cls, data: Data, tables: bool = True) -> Provenance:
+        """Provenance of a run whose scans are mapped: cards of its origin; the command and the
+        resolved YAML as history. ``tables``: with these.
         """
         import zonda
 
         scene, provenance = data.scene, data.provenance
         version = provenance.get("versions", {}).get("zonda", zonda.__version__)
-        start = str(min((o.start for o in data.scans), default=scene.time))
+        start = min((o.start for o in data.scans), default=scene.time)
+        days = start.nanoseconds / (86400 * SECOND)
         cards = [
             *_origin(version),
             ("PIPELINE", ascii_text(str(provenance.get("name", ""))), "pipeline"),
             ("SEED", int(scene.seed), "root of all random numbers"),
-            ("DATE-OBS", start, "start of the first scan, UTC"),
+            ("DATE-OBS", start.isoformat().rstrip("Z"), "start of the first scan, UTC"),
+            ("MJD-OBS", MJD_OF_1970 + days, "[d] the same"),
+            ("EXPTIME", sum(o.duration for o in data.scans), "[s] of all scans, without gaps"),
             ("NSCANS", len(data.scans), "scans"),
         ]
         history: list[str] = []
@@ -80,15 +91,19 @@ class Provenance:
         origins = [o.origin for o in data.scans] or [
             (camera.telescope.name, camera.name, scene.site.name)
         ]
-        for key, every in zip(
-            ("TELESCOP", "INSTRUME", "SITE"), zip(*origins, strict=True), strict=True
-        ):
+        named: dict[str, Any] = dict(
+            zip(("TELESCOP", "INSTRUME", "SITE"), zip(*origins, strict=True), strict=True)
+        )
+        named["OBJECT"] = _positions({o.centre for o in data.scans})
+        for key, every in named.items():
             text, names = listed(every)
             history += [f"{key}: {name}" for name in names]
             cards.append((key, text))
         yaml = str(provenance.get("resolved_yaml", ""))
         history += map(ascii_text, filter(None, (str(provenance.get("command", "")),)))
         history += map(ascii_text, yaml.splitlines())
+        if not tables:
+            return cls(cards, history)
         texts: list[tuple[str, tuple[str, ...], Any]] = [
             ("RESOLVED_YAML", ("LINE",), [(line,) for line in yaml.splitlines()]),
             ("PLAN", ("EFFECT", "DECISION", "BOUND", "FORMULA"), provenance.get("plan")),
@@ -100,6 +115,23 @@ class Provenance:
             if rows
         )
         return cls(cards, history, b"".join(written))
+
+
+def _positions(centres: Collection[tuple[float, float]]) -> list[str]:
+    """ICRS directions (ra, dec) [rad] as text: ``05h00m00.00s +20d00m00.0s``."""
+    from astropy.coordinates import Angle
+
+    if not centres:
+        return []
+    longitudes, latitudes = Angle(np.transpose(sorted(centres)), "rad")
+    return [
+        f"{a} {b}"
+        for a, b in zip(
+            longitudes.to_string("hourangle", precision=2, pad=True),
+            latitudes.to_string("deg", precision=1, pad=True, alwayssign=True),
+            strict=True,
+        )
+    ]
 
 
 def _origin(version: str) -> Cards:
@@ -201,6 +233,8 @@ class MapFile:
         if (band := self.product.band) is not None:
             cards.append(("RESTFRQ", float(f"{band.centre:.12g}"), "[Hz] centre of the band"))
             cards.append(("BAND", ascii_text(band.name), "name of the band"))
+        if (index := self.product.spectral_index) is not None:
+            cards.append(("SPECINDX", index, "of the flux density, for the unit: at RESTFRQ"))
         return header_of(cards, about.history)
 
     def write(self, path: Path, about: Provenance) -> Path:
@@ -256,12 +290,12 @@ class MapFile:
             ("COORDSYS", _COORDSYS[product.frame], f"{product.frame}"),
             ("NSIDE", product.nside, "resolution"),
             ("INDXSCHM", "EXPLICIT", "pixel numbers are in the column PIXEL"),
-            ("OBJECT", "PARTIAL", "not all of the sky"),
             *self.about(self.rows, one=False),
         ]
+        part = header_of([("OBJECT", "PARTIAL", "not all of the sky")])
         primary = fits.PrimaryHDU()
         primary.header.extend(self.first(about))
-        table.header.extend(joined(header_of(cards), self.first(about), self.cards))
+        table.header.extend(joined(header_of(cards), self.first(about), self.cards, part))
         fits.HDUList([primary, table]).writeto(path, output_verify="exception")
 
 
@@ -272,15 +306,18 @@ def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
         raise OutputError(
             "exists already", place=str(path), cure="choose another name, or write overwrite=True"
         )
-    noise = {}
+    about: Provenance = product.origin or Provenance.of_a_map(product)
+    noise: dict[str, tuple[float | None, str]] = {}
     for key, plane in product.by_stokes().items():
         half = plane.half_difference
-        if np.isfinite(plane.noise).any():
+        if about.quiet:
+            noise[key] = None, ELSEWHERE
+        elif np.isfinite(plane.noise).any():
             noise[key] = stated(
                 plane.noise,
                 None if half is None else (half, f"half the difference, {plane.difference}"),
             )
-    return MapFile.of("map", product, noise).write(path, Provenance.of_a_map(product))
+    return MapFile.of(about.product, product, noise).write(path, about)
 
 
 def _type(values: NDArray[Any]) -> np.dtype[Any]:

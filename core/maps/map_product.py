@@ -25,13 +25,14 @@ if TYPE_CHECKING:
 class MapProduct(MapArrays):
     """`MapArrays`, and what is done with them."""
 
-    def to(self, unit: str, *, spectral_index: float = 0.0) -> MapProduct:
+    def to(self, unit: str, *, spectral_index: float | None = None) -> MapProduct:
         """The map in another unit: K_RJ, K_CMB, Jy/beam, Jy/pixel, MJy/sr or y, with a prefix
         (``uK_CMB``, ``mJy/beam``).
 
         ``uK`` alone is on the map's own temperature scale. Equation (1) of
         `core.numerics.radiation` averages over the band of the run; ``spectral_index`` is that of
-        the flux density within the band. A beam is a Gaussian of `resolution`. Weights that are an
+        the flux density within the band (None: that of the map's own unit, else 0), and values are
+        those at the band's centre. A beam is a Gaussian of `resolution`. Weights that are an
         inverse variance are divided by the square of the factor. Raises InputError for a unit that
         is not known, and where the map has no band or beam.
         """
@@ -75,8 +76,8 @@ class MapProduct(MapArrays):
         return draw_map(self, ax, plane, title, limit)
 
     def write(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write it as `SaveMap` does (FITS image, or HEALPix table), without the log of the run;
-        the path.
+        """Write it as `SaveMap` does (FITS image, or HEALPix table), without the tables of the
+        run's YAML, plan and log; the path. NOISEFAC is measured in the half-difference.
 
         Raises `OutputError` where the file is there already (unless ``overwrite``), or cannot be
         written.

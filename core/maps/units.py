@@ -20,7 +20,7 @@ from .map_arrays import MapArrays
 Map = TypeVar("Map", bound=MapArrays)
 
 
-def converted(product: Map, unit: str, spectral_index: float) -> Map:
+def converted(product: Map, unit: str, spectral_index: float | None) -> Map:
     """`MapProduct.to`: values times K_RJ per old unit over K_RJ per new unit."""
     scale = scale_of(product.unit)[1] or "K_RJ"
     try:
@@ -28,11 +28,13 @@ def converted(product: Map, unit: str, spectral_index: float) -> Map:
     except InputError as err:
         cure = f"use {KNOWN_UNITS}, with a prefix where you like: mK_RJ"
         raise InputError(err.message, place="map.to", cure=cure) from None
-    factor = _kelvin_per(product, product.unit, spectral_index) / _kelvin_per(
-        product, name, spectral_index
-    )
+    own = product.spectral_index or 0.0
+    index = own if spectral_index is None else float(spectral_index)
+    factor = _kelvin_per(product, product.unit, own) / _kelvin_per(product, name, index)
     planes = {key: plane.scaled(factor) for key, plane in product.planes.items()}
-    return replace(product, unit=name, planes=planes)
+    plain, _ = parse_unit(name, place="map.to")
+    stated = index if plain in SURFACE_BRIGHTNESS_UNITS else None
+    return replace(product, unit=name, planes=planes, spectral_index=stated)
 
 
 def _kelvin_per(product: MapArrays, unit: str, spectral_index: float) -> float | Floats:
@@ -43,6 +45,9 @@ def _kelvin_per(product: MapArrays, unit: str, spectral_index: float) -> float |
     if product.band is None:
         cure = "convert a map that a run made, or set map.band = zonda.Band(...)"
         raise InputError(f"the band of the map is not known: no {unit}", place="map", cure=cure)
+    if plain == "Jy/beam" and not product.resolution > 0:
+        cure = "use MJy/sr, or set map.fwhm, the FWHM of its beam in radian"
+        raise InputError(f"the beam of the map is not known: no {unit}", place="map", cure=cure)
     beam = math.pi / (4 * math.log(2)) * product.resolution**2 if plain == "Jy/beam" else None
     index = spectral_index if plain in SURFACE_BRIGHTNESS_UNITS else 0.0
     return (

@@ -34,7 +34,7 @@ from zonda.core.maps.noise_figures import Noise, maps_of, noise_alone, noise_sou
 from zonda.core.maps.on_plane import on_plane
 from zonda.core.maps.smoothing import smoother
 from zonda.core.numerics.angles import angle_text, sides_text
-from zonda.core.output import Output, output_folder
+from zonda.core.output import MapOutput, output_folder
 from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.types import AnyFloats, Floats
 
@@ -182,7 +182,7 @@ def draw_map(
         lines = f"Contours of the signal-to-noise ratio: {contour_text(style.contours)}"
         text += f" {lines} (negative ones dashed). Its noise: {noise_text(snr[1])}."
     limit = flat.limit("signal", SHOWN if signal == "noiseless" else 99.7)
-    ax = _panels([(flat, flat.planes["signal"], head)], shown.resolution, limit)[0]
+    ax = _panels([(flat, flat.planes["signal"], head)], shown, limit)[0]
     if snr is not None:
         plot_contours(ax, np.where(flat.covered, flat.planes["snr"], np.nan), style.contours)
     return [Sketch(file, title, text, ax)]
@@ -213,8 +213,9 @@ def draw_noise(
         limits.append(flat.limit(plane, 99.7))
         rms = shown.rms(diameter / 2, of=plane)
         if math.isfinite(rms):
-            values.append(f"{words} {rms * 1e6:.4g} µK_RJ")
-    axes = _panels(panels, shown.resolution, max((x for x in limits if x), default=None))
+            scale, unit = (1e6, "µK_RJ") if shown.unit == "K_RJ" else (1.0, shown.unit)
+            values.append(f"{words} {rms * scale:.4g} {unit}")
+    axes = _panels(panels, shown, max((x for x in limits if x), default=None))
     place = axes[0].wcs.wcs_world2pix([np.degrees(first.centre)], 0)[0]
     for ax in axes:
         plot_circle(ax, panels[0][1].shape, place, diameter)
@@ -296,7 +297,7 @@ def _titled(title: str, shown: MapProduct) -> str:
 
 def _panels(
     panels: Sequence[tuple[Flat, AnyFloats, str]],
-    fwhm: float,
+    product: MapProduct,
     limit: float | None,
 ) -> list[Any]:
     """Axes of maps side by side with their titles, where the first map is well covered."""
@@ -304,7 +305,8 @@ def _panels(
     axes = map_axes(first.covered.shape, first.wcs, len(panels))
     for ax, (_, values, title) in zip(axes, panels, strict=True):
         shown = np.where(first.covered, values, np.nan)
-        plot_map(shown, first.wcs, ax=ax, title=title, fwhm=fwhm or None, limit=limit)
+        more: Any = {"fwhm": product.resolution or None, "unit": product.unit}
+        plot_map(shown, first.wcs, ax=ax, title=title, limit=limit, **more)
     return axes
 
 
@@ -326,7 +328,7 @@ FILES: dict[type, str] = {Spectrum: "power_spectra", TimeStream: "tod"}
 """File names of pictures that are not named as their product."""
 
 
-class Plots(Output):
+class Plots(MapOutput):
     """Pictures of the products, as PNG, PDF or SVG files in the output folder, each where there is
     something to show.
 
@@ -360,10 +362,6 @@ class Plots(Output):
     dpi: float = Field(DPI, ge=50, le=600)
     """Dots per inch of PNG files; images within PDF and SVG files have at least 300."""
 
-    def observe(self, data: Data) -> None:
-        """Refuse a missing or unwritable output folder before anything is simulated."""
-        output_folder(data, self.label)
-
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
         data.products["pictures"] = made = list(pictures(data, self))
@@ -378,9 +376,9 @@ class Plots(Output):
         return float(width)
 
     def smoothed(self, product: MapProduct) -> MapProduct:
-        """The map as its picture shows it."""
+        """The map as its picture shows it, in its unit."""
         fwhm = self.smoothing(product)
-        return product.smoothed(fwhm) if fwhm > 0 else product
+        return self.in_unit(product.smoothed(fwhm) if fwhm > 0 else product)
 
     def printed(self, sketch: Sketch) -> Picture:
         """A sketch in all formats; PNG always, since reports show it."""

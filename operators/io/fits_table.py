@@ -120,7 +120,7 @@ def _primary_header(tod: TimeOrderedData) -> fits.Header:
     header["SITELAT"] = (float(np.degrees(latitude)), "[deg] geodetic latitude")
     header["SITELON"] = (float(np.degrees(longitude)), "[deg] longitude, east positive")
     header["SITEALT"] = (float(altitude), "[m] height above the ellipsoid")
-    header["DATE-OBS"] = (tod.start, "UTC, start of the scan")
+    header["DATE-OBS"] = (tod.start.rstrip("Z"), "UTC, start of the scan")
     header["TIMESYS"] = "UTC"
     header["SAMPRATE"] = (float(tod.sample_rate), "[Hz]")
     header["FOV"] = (float(np.degrees(tod.field_of_view)), "[deg] diameter")
@@ -283,7 +283,7 @@ def _read(file: Any) -> TimeOrderedData:
     )
     tod = TimeOrderedData(
         name=header["OBJECT"],
-        start=header["DATE-OBS"],
+        start=f"{str(header['DATE-OBS']).rstrip('Z')}Z",  # UTC: FITS writes no Z
         sample_rate=header["SAMPRATE"],
         telescope=header["TELESCOP"],
         field_of_view=float(np.radians(header["FOV"])),

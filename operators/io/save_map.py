@@ -22,7 +22,7 @@ from zonda.core.maps.noise_figures import (
     noise_stated,
 )
 from zonda.core.maps.planes import Plane
-from zonda.core.output import Output, output_folder
+from zonda.core.output import MapOutput, output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, product_path
 from zonda.core.storage.fits_files import header_of
 
@@ -33,10 +33,11 @@ MEANINGS = {
 """Of the planes of a noise map."""
 
 
-class SaveMap(Output):
+class SaveMap(MapOutput):
     """FITS files of all maps, in the output folder.
 
-    ``map.fits``, ``noiseless_map.fits`` ...: the signal in the primary HDU (K_RJ), then HITS,
+    ``map.fits``, ``noiseless_map.fits`` ...: the signal in the primary HDU (K_RJ, or
+    `unit`), then HITS,
     WEIGHTS, NOISE and, where it was made, HALF_DIFFERENCE, all with the same world coordinates;
     HEALPix maps are explicit-index (partial) tables that healpy reads. Of polarized maps I, Q, U
     (POLCCONV = COSMO), HITS, WEIGHTS, the covariance COV_II ... COV_UU and CONDITION. CROSSLINKING
@@ -45,8 +46,9 @@ class SaveMap(Output):
     it is to be multiplied by for noise that is correlated between pixels, and NOISEOF says what
     that was measured in, else "white noise only"; of a signal without noise, that NOISE is that of
     the complete map. ``noise_map.fits``: the half-difference of the scans and the source-free run's
-    map, with the rms in the middle (`central_diameter`). Every file carries beam, seed, versions,
-    the resolved YAML and the log of the run.
+    map, with the rms in the middle in kelvin (`central_diameter`). Every file carries beam, seed,
+    versions, start (DATE-OBS, MJD-OBS), observing time (EXPTIME), the position of each target
+    (OBJECT), the resolved YAML and the log of the run.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
@@ -60,10 +62,6 @@ class SaveMap(Output):
     overwrite: bool = Field(True)
     """Replace files of an earlier run; if false, they are an error."""
 
-    def observe(self, data: Data) -> None:
-        """Refuse a missing or unwritable output folder before anything is simulated."""
-        output_folder(data, self.label)
-
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)
         maps = maps_of(data.products, split=False)
@@ -76,7 +74,7 @@ class SaveMap(Output):
         planes, runs = maps_of(data.products), data.provenance.get("runs")
         files = {
             product_path(folder, name, ".fits"): MapFile.of(
-                name, product, noise_stated(planes, name, runs)
+                name, self.in_unit(product), noise_stated(planes, name, runs)
             )
             for name, product in maps.items()
         }
@@ -84,12 +82,12 @@ class SaveMap(Output):
         for name, product in maps.items():
             if sources := noise_sources(maps, name):
                 alone: dict[str, Plane] = {
-                    of: replace(found.plane(plane), names={of: MEANINGS[of]})
+                    of: replace(self.in_unit(found).plane(plane), names={of: MEANINGS[of]})
                     for of, (found, plane) in sources.items()
                 }
                 cards = noise_cards([f for f in figures if f.product == name])
                 files[product_path(folder, f"noise_{name}", ".fits")] = MapFile(
-                    f"noise_{name}", product, alone, cards
+                    f"noise_{name}", self.in_unit(product), alone, cards
                 )
         if not self.overwrite:
             for path in files:

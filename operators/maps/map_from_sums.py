@@ -15,7 +15,9 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.log import Log
 from zonda.core.maps.beams import SPREAD
+from zonda.core.maps.map_file import Provenance
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.noise_figures import is_quiet
 from zonda.core.maps.planes import ScanHits
 from zonda.core.numerics.angles import angle_text
 from zonda.core.numerics.chunks import empty
@@ -52,6 +54,7 @@ class MapFromSums:
         """Add the map of each signal to the products. Raises PipelineError where another step has
         made one of this name.
         """
+        origin, runs = Provenance.of(data, tables=False), data.provenance.get("runs", {})
         for stream in self.sums.signals or (MAIN,):
             key = product_name(stream, self.parameters.product)
             if key in data.products:
@@ -61,6 +64,9 @@ class MapFromSums:
                 )
             product = self.map_of(stream)
             product.band = data.scene.instrument.band
+            signal, slash, plain = key.rpartition("/")
+            name = f"{signal}{slash}{data.named(plain)}"
+            product.origin = replace(origin, product=name, quiet=is_quiet(runs, name))
             if stream == MAIN:
                 self._add_coverage(product)
                 self._state_choices(product, data.log)

@@ -120,6 +120,8 @@ STEPS = (
             "contours": ({}, {"contours": [-1.0, 1.0]}),
             "formats": ({}, {"formats": ["svg"]}),
             "dpi": ({}, {"dpi": 60.0}),
+            "unit": ({}, {"unit": "MJy/sr"}),
+            "spectral_index": ({"unit": "MJy/sr"}, {"unit": "MJy/sr", "spectral_index": 9.0}),
         },
     ),
     Step(

@@ -51,6 +51,8 @@ STEPS = (
         changes={
             "central_diameter": ({}, {"central_diameter": "30 arcsec"}),
             "overwrite": ({}, {"overwrite": False}),
+            "unit": ({}, {"unit": "MJy/sr"}),
+            "spectral_index": ({"unit": "MJy/sr"}, {"unit": "MJy/sr", "spectral_index": 2.0}),
         },
         refused={"overwrite": "exists already"},
     ),

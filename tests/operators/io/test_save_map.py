@@ -11,12 +11,16 @@ import healpy as hp
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.time import Time
 from astropy.wcs import WCS
 
-from zonda.core.errors import OutputError, PipelineError
+import zonda
+from zonda.core.errors import InputError, OutputError, PipelineError, ZondaError
 from zonda.core.maps import map_file
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.numerics.radiation import band_average, intensity_to_kelvin
 from zonda.operators.io.save_map import SaveMap
+from zonda.plugins.checks.scenes import camera, scene
 
 ARCSEC = np.pi / 648000
 
@@ -130,6 +134,89 @@ def test_the_header_says_what_it_is(run):
     assert header["SITE"] == "hill"
     assert header["DATE-OBS"].startswith("2024-11-25T07:00:00.123456789")
     assert list(header["HISTORY"]) == ["a: 1", "b: '\\xe9'"]
+
+
+STATED = ("DATE-OBS", "MJD-OBS", "EXPTIME", "NSCANS", "OBJECT", "SITE", "INSTRUME", "RESTFRQ")
+
+
+@pytest.fixture(scope="module")
+def observed(tmp_path_factory):
+    """Two scans with a gap, of a mosaic; the scene's own target and time are not those of the map's
+    first scan alone."""
+    folder = tmp_path_factory.mktemp("observed")
+    steps = [
+        zonda.PointingDaisy(
+            radius="1 arcmin",
+            scan_duration="8 s",
+            gap="30 s",
+            targets=["05h +20d", "05h00m04s +20d01m"],
+        ),
+        zonda.SkyMap(map=np.ones((9, 9)), pixel_size="1 arcmin", centre="05h +20d", unit="K_RJ"),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.BinMap(pixel="6 arcsec"),
+        zonda.SaveMap(),
+    ]
+    where = scene(camera(7), time="2024-11-25T07:00:12.25", target="06h +10d")
+    data = zonda.Pipeline(steps, runs={"noiseless": {"only": ["sky"]}}).run(
+        where, output=folder / "out", threads=1
+    )
+    return data, folder
+
+
+def test_the_header_says_when_and_where_the_scans_were(observed):
+    _data, folder = observed
+    header = fits.getheader(folder / "out" / "map.fits")
+    # 8 s at the camera's rate twice; not the 46 s from the first sample to the last
+    assert header["EXPTIME"] == pytest.approx(16.0, abs=0.05)
+    assert header["DATE-OBS"] == "2024-11-25T07:00:12.25"  # no Z: FITS 4.0, section 9.1.1
+    assert Time(header["MJD-OBS"], format="mjd").isot == "2024-11-25T07:00:12.250"
+    assert header["OBJECT"] == "05h00m00.00s +20d00m00.0s, 05h00m04.00s +20d01m00.0s"
+
+
+def test_a_map_written_in_python_has_the_headers_of_the_step(observed):
+    data, folder = observed
+    for name in ("map", "noiseless/map"):
+        path = data[name].write(folder / "own.fits", overwrite=True)
+        saved = folder / "out" / f"{name.replace('/', '_')}.fits"
+        with fits.open(path) as own, fits.open(saved) as theirs:
+            for a, b in zip(own, theirs, strict=False):  # SaveMap's tables stand behind
+                assert repr(a.header) == repr(b.header)
+    assert all(key in fits.getheader(path) for key in STATED)
+
+
+def test_other_units_are_those_of_the_maps_beam_and_spectrum(observed, tmp_path):
+    data, _ = observed
+    data.output, step = tmp_path, zonda.SaveMap(unit="mJy/beam", spectral_index=2.5)
+    step.finalize(data)
+    with fits.open(tmp_path / "map.fits") as file, fits.open(tmp_path / "noise_map.fits") as noise:
+        header, known = file[0].header, np.isfinite(file[0].data)
+        band, fwhm = data.scene.instrument.band, np.radians(header["BMAJ"])
+
+        def spectrum(nu):
+            return (nu / band.centre) ** 2.5 * intensity_to_kelvin(nu)
+
+        beam = np.pi * fwhm**2 / (4 * np.log(2))
+        kelvin = file[0].data[known] * 1e-29 / beam * band_average(band, spectrum)
+        np.testing.assert_allclose(kelvin, data["map"].signal[known], rtol=1e-12)
+        assert (header["BUNIT"], header["SPECINDX"]) == ("mJy/beam", 2.5)
+        assert header["RESTFRQ"] == pytest.approx(band.centre)
+        assert file["NOISE"].header["BUNIT"] == noise[0].header["BUNIT"] == "mJy/beam"
+        # the rms stays in kelvin, as its comment says
+        assert noise[0].header["RMSHALF"] == pytest.approx(data["map"].rms(of="half_difference"))
+    assert data["map"].unit == "K_RJ"
+
+
+def test_a_unit_that_cannot_be_is_refused_with_its_cause(data):
+    with pytest.raises(ZondaError, match="unknown unit 'furlong'"):
+        SaveMap(unit="furlong")
+    with pytest.raises(ZondaError, match="spectral_index is for Jy"):
+        SaveMap(unit="K_CMB", spectral_index=1)
+    product = wcs_map(20, 20)
+    product.fwhm, product.band = 0.0, scene(camera(1)).instrument.band
+    data.products["map"] = product
+    with pytest.raises(InputError, match=r"SaveMap(.|\n)*beam of the map is not known"):
+        SaveMap(unit="Jy/beam").finalize(data)
 
 
 def test_the_tables_hold_the_configuration_and_the_tally(run):
