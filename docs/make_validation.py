@@ -87,7 +87,7 @@ side. `zonda validate` draws these; each is in the folder of its row.
 | noise maps | `noise_shared/noise_map.png` | no real noise map beside it |
 | radial spectra of noise maps | `noise_spectrum_small/map_spectra.png` | of one scan; no real map beside it; few modes above 2 arcmin |
 | mock of 45 min with contours at -8, -4, -2, 2, 4 sigma | `contours_of_mock/map.png` | the contour at -8 sigma is a few pixels wide; islands of 2 sigma noise distract |
-| transfer functions of MUSTANG-2 and AtLAST | `contours_of_mock/transfer_function.png`, `transfer_of_atlast/transfer_function.png` | in two pictures; a sky without power on small scales ends the ratio of amplitudes at about 15 arcsec |
+| transfer functions of MUSTANG-2 and AtLAST | `contours_of_mock/transfer_function.png`, `transfer_of_atlast/transfer_function.png` | in two pictures; a sky without power on small scales ends it at about 15 arcsec |
 | first component of three apertures | `component_6m/values.png`, `component_42cm/values.png` | significances and differences, no histogram of the three |
 | AtLAST's mock of 12 scans | `noise_of_atlast_12_scans/map.png` | 300 detectors stand for 3000 |
 """

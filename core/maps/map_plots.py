@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..canvas import DPI, PALE, log_labels, unit_of
+from ..configuration.diagnostics import nearest
+from ..errors import InputError
 from ..numerics.angles import angle_text
 from ..types import AnyFloats
 from .grid import wcs_grid
@@ -33,14 +36,73 @@ BAR, NEAR, FAR_OFF, TEXT = 0.14, 0.12, 0.8, 1.3
 for its numbers and label, in."""
 SHOWN = 99.95
 """Per cent of the pixels of a noise-free map that its colour scale covers."""
-ONE_SIDED = 0.05
-"""A sky whose values of one sign reach this share of those of the other has a scale that begins or
-ends near zero.
+ONE_SIDED = 0.25
+"""A sky whose values of one sign reach this share of those of the other has sequential colours: a
+source, with the bowl that filters leave around it.
 """
+SIGNED = "RdBu_r"
+"""Colours of residuals, noise, and skies of both signs: zero is white."""
 POSITIVE, NEGATIVE, FAR = "inferno", "Blues_r", "viridis"
 """Colours of positive skies, of negative ones (as in the diverging scale), and of maps far from
 zero.
 """
+
+
+@dataclass(frozen=True)
+class Look:
+    """Colours of a map's picture, as a user wants them; None: chosen by the values.
+
+    Attributes
+    ----------
+    colours
+        Name of one of matplotlib's colour maps.
+    limits
+        Where the colours begin and end, in the map's unit.
+    stretch
+        ``linear``, ``sqrt`` (of the distance from the lower limit), ``asinh`` (linear within a
+        twentieth of the larger limit) or ``log`` (three decades, unless the lower limit is
+        positive).
+    scale_bar
+        Length of a bar on the sky, rad; 0: none.
+    """
+
+    colours: str | None = None
+    limits: tuple[float, float] | None = None
+    stretch: str = "linear"
+    scale_bar: float = 0.0
+
+    def check(self, place: str) -> None:
+        """Raise InputError for colours that matplotlib has not, limits that are none, and another
+        stretch.
+        """
+        from matplotlib import colormaps
+
+        if self.colours is not None and self.colours not in colormaps:
+            cure = nearest(self.colours, colormaps) or "e.g. inferno, viridis, RdBu_r"
+            raise InputError(f"no colour map {self.colours!r}", place=place, cure=cure)
+        low, high = self.limits or (0.0, 1.0)
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            cure = "give the lower, then the upper"
+            raise InputError(f"{low:g} to {high:g} are no limits", place=place, cure=cure)
+        if self.stretch not in STRETCHES:
+            cure = f"choose from: {', '.join(STRETCHES)}"
+            raise InputError(f"no stretch {self.stretch!r}", place=place, cure=cure)
+
+    def norm(self, low: float, high: float) -> Any:
+        """Normalization of values between two limits."""
+        from matplotlib import colors
+
+        if self.stretch == "sqrt":
+            return colors.PowerNorm(0.5, low, high)
+        if self.stretch == "asinh":
+            return colors.AsinhNorm(0.05 * max(abs(low), abs(high)), low, high)
+        if self.stretch == "log" and high > 0:
+            return colors.LogNorm(low if low > 0 else 1e-3 * high, high, clip=False)
+        return colors.Normalize(low, high)
+
+
+STRETCHES = ("linear", "sqrt", "asinh", "log")
+AS_IT_IS = Look()
 
 
 def map_axes(
@@ -144,21 +206,25 @@ def _label(ax: Any, shape: tuple[int, ...], stretched: float) -> None:
         ax.coords[1].set_axislabel("")
 
 
-def draw_map(product: MapArrays, ax: Any, plane: str, title: str, limit: float | None) -> Any:
+def draw_map(
+    product: MapArrays, ax: Any, plane: str, title: str, limit: float | None, look: Look
+) -> Any:
     """`MapProduct.plot`."""
+    look.check("map.plot")
     if product.polarization is not None and plane in ("I", "Q", "U", "P"):
-        return draw_map(product.stokes(plane), ax, "signal", title or plane, limit)
+        return draw_map(product.stokes(plane), ax, "signal", title or plane, limit, look)
     found, title = product.plane(plane), title or plane.replace("_", " ")
     shown, wcs = on_plane(product, {plane: np.where(product.hits > 0, found.values[0], np.nan)})
     values = shown[plane]
     ax = notebook_axes(values.shape, wcs) if ax is None else ax
     if found.smoothing == "mean":
         more: dict[str, Any] = {"fwhm": product.resolution, "unit": product.unit}
-        return plot_map(values, wcs, ax=ax, title=title, limit=limit, **more)
+        return plot_map(values, wcs, ax=ax, title=title, limit=limit, look=look, **more)
     known = values[np.isfinite(values)]
     limits = float(known.min(initial=0.0)), limit or float(known.max(initial=0.0))
     unit = found.unit or found.fits_unit(product.unit)
-    return plot_plain(values, wcs, limits, FAR, unit, ax=ax, title=title)
+    colours, limits = look.colours or FAR, look.limits or limits
+    return plot_plain(values, wcs, limits, colours, unit, ax=ax, title=title, look=look)
 
 
 def notebook_axes(shape: tuple[int, ...], wcs: WCS) -> Any:
@@ -177,6 +243,7 @@ def plot_map(
     fwhm: float | None = None,
     limit: float | None = None,
     unit: str = "K_RJ",
+    look: Look = AS_IT_IS,
 ) -> Axes:
     """Brightness map with its colour bar and resolution.
 
@@ -200,15 +267,21 @@ def plot_map(
         Largest brightness of the colour scale, K; default: what `SHOWN` % of the pixels stay below.
     unit
         Of the values; those in K_RJ are shown in the unit that reads best.
+    look
+        Colours, limits, stretch and scale bar.
     """
-    bottom, top, name = _range_of(values, limit)
+    bottom, top, name = range_of(values, limit)
+    if look.limits is not None:
+        bottom, top = look.limits
+        name = _colours_of(bottom, top)
+    name = look.colours or name
     factor, label = unit_of(max(abs(bottom), abs(top)))
     if unit == "K_RJ":
         label = f"Rayleigh–Jeans brightness [{label}]"
     else:
         factor, label = 1.0, f"brightness [{unit}]" if unit else "brightness"
     limits = (bottom * factor, top * factor)
-    drawn = plot_plain(values * factor, wcs, limits, name, label, ax=ax, title=title)
+    drawn = plot_plain(values * factor, wcs, limits, name, label, ax=ax, title=title, look=look)
     if fwhm:
         draw_beam(drawn, wcs, values.shape, fwhm)
     return drawn
@@ -223,15 +296,15 @@ def plot_plain(
     *,
     ax: Any = None,
     title: str = "",
+    look: Look = AS_IT_IS,
 ) -> Axes:
-    """Quantity (ny, nx) of a map, e.g. its SNR, on a linear scale between ``limits``, with the text
-    ``label`` at the colour bar.
+    """Quantity (ny, nx) of a map, e.g. its SNR, between ``limits``, with the text ``label`` at the
+    colour bar; of a ``look`` stretch and scale bar.
     """
-    from matplotlib.colors import Normalize
-
-    drawn: Axes = _show(
-        ax, wcs, np.ma.masked_invalid(values), label, title, colours, Normalize(*limits)
-    )
+    shown = np.ma.masked_invalid(values)
+    drawn: Axes = _show(ax, wcs, shown, label, title, colours, look.norm(*limits))
+    if look.scale_bar:
+        draw_scale(drawn, wcs, values.shape, look.scale_bar)
     return drawn
 
 
@@ -323,7 +396,16 @@ def _count_samples(bar: Any, per_beam: float) -> None:
         log_labels(axis)
 
 
-def _range_of(values: AnyFloats, limit: float | None) -> tuple[float, float, str]:
+def _colours_of(low: float, high: float) -> str:
+    """Colours between two limits."""
+    if low >= -ONE_SIDED * high and high > 0:
+        return POSITIVE
+    if high <= -ONE_SIDED * low and low < 0:
+        return NEGATIVE
+    return SIGNED if math.isclose(-low, high, rel_tol=1e-6) else FAR
+
+
+def range_of(values: AnyFloats, limit: float | None = None) -> tuple[float, float, str]:
     """Lowest and highest brightness of the colours, and their name."""
     finite = values[np.isfinite(values)]
     if limit is None:
@@ -338,11 +420,12 @@ def _range_of(values: AnyFloats, limit: float | None) -> tuple[float, float, str
     limit = limit or max(abs(low), abs(high)) or 1.0
     if low * high > 0 and 0 < high - low < 0.5 * max(abs(low), abs(high)):
         return low, high, FAR
-    if low >= -ONE_SIDED * high and high > 0:
-        return min(low, 0.0), limit, POSITIVE
-    if high <= -ONE_SIDED * low and low < 0:
-        return -limit, max(high, 0.0), NEGATIVE
-    return -limit, limit, "RdBu_r"
+    name = _colours_of(low, high)
+    if name == POSITIVE:
+        return min(low, 0.0), limit, name
+    if name == NEGATIVE:
+        return -limit, max(high, 0.0), name
+    return -limit, limit, SIGNED
 
 
 def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, norm: Any) -> Any:
@@ -383,6 +466,11 @@ def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, 
     )
     if bar.long_axis.get_scale() == "log":
         log_labels(bar.long_axis)
+    elif bar.long_axis.get_scale() == "asinh":  # matplotlib's own marks lie on each other about 0
+        ticks = {float(f"{v:.0e}") for v in norm.inverse(np.linspace(0, 1, 9))}
+        bar.set_ticks(sorted(t for t in ticks if low <= t <= high), minor=False)
+        bar.minorticks_off()
+        bar.long_axis.set_major_formatter("{x:g}")
     bar.set_label(label, wrap=True)
     ax.set_title(title, wrap=True)
     return ax
@@ -420,6 +508,26 @@ def draw_beam(ax: Any, wcs: WCS, shape: tuple[int, ...], fwhm: float) -> None:
         xytext=(6, 0),
         textcoords="offset points",
         va="center",
+        fontsize=8,
+        zorder=5,
+        bbox=PALE,
+    )
+
+
+def draw_scale(ax: Any, wcs: WCS, shape: tuple[int, ...], length: float) -> None:
+    """Draw a bar of ``length`` [rad] on the sky in the lower right corner, with its length."""
+    ny, nx = shape
+    xx, _, _ = (float(g) for g in wcs_grid(wcs, shape).metric(0.8 * nx, 0.06 * ny))
+    if not math.isfinite(xx):
+        xx = wcs_grid(wcs, shape).middle[0]
+    end, y, size = 0.95 * nx, 0.06 * ny, length / math.sqrt(xx)
+    ax.plot([end - size, end], [y, y], color="black", linewidth=2.5, zorder=5)
+    ax.annotate(
+        angle_text(length),
+        (end - size / 2, y),
+        xytext=(0, 4),
+        textcoords="offset points",
+        ha="center",
         fontsize=8,
         zorder=5,
         bbox=PALE,

@@ -55,6 +55,10 @@ class MapProduct(MapArrays):
         plane: str = "signal",
         title: str = "",
         limit: float | None = None,
+        colours: str | None = None,
+        limits: tuple[float, float] | None = None,
+        stretch: str = "linear",
+        scale_bar: Any = None,
     ) -> Any:
         """Draw a plane; the matplotlib Axes.
 
@@ -70,10 +74,19 @@ class MapProduct(MapArrays):
         limit
             Where the colours end, in the map's unit; default: what 99.95 % of the pixels stay
             below.
+        colours, limits, stretch
+            matplotlib's colour map; the lower and the upper end of the colours, in the map's unit;
+            ``linear``, ``sqrt``, ``asinh`` or ``log``. Default: sequential colours for a source,
+            diverging ones for both signs.
+        scale_bar
+            Length of a bar on the sky: ``"1 arcmin"``, an astropy quantity.
         """
-        from .map_plots import draw_map
+        from .map_plots import Look, draw_map
+        from .units import angle_of
 
-        return draw_map(self, ax, plane, title, limit)
+        call = "map.plot(scale_bar='1 arcmin')"
+        bar = 0.0 if scale_bar is None else angle_of(scale_bar, call)
+        return draw_map(self, ax, plane, title, limit, Look(colours, limits, stretch, bar))
 
     def write(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write it as `SaveMap` does (FITS image, or HEALPix table), without the tables of the

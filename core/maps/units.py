@@ -65,19 +65,21 @@ def smoothing_width(given: Any, beam: float) -> float:
                 "the beam of the map is not known", place="map", cure="write map.smooth('9 arcsec')"
             )
         return beam
+    return angle_of(given, "map.smooth('9 arcsec')")
+
+
+def angle_of(given: Any, call: str) -> float:
+    """Angle above 0 [rad] as text or quantity. Raises InputError for what is none; ``call``: how it
+    is written.
+    """
+    place, cure = call.partition("(")[0], f"write {call}"
     try:
-        width = Unit("rad").parse(given)
+        angle = Unit("rad").parse(given)
     except PydanticCustomError as err:
-        raise InputError(
-            err.message(), place="map.smooth", cure="write map.smooth('9 arcsec')"
-        ) from None
-    if not width > 0:
-        raise InputError(
-            f"{given} cannot be the width of a smoothing",
-            place="map.smooth",
-            cure="write map.smooth('9 arcsec')",
-        )
-    return width
+        raise InputError(err.message(), place=place, cure=cure) from None
+    if not angle > 0:
+        raise InputError(f"{given} is no angle above 0", place=place, cure=cure)
+    return angle
 
 
 KNOWN_UNITS = "Jy/pixel, Jy/beam, MJy/sr, K_RJ, K_CMB or y (Compton-y)"

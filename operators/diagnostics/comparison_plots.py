@@ -10,12 +10,16 @@ import numpy as np
 
 from zonda.core.canvas import OTHER, SEQUENCE, Sketch, axis_above, finish, new_axes, unit_of
 from zonda.core.maps.map_plots import (
+    SHOWN,
+    SIGNED,
+    Look,
     contour_text,
     map_axes,
     noise_text,
     plot_contours,
     plot_map,
     plot_plain,
+    range_of,
     wcs_of,
 )
 from zonda.core.numerics.angles import ARCSEC, angle_text
@@ -44,23 +48,26 @@ def draw_comparison(file: str, found: Comparison, contours: Sequence[float] = ()
 def _maps(file: str, found: Comparison) -> Sketch:
     planes, where, f = found.planes, wcs_of(found.header), found.values
     axes = map_axes(planes["map"].shape, where, 3)
-    both = np.abs(np.stack([planes["reference"], planes["map"]]))
-    limit = float(np.percentile(both[np.isfinite(both)], 99.7))
+    both = np.stack([planes["reference"], planes["map"]])
+    known = both[np.isfinite(both)]
+    low, high, colours = range_of(known, float(np.percentile(np.abs(known), 99.7)))
+    same, away = Look(colours, (low, high)), planes["difference"]
+    most = float(np.percentile(np.abs(away[np.isfinite(away)]), SHOWN)) or 1.0
     reference, other = found.names
     style: dict[str, Any] = {"fwhm": found.fwhm or None, "unit": found.unit}
-    for ax, (name, title, most) in zip(
+    for ax, (name, title, look) in zip(
         axes,
         (
-            ("reference", _short(f"Reference: {reference}"), limit),
-            ("map", _short(f"Map: {other}"), limit),
-            ("difference", "Map − reference", None),
+            ("reference", _short(f"Reference: {reference}"), same),
+            ("map", _short(f"Map: {other}"), same),
+            ("difference", "Map − reference", Look(SIGNED, (-most, most))),
         ),
         strict=True,
     ):
-        plot_map(planes[name], where, ax=ax, title=title, limit=most, **style)
+        plot_map(planes[name], where, ax=ax, title=title, look=look, **style)
     gain = f"Gain {f['gain']:.4g} ± {f['gain error']:.2g}, correlation {f['correlation']:.4g}."
     notes = f"{other} against {reference}: {'; '.join(found.notes)}."
-    caption = f"{notes} {gain} The difference has a scale of its own."
+    caption = f"{notes} {gain} Both maps have one scale; the difference has its own."
     return Sketch(file, "Comparison", caption, axes[0])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,11 +14,15 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.canvas import DPI, Sketch, file_of, unit_of
+from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
+from zonda.core.errors import InputError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_plots import (
     SHOWN,
+    SIGNED,
+    Look,
     contour_text,
     map_axes,
     noise_text,
@@ -33,6 +38,7 @@ from zonda.core.maps.measured_noise import central_diameter, in_beams
 from zonda.core.maps.noise_figures import Noise, maps_of, noise_alone, noise_sources
 from zonda.core.maps.on_plane import on_plane
 from zonda.core.maps.smoothing import smoother
+from zonda.core.maps.units import parse_unit
 from zonda.core.numerics.angles import angle_text, sides_text
 from zonda.core.output import MapOutput, output_folder
 from zonda.core.storage.files import atomic_path, product_path
@@ -45,6 +51,7 @@ from .series import Spectrum, TimeStream
 from .series_plots import draw, draw_scan
 
 Window = tuple[slice, slice]
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 LARGEST = 1500
 """Pixels of an image's longer side in a picture; larger images are thinned out."""
 
@@ -182,7 +189,8 @@ def draw_map(
         lines = f"Contours of the signal-to-noise ratio: {contour_text(style.contours)}"
         text += f" {lines} (negative ones dashed). Its noise: {noise_text(snr[1])}."
     limit = flat.limit("signal", SHOWN if signal == "noiseless" else 99.7)
-    ax = _panels([(flat, flat.planes["signal"], head)], shown, limit)[0]
+    look = style.look(shown.unit)
+    ax = _panels([(flat, flat.planes["signal"], head)], shown, limit, look)[0]
     if snr is not None:
         plot_contours(ax, np.where(flat.covered, flat.planes["snr"], np.nan), style.contours)
     return [Sketch(file, title, text, ax)]
@@ -215,7 +223,9 @@ def draw_noise(
         if math.isfinite(rms):
             scale, unit = (1e6, "µK_RJ") if shown.unit == "K_RJ" else (1.0, shown.unit)
             values.append(f"{words} {rms * scale:.4g} {unit}")
-    axes = _panels(panels, shown, max((x for x in limits if x), default=None))
+    top = max((x for x in limits if x), default=1.0)
+    look = Look(SIGNED, (-top, top), scale_bar=style.scale_bar)
+    axes = _panels(panels, shown, None, look)
     place = axes[0].wcs.wcs_world2pix([np.degrees(first.centre)], 0)[0]
     for ax in axes:
         plot_circle(ax, panels[0][1].shape, place, diameter)
@@ -299,6 +309,7 @@ def _panels(
     panels: Sequence[tuple[Flat, AnyFloats, str]],
     product: MapProduct,
     limit: float | None,
+    look: Look,
 ) -> list[Any]:
     """Axes of maps side by side with their titles, where the first map is well covered."""
     first = panels[0][0]
@@ -306,7 +317,7 @@ def _panels(
     for ax, (_, values, title) in zip(axes, panels, strict=True):
         shown = np.where(first.covered, values, np.nan)
         more: Any = {"fwhm": product.resolution or None, "unit": product.unit}
-        plot_map(shown, first.wcs, ax=ax, title=title, limit=limit, **more)
+        plot_map(shown, first.wcs, ax=ax, title=title, limit=limit, look=look, **more)
     return axes
 
 
@@ -357,10 +368,48 @@ class Plots(MapOutput):
     """Levels of the signal-to-noise ratio, in sigma, at which maps have contours, e.g. [-8, -4, -2,
     2, 4].
     """
+    colours: str | None = None
+    """Colour map of maps, one of matplotlib's. Default: sequential for a source, diverging where
+    both signs are in the map; noise and residuals are diverging in any case."""
+    limits: list[str] | None = Field(None, min_length=2, max_length=2)
+    """Where the colours of maps begin and end, e.g. [-0.1 mK, 2 mK]. Default: what nearly all
+    pixels stay below.
+    """
+    stretch: Literal["linear", "sqrt", "asinh", "log"] = "linear"
+    """Of the colours of maps: linear, the square root (of the distance from the lower limit), asinh
+    (linear within a twentieth of the larger limit), or logarithmic (three decades, unless the
+    lower limit is positive)."""
+    scale_bar: Angle = quantity("0 arcmin", ge=0, le=1)
+    """Length of a bar on the sky that maps show; 0: none."""
     formats: list[Literal["png", "pdf", "svg"]] = Field(["png"], min_length=1)
     """Files of each picture; PDF and SVG for print."""
     dpi: float = Field(DPI, ge=50, le=600)
     """Dots per inch of PNG files; images within PDF and SVG files have at least 300."""
+
+    def check(self, data: Data) -> list[str]:
+        """Refuse colours that there are not."""
+        if self.colours is not None or self.limits is not None:
+            self.look(self.unit or "K_RJ").check(self.label)
+        return []
+
+    def observe(self, data: Data) -> None:
+        """Refuse a missing or unwritable output folder before anything is simulated."""
+        super().observe(data)
+        self.check(data)
+
+    def look(self, unit: str) -> Look:
+        """Colours of maps in ``unit``. Raises InputError for limits in another."""
+        plain, size = parse_unit(unit or "K_RJ", place=self.label, temperature_scale="K_RJ")
+        scale, ends = plain if plain.startswith("K_") else "K_RJ", []
+        for text in self.limits or ():
+            number, _, of = text.strip().partition(" ")
+            other, factor = parse_unit(of, place=self.label, temperature_scale=scale)
+            if other != plain or not _NUMBER.fullmatch(number):
+                cure = f"write limits: [-1 {unit}, 5 {unit}]"
+                raise InputError(f"{text!r} is no value in {unit}", place=self.label, cure=cure)
+            ends.append(float(number) * factor / size)
+        limits = (ends[0], ends[1]) if ends else None
+        return Look(self.colours, limits, self.stretch, self.scale_bar)
 
     def finalize(self, data: Data) -> None:
         folder = output_folder(data, self.label)

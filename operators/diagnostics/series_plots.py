@@ -33,6 +33,10 @@ from .transfer_function import Transfer
 if TYPE_CHECKING:
     from zonda.core.data import Observation
 
+NOTHING_THERE = 2.0
+"""S from which a ring of a transfer function holds what filters brought from other scales: a filter
+does not double amplitudes.
+"""
 MODES = 4
 """Modes whose streams are drawn."""
 
@@ -168,25 +172,24 @@ def draw_transfer(transfer: Transfer, file: str, where: str) -> list[Sketch]:
     """Share of each angular scale that the filters leave: T with its standard error, and S, the
     ratio of amplitudes.
 
-    S grows without bound where the beam leaves no sky: above 2 it is not drawn, so that T can be
-    read; the legend says where. Horizontal bars are the rings. The dotted line is the beam's FWHM;
-    the upper axis counts wavelengths.
+    Rings are left out where the sky has no power beside what the filters bring from other scales
+    (S above `NOTHING_THERE`, or none at all). Horizontal bars are the rings. The dotted line is the
+    beam's FWHM; the upper axis counts wavelengths.
     """
     ax = new_axes(size=(7.2, 5.0), above=0.9)
     r = transfer.rings
     scale, edges = transfer.scale / ARCSEC, 1 / transfer.edges / ARCSEC
-    width = [np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)]
+    known = r.amplitude <= NOTHING_THERE  # and no NaN
+    width = np.stack([np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)])[:, known]
     style: dict[str, Any] = {"fmt": "o", "markersize": 4, "label": "T: share in phase"}
-    error = np.where(np.isfinite(r.error), r.error, 0.0)
-    ax.errorbar(scale, r.transfer, yerr=error, xerr=width, color=SEQUENCE[0], **style)
-    high = scale[r.amplitude > 2].max(initial=0.0)
-    label = "S: ratio of amplitudes" + (f" (above 2 from {high:.2g} arcsec down)" if high else "")
-    shown = np.where(r.amplitude > 2, np.nan, r.amplitude)
-    ax.plot(scale, shown, "--", color=SEQUENCE[1], linewidth=1.2, label=label)
+    error, shown = np.nan_to_num(r.error[known]), (r.transfer[known], r.amplitude[known])
+    ax.errorbar(scale[known], shown[0], yerr=error, xerr=width, color=SEQUENCE[0], **style)
+    label = "S: ratio of amplitudes"
+    ax.plot(scale[known], shown[1], "--", color=SEQUENCE[1], linewidth=1.2, label=label)
     ax.set_xscale("log")
     ax.set_xlim(edges[0], edges[-1])
-    top = float(np.nanmax(np.append(shown, r.transfer), initial=1.0))
-    ax.set_ylim(min(0.0, float(np.nanmin(r.transfer, initial=0.0))) * 1.05, 1.15 * top)
+    top, bottom = (float(f(shown, initial=x)) for f, x in ((np.max, 1.0), (np.min, 0.0)))
+    ax.set_ylim(1.05 * bottom, 1.15 * top)
     ax.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
     if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / ARCSEC <= edges[0]:
         ax.axvline(transfer.fwhm / ARCSEC, color="black", linestyle=":", linewidth=1.0)
@@ -202,6 +205,10 @@ def draw_transfer(transfer: Transfer, file: str, where: str) -> list[Sketch]:
         " standard error from the scatter of the modes (bars); dashed, the ratio of amplitudes."
         f" Dotted, the beam. Singular modes of {whose}."
     )
+    if empty := int(np.count_nonzero(~known)):
+        text = f"{empty} of {known.size} rings are left out: the sky has no power there"
+        ax.annotate(text, (0.5, 0.02), xycoords="axes fraction", ha="center", fontsize=8)
+        caption += f" {text}; the table has them."
     return [Sketch(file, what, caption, ax)]
 
 

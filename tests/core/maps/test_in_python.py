@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from astropy import units
 from astropy.io import fits
+from matplotlib.figure import Figure
 
 import zonda
 from zonda.core.errors import InputError, OutputError
 from zonda.core.maps.image import Image
+from zonda.core.maps.map_plots import Look
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.radiation import band_average, cmb_slope, intensity_to_kelvin
 from zonda.plugins.checks.scenes import TARGET, camera, scene
@@ -121,7 +123,7 @@ def test_what_cannot_be_converted_is_said(brightness):
         brightness.to(None)
     with pytest.raises(InputError, match="9 arcsec"):
         brightness.smooth(9)
-    with pytest.raises(InputError, match="cannot be the width of a smoothing"):
+    with pytest.raises(InputError, match="is no angle above 0"):
         brightness.smooth("0 arcsec")
     bare = MapProduct(
         np.ones((2, 2)),
@@ -143,7 +145,8 @@ def test_what_cannot_be_converted_is_said(brightness):
 def test_pictures_are_drawn_into_the_axes_that_are_given(brightness):
     from matplotlib import pyplot as plt
 
-    figure, (left, right) = plt.subplots(1, 2)
+    figure = plt.figure()
+    left, right = (figure.add_subplot(1, 2, k, projection=brightness.wcs) for k in (1, 2))
     assert brightness.plot(left, title="mine") is left
     assert left.get_title() == "mine"
     assert brightness.plot(ax=right, plane="hits") is right
@@ -158,6 +161,37 @@ def test_pictures_are_drawn_into_the_axes_that_are_given(brightness):
     image = Image(np.eye(3), brightness.header, "K_RJ").plot()
     assert image.images[0].get_array().shape == (3, 3)
     plt.close("all")
+
+
+def test_colours_are_the_users(brightness):
+    """Limits are in the map's unit, the bar in K_RJ; a bar of 1 arcmin is 60 arcsec / pixel long."""
+    from matplotlib import colors
+
+    look = {"colours": "magma", "limits": (-1e-4, 2e-3), "stretch": "asinh"}
+    ax = brightness.plot(Figure().subplots(), scale_bar="1 arcmin", **look)
+    image = ax.images[0]
+    assert (image.cmap.name, type(image.norm)) == ("magma", colors.AsinhNorm)
+    np.testing.assert_allclose(image.get_clim(), (-100, 2000))  # the bar's microkelvin
+    pixels = np.ptp(ax.lines[0].get_xdata())
+    assert pixels * brightness.sides[0] == pytest.approx(np.radians(1 / 60), rel=1e-3)
+    wrong = {"colours": "magna"}, {"limits": (2, 1)}, {"stretch": "cubic"}, {"scale_bar": "0 deg"}
+    texts = (
+        "no colour map 'magna'",
+        "2 to 1 are no limits",
+        "no stretch 'cubic'",
+        "0 deg is no angle",
+    )
+    for given, text in zip(wrong, texts, strict=True):
+        with pytest.raises(InputError, match=text):
+            brightness.plot(Figure().subplots(), **given)
+
+
+@pytest.mark.parametrize("stretch", ["linear", "sqrt", "asinh", "log"])
+def test_each_stretch_ends_at_the_limits_and_grows(stretch):
+    norm = Look(stretch=stretch).norm(1e-3, 2.0)
+    values = np.ma.filled(norm(np.geomspace(1e-3, 2.0, 50)))
+    np.testing.assert_allclose(values[[0, -1]], [0, 1], atol=1e-12)
+    assert (np.diff(values) > 0).all()
 
 
 def test_a_map_far_from_zero_is_shown_between_its_lowest_and_highest(brightness):

@@ -161,8 +161,7 @@ def test_the_beam_of_a_picture_is_round_on_the_sky():
     one = product("CAR", 60.0)
     from matplotlib.figure import Figure
 
-    ax = Figure().add_subplot()
-    plot_map(one.signal, one.wcs, fwhm=FWHM, ax=ax)
+    ax = plot_map(one.signal, one.wcs, fwhm=FWHM, ax=Figure().add_subplot())
     (beam,) = ax.patches
     sizes = sorted([beam.width, beam.height])
     assert sizes == pytest.approx(

@@ -22,7 +22,7 @@ from zonda.operators.diagnostics.compare_maps import CompareMaps
 from zonda.operators.diagnostics.comparison.files import plane_of, read_planes
 from zonda.operators.diagnostics.comparison.radial import radial_spectra
 from zonda.operators.diagnostics.comparison.statistics import compare
-from zonda.operators.diagnostics.comparison_plots import plot_radial_spectra
+from zonda.operators.diagnostics.comparison_plots import draw_comparison, plot_radial_spectra
 from zonda.operators.diagnostics.map_spectra import MapSpectrum
 from zonda.operators.diagnostics.plot_operators import Plots
 from zonda.plugins.checks import scenes
@@ -223,6 +223,13 @@ def test_pictures(tmp_path, products):
     for name in names:
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert not list(tmp_path.glob("*.pdf"))
+    axes = draw_comparison("comparison", run.products["comparison"])[0].ax.figure.axes
+    one, other, difference = (
+        ax.images[0] for ax in axes if ax.images[:1] and hasattr(ax, "coords")
+    )
+    assert (one.cmap.name, one.get_clim()) == (other.cmap.name, other.get_clim())
+    assert difference.cmap.name == "RdBu_r"
+    assert difference.get_clim()[0] == -difference.get_clim()[1]
 
 
 @pytest.mark.parametrize(

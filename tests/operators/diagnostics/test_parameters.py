@@ -122,6 +122,10 @@ STEPS = (
             "dpi": ({}, {"dpi": 60.0}),
             "unit": ({}, {"unit": "MJy/sr"}),
             "spectral_index": ({"unit": "MJy/sr"}, {"unit": "MJy/sr", "spectral_index": 9.0}),
+            "colours": ({}, {"colours": "magma"}),
+            "limits": ({}, {"limits": ["-1 mK", "2 mK"]}),
+            "stretch": ({}, {"stretch": "asinh"}),
+            "scale_bar": ({}, {"scale_bar": "20 arcsec"}),
         },
     ),
     Step(

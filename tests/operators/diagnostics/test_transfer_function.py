@@ -167,11 +167,15 @@ def test_the_picture(transfer, data):
     low, high = ax.get_xlim()
     assert low == pytest.approx(1 / transfer.edges[0] / ARCSEC)
     assert high == pytest.approx(1 / transfer.edges[-1] / ARCSEC)
-    wild = replace(
-        transfer,
-        rings=replace(transfer.rings, amplitude=np.full_like(transfer.rings.amplitude, 50.0)),
-    )
-    assert draw(wild, "transfer_function", "")[0].ax.get_ylim()[1] <= 2.2  # T can still be read
+    amplitude = transfer.rings.amplitude.copy()
+    amplitude[-2:] = 50.0, np.nan  # the sky has no power there
+    wild = replace(transfer, rings=replace(transfer.rings, amplitude=amplitude))
+    sketch = draw(wild, "transfer_function", "")[0]
+    shown = sketch.ax.lines[-1 if sketch.ax.lines[-1].get_linestyle() == "--" else 1].get_xdata()
+    np.testing.assert_allclose(shown, transfer.scale[:-2] / ARCSEC)
+    left = f"2 of {amplitude.size} rings are left out: the sky has no power there"
+    assert left in sketch.caption
+    assert left in [text.get_text() for text in sketch.ax.texts]
     data.products["transfer_function"] = transfer
     made = {p.name: p for p in pictures(data, Plots())}
     assert made["transfer_function"].png.startswith(b"\x89PNG")
