@@ -35,6 +35,7 @@ _WHERE = {
     "Experiment": "zonda.core.experiment.experiment",
     "measure": "zonda.core.figures",
     "sensitivity": "zonda.plugins.forecast.sensitivity",
+    "read_map": "zonda.core.maps.read_map",
     "hookimpl": "zonda.core.hooks",
     # for authors of operators
     "Block": "zonda.core.block",
@@ -107,6 +108,7 @@ if TYPE_CHECKING:
     from zonda.core.instrument import Telescope as Telescope
     from zonda.core.mapmaker import MapMaker as MapMaker
     from zonda.core.mapping import map as map
+    from zonda.core.maps.read_map import read_map as read_map
     from zonda.core.numerics.random import normals as normals
     from zonda.core.numerics.random import uniforms as uniforms
     from zonda.core.operator import Operator as Operator

@@ -81,6 +81,8 @@ class MapArrays:
         `map_file.Provenance`, what files state of the run that made it; None: of no run.
     spectral_index
         That of the flux density with which the map was converted to its `unit`; None: it was not.
+    square
+        Pixels of an image are as wide as high.
     beams
         FWHM [rad] of the narrowest and the widest beam in the map; zeros: not known.
     """
@@ -105,6 +107,7 @@ class MapArrays:
     scan_hits: ScanHits | None = None
     band: Band | None = None
     beams: tuple[float, float] = (0.0, 0.0)
+    square: bool = True
     origin: Any = None
     spectral_index: float | None = None
 
@@ -282,24 +285,24 @@ class MapArrays:
         return self.scan_hits.plane(scan, self.signal.shape)
 
     @property
-    def projection(self) -> Literal["TAN", "CAR", "HEALPix"]:
-        """Projection of the pixels."""
-        if self.header is None:
-            return "HEALPix"
-        return "CAR" if str(self.header["CTYPE1"]).endswith("-CAR") else "TAN"
+    def projection(self) -> str:
+        """Projection of the pixels: TAN, CAR, HEALPix; of files from elsewhere any of FITS."""
+        return "HEALPix" if self.header is None else str(self.header["CTYPE1"])[-3:]
 
     @property
     def grid(self) -> ImagePixels | HealpixPixels:
         """Positions and sizes of the pixels on the sky."""
         if self.header is not None:
-            return image_grid(self.header, self.signal.shape, self.pixel)
+            side = self.pixel if self.square else None
+            return image_grid(self.header, self.signal.shape, side)
         assert self.pixels is not None  # of HEALPix
         return HealpixPixels(self.nside, self.nest, self.pixels, self.frame)
 
     @property
     def sides(self) -> tuple[float, float]:
         """Steps (y, x) from pixel to pixel on the sky [rad], in the middle of the map."""
-        return self.grid.sides if self.projection == "CAR" else (self.pixel, self.pixel)
+        plain = self.square and self.projection != "CAR"
+        return (self.pixel, self.pixel) if plain else self.grid.sides
 
     def areas(self) -> Floats | float:
         """Solid angles of the pixels [sr]: one number (HEALPix), of rows (ny, 1) (CAR), or of all

@@ -19,6 +19,7 @@ from ..data import Data
 from ..errors import OutputError
 from ..storage.files import atomic_path
 from ..storage.fits_files import header_of, joined, table_bytes, write_image
+from ..versions import versions
 from .header import exact_header
 from .map_arrays import MapArrays
 from .measured_noise import ELSEWHERE, stated
@@ -62,19 +63,15 @@ class Provenance:
     @classmethod
     def of_a_map(cls, product: MapArrays) -> Provenance:
         """Provenance of a map apart from its run."""
-        from zonda import __version__
-
-        return cls([*_origin(__version__), ("NSCANS", len(product.scans), "scans")])
+        return cls([*_origin(versions()["zonda"]), ("NSCANS", len(product.scans), "scans")])
 
     @classmethod
     def of(cls, data: Data, tables: bool = True) -> Provenance:
         """Provenance of a run whose scans are mapped: cards of its origin; the command and the
         resolved YAML as history. ``tables``: with these.
         """
-        import zonda
-
         scene, provenance = data.scene, data.provenance
-        version = provenance.get("versions", {}).get("zonda", zonda.__version__)
+        version = provenance.get("versions", {}).get("zonda") or versions()["zonda"]
         start = min((o.start for o in data.scans), default=scene.time)
         days = start.nanoseconds / (86400 * SECOND)
         cards = [

@@ -222,8 +222,8 @@ class MapProduct(MapArrays):
             else f"{self.hits.shape[1]} x {self.hits.shape[0]}"
         )
         return (
-            f"<MapProduct {size}, {int(self.hits.sum())} samples of {len(self.scans)} scans,"
-            f" {self.unit}>"
+            f"<MapProduct {size}, {int(self.hits.sum())} samples"
+            f"{f' of {len(self.scans)} scans' if len(self.scans) else ''}, {self.unit}>"
         )
 
     def _repr_html_(self) -> str:
