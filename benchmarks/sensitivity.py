@@ -1,10 +1,12 @@
 """The forecast of `zonda sensitivity` against simulations of the same pipelines on four cameras:
-table of docs/sensitivity.md.
+tables of docs/sensitivity.md.
 
     python benchmarks/sensitivity.py [--case NAME ...] [--seeds N] [--json FILE]
+    python benchmarks/sensitivity.py --radii [--seeds N]
 
 The cases are daisies of MUSTANG-2 (one scan), AtLAST's reduced camera and APEX (345 GHz), and
-azimuth scans of ACT.
+azimuth scans of ACT. ``--radii``: minutes of MUSTANG-2 to 5 sigma on a Gaussian of 1 arcmin, with
+daisies of several radii.
 """
 
 from __future__ import annotations
@@ -88,14 +90,37 @@ def file_of(case: Case) -> PipelineFile:
     )
 
 
+RADII = 1.5, 3, 5, 8
+
+
+def minutes(seeds: int) -> None:
+    """Print the minutes to 5 sigma of a source's peak: by noise alone, forecast, simulated."""
+    print("| radius of the daisy | noise alone | forecast | simulated |")
+    print("| --- | --- | --- | --- |", flush=True)
+    for radius in RADII:
+        settings = [f"PointingDaisy.radius={radius} arcmin", "PointingDaisy.scans=1"]
+        file = zonda.load("mustang2_cluster", [*settings, "PointingDaisy.offsets=none"])
+        found = zonda.sensitivity(file, source="gaussian 1 arcmin", peak="0.3 mJy/beam")
+        row = next(r for r in found.audited(seeds).audit.rows if r.part == "S/N peak")
+        noise = found.seconds * (5 * found.rms() / found.source.smoothed) ** 2
+        simulated = found.seconds * (5 / row.mean) ** 2
+        each = [noise, found.reach("5 sigma"), simulated, 2 * simulated * row.error / row.mean]
+        figures = "{:.1f} | {:.1f} | {:.1f} +- {:.1f}".format(*(t / 60 for t in each))
+        print(f"| {radius} arcmin | {figures} |", flush=True)
+
+
 def main() -> None:
     """Print a table in Markdown."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--case", action="append", choices=CASES, help="default: all")
     parser.add_argument("--seeds", type=int, help="default: as many as the case has")
     parser.add_argument("--json", type=Path, help="write the figures to a file, too")
+    parser.add_argument("--radii", action="store_true", help="minutes to 5 sigma of a source")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
+    if arguments.radii:
+        minutes(arguments.seeds or 16)
+        return
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"],
         capture_output=True,

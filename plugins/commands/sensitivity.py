@@ -62,6 +62,18 @@ from zonda.core.command_options import set_option
     help="Integration time, e.g. '3 h'.  [default: 1 h; of a pipeline its scans]",
 )
 @click.option(
+    "--source",
+    metavar="SOURCE",
+    help="S/N of a source: 'point', 'gaussian 1 arcmin' (FWHM), 'beta 1 arcmin 0.7' (core radius,"
+    " beta), 'disc 30 arcsec' (diameter), or a FITS map.",
+)
+@click.option(
+    "--peak",
+    metavar="BRIGHTNESS",
+    help="Of its peak as the beam sees it, e.g. '1 mJy/beam' or '200 uK_CMB'.",
+)
+@click.option("--flux", metavar="FLUX", help="Its flux density instead, e.g. '3 mJy'.")
+@click.option(
     "--radius",
     metavar="ANGLE",
     help="Of the circle that the depth is averaged over.  [default: 0.5 arcmin or two beams]",
@@ -70,7 +82,7 @@ from zonda.core.command_options import set_option
 @click.option(
     "--reach",
     metavar="DEPTH",
-    help="How long it takes to reach e.g. '10 uK', '10 uK_CMB' or '0.1 mJy/beam'.",
+    help="How long it takes to reach e.g. '10 uK', '0.1 mJy/beam', or '5 sigma' of the source.",
 )
 @click.option(
     "--audit",
@@ -91,6 +103,9 @@ from zonda.core.command_options import set_option
 def sensitivity(
     pipeline: str | None,
     radius: str | None,
+    source: str | None,
+    peak: str | None,
+    flux: str | None,
     settings: tuple[str, ...],
     reach: str | None,
     audit: int | None,
@@ -115,25 +130,31 @@ def sensitivity(
     one_blas_thread()
     from zonda.core.storage.files import check_output_folder
     from zonda.plugins.forecast import default_pipeline
-    from zonda.plugins.forecast.depth import duration
-    from zonda.plugins.forecast.sensitivity import SensitivityOfBands, reached
+    from zonda.plugins.forecast.report import SensitivityOfBands, noise_alone, report
     from zonda.plugins.forecast.sensitivity import sensitivity as forecast
+    from zonda.plugins.forecast.source import OF, sigmas
 
     if output is not None:
         check_output_folder(output)
-    found = forecast(pipeline, radius=radius, settings=settings, **asked)
+    about = {"radius": radius, "source": source, "peak": peak, "flux": flux}
+    found = forecast(pipeline, settings=settings, **about, **asked)
     each = [*found.bands.values()] if isinstance(found, SensitivityOfBands) else [found]
-    needed = [] if reach is None else [one.reach(reach) for one in each]
+    if reach is not None:
+        found.reach(reach)  # what cannot be read is told before anything is simulated
     if audit is not None:
         found = found.audited(audit, threads)
+        each = [*found.bands.values()] if isinstance(found, SensitivityOfBands) else [found]
     written = found.write(output) if output is not None else []
     if as_json:
         import json
 
         text = found.as_dict()
         if reach is not None:
-            text["reach"] = {"depth": reach, "seconds": max(needed)}
-            if planes := each[0].polarization:
+            text["reach"] = {"depth": reach, "seconds": found.reach(reach)}
+            if sigmas(reach):
+                text["reach"] = {"sigma": sigmas(reach)}
+                text["reach"] |= {f"{of}_seconds": found.reach(reach, of=of) for of in OF}
+            elif planes := each[0].polarization:
                 text["reach"]["stokes"] = {
                     plane: max(one.reach(reach, plane) for one in each) for plane in planes
                 }
@@ -142,10 +163,10 @@ def sensitivity(
     if pipeline is None:
         made = default_pipeline.text(**asked).rstrip()
         click.echo("\n".join(["# the pipeline:", made, *(f"# --set {s}" for s in settings), ""]))
-    click.echo(str(found))
-    for one, seconds in zip(each, needed, strict=False):
-        click.echo(f"\n{reached(one, str(reach), seconds)}")
-    if len(needed) > 1:
-        click.echo(f"\n{reach} in all bands after {duration(max(needed))} of integration")
+    told = report(each, reach)
+    for one in each:
+        if one.source is None:
+            told = told.replace(noise_alone(one), click.style(noise_alone(one), bold=True))
+    click.echo(told)
     for path in written:
         click.echo(f"{path}")

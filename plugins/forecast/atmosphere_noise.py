@@ -19,9 +19,12 @@ of what the filters leave.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from zonda.core.types import AnyFloats, Floats
@@ -90,6 +93,22 @@ class Left:
     mode: Mode | None = None
 
 
+class Template(NamedTuple):
+    """A source of which equation (1) is made in place of the beam's: with
+    sum_d s_dt (exp(i q J d) - A) for g (exp(i q J delta) - A), (sum a s F s)^2 for (sum_t g)^2.
+
+    Attributes
+    ----------
+    rows
+        Makes (n_det, n) s of some detectors (numbers) along a track.
+    signal
+        (n_scan,) sum a s F s after each scan.
+    """
+
+    rows: Callable[[Track, NDArray[np.intp]], AnyFloats]
+    signal: Floats
+
+
 def step_of_modes(survey: Survey) -> bool:
     """True if the common signal of the detectors is found in the data: equation (1), which takes
     their mean off, need not hold.
@@ -123,9 +142,14 @@ class _Scan:
         return series, waves @ (matrix @ self.jacobian)
 
 
-def variance(survey: Survey, radius: float, waves: int = WAVES) -> Left:
+def variance(
+    survey: Survey,
+    radius: float,
+    waves: int = WAVES,
+    template: Template | None = None,
+) -> Left:
     """Equation (1) from about so many waves, averaged over probes in a circle of ``radius`` [rad]
-    about the map's centre.
+    about the map's centre; of a ``template`` the variance is relative to its signal.
     """
     step, number = survey.atmosphere, len(survey.observations)
     if step is None or step.pwv_rms == 0:
@@ -136,14 +160,19 @@ def variance(survey: Survey, radius: float, waves: int = WAVES) -> Left:
     share = np.array([s.sum() for s in shares]) * [k not in step.omit for k in range(len(shares))]
     some = survey.offsets[:: max(1, len(survey.offsets) // DETECTORS)]  # they stand for all
     total, spread, modes = np.zeros(len(scans)), 0.0, []
+    rows = [] if template is None else _rows(survey, scans, template)
     rng = np.random.default_rng(3)
     for k in np.flatnonzero(share > NEGLIGIBLE * share.sum()).tolist():
         each = max(8, round(waves * share[k] / share.sum()))
         drawn, weights = _drawn(found, k, shares[k], each, rng)
         model = found.layers[k]
         weights = weights * (found.kelvin * model.amplitude) ** 2
-        added = _of_waves(survey, scans, some, model, drawn) * weights
-        if step_of_modes(survey):
+        if template is None:
+            added = _of_waves(survey, scans, some, model, drawn) * weights
+        else:
+            added = _of_template(survey, scans, rows, model, drawn) * weights
+            added /= template.signal[: len(scans), None] ** 2
+        if template is None and step_of_modes(survey):
             modes.append(_covariance(survey, scans[0], some, model, drawn, weights))
         total += added.sum(axis=1)
         spread += float(added[-1].size * added[-1].var())
@@ -276,6 +305,38 @@ def _of_waves(
         weighted = np.where(amount > 0, amount, np.inf)
         rows.append((squares / weighted[:, None]).sum(axis=0) / max(amount.sum(), 1e-300))
     return np.array(rows)
+
+
+def _rows(survey: Survey, scans: list[_Scan], template: Template) -> list[tuple[Floats, AnyFloats]]:
+    """For each scan offsets of some detectors, and their series of a template, which stand for
+    all.
+    """
+    every = len(survey.offsets)
+    few = np.sort(np.random.default_rng(6).permutation(every)[:DETECTORS])
+    made = (template.rows(scan.track, few) for scan in scans)
+    weights = (
+        w * s.track.step * every / len(few) for w, s in zip(survey.weights, scans, strict=False)
+    )
+    return [(survey.offsets[few], w * rows) for w, rows in zip(weights, made, strict=True)]
+
+
+def _of_template(
+    survey: Survey,
+    scans: list[_Scan],
+    rows: list[tuple[Floats, AnyFloats]],
+    model: Layer,
+    waves: Floats,
+) -> Floats:
+    """(n_scan, n_wave) the square in equation (1) of a template (`Template`), after each scan."""
+    squares, n = [], len(waves)
+    for scan, (offsets, seen) in zip(scans, rows, strict=True):
+        both, across = scan.waves(survey, model, waves)
+        phases = np.exp(1j * (across @ offsets.T)).astype(np.complex64)
+        if survey.common:
+            phases -= phases.mean(axis=1, keepdims=True)
+        value = ((phases @ seen) * (both[:n] + 1j * both[n:])).sum(axis=1)
+        squares.append(abs(value) ** 2)
+    return np.cumsum(squares, axis=0)
 
 
 def _covariance(

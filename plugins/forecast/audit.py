@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,10 +26,17 @@ from .survey import steps_of
 
 if TYPE_CHECKING:
     from zonda.core.configuration.loaded import PipelineFile
+    from zonda.operators.sky.skymap import SkyMap
+
+    from .source import Seen
 
 COMPONENTS = {"white": "white", "1/f": "pink", "atmosphere": "atmosphere"}
 """By part of the noise, the component that makes it."""
-TOGETHER = "together"
+TOGETHER, SKY, GIVEN = "together", "only_source", "source_unfiltered"
+PIXELS = 0.003
+"""Relative error of a peak that is read off a map's pixels."""
+RATIO = "S/N"
+"""Rows that begin so are numbers; the others K_RJ."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +86,13 @@ class Audited:
         return [{**asdict(r), "difference": r.difference, "z": r.z} for r in self.rows]
 
     def __str__(self) -> str:
-        factor, unit = prefixed(max(r.mean for r in self.rows), "K_RJ")
+        kelvin = [r for r in self.rows if not r.part.startswith(RATIO)]
+        factor, unit = prefixed(max(r.mean for r in kelvin), "K_RJ")
         head = ("", f"forecast [{unit}]", "simulated", "standard error", "difference", "z")
         table = []
         for r in self.rows:
-            figures = (f"{v * factor:.4g}" for v in (r.forecast, r.mean, r.error))
+            scale = factor if r in kelvin else 1.0
+            figures = (f"{v * scale:.4g}" for v in (r.forecast, r.mean, r.error))
             table.append((r.part, *figures, f"{100 * r.difference:+.1f} %", f"{r.z:+.1f}"))
         title = f"audit: {self.rows[0].seeds} simulations of the whole pipeline"
         return "\n".join([title, *aligned(table, head, "<>")])
@@ -92,12 +101,14 @@ class Audited:
 @dataclass(frozen=True)
 class Forecasted:
     """Forecast beside the simulations: the depths of a map's planes, the radius of its circle and
-    its beam's FWHM, rad.
+    its beam's FWHM, rad; the place that the circle is about, if not the map's centre; the source.
     """
 
     planes: Mapping[str, Depth]
     radius: float
     fwhm: float
+    centre: tuple[float, float] | None = None
+    source: Seen | None = None
 
     def parts(self, plane: str) -> list[str]:
         """The parts of the noise that are forecast of a plane, but for those that it has not."""
@@ -122,17 +133,23 @@ def audit(
         )
     every = list(dict.fromkeys(p for f in forecasts.values() for p in f.parts("I")))
     first, made = file.scene().seed, list[dict[str, dict[str, MapProduct]]]()
-    variant = _signals(file, every)
+    sky = next((f.source.sky for f in forecasts.values() if f.source), None)
+    variant = _signals(file, every, sky)
     name = next(o.product for o in variant.pipeline.operators if isinstance(o, BinMap))
-    metrics = [_Maps(every, list(forecasts), name)]
+    metrics = [_Maps(every, list(forecasts), name, sky is not None)]
     experiment = Experiment([variant], range(first, first + seeds), metrics, threads=threads)
     experiment.run(take=lambda _, number, found: made.extend(found.values()))
-    return {band: _audited(of, [one[band] for one in made]) for band, of in forecasts.items()}
+    return {
+        band: Audited(tuple(_audited(of, [one[band] for one in made], sky)))
+        for band, of in forecasts.items()
+    }
 
 
-def _audited(of: Forecasted, made: list[dict[str, MapProduct]]) -> Audited:
+def _audited(of: Forecasted, made: list[dict[str, MapProduct]], sky: SkyMap | None) -> list[Row]:
     """``made``: of each seed the maps of each part of the noise, and of all of it."""
     rows, seeds = [], len(made)
+    if of.centre is not None:
+        made = [{k: replace(m, centre=of.centre) for k, m in one.items()} for one in made]
     for plane, depth in of.planes.items():
         parts = of.parts(plane)
         together = [TOGETHER] if len(depth.known) == len(PARTS) else []
@@ -157,11 +174,44 @@ def _audited(of: Forecasted, made: list[dict[str, MapProduct]]) -> Audited:
                     seeds,
                 )
             )
-    return Audited(tuple(rows))
+    if of.source is not None and sky is not None:
+        rows += _of_source(of, of.source, made, of.source.sky.scale / sky.scale, rows[-1])
+    return rows
 
 
-def _signals(file: PipelineFile, parts: Sequence[str]) -> Variant:
-    """The pipeline with a signal of each part of the noise."""
+def _of_source(
+    of: Forecasted,
+    source: Seen,
+    made: list[dict[str, MapProduct]],
+    scale: float,
+    noise: Row,
+) -> list[Row]:
+    """Rows of the source: its peak, and where all noise is forecast, which ``noise`` is, its S/N;
+    ``scale``: of the source over the one in the maps."""
+    depth, end = of.planes["I"], float(of.planes["I"].seconds[-1])
+    maps = [{k: one[k].by_stokes()["I"] for k in (SKY, GIVEN, TOGETHER)} for one in made]
+    some = maps[0][SKY]
+    peaks = scale * np.array([m[SKY].smoothed_rms(of.fwhm, 0.75 * some.pixel) for m in maps])
+    mean, seeds = float(peaks.mean()), len(made)
+    error = math.hypot(float(peaks.std(ddof=1)) / math.sqrt(seeds), PIXELS * mean)
+    rows = [Row("peak of the source", abs(float(source.left(end))), mean, error, seeds)]
+    if noise.part != TOGETHER:
+        return rows
+    ratio = mean / noise.mean
+    error = ratio * math.hypot(error / mean, noise.error / noise.mean)
+    rows.append(Row(f"{RATIO} peak", float(source.snr(depth, end)), ratio, error, seeds))
+    sums = np.array(
+        [[np.nansum(m.weights * g.signal * m.signal) for m in (one[SKY], one[TOGETHER])]
+         for one in maps for g in [one[GIVEN]]]
+    )  # fmt: skip
+    ratio = scale * float(sums[:, 0].mean() / np.sqrt((sums[:, 1] ** 2).mean()))
+    error = ratio / math.sqrt(2 * seeds)  # of the rms of so many normal deviates
+    forecast = float(source.snr(depth, end, "template"))
+    return [*rows, Row(f"{RATIO} template", forecast, ratio, error, seeds)]
+
+
+def _signals(file: PipelineFile, parts: Sequence[str], sky: SkyMap | None) -> Variant:
+    """The pipeline with a signal of each part of the noise, and with a source and its signals."""
     operators = [
         o.model_copy(update={"smooth": None, "half_difference": False})
         if isinstance(o, BinMap)
@@ -171,25 +221,35 @@ def _signals(file: PipelineFile, parts: Sequence[str]) -> Variant:
     runs = {
         f"only_{COMPONENTS[p]}": {"only": [COMPONENTS[p]], "modes": "full"}
         for p in parts
-        if len(parts) > 1
+        if len(parts) > 1 or sky
     }
+    if sky is not None:
+        pointing = [k for k, o in enumerate(operators) if "boresight" in o.provides]
+        operators.insert(pointing[-1] + 1, sky)
+        alone: dict[str, Any] = {"only": ["sky"], "modes": "full"}
+        runs |= {"noise": {"without": ["sky"], "modes": "full"}, SKY: alone}
+        runs |= {GIVEN: {**alone, "filters": "none"}}
     header = file.header
     pipeline = Pipeline(operators, runs=runs, name=header.name, precision=header.precision)
     return Variant(pipeline, file.scene())
 
 
 class _Maps(Metric):
-    """Maps of each part, and of the total noise, by band ("" where there is one)."""
+    """Maps of each part, and of the total noise, by band ("" where there is one); and of the
+    source, filtered and not, where there is one."""
 
-    def __init__(self, parts: Sequence[str], bands: Sequence[str], name: str) -> None:
-        self.parts, self.bands, self.name = parts, bands, name
+    def __init__(self, parts: Sequence[str], bands: Sequence[str], name: str, source: bool) -> None:
+        self.parts, self.bands, self.name, self.source = parts, bands, name, source
 
     def measure(self, data: Data) -> dict[str, dict[str, MapProduct]]:
         found = {}
         for band in self.bands:
             plain = f"{self.name}_{band}" if band else self.name
-            found[band] = {TOGETHER: data.products[plain]}
-            for part in self.parts:
-                name = product_name(stream_of(f"only_{COMPONENTS[part]}"), plain)
-                found[band][part] = data.products[name if len(self.parts) > 1 else plain]
+            signals = {TOGETHER: "noise", SKY: SKY, GIVEN: GIVEN} if self.source else {TOGETHER: ""}
+            alone = len(self.parts) == 1 and not self.source
+            signals |= {p: "" if alone else f"only_{COMPONENTS[p]}" for p in self.parts}
+            found[band] = {
+                what: data.products[product_name(stream_of(signal), plain)]
+                for what, signal in signals.items()
+            }
         return found

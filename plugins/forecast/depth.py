@@ -31,36 +31,47 @@ _DEPTH = re.compile(
 )
 
 
-def read_depth(text: str, factors: Mapping[str, float]) -> float:
+DEPTHS = "'10 uK', '10 uK_CMB', '0.2 mJy/beam', '0.01 MJy/sr', or '0.1 mJy' of a point source"
+
+
+def read_depth(
+    text: str,
+    factors: Mapping[str, float],
+    place: str = "--reach",
+    what: str = "a depth",
+    examples: str = DEPTHS,
+) -> float:
     """A depth such as ``10 uK``, ``10 uK_CMB``, ``0.2 mJy/beam``, ``3 kJy/sr``, ``0.1 mJy`` (a
-    point source) in K_RJ.
+    point source) in K_RJ, or another quantity in the units of ``factors`` over these.
 
     Raises InputError.
     """
-    examples = "'10 uK', '10 uK_CMB', '0.2 mJy/beam', '0.01 MJy/sr', or '0.1 mJy' of a point source"
     wrong, cure = "", f"write e.g. {examples}"
-    units = {**ALIASES, **{unit: unit for unit in factors}}
+    units = {a: unit for a, unit in ALIASES.items() if unit in factors} | {u: u for u in factors}
     known = {
         prefix + name: (size, unit)
         for name, unit in units.items()
         for prefix, size in PREFIXES.items()
         if "MJy" not in name
     }
-    known |= {"MJy/sr": (1.0, "MJy/sr"), "kJy/sr": (1e-3, "MJy/sr"), "Jy/sr": (1e-6, "MJy/sr")}
+    if "MJy/sr" in factors:
+        known |= {"MJy/sr": (1.0, "MJy/sr"), "kJy/sr": (1e-3, "MJy/sr"), "Jy/sr": (1e-6, "MJy/sr")}
     match = _DEPTH.fullmatch(text)
     if match is None:
-        wrong = f"cannot read '{text}' as a depth"
+        wrong = f"cannot read '{text}' as {what}"
     elif match["unit"] is None:
         wrong = f"{text.strip()} has no unit"
     elif match["unit"] not in known:
-        wrong = f"'{match['unit']}' is no unit of a depth"
+        wrong = f"'{match['unit']}' is no unit of {what}"
     else:
         size, unit = known[match["unit"]]
         value = float(match["number"]) * size / factors[unit]
         if math.isfinite(value) and value > 0:
             return value
         wrong, cure = f"no observation reaches a depth of {text}", "give a positive depth"
-    raise InputError(wrong, place="--reach", cure=cure)
+        if place != "--reach":
+            wrong, cure = f"{text} is not positive", "give its magnitude, also of a decrement"
+    raise InputError(wrong, place=place, cure=cure)
 
 
 def prefixed(value: float, unit: str) -> tuple[float, str]:
@@ -84,12 +95,17 @@ def in_unit(value: float, unit: str) -> str:
     return f"{number(value * factor)} {name}"
 
 
-def duration(seconds: float) -> str:
-    """``8.6 min``, ``1 h``, ``20 s``."""
-    for size, name in ((3600.0, "h"), (60.0, "min")):
-        if seconds >= size * (1 - 1e-9):
-            return f"{seconds / size:.4g} {name}"
-    return f"{seconds:.3g} s"
+TIMES = {"h": 3600.0, "min": 60.0, "s": 1.0}
+
+
+def unit_of(seconds: float) -> str:
+    """The unit in which a time reads well, of `TIMES`."""
+    return next((name for name, size in TIMES.items() if seconds >= size * (1 - 1e-9)), "s")
+
+
+def duration(seconds: float, unit: str) -> str:
+    """``8.6 min``, ``0.143 h``: a time in a unit of `TIMES`."""
+    return f"{number(seconds / TIMES[unit])} {unit}"
 
 
 PARTS = ("white", "1/f", "atmosphere")

@@ -211,11 +211,11 @@ def _signed(survey: Survey, chosen: list[Comb], total: Floats) -> list[Series]:
             factors[comb.inside] = np.where(
                 there > 0, signs / np.sqrt(np.where(there > 0, there, 1.0)), 0.0
             )
-            draws.append(partial(_kernels, survey, comb, factors))
+            draws.append(partial(kernels, survey, comb, factors))
     return draws
 
 
-def _kernels(
+def kernels(
     survey: Survey,
     comb: Comb,
     factors: Floats,
@@ -267,9 +267,9 @@ class Filtered:
         survey.filter(track, rows)
         if common:
             rows -= rows.mean(axis=0)
-        frequency, energy = _power(rows, track.rate)
+        frequency, energy = energies(rows, track.rate)
         for k, noise in enumerate(survey.levels[scan]):
-            self._left[k] += weight * noise.sample**2 * float(energy @ _spectrum(noise, frequency))
+            self._left[k] += weight * noise.sample**2 * float(energy @ over_white(noise, frequency))
             self._all[k] += before * noise.sample**2
 
     def share(self, noise: int) -> float:
@@ -283,8 +283,8 @@ class Filtered:
         return found
 
 
-def _spectrum(noise: Noise, frequency: Floats) -> Floats:
-    """R at the frequencies of `_power`; of the lowest, where it is steep, its mean over the bin."""
+def over_white(noise: Noise, frequency: Floats) -> Floats:
+    """R at the frequencies of `energies`; of the lowest, where it is steep, its mean over a bin."""
     if noise.spectrum is None:
         return np.ones_like(frequency)
     found, step = noise.spectrum(frequency), frequency[1]
@@ -297,7 +297,7 @@ def _spectrum(noise: Noise, frequency: Floats) -> Floats:
     return found
 
 
-def _power(rows: AnyFloats, rate: float) -> tuple[Floats, Floats]:
+def energies(rows: AnyFloats, rate: float) -> tuple[Floats, Floats]:
     """(f, sum over rows of |W(f)|^2), one-sided, by transforms of twice the length: their sum over
     f is that of the squares.
     """

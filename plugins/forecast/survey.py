@@ -299,6 +299,8 @@ class Survey:
     levels: list[tuple[Noise, ...]]
     weights: Floats
     configured: list[int]
+    centre: tuple[float, float] | None = None
+    """(lon, lat) [rad] in the map's frame of the place looked at; None: the map's centre."""
     _tracks: dict[tuple[int, int], Track] = field(default_factory=dict)
 
     @property
@@ -394,7 +396,7 @@ class Survey:
         if (scan, step) not in self._tracks:
             index = np.arange(step // 2, o.n_samples // step * step, step)
             grid = self.grid
-            plane = tangent_wcs(grid.origin, 1.0, (1, 1), grid.frame)
+            plane = tangent_wcs(self.centre or grid.origin, 1.0, (1, 1), grid.frame)
             matrices = np.ascontiguousarray(
                 ray_coefficients(o.boresight_radec[index], pixel_matrix(plane)).T
             )
@@ -420,6 +422,13 @@ class Survey:
                 cure="leave nside and projection of BinMap out",
             )
         return grid
+
+    @property
+    def reach(self) -> float:
+        """Largest distance of a detector from the place that is looked at, rad."""
+        field = float(np.hypot(*self.offsets.T).max()) + 3 * self.fwhm
+        tracks = (self.track(k, 1.0) for k in range(len(self.observations)))
+        return field + max(float(np.hypot(*t.centre.T).max()) for t in tracks)
 
     def check_radius(self, radius: float) -> None:
         """Raise PipelineError where a circle [rad] about the map's centre is not on the map."""

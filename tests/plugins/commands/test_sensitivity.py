@@ -7,7 +7,7 @@ import pytest
 import zonda
 from zonda.core import cli
 from zonda.core.errors import InputError
-from zonda.plugins.forecast.depth import duration, in_unit, read_depth
+from zonda.plugins.forecast.depth import duration, in_unit, read_depth, unit_of
 
 MEAN = (
     "--set",
@@ -25,7 +25,7 @@ def test_of_a_pipeline(capsys):
     assert sensitivity("mustang2_cluster", *SHORT, "--reach", "20 uK") == 0
     text = " ".join(capsys.readouterr().out.split())
     for words in (
-        "mustang2 at green_bank, 1 scan, 30 s in all",
+        "mustang2 at green_bank, 1 scan, 0.00833 h in all",  # one unit: the reach takes hours
         "PWV 7.7 mm with 0.5 % rms",
         "filters: high-pass 0.08 Hz, common mode",
         "beam of 8.5 arcsec, averaged over a circle of radius 0.5 arcmin",
@@ -33,6 +33,7 @@ def test_of_a_pipeline(capsys):
         "stated errors of the rms: white 5 %, 1/f 5 %, atmosphere",
         "at the band's centre",
         "20 uK after ",
+        "noise alone: behind these filters a point source keeps ",
     ):
         assert words in text
     assert "# the pipeline" not in text
@@ -102,6 +103,7 @@ def test_the_audit_stands_beside_the_forecast_whatever_the_threads(tmp_path, cap
         )
         found.append(json.loads(capsys.readouterr().out))
     assert found[0] == found[1]
+    assert 0 < found[0]["keeps"]["Gaussian of FWHM 1′"] < found[0]["keeps"]["point source"] < 1
     rows = {row["part"]: row for row in found[0]["audit"]}
     assert list(rows) == ["white", "1/f", "atmosphere", "together"]
     for row in rows.values():
@@ -182,6 +184,8 @@ def test_in_python():
         ),
         (("mustang2_cluster", *SHORT, "--reach", "10 apples"), "'apples' is no unit of a depth"),
         (("mustang2_cluster", *SHORT, "--reach", "100"), "100 has no unit"),
+        (("mustang2_cluster", *SHORT, "--reach", "5 sigma"), "--reach: a signal-to-noise ratio is"),
+        (("mustang2_cluster", *SHORT, "--source", "point", "--peak", "1 mJy"), "no unit of a peak"),
         (("mustang2_cluster", *SHORT, "--reach", "deep"), "cannot read 'deep' as a depth"),
         (("mustang2_cluster", *SHORT, "--reach", "0 uK"), "no observation reaches"),
         (("mustang2_cluster", *SHORT, "--radius", "1 deg"), "is not on the map"),
@@ -210,4 +214,5 @@ def test_depths_with_units():
         assert read_depth(text, factors) == pytest.approx(kelvin)
     assert in_unit(158e-6, "K_RJ") == "158 uK_RJ"
     assert in_unit(2e-3, "MJy/sr") == "2 kJy/sr"
-    assert (duration(30), duration(516), duration(7200)) == ("30 s", "8.6 min", "2 h")
+    assert [unit_of(t) for t in (30, 516, 7200)] == ["s", "min", "h"]
+    assert [duration(t, "min") for t in (30, 516, 7200)] == ["0.5 min", "8.6 min", "120 min"]
