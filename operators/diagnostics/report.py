@@ -291,8 +291,8 @@ def readable(text: str) -> str:
     return f"{value * factor:.6g} {name}"
 
 
-Card = tuple[str, str]
-"""Text of a value, and its meaning."""
+Row = tuple[str, str, str]
+"""A quantity in words, and its value per beam and per pixel; empty where there is none."""
 
 
 def brightness(kelvin: float) -> str:
@@ -308,8 +308,8 @@ def flux_density(kelvin: float, fwhm: float, band: Band) -> str:
     return scaled(jansky, "Jy", 0.9995)
 
 
-def results(data: Data, given: float | None) -> list[Card]:
-    """Cards of how much was observed, how noisy and how deep the maps are.
+def results(data: Data, given: float | None) -> tuple[dict[str, str], list[Row]]:
+    """How much was observed, by name; how noisy and how deep the maps are.
 
     ``given`` is the diameter [rad] of the circle in which that is taken; None stands for
     `central_diameter` of each map.
@@ -319,21 +319,20 @@ def results(data: Data, given: float | None) -> list[Card]:
     main = {name: product for name, product in maps.items() if "/" not in name}
     seconds = sum(o.duration for o in data.scans)
     samples = sum(o.n_samples * o.n_detectors for o in data.observations)
-    cards: list[Card] = [
-        (str(len(data.scans)), "scan" if len(data.scans) == 1 else "scans"),
-        (f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s", "on the sky"),
-        (f"{samples:,}".replace(",", "\u202f"), "samples of all detectors"),
-    ]
+    found = {
+        "scans": str(len(data.scans)),
+        "on the sky": f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s",
+        "samples of all detectors": f"{samples:,}".replace(",", "\u202f"),
+    }
     for name, product in whole.items():
         if "/" not in name:
-            cards += _unsolved(name, product)
-    for figure in noise_figures(maps, given):
-        cards += _noise(figure, maps[figure.product])
+            found |= _unsolved(name, product)
+    rows = [_noise(figure, maps[figure.product]) for figure in noise_figures(maps, given)]
     for name, product in main.items():
         if name in data.products:
-            cards += _depth(name, product, wide[name])
+            rows += _depth(name, product, wide[name])
     for name, product in main.items() if has_white_noise(data) else ():
-        cards += expected(name, product, wide[name])
+        rows += expected(name, product, wide[name])
     strongest = {
         "input": getattr(data.products.get("input"), "values", np.nan),
         "noiseless map": getattr(maps.get("noiseless/map"), "signal", np.nan),
@@ -342,8 +341,8 @@ def results(data: Data, given: float | None) -> list[Card]:
         known = np.asarray(values)[np.isfinite(values)]
         if known.size:
             peak = float(known[np.abs(known).argmax()])
-            cards.append((brightness(peak), f"strongest pixel of the {what}"))
-    return cards
+            found[f"strongest pixel of the {what}"] = brightness(peak)
+    return found, rows
 
 
 def _of(name: str) -> str:
@@ -351,38 +350,29 @@ def _of(name: str) -> str:
     return "" if name == "map" else f", {name}"
 
 
-def _unsolved(name: str, product: MapProduct) -> list[Card]:
-    """In how many pixels with samples a map has no I, Q and U: a card, or none where there are
-    all.
-    """
+def _unsolved(name: str, product: MapProduct) -> dict[str, str]:
+    """Number of pixels with samples in which a map has no I, Q and U; none where there are all."""
     if product.polarization is None:
-        return []
+        return {}
     hit, solved = int(np.count_nonzero(product.hits)), int(np.count_nonzero(product.known))
     label = _of(name)
     text = f"pixels with samples are NaN: too few angles of polarization for I, Q and U{label}"
-    return [(f"{hit - solved} of {hit}", text)] if solved < hit else []
+    return {text: f"{hit - solved} of {hit}"} if solved < hit else {}
 
 
-def _noise(figure: NoiseFigure, product: MapProduct) -> list[Card]:
-    """Cards of the noise at the centre of a map, smoothed with the beam if that can be done, and as
-    it is.
+def _noise(figure: NoiseFigure, product: MapProduct) -> Row:
+    """The noise at the centre of a map, smoothed with the beam if that can be done, and as it
+    is.
     """
     of = {
         "half_difference": product.difference.replace(" - ", " − "),
         "source_free": "all but the sky",
     }[figure.of]
-    where = f"rms, {_central(figure.diameter, product)}, {of}"
-    label = _of(figure.product)
-    if math.isfinite(figure.smoothed):
-        how = _smoothed(figure.smoothed, product)
-        before = f"the same before smoothing, per {sides_text(*product.sides)} pixel"
-        return [
-            (brightness(figure.smoothed), f"{where}, {how}{label}"),
-            (brightness(figure.rms), before),
-        ]
-    if math.isfinite(figure.rms):
-        return [(brightness(figure.rms), f"{where}{label}")]
-    return [("unknown", f"{where}{label}: too few pixels; set central_diameter")]
+    where = f"rms, {_central(figure.diameter, product)}, {of}{_of(figure.product)}"
+    if not math.isfinite(figure.rms):
+        return f"{where}: too few pixels; set central_diameter", "", "unknown"
+    smoothed = _smoothed(figure.smoothed, product) if math.isfinite(figure.smoothed) else ""
+    return where, smoothed, _each(brightness(figure.rms), product)
 
 
 def _central(diameter: float, product: MapProduct) -> str:
@@ -395,8 +385,8 @@ def has_white_noise(data: Data) -> bool:
     return any(cls is not None and "white" in declared(cls, "provides") for cls in classes)
 
 
-def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
-    """Card of the white noise at the centre of a map that NET and samples promise; none if nothing
+def expected(name: str, product: MapProduct, diameter: float) -> list[Row]:
+    """The white noise at the centre of a map that NET and samples promise; none if nothing
     is known.
 
     Smoothing with a beam of width sigma divides the variance of pixels of area A by 4 pi sigma^2 /
@@ -408,32 +398,28 @@ def expected(name: str, product: MapProduct, diameter: float) -> list[Card]:
     if not known.any() or product.noise_from != "net" or product.contents != "all":
         return []
     rms = float(1 / np.sqrt(np.sum(noise[known] ** -2.0) / noise.size))  # of the mean weight
-    label = _of(name)
-    where = _central(diameter, product)
+    what = f"white noise by NET and samples, {_central(diameter, product)}{_of(name)}"
     side = math.sqrt(float(areas.mean()))
     factor = math.inf
     if product.fwhm > 0 and not product.smoothed_by:
         factor = side / product.fwhm * math.sqrt(2 * math.log(2) / math.pi)
-    what = f"white noise by NET and samples, {where}"
-    if factor > 0.5:  # pixels that are not small beside the beam
-        return [(brightness(rms), f"{what}{label}")]
-    return [(brightness(rms * factor), f"{what}, {_smoothed(rms * factor, product)}{label}")]
+    smoothed = "" if factor > 0.5 else _smoothed(rms * factor, product)  # small beside the beam
+    return [(what, smoothed, _each(brightness(rms), product))]
+
+
+def _each(value: str, product: MapProduct) -> str:
+    return f"{value} ({sides_text(*product.sides)} pixels)"
 
 
 def _smoothed(kelvin: float, product: MapProduct) -> str:
-    """Resolution of a map smoothed with its beam, and the flux density of ``kelvin`` in it, in
-    words.
-    """
+    """``kelvin`` in a map smoothed with its beam, its flux density, and the resolution."""
     resolution = math.sqrt(2) * product.fwhm
-    how = f"{angle_text(product.fwhm)} beam and as much smoothing, added in quadrature"
-    text = f"smoothed with the beam to {angle_text(resolution)} ({how})"
-    if product.band:
-        text += f": {flux_density(kelvin, resolution, product.band)} per such beam"
-    return text
+    flux = f", {flux_density(kelvin, resolution, product.band)}" if product.band else ""
+    return f"{brightness(kelvin)}{flux} ({angle_text(resolution)} beam)"
 
 
-def _depth(name: str, product: MapProduct, diameter: float) -> list[Card]:
-    """Card of the time for which the centre of a map was observed, the median over its pixels; none
+def _depth(name: str, product: MapProduct, diameter: float) -> list[Row]:
+    """The time for which the centre of a map was observed, the median over its pixels; none
     if it is not known.
     """
     factor, near = product.seconds_per_beam(), product.distance() <= diameter / 2
@@ -443,9 +429,9 @@ def _depth(name: str, product: MapProduct, diameter: float) -> list[Card]:
     each = np.broadcast_to(np.asarray(factor), product.hits.shape)[near]
     seconds = float(np.median(samples * each))
     time = f"{seconds:.3g}\u00a0s" if seconds < 6000 else f"{seconds / 3600:.3g}\u00a0h"
-    where = _central(diameter, product) + _of(name)
-    counted = f"{np.median(samples):.4g} samples per {sides_text(*product.sides)} pixel"
-    return [(time, f"of all detectors per {angle_text(product.fwhm)} beam, {where}; {counted}")]
+    where = f"time of all detectors, {_central(diameter, product)}{_of(name)}"
+    counted = _each(f"{np.median(samples):.4g} samples", product)
+    return [(where, f"{time} ({angle_text(product.fwhm)} beam)", counted)]
 
 
 def class_of(kind: str) -> type[Operator] | None:

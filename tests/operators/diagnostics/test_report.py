@@ -241,18 +241,16 @@ def test_the_white_noise_that_is_expected():
     ]
     data = zonda.Pipeline(steps).run(scene)
     product, circle = data.products["map"], np.radians(2 / 60)
-    ((shown, what),) = expected("map", product, circle)
-    value, unit = shown.split("\u00a0")
+    ((what, beam, pixel),) = rows = expected("map", product, circle)
+    value, unit = beam.partition(",")[0].split("\u00a0")
     smoothed = product.smoothed(product.fwhm).noise[product.distance() <= circle / 2]
     wanted = np.nanmedian(smoothed)
     assert float(value) * {"µK_RJ": 1e-6, "mK_RJ": 1e-3}[unit] == pytest.approx(wanted, rel=0.05)
-    assert (
-        "smoothed with the beam to 12″ (8.5″ beam and as much smoothing, added in quadrature)"
-        in what
-    )
-    assert what in [meaning for _, meaning in results(data, circle)]
-    ((shown, what),) = expected("map", dataclasses.replace(product, fwhm=0.0), circle)
-    assert "beam" not in what
+    assert beam.endswith("(12″ beam)")
+    assert what == "white noise by NET and samples, central 2′ (14 beams)"
+    assert rows[0] in results(data, circle)[1]
+    ((what, beam, same),) = expected("map", dataclasses.replace(product, fwhm=0.0), circle)
+    assert (beam, same) == ("", pixel)
     assert (
         expected(
             "map", dataclasses.replace(product, noise=np.full(product.hits.shape, np.nan)), circle
@@ -324,10 +322,10 @@ def test_the_depth_of_a_map_is_told_per_beam():
     product = data.products["map"]
     near = product.distance() <= np.radians(1 / 60)
     seconds = np.median(product.hits[near]) / 40 * np.pi / (4 * np.log(2)) * (8.5 / 3) ** 2
-    shown = " ".join(" ".join(card) for card in results(data, np.radians(2 / 60)))
-    assert f"{seconds:.3g}\u00a0s" in shown
-    assert "of all detectors per 8.5″ beam, central 2′ (14 beams); " in shown
-    assert f"{np.median(product.hits[near]):.4g} samples per 3″ pixel" in shown
+    what = "time of all detectors, central 2′ (14 beams)"
+    samples = f"{np.median(product.hits[near]):.4g} samples (3″ pixels)"
+    rows = results(data, np.radians(2 / 60))[1]
+    assert (what, f"{seconds:.3g}\u00a0s (8.5″ beam)", samples) in rows
 
 
 def test_the_central_circle_holds_several_beams(tmp_path):
@@ -361,7 +359,7 @@ def test_the_central_circle_holds_several_beams(tmp_path):
     assert header["RMSHALF"] == pytest.approx(product.rms(radius, of="half_difference"))
     assert "central 10 arcmin" in header.comments["RMSHALF"]
     asked = results(data, np.radians(3 / 60))
-    assert any("central 3′ (1.5 beams)" in meaning for _, meaning in asked)
+    assert any("central 3′ (1.5 beams)" in what for what, *_ in asked[1])
 
 
 def test_the_net_is_that_of_all_scans(data, report, make_observation):
