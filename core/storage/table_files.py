@@ -418,11 +418,14 @@ def _fits(path: Path, place: str) -> Table:
         for column in hdu.columns:
             values = np.asarray(hdu.data[column.name])
             if values.ndim == 1 and values.dtype.kind in "SU":
-                columns[column.name] = [str(v).strip() for v in values.tolist()], column.unit or ""
+                columns[column.name] = (
+                    [str(v).strip() for v in values.tolist()],
+                    str(column.unit or ""),
+                )
             elif values.ndim == 1 and values.dtype.kind in "fiub":
                 if isinstance(column.null, int) and values.dtype.kind in "iu":
                     values = np.where(values == column.null, np.nan, values)
-                columns[column.name] = values, column.unit or ""
+                columns[column.name] = values, str(column.unit or "")
         table = Table(place, columns, [*range(1, 1 + len(hdu.data)), 0], meta, "row")
     if not len(table):
         table.note(None, "has no rows", "give a table with a row or more")

@@ -23,7 +23,7 @@ from zonda.core.stream import UNITS
 from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
 
-from .time_ordered_data import TimeOrderedData, TodWriter
+from .time_ordered_data import OF_DETECTORS, TimeOrderedData, TodWriter
 from .toast_hdf5 import COLUMNS
 
 SUFFIX = ".fits"
@@ -208,14 +208,15 @@ class Reader:
                 raise InputError(
                     "TOD and DETECTORS have other numbers of rows", place=self.place, cure=CURE
                 )
-        self.tod.check(self.place)
-        self.streams, self._at = {}, {}
-        for column in columns:
-            kind = {"D": ">f8", "E": ">f4"}.get(column.format[-1:])
-            name = column.name.lower()
-            if kind and (column.format[:-1] or "1") == str(self.tod.n_samples):
-                self.streams[name] = column.unit or ""
-                self._at[name] = begin + columns.dtype.fields[column.name][1], np.dtype(kind)
+            self.tod.check(self.place)
+            self.streams: dict[str, str] = {}
+            self._at: dict[str, tuple[int, Any]] = {}
+            for column in columns:
+                kind = {"D": ">f8", "E": ">f4"}.get(column.format[-1:])
+                if kind and (column.format[:-1] or "1") == str(self.tod.n_samples):
+                    name = column.name.lower()
+                    self.streams[name] = str(column.unit or "")
+                    self._at[name] = begin + columns.dtype.fields[column.name][1], np.dtype(kind)
         self._lock = threading.Lock()
         self._file: Any = None
         if not is_packed(path):
@@ -296,7 +297,12 @@ def _read(file: Any) -> TimeOrderedData:
         detector_flags=_native(detectors["FLAGS"]),
         names=[str(d) for d in detectors["NAME"]],
         quats=_native(detectors["QUAT"]),
-        columns={c.lower(): _native(detectors[c]) for c in detectors.names if c not in DETECTORS},
+        columns={
+            c.lower(): _native(detectors[c])
+            for c in detectors.names
+            if c not in DETECTORS
+            and (c.lower() in OF_DETECTORS or detectors[c].dtype.kind in "fiu")
+        },
         intervals=intervals,
         weather=weather,
         metadata={

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.configuration.time import Instant
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.flags import (
@@ -32,6 +33,17 @@ from zonda.core.storage.files import writing
 from zonda.core.types import AnyFloats
 from zonda.core.weather import GroundWeather
 
+LIMITS = {
+    "latitude": (-np.pi / 2, np.pi / 2),
+    "longitude": (-2 * np.pi, 2 * np.pi),
+    "altitude": (-1e4, 1e6),
+    "sample_rate": (1e-9, 1e9),
+    "field_of_view": (0.0, 2 * np.pi),
+    "centre_ra": (-2 * np.pi, 2 * np.pi),
+    "centre_dec": (-np.pi / 2, np.pi / 2),
+    "telescope_diameter": (1e-6, 1e6),
+}
+"""What is stated once: least and most, SI."""
 OF_SAMPLES = (
     "times",
     "seconds",
@@ -150,9 +162,10 @@ class TimeOrderedData:
         return len(self.names)
 
     def check(self, place: str) -> None:
-        """Raise an `InputError` about ``place`` where shapes do not fit each other, or times and
-        pointing are not finite.
+        """Raise an `InputError` about ``place`` where what is stated is no text or number of its
+        kind, shapes do not fit each other, or times and pointing are not finite.
         """
+        self._check_statements(place)
         n, d = np.shape(self.times)[:1], np.shape(self.names)
         given = vars(self) | self.columns
         pointed = [name for name in ("boresight_azel", "boresight_radec") if len(given[name])]
@@ -162,6 +175,7 @@ class TimeOrderedData:
         shapes |= dict.fromkeys(self.columns, d)
         known = {name: given[name] for name in shapes if given[name] is not None}
         wrong = [name for name, values in known.items() if np.shape(values) != shapes[name]]
+        wrong += [name for name, v in known.items() if np.asarray(v).dtype.kind not in "fiu"]
         wrong += [
             name
             for name, stream in self.streams.items()
@@ -173,8 +187,6 @@ class TimeOrderedData:
         for name in ("azimuth", *self.columns):  # where it is no number, another is taken
             known.pop(name, None)
         known |= {f"intervals {name}": spans for name, spans in self.intervals.items()}
-        stated = [self.sample_rate, self.field_of_view, *self.site[1:]]
-        known["sample rate, field of view or site"] = stated if self.sample_rate > 0 else np.nan
         numbers = [name for name, values in known.items() if not np.isfinite(values).all()]
         if numbers:
             raise InputError(
@@ -182,6 +194,39 @@ class TimeOrderedData:
                 place=place,
                 cure="save it again",
             )
+
+    def _check_statements(self, place: str) -> None:
+        """Raise an `InputError` where a text, a number or the start is none, or beyond its
+        limits.
+        """
+        site, *where = self.site
+        texts = {"name": self.name, "telescope": self.telescope, "site": site, "start": self.start}
+        wrong = [
+            f"{name} is {value!r:.60}"
+            for name, value in texts.items()
+            if not isinstance(value, str)
+        ]
+        if isinstance(self.start, str):
+            try:
+                Instant.parse(self.start)
+            except ValueError as error:
+                wrong.append(f"start: {error}")
+        named: dict[str, Any] = dict(zip(("latitude", "longitude", "altitude"), where, strict=True))
+        named |= {"sample_rate": self.sample_rate, "field_of_view": self.field_of_view}
+        named |= {key: self.metadata[key] for key in LIMITS if key in self.metadata}
+        if self.weather is not None:
+            named |= {f"weather {key}": value for key, value in asdict(self.weather).items()}
+        for name, value in named.items():
+            least, most = LIMITS.get(name, (-1e30, 1e30))
+            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+            if not (number and least <= value <= most):
+                wrong.append(f"{name} is {value!r:.60}, not {least:g} to {most:g}")
+        for name, value in self.metadata.items():
+            if not isinstance(value, str | int | float | np.generic):
+                wrong.append(f"{name} is {value!r:.60}")
+        if wrong:
+            text = f"states what cannot be: {'; '.join(wrong)}"
+            raise InputError(text, place=place, cure="mend these values, or save it again")
 
     def of_samples(self) -> dict[str, NDArray[Any]]:
         """Arrays of the samples, by name: those that it has, with azimuth (as recorded, where it

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
+from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
 from zonda.core.flags import INVALID, Flags
 from zonda.core.storage.files import reading, writing
@@ -332,7 +333,7 @@ class Reader:
             with self._reading():
                 self.tod, self._data = self._opened()
                 self.streams = self._streams()
-            self.tod.check(self.place)
+                self.tod.check(self.place)
         except BaseException:
             self.close()
             raise
@@ -561,18 +562,12 @@ def _weather(attributes: Any) -> GroundWeather | None:
     """None where there is none, or one that states no numbers (TOAST's simulated weather names its
     distribution alone).
     """
-    import astropy.units as u
-
     if not {"weather_time", *(f"weather_{theirs}" for theirs, _ in WEATHER.values())} <= set(
         attributes
     ):
         return None
     stated = {
-        ours: float(
-            u.Quantity(str(attributes[f"weather_{theirs}"])).to_value(
-                unit or u.dimensionless_unscaled
-            )
-        )
+        ours: Unit(unit).parse(str(attributes[f"weather_{theirs}"]))
         for ours, (theirs, unit) in WEATHER.items()
     }
     return GroundWeather(time=float(attributes["weather_time"]), **stated)

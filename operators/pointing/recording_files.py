@@ -138,7 +138,8 @@ def read_recording(path: Path, clock: Clock, mask: int | None = None) -> Recordi
         magic = file.read(9)
     kinds = ((b"#time ra-", _antenna_log), (b"\x89HDF", _hdf5), (b"SIMPLE  =", _fits), (b"", _text))
     read = next(read for begins, read in kinds if magic.startswith(begins))
-    return _recording(read(path, place), clock, mask, place)
+    with reading(place, "a recording", CURE):
+        return _recording(read(path, place), clock, mask, place)
 
 
 def _text(path: Path, place: str) -> RecordedTable:

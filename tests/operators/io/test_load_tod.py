@@ -14,6 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import zonda
 import zonda.testing
@@ -528,6 +529,52 @@ def test_bad_files_are_named_with_a_cure(saved: Any, tmp_path: Path, what: str) 
         load(path, MAP)
     assert "bad.h5" in caught.value.place
     assert caught.value.cure
+
+
+def attribute(path: Path, where: str, name: str, value: Any) -> Path:
+    """A copy of a file with another attribute, or card of the extension ``where``."""
+    made = path.with_name(f"bad{path.suffix}")
+    shutil.copy(path, made)
+    if path.suffix == ".fits":
+        with fits.open(made, mode="update") as hdus:
+            hdus[where].header[name] = value
+        return made
+    with h5py.File(made, "r+") as file:
+        del file[where].attrs[name]
+        file[where].attrs[name] = value
+    return made
+
+
+@pytest.mark.parametrize(
+    ("where", "name", "value", "match"),
+    [
+        ("PRIMARY", "SAMPRATE", "fast", "sample_rate is 'fast', not 1e-09 to 1e+09"),
+        ("PRIMARY", "SAMPRATE", -1.0, "sample_rate is -1.0"),
+        ("PRIMARY", "OBJECT", 7, "name is 7"),
+        ("PRIMARY", "DATE-OBS", "now", "start: cannot read 'now' as a time"),
+        ("PRIMARY", "SITELAT", 91.0, "latitude is "),
+        ("PRIMARY", "SITEALT", True, "altitude is True"),
+        ("TOD", "TTYPE1", "", "cannot be read as FITS"),
+        ("TOD", "TUNIT2", 7, "signal is in '7', not in kelvin"),
+        ("metadata/other", "zonda_centre_ra", -np.inf, "centre_ra is -inf"),
+        ("metadata/other", "zonda_centre_ra", np.array([1.0, 2.0]), "centre_ra is array("),
+        ("metadata/other", "zonda_telescope_diameter", "wide", "telescope_diameter is 'wide'"),
+        ("metadata/other", "zonda_seed", np.zeros(2), "seed is array("),
+        ("metadata/other", "zonda_start_utc", 5.0, "start: cannot read '5.0' as a time"),
+        ("instrument", "weather_time", np.nan, "weather time is nan"),
+        ("instrument", "weather_pwv", "1 10**9999999 m", "cannot be read as HDF5"),
+        ("instrument", "site_lat_deg", np.array([1.0, 2.0]), "cannot be read as HDF5"),
+    ],
+)
+def test_what_a_file_states_is_checked(
+    saved: Any, where: str, name: str, value: Any, match: str
+) -> None:
+    of_fits = where in ("PRIMARY", "TOD")
+    path = attribute(saved["Fits" if of_fits else "Filtered"][0], where, name, value)
+    with pytest.raises(InputError, match=re.escape(match)) as caught:
+        load(path, MAP)
+    assert path.name in caught.value.place
+    path.unlink()
 
 
 @pytest.mark.parametrize("column", ["net", "fwhm", "knee", "slope", "polarization_angle"])

@@ -466,7 +466,7 @@ def saved(observe: Callable[..., Data], tmp_path: Path) -> Callable[[str], Path]
         zonda.Pipeline([step, zonda.WhiteNoise(), zonda.Efficiency(), SaveTOD(format=form)]).run(
             scene, output=tmp_path / form, threads=1
         )
-        (path,) = (tmp_path / form).iterdir()
+        (path,) = (tmp_path / form).glob("tod*")
         return path
 
     return write
