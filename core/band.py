@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, create_model, model_validator
 
 from .configuration.diagnostics import mistake, refusal
 from .configuration.input_paths import InputPath
@@ -167,7 +167,25 @@ def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return nu, t / t.max()
 
 
-class CameraBand(Band):
+def with_yield(base: type[Parameters], default: float | None) -> Any:
+    """A subclass of ``base`` with the field ``yield``, which is no name in a class statement."""
+    text = "Share of the detectors that give data. The others are dead, the same ones in each run."
+    field = Field(default, gt=0, le=1, description=text)
+    kind: Any = Fraction if default is not None else Fraction | None
+    fields: dict[str, Any] = {"yield": (kind, field)}
+    return create_model(f"{base.__name__}WithYield", __base__=base, **fields)
+
+
+if TYPE_CHECKING:
+
+    class BandWithYield(Band):
+        """A band with the field ``yield``."""
+
+else:
+    BandWithYield = with_yield(Band, None)
+
+
+class CameraBand(BandWithYield):
     """One of the bands of a camera that has several: its passband, and what its detectors have of
     their own.
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
     Field,
     ModelWrapValidatorHandler,
@@ -21,7 +22,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from .array_table import OF_INSTRUMENT, ArrayTable, read_array, stated_by
-from .band import NO_BAND, PER_BAND, SPEED_OF_LIGHT, Band, BandOfCamera, CameraBand
+from .band import NO_BAND, PER_BAND, SPEED_OF_LIGHT, Band, BandOfCamera, CameraBand, with_yield
 from .configuration.diagnostics import mistake, nearest, refusal
 from .configuration.input_paths import InputPath, find
 from .configuration.parameters import Parameters, named, named_or_written, quantity
@@ -39,6 +40,7 @@ from .configuration.units import (
 from .errors import InputError, ZondaError
 from .focalplane import Focalplane
 from .layouts import Layout, hexagonal_packing, rings, wafers
+from .numerics.random import stream_key, uniforms
 from .registry import RegistryError, bands, instruments, layouts
 from .types import Floats
 from .variants import LIKE, is_variant, variant
@@ -106,7 +108,16 @@ class Telescope(Parameters):
         return repr(self)
 
 
-class Instrument(Parameters):
+if TYPE_CHECKING:
+
+    class ParametersWithYield(Parameters):
+        """Parameters with the field ``yield``."""
+
+else:
+    ParametersWithYield = with_yield(Parameters, 1.0)
+
+
+class Instrument(ParametersWithYield):
     """A camera on a telescope: detectors in a round field of view, laid out or from a table.
     Subclass to lay out others.
     """
@@ -241,6 +252,9 @@ class Instrument(Parameters):
         none, cure = self.band is None and not names, "name one with band, or several with bands"
         yield none, "a camera needs a band", cure, ("band",)
         if self.focalplane_table is not None:
+            lost = any(getattr(part, "yield") not in (None, 1.0) for part in (self, *self.bands))
+            cure = "leave it out: the column `dead` of the table tells which detectors give no data"
+            yield lost, "yield is for layouts, not for a table of detectors", cure, ("yield",)
             return
         counts, wafers, pairs = self._counts, self._wafers, self.polarization == "pairs"
         listed = ", ".join(f"{name} has {number}" for name, number in counts.items())
@@ -437,8 +451,16 @@ class Instrument(Parameters):
             polarization_angle=angle,
             polarization_efficiency=np.full(n, float(pair == 2)),
             wafer=np.repeat(layout.wafer, pair),
+            dead=self._dead(n),
             **{key: np.full(n, value) for key, value in stated.items()},
         )
+
+    def _dead(self, number: int) -> NDArray[np.int64]:
+        """1 for the detectors (number,) that give no data, by `yield`: the same in each run."""
+        alive = max(1, round(number * getattr(self, "yield")))
+        drawn = uniforms(stream_key(0, *self.identity, "yield"), 0, number)
+        rank = drawn.argsort(kind="stable").argsort(kind="stable")
+        return np.asarray(rank >= alive, np.int64)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the focal plane, and beside it the middle with beams and polarization angles; return

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -318,8 +318,7 @@ class Survey:
         """FWHM of the map's beam [rad], `core.maps.beams`: by the weights of the detectors of the
         first scan.
         """
-        good = self.observations[0].good_detectors
-        fwhm, net = self.focalplane.fwhm[good], self.focalplane.net[good]
+        fwhm, net = self.focalplane.fwhm, self.focalplane.net
         net = net if self.steps.binning.weights == "inverse_variance" else np.ones(len(net))
         return expected_fwhm(fwhm, net) or self.scene.instrument.beam_fwhm
 
@@ -453,7 +452,7 @@ def survey_of(file: PipelineFile, band: str = "") -> Survey:
     pipeline = Pipeline(chosen.operators, name=header.name, precision=header.precision)
     steps = Steps.among(pipeline.operators)  # copies, which know the scans
     data = observed(pipeline.operators, file.scene(), band)
-    observations = data.observations
+    observations = [_alive(o) for o in data.observations]
     if observations and steps.binning.stokes == "IQU":
         check_polarized(observations[0], steps.binning.label)
     note_signals(observations, pipeline.signals.components, pipeline.signals.formed)
@@ -487,6 +486,13 @@ def polarization_angles(survey: Survey, observation: Observation, index: Any) ->
         if found.plate.size
         else found
     )
+
+
+def _alive(observation: Observation) -> Observation:
+    """The scan with the detectors that give data alone."""
+    kept = np.flatnonzero(observation.good_detectors)
+    plane, flags = observation.focalplane.rows(kept), observation.detector_flags[kept]
+    return replace(observation, focalplane=plane, detector_flags=flags)
 
 
 def _check_scans(observations: Sequence[Observation], name: str) -> None:

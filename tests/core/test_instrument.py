@@ -206,3 +206,38 @@ def test_a_polarization_efficiency_beyond_one_is_refused():
         InputError, match="polarization_efficiency of detector d2 is not between 0 and 1"
     ):
         plane.copy()
+
+
+def two_bands(**more):
+    bands = [
+        {"name": "low", "low": "80 GHz", "high": "100 GHz"},
+        {"name": "high", "low": "140 GHz", "high": "160 GHz", "yield": "30 %"},
+    ]
+    given = {"name": "camera", "telescope": {"name": "dish", "diameter": "12 m"}, "bands": bands}
+    given |= {"detectors": 91, "field_of_view": "10 arcmin", "main_beam_efficiency": 0.6}
+    given |= {"illumination_efficiency": 0.9, "net": "1 mK s(1/2)", "sample_rate": "50 Hz"}
+    return zonda.Instrument(**(given | more))
+
+
+def test_yield_is_the_share_of_live_detectors():
+    made = two_bands(**{"yield": "80 %"})
+    planes = [made.focalplane().of_band(k) for k in (0, 1)]
+    assert [int((1 - plane.dead).sum()) for plane in planes] == [73, 27]  # round(91 x 0.8), 0.3
+    # a band alone has the dead detectors that it has in the camera, in each run
+    for plane, camera in zip(planes, made.cameras.values(), strict=True):
+        assert (camera.focalplane().dead == plane.dead).all()
+    # fewer alive: those that were dead still are, and they are not the last ones
+    fewer = two_bands(**{"yield": "50 %"}).focalplane().of_band(0).dead
+    assert (fewer >= planes[0].dead).all()
+    assert 0 < planes[0].dead[:45].sum() < planes[0].dead.sum()
+    assert not two_bands().focalplane().of_band(0).dead.any()
+    one = two_bands(detectors=1, bands=[{"name": "b", "low": "1 GHz", "high": "2 GHz"}])
+    assert not one.varied(**{"yield": 0.1}).focalplane().dead.any()  # one at least is alive
+
+
+def test_yield_of_a_table_is_refused(tmp_path):
+    table = tmp_path / "array.csv"
+    table.write_text("name, xi [arcmin], eta [arcmin]\na, 0, 0\nb, 1, 0\n")
+    bands = [{"name": "b", "low": "80 GHz", "high": "90 GHz"}]
+    with pytest.raises(ZondaError, match="yield is for layouts"):
+        two_bands(focalplane=table, detectors=None, bands=bands, **{"yield": 0.5})

@@ -62,6 +62,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         },
         "polarization": {"polarization": "pairs", "detectors": 20},
         "detectors": {"detectors": 7},
+        "yield": {"yield": "50 %"},
         "field_of_view": {"field_of_view": "3 arcmin"},
         "layout": {"layout": "rings"},
         "wafers": {"layout": "wafers", "detectors": 21, "wafers": 3},

@@ -56,6 +56,28 @@ def pipeline(*steps, detectors=37, field="3 arcmin"):
     )
 
 
+def test_dead_detectors_are_none(tmp_path):
+    """A table with dead detectors has the depth of the same table without them, of all noises."""
+    rng = np.random.default_rng(5)
+    rows = [
+        f"d{k}, {x:.4f}, {y:.4f}, {dead}"
+        for k, ((x, y), dead) in enumerate(
+            zip(rng.uniform(-1, 1, (12, 2)), 6 * [0, 1], strict=True)
+        )
+    ]
+    depths = []
+    for name, kept in (("all", rows), ("alive", rows[::2])):
+        path = tmp_path / f"{name}.csv"
+        path.write_text("\n".join(["name, xi [arcmin], eta [arcmin], dead", *kept]) + "\n")
+        text = CAMERA.replace("  detectors: DETECTORS\n  field_of_view: FIELD\n", "")
+        text = text.replace("  net: ", f"  focalplane: {path}\n  net: ")
+        steps = (DAISY, "WhiteNoise", "PinkNoise", "Efficiency", *FILTERS)
+        made = "".join(f"  - {s}\n" for s in [*steps, "BinMap: {half_difference: false}"])
+        found = zonda.sensitivity(parse(text + made))
+        depths.append([found.rms(part=part) for part in ("white", "1/f")])
+    assert depths[0] == pytest.approx(depths[1], rel=1e-9)
+
+
 def test_one_detector_that_stares_has_its_net_over_the_root_of_the_time():
     file = pipeline(
         "PointingStare: {scan_duration: 80 s}",
