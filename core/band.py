@@ -90,6 +90,17 @@ class Band(Parameters):
         return float(np.trapezoid(nu * t, nu) / np.trapezoid(t, nu))
 
     @property
+    def edges(self) -> tuple[float, float]:
+        """Lowest and highest frequency of half the peak's transmission, Hz."""
+        nu, t = self._table
+        first, last = np.flatnonzero(t >= 0.5)[[0, -1]].tolist()
+        low = (
+            np.interp(0.5, t[first - 1 : first + 1], nu[first - 1 : first + 1]) if first else nu[0]
+        )
+        above = slice(last, last + 2)
+        return float(low), float(np.interp(-0.5, -t[above], nu[above]))
+
+    @property
     def width(self) -> float:
         """Equivalent width, integral of the (peak-normalized) transmission, Hz."""
         return float(np.trapezoid(self.transmission, self.frequency))

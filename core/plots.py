@@ -121,7 +121,7 @@ def _bands(instrument: Any, plane: Focalplane) -> list[str]:
     table = []
     for k, (name, camera) in enumerate(instrument.cameras.items()):
         rows = plane.of_band(k) if instrument.bands else plane
-        nu = camera.band.frequency / 1e9
+        nu = np.array(camera.band.edges) / 1e9
         table.append(
             (
                 name,

@@ -151,7 +151,7 @@ def _scene(data: Data) -> dict[str, Any]:
 def _band(camera: Instrument, data: Data) -> dict[str, str]:
     """A band, with what its detectors are like in the first scan."""
     band = camera.band
-    low, high, centre = (f / 1e9 for f in (band.frequency[0], band.frequency[-1], band.centre))
+    low, high, centre = (f / 1e9 for f in (*band.edges, band.centre))
     rows = {"Band": f"{band.name}: {low:.4g} to {high:.4g} GHz about {centre:.4g} GHz"}
     scans = [o for o in data.observations if o.instrument == camera]
     if not scans:

@@ -447,3 +447,13 @@ def test_what_bands_hold_for_each_other_counts_in_the_budget() -> None:
     maps = planning_of(made["f090",].operators[-1]).memory(scans["f090",][0])
     more = least["f090", "f150"] - max(least["f090",], least["f150",])
     assert abs(more - 1.05 * maps) <= 1e6  # rounded up to MB with a margin of 5 %
+
+
+def test_edges_are_where_a_band_has_half_of_its_peak(tmp_path):
+    path = tmp_path / "band.txt"
+    path.write_text("80 0\n90 0.8\n100 2\n110 0.2\n130 0\n")
+    # half of 2 is 1: 90 + 10 (1 - 0.8) / (2 - 0.8), 100 + 10 (2 - 1) / (2 - 0.2)
+    assert zonda.Band(name="b", file=path).edges == pytest.approx((91.6667e9, 105.5556e9), rel=1e-6)
+    assert zonda.Band(name="b", low="80 GHz", high="90 GHz").edges == (80e9, 90e9)
+    path.write_text("80 1\n90 1.5\n")  # the table ends above half of the peak
+    assert zonda.Band(name="b", file=path).edges == (80e9, 90e9)

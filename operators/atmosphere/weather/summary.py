@@ -116,9 +116,8 @@ def band_lines(profile: Profile, bands: Iterable[Band], elevation: float) -> lis
     lines = [f"{at}: emission of the atmosphere (background 0 K), transmission, opacity"]
     for band in bands:
         seen = BandAtmosphere(band, profile, min(max(*steps, 1e-4) * 1.01, PWV_MAX))
-        lines.append(
-            f"  {band.name} ({band.frequency[0] / 1e9:g} to {band.frequency[-1] / 1e9:g} GHz)"
-        )
+        low, high = (edge / 1e9 for edge in band.edges)
+        lines.append(f"  {band.name} ({low:.6g} to {high:.6g} GHz)")
         rows = []
         for pwv in steps:
             passed = float(seen.transmission(pwv, elevation))
