@@ -83,6 +83,9 @@ class MapArrays:
         That of the flux density with which the map was converted to its `unit`; None: it was not.
     square
         Pixels of an image are as wide as high.
+    taken_off
+        What a map maker took off I, since the data hardly determine it: ``mean``, ``plane``; empty:
+        nothing.
     beams
         FWHM [rad] of the narrowest and the widest beam in the map; zeros: not known.
     """
@@ -94,7 +97,7 @@ class MapArrays:
     frame: str = "icrs"
     unit: str = "K_RJ"
     weighting: Literal["uniform", "inverse_variance"] = "uniform"
-    noise_from: Literal["net", "scatter"] = "net"
+    noise_from: Literal["net", "scatter", "streams"] = "net"
     nside: int = 0
     nest: bool = False
     pixels: NDArray[np.int64] | None = None
@@ -108,6 +111,7 @@ class MapArrays:
     band: Band | None = None
     beams: tuple[float, float] = (0.0, 0.0)
     square: bool = True
+    taken_off: str = ""
     origin: Any = None
     spectral_index: float | None = None
 

@@ -230,6 +230,8 @@ class MapFile:
         if (band := self.product.band) is not None:
             cards.append(("RESTFRQ", float(f"{band.centre:.12g}"), "[Hz] centre of the band"))
             cards.append(("BAND", ascii_text(band.name), "name of the band"))
+        if taken := self.product.taken_off:
+            cards.append(("TAKENOFF", taken, "of I, which the data hardly determine"))
         if (index := self.product.spectral_index) is not None:
             cards.append(("SPECINDX", index, "of the flux density, for the unit: at RESTFRQ"))
         return header_of(cards, about.history)

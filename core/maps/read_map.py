@@ -200,6 +200,7 @@ class _Reader(FileHeader):
             beams=(low, high),
             band=known,
             spectral_index=self.number("SPECINDX"),
+            taken_off=self.text("TAKENOFF"),
             contents=contents,
             **self.where,
         )

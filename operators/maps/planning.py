@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from zonda.core.data import Observation
+from zonda.core.numerics.projection import boresights
 from zonda.core.plan.bounds import Traits
 from zonda.core.plan.planning import Planning
 
 from .bin_map import BinMap
 from .coverage import COUNTS
 from .grid import in_frame
+from .maximum_likelihood import MaximumLikelihoodMap
 
 
 class BinMapPlanning(Planning[BinMap]):
@@ -47,3 +51,40 @@ class BinMapPlanning(Planning[BinMap]):
         each += 40 if step.scan_hits else 0
         samples += 144 if step.crosslinking else 0
         return each * step.grid.n_pixels + samples * observation.n_samples
+
+
+class MaximumLikelihoodPlanning(BinMapPlanning):
+    """Runs and baselines of all scans, and the maps of the iteration."""
+
+    of = MaximumLikelihoodMap
+    operator: MaximumLikelihoodMap
+    smaller = "choose a larger pixel or a longer baseline"
+
+    def memory(self, observation: Observation) -> int:
+        """Six bytes a run (22 with I, Q and U), twice while runs are put in order; sums of
+        baselines and free modes; and maps.
+        """
+        step = self.operator
+        samples, instants = step._samples
+        signals, length = len(observation.signals), max(step.baseline * observation.sample_rate, 1)
+        stokes = 3 if step.stokes == "IQU" else 1
+        runs = (6 if stokes == 1 else 22) * samples * self.runs(observation)
+        sums = (40 + 16 * signals) * samples / length + 16 * signals * step.free * instants
+        maps = 8 * (5 + step.refine) * stokes * int(step.grid.n_pixels)
+        return super().memory(observation) + int(2 * runs + sums) + maps
+
+    def runs(self, observation: Observation) -> float:
+        """Runs per sample: the boresight crosses 4 / pi pixels for each pixel of its way, and runs
+        end with baselines.
+        """
+        step = self.operator
+        if observation.hwp_angle is not None:
+            return 1.0
+        forward = np.diff(boresights(observation.boresight_radec), axis=1)
+        way = float(np.sqrt((forward**2).sum(axis=0)).mean()) if forward.size else 0.0
+        crossed = 4 / math.pi * way / (self.traits(observation).pixel or way or 1.0)
+        return min(1.0, 1.1 * crossed + 1 / max(step.baseline * observation.sample_rate, 1))
+
+    def sweeps(self, observation: Observation) -> int:
+        """One reading finds runs and baselines."""
+        return 1

@@ -39,6 +39,7 @@ BUILT_IN = {
     "TimeConstant": {},
     "Crosstalk": {},
     "BinMap": {"pixel": "20 arcsec"},
+    "MaximumLikelihoodMap": {"pixel": "20 arcsec"},
     "PowerSpectrum": {},
     "TimeStreams": {},
     "SaveTOD": {},

@@ -1,0 +1,327 @@
+"""Maximum-likelihood maps beside filter-and-bin on the same streams: transfer by scale, peak, noise,
+signal-to-noise ratio of the true source, CPU time of a reading and of an iteration.
+
+    python benchmarks/map_makers.py m2                  # MUSTANG-2, two daisies of 8.6 min
+    python benchmarks/map_makers.py m2 --templates 6    # and of the cluster in noise, so many seeds
+    python benchmarks/map_makers.py atlast              # AtLAST's reduced camera, a daisy of 20 s
+    python benchmarks/map_makers.py survey              # constant-elevation scans, I, Q and U
+
+Transfer and noise are those of rings in angular frequency under a window of the hits, a plane taken
+off all maps. CPU seconds are those of one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+import warnings
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np  # noqa: E402
+from scipy import ndimage  # noqa: E402
+
+import zonda  # noqa: E402
+import zonda.pipelines  # noqa: E402
+from zonda.operators.maps import maximum_likelihood as ml  # noqa: E402
+
+CLUSTER = Path(zonda.pipelines.__path__[0]) / "data/merging_cluster.fits"
+SCALES = {
+    "m2": [720, 480, 320, 220, 150, 100, 70, 50, 30, 20, 12, 8],
+    "atlast": [1800, 1200, 800, 500, 300, 180, 100, 60, 30, 15],
+}
+BEAM = {"m2": 9, "atlast": 15}
+KEPT: list[Any] = []
+
+
+class Maker(zonda.MaximumLikelihoodMap):
+    """The map maker; what it solves is kept."""
+
+    def finalize(self, data: Any) -> None:
+        maps: dict[str, Any] = {}
+
+        class Keeps(ml.LikelihoodMaps):
+            def map_of(self, stream: str) -> Any:
+                start = time.process_time()
+                equations = self.equations
+                maps["refine"] = maps.get("refine", 0.0) + time.process_time() - start
+                start = time.process_time()
+                solution = self._solved(equations, stream)
+                seconds = time.process_time() - start
+                maps[stream] = equations, solution, seconds
+                return super().map_of(stream)
+
+        whole, ml.LikelihoodMaps = ml.LikelihoodMaps, Keeps  # type: ignore[misc]
+        try:
+            super().finalize(data)
+        finally:
+            ml.LikelihoodMaps = whole  # type: ignore[misc]
+        KEPT[:] = [maps]
+
+
+def m2(seed: int) -> tuple[dict[str, Any], list[Any], dict[str, Any], list[Any]]:
+    scene = {
+        "site": "green_bank",
+        "instrument": "mustang2",
+        "time": "2024-11-25T02:00-05:00",
+        "target": "05h +20d",
+        "seed": seed,
+    }
+    steps = [
+        zonda.PointingDaisy(
+            radius="4 arcmin", speed="50 arcsec/s", scan_duration="8.6 min", scans=2, gap="30 s",
+            offsets="box", offset_size="1 arcmin",
+        ),
+        zonda.SkyMap(file=str(CLUSTER)),
+        zonda.AtmosphereLayers(pwv="7.7 mm", pwv_rms="0.5 %"),
+        zonda.WhiteNoise(),
+        zonda.PinkNoise(shared=0.8),
+        zonda.Efficiency(),
+    ]  # fmt: skip
+    filters = [zonda.HighpassFilter(frequency="0.08 Hz"), zonda.CommonModeFilter()]
+    return scene, steps, {"pixel": "2 arcsec", "half_difference": False}, filters
+
+
+def atlast(seed: int) -> tuple[dict[str, Any], list[Any], dict[str, Any], list[Any]]:
+    scene = {
+        "site": "llano_de_chajnantor",
+        "instrument": "atlast",
+        "time": "2022-08-01T23:00",
+        "target": "260d -10d",
+        "seed": seed,
+    }
+    steps = [
+        zonda.PointingDaisy(
+            radius="0.25 deg", speed="0.5 deg/s", scan_duration="20 s", check_limits="warn"
+        ),
+        zonda.SkyMap(file=str(CLUSTER), centre="target"),
+        zonda.AtmosphereLayers(pwv_rms="5 %", highest="3000 m"),
+        zonda.WhiteNoise(),
+        zonda.PinkNoise(),
+        zonda.Efficiency(),
+    ]
+    filters = [zonda.HighpassFilter(frequency="0.5 Hz"), zonda.CommonModeFilter()]
+    return scene, steps, {"pixel": "4 arcsec", "half_difference": False}, filters
+
+
+SIGNALS = {"sky": {"only": ["sky"]}, "rest": {"without": ["sky"]}}
+
+
+def run(of: Any, steps: list[Any], full: bool = False, signals: Any = SIGNALS) -> Any:
+    """Products of a pipeline; ``full``: filters act as they do on the complete signal."""
+    runs = {name: {**how, **({"modes": "full"} if full else {})} for name, how in signals.items()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return zonda.Pipeline(steps, runs=runs).run(zonda.Scene(**of), threads=1)
+
+
+class Rings:
+    """Window of the hits (smooth, zero where thin) and rings between angular ``scales``, arcsec."""
+
+    def __init__(self, product: Any, scales: list[float]) -> None:
+        hits, arcsec = product.hits.astype(float), np.degrees(product.pixel) * 3600
+        h = ndimage.gaussian_filter(hits, 4)
+        w = np.clip((h / np.percentile(h, 98) - 0.15) / 0.35, 0, 1)
+        self.w = ndimage.gaussian_filter(w, 6) * (hits > 0) * (w > 0)
+        ny, nx = hits.shape
+        k = np.hypot(*np.meshgrid(np.fft.fftfreq(nx, arcsec), np.fft.fftfreq(ny, arcsec)))
+        edges = 1 / np.asarray(scales, float)
+        self.index, self.n = np.digitize(k, edges) - 1, len(scales) - 1
+        self.scale = 1 / np.sqrt(edges[1:] * edges[:-1])
+        y, x = np.indices(hits.shape)
+        root = np.sqrt(self.w).ravel()
+        basis = np.stack([np.ones(x.size), x.ravel() - nx / 2, y.ravel() - ny / 2], axis=1)
+        self.q, self.root = np.linalg.qr(basis * root[:, None])[0], root
+
+    def flat(self, m: Any) -> Any:
+        """A map under the window without the plane that fits best."""
+        v = np.nan_to_num(m).ravel() * self.root
+        v -= self.q @ (self.q.T @ v)
+        return (v * np.where(self.root > 0, 1 / np.where(self.root > 0, self.root, 1), 0)).reshape(
+            m.shape
+        )
+
+    def sums(self, x: Any) -> Any:
+        return np.array([x[self.index == r].sum() for r in range(self.n)])
+
+    def transfer(self, m: Any, true: Any) -> Any:
+        a, b = (np.fft.fft2(self.flat(x) * self.w) for x in (true, m))
+        return self.sums((b * a.conj()).real) / self.sums(np.abs(a) ** 2)
+
+    def smooth(self, m: Any, product: Any, fwhm: float) -> Any:
+        s = fwhm / 2.3548 / (np.degrees(product.pixel) * 3600)
+        h = product.hits * (self.w > 0)
+        total = ndimage.gaussian_filter(h.astype(float), s)
+        return ndimage.gaussian_filter(self.flat(m) * h, s) / np.maximum(total, 1e-3 * h.max())
+
+
+def compare(kind: str, seed: int) -> None:
+    of, steps, how, filters = {"m2": m2, "atlast": atlast}[kind](seed)
+    truth = run(of, [*steps, zonda.BinMap(**how)], signals={"sky": SIGNALS["sky"]})["sky/map"]
+    binned = run(of, [*steps, *filters, zonda.BinMap(**how)], full=True)
+    start = time.process_time()
+    likely = run(of, [*steps, Maker(**how)])
+    seconds = time.process_time() - start
+    maps = KEPT[0]
+    rings, beam = Rings(truth, SCALES[kind]), BEAM[kind]
+    core = rings.w > 0.9
+    true = rings.smooth(truth.signal, truth, beam)
+    at = np.unravel_index(np.argmin(np.where(core, true, 0)), true.shape)
+    samples = int(truth.hits.sum())
+    equations, solution, cpu = maps["signal"]
+    runs = sum(scan.pixel.size for scan, _ in equations.scans) / samples
+    print(f"{samples:.3g} samples, {runs:.2f} runs a sample, {seconds:.1f} CPU s in all")
+    print(
+        f"{len(solution.history)} iterations to {solution.history[-1]:.0e},"
+        f" {cpu / len(solution.history) / samples * 1e9:.1f} ns a sample and iteration;"
+        f" smallest Ritz value {solution.ritz[0]:.1e}"
+    )
+    print("scale [arcsec]     ", *(f"{s:6.0f}" for s in rings.scale))
+    noises = {}
+    for name, data in (("filter and bin", binned), ("maximum likelihood", likely)):
+        transfer = rings.transfer(data["sky/map"].signal, truth.signal)
+        noises[name] = rings.smooth(data["rest/map"].signal, truth, beam)[core].std()
+        peak = rings.smooth(data["sky/map"].signal, truth, beam)[at] / true[at]
+        print(f"{name:19s}", *(f"{t:6.3f}" for t in transfer), f" peak {peak:.3f}")
+    one, other = noises.values()
+    print(
+        f"noise of the map smoothed with {beam} arcsec: {one * 1e6:.0f}, {other * 1e6:.0f} uK,"
+        f" {other / one:.3f} times"
+    )
+
+
+def templates(seeds: int) -> None:
+    """Signal-to-noise ratio of the true cluster, and deviates of noise in its units, at four places
+    for each seed: sqrt(t^T A t), and t^T b / sqrt(t^T A t)."""
+    rows = []
+    for seed in range(1, seeds + 1):
+        of, steps, how, filters = m2(seed)
+        truth = run(of, [*steps, zonda.BinMap(**how)], signals={"sky": SIGNALS["sky"]})["sky/map"]
+        run(of, [*steps, Maker(**how)])
+        maps = KEPT[0]
+        equations = maps["signal"][0]
+        noise = maps["signal/rest"][1].values
+        binned = run(of, [*steps, *filters, zonda.BinMap(**how)], full=True)
+        for dy, dx in ((0, 0), (30, 30), (-30, 30), (30, -30)):
+            t = np.roll(np.nan_to_num(truth.signal), (dy, dx), (0, 1))
+            t = t.ravel()[None] * (equations.weights[0] > 0)
+            product = equations.apply(t)
+            size = np.sqrt(float((t * product).sum()))
+            rows.append((size, float((product * noise).sum()) / size))
+        del binned
+    found = np.array(rows)
+    print(
+        f"template: S/N {found[:, 0].mean():.2f}, rms of {len(found)} deviates"
+        f" {np.sqrt((found[:, 1] ** 2).mean()):.3f} +- {1 / np.sqrt(2 * len(found)):.3f}"
+    )
+
+
+SCHEDULE = """# %ECSV 1.0
+# ---
+# datatype:
+# - {name: name, datatype: string}
+# - {name: start_time, datatype: string}
+# - {name: stop_time, datatype: string}
+# - {name: boresight_angle, unit: deg, datatype: float64}
+# - {name: azmin, unit: deg, datatype: float64}
+# - {name: azmax, unit: deg, datatype: float64}
+# - {name: el, unit: deg, datatype: float64}
+# - {name: scan_index, datatype: int32}
+# - {name: subscan_index, datatype: int32}
+# meta:
+#   site_name: Atacama
+#   telescope_name: LAT
+#   site_lat: -22.958064 deg
+#   site_lon: -67.786222 deg
+#   site_alt: 5200.0 m
+# schema: astropy-2.0
+name start_time stop_time boresight_angle azmin azmax el scan_index subscan_index
+field "2025-08-01 05:12:30" "2025-08-01 05:15:00"  0.0  73.0  82.0 50.0 0 0
+field "2025-08-01 05:15:10" "2025-08-01 05:17:40" 45.0  73.0  82.0 50.0 0 1
+field "2025-08-01 10:27:30" "2025-08-01 10:30:00"  0.0 278.0 287.0 50.0 1 0
+field "2025-08-01 10:30:10" "2025-08-01 10:32:40" 45.0 278.0 287.0 50.0 1 1
+"""
+LAT = {
+    "name": "lat",
+    "telescope": {"name": "LAT", "diameter": "6 m"},
+    "band": {"name": "f150", "low": "127 GHz", "high": "169 GHz"},
+    "net": "360 uK s(1/2)",
+    "fwhm": "1.4 arcmin",
+    "pixels": "shared",
+    "polarization": "pairs",
+    "detectors": 74,
+    "field_of_view": "1 deg",
+    "main_beam_efficiency": 0.9,
+    "illumination_efficiency": 1,
+    "knee": "1 Hz",
+    "sample_rate": "100 Hz",
+}
+
+
+def survey(seed: int) -> None:
+    """Noise of I, Q and U over white noise."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "night.ecsv"
+        file.write_text(SCHEDULE)
+        of = {
+            "site": "llano_de_chajnantor",
+            "instrument": LAT,
+            "time": "2025-08-01T05:12",
+            "seed": seed,
+        }
+        steps = [
+            zonda.PointingSchedule(
+                schedule=str(file), speed="1 deg/s", acceleration="2 deg/s2", turnaround="smooth"
+            ),
+            zonda.AtmosphereLayers(pwv="1 mm"),
+            zonda.WhiteNoise(),
+            zonda.PinkNoise(),
+            zonda.Efficiency(),
+        ]
+        how = {"pixel": "3 arcmin", "stokes": "IQU", "half_difference": False}
+        start = time.process_time()
+        found = run(of, [*steps, Maker(**how, baseline="0.1 s")], signals={})["map"]
+        seconds = time.process_time() - start
+        filters = [zonda.PolynomialFilter(order=1)]
+        binned = run(of, [*steps, *filters, zonda.BinMap(**how)], signals={})["map"]
+    _, solution, cpu = KEPT[0]["signal"]
+    samples = int(found.hits.sum())
+    print(
+        f"{samples:.3g} samples, {len(solution.history)} iterations,"
+        f" {cpu / len(solution.history) / samples * 1e9:.1f} ns a sample and iteration,"
+        f" {seconds:.1f} CPU s in all"
+    )
+    weight = found.stokes("I").weights
+    ok = found.known & (weight > 0.3 * np.percentile(weight[found.known], 95))
+    for name, product in (("a line per detector", binned), ("maximum likelihood", found)):
+        ratio = []
+        for k in "IQU":
+            one = product.stokes(k)
+            m = one.signal - np.nanmean(one.signal[ok])
+            ratio.append(np.nanstd((m / found.stokes(k).noise)[ok]))
+        print(f"{name:19s} noise over white: " + ", ".join(f"{r:.2f}" for r in ratio))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("kind", choices=["m2", "atlast", "survey"])
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--templates", type=int, default=0, metavar="SEEDS")
+    options = parser.parse_args()
+    if options.templates:
+        templates(options.templates)
+    elif options.kind == "survey":
+        survey(options.seed)
+    else:
+        compare(options.kind, options.seed)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,258 @@
+"""Noise of a scan in maximum-likelihood maps: white noise of each detector, baselines with a
+spectrum of their own, and modes that detectors share.
+
+In units of each detector's white level, with g = sigma^2 / L the white variance of a baseline,
+
+    N / sigma^2 = 1 + B C B^T + infinity u u^T,                                              (1)
+    C(f) + 1 = D(f) + sum_k E_k(f) q_k q_k^T,   D >= 1                                      (2)
+
+in which B spreads baselines over samples, and the free modes u (the first of the q_k) have no
+weight at any frequency, within baselines too. D and the spectra E_k of the modes are means over
+bins of frequency of the residual baselines' powers. The inverse of (2) is
+
+    1 / D (1 - sum_k h_k q_k q_k^T),   h_k = E_k / (D + E_k), 1 for a free mode.            (3)
+
+Q_b = Z g^(-1/2) (3) g^(-1/2) Z; Z takes a polynomial of each detector's scan off. Any Q_b >= 0
+makes an unbiased map; that of the noise itself makes the one of least noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from zonda.core.kernels import kernel
+from zonda.core.numerics.random import normals, stream_key
+from zonda.core.types import Floats
+
+BINS = 40
+"""Bins of frequency, equal in its logarithm."""
+LOWEST = 3
+"""Frequencies of the first bin above zero."""
+SLOW = 1.0
+"""Modes are those of baselines below this frequency, Hz."""
+FEWEST = 8
+"""Frequencies that modes are found in at least."""
+ITERATIONS = 40
+"""Products with the covariance in the search for its leading modes."""
+
+
+@dataclass(frozen=True)
+class BaselineNoise:
+    """Equations (1) to (3) for the good detectors of a scan.
+
+    Attributes
+    ----------
+    white
+        (n_det,) variance of a sample, K^2.
+    length
+        Samples of a baseline.
+    lines
+        (n, n_base) orthonormal polynomials that Z takes off.
+    modes
+        (k, n_det) q_k, orthonormal; the first ``free`` have no weight.
+    values
+        (k,) mean power of the modes below `SLOW` Hz, in units of the white level.
+    frequency
+        (n_bins,) Hz.
+    own, shared
+        (n_bins,) D and (n_bins, k) E_k.
+    least
+        (n_bins,) power of baselines without the modes, in units of white noise: D, but for its
+        limit.
+    fast
+        (n_det,) the same of each detector, in the upper half of the frequencies.
+    edges
+        (n_bins + 1,) first frequency of each bin, and the end.
+    """
+
+    white: Floats
+    length: int
+    lines: Floats
+    modes: Floats
+    free: int
+    values: Floats
+    frequency: Floats
+    edges: NDArray[np.intp]
+    own: Floats
+    shared: Floats
+    least: Floats
+    fast: Floats
+
+    @property
+    def free_modes(self) -> Floats:
+        """(free, n_det) u / sigma, 1 / K: what makes streams of free modes."""
+        return np.ascontiguousarray(self.modes[: self.free] / np.sqrt(self.white))
+
+    def weigh(self, y: Floats) -> Floats:
+        """Q_b y of baselines (n_det, n_base)."""
+        g = np.sqrt(self.white / self.length)[:, None]
+        z = y / g
+        take_lines(z, self.lines)
+        found = fft.rfft(z, axis=1)
+        bins = np.repeat(np.arange(len(self.own)), np.diff(self.edges))
+        share = self.shared / (self.own[:, None] + self.shared)
+        share[:, : self.free] = 1.0
+        _weigh(found, 1 / self.own[bins], np.ascontiguousarray(share[bins].T), self.modes)
+        z = fft.irfft(found, y.shape[1], axis=1)
+        take_lines(z, self.lines)
+        return np.asarray(z / g)
+
+
+def estimate(
+    residual: Floats,
+    white: Floats,
+    length: int,
+    rate: float,
+    *,
+    modes: int,
+    free: int,
+    trend: int,
+    fixed: Floats | None = None,
+) -> BaselineNoise:
+    """Estimate the noise from baselines without a source, (n_det, n_base) [K].
+
+    Parameters
+    ----------
+    white
+        (n_det,) variance of a sample, K^2.
+    length, rate
+        Samples of a baseline; samples per second.
+    modes, free
+        Modes that detectors share, and how many of these have no weight.
+    trend
+        Degree of the polynomials of each detector's scan.
+    fixed
+        (free, n_det) the free modes, where they are known.
+    """
+    n_det, n_base = residual.shape
+    lines = polynomials(n_base, trend)
+    scaled = residual / np.sqrt(white / length)[:, None]
+    take_lines(scaled, lines)
+    powers = fft.rfft(scaled, axis=1) / np.sqrt(n_base)
+    top = min(max(int(SLOW * length / rate * n_base), FEWEST), powers.shape[1])
+    slow = np.concatenate([powers[:, 1:top].real, powers[:, 1:top].imag], axis=1)
+    modes = min(modes, n_det - 1)
+    known = np.zeros((0, n_det)) if fixed is None else fixed
+    found = leading(slow, modes, known)
+    seen = np.einsum("kd,dt->kt", found, slow)
+    values = np.einsum("kt,kt->k", seen, seen) / max(top - 1, 1)
+    edges = bins_of(powers.shape[1])
+    own, least = np.empty((2, len(edges) - 1))
+    shared = np.empty((len(edges) - 1, modes))
+    amplitude = np.abs(_projected(powers, found)) ** 2
+    every = np.einsum("dt,dt->t", powers.real, powers.real)
+    every += np.einsum("dt,dt->t", powers.imag, powers.imag)
+    for k, (low, high) in enumerate(pairwise(edges.tolist())):
+        at = slice(max(low, 1), max(high, 2))
+        rest = (every[at] - amplitude[:, at].sum(axis=0)).mean() / max(n_det - modes, 1)
+        least[k], own[k] = rest, max(rest, 1.0)
+        shared[k] = np.maximum(amplitude[:, at].mean(axis=1) - own[k], 0.0)
+    upper = powers[:, powers.shape[1] // 2 :]
+    rest_of_each = upper - np.einsum("kd,kt->dt", found, _projected(upper, found))
+    fast = (np.abs(rest_of_each) ** 2).mean(axis=1)
+    middle = (edges[:-1] + edges[1:] - 1) / 2 / n_base * rate / length
+    return BaselineNoise(
+        white,
+        length,
+        lines,
+        found,
+        min(free, modes),
+        values,
+        middle,
+        edges,
+        own,
+        shared,
+        least,
+        fast,
+    )
+
+
+def _projected(powers: NDArray[np.complex128], modes: Floats) -> NDArray[np.complex128]:
+    """Amplitudes (k, n) of modes in spectra (n_det, n)."""
+    real = np.einsum("kd,dt->kt", modes, powers.real)
+    return np.asarray(real + 1j * np.einsum("kd,dt->kt", modes, powers.imag))
+
+
+def bins_of(n: int) -> NDArray[np.intp]:
+    """Edges of bins of ``n`` frequencies: 0 alone, `LOWEST` of them, then equal in the
+    logarithm.
+    """
+    upper = np.geomspace(1 + LOWEST, max(n, 1 + LOWEST), BINS).round()
+    edges = np.unique(np.concatenate([[0, 1, n], upper]).astype(np.intp))
+    return edges[edges <= n]
+
+
+def polynomials(n: int, degree: int) -> Floats:
+    """Orthonormal polynomials (degree + 1, n) up to a degree."""
+    x, found = np.linspace(-1, 1, n) if n > 1 else np.zeros(1), list[Floats]()
+    for power in range(min(degree + 1, n)):
+        row = x**power
+        for _ in range(2):
+            for other in found:
+                row = row - (row * other).sum() * other
+        found.append(row / np.sqrt((row * row).sum()))
+    return np.array(found)
+
+
+def leading(rows: Floats, number: int, known: Floats) -> Floats:
+    """Leading left singular vectors (number, n_det) of ``rows`` (n_det, n), of which the first are
+    ``known`` (k, n_det). Each has a positive sum.
+    """
+    n_det = len(rows)
+    start = normals(stream_key(0, "MaximumLikelihoodMap", 0), 0, number * n_det)
+    vectors = _orthonormal(start.reshape(number, n_det).astype(np.float64), known)
+    for _ in range(ITERATIONS):
+        times = np.einsum("kd,dt->kt", vectors, rows)
+        vectors = _orthonormal(np.einsum("kt,dt->kd", times, rows), known)
+    return np.where(vectors.sum(axis=1, keepdims=True) < 0, -vectors, vectors)
+
+
+def _orthonormal(vectors: Floats, known: Floats) -> Floats:
+    """Gram-Schmidt, in the order of the vectors; the first are ``known``."""
+    found = list(known)[: len(vectors)]
+    for row in vectors[len(found) :]:
+        for _ in range(2):
+            for other in found:
+                row = row - (row * other).sum() * other
+        size = np.sqrt((row * row).sum())
+        found.append(row / size if size > 0 else np.zeros_like(row))
+    return np.array(found).reshape(len(vectors), vectors.shape[1])
+
+
+@kernel
+def take_lines(rows, lines):  # type: ignore[no-untyped-def]
+    """Subtract from each row (n_det, n) its projection on orthonormal ``lines`` (k, n)."""
+    for d in range(rows.shape[0]):
+        for k in range(lines.shape[0]):
+            total = 0.0
+            for t in range(rows.shape[1]):
+                total += rows[d, t] * lines[k, t]
+            for t in range(rows.shape[1]):
+                rows[d, t] -= total * lines[k, t]
+
+
+@kernel
+def _weigh(found, inverse, share, modes):  # type: ignore[no-untyped-def]
+    """Equation (3) of spectra ``found`` (n_det, n), in place: ``inverse`` (n,) 1 / D, ``share``
+    (k, n) h, ``modes`` (k, n_det).
+    """
+    n_det, n = found.shape
+    amplitude = np.zeros((modes.shape[0], n), np.complex128)
+    for d in range(n_det):
+        for k in range(modes.shape[0]):
+            for t in range(n):
+                amplitude[k, t] += modes[k, d] * found[d, t]
+    for k in range(modes.shape[0]):
+        for t in range(n):
+            amplitude[k, t] *= share[k, t]
+    for d in range(n_det):
+        for k in range(modes.shape[0]):
+            for t in range(n):
+                found[d, t] -= modes[k, d] * amplitude[k, t]
+        for t in range(n):
+            found[d, t] *= inverse[t]

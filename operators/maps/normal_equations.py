@@ -1,0 +1,173 @@
+"""The equations of a maximum-likelihood map, P^T Q P m = P^T Q d, and their solution.
+
+With the noise of `baseline_noise`, in which x is what a map m, or the data, make of the samples,
+
+    P^T Q x = P^T x / sigma^2 - Y^T (n / sigma^2) y - S^T s + Y^T Q_b y,                     (1)
+
+where y and s are those of `compressed_scan`, and n the samples of a baseline that count: samples
+about the mean of their baseline, without free modes, have the weight of white noise; baselines have
+that of their own spectrum. (1) is added up over scans, in their order.
+
+Conjugate gradients, preconditioned with the inverse of the weights in each pixel (of I, Q and U the
+pseudo-inverse of a 3 x 3 matrix), end where the norm of the residual in that metric is `tolerance`
+times that of the right side. Of their coefficients follow the Ritz values of the preconditioned
+matrix: where the smallest is far below 1 there are patterns that the data hardly determine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from zonda.core.stream import in_order
+from zonda.core.types import Floats
+
+from .baseline_noise import BaselineNoise
+from .compressed_scan import CompressedScan
+from .stokes_kernel import PLACES
+
+SINGULAR = 1e-8
+"""Of the smallest eigenvalue of the weights in a pixel, as a share of the largest."""
+
+
+class WeighedScan(NamedTuple):
+    """A scan with its noise."""
+
+    scan: CompressedScan
+    noise: BaselineNoise
+
+    def spread(self, y: Floats, s: Floats, n_stokes: int, n_pixels: int) -> Floats:
+        """The last three terms of equation (1), (n_stokes, n_pixels)."""
+        scan, noise = self
+        found = np.zeros((n_stokes, n_pixels))
+        within = scan.counted / noise.white[:, None]
+        scan.spread(noise.weigh(y) - within * y, -s, noise.free_modes, found)
+        return found
+
+
+class Solution(NamedTuple):
+    """A map, and how it was found.
+
+    Attributes
+    ----------
+    values
+        (n_stokes, n_pixels), K; 0 without samples.
+    history
+        Norm of the residual after each iteration, over that of the right side.
+    ritz
+        Ritz values of the preconditioned matrix, rising.
+    """
+
+    values: Floats
+    history: list[float]
+    ritz: Floats
+
+
+@dataclass
+class NormalEquations:
+    """Equation (1) of some scans, for maps (n_stokes, n_pixels).
+
+    ``threads``: scans that are worked on at a time.
+    """
+
+    scans: Sequence[WeighedScan]
+    n_stokes: int
+    n_pixels: int
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        self.weights = np.zeros((1 if self.n_stokes == 1 else 6, self.n_pixels))
+        for scan, noise in self.scans:
+            scan.weigh(1 / noise.white, self.weights)
+        self._inverse = self._inverse_weights()
+
+    @property
+    def spread(self) -> Floats:
+        """(n_stokes, n_pixels) diagonal of the inverse weights; 0 without samples."""
+        return self._inverse if self.n_stokes == 1 else self._inverse[[0, 3, 5]]
+
+    def right_side(self, binned: Floats, data: Sequence[tuple[Floats, Floats]]) -> Floats:
+        """The right side: ``binned`` P^T d / sigma^2, and y and s of the data of each scan."""
+        return binned + self._added(data)
+
+    def apply(self, m: Floats) -> Floats:
+        """P^T Q P m."""
+        if self.n_stokes == 1:
+            out = self.weights * m
+        else:
+            out = np.stack([(self.weights[list(row)] * m).sum(axis=0) for row in _ROWS])
+        return out + self._added([m] * len(self.scans))
+
+    def solve(self, right: Floats, tolerance: float, most: int) -> Solution:
+        """Conjugate gradients from 0, at most so many iterations."""
+        m, r = np.zeros_like(right), right.copy()
+        z = self._preconditioned(r)
+        p, product = z.copy(), float((r * z).sum())
+        first, history = product, list[float]()
+        steps, turns = list[float](), list[float]()
+        while first > 0 and len(history) < most and (not history or history[-1] >= tolerance):
+            q = self.apply(p)
+            step = product / float((p * q).sum())
+            m += step * p
+            r -= step * q
+            z = self._preconditioned(r)
+            product, before = float((r * z).sum()), product
+            steps.append(step)
+            turns.append(product / before)
+            history.append(float(np.sqrt(max(product, 0.0) / first)))
+            p = z + turns[-1] * p
+        return Solution(m, history, ritz_values(steps, turns))
+
+    def _added(self, of: Sequence[Floats | tuple[Floats, Floats]]) -> Floats:
+        """Last three terms of equation (1), added up in order: of a map, or of y and s of the data
+        of each scan.
+        """
+
+        def one(weighed: WeighedScan, what: Floats | tuple[Floats, Floats]) -> Floats:
+            scan, noise = weighed
+            y, s = what if isinstance(what, tuple) else scan.seen(what, noise.free_modes)
+            return weighed.spread(y, s, self.n_stokes, self.n_pixels)
+
+        total = np.zeros((self.n_stokes, self.n_pixels))
+        items = list(zip(self.scans, of, strict=True))
+        for part in in_order(one, items, min(self.threads, len(items))):
+            total += part
+        return total
+
+    def _preconditioned(self, r: Floats) -> Floats:
+        if self.n_stokes == 1:
+            return self._inverse * r
+        return np.stack([(self._inverse[list(row)] * r).sum(axis=0) for row in _ROWS])
+
+    def _inverse_weights(self) -> Floats:
+        """Pseudo-inverse of the weights, in their places; 0 without samples."""
+        out = np.zeros_like(self.weights)
+        seen = self.weights[0] > 0
+        if self.n_stokes == 1:
+            out[:, seen] = 1 / self.weights[:, seen]
+            return out
+        low, axes = np.linalg.eigh(self.weights[:, seen].T[:, PLACES].reshape(-1, 3, 3))
+        fine = low > SINGULAR * low[:, 2:]
+        inverse = np.where(fine, 1 / np.where(fine, low, 1.0), 0.0)
+        every = np.einsum("nij,nj,nkj->nik", axes, inverse, axes)
+        out[:, seen] = every[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)].T
+        return out
+
+
+_ROWS = (0, 1, 2), (1, 3, 4), (2, 4, 5)
+"""Places of the rows of a symmetric matrix: ii, iq, iu, qq, qu, uu."""
+
+
+def ritz_values(steps: Sequence[float], turns: Sequence[float]) -> Floats:
+    """Ritz values of the coefficients of conjugate gradients (Golub & Van Loan 2013, 11.3)."""
+    if not steps:
+        return np.zeros(0)
+    alpha, beta = np.array(steps), np.array(turns[:-1])
+    diagonal = 1 / alpha
+    diagonal[1:] += beta / alpha[:-1]
+    from scipy.linalg import eigh_tridiagonal
+
+    return np.asarray(eigh_tridiagonal(diagonal, np.sqrt(beta) / alpha[:-1], eigvals_only=True))

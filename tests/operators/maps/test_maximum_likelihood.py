@@ -1,0 +1,265 @@
+"""Maximum-likelihood maps of scans: recovery, noise, bits, and what is refused."""
+
+import warnings
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import zonda
+from zonda.core.data import Data
+from zonda.core.errors import PipelineError
+from zonda.core.polarization import PolarizationAngles
+from zonda.operators.maps.bin_map import BinMap
+from zonda.operators.maps.grid import Looking
+from zonda.operators.maps.maximum_likelihood import CompressedScans, MaximumLikelihoodMap
+from zonda.plugins.checks.scenes import run, scan, scene
+
+SIGMA = 1e-3
+"""White noise of a sample, K."""
+
+
+def observation(polarized=False, plate=False):
+    """Three turns of 4 arcmin, around a point that moves."""
+    o = scan(37, 6000, radius=3.0)
+    if polarized:
+        o.focalplane.polarization_angle[:] = np.resize(np.radians([0, 90, 45, 135]), 37)
+        o.focalplane.polarization_efficiency[:] = 0.9
+    if plate:
+        o.hwp_angle = 11.0 * o.seconds
+    o.focalplane.net[:] = SIGMA / np.sqrt(o.sample_rate)
+    return o
+
+
+def drifts(o, rng):
+    """Slow noise (n_det, n_samp): a random walk that all see, and one of each detector."""
+    walk = np.cumsum(rng.normal(size=o.n_samples)) * 2 * SIGMA
+    own = np.cumsum(rng.normal(size=(o.n_detectors, o.n_samples)), axis=1) * 0.003 * SIGMA
+    gain = rng.uniform(0.8, 1.2, o.n_detectors)
+    return np.outer(gain, walk) + own + 20.0  # and a load of 20 K
+
+
+def grid_of(o, **how):
+    maker = BinMap(**how)
+    maker.observe(Data(scene(o.instrument), [o]))
+    return maker.grid
+
+
+def sky_of(o, how, rng, polarized=False):
+    """A sky that is constant in pixels: maps (1 or 3, n_pixels), and samples."""
+    grid = grid_of(o, **how)
+    pixel = Looking.of(o, grid).pixels(np.arange(o.n_detectors), 0, o.n_samples)
+    x = np.arange(grid.n_pixels) % grid.shape[-1] / 7
+    y = np.arange(grid.n_pixels) // grid.shape[-1] / 5
+    maps = np.stack([np.sin(x + k) * np.cos(y - k) for k in range(3 if polarized else 1)])
+    signal = maps[0][pixel]
+    if polarized:
+        pole = np.array([0.0, 0.0, 1.0])
+        c, s = np.empty((2, *pixel.shape))
+        PolarizationAngles.of(o, o.boresight_radec, pole).fill(np.arange(37), 0, c, s)
+        p = o.focalplane.polarization_efficiency[:, None]
+        signal = signal + p * (c * maps[1][pixel] + s * maps[2][pixel])
+    return maps, signal
+
+
+def mapped(o, signal, **how):
+    how = {"pixel": "15 arcsec", "half_difference": False, **how}
+    return run([MaximumLikelihoodMap(**how)], o, signal).products["map"]
+
+
+@pytest.mark.parametrize("taken", ["mean", "plane"])
+def test_the_sky_comes_back(taken):
+    """A sky ten times the noise of a pixel, below drifts a thousand times as strong."""
+    rng, o, how = np.random.default_rng(1), observation(), {"pixel": "15 arcsec"}
+    maps, signal = sky_of(o, how, rng)
+    noise = drifts(o, rng) + SIGMA * rng.normal(size=signal.shape)
+    found = mapped(o, 1e-3 * signal + noise, undetermined=taken)
+    ok = found.known & (found.hits > 0.3 * np.percentile(found.hits, 98))
+    sky = 1e-3 * maps[0].reshape(found.hits.shape)
+    rows, columns = np.indices(ok.shape)
+    if taken == "plane":
+        sides = rows - rows.mean(), columns - columns.mean()
+        basis = np.stack([np.ones(ok.size), *(side.ravel() for side in sides)], axis=1)
+        root = np.sqrt(found.weights.ravel())
+        fit = np.linalg.lstsq(basis * root[:, None], sky.ravel() * root, rcond=None)[0]
+        sky = sky - (basis @ fit).reshape(sky.shape)
+    error = (found.signal - sky)[ok]
+    error -= error.mean()
+    centred = sky[ok] - sky[ok].mean()
+    # white noise alone leaves an error of 1 sigma / sqrt(sum sky^2 / noise^2): 0.3 %
+    assert (found.signal[ok] * centred).sum() / (centred**2).sum() == pytest.approx(1, abs=0.02)
+    # of 37 detectors one mode and a line of each are lost, and slow noise adds less than half
+    # to white noise; where a plane stays in the map, noise fills it
+    assert 0.9 < (error / found.noise[ok]).std() < (1.5 if taken == "plane" else 2.5)
+
+
+@pytest.mark.parametrize("plate", [False, True])
+def test_i_q_and_u_come_back(plate):
+    """Maps of sky and noise minus those of the noise alone, with nearly the same noise model."""
+    rng, o = np.random.default_rng(2), observation(True, plate)
+    how = {"pixel": "20 arcsec", "stokes": "IQU"}
+    maps, signal = sky_of(o, how, rng, polarized=True)
+    noise = SIGMA * rng.normal(size=signal.shape)
+    more = {**how, "tolerance": 1e-8, "undetermined": "none"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # few angles, without a plate
+        full, alone = (mapped(o, values, **more) for values in (SIGMA * signal + noise, noise))
+    assert full.polarization is not None
+    ok = full.known & (full.polarization.condition < 20)
+    assert ok.sum() > 50
+    for k, name in enumerate("IQU"):
+        one, other = full.stokes(name), alone.stokes(name)
+        error = (one.signal - other.signal)[ok] - SIGMA * maps[k].reshape(ok.shape)[ok]
+        if k == 0 or not plate:  # detectors' offsets take the mean
+            error -= error.mean()
+        # the noise models differ: what noise leaves differs by
+        # less than itself; the sky is 15 times as large
+        assert np.abs(error).max() < 2 * np.nanmax(one.noise[ok]), name
+        assert error.std() < np.nanmedian(one.noise[ok]), name
+
+
+def test_white_noise_alone_is_weighed_as_it_is():
+    """Noise of the map over what it states: that of white noise, since there is no other."""
+    rng, o = np.random.default_rng(3), observation()
+    noise = SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
+    found = mapped(o, noise, modes=0, free=0)
+    ok = found.known & (found.hits > 50)
+    ratio = (found.signal / found.noise)[ok]
+    # a deviate for each pixel: its standard deviation to 1 / sqrt(2 n); three times that; slow
+    # baselines weigh a little less than white noise does
+    assert ratio.std() == pytest.approx(1, abs=3 / np.sqrt(2 * ok.sum()) + 0.05)
+    assert np.nanmedian(found.noise * np.sqrt(found.hits)) == pytest.approx(SIGMA, rel=0.01)
+
+
+SCENE = {
+    "site": "green_bank",
+    "instrument": {
+        "name": "camera",
+        "telescope": {"name": "GBT", "diameter": "100 m"},
+        "band": {"name": "m2", "low": "75 GHz", "high": "105 GHz"},
+        "net": "600 uK s(1/2)",
+        "knee": "0.5 Hz",
+        "detectors": 40,
+        "field_of_view": "4 arcmin",
+        "main_beam_efficiency": 0.8,
+        "illumination_efficiency": 0.9,
+        "sample_rate": "50 Hz",
+    },
+    "time": "2024-02-01T05:00",
+    "target": "75 deg 20 deg",
+    "seed": 5,
+}
+
+
+def simulated(threads=1, runs=None, **how):
+    """The complete signal's map, and all products."""
+    steps = [
+        zonda.PointingDaisy(
+            radius="3 arcmin", speed="50 arcsec/s", scan_duration="50 s", scans=2, gap="10 s"
+        ),
+        zonda.AtmosphereLayers(pwv="5 mm"),
+        zonda.WhiteNoise(),
+        zonda.PinkNoise(),
+        zonda.Efficiency(),
+        MaximumLikelihoodMap(pixel="10 arcsec", **how),
+    ]
+    pipeline = zonda.Pipeline(steps, runs=runs or {})
+    return pipeline.run(zonda.Scene(**SCENE), threads=threads)
+
+
+def test_bits_depend_neither_on_threads_nor_on_other_signals():
+    one, two = simulated(), simulated(threads=2, runs={"quiet": {"only": ["white", "pink"]}})
+    for plane in ("signal", "half_difference", "noise", "hits"):
+        np.testing.assert_array_equal(getattr(one["map"], plane), getattr(two["map"], plane))
+    assert "quiet/map" in two
+
+
+def test_a_compressed_scan_crosses_processes():
+    """Its arrays make the same scan: maps of campaigns have the bits of one run."""
+    kept = []
+
+    class Keeps(MaximumLikelihoodMap):
+        def finalize(self, data):
+            kept.append(data.partial[f"{self.label} scans"])
+            super().finalize(data)
+
+    o, rng = observation(), np.random.default_rng(4)
+    noise = drifts(o, rng) + SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
+    run([Keeps(pixel="15 arcsec", half_difference=False)], o, noise)
+    (scans,) = kept
+    again = CompressedScans.of(scans.arrays())
+    for one, other in zip(scans.scans, again.scans, strict=True):
+        assert vars(one.scan).keys() == vars(other.scan).keys()
+        for key, value in (*vars(one.scan).items(), *vars(one.noise).items()):
+            np.testing.assert_array_equal(value, {**vars(other.scan), **vars(other.noise)}[key])
+    assert (again.scans[0].scan.nbytes) < 8 * o.n_detectors * o.n_samples
+
+
+@pytest.mark.parametrize(
+    ("how", "taken"),
+    [
+        ({"pixel": "15 arcsec"}, "plane"),
+        ({"pixel": "15 arcsec", "undetermined": "none"}, ""),
+        ({"nside": 8192}, "mean"),
+    ],
+)
+def test_files_say_what_was_taken_off(how, taken, tmp_path):
+    o, rng = observation(), np.random.default_rng(9)
+    noise = SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
+    found = run([MaximumLikelihoodMap(**how, half_difference=False)], o, noise).products["map"]
+    found.write(tmp_path / "m.fits")
+    assert zonda.read_map(tmp_path / "m.fits").taken_off == found.taken_off == taken
+    keys = fits.getheader(tmp_path / "m.fits", 0)
+    assert keys.get("TAKENOFF", "") == taken
+
+
+@pytest.mark.parametrize(
+    ("how", "place"),
+    [
+        ({"free": 2, "modes": 1}, "free"),
+        ({"weights": "uniform"}, "BinMap"),
+        ({"noise": "scatter"}, "BinMap"),
+        ({"contents": "hits"}, "BinMap"),
+        ({"half_difference": "detectors"}, "half_difference"),
+        ({"nside": 1024, "undetermined": "plane"}, "undetermined"),
+    ],
+)
+def test_parameters_that_do_not_go_together(how, place):
+    with pytest.raises(zonda.ZondaError, match=place):
+        MaximumLikelihoodMap(**how)
+
+
+def test_streams_that_a_filter_has_changed_are_refused():
+    o, rng = observation(), np.random.default_rng(5)
+    noise = drifts(o, rng) + SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
+    steps = [zonda.HighpassFilter(frequency="0.5 Hz"), MaximumLikelihoodMap(pixel="15 arcsec")]
+    with pytest.raises(PipelineError, match="filter") as caught:
+        run(steps, o, noise)
+    assert "MaximumLikelihoodMap" in str(caught.value)
+
+
+def test_a_window_is_refused():
+    o, rng = observation(), np.random.default_rng(6)
+    noise = SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
+    with pytest.raises(PipelineError, match="Taper"):
+        run([zonda.Taper(), MaximumLikelihoodMap(pixel="15 arcsec")], o, noise)
+
+
+def test_streams_without_noise_are_refused():
+    o = observation()
+    with pytest.raises(PipelineError, match="no noise"):
+        run([MaximumLikelihoodMap(pixel="15 arcsec")], o, np.zeros((o.n_detectors, o.n_samples)))
+
+
+def test_flagged_samples_and_detectors_have_no_part():
+    """What they hold changes no bit of the map."""
+    o, rng = observation(), np.random.default_rng(7)
+    o.flags[1000:1100] = 2
+    o.detector_flags[3] = 2
+    noise = drifts(o, rng) + SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
+    spoilt = noise.copy()
+    spoilt[:, 1000:1100] = rng.choice([1e3, -1e3, np.nan], size=(o.n_detectors, 100))
+    spoilt[3] = 5.0
+    one, two = mapped(o, noise), mapped(o, spoilt)
+    np.testing.assert_array_equal(one.signal, two.signal)
+    np.testing.assert_array_equal(one.hits, two.hits)

@@ -1,0 +1,237 @@
+"""Compressed scans and normal equations against dense linear algebra."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from zonda.operators.maps.baseline_noise import BaselineNoise, estimate, leading, polynomials
+from zonda.operators.maps.compressed_scan import RunsOfTiles, Tile, add_baselines
+from zonda.operators.maps.normal_equations import NormalEquations, WeighedScan
+
+N_DET, N, LENGTH, N_PIX, RATE = 5, 144, 6, 40, 6.0
+
+
+def pointing(rng, flagged, n=N):
+    """Pixels (n_det, n), -1 where a sample does not count."""
+    t = np.arange(n)
+    place = 20 + 17 * np.sin(t / 5.9) * np.cos(t / 16) + np.arange(N_DET)[:, None] - 2
+    pixel = np.clip(np.rint(place), 0, N_PIX - 1).astype(np.int32)
+    if flagged:
+        pixel[rng.random(pixel.shape) < 0.1] = -1
+        pixel[2, 6:18] = -1  # whole baselines
+    return pixel
+
+
+def compressed(signal, pixel, angles=None, cuts=(50, 96), single=False):
+    """The scan, found in tiles that end at ``cuts``."""
+    c, s = np.zeros((2, N_DET, 0)) if angles is None else angles
+    found = RunsOfTiles(N_DET, pixel.shape[1], LENGTH)
+    edges = [0, *cuts, pixel.shape[1]]
+    for a, b in pairwise(edges):
+        part = slice(a, b)
+        tile = Tile.of(
+            signal[:, part], pixel[:, part], a, LENGTH, N_PIX, c[:, part], s[:, part], single
+        )
+        found.add(np.arange(N_DET), tile)
+    return found, found.scan(RATE)
+
+
+def matrix(pixel, angles=None):
+    """P (n_det n, n_stokes N_PIX)."""
+    size = 1 if angles is None else 3
+    p = np.zeros((pixel.size, size, N_PIX))
+    at, seen = np.arange(pixel.size), pixel.ravel() >= 0
+    rows = [np.ones(pixel.size)] + ([] if angles is None else [x.ravel() for x in angles])
+    for k, row in enumerate(rows):
+        p[at[seen], k, pixel.ravel()[seen]] = row[seen]
+    return p.reshape(pixel.size, -1)
+
+
+def noise_of(white, free, modes=2, n=N, seed=2):
+    """A model with a bin for each frequency."""
+    n_base = -(-n // LENGTH)
+    f = np.maximum(np.arange(n_base // 2 + 1), 0.5)
+    q = leading(np.random.default_rng(seed).normal(size=(N_DET, 30)), modes, np.zeros((0, N_DET)))
+    shared = np.array([300 / f**2.5, 40 / f**1.5])[:modes].T.reshape(len(f), modes)
+    edges = np.arange(len(f) + 1)
+    none = np.zeros((0, n_base))
+    values = np.zeros(modes)
+    own = 1 + 20 / f**1.5
+    return BaselineNoise(white, LENGTH, none, q, free, values, f, edges, own, shared, own, white)
+
+
+def dense(pixel, noise):
+    """Q of the samples (n_det n, n_det n), from its definition."""
+    n = pixel.shape[1]
+    n_base = -(-n // LENGTH)
+    counts = pixel >= 0
+    mean = np.zeros((N_DET * n_base, pixel.size))
+    for d in range(N_DET):
+        for b in range(n_base):
+            at = d * n + np.flatnonzero(counts[d, b * LENGTH : (b + 1) * LENGTH]) + b * LENGTH
+            if at.size:
+                mean[d * n_base + b, at] = 1 / at.size
+    spread = np.zeros((pixel.size, N_DET * n_base))
+    for d in range(N_DET):
+        for t in range(n):
+            spread[d * n + t, d * n_base + t // LENGTH] = counts[d, t]
+    about = np.diag(counts.ravel().astype(float)) - spread @ mean
+    white = np.diag(1 / np.repeat(noise.white, n))
+    s = np.zeros((len(noise.free_modes) * n, pixel.size))
+    for k, a in enumerate(noise.free_modes):
+        for d in range(N_DET):
+            s[k * n + np.arange(n), d * n + np.arange(n)] = a[d]
+    s = s @ about
+    unit = np.eye(N_DET * n_base).reshape(-1, N_DET, n_base)
+    slow = np.array([noise.weigh(one.copy()).ravel() for one in unit])
+    return about.T @ white @ about - s.T @ s + mean.T @ slow @ mean
+
+
+@pytest.mark.parametrize("free", [0, 1])
+@pytest.mark.parametrize("polarized", [False, True])
+@pytest.mark.parametrize("flagged", [False, True])
+def test_the_matrix_is_the_dense_one(flagged, polarized, free):
+    rng = np.random.default_rng(1)
+    pixel = pointing(rng, flagged)
+    angle = rng.uniform(0, np.pi, pixel.shape)
+    angles = (np.cos(angle), np.sin(angle)) if polarized else None
+    white = rng.uniform(0.5, 2, N_DET)
+    noise = noise_of(white, free)
+    _, scan = compressed(rng.normal(size=pixel.shape), pixel, angles, single=polarized)
+    size = 3 if polarized else 1
+    system = NormalEquations([WeighedScan(scan, noise)], size, N_PIX)
+    p, q = matrix(pixel, angles), dense(pixel, noise)
+    m = rng.normal(size=(size, N_PIX))
+    expected = p.T @ (q @ (p @ m.ravel()))
+    # float64 sums of some 700 samples
+    np.testing.assert_allclose(
+        system.apply(m).ravel(), expected, atol=1e-11 * np.abs(expected).max()
+    )
+    other = rng.normal(size=(size, N_PIX))
+    assert (other * system.apply(m)).sum() == pytest.approx(
+        (m * system.apply(other)).sum(), rel=1e-11
+    )
+    assert (m * system.apply(m)).sum() > 0
+
+
+def circulant(power, n_base):
+    """Covariance (n_base, n_base) of a periodic series of a spectrum."""
+    k = np.arange(n_base)
+    f = np.minimum(k, n_base - k)
+    wave = np.exp(2j * np.pi * np.outer(k, k) / n_base)
+    return (wave @ np.diag(power[f]) @ wave.conj().T).real / n_base
+
+
+@pytest.mark.parametrize("free", [0, 1])
+def test_the_map_is_that_of_generalized_least_squares(free):
+    """N of equation (1) of `baseline_noise` as a dense matrix; a free mode has 1e7 times the white
+    variance."""
+    rng, n_base = np.random.default_rng(3), N // LENGTH
+    pixel = pointing(rng, flagged=False)
+    white = rng.uniform(0.5, 2, N_DET)
+    noise = noise_of(white, free)
+    p = matrix(pixel)
+    whitened = np.kron(np.eye(N_DET), circulant(noise.own - 1, n_base))
+    for k in range(free, 2):
+        q = np.outer(noise.modes[k], noise.modes[k])
+        whitened += np.kron(q, circulant(noise.shared[:, k], n_base))
+    spread = np.kron(np.eye(N_DET * n_base), np.ones((LENGTH, 1))) / np.sqrt(LENGTH)
+    n = np.eye(N_DET * N) + spread @ whitened @ spread.T
+    for k in range(free):
+        n += 1e7 * np.kron(np.outer(noise.modes[k], noise.modes[k]), np.eye(N))
+    sigma = np.repeat(np.sqrt(white), N)
+    inverse = np.linalg.inv(n) / np.outer(sigma, sigma)
+    sky = rng.normal(size=N_PIX) * (p.sum(axis=0) > 0)
+    data = p @ sky + sigma * (np.linalg.cholesky(n) @ rng.normal(size=sigma.size))
+    left, right = p.T @ inverse @ p, p.T @ inverse @ data
+    seen = p.sum(axis=0) > 0
+    _, scan = compressed(data.reshape(N_DET, N), pixel)
+    system = NormalEquations([WeighedScan(scan, noise)], 1, N_PIX)
+    product = system.apply(sky[None])[0]
+    # the free mode's variance is 1e7, not infinite: 1e-7, times the number of detectors
+    accuracy = 1e-6 if free else 1e-10
+    np.testing.assert_allclose(
+        product[seen], (left @ sky)[seen], atol=accuracy * np.abs(left @ sky).max()
+    )
+    y = data.reshape(N_DET, n_base, LENGTH).mean(axis=2)
+    a = noise.free_modes
+    s = scan.about_means(np.einsum("kd,dt->kt", a, data.reshape(N_DET, N)), y, a, N_PIX)
+    binned = (p.T @ (data / sigma**2))[None]
+    found = system.solve(system.right_side(binned, [(y, s)]), 1e-12, 500)
+    best = np.linalg.lstsq(left[np.ix_(seen, seen)], right[seen], rcond=1e-12)[0]
+    difference = found.values[0][seen] - best
+    if free:  # the mean is not determined: a free mode and offsets take it
+        difference -= difference.mean()
+    np.testing.assert_allclose(difference, 0, atol=1e-4 * np.abs(best).max())
+
+
+@pytest.mark.parametrize("flagged", [False, True])
+def test_a_noiseless_sky_comes_back(flagged):
+    """Exactly, whatever the noise model, but for the mean."""
+    rng = np.random.default_rng(5)
+    pixel = pointing(rng, flagged)
+    noise, p = noise_of(np.ones(N_DET), 1), matrix(pixel)
+    sky = rng.normal(size=N_PIX)
+    data = (p @ sky).reshape(N_DET, N) + 20.0 * np.arange(N_DET)[:, None]  # and offsets
+    found, scan = compressed(data, pixel)
+    noise = BaselineNoise(**{**vars(noise), "lines": polynomials(scan.shape[1], 1)})
+    system = NormalEquations([WeighedScan(scan, noise)], 1, N_PIX)
+    a, counted = noise.free_modes, np.where(pixel >= 0, data, 0.0)
+    s = scan.about_means(np.einsum("kd,dt->kt", a, counted), found.means, a, N_PIX)
+    right = system.right_side((p.T @ counted.ravel())[None], [(found.means, s)])
+    m = system.solve(right, 1e-13, 1000).values[0]
+    seen = system.weights[0] > 0
+    error = (m - sky)[seen]
+    np.testing.assert_allclose(error - error.mean(), 0, atol=1e-6)
+
+
+def test_tiles_change_no_bit():
+    rng = np.random.default_rng(6)
+    pixel, signal = pointing(rng, True), rng.normal(size=(N_DET, N))
+    one, two = (compressed(signal, pixel, cuts=cuts)[0] for cuts in ((48, 96), (48, 96)))
+    assert (one.sums == two.sums).all()
+    whole = compressed(signal, pixel, cuts=())[1]
+    parts = compressed(signal, pixel, cuts=(48, 96))[1]  # tiles end where baselines end
+    for name in ("pixel", "samples", "first", "counted"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
+
+
+def test_sums_of_tiles_are_those_of_the_samples():
+    rng = np.random.default_rng(7)
+    pixel, signal, a = pointing(rng, True), rng.normal(size=(N_DET, N)), rng.normal(size=(2, N_DET))
+    y, s = np.zeros((N_DET, N // LENGTH), np.int64), np.zeros((2, N), np.int64)
+    add_baselines(signal, pixel, 0, LENGTH, a, 2.0**36, y, s)
+    counted = np.where(pixel >= 0, signal, 0.0)
+    # each sample is rounded to 2^-37
+    expected = counted.reshape(N_DET, -1, LENGTH).sum(axis=2)
+    np.testing.assert_allclose(y / 2.0**36, expected, atol=LENGTH * 2.0**-37)
+    np.testing.assert_allclose(s / 2.0**36, a @ counted, atol=N_DET * 2.0**-36)
+
+
+def test_spectra_and_modes_are_found():
+    """White noise of power 1, a mode of all detectors with a power of 1 / f, and noise of each."""
+    rng, n_det, n_base, length, rate = np.random.default_rng(8), 60, 3000, 20, 100.0
+    f = np.fft.rfftfreq(n_base, length / rate)
+    f[0] = f[1]
+
+    def series(power, count):
+        wave = rng.normal(size=(2, count, len(f))) * np.sqrt(power * n_base / 2)
+        return np.fft.irfft(wave[0] + 1j * wave[1], n_base)
+
+    u = rng.uniform(0.5, 1.5, n_det)
+    u /= np.sqrt((u**2).sum())
+    white = rng.uniform(1, 4, n_det)
+    whitened = series(1 + (0.1 / f) ** 1.5, n_det) + np.outer(u, series(1e4 * (0.1 / f), 1)[0])
+    y = whitened * np.sqrt(white / length)[:, None]
+    noise = estimate(y, white, length, rate, modes=2, free=0, trend=1)
+    assert abs(noise.modes[0] @ u) > 0.999
+    at = noise.frequency > 0.02  # below, lines take part of the power
+    own, shared = noise.own[at], noise.shared[at, 0]
+    frequencies = np.diff(noise.edges)[at]
+    expected = 1 + (0.1 / noise.frequency[at]) ** 1.5
+    # powers of (n_det - 2) n deviates; the bins' mean power is not that of their middle: 2 %
+    error = 4 / np.sqrt(frequencies * (n_det - 2))
+    assert (np.abs(own / expected - 1) < error + 0.03).all()
+    error = 4 / np.sqrt(frequencies)
+    assert (np.abs(shared / (1e4 * 0.1 / noise.frequency[at]) - 1) < error + 0.1).all()
