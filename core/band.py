@@ -27,7 +27,7 @@ class Band(Parameters):
     """Registered name."""
     low: RadioFrequency | None = None
     """Lower edge of a flat band."""
-    high: RadioFrequency | None = None
+    high: RadioFrequency | None = Field(None, examples=["110 GHz"])
     """Upper edge of a flat band."""
     file: InputPath | None = None
     """Table with frequency (in GHz where it states no unit) or wavelength, and transmission (any
@@ -210,11 +210,11 @@ class CameraBand(BandWithYield):
     """
     detectors: int | None = Field(None, ge=1, le=1_000_000)
     """Number of its detectors."""
-    fwhm: Angle | None = Field(None, gt=0)
+    fwhm: Angle | None = Field(None, gt=0, examples=["9 arcsec"])
     """Main-beam FWHM."""
-    main_beam_efficiency: Fraction | None = Field(None, gt=0, le=1)
+    main_beam_efficiency: Fraction | None = Field(None, gt=0, le=1, examples=["0.6"])
     """zeta: share of an astronomical signal that the main beam delivers."""
-    illumination_efficiency: Fraction | None = Field(None, gt=0, le=1)
+    illumination_efficiency: Fraction | None = Field(None, gt=0, le=1, examples=["0.9"])
     """epsilon: share of the atmosphere's emission that reaches a detector."""
     net: KelvinRootSecond | None = Field(None, ge=0)
     """White noise on the sky after calibration, K_RJ sqrt(s)."""
@@ -222,7 +222,7 @@ class CameraBand(BandWithYield):
     """Frequency at which pink noise equals white noise."""
     slope: float | None = Field(None, gt=0, le=3)
     """Pink noise falls as f^-slope."""
-    pink_minimum_frequency: Hertz | None = Field(None, gt=0)
+    pink_minimum_frequency: Hertz | None = Field(None, gt=0, examples=["1 mHz"])
     """Below this frequency pink noise is flat."""
 
     @model_validator(mode="before")

@@ -77,7 +77,7 @@ class Telescope(Parameters):
 
     name: str
     """E.g. GBT."""
-    diameter: Metres = Field(gt=0)
+    diameter: Metres = Field(gt=0, examples=["12 m"])
     """Primary diameter."""
     site: str = Field("", exclude=True)
     """Registered name of the site where it stands; `zonda check` says so where the scene has
@@ -87,17 +87,17 @@ class Telescope(Parameters):
     """Lowest elevation the mount reaches."""
     elevation_max: Angle = quantity("90 deg", gt=0)
     """Highest elevation the mount reaches."""
-    speed_max: AngularSpeed | None = Field(None, gt=0)
+    speed_max: AngularSpeed | None = Field(None, gt=0, examples=["2 deg/s"])
     """Fastest motion on the sky, where there is a limit."""
     acceleration_max: AngularAcceleration | None = Field(None, gt=0)
     """Largest acceleration on the sky, where there is a limit."""
-    azimuth_speed_max: AngularSpeed | None = Field(None, gt=0)
+    azimuth_speed_max: AngularSpeed | None = Field(None, gt=0, examples=["3 deg/s"])
     """Fastest turn of the azimuth axis: the speed on the sky over the cosine of the elevation."""
     azimuth_acceleration_max: AngularAcceleration | None = Field(None, gt=0)
     """Largest acceleration of the azimuth axis."""
     azimuth_jerk_max: AngularJerk | None = Field(None, gt=0)
     """Fastest change of the azimuth axis' acceleration."""
-    elevation_speed_max: AngularSpeed | None = Field(None, gt=0)
+    elevation_speed_max: AngularSpeed | None = Field(None, gt=0, examples=["1.5 deg/s"])
     """Fastest turn of the elevation axis."""
     elevation_acceleration_max: AngularAcceleration | None = Field(None, gt=0)
     """Largest acceleration of the elevation axis."""
@@ -160,16 +160,16 @@ class Instrument(ParametersWithYield):
     """`pairs`: each pixel has two detectors, A and B, polarized at right angles; A is at 0 and at
     45 deg in alternate pixels.
     """
-    fwhm: Angle | None = Field(None, gt=0)
+    fwhm: Angle | None = Field(None, gt=0, examples=["9 arcsec"])
     """Main-beam FWHM; where absent, the diffraction limit 1.22 lambda / D at the band centre."""
-    main_beam_efficiency: Fraction = Field(gt=0, le=1)
+    main_beam_efficiency: Fraction = Field(gt=0, le=1, examples=["0.6"])
     """zeta: share of an astronomical signal that the main beam delivers."""
-    illumination_efficiency: Fraction = Field(gt=0, le=1)
+    illumination_efficiency: Fraction = Field(gt=0, le=1, examples=["0.9"])
     """epsilon: share of the atmosphere's emission that reaches a detector."""
     net: KelvinRootSecond = Field(ge=0)
     """White noise on the sky after calibration, K_RJ sqrt(s): the rms of one second of integration.
     """
-    knee: Hertz = quantity("0 Hz", ge=0)
+    knee: Hertz = quantity("0 Hz", ge=0, examples=["0.5 Hz"])
     """Frequency at which pink noise equals white noise (0: no pink noise)."""
     slope: float = Field(1.0, gt=0, le=3)
     """Pink noise falls as f^-slope."""

@@ -16,11 +16,11 @@ class Site(Parameters):
     """Registered name."""
     description: str = ""
     """What it is, in one line."""
-    latitude: Angle = Field(ge=-1.5707963267948966, le=1.5707963267948966)
+    latitude: Angle = Field(ge=-1.5707963267948966, le=1.5707963267948966, examples=["38.43 deg"])
     """Geodetic latitude, north positive."""
-    longitude: Angle = Field(ge=-6.283185307179586, le=6.283185307179586)
+    longitude: Angle = Field(ge=-6.283185307179586, le=6.283185307179586, examples=["-79.84 deg"])
     """Longitude, east positive."""
-    altitude: Metres = quantity("0 m", ge=-500, le=9000)
+    altitude: Metres = quantity("0 m", ge=-500, le=9000, examples=["2600 m"])
     """Height above the ellipsoid."""
     climatology: str | None = None
     """Name of the embedded climatology, where there is one: those of the built-in sites that have

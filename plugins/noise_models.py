@@ -57,11 +57,11 @@ class BackgroundLimited(NoiseModel):
     """
     modes: int = Field(1, ge=1)
     """Spatial modes per polarization."""
-    telescope_temperature: Kelvin = quantity("0 K", ge=0)
+    telescope_temperature: Kelvin = quantity("0 K", ge=0, examples=["270 K"])
     """Emission of mirrors and ground spill-over, as a Rayleigh-Jeans temperature at the receiver's
     window.
     """
-    receiver_temperature: Kelvin = quantity("0 K", ge=0)
+    receiver_temperature: Kelvin = quantity("0 K", ge=0, examples=["40 K"])
     """Emission of windows and filters in the receiver, as a Rayleigh-Jeans temperature."""
 
     def check(self, focalplane: Focalplane) -> None:

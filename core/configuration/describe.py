@@ -9,6 +9,7 @@ import sys
 import textwrap
 import tokenize
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from types import UnionType
@@ -16,6 +17,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticCustomError
 
 from .target import Target
 from .time import Instant
@@ -153,12 +155,19 @@ def kind(field: FieldInfo) -> str:
 
 
 def unit_of(field: FieldInfo) -> Unit | None:
-    """The unit that a parameter is annotated with."""
+    """The unit that a parameter is annotated with; its example is the parameter's own, or the
+    default where that is not zero.
+    """
     everything = [
         *field.metadata,
         *(m for t in types_in(field.annotation) for m in getattr(t, "__metadata__", ())),
     ]
-    return next((m for m in everything if isinstance(m, Unit)), None)
+    unit = next((m for m in everything if isinstance(m, Unit)), None)
+    own = [str(example) for example in field.examples or ()]
+    if unit and not own and isinstance(field.default, str | float):
+        with suppress(PydanticCustomError):  # a default that is a name, as `beam`
+            own = [f"{field.default}"] if unit.parse(field.default) else []
+    return Unit(unit.unit, *own) if unit and own else unit
 
 
 def document(cls: type[BaseModel]) -> str:
@@ -191,11 +200,18 @@ def _value(field: FieldInfo) -> Any:
 
 def members(field: FieldInfo) -> tuple[Any, ...]:
     """The types of which a parameter takes one, without what they are annotated with."""
-    annotation = field.annotation
-    members = (
-        get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-    )
-    return tuple(get_args(m)[0] if get_origin(m) is Annotated else m for m in members)
+    return tuple(_alternatives(field.annotation))
+
+
+def _alternatives(annotation: Any) -> Iterator[Any]:
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        yield from _alternatives(arguments[0])
+    elif origin in (Union, UnionType):
+        for argument in arguments:
+            yield from _alternatives(argument)
+    else:
+        yield annotation
 
 
 def types_in(annotation: Any) -> Iterator[Any]:

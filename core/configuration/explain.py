@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticCustomError
 
 from .describe import described, types_in, unit_of
 from .diagnostics import ConfigurationError, Diagnostic, nearest
@@ -186,7 +187,13 @@ class _Validated:
             return Diagnostic(f"{self.name(loc)}: {first.message}", span, first.label, first.help)
         if (caret := context.get("caret")) and not self.python:
             span = span.part(*caret)
-        message, label = self.message(e, unit_of(field) if field else None, path)
+        unit = unit_of(field) if field else None
+        if unit and e["type"] == "mistake":
+            try:
+                unit.parse(e["input"])
+            except PydanticCustomError as own:  # the same, with the parameter's example
+                e = {**e, "msg": own.message(), "ctx": own.context}
+        message, label = self.message(e, unit, path)
         message = (
             message[:1].lower() + message[1:] if re.match(r"[A-Z][a-z]+\b", message) else message
         )

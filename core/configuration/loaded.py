@@ -32,7 +32,7 @@ from .yaml_places import Path as Place
 class Accuracy(Parameters):
     """Metric for which the knobs are chosen."""
 
-    target: Fraction = Field(gt=0, le=1)
+    target: Fraction = Field(gt=0, le=1, examples=["1 %"])
     """Largest error of the metric."""
     metric: str = "map_rms"
     """A metric of `zonda accuracy`."""
@@ -46,16 +46,16 @@ class Accuracy(Parameters):
 class Limits(Parameters):
     """Largest errors that the plan may add, in the products' own units."""
 
-    map_rms: Kelvin | None = Field(None, ge=0)
+    map_rms: Kelvin | None = Field(None, ge=0, examples=["50 uK"])
     """rms per map pixel, e.g. 3 uK; where absent, a tenth of the noise."""
-    peak: Kelvin | None = Field(None, ge=0)
+    peak: Kelvin | None = Field(None, ge=0, examples=["50 uK"])
     """Of the sky's brightness in the map; where absent, as `map_rms`."""
-    transfer: Fraction | None = Field(None, ge=0, le=1)
+    transfer: Fraction | None = Field(None, ge=0, le=1, examples=["1 %"])
     """Of the transfer function; where absent, 1 %."""
-    tod: Kelvin | None = Field(None, ge=0)
+    tod: Kelvin | None = Field(None, ge=0, examples=["1 mK"])
     """rms of one sample of the calibrated time stream; where absent, a tenth of its white noise."""
 
-    psd: Fraction | None = Field(None, ge=0, le=1)
+    psd: Fraction | None = Field(None, ge=0, le=1, examples=["1 %"])
     """Of the time stream's power spectrum, relative; where absent, 10 %."""
 
     @model_validator(mode="after")

@@ -216,7 +216,7 @@ class AtmosphereScreens(Output):
 
     observation: int = Field(0, ge=0)
     """Number of the scan, counted from 0."""
-    moment: Seconds | None = Field(None, ge=0)
+    moment: Seconds | None = Field(None, ge=0, examples=["30 s"])
     """When the layers are shown, since the start of the scan. Default: the middle."""
     moments: int = Field(6, ge=1, le=100)
     """How many pictures of the PWV over the field, evenly over the scan."""

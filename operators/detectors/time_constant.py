@@ -59,7 +59,7 @@ class TimeConstant(Operator):
 
     tau: Seconds = quantity("5 ms", ge=0, le=60)
     """Time constant."""
-    scatter: Fraction = quantity("0 %", ge=0, le=1)
+    scatter: Fraction = quantity("0 %", ge=0, le=1, examples=["5 %"])
     """Relative scatter of the time constants between detectors (log-normal with this median spread,
     the same in all scans).
     """

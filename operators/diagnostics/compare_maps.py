@@ -83,7 +83,7 @@ class CompareMaps(Output):
     """Coordinate system of a HEALPix `file` whose header has no COORDSYS: C (ICRS), G (galactic) or
     E (ecliptic).
     """
-    beam: Angle | None = Field(None, gt=0)
+    beam: Angle | None = Field(None, gt=0, examples=["9 arcsec"])
     """Common resolution (FWHM). Default: that of the map with the wider beam, once more smoothed
     with it if it was not yet.
     """

@@ -353,11 +353,13 @@ class Plots(MapOutput):
     optional: ClassVar[frozenset[str]] = DRAWN
     provides: ClassVar[frozenset[str]] = frozenset({"pictures"})
 
-    smooth: Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"] = "beam"
+    smooth: Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"] = Field(
+        "beam", examples=["9 arcsec"]
+    )
     """Smooth image maps that are not smoothed yet for their pictures: with the beam, with a
     Gaussian of this FWHM, or not.
     """
-    central_diameter: Angle | None = Field(None, gt=0)
+    central_diameter: Angle | None = Field(None, gt=0, examples=["1 arcmin"])
     """Diameter of the circle that noise maps show, in which their rms is taken; where absent 1
     arcmin, or five beams or pixels where these are wider."""
     least_coverage: float = Field(0.1, ge=0, lt=1)
@@ -379,7 +381,7 @@ class Plots(MapOutput):
     """Of the colours of maps: linear, the square root (of the distance from the lower limit), asinh
     (linear within a twentieth of the larger limit), or logarithmic (three decades, unless the
     lower limit is positive)."""
-    scale_bar: Angle = quantity("0 arcmin", ge=0, le=1)
+    scale_bar: Angle = quantity("0 arcmin", ge=0, le=1, examples=["1 arcmin"])
     """Length of a bar on the sky that maps show; 0: none."""
     formats: list[Literal["png", "pdf", "svg"]] = Field(["png"], min_length=1)
     """Files of each picture; PDF and SVG for print."""

@@ -59,7 +59,7 @@ class Report(Output):
     optional: ClassVar[frozenset[str]] = DRAWN | {"pictures", "map_file", "tod_file", "figures"}
     provides: ClassVar[frozenset[str]] = frozenset({"report"})
 
-    central_diameter: Angle | None = Field(None, gt=0)
+    central_diameter: Angle | None = Field(None, gt=0, examples=["1 arcmin"])
     """Diameter of the circle about the map's centre in which the noise is stated; where absent 1
     arcmin, or five beams or pixels where these are wider."""
 

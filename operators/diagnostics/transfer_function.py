@@ -77,7 +77,7 @@ class TransferFunction(Output):
     """Number of rings, of equal width in the logarithm of the scale."""
     largest: Angle | None = Field(None, gt=0)
     """Largest angular scale, 1/k; where absent, the diameter of the disc with the window's area."""
-    smallest: Angle | None = Field(None, gt=0)
+    smallest: Angle | None = Field(None, gt=0, examples=["9 arcsec"])
     """Smallest angular scale; where absent, the beam's FWHM, or two pixels."""
     radius: Angle | None = Field(None, gt=0)
     """Use only what lies this near to the map's centre."""

@@ -62,7 +62,7 @@ class HighpassFilter(LinearFilter):
     """Degree of the polynomial fitted to each detector's scan and removed first (1: a line; null:
     none, for `bessel` alone).
     """
-    trim: Seconds = quantity("0 s", ge=0)
+    trim: Seconds = quantity("0 s", ge=0, examples=["10 s"])
     """Time at either end of each scan that is flagged."""
     oversampling: float = Field(24.0, ge=8, le=1000)
     """Of the brick wall: coarse knots per cut cycle (M / (K / 2)); the low part's error at the cut

@@ -53,7 +53,7 @@ class SourceMask(Parameters):
     what it removes.
     """
 
-    radius: Angle | None = Field(None, gt=0, le=0.5)
+    radius: Angle | None = Field(None, gt=0, le=0.5, examples=["30 arcsec"])
     """Radius of the disc; where absent, 1 arcmin."""
     centre: Target | None = None
     """Centre of the disc; where absent, the target of the scan."""

@@ -56,7 +56,7 @@ class SaveMap(MapOutput):
     requires: ClassVar[frozenset[str]] = frozenset({"map"})
     provides: ClassVar[frozenset[str]] = frozenset({"map_file"})
 
-    central_diameter: Angle | None = Field(None, gt=0)
+    central_diameter: Angle | None = Field(None, gt=0, examples=["1 arcmin"])
     """Diameter of the circle about the target in which the noise map's rms is taken; where absent 1
     arcmin, or five beams or pixels where these are wider."""
     overwrite: bool = Field(True)

@@ -70,9 +70,9 @@ class MapParameters(MapMaker):
 
     pixel: Angle = quantity("2 arcsec", gt=0)
     """Side of a pixel."""
-    width: Angle | None = Field(None, gt=0)
+    width: Angle | None = Field(None, gt=0, examples=["10 arcmin"])
     """Width of the map; where absent, it covers the scans."""
-    height: Angle | None = Field(None, gt=0)
+    height: Angle | None = Field(None, gt=0, examples=["10 arcmin"])
     """Height of the map; where absent, the width if that is given, else it covers the scans."""
     centre: Target | None = None
     """Centre of the map; where absent, the scans' target; of several targets the middle of all
@@ -111,7 +111,7 @@ class MapParameters(MapMaker):
     """Count the scans that have samples in each pixel."""
     scan_hits: bool = False
     """Keep the hits of each scan in each pixel."""
-    smooth: Angle | Literal["beam"] | None = None
+    smooth: Angle | Literal["beam"] | None = Field(None, examples=["9 arcsec"])
     """Smooth the map with a Gaussian of this FWHM, or with the instrument's beam; the resolution is
     then that of both, added in quadrature."""
     product: str = Field("map", pattern=r"^[A-Za-z0-9_]+$")

@@ -54,13 +54,13 @@ class PinkNoise(Operator):
     """The power spectrum falls as f^-slope; None: each detector's own, where they differ rounded to
     a tenth.
     """
-    minimum_frequency: Hertz | None = Field(None, gt=0)
+    minimum_frequency: Hertz | None = Field(None, gt=0, examples=["1 mHz"])
     """The spectrum is flat below; None: the instrument's."""
     poles: int = Field(8, ge=2, le=16)
     """Accuracy of the spectrum: its error falls about threefold for every two more poles (1.8 %
     with 8, 0.06 % with 16 for 1/f noise over 4.7 decades; with 16 at most 0.45 % for slopes to 2, 1
     % to 3, over 7.7 decades)."""
-    shared: Fraction = Field(0.0, ge=0, le=1)
+    shared: Fraction = Field(0.0, ge=0, le=1, examples=["0.8"])
     """Share of the variance that all detectors have in common."""
 
     @model_validator(mode="after")

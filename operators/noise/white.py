@@ -53,7 +53,7 @@ class WhiteNoise(Operator):
     """
     reference: Literal["sky", "detector"] = "sky"
     """Whether `net` is quoted on the sky, after division by zeta e^-tau, or at the detector."""
-    scatter: Fraction = Field(0.0, ge=0, le=2)
+    scatter: Fraction = Field(0.0, ge=0, le=2, examples=["10 %"])
     """Relative scatter of NET from detector to detector (log-normal, mean 1, the same in every
     observation).
     """

@@ -54,21 +54,21 @@ class Efficiency(Operator):
         {"sky", "atmosphere", "transmission", "white", "pink"}
     )
 
-    main_beam: Fraction | None = Field(None, gt=0, le=1)
+    main_beam: Fraction | None = Field(None, gt=0, le=1, examples=["0.6"])
     """zeta, the share of an astronomical signal that the main beam delivers; where absent, the
     instrument's.
     """
-    illumination: Fraction | None = Field(None, gt=0, le=1)
+    illumination: Fraction | None = Field(None, gt=0, le=1, examples=["0.9"])
     """epsilon, the share of the atmosphere's emission that reaches a detector; where absent, the
     instrument's.
     """
-    scatter: Fraction = quantity("0 %", ge=0, le=0.5)
+    scatter: Fraction = quantity("0 %", ge=0, le=0.5, examples=["5 %"])
     """Relative rms of zeta between detectors (normal). The calibration knows it: the sky keeps its
     gain, and so does a NET quoted on the sky. The atmosphere's fluctuation, and noise given at the
     detector (`reference: detector`), vary as 1 / zeta."""
     calibration: Literal["mean", "instantaneous"] = "mean"
     """Divide by e^-tau at the mean PWV and current elevation, or by the fluctuating e^-tau."""
-    calibration_error: Fraction = quantity("0 %", ge=0, le=0.5)
+    calibration_error: Fraction = quantity("0 %", ge=0, le=0.5, examples=["5 %"])
     """Relative rms of an unknown gain error per detector (normal), constant over a scan."""
 
     def configure(self, observation: Observation) -> None:

@@ -48,7 +48,7 @@ class GroundPickup(Operator):
     """FWHM of the sidelobes that smooth the ground."""
     power: float = Field(-1.0, ge=-6, le=6)
     """Exponent of the dependence on elevation."""
-    scatter: Fraction = quantity("0 %", ge=0, le=1)
+    scatter: Fraction = quantity("0 %", ge=0, le=1, examples=["5 %"])
     """Relative rms of the pickup between detectors (normal, the same in all scans)."""
     realization: int | None = Field(None, ge=0)
     """Number of the ground: the same for every seed. Where absent the seed draws it, and in a

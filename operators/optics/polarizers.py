@@ -39,7 +39,7 @@ class Leakage(Operator):
 
     share: Fraction = quantity("1 %", ge=0, le=0.5)
     """l, the share of the intensity that becomes polarized."""
-    angle: Angle = quantity("0 deg")
+    angle: Angle = quantity("0 deg", examples=["45 deg"])
     """beta, its direction in the focal plane, counted as the detectors' polarization angles."""
 
     def prepare(self, observation: Observation) -> tuple[Floats, Floats]:
@@ -81,9 +81,9 @@ class HalfWavePlate(Operator):
 
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
 
-    frequency: Hertz = Field(ge=-1e4, le=1e4)
+    frequency: Hertz = Field(ge=-1e4, le=1e4, examples=["2 Hz"])
     """Turns per second; negative: the other way. 0 for a plate that is stepped by `angle`."""
-    angle: Angle = quantity("0 deg")
+    angle: Angle = quantity("0 deg", examples=["22.5 deg"])
     """At the start of each scan."""
 
     def check(self, data: Data) -> list[str]:

@@ -177,7 +177,7 @@ class Pointing(Scans):
     """Side of the box of `offsets: box`."""
     sample_rate: SampleRate | None = Field(None, gt=0, le=1e6)
     """Read-out rate; the instrument's where absent."""
-    jitter: Seconds = quantity("0 s", ge=0, le=1)
+    jitter: Seconds = quantity("0 s", ge=0, le=1, examples=["1 ms"])
     """rms by which samples are taken early or late (Gaussian, known: the times in the products are
     the true ones).
     """

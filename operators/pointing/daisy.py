@@ -38,7 +38,7 @@ class PointingDaisy(Pointing):
     """
     inner: Fraction = Field(0.15, ge=0, lt=1)
     """a of equation (1): amplitude of the inner daisy, as a fraction of `radius`."""
-    phase: Angle = quantity("0 rad")
+    phase: Angle = quantity("0 rad", examples=["45 deg"])
     """phi at the start of each scan."""
 
     slows: ClassVar[dict[str, tuple[int, int]]] = {"speed": (-1, 1), "radius": (1, 0)}

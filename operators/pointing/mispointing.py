@@ -22,6 +22,7 @@ import math
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, Seconds
@@ -46,11 +47,11 @@ class Mispointing(Operator):
     requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
     provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
 
-    offset: tuple[Angle, Angle] | None = None
+    offset: tuple[Angle, Angle] | None = Field(None, examples=["3 arcsec"])
     """Constant error towards increasing azimuth (on the sky) and elevation; none where absent."""
-    scan_rms: Angle = quantity("0 arcsec", ge=0, le=0.1)
+    scan_rms: Angle = quantity("0 arcsec", ge=0, le=0.1, examples=["2 arcsec"])
     """Rms of an error that is constant in each scan."""
-    jitter_rms: Angle = quantity("0 arcsec", ge=0, le=0.1)
+    jitter_rms: Angle = quantity("0 arcsec", ge=0, le=0.1, examples=["1 arcsec"])
     """Rms of the jitter."""
     jitter_time: Seconds = quantity("1 s", gt=0, le=1e6)
     """Correlation time of the jitter."""

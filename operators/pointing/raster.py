@@ -127,7 +127,7 @@ class RasterParameters(Pointing):
     """Length of a row; where absent, the field of view (at least 6 beams, at most 5 deg)."""
     height: Angle | None = Field(None, ge=0, le=0.5)
     """Distance between the first and the last row, at most; where absent, the `width`."""
-    spacing: Angle | None = Field(None, gt=0, le=0.5)
+    spacing: Angle | None = Field(None, gt=0, le=0.5, examples=["10 arcsec"])
     """Distance between rows; where absent, a quarter of the field of view, or half a beam where
     that is more.
     """
@@ -143,7 +143,7 @@ class RasterParameters(Pointing):
     position_angle: Angle = quantity("90 deg")
     """Position angle of the rows, from north through east: 90 deg is along right ascension. In
     horizontal axes from the zenith through larger azimuth: 90 deg is along azimuth."""
-    angles: Angles = "same"
+    angles: Angles = Field("same", examples=["45 deg"])
     """What is added to `position_angle` in the scans in turn: nothing; `cross_hatch`, every second
     scan crosses the same field at right angles; or a list of angles."""
     axes: Literal["sky", "horizontal"] = "sky"

@@ -314,7 +314,7 @@ class ScheduleParameters(Scans):
     sun_close: Angle = quantity("45 deg", gt=0, le=math.pi)
     """Distance of the Sun below which samples are flagged *sun close*. They are used all the same,
     as are those while the Sun is up: both are flags and intervals of files."""
-    elevation_nods: list[Angle] = Field(default_factory=list, max_length=100)
+    elevation_nods: list[Angle] = Field(default_factory=list, max_length=100, examples=["1 deg"])
     """Offsets in elevation to which the telescope goes in turn before each scan, the last of them
     0, e.g. [1 deg, -1 deg, 0 deg]; flagged irregular."""
     elevation_speed: AngularSpeed = quantity("1 deg/s", gt=0)

@@ -121,14 +121,14 @@ class SkyInput(Operator):
     """Unit of the map: Jy/pixel, Jy/beam, MJy/sr, K_RJ, K_CMB or y (Compton-y), with a prefix
     (mK_CMB). Default: its header's.
     """
-    pixel_size: Angle | None = Field(None, gt=0)
+    pixel_size: Angle | None = Field(None, gt=0, examples=["2 arcsec"])
     """Side of a pixel; replaces the header's scale (its orientation is kept). Default: the
     header's.
     """
     centre: Target | Literal["target"] | None = None
     """Put the map's centre here: a position fixed on the sky, or `target` for the scan's.
     Directions there keep their angles from ICRS north. Default: where its header says."""
-    input_beam: Angle | None = Field(None, gt=0)
+    input_beam: Angle | None = Field(None, gt=0, examples=["18 arcsec"])
     """Full width at half maximum of the beam that a map in Jy/beam was made with. Default: its
     header's BMAJ and BMIN.
     """
@@ -156,9 +156,9 @@ class SkyInput(Operator):
     """
     beam: Literal["gaussian", "none"] = "gaussian"
     """Shape of the main beam; `none` for a map that is convolved already."""
-    fwhm: Angle | None = Field(None, gt=0)
+    fwhm: Angle | None = Field(None, gt=0, examples=["9 arcsec"])
     """Full width at half maximum of the beam. Default: each detector's own."""
-    outside: Kelvin = quantity("0 K")
+    outside: Kelvin = quantity("0 K", examples=["1 mK"])
     """Brightness of the sky beyond the map's edge, K_RJ; samples there are counted."""
     scale: float = Field(1.0, ge=-1e30, le=1e30)
     """Factor on the whole map (not on `outside`)."""

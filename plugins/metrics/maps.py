@@ -256,7 +256,7 @@ class _OfMap(FigureMetric):
 class _OfSmoothMap(_OfMap):
     """A figure of one smoothed map."""
 
-    smooth: Smoothing = "beam"
+    smooth: Smoothing = Field("beam", examples=["9 arcsec"])
     """Smooth a map that is not smoothed yet: with the beam, with a Gaussian of this FWHM, or not.
     """
 
@@ -403,7 +403,7 @@ class PeakSnr(_OfSmoothMap):
     noise: Literal["source_free", "half_difference", "white"] = "source_free"
     """What scales the noise: the map of everything but the sky (with the modes of the complete
     data), half the difference of even and odd scans, or nothing: white noise by NET and samples."""
-    radius: Angle | None = Field(None, gt=0)
+    radius: Angle | None = Field(None, gt=0, examples=["1 arcmin"])
     """Where the noise map is compared with the white noise: this near to the map's centre. Default:
     1 arcmin, or 2.5 beams or pixels where these are wider."""
     within: Angle | None = Field(None, gt=0)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import inspect
 import pydoc
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
+from pydantic import TypeAdapter
 
 import zonda
-from zonda.core.configuration.describe import choices, kind, own_doc
+from zonda.core.configuration.describe import choices, kind, own_doc, unit_of
 from zonda.core.registry import operators
 
 
 @pytest.mark.parametrize(
     ("cls", "parameter", "words"),
     [
-        ("BinMap", "pixel", "an angle such as '4 arcmin'"),
+        ("BinMap", "pixel", "an angle such as '2 arcsec'"),
         ("BinMap", "frame", "'icrs' or 'galactic'"),
         ("BinMap", "projection", "'TAN' or 'CAR'"),
         (
@@ -59,6 +60,33 @@ def test_help_shows_every_parameter_and_nothing_of_pydantics(name: str) -> None:
         assert "see below" not in line
     for jargon in ("pydantic", "model_dump", "model_validate", "__", "Annotated[", "FieldInfo"):
         assert jargon not in text
+
+
+def test_the_example_of_a_parameter_is_one_of_its_values() -> None:
+    """Of every parameter with a unit, within its limits, and not of the size of another: a
+    telescope of 1.8 mm, an altitude of 1.8 mm.
+    """
+    seen = {}
+    for name in [*operators, "Scene", "Site", "Instrument", "Telescope", "Band"]:
+        for parameter, field in getattr(zonda, name).model_fields.items():
+            if (unit := unit_of(field)) is None:
+                continue
+            seen[name, parameter] = unit.example
+            scalar = "list" not in str(field.annotation) and "tuple" not in str(field.annotation)
+            kind: Any = (
+                Annotated[field.annotation, "", *field.metadata]
+                if scalar
+                else Annotated[float, unit]
+            )
+            assert isinstance(TypeAdapter(kind).validate_python(unit.example), float)
+    assert len(seen) > 100
+    assert seen["Telescope", "diameter"] == "12 m"
+    assert seen["Site", "altitude"] == "2600 m"
+    assert seen["BinMap", "pixel"] == "2 arcsec"
+    with pytest.raises(zonda.ZondaError, match=r"write a length such as '12 m'(.|\n)*e.g. 6 m"):
+        zonda.Telescope(name="dish", diameter=6)
+    with pytest.raises(zonda.ZondaError, match="add diameter='12 m'"):
+        zonda.Telescope(name="dish")
 
 
 def test_the_signature_is_what_a_user_writes() -> None:

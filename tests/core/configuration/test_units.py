@@ -201,7 +201,7 @@ def test_schema_shows_unit_and_examples() -> None:
 @pytest.mark.parametrize(
     ("make", "example"),
     [
-        (lambda: zonda.HighpassFilter(frequency=3), "0.1 Hz"),
+        (lambda: zonda.HighpassFilter(frequency=3), "0.08 Hz"),
         (lambda: zonda.Band(name="x", low=3, high="4 GHz"), "90 GHz"),
         (lambda: zonda.PointingStare(sample_rate=3), "100 Hz"),
     ],

@@ -57,7 +57,7 @@ def complaint(
         ("outer_scale: -5 m", ["outer_scale: must be greater than 0 m, got -5 m"]),
         (
             "outer_scale: nan m",
-            ["my.yaml:8:37", "cannot read 'nan m' as a length", "such as '1.8 mm'"],
+            ["my.yaml:8:37", "cannot read 'nan m' as a length", "such as '500 m'"],
         ),
         ("outer_scale: .nan", ["outer_scale: nan has no unit"]),
         (
