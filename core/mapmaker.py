@@ -22,9 +22,14 @@ class MapMaker(Operator):
 
     What is not finite in one of them is NaN in all.
 
+    Where it does more than to average (`averages`), the maps of signals with ``filters: none`` are
+    means of samples all the same: what its other maps are compared with.
+
     Where it is `linear`, the product of a remainder is subtracted
     (`core.product.Product.subtract`), not simulated. With `all_bands` it has `exec_bands`.
     """
+
+    averages: ClassVar[bool] = True
 
     def exec_bands(self, blocks: Sequence[Block], states: Sequence[Any]) -> None:
         """Act on the blocks of several bands, of the same detectors and samples, each with what

@@ -235,7 +235,7 @@ class Signals:
         transmission are the complete data's.
         """
         kept = frozenset(o.label for o in self._generators if self._keeps(signal, o))
-        changing = [o for o in self.operators if filters(o)]
+        changing = [o for o in self.operators if filters(o) or _weighs(o)]
         filtered = signal is None or signal.filters == "all" or not changing
         full = signal is not None and signal.modes == "full" and len(kept) < len(self._generators)
         gone = any(TRANSMISSION in o.provides and o.label not in kept for o in self._generators)
@@ -286,6 +286,11 @@ class Signals:
             and not whole
             and not narrowed
         )
+
+
+def _weighs(operator: Operator) -> bool:
+    """Tell whether a step is a map maker that does more than to average."""
+    return isinstance(operator, MapMaker) and not operator.averages
 
 
 def acting_steps(operators: Sequence[Operator], keep: Iterable[str] = ()) -> list[Operator]:

@@ -63,6 +63,7 @@ class MaximumLikelihoodMap(BinMap):
     knows_means: ClassVar[bool] = True
     all_bands: ClassVar[bool] = False
     linear: ClassVar[bool] = False
+    averages: ClassVar[bool] = False
 
     baseline: Seconds = quantity("0.2 s", gt=0)
     """Length of a baseline: noise is white within it, but for the free modes."""
@@ -305,7 +306,7 @@ class LikelihoodScan:
         self.prepared = replace(self.prepared, halves=made)
         scan: CompressedScan = self.found.scan(observation.sample_rate)
         self.found = scan
-        for name in observation.signals:
+        for name in sorted({*observation.signals} - observation.unfiltered):
             self.baselines[name] = np.zeros(scan.shape, np.int64)
             self.common[name] = np.zeros(
                 (len(self.noise.free_modes), observation.n_samples), np.int64
@@ -325,6 +326,8 @@ class LikelihoodScan:
             pixel = self.pixels(which, start, stop, *parts)
             base = slice(start // self.length, (stop - 1) // self.length + 1)
             for name, part in zip(block.signals, parts, strict=True):
+                if name not in self.baselines:
+                    continue
                 y = np.zeros((which.size, base.stop - base.start), np.int64)
                 s = np.zeros((len(a), stop - start), np.int64)
                 add_baselines(part, pixel, start, self.length, a, VALUE, y, s)
@@ -404,10 +407,21 @@ class LikelihoodMaps(MapFromSums):
     data: Data
 
     def map_of(self, stream: str) -> MapProduct:
-        """The map of a signal; its weights and its noise are those of white noise."""
+        """The map of a signal; its weights and its noise are those of white noise. Without filters
+        it is the mean of the samples, of which the same is taken off.
+        """
         product, equations = super().map_of(stream), self.equations
+        mean = stream not in self.scans.scans[0].data
+        if mean:
+            rows = np.nan_to_num(product.planes["signal"].values)
+            values = np.zeros((len(rows), self.grid.n_pixels))
+            values[:, self._seen] = rows.reshape(len(rows), -1)
+            signal = self._determined(values, equations)
+            return replace(
+                product.with_planes(signal=self._rows(product, signal)), taken_off=self._taken
+            )
         solution = self._solved(equations, stream)
-        planes = {"signal": self._rows(product, self._determined(solution, equations))}
+        planes = {"signal": self._rows(product, self._determined(solution.values, equations))}
         if self.halves:
             (one, first), (two, second) = (self._half(stream, k) for k in range(2))
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -418,8 +432,8 @@ class LikelihoodMaps(MapFromSums):
             planes["half_difference"] = self._rows(product, values)
         if stream == MAIN:
             self._tell(solution)
-        taken = self.parameters.taken_off.removeprefix("none")
-        return replace(product.with_planes(**planes), noise_from="streams", taken_off=taken)
+        made = product.with_planes(**planes)
+        return replace(made, noise_from="streams", taken_off=self._taken)
 
     @cached_property
     def equations(self) -> NormalEquations:
@@ -465,11 +479,22 @@ class LikelihoodMaps(MapFromSums):
     def _half(self, stream: str, half: int) -> tuple[Floats, NormalEquations]:
         """The map of the even or odd scans, and their equations."""
         equations = self._of(self.equations.scans[half::2])
-        return self._determined(self._solved(equations, stream, half), equations), equations
+        values = self._solved(equations, stream, half).values
+        return self._determined(values, equations), equations
 
-    def _determined(self, solution: Solution, equations: NormalEquations) -> Floats:
-        """The solution without what the data hardly determine."""
-        values, weight = solution.values.copy(), equations.weights[0]
+    @property
+    def _seen(self) -> Any:
+        """Places of the pixels that the product has."""
+        return self.grid.seen(self.sums.hits.any(axis=0))
+
+    @property
+    def _taken(self) -> str:
+        """What is taken off, as products state it."""
+        return self.parameters.taken_off.removeprefix("none")
+
+    def _determined(self, values: Floats, equations: NormalEquations) -> Floats:
+        """A map without what the data hardly determine."""
+        values, weight = values.copy(), equations.weights[0]
         if self.parameters.taken_off == "none":
             return values
         patterns = [np.ones(self.grid.n_pixels)]
@@ -484,8 +509,7 @@ class LikelihoodMaps(MapFromSums):
 
     def _rows(self, product: MapProduct, values: Floats) -> Floats:
         """Rows in the shape of the map, NaN where there is no value."""
-        seen = self.grid.seen(self.sums.hits.any(axis=0))
-        shaped = values[:, seen].reshape(len(values), *product.hits.shape)
+        shaped = values[:, self._seen].reshape(len(values), *product.hits.shape)
         return np.where(product.known, shaped, np.nan)
 
     def _tell(self, solution: Solution) -> None:

@@ -1,12 +1,14 @@
 """Maximum-likelihood maps of scans: recovery, noise, bits, and what is refused."""
 
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
 
 import zonda
+import zonda.pipelines
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.polarization import PolarizationAngles
@@ -172,6 +174,35 @@ def test_bits_depend_neither_on_threads_nor_on_other_signals():
     for plane in ("signal", "half_difference", "noise", "hits"):
         np.testing.assert_array_equal(getattr(one["map"], plane), getattr(two["map"], plane))
     assert "quiet/map" in two
+
+
+def test_the_map_without_filters_is_a_mean():
+    """What transfer functions compare with is no maximum-likelihood map itself: pixels as wide as
+    the beam, in which the sky is no constant, tell the two apart."""
+    runs = {"seen": {"only": ["sky"]}, "true": {"only": ["sky"], "filters": "none"}}
+    cluster = Path(zonda.pipelines.__path__[0]) / "data" / "merging_cluster.fits"
+    maps = {}
+    for maker in (MaximumLikelihoodMap, BinMap):
+        steps = [
+            zonda.PointingDaisy(radius="3 arcmin", speed="50 arcsec/s", scan_duration="50 s"),
+            zonda.SkyMap(file=cluster, centre="target"),
+            zonda.AtmosphereLayers(pwv="5 mm"),
+            zonda.WhiteNoise(),
+            zonda.Efficiency(),
+            maker(pixel="8 arcsec", half_difference=False),
+        ]
+        made = zonda.Pipeline(steps, runs=runs).run(zonda.Scene(**SCENE), threads=1)
+        maps[maker] = [made[f"{name}/map"] for name in runs]
+    (seen, true), (_, mean) = maps[MaximumLikelihoodMap], maps[BinMap]
+    ok = mean.hits > 20
+    one, two = true.signal[ok], mean.signal[ok]
+    # a mean too, with other weights of detectors (some percent), and a plane less
+    y, x = np.indices(ok.shape)
+    basis = np.stack([np.ones(ok.sum()), x[ok], y[ok]], axis=1)
+    rest = one - two
+    rest -= basis @ np.linalg.lstsq(basis, rest, rcond=None)[0]
+    assert rest.std() < 0.02 * two.std()
+    assert 0.002 < (seen.signal[ok] - one).std() / one.std() < 0.3
 
 
 def test_a_compressed_scan_crosses_processes():
