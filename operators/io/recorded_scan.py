@@ -130,6 +130,13 @@ def rows_of_bands(tod: TimeOrderedData, band: float | None, place: str) -> list[
     centre = tod.columns.get("band_centre")
     if centre is None:
         return [np.arange(tod.n_detectors)]
+    known = np.isfinite(centre) & (centre > 0)
+    for row in np.flatnonzero(~known & (tod.detector_flags == 0))[:1]:
+        text = f"the band of detector {tod.names[row]} is at {centre[row] / 1e9:g} GHz"
+        raise InputError(text, place=place, cure="give it its centre, or flag the detector")
+    if not known.any():
+        raise InputError("states no band of any detector", place=place, cure="unflag what is used")
+    centre = np.where(known, centre, centre[known][0])
     order = np.argsort(centre, kind="stable")
     steps = np.flatnonzero(np.diff(centre[order]) > SAME_BAND * centre[order][:-1]) + 1
     every = [np.sort(rows) for rows in np.split(order, steps)]

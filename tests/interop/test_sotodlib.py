@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import zonda
-from zonda.core.errors import InputError
+from zonda.core.errors import InputError, ZondaError
 from zonda.core.numerics.quaternions import detector_quaternions, multiply
 from zonda.interop.sotodlib import sight_line, to_axismanager
 from zonda.operators.io.save_tod import load_tod
@@ -378,3 +378,46 @@ def test_its_demodulation_finds_the_sky(modulated, file):
         # 1 uK s(1/2) of 14 detectors in 80 s: sqrt(2) x 1 uK / sqrt(14 x 80) = 0.04 uK; the filters'
         # ends and the apodized band leave 1e-4 of 1 mK
         np.testing.assert_allclose(mean, value, rtol=0, atol=5e-7)
+
+
+def test_damaged_flac_is_refused(tmp_path):
+    """A scan compressed with FLAC in which bytes, starts or types of the streams are others."""
+    import json
+    import random
+
+    import flacarray.hdf5
+    import h5py
+
+    from ..axismanagers import saved
+    from ..fuzz.test_values import in_array, mapped
+
+    refused = 0
+    for seed in range(20):
+        rng, path = random.Random(seed), saved(tmp_path / "a.h5")
+        with h5py.File(path, "a") as file:
+            values = file["signal"][:]
+            del file["signal"]
+            group = file.create_group("signal")
+            flacarray.hdf5.write_array(values, group, quanta=1e-7)
+            about = json.loads(file.attrs["_axisman"])
+            about["schema"][1]["encoding"] = "flacarray"
+            file.attrs["_axisman"] = json.dumps(about)
+            name = rng.choice(list(group))
+            item = group[name]
+            made, kept = np.array(item[()]), dict(item.attrs)
+            if seed == 0:
+                pass
+            elif rng.random() < 0.5 and made.size:
+                made.flat[rng.randrange(made.size)] = rng.randrange(128)
+            else:
+                made = in_array(made, rng)
+            del group[name]
+            group[name] = made
+            for key, value in kept.items():
+                group[name].attrs[key] = value
+        try:
+            mapped(path)
+        except ZondaError:
+            refused += 1
+            assert seed
+    assert refused > 5

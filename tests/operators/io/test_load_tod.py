@@ -551,7 +551,7 @@ def attribute(path: Path, where: str, name: str, value: Any) -> Path:
         ("PRIMARY", "SAMPRATE", "fast", "sample_rate is 'fast', not 1e-09 to 1e+09"),
         ("PRIMARY", "SAMPRATE", -1.0, "sample_rate is -1.0"),
         ("PRIMARY", "OBJECT", 7, "name is 7"),
-        ("PRIMARY", "DATE-OBS", "now", "start: cannot read 'now' as a time"),
+        ("PRIMARY", "DATE-OBS", "now", "start: cannot read 'nowZ' as a time"),
         ("PRIMARY", "SITELAT", 91.0, "latitude is "),
         ("PRIMARY", "SITEALT", True, "altitude is True"),
         ("TOD", "TTYPE1", "", "cannot be read as FITS"),
