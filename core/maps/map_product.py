@@ -20,6 +20,8 @@ from .smoothing import CUT, error_of_mean, smoother, weighted_mean
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from .apertures import ApertureFlux
+
 
 @dataclass(init=False, repr=False)
 class MapProduct(MapArrays):
@@ -98,6 +100,25 @@ class MapProduct(MapArrays):
         from .map_file import write_map
 
         return write_map(self, path, overwrite)
+
+    def aperture_flux(
+        self,
+        radius: Any,
+        *,
+        centre: Any = None,
+        annulus: Any = None,
+        spectral_index: float | None = None,
+    ) -> ApertureFlux:
+        """Flux density [Jy] within ``radius`` of ``centre`` (default: the map's), of I: `flux`, and
+        `error` from the noise and the half-difference of the map (`core.maps.apertures`).
+
+        ``annulus``: (inner, outer) radii of the ring whose mean is taken off. Angles are texts
+        with units or quantities, ``spectral_index`` is as of `to`. What filters and the beam have
+        taken is not in it. Raises InputError where the map has no value there, or no Jy.
+        """
+        from .apertures import aperture_flux
+
+        return aperture_flux(self, radius, centre, annulus, spectral_index)
 
     @property
     def central_radius(self) -> float:

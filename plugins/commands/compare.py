@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,6 +105,14 @@ def _twice(flag: str, name: str, metavar: str, text: str) -> Any:
 )
 @click.option(
     "--sky", is_flag=True, help="REFERENCE is a sky before any beam: it gets the whole common beam."
+)
+@click.option(
+    "--aperture",
+    "apertures",
+    multiple=True,
+    callback=lambda *given: tuple(_quantity("rad")(*given[:2], text) for text in given[2]),
+    metavar="RADIUS",
+    help="Fluxes within this radius of the centre, e.g. '30 arcsec'; may be given several times.",
 )
 @_twice(
     "--hdu",
@@ -208,6 +217,7 @@ def _compare(
     threshold: float,
     contours: tuple[float, ...],
     formats: tuple[str, ...],
+    apertures: tuple[float, ...],
 ) -> None:
     """One comparison, printed and written to ``folder``."""
     from zonda.operators.diagnostics.comparison import statistics
@@ -243,8 +253,9 @@ def _compare(
         fwhm = 0.0 if sky else one.fwhm
         common = beam or common_beam(replace(one, fwhm=fwhm), maps[plane])
         one, other = _in_one_unit(one, maps[plane], unit, hertz, common)
-        found = statistics.compare(replace(one, fwhm=fwhm), other, beam, threshold)
-        text = "\n".join(lines(found))
+        both_of = replace(one, fwhm=fwhm), other
+        found = statistics.compare(*both_of, beam, threshold, apertures=apertures)
+        text = "\n".join(lines(found, fluxes(found, apertures, other, hertz)))
         click.echo(f"Stokes {plane}\n{text}\n" if len(both) > 1 else text)
         name = plane_key("comparison", plane)
         written += write_comparison(found, folder / name, {})
@@ -292,8 +303,43 @@ def _in_one_unit(
     return first, second
 
 
-def lines(found: Comparison) -> list[str]:
-    """The table as text."""
+def fluxes(
+    found: Comparison,
+    apertures: tuple[float, ...],
+    plane: Plane,
+    hertz: float | None,
+) -> list[tuple[str, str]]:
+    """Rows of the table about apertures: fluxes in Jy where the frequency is known, and their
+    ratio.
+    """
+    import numpy as np
+
+    from zonda.core.errors import InputError
+    from zonda.core.maps.units import parse_unit
+    from zonda.core.numerics.angles import angle_text
+    from zonda.operators.diagnostics.comparison.files import in_unit
+
+    rows, jansky = [], math.nan
+    try:
+        unit, size = parse_unit(plane.unit, place=plane.name)
+        alone: Any = {"values": np.full((), size), "noise": None, "alone": None}
+        one = replace(plane, unit=unit, fwhm=found.fwhm or None, **alone)
+        jansky = 1e6 * float(in_unit(one, "MJy/sr", hertz).values)
+    except InputError:  # ratios are known without
+        pass
+    for radius in apertures:
+        of, seen = (found.values[f"{name} within {radius!r}"] for name in ("reference", "map"))
+        text = f"{seen / of:.5g}" if of else "none in the reference"
+        if not math.isfinite(seen):
+            text = "not known: less than 95 % of the circle is in both maps"
+        elif math.isfinite(jansky):
+            text += f" ({seen * jansky:.5g} / {of * jansky:.5g} Jy)"
+        rows.append((f"flux of map / reference within {angle_text(radius)}", text))
+    return rows
+
+
+def lines(found: Comparison, more: Sequence[tuple[str, str]] = ()) -> list[str]:
+    """The table as text, with ``more`` rows."""
     from zonda.core.numerics.angles import angle_text
     from zonda.core.tables import aligned
 
@@ -316,7 +362,7 @@ def lines(found: Comparison) -> list[str]:
         scatter = math.sqrt(2 / f["chi2 values"]) if f["chi2 values"] else math.nan
         text = f"{f['chi2']:.5g} / {f['chi2 pixels']:.0f} = {ratio:.4g} +- {scatter:.2g}"
         rows.append(("chi2 of the difference / pixels", text))
-    return [*aligned(rows), "", *found.notes]
+    return [*aligned([*rows, *more]), "", *found.notes]
 
 
 def _readable(size: float, unit: str) -> tuple[float, str]:

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.maps.apertures import COMPLETE, Aperture
 from zonda.core.maps.grid import ImagePixels, MapGrid, image_grid
 from zonda.core.numerics.angles import beam_area
 from zonda.core.numerics.sphere import angles
@@ -95,6 +96,7 @@ def compare(
     threshold: float = THRESHOLD,
     bins: int = 24,
     label: str = "compare",
+    apertures: Sequence[float] = (),
 ) -> Comparison:
     """Compare a map with a reference. Raises InputError for maps that cannot be compared
     (`planes.common`).
@@ -107,6 +109,10 @@ def compare(
         t of equation (2).
     bins
         Number of rings.
+    apertures
+        Radii [rad] about the centre within which both are integrated: ``reference within RADIUS``
+        and ``map within RADIUS`` of the values, in the unit times sr; NaN where less than
+        `COMPLETE` of the circle has values.
     """
     a, b, notes = common(reference, other, fwhm)
     centre, names = _centre(a), (reference.name, other.name)
@@ -140,6 +146,11 @@ def compare(
         weights,
         _places(a, centre),
     )
+    for radius in apertures:
+        shares, missing = Aperture(radius).weights(grid, centre, both)
+        for name in ("reference", "map"):
+            flux = float((shares[both] * planes[name][both]).sum())
+            values[f"{name} within {radius!r}"] = flux if missing <= 1 - COMPLETE else math.nan
     values["pixels"] = float(np.count_nonzero(both & (weights > 0)))
     values["median fidelity where the reference is above 10 % of its peak"] = _median_fidelity(
         planes

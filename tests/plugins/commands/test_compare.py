@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 
 import healpy
 import numpy as np
@@ -391,3 +392,19 @@ def test_a_pipe_is_not_waited_for(tmp_path, values, capsys, suffix):
     a = write(tmp_path / "a.fits", values)
     assert compare(pipe, a, "--output", tmp_path / "o") == 2
     assert str(pipe) in capsys.readouterr().err
+
+
+def test_fluxes_in_apertures_of_two_files(tmp_path, capsys):
+    """Of a Gaussian and 0.6 of it, in two units."""
+    y, x = np.indices((61, 61)) - 30
+    wide = {"CDELT1": -4 / 3600, "CDELT2": 4 / 3600}
+    shape = np.exp(-4 * np.log(2) * (x**2 + y**2) * (4 / 30) ** 2)
+    write(tmp_path / "a.fits", shape, "MJy/sr", BMAJ=9 / 3600, RESTFRQ=93e9, **wide)
+    write(tmp_path / "b.fits", 0.6e9 * shape, "mJy/sr", BMAJ=9 / 3600, RESTFRQ=93e9, **wide)
+    given = ["--aperture", "30 arcsec", "--aperture", "5 arcmin", "--output", tmp_path / "out"]
+    assert compare(tmp_path / "a.fits", tmp_path / "b.fits", *given) == 0
+    row, far = (x for x in capsys.readouterr().out.splitlines() if "flux of map" in x)
+    numbers = [float(n) for n in re.findall(r"\d\.\d+(?:e-\d+)?", row)]
+    flux = 1e6 * np.pi / (4 * np.log(2)) * (30 * np.pi / 648000) ** 2 * (1 - 2**-4)
+    assert numbers == pytest.approx([0.6, 0.6 * flux, flux], rel=0.01)
+    assert "less than 95 %" in far

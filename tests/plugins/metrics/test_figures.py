@@ -505,3 +505,74 @@ def test_figures_by_name():
     assert figures["a"].error == 0.1
     with pytest.raises(KeyError, match="there are a, b"):
         figures["c"]
+
+
+def source(fwhm, side=SIDE):
+    y, x = np.indices((side, side)) - (side - 1) / 2
+    return np.exp(-4 * np.log(2) * (x**2 + y**2) * (PIXEL / fwhm) ** 2)
+
+
+def test_fluxes_in_apertures_and_what_is_left_of_them():
+    """The filters leave 0.7 of the sky within 20 arcsec, and less further out; noise is known."""
+    band, rng = scenes.camera().band, np.random.default_rng(5)
+    sky = source(24.0)
+    left = 0.7 * sky - 0.02
+    noise, half = (rng.normal(0, 0.01, sky.shape) for _ in range(2))
+    runs = {
+        "plain": {"only": ["sky"], "filters": "none"},
+        "filtered": {"only": ["sky"]},
+    }
+    made = data(
+        runs,
+        map=product(left + noise, noise=0.01, band=band),
+        plain__map=product(sky, band=band),
+        filtered__map=product(left, band=band),
+    )
+    made.products["map"].half_difference = half
+    area = np.pi * (20 * ARCSEC) ** 2
+    jansky = 1e6 * product([[1.0]], band=band).to("MJy/sr").signal[0, 0]
+    flux = jansky * np.pi / (4 * np.log(2)) * (24 * ARCSEC) ** 2 * (1 - 2 ** (-4 * (20 / 24) ** 2))
+    found = measure(made, "aperture_flux", radius="20 arcsec", signal="plain")
+    # pixels of a sixth of the FWHM: 2 % (core.maps.apertures)
+    assert found.value == pytest.approx(flux, rel=0.02)
+    assert found.error == 0  # of a signal without noise
+    assert found.unit == "Jy"
+    ratio = measure(made, "aperture_ratio", radius="20 arcsec", of="sky")
+    wanted = 0.7 - 0.02 * jansky * area / flux
+    assert ratio.value == pytest.approx(wanted, rel=0.01)
+    noisy = measure(made, "aperture_ratio", radius="20 arcsec")
+    white = 0.01 * jansky * PIXEL * ARCSEC * np.sqrt(area) / flux
+    # the factor of 30 apertures scatters by 1 / sqrt(60) = 13 %
+    assert noisy.error == pytest.approx(white, rel=0.4)
+    assert abs(noisy.value - ratio.value) < 4 * white
+    assert "9 apertures on half the difference" in measure(made, "aperture_flux").description
+    # what the filters took of the ring comes back, all of the constant
+    parted = measure(
+        made, "aperture_ratio", radius="20 arcsec", inner="60 arcsec", outer="90 arcsec", of="sky"
+    )
+    assert parted.value == pytest.approx(0.7, rel=0.001)
+
+
+def test_the_aperture_is_where_it_is_asked_for(tmp_path):
+    """A run: two sources, of which the fainter is away from the centre, without filters."""
+    sky = source(24.0, 64) + 0.5 * np.roll(source(24.0, 64), 15, axis=0)  # 60 arcsec north
+    steps = [
+        zonda.PointingDaisy(radius="2 arcmin", scan_duration="60 s"),
+        zonda.SkyMap(map=1e-3 * sky, pixel_size="4 arcsec", centre="05h +20d", unit="K_RJ"),
+        zonda.Efficiency(),
+        zonda.BinMap(pixel="6 arcsec"),
+        zonda.MeasureFigures(
+            metrics=[
+                {"aperture_flux": {"radius": "24 arcsec"}},
+                {"aperture_flux": {"radius": "24 arcsec", "centre": "75 deg 20.016666667 deg"}},
+                {"aperture_ratio": {"radius": "24 arcsec"}},
+            ]
+        ),
+    ]
+    where = scenes.scene(scenes.camera(61), target="05h +20d")
+    bright, faint, ratio = zonda.Pipeline(steps).run(where, threads=1)["figures"]
+    assert faint.value == pytest.approx(0.5 * bright.value, rel=0.05)
+    assert ratio.value == 1  # the map is that without filters
+    assert "20.016666667" in faint.description
+    with pytest.raises(ZondaError, match="radius <= inner < outer"):
+        measure(None, "aperture_flux", radius="1 arcmin", inner="30 arcsec", outer="2 arcmin")
