@@ -49,7 +49,7 @@ from zonda.core.command_options import set_option
 @click.option(
     "--target",
     metavar="POSITION",
-    help="A position on the sky instead, observed when it culminates.",
+    help="A position on the sky instead, observed when it culminates, or below 80 deg.",
 )
 @click.option(
     "--area",
@@ -57,10 +57,11 @@ from zonda.core.command_options import set_option
     help="Diameter of the field that is scanned.  [default: two fields of view]",
 )
 @click.option(
-    "--time",
+    "--integration",
     metavar="TIME",
     help="Integration time, e.g. '3 h'.  [default: 1 h; of a pipeline its scans]",
 )
+@click.option("--time", hidden=True)
 @click.option(
     "--source",
     metavar="SOURCE",
@@ -106,6 +107,7 @@ def sensitivity(
     source: str | None,
     peak: str | None,
     flux: str | None,
+    time: str | None,
     settings: tuple[str, ...],
     reach: str | None,
     audit: int | None,
@@ -118,12 +120,16 @@ def sensitivity(
 
     The depth is the rms of the noise behind the beam, split into white noise, 1/f noise and
     atmosphere. Without a pipeline one is made: daisy scans of the area, a high-pass filter, the
-    common mode; it is shown. A map of I, Q and U has a depth of each.
+    common mode; it is shown. A map of I, Q and U has a depth of each. With --source it is the
+    signal-to-noise ratio of that source behind the filters.
 
       zonda sensitivity mustang2_cluster
 
       zonda sensitivity --instrument mustang2 --site green_bank --pwv '7.7 mm' --area '8 arcmin'
       --reach '20 uK'
+
+      zonda sensitivity mustang2_cluster --source 'gaussian 1 arcmin' --peak '0.1 mJy/beam'
+      --reach '5 sigma'
     """
     from zonda.core.machine import one_blas_thread
 
@@ -136,6 +142,8 @@ def sensitivity(
 
     if output is not None:
         check_output_folder(output)
+    if time is not None:
+        asked["time"] = time  # it has another name, which the forecast tells
     about = {"radius": radius, "source": source, "peak": peak, "flux": flux}
     found = forecast(pipeline, settings=settings, **about, **asked)
     each = [*found.bands.values()] if isinstance(found, SensitivityOfBands) else [found]

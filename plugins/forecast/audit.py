@@ -19,6 +19,7 @@ from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.pipeline import Pipeline
 from zonda.core.signal import product_name, stream_of
 from zonda.core.tables import aligned
+from zonda.core.types import Floats
 from zonda.operators.maps.bin_map import BinMap
 
 from .depth import PARTS, Depth, prefixed, scatter
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
 COMPONENTS = {"white": "white", "1/f": "pink", "atmosphere": "atmosphere"}
 """By part of the noise, the component that makes it."""
 TOGETHER, SKY, GIVEN = "together", "only_source", "source_unfiltered"
-PIXELS = 0.003
-"""Relative error of a peak that is read off a map's pixels."""
 RATIO = "S/N"
 """Rows that begin so are numbers; the others K_RJ."""
 
@@ -147,7 +146,7 @@ def audit(
 
 def _audited(of: Forecasted, made: list[dict[str, MapProduct]], sky: SkyMap | None) -> list[Row]:
     """``made``: of each seed the maps of each part of the noise, and of all of it."""
-    rows, seeds = [], len(made)
+    rows = []
     if of.centre is not None:
         made = [{k: replace(m, centre=of.centre) for k, m in one.items()} for one in made]
     for plane, depth in of.planes.items():
@@ -161,22 +160,20 @@ def _audited(of: Forecasted, made: list[dict[str, MapProduct]], sky: SkyMap | No
                 one[name] if one[name].polarization is None else one[name].stokes(plane)
                 for one in made
             ]
-            squares = np.array([m.smoothed_rms(m.fwhm, of.radius) ** 2 for m in maps])
-            mean = math.sqrt(squares.mean())
-            own = float(squares.std(ddof=1)) / (2 * mean)
-            error = max(own, scatter(of.fwhm / FWHM_PER_SIGMA, of.radius) * mean) / math.sqrt(seeds)
-            rows.append(
-                Row(
-                    name if plane == "I" else f"{plane} {name}",
-                    math.sqrt(forecast),
-                    mean,
-                    error,
-                    seeds,
-                )
-            )
+            what = name if plane == "I" else f"{plane} {name}"
+            rows.append(_row(what, math.sqrt(forecast), maps, of))
     if of.source is not None and sky is not None:
-        rows += _of_source(of, of.source, made, of.source.sky.scale / sky.scale, rows[-1])
+        rows += _of_source(of, of.source, made, of.source.sky.scale / sky.scale)
     return rows
+
+
+def _row(what: str, forecast: float, maps: Sequence[MapProduct], of: Forecasted) -> Row:
+    """Rms of maps in the circle beside its forecast."""
+    squares = np.array([m.smoothed_rms(m.fwhm, of.radius) ** 2 for m in maps])
+    mean = math.sqrt(squares.mean())
+    own = float(squares.std(ddof=1)) / (2 * mean)
+    error = max(own, scatter(of.fwhm / FWHM_PER_SIGMA, of.radius) * mean) / math.sqrt(len(maps))
+    return Row(what, forecast, mean, error, len(maps))
 
 
 def _of_source(
@@ -184,30 +181,37 @@ def _of_source(
     source: Seen,
     made: list[dict[str, MapProduct]],
     scale: float,
-    noise: Row,
 ) -> list[Row]:
-    """Rows of the source: its peak, and where all noise is forecast, which ``noise`` is, its S/N;
-    ``scale``: of the source over the one in the maps."""
+    """Rows of the source: its peak, and its S/N by all noise; ``scale``: of the source over the one
+    in the maps.
+    """
     depth, end = of.planes["I"], float(of.planes["I"].seconds[-1])
     maps = [{k: one[k].by_stokes()["I"] for k in (SKY, GIVEN, TOGETHER)} for one in made]
-    some = maps[0][SKY]
-    peaks = scale * np.array([m[SKY].smoothed_rms(of.fwhm, 0.75 * some.pixel) for m in maps])
-    mean, seeds = float(peaks.mean()), len(made)
-    error = math.hypot(float(peaks.std(ddof=1)) / math.sqrt(seeds), PIXELS * mean)
+    sigma = of.fwhm / FWHM_PER_SIGMA
+    beam = np.exp(-((maps[0][SKY].distance() / sigma) ** 2) / 2)
+    peaks = scale * np.array([_mean(m[SKY], beam) for m in maps])
+    mean, seeds = abs(float(peaks.mean())), len(made)
+    pixels = maps[0][SKY].pixel ** 2 / 24 / sigma**2  # share of a point's peak that they smear
+    error = math.hypot(float(peaks.std(ddof=1)) / math.sqrt(seeds), pixels * mean)
     rows = [Row("peak of the source", abs(float(source.left(end))), mean, error, seeds)]
-    if noise.part != TOGETHER:
-        return rows
+    noise = _row(TOGETHER, float(depth.total(end)), [m[TOGETHER] for m in maps], of)
     ratio = mean / noise.mean
     error = ratio * math.hypot(error / mean, noise.error / noise.mean)
     rows.append(Row(f"{RATIO} peak", float(source.snr(depth, end)), ratio, error, seeds))
     sums = np.array(
-        [[np.nansum(m.weights * g.signal * m.signal) for m in (one[SKY], one[TOGETHER])]
-         for one in maps for g in [one[GIVEN]]]
-    )  # fmt: skip
+        [[_mean(m, one[GIVEN].signal) for m in (one[SKY], one[TOGETHER])] for one in maps]
+    )
     ratio = scale * float(sums[:, 0].mean() / np.sqrt((sums[:, 1] ** 2).mean()))
     error = ratio / math.sqrt(2 * seeds)  # of the rms of so many normal deviates
     forecast = float(source.snr(depth, end, "template"))
     return [*rows, Row(f"{RATIO} template", forecast, ratio, error, seeds)]
+
+
+def _mean(product: MapProduct, template: Floats) -> float:
+    """sum w k m / sum w k of a map m with the weights w, k a template."""
+    known = np.isfinite(product.signal * template)
+    weight = (product.weights * template)[known]
+    return float(weight @ product.signal[known] / weight.sum())
 
 
 def _signals(file: PipelineFile, parts: Sequence[str], sky: SkyMap | None) -> Variant:

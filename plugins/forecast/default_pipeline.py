@@ -14,11 +14,13 @@ choose them.
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from zonda.core import registry
 from zonda.core.configuration.target import Target
@@ -53,6 +55,9 @@ YEAR = 2024
 """Year of the observation: the climatology does not depend on it, and the Earth's orientation is
 known.
 """
+HIGHEST = math.radians(80)
+"""Largest elevation at which a target is observed: nearer to the zenith the azimuth axis has to
+turn more than six times as fast as the beam moves."""
 DAY, GRID = 86400.0, 300.0
 """Seconds in which a target's culmination is looked for, and steps."""
 PLACE = "zonda sensitivity"
@@ -80,7 +85,10 @@ def make(settings: Sequence[str] = (), **asked: Any) -> PipelineFile:
     """
     from zonda.core.configuration.pipeline_file import parse
 
-    return parse(text(**asked), name="the pipeline of zonda sensitivity", overrides=settings)
+    file = parse(text(**asked), name="the pipeline of zonda sensitivity", overrides=settings)
+    if file.header.description:
+        warnings.warn(f"--target: {file.header.description}", stacklevel=2)
+    return file
 
 
 def text(
@@ -92,7 +100,7 @@ def text(
     elevation: str | None = None,
     target: str | None = None,
     area: str | None = None,
-    time: str | None = None,
+    integration: str | None = None,
 ) -> str:
     """YAML of the pipeline for an observer's request.
 
@@ -107,11 +115,12 @@ def text(
         present month where nothing is said.
     elevation, target
         Elevation of a target that culminates in the middle of the night, or a target, observed when
-        it culminates.
+        it culminates; one that culminates too near the zenith for the azimuth axis to follow, when
+        it is below `HIGHEST`: the description of the pipeline says so.
     area
         Diameter of the field that the boresight covers; twice the field of view where it is not
         said.
-    time
+    integration
         Integration time.
 
     Raises
@@ -135,27 +144,34 @@ def text(
     if height > math.pi / 2:
         wrong = f"an elevation of {elevation} is outside the limits, 0 to 90 deg"
         raise InputError(wrong, place="--elevation")
-    wanted = positive("--time", Unit("s", "3 h"), time, 3600.0)
+    wanted = positive("--integration", Unit("s", "3 h"), integration, 3600.0)
     usual = min(2 * max(camera.field_of_view, 10 * camera.beam_fwhm), WIDEST)
-    scan = daisy(camera, height, positive("--area", Unit("rad"), area, usual), wanted)
+    size = positive("--area", Unit("rad"), area, usual)
+    middle, day, note = _midnight(place, month), None, ""
+    if target is not None:
+        centre = parsed("--target", Target.parse, target)
+        day = Day.of(place, middle, centre)
+        most = min(HIGHEST, camera.telescope.elevation_max) - size / 2
+        height = min(float(day.elevation.max()), most)
+    scan = daisy(camera, height, size, wanted)
     if not scan.duration <= DAY:
         wrong = (
             f"at an elevation of {math.degrees(height):.6g} deg the azimuth axis lets the beam scan"
             f" with {math.degrees(scan.speed) * 3600:.3g} arcsec/s at most"
         )
         raise InputError(wrong, place="--elevation", cure="give a lower one")
-    middle = _midnight(place, month)
-    if target is None:
+    half = (scan.scans * (scan.duration + 30) - 30) / 2
+    if day is None:
         centre = _culminating(place, middle, height)
     else:
-        centre = parsed("--target", Target.parse, target)
-        middle = _culmination(place, middle, centre)
-    start = middle.shifted(-(scan.scans * (scan.duration + 30) - 30) / 2)
+        middle, note = day.best(half, most)
+    start = middle.shifted(-half)
     if quantile is not None:
         pwv = f"{100 * quantile:.12g} %"
     angle, rate = Unit("rad"), Unit("rad / s")
     lines = [
         f"name: sensitivity_{instrument}",
+        f"description: {note}" if note else "",
         f"site: {site}",
         f"instrument: {instrument}",
         f"time: {start}",
@@ -238,28 +254,54 @@ def _culminating(site: Site, middle: Instant, elevation: float) -> Target:
     return Target.parse(f"{right_ascension:.4f} deg {declination:.4f} deg")
 
 
-def _culmination(site: Site, middle: Instant, target: Target) -> Instant:
-    """When a target is highest within half a day of ``middle``. Raises PointingError where it never
-    rises.
-    """
-    from zonda.core.numerics.celestial import CelestialTransform
+@dataclass(frozen=True)
+class Day:
+    """Elevations (n,) [rad] of a target on the day about an instant, each `GRID` seconds."""
 
-    if target.frame == "horizontal":
-        cure = "give --elevation, or a position on the sky"
-        raise InputError(
-            "a target in azimuth and elevation moves over the sky", place="--target", cure=cure
-        )
-    start = middle.shifted(-DAY / 2)
-    transform = CelestialTransform(site, start, DAY, 1e-6)
-    right_ascension, declination = target.icrs()
-    seconds: Floats = np.arange(0.0, DAY + 1, GRID)
-    height = transform.horizontal(unit_vectors(right_ascension, declination), seconds)[:, 2]
-    best = int(np.argmax(height))
-    if height[best] <= 0:
-        raise PointingError(
-            f"{target} never rises at {site.name}", place="--target", cure="choose another site"
-        )
-    return start.shifted(float(seconds[best]))
+    start: Instant
+    elevation: Floats
+
+    @classmethod
+    def of(cls, site: Site, middle: Instant, target: Target) -> Day:
+        """Raises PointingError where the target never rises."""
+        from zonda.core.numerics.celestial import CelestialTransform
+
+        if target.frame == "horizontal":
+            cure = "give --elevation, or a position on the sky"
+            raise InputError(
+                "a target in azimuth and elevation moves over the sky", place="--target", cure=cure
+            )
+        start = middle.shifted(-DAY / 2)
+        transform = CelestialTransform(site, start, DAY, 1e-6)
+        seconds: Floats = np.arange(0.0, DAY + 1, GRID)
+        height = transform.horizontal(unit_vectors(*target.icrs()), seconds)[:, 2]
+        if height.max() <= 0:
+            raise PointingError(
+                f"{target} never rises at {site.name}", place="--target", cure="choose another site"
+            )
+        return cls(start, np.arcsin(np.clip(height, -1, 1)))
+
+    def best(self, half: float, most: float) -> tuple[Instant, str]:
+        """Middle of an observation of 2 ``half`` seconds when the target culminates; with a note,
+        nearest to that where it stays below an elevation ``most`` [rad].
+        """
+        top = int(np.argmax(self.elevation))
+        middle, note = top, ""
+        if self.elevation[top] > most:
+            reach = math.ceil(half / GRID)
+            highest = maximum_filter1d(self.elevation, 2 * reach + 1, mode="wrap")
+            low = np.flatnonzero((highest <= most) & (self.elevation > 0))
+            if not low.size:
+                wrong = f"it stays above {math.degrees(most):.3g} deg for longer than that"
+                raise PointingError(wrong, place="--target", cure="give a shorter --integration")
+            middle = int(low[np.argmin(abs(low - top))])
+            hours = (middle - top) * GRID / 3600
+            note = (
+                f"the target culminates at {math.degrees(self.elevation[top]):.1f} deg, too near"
+                f" the zenith to be followed; it is observed {abs(hours):.1f} h"
+                f" {'later' if hours > 0 else 'earlier'}, below {math.degrees(most):.3g} deg"
+            )
+        return self.start.shifted(middle * GRID), note
 
 
 def _in(unit: Unit, value: float, *names: str) -> str:

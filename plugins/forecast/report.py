@@ -21,6 +21,7 @@ from zonda.core.numerics.angles import ARCMIN, ARCSEC, angle_text
 from zonda.core.storage.files import atomic_path, check_output_folder, write_text
 from zonda.core.storage.table_files import Column, write_ecsv
 from zonda.core.tables import aligned, html_table
+from zonda.core.types import Floats
 
 from .audit import Audited, Forecasted, audit
 from .calculator import Calculated
@@ -564,13 +565,14 @@ def _write(found: Sensitivity, folder: Path) -> list[Path]:
 
 
 def figure(found: Sensitivity) -> Any:
-    """Depth against time, all noise and its parts, with bands of their stated errors: a matplotlib
-    figure, not pyplot's.
+    """Depth against time, all noise and its parts, with bands of their stated errors, and the
+    S/N of the source beside it: a matplotlib figure, not pyplot's.
     """
     from matplotlib.figure import Figure
 
-    drawn = Figure(figsize=(7.2, 5.0), dpi=DPI, layout="constrained")
-    ax: Any = drawn.subplots()
+    panels = 1 if found.source is None else 2
+    drawn = Figure(figsize=(7.2 * panels, 5.0), dpi=DPI, layout="constrained")
+    ax, *others = drawn.subplots(1, panels, squeeze=False)[0]
     depth = found.depth
     end = float(depth.seconds[-1])
     grid = np.geomspace(found.times.min(), found.times.max(), 200)
@@ -606,4 +608,20 @@ def figure(found: Sensitivity) -> Any:
     ax.legend(frameon=False)
     circle = f"circle of radius {found.radius / ARCMIN:.3g}′"
     ax.set_title(f"{found.file.header.name}: {found.camera}, {circle}", fontsize=10)
+    if found.source is not None:
+        _draw_source(found, found.source, others[0], t)
     return drawn
+
+
+def _draw_source(found: Sensitivity, source: Seen, ax: Any, t: Floats) -> None:
+    """Signal-to-noise ratios against time [s]."""
+    for of, color in zip(OF, ("#0072B2", "#009E73"), strict=True):
+        ax.plot(t / 3600, source.snr(found.depth, t, of), lw=2, color=color, label=of)
+    ax.axhline(5, color="black", lw=0.8, ls=":", label="5 sigma")
+    ax.set(xscale="log", yscale="log", xlabel="integration time [h]", ylabel="S/N")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_formatter("{x:g}")
+    ax.grid(alpha=0.25, lw=0.5, which="both")
+    ax.legend(frameon=False)
+    kept = f"{100 * source.kept[-1]:.3g} % of its peak left"
+    ax.set_title(f"{source.source.words}: {kept}", fontsize=10)

@@ -43,8 +43,8 @@ def sensitivity(
 
     >>> zonda.sensitivity("mustang2_cluster")                                            # doctest:
     +SKIP
-    >>> zonda.sensitivity(instrument="mustang2", site="green_bank", pwv="7.7 mm", time="1
-    h").reach("20 uK")    # doctest: +SKIP
+    >>> zonda.sensitivity(instrument="mustang2", site="green_bank", pwv="7.7 mm",
+    integration="1 h").reach("20 uK")    # doctest: +SKIP
 
     Parameters
     ----------
@@ -64,8 +64,8 @@ def sensitivity(
         Changes to the pipeline as `zonda run --set` takes them; of a path or name, or of the
         pipeline that is made.
     asked
-        ``time``, and without a pipeline ``instrument``, ``site``, ``pwv``, ``month``, ``quantile``,
-        ``elevation``, ``target``, ``area`` (`default_pipeline.text`).
+        ``integration`` (time), and without a pipeline ``instrument``, ``site``, ``pwv``, ``month``,
+        ``quantile``, ``elevation``, ``target``, ``area`` (`default_pipeline.text`).
 
     Raises
     ------
@@ -106,7 +106,9 @@ def _forecast(
     planes = depths_of(survey, size)
     depth = planes.pop("I")
     end = float(depth.seconds[-1])
-    seconds = default_pipeline.positive("--time", Unit("s", "3 h"), asked.get("time"), end)
+    seconds = default_pipeline.positive(
+        "--integration", Unit("s", "3 h"), asked.get("integration"), end
+    )
     seen = None
     if placed is not None:
         noisy = 1.0
@@ -135,6 +137,10 @@ def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> P
     """The pipeline that is named, or one that is made for an instrument and a site."""
     from zonda.core.configuration.pipeline_file import PipelineFile, load
 
+    if asked.get("time") is not None:
+        wrong = "a time is a moment in zonda, as in `zonda when`"
+        cure = f"give the integration time as --integration '{asked['time']}'"
+        raise InputError(wrong, place="--time", cure=cure)
     unknown = sorted(asked.keys() - default_pipeline.text.__annotations__.keys())
     if unknown:
         raise TypeError(f"sensitivity() got an unexpected keyword argument {unknown[0]!r}")
@@ -144,7 +150,7 @@ def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> P
         if missing := [key for key in ("instrument", "site") if key not in given]:
             text = f"neither a pipeline nor --{missing[0]} is given"
             cure = "name a pipeline, or --instrument and --site (`zonda plugins` lists them)"
-    elif beside := sorted(given.keys() - {"time"}):
+    elif beside := sorted(given.keys() - {"integration"}):
         text = f"--{beside[0]} is part of a pipeline, and cannot be given beside one"
         cure = f"change the pipeline with --set, or leave it or --{beside[0]} out"
         if pipeline in {found.name for found in instruments.candidates()}:

@@ -4,8 +4,8 @@ ratio of its peak and of its template.
 With s_i the source as the beam of sample i = (detector d, time t) sees it, F the filters of
 `detector_noise`, a_i the weights of samples in the map, K the beam about the peak, and n the noise,
 
-    kept     = sum a K F s / sum a K s                                                           (1)
-    peak     = |kept x height of the peak behind the beam K| / depth                             (2)
+    kept     = sum a K F s / sum a K s,   smoothed = sum a K s / sum a K                         (1)
+    peak     = |kept smoothed| / depth                                                           (2)
     template = sum a s F s / rms(sum a s F n)                                                    (3)
 
 (2) is the height of the peak in the map that is smoothed with the beam, over the rms there. (3) is
@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic_core import PydanticCustomError
-from scipy.ndimage import correlate1d, map_coordinates
+from scipy.ndimage import correlate1d
 
 from zonda.core.configuration.input_paths import find_in
 from zonda.core.configuration.units import Unit
@@ -43,7 +43,7 @@ from zonda.core.types import AnyFloats, Floats
 from zonda.operators.maps.grid import tangent_wcs
 from zonda.operators.sky.convolved import Beam, tangent_areas
 from zonda.operators.sky.input_map import ImageMap
-from zonda.operators.sky.region import directions_on, places_on
+from zonda.operators.sky.region import directions_on
 from zonda.operators.sky.sampling import Rows, pointing
 from zonda.operators.sky.skymap import SkyMap
 
@@ -256,7 +256,7 @@ class Seen:
 class Placed:
     """A source on the map of a pipeline: the step that makes it, (lon, lat) of its peak [rad] in
     the map's frame, the peak's angle from the map's centre [rad], and its height as the beam sees
-    it and behind another beam [K_RJ].
+    it [K_RJ].
     """
 
     source: Source
@@ -264,7 +264,6 @@ class Placed:
     centre: tuple[float, float]
     away: float
     peak: float
-    smoothed: float
 
     @classmethod
     def of(
@@ -288,10 +287,7 @@ class Placed:
         at = np.unravel_index(int(np.argmax(abs(values))), values.shape)
         peak = float(values[at])
         towards = directions_on(beam.matrix, *(np.array([float(k)]) for k in at[::-1]))
-        twice = sky.with_beam(grid_of_sky, band, math.sqrt(2) * survey.fwhm)
-        x, y = places_on(twice.matrix, towards)
-        smoothed = float(map_coordinates(_values(twice), [y, x], order=3)[0])
-        found = cls(source, sky, grid.origin, 0.0, peak, smoothed)
+        found = cls(source, sky, grid.origin, 0.0, peak)
         if source.kind == "file":
             found = found._where_it_is(survey, towards[0])
         return found if factors is None else found._as_bright(survey, factors)
@@ -332,7 +328,7 @@ class Placed:
             raise InputError("its brightness is not given", place=PLACE, cure=cure)
         # a copy of a step keeps what it has computed, unless it is a deep one
         sky = self.sky.model_copy(update={"scale": self.sky.scale * ratio}, deep=True)
-        return replace(self, sky=sky, peak=self.peak * ratio, smoothed=self.smoothed * ratio)
+        return replace(self, sky=sky, peak=self.peak * ratio)
 
     def _sum(self, survey: Survey) -> float:
         """Integral of its brightness, K_RJ sr."""
@@ -356,11 +352,11 @@ class Placed:
         """
         sums = _sums(survey, self.sky, noisy, air)
         with np.errstate(invalid="ignore", divide="ignore"):
-            kept = sums.kept / sums.whole
+            kept, smoothed = sums.kept / sums.whole, float(sums.whole[-1] / sums.weight[-1])
         if not math.isfinite(kept[-1]):
             cure = "choose a source that the scans cross"
             raise InputError("nothing of it is observed", place=PLACE, cure=cure)
-        where = (self.source, self.sky, self.centre, self.away, self.peak, self.smoothed)
+        where = (self.source, self.sky, self.centre, self.away, self.peak, smoothed)
         return Seen(*where, survey.seconds, kept, sums.template)
 
 
@@ -369,6 +365,7 @@ class _Sums(NamedTuple):
 
     kept: Floats
     whole: Floats
+    weight: Floats
     template: Floats
 
 
@@ -401,13 +398,13 @@ def _sums(survey: Survey, sky: SkyMap, noisy: float, air: bool) -> _Sums:
             own = noise.sample**2 * (1 - noise.shared if survey.common else 1.0)
             variance += own * float(energy @ detector_noise.over_white(noise, frequency))
         weight = survey.weights[scan] * track.step * stands
-        each = [gain * _dot(near, left), _dot(near, source), gain * _dot(source, left)]
-        each.append(survey.weights[scan] * gain * noisy * variance)
+        each = [gain * _dot(near, left), _dot(near, source), float(near.sum(dtype=np.float64))]
+        each += [gain * _dot(source, left), survey.weights[scan] * gain * noisy * variance]
         rows.append([weight * value for value in each])
     summed = np.array(
         [np.interp(np.arange(number), scans, column) for column in zip(*rows, strict=True)]
     )
-    kept, whole, signal, variance = np.cumsum(summed, axis=1)
+    kept, whole, near, signal, variance = np.cumsum(summed, axis=1)
     template = np.full(number, np.nan)
     if noisy:
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -417,7 +414,7 @@ def _sums(survey: Survey, sky: SkyMap, noisy: float, air: bool) -> _Sums:
             template += atmosphere_noise.variance(survey, survey.sigma, template=given).variance
         with np.errstate(divide="ignore"):
             template = 1 / np.sqrt(template)
-    return _Sums(kept, whole, template)
+    return _Sums(kept, whole, near, template)
 
 
 def _values(beam: Beam) -> Floats:

@@ -46,7 +46,7 @@ def test_of_an_instrument_with_files(tmp_path, capsys):
             *M2,
             "--pwv",
             "7.7 mm",
-            "--time",
+            "--integration",
             "1 min",
             "--set",
             "PointingDaisy.scan_duration=60 s",
@@ -77,7 +77,9 @@ def test_of_an_instrument_with_files(tmp_path, capsys):
 
 def test_json(capsys):
     assert (
-        sensitivity("mustang2_cluster", *SHORT, "--json", "--time", "2 h", "--radius", "1 arcmin")
+        sensitivity(
+            "mustang2_cluster", *SHORT, "--json", "--integration", "2 h", "--radius", "1 arcmin"
+        )
         == 0
     )
     found = json.loads(capsys.readouterr().out)
@@ -177,7 +179,9 @@ def test_in_python():
         ((*M2, "--target", "nowhere"), "--target"),
         ((*M2, "--quantile", "2"), "--quantile"),
         ((*M2, "--elevation", "20"), "20 has no unit; write an angle such as '60 deg'"),
-        ((*M2, "--time", "2"), "2 has no unit; write a time such as '3 h'"),
+        ((*M2, "--integration", "2"), "2 has no unit; write a time such as '3 h'"),
+        ((*M2, "--time", "2 h"), "--time: a time is a moment in zonda"),
+        ((*M2, "--time", "2 h"), "--integration '2 h'"),
         (
             ("mustang2_cluster", "--set", "CommonModeFilter.modes=3"),
             "the forecast does not cover modes: 3",

@@ -72,7 +72,7 @@ def test_beside_the_forecast():
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the paper's daisy is too fast for the telescope
-        found = zonda.sensitivity(file, time="516 s")
+        found = zonda.sensitivity(file, integration="516 s")
     assert found.calculated.seconds == 516
     assert found.calculated.centre * 1e6 == pytest.approx(12.6, rel=0.02)
     assert "AtLAST sensitivity calculator" in str(found)

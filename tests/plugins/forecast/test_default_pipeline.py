@@ -52,7 +52,7 @@ def test_short_and_long_times():
 )
 def test_the_target_culminates_at_the_elevation(site, elevation):
     file = make(
-        instrument="atlast", site=site, month=6, elevation=f"{elevation} deg", time="10 min"
+        instrument="atlast", site=site, month=6, elevation=f"{elevation} deg", integration="10 min"
     )
     pipeline = file.pipeline()
     o = pipeline.point(file.scene(), {}, Path()).observations[0]
@@ -67,11 +67,35 @@ def test_the_target_culminates_at_the_elevation(site, elevation):
 
 
 def test_a_target_is_observed_when_it_culminates():
-    file = make(**M2, target="83.633 deg 22.014 deg", time="20 min")
+    file = make(**M2, target="83.633 deg 22.014 deg", integration="20 min")
     first, last = file.pipeline().point(file.scene(), {}, Path()).observations
     # 90 - 38.43 + 22.01 at culmination, found on a grid of 5 min: 0.3 deg
     assert np.degrees(first.elevation.max()) == pytest.approx(73.6, abs=0.5)
     assert np.degrees(last.elevation.min()) == pytest.approx(73.6, abs=0.8)
+
+
+@pytest.mark.parametrize(("integration", "scans"), [("10 min", 1), ("2 h", 6)])
+def test_a_target_near_the_zenith_is_observed_beside_it(integration, scans):
+    """At 38.4 deg north a target at +38 deg culminates at 89.6 deg, found on a grid of 5 min."""
+    with pytest.warns(UserWarning, match=r"culminates at 89\.5 deg.* earlier, below 79\.9"):
+        file = make(**M2, target="83.633 deg 38 deg", integration=integration, area="10 arcmin")
+    found = file.pipeline().point(file.scene(), {}, Path()).observations
+    highest = max(np.degrees(o.elevation.max()) for o in found)
+    # the daisy's radius is left below 80 deg; culminations are found on a grid of 5 min, 1 deg
+    assert 78.5 < highest < 80
+    assert len(found) == scans
+
+
+def test_of_a_camera_that_cannot_look_high(monkeypatch):
+    camera = registry.instruments.create("mustang2")
+    telescope = camera.telescope.model_copy(update={"elevation_max": math.radians(60)})
+    camera = camera.model_copy(update={"telescope": telescope})
+    monkeypatch.setattr(registry.instruments, "create", lambda *name: camera)
+    with pytest.warns(UserWarning, match="--target: the target culminates at 73"):
+        file = make(**M2, target="83.633 deg 22.014 deg")
+    assert "description: the target culminates at 73" in text(**M2, target="83.633 deg 22.014 deg")
+    found = file.pipeline().point(file.scene(), {}, Path()).observations
+    assert np.degrees(max(o.elevation.max() for o in found)) < 60
 
 
 def test_weather():
@@ -108,7 +132,7 @@ def test_one_detector_has_no_common_mode(monkeypatch):
         ({"elevation": "50"}, "--elevation: .*no unit"),
         ({"quantile": 1.5}, "outside the limits"),
         ({"month": 13}, "no month 13"),
-        ({"time": "-1 h"}, "not positive"),
+        ({"integration": "-1 h"}, "not positive"),
         ({"area": "10 s"}, "--area: .*an angle"),
         ({"pwv": "100 mm"}, "--pwv"),
         ({"target": "az 180 deg el 60 deg"}, "moves over the sky"),
