@@ -73,6 +73,13 @@ KINDS = {
 }
 """Kinds of quantities by SI unit."""
 
+OTHER_NETS = {
+    "Jy": ("a flux density", "write 1222 K NEFD / mJy / (GHz^2 arcsec^2): band's centre, FWHM"),
+    "CMB": ("the CMB's temperature", "times x^2 e^x / (e^x - 1)^2, x = GHz / 56.79 of the band"),
+}
+"""Quantities that noise levels in other units are of, and their conversion, by a part of the unit's
+name."""
+
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$", re.DOTALL)
 _LARGE_POWER = re.compile(r"\d{3}")
 """Powers of three digits are refused: astropy would compute 10**9999999."""
@@ -176,6 +183,10 @@ class Unit:
         return float(match[1]), match[2], (match.start(2), len(match[2]))
 
     def _factor(self, text: str, unit: str, caret: tuple[int, int]) -> float:
+        for part, (noun, cure) in OTHER_NETS.items():
+            if self.unit == "K s(1/2)" and part in unit:
+                message = f"{self.kind.noun} is in K s(1/2), Rayleigh-Jeans; '{unit}' is of {noun}"
+                raise mistake(message, cure, caret=caret)
         if self.unit == "K s(1/2)" and "Hz" in unit:
             message = (
                 f"'{unit}' may mean two things that differ by sqrt(2); write {self.kind.noun} in K"
@@ -207,7 +218,8 @@ class Unit:
             return float(value.to_value(read_unit(self.unit)))
         except u.UnitConversionError:
             kinds = (kind.noun for si, kind in KINDS.items() if value.unit.is_equivalent(si))
-            got = next(kinds, f"a {value.unit.physical_type}").split("/")[0].split(" ", 1)[1]
+            known = str(value.unit.physical_type).replace("unknown", "something else")
+            got = next(kinds, f"a {known}").split("/")[0].split(" ", 1)[1]
             message = (
                 f"expected {self.kind.noun} such as '{self.example}', but '{unit}' is a unit of"
                 f" {got}"

@@ -25,6 +25,7 @@ from zonda.core.configuration.units import (
     factor_to,
 )
 from zonda.core.errors import ZondaError
+from zonda.core.numerics.radiation import BOLTZMANN, PLANCK, T_CMB, intensity_to_kelvin
 
 
 class All(Parameters):
@@ -209,3 +210,19 @@ def test_schema_shows_unit_and_examples() -> None:
 def test_an_example_is_of_the_parameters_own_size(make, example):
     with pytest.raises(ZondaError, match=f"such as '{example}'"):
         make()
+
+
+@pytest.mark.parametrize(
+    ("text", "cure"),
+    [("9 mJy/beam s(1/2)", "1222 K NEFD / mJy"), ("9 uK_CMB s(1/2)", r"GHz / 56\.79")],
+)
+def test_a_noise_level_in_another_unit_is_told_its_conversion(text: str, cure: str) -> None:
+    with pytest.raises(ZondaError, match=cure):
+        All(net=text)
+
+
+def test_the_conversions_of_noise_levels() -> None:
+    """As the messages and docs/plugins.md have them, against the constants."""
+    solid_angle = np.pi / (4 * np.log(2)) * np.radians(1 / 3600) ** 2
+    assert 1e-29 * intensity_to_kelvin(1e9) / solid_angle == pytest.approx(1222, rel=1e-3)
+    assert pytest.approx(56.79, rel=1e-4) == BOLTZMANN * T_CMB / PLANCK / 1e9
