@@ -397,8 +397,8 @@ class HealpixTable(FileHeader):
         if not may_be:
             raise self.error(
                 f"none of its columns is an intensity: {there}",
-                "write a column I_STOKES, or set the operator's parameter column to the one that is"
-                " the map",
+                "write a column I_STOKES, or set column (--column of zonda compare) to the one that"
+                " is the map",
             )
         known = [k for k in may_be if _INTENSITY.fullmatch(names[k].strip())]
         known = known or [
@@ -406,7 +406,7 @@ class HealpixTable(FileHeader):
         ]
         if not known and len(may_be) > 1:
             which = ", ".join(names[k] for k in may_be)
-            cure = f"set the operator's parameter column, e.g. to {names[may_be[0]]}"
+            cure = f"set column (--column of zonda compare), e.g. to {names[may_be[0]]}"
             raise self.error(f"several of its columns may be the map: {which}", cure)
         return (known or may_be)[0]
 
@@ -441,7 +441,7 @@ class HealpixTable(FileHeader):
     def _numbers(self, column: int) -> Floats:
         found = np.asarray(self.hdu.data.field(column))
         if found.dtype.kind not in "iuf":
-            cure = "give a column of numbers, or set the operator's parameter column to another"
+            cure = "give a column of numbers, or set column (--column of zonda compare) to another"
             raise self.error(f"its column {self.names[column]} holds no numbers", cure)
         return np.array(found, np.float64).ravel()
 

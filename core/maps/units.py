@@ -152,8 +152,8 @@ def _scale(text: str, scale: str | None, place: str) -> str:
             f"the unit '{text}' does not say on which temperature scale",
             place=place,
             cure=(
-                "set the header key TEMPSCAL to 'K_RJ' or 'K_CMB', or the operator's parameter"
-                " unit: K_RJ"
+                "set the header key TEMPSCAL to 'K_RJ' or 'K_CMB', or the parameter unit: K_RJ of"
+                " SkyMap"
             ),
         )
     known = _SCALES.get(re.sub(r"^k_?(?=rj|cmb)|[\s_-]", "", scale.strip().lower()))

@@ -83,6 +83,10 @@ class CompareMaps(Output):
     """Coordinate system of a HEALPix `file` whose header has no COORDSYS: C (ICRS), G (galactic) or
     E (ecliptic).
     """
+    column: int | str | None = None
+    """Column of a HEALPix `file` that is the map, by name or counted from 1. Default: that of a
+    known name, or the only possible one.
+    """
     beam: Angle | None = Field(None, gt=0, examples=["9 arcsec"])
     """Common resolution (FWHM). Default: that of the map with the wider beam, once more smoothed
     with it if it was not yet.
@@ -178,7 +182,7 @@ class CompareMaps(Output):
         """The file. Raises InputError as `read_planes`."""
         assert self.file is not None
         plane = None if self.plane is None else tuple(np.atleast_1d(self.plane).tolist())
-        return read_planes(self.file, wanted=Wanted(self.hdu, plane, self.coordsys))
+        return read_planes(self.file, wanted=Wanted(self.hdu, plane, self.coordsys, self.column))
 
 
 def _in_kelvin(plane: Plane, band: Band) -> Plane:

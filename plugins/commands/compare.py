@@ -132,6 +132,12 @@ def _twice(flag: str, name: str, metavar: str, text: str) -> Any:
     "C|G|E",
     "Of a HEALPix map without COORDSYS; given twice: of REFERENCE and of MAP.",
 )
+@_twice(
+    "--column",
+    "columns",
+    "COLUMN",
+    "Of a HEALPix map, by name or number; given twice: of REFERENCE and of MAP.",
+)
 @click.option(
     "--threshold",
     type=click.FloatRange(0, 100, min_open=True),
@@ -214,6 +220,7 @@ def _compare(
     hdus: Any,
     planes: Any,
     systems: Any,
+    columns: Any,
     threshold: float,
     contours: tuple[float, ...],
     formats: tuple[str, ...],
@@ -232,9 +239,13 @@ def _compare(
     from zonda.operators.diagnostics.plot_operators import Plots
     from zonda.operators.diagnostics.series import plane_key
 
-    shared = not (planes[2] or systems[2])
+    shared = not (planes[2] or systems[2] or columns[2])
     read = [
-        read_planes(path, _name(path, paths), Wanted(hdus[k], planes[k], systems[k], shared))
+        read_planes(
+            path,
+            _name(path, paths),
+            Wanted(hdus[k], planes[k], systems[k], columns[k], shared),
+        )
         for k, path in enumerate(paths)
     ]
     names = [_name(path, paths) for path in paths]

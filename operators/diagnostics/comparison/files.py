@@ -34,6 +34,7 @@ from zonda.core.maps.map_reading import (
     HealpixTable,
     chosen,
     is_healpix,
+    polarized_letter,
     q_and_u,
 )
 from zonda.core.maps.measured_noise import ELSEWHERE
@@ -176,14 +177,17 @@ class Wanted:
         be the only one, or I of Stokes parameters.
     coordsys
         Of a HEALPix table: C, G or E; None: that of its header.
+    column
+        Of a HEALPix table, by name or counted from 1: the column of I; None: that of a known name.
     shared
-        Plane and system are those of another file, too: where they do not apply to this one, they
-        are left out.
+        Plane, system and column are those of another file, too: where they do not apply to this
+        one, they are left out.
     """
 
     hdu: int | str | None = None
     plane: tuple[int, ...] | None = None
     coordsys: str | None = None
+    column: int | str | None = None
     shared: bool = False
 
 
@@ -249,6 +253,9 @@ def _read(path: Path, name: str, wanted: Wanted) -> ReadMap:
                     "remove it: CTYPE says what an image's are",
                 )
                 raise InputError(what, place=place, cure=cure)
+            if not healpix and wanted.column is not None:
+                what = "column is for HEALPix maps"
+                raise InputError(what, place=place, cure="remove it, or choose plane or hdu")
         found = _healpix(hdu, wanted, place) if healpix else _images(hdus, hdu, wanted, place)
         return found.read(name, FileHeader(hdu.header, place))
 
@@ -271,7 +278,12 @@ class Found:
         unit, factor = "", 1.0
         if written := str(self.unit or "").strip():
             scale = about.text("TEMPSCAL") or None
-            unit, factor = parse_unit(written, place=about.place, temperature_scale=scale)
+            try:
+                unit, factor = parse_unit(written, place=about.place, temperature_scale=scale)
+            except InputError as error:
+                key = "BUNIT" if image else "TUNIT of the column"
+                cure = f"set {key} to {KNOWN_UNITS}; of kelvin, TEMPSCAL to K_RJ or K_CMB, too"
+                raise about.error(error.message, cure) from None
         major = about.number("BMAJ") or 0.0
         minor = about.number("BMIN") or major
         fwhm = math.radians(math.sqrt(major * minor)) if min(major, minor) > 0 else None
@@ -393,7 +405,9 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
     given = (table.text("COORDSYS") or wanted.coordsys) if wanted.shared else wanted.coordsys
     frame, _ = table.frame(given or None)
     names = [name.upper() for name in table.names]
-    columns = dict(zip("IQU", (table.intensity(), *q_and_u(names)), strict=False))
+    first = table.intensity(wanted.column)
+    others = [] if polarized_letter(table.names[first]) else q_and_u(names)
+    columns = dict(zip("IQU", (first, *others), strict=False))
     columns |= {
         key: names.index(name)
         for name, key in NOISES.items()

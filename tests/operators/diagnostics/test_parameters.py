@@ -91,6 +91,7 @@ STEPS = (
             "plane": ({"file": "cube.fits", "plane": 1}, {"plane": 2}),
             "hdu": ({"file": "two.fits"}, {"hdu": "second"}),
             "coordsys": ({"file": "fine.fits"}, {"coordsys": "galactic"}),
+            "column": ({"file": "fine.fits"}, {"column": "other"}),
             "beam": ({}, {"beam": "20 arcsec"}),
             "least_coverage": ({}, {"least_coverage": 0.6}),
             "threshold": ({}, {"threshold": 3.0}),

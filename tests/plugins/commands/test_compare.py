@@ -408,3 +408,26 @@ def test_fluxes_in_apertures_of_two_files(tmp_path, capsys):
     flux = 1e6 * np.pi / (4 * np.log(2)) * (30 * np.pi / 648000) ** 2 * (1 - 2**-4)
     assert numbers == pytest.approx([0.6, 0.6 * flux, flux], rel=0.01)
     assert "less than 95 %" in far
+
+
+def test_the_columns_and_the_unit_of_healpix_files_are_chosen(tmp_path, capsys):
+    values = np.arange(12.0 * 16**2)
+    columns = [("A", values, "K"), ("B", 3 * values, "K"), ("C", values, "furlong")]
+    table = fits.BinTableHDU.from_columns(
+        [fits.Column(name, "D", unit=unit, array=v) for name, v, unit in columns]
+    )
+    cards = {"PIXTYPE": "HEALPIX", "NSIDE": 16, "ORDERING": "RING", "COORDSYS": "C"}
+    table.header.update(cards | {"TEMPSCAL": "K_RJ"})
+    path = tmp_path / "h.fits"
+    table.writeto(path)
+    more = path, "--output", tmp_path / "o"
+    assert compare(path, *more) == 2
+    assert "--column of zonda compare" in capsys.readouterr().err
+    assert compare(path, *more, "--column", "A", "--column", "2") == 0
+    gain = rows(capsys.readouterr().out)["gain: map = gain x reference + offset"]
+    assert float(gain.split()[0]) == pytest.approx(3)
+    assert compare(path, *more, "--column", "C") == 2
+    told = capsys.readouterr().err
+    assert "unknown unit 'furlong'" in told
+    assert "set TUNIT of the column to" in told
+    assert "parameter" not in told
